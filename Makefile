@@ -1,0 +1,47 @@
+# tactomo: everything a fresh machine needs is Python 3.11+ (with venv), git and make.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.PHONY: help run test test-slow lint format bench lock clean
+
+help:            ## list these targets
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
+
+run: $(READY)    ## twin, daemon and viewer: a skin to press in the browser
+	$(BIN)/tactomo demo $(ARGS)
+
+test: $(READY)   ## the default test suite
+	$(BIN)/pytest $(ARGS)
+
+test-slow: $(READY)  ## the tests too long for every run
+	$(BIN)/pytest -m slow $(ARGS)
+
+lint: $(READY)   ## ruff and mypy --strict
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(READY) ## let ruff rewrite what it can
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(READY)  ## latency and time per frame on this machine
+	$(BIN)/tactomo bench $(ARGS)
+
+lock:            ## refresh requirements.lock (needs uv on the PATH)
+	uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 \
+	  --generate-hashes --no-emit-package tactomo-client --no-emit-package tactomo \
+	  -o requirements.lock
+
+clean:           ## remove the environment and caches
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis
+
+# Built in place under a temporary marker so that an interrupted install is simply redone.
+$(READY): requirements.lock pyproject.toml clients/python/pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "tactomo needs Python 3.11 or newer")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --require-hashes -r requirements.lock
+	$(BIN)/python -m pip install --quiet --no-build-isolation --no-deps -e clients/python -e .
+	touch $@

@@ -1,0 +1,225 @@
+"""Stream and control messages: they round-trip, and no bytes at all break the decoder."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from tactomo_client.errors import ControlError, MessageError
+from tactomo_client.messages import (
+    ARRAY_DTYPES,
+    KINDS,
+    MAX_ARRAY_VALUES,
+    array_from_wire,
+    array_to_wire,
+    decode_message,
+    decode_reply,
+    decode_request,
+    encode_error,
+    encode_message,
+    encode_reply,
+    encode_request,
+    topic,
+)
+
+HEADER: dict[str, Any] = {
+    "session": "0123456789abcdef",
+    "sequence": 7,
+    "acquired_realtime_ns": 1_700_000_000_000_000_000,
+    "acquired_monotonic_ns": 123_456_789,
+    "device_us": 42,
+    "age_ns": 1_000_000,
+    "tier": "levelset",
+    "tier_reason": "two contacts",
+    "flags": ["misfit_high"],
+    "misfit": 1.25,
+}
+
+scalars = st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text()
+values = st.recursive(
+    scalars | st.binary(max_size=64),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=12,
+)
+
+
+def arrays() -> st.SearchStrategy[np.ndarray[Any, Any]]:
+    return st.sampled_from(ARRAY_DTYPES).flatmap(
+        lambda name: hnp.arrays(
+            np.dtype(name), hnp.array_shapes(min_dims=1, max_dims=4, min_side=0, max_side=5)
+        )
+    )
+
+
+@given(
+    sensor=st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", fullmatch=True),
+    kind=st.sampled_from(KINDS),
+    extra=st.dictionaries(
+        st.text().filter(lambda k: k not in HEADER and k not in {"schema", "sensor", "kind"}),
+        values.filter(lambda v: v == v),
+        max_size=4,
+    ),
+)
+def test_any_message_round_trips(sensor: str, kind: str, extra: dict[str, Any]) -> None:
+    header = {name: value for name, value in HEADER.items() if name != "clock_id"}
+    data = encode_message(sensor, kind, header | {k: v for k, v in extra.items() if k != "clock_id"})
+    assert data.startswith(topic(sensor, kind))
+    message = decode_message(data)
+    assert (message.sensor, message.kind) == (sensor, kind)
+    for name, value in header.items():
+        assert message.fields[name] == value
+    assert message.fields.keys() >= extra.keys() - {"clock_id"}
+
+
+@given(arrays())
+def test_any_array_round_trips(array: np.ndarray[Any, Any]) -> None:
+    wire = msgpack.unpackb(msgpack.packb(array_to_wire(array)))
+    back = array_from_wire(wire)
+    assert back.dtype == array.dtype
+    assert back.shape == array.shape
+    assert back.tobytes() == array.tobytes()
+    assert not back.flags.writeable
+
+
+def test_big_endian_and_strided_arrays_keep_their_values() -> None:
+    array = np.arange(12, dtype=">f4").reshape(3, 4)[:, ::2]
+    np.testing.assert_array_equal(array_from_wire(array_to_wire(array)), array)
+    assert array_to_wire(array)["dtype"] == "<f4"
+
+
+def test_numpy_values_may_stand_anywhere() -> None:
+    fields = HEADER | {"map": np.ones((2, 3), np.float32), "scan_counter": np.uint32(5)}
+    decoded = decode_message(encode_message("left", "map", fields)).fields
+    assert decoded["scan_counter"] == 5
+    np.testing.assert_array_equal(array_from_wire(decoded["map"]), np.ones((2, 3)))
+
+
+@given(st.binary(max_size=300))
+def test_no_bytes_break_the_decoders(data: bytes) -> None:
+    for decode in (decode_message, decode_request, decode_reply):
+        try:
+            decode(data)
+        except (MessageError, ControlError):
+            pass
+
+
+@given(body=values | st.binary(max_size=80))
+def test_no_body_breaks_the_decoders(body: object) -> None:
+    packed = body if isinstance(body, bytes) else msgpack.packb(body)
+    with pytest.raises(MessageError):
+        decode_message(b"left/map\0" + packed)
+    with pytest.raises(MessageError):
+        decode_reply(packed)
+
+
+@given(data=st.data())
+def test_no_corruption_of_a_message_breaks_the_decoder(data: st.DataObject) -> None:
+    fields = HEADER | {"map": np.zeros((4, 4), np.float32), "contacts": [{"id": 1, "x_mm": 2.0}]}
+    message = bytearray(encode_message("left", "map", fields))
+    for _ in range(data.draw(st.integers(1, 4))):
+        position = data.draw(st.integers(0, len(message) - 1))
+        message[position] = data.draw(st.integers(0, 255))
+    length = data.draw(st.integers(0, len(message)))
+    try:
+        decoded = decode_message(bytes(message[:length])).fields
+        array_from_wire(decoded.get("map"))
+    except MessageError:
+        pass
+
+
+@given(
+    shape=values | st.lists(st.integers(-1, 2**63), max_size=6),
+    dtype=values | st.sampled_from([*ARRAY_DTYPES, ">f4", "O", "|V8", "f4,f4", "<M8[s]"]),
+    data=values | st.binary(max_size=64),
+)
+def test_no_array_map_breaks_the_decoder(shape: object, dtype: object, data: object) -> None:
+    try:
+        array = array_from_wire({"shape": shape, "dtype": dtype, "data": data})
+    except MessageError:
+        return
+    assert list(array.shape) == shape
+    assert array.tobytes() == data
+
+
+@pytest.mark.parametrize(
+    "wire",
+    [
+        {"shape": [2**40], "dtype": "<f4", "data": b""},
+        {"shape": [MAX_ARRAY_VALUES, MAX_ARRAY_VALUES, 0], "dtype": "<f4", "data": b"\0"},
+        {"shape": [True], "dtype": "|u1", "data": b"\0"},
+        {"shape": [-1], "dtype": "|u1", "data": b"\0"},
+        {"shape": [], "dtype": "|u1", "data": b"\0"},
+        {"shape": [2], "dtype": "<f4", "data": b"\0" * 7},
+        {"shape": [1], "dtype": "O", "data": b"\0" * 8},
+        None,
+        [],
+    ],
+)
+def test_a_bad_array_is_named(wire: object) -> None:
+    with pytest.raises(MessageError):
+        array_from_wire(wire)
+
+
+@pytest.mark.parametrize(
+    ("change", "mentions"),
+    [
+        ({"sequence": -1}, "sequence"),
+        ({"sequence": True}, "sequence"),
+        ({"session": None}, "session"),
+        ({"flags": [1]}, "flags"),
+        ({"flags": "misfit_high"}, "flags"),
+        ({"misfit": "1"}, "misfit"),
+    ],
+)
+def test_a_bad_header_is_refused_on_both_sides(change: dict[str, Any], mentions: str) -> None:
+    with pytest.raises(MessageError, match=mentions):
+        encode_message("left", "map", HEADER | change)
+    body = {"schema": 1, "sensor": "left", "kind": "map"} | HEADER | change
+    with pytest.raises(MessageError, match=mentions):
+        decode_message(b"left/map\0" + msgpack.packb(body))
+
+
+def test_a_missing_header_field_is_named() -> None:
+    with pytest.raises(MessageError, match="session"):
+        encode_message("left", "map", {k: v for k, v in HEADER.items() if k != "session"})
+
+
+def test_another_schema_says_what_to_do() -> None:
+    body = msgpack.packb({"schema": 2, "sensor": "left", "kind": "map"} | HEADER)
+    with pytest.raises(MessageError, match="schema 2 is not 1.*install"):
+        decode_message(b"left/map\0" + body)
+
+
+def test_topic_and_body_must_agree() -> None:
+    body = encode_message("left", "map", HEADER).partition(b"\0")[2]
+    with pytest.raises(MessageError, match="disagree"):
+        decode_message(b"right/map\0" + body)
+
+
+@pytest.mark.parametrize("sensor", ["", "a/b", "a\0", "ä", "a" * 65, ".hidden", None])
+def test_names_that_cannot_be_topics_are_refused(sensor: Any) -> None:
+    with pytest.raises(MessageError, match="sensor name"):
+        topic(sensor, "map")
+
+
+@given(command=st.text(), arguments=st.dictionaries(st.text(), scalars.filter(lambda v: v == v)))
+def test_any_request_round_trips(command: str, arguments: dict[str, Any]) -> None:
+    try:
+        data = encode_request(command, arguments)
+    except MessageError:  # lone surrogates have no UTF-8
+        return
+    assert decode_request(data) == (command, arguments)
+
+
+def test_replies_round_trip() -> None:
+    assert decode_reply(encode_reply({"scans": 20})) == {"scans": 20}
+    with pytest.raises(ControlError) as caught:
+        decode_reply(encode_error("tare_refused", "a contact is there", "lift it and tare again"))
+    assert caught.value.name == "tare_refused"
+    assert str(caught.value) == "a contact is there; lift it and tare again"
