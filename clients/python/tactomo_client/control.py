@@ -29,9 +29,11 @@ def request(
     Raises:
         ControlError: the command was refused, or nothing answered (`name` is then ``no_answer``).
         MessageError: what answered does not speak this protocol.
+
     """
     message = encode_request(command, arguments)
     # A socket per command: after an unanswered request a REQ socket cannot send another.
+    socket: zmq.Socket[bytes]
     with zmq.Context.instance().socket(zmq.REQ) as socket:
         socket.linger = 0
         socket.maxmsgsize = MAX_MESSAGE_BYTES

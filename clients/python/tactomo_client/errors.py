@@ -1,11 +1,11 @@
 """What can go wrong between a client and the daemon, each with a name, a cause and a next step.
 
-    ClientError
-    ├── MessageError    a message does not follow STREAM.md: another program publishes there,
-    │                   or its version is another one
-    ├── ControlError    a command was refused, or nothing answered it: `tactomo tare` while
-    │                   somebody presses the skin, the daemon is not running
-    └── StreamTimeout   no frame came within `timeout_s`: the cable is out, the name is misspelt
+ClientError
+├── MessageError    a message does not follow STREAM.md: another program publishes there,
+│                   or its version is another one
+├── ControlError    a command was refused, or nothing answered it: `tactomo tare` while
+│                   somebody presses the skin, the daemon is not running
+└── StreamTimeout   no frame came within `timeout_s`: the cable is out, the name is misspelt
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ class ClientError(Exception):
         name: a short stable identifier such as ``no_answer``, for programs.
         cause: what went wrong, for people.
         next_step: what to do about it, for people; may be empty.
+
     """
 
     def __init__(self, cause: str, next_step: str = "", name: str = "client_error") -> None:

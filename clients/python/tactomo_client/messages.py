@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import msgpack
+import msgpack  # type: ignore[import-untyped]
 import numpy as np
 from numpy.typing import NDArray
 
@@ -100,6 +100,7 @@ def encode_message(sensor: str, kind: str, fields: Mapping[str, Any]) -> bytes:
 
     Raises:
         MessageError: a header field is missing or of the wrong type, or a value has no wire form.
+
     """
     head = topic(sensor, kind)
     _check_header(fields)
@@ -201,15 +202,16 @@ def decode_reply(data: bytes) -> dict[str, Any]:
     Raises:
         ControlError: the command was refused; name, cause and next step are the server's.
         MessageError: the bytes are no reply.
+
     """
     fields = _unpack_map(data)
     result, error = fields.get("result"), fields.get("error")
     if fields.get("ok") is True and isinstance(result, dict):
         return result
     if fields.get("ok") is False and isinstance(error, dict):
-        texts = (error.get("cause"), error.get("next_step", ""), error.get("name"))
-        if all(isinstance(text, str) for text in texts):
-            raise ControlError(*texts)
+        name, cause, next_step = (error.get(key) for key in ("name", "cause", "next_step"))
+        if isinstance(name, str) and isinstance(cause, str) and isinstance(next_step, str):
+            raise ControlError(cause, next_step, name)
     raise MessageError("a reply is {schema, ok: true, result} or {schema, ok: false, error}")
 
 
