@@ -1,0 +1,73 @@
+"""What can go wrong in the daemon and its tools, each with a name, a cause and a next step.
+
+TactomoError
+├── ConfigError      the configuration cannot be used: `tactomo daemon skin.toml` where the file
+│                    is not TOML, has an unknown key or a value out of range
+├── PortError        a serial port cannot be used: the path does not exist, is no serial device,
+│                    may not be opened by this user
+│   └── PortBusyError    ... or another process holds it: a terminal program was left open
+├── AddressError     a socket cannot be bound: a second daemon runs with the same configuration
+├── CommandError     a control command was refused: its argument is out of range, or there is
+│                    nothing to tare against yet
+└── RecordingError   a recording cannot be written or read: the disk is full, the file is not MCAP
+
+They are raised for what a user can cause. A program shows `cause` and `next_step` and exits with
+status 1; a traceback is for a mistake of ours.
+"""
+
+from __future__ import annotations
+
+
+class TactomoError(Exception):
+    """Base of everything that tactomo raises on purpose.
+
+    Attributes:
+        name: a short stable identifier such as ``port_busy``, for programs.
+        cause: what went wrong, for people.
+        next_step: what to do about it, for people; may be empty.
+
+    """
+
+    name = "tactomo_error"
+
+    def __init__(self, cause: str, next_step: str = "", name: str | None = None) -> None:
+        super().__init__(f"{cause}; {next_step}" if next_step else cause)
+        self.name = name or type(self).name
+        self.cause = cause
+        self.next_step = next_step
+
+
+class ConfigError(TactomoError):
+    """The configuration cannot be used."""
+
+    name = "bad_config"
+
+
+class PortError(TactomoError):
+    """A serial port cannot be used."""
+
+    name = "port_unusable"
+
+
+class PortBusyError(PortError):
+    """A serial port is held by another process."""
+
+    name = "port_busy"
+
+
+class AddressError(TactomoError):
+    """A socket cannot be bound."""
+
+    name = "address_unusable"
+
+
+class CommandError(TactomoError):
+    """A control command was refused."""
+
+    name = "refused"
+
+
+class RecordingError(TactomoError):
+    """A recording cannot be written or read."""
+
+    name = "bad_recording"
