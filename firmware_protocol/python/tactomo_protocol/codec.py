@@ -1,0 +1,398 @@
+"""Packets to bytes and back: COBS framing, CRC-32, and a decoder that survives any input.
+
+A frame is `0x00 COBS(version type body crc32) 0x00`. Both delimiters are sent, so that damage to
+the end of one frame cannot swallow the start of the next; two in a row enclose an empty frame,
+which means nothing. PROTOCOL.md is the specification; this module follows it field by field.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+import struct
+from dataclasses import dataclass
+from zlib import crc32
+
+import numpy as np
+from cobs import cobs
+
+from .packets import (
+    Acknowledge,
+    AckStatus,
+    Channel,
+    Command,
+    CommandCode,
+    Hello,
+    Packet,
+    SampleFormat,
+    Samples,
+    Scan,
+    ScanFlag,
+    UnknownPacket,
+)
+
+PROTOCOL_VERSION = 1
+MAX_SAMPLES = 1024
+MAX_STRING_BYTES = 64
+
+_SCAN, _HELLO, _ACKNOWLEDGE, _COMMAND = 0x01, 0x02, 0x03, 0x81
+_KNOWN_TYPES = (_SCAN, _HELLO, _ACKNOWLEDGE, _COMMAND)
+
+# Each layout starts with the version and the type, as the payload does.
+_PREFIX = struct.Struct("<BB")
+_SCAN_HEAD = struct.Struct("<BBBBIQBBH")
+_HELLO_HEAD = struct.Struct("<BBBBHBBddB")
+_ACKNOWLEDGE_BODY = struct.Struct("<BBBBB")
+_COMMAND_BODY = struct.Struct("<BBBBd")
+_CRC_BYTES = 4
+
+_MAX_PAYLOAD = _SCAN_HEAD.size + 4 * MAX_SAMPLES + _CRC_BYTES
+_MAX_BODY = _MAX_PAYLOAD - _PREFIX.size - _CRC_BYTES
+_MAX_ENCODED: int = cobs.max_encoded_length(_MAX_PAYLOAD)
+MAX_FRAME_BYTES = _MAX_ENCODED + 2
+
+_U8, _U16, _U32, _U64 = 2**8 - 1, 2**16 - 1, 2**32 - 1, 2**64 - 1
+
+
+class FieldError(ValueError):
+    """A packet field that the wire cannot carry: says which, what it is and what is allowed."""
+
+    def __init__(self, field: str, value: object, allowed: str) -> None:
+        super().__init__(f"{field} is {value!r}; it must be {allowed}")
+        self.field = field
+        self.value = value
+        self.allowed = allowed
+
+
+def encode(packet: Packet) -> bytes:
+    """One whole frame, both delimiters included, at most `MAX_FRAME_BYTES` long.
+
+    Raises `FieldError` (a `ValueError`) for a field that the wire cannot carry.
+    """
+    payload = _pack(packet)
+    payload += crc32(payload).to_bytes(_CRC_BYTES, "little")
+    return b"\0" + bytes(cobs.encode(payload)) + b"\0"
+
+
+@dataclass(slots=True)
+class DecoderCounts:
+    """What a decoder has met since it was made.
+
+    The error counts are of frames, not of packets: damage that writes a zero into a frame splits
+    it in two, and damage that removes delimiters joins several. Lost scans show as gaps in their
+    counter.
+    """
+
+    packets: int = 0  # returned by `feed`, those of unknown type included
+    crc_errors: int = 0  # the checksum does not match, or the frame is too short to hold one
+    cobs_errors: int = 0  # not a COBS encoding of anything
+    malformed: int = 0  # intact, but its body breaks the specification: a sender's mistake
+    oversize: int = 0  # longer than any frame may be; dropped up to the next delimiter
+    wrong_version: int = 0  # intact, of a protocol version that is not spoken here
+    unknown_type: int = 0  # returned as `UnknownPacket`; not an error
+
+    @property
+    def corrupt(self) -> int:
+        """Frames that arrived and yielded no packet."""
+        return (
+            self.crc_errors + self.cobs_errors + self.malformed + self.oversize + self.wrong_version
+        )
+
+
+class Decoder:
+    """Turns the bytes of one port into packets; not thread-safe.
+
+    Holds at most one frame's bytes between calls. What comes before the first delimiter is the
+    rest of a frame whose start was missed: it is dropped and not counted.
+    """
+
+    def __init__(self) -> None:
+        self.counts = DecoderCounts()
+        self._pending = bytearray()
+        self._dropping = True  # until the next delimiter
+
+    def feed(self, data: bytes | bytearray | memoryview) -> list[Packet]:
+        """The packets completed by `data`, in order; any bytes in any chunking, never raises."""
+        data = bytes(data)
+        packets: list[Packet] = []
+        start = 0
+        while (end := data.find(0, start)) >= 0:
+            self._collect(data, start, end)
+            if self._pending:
+                packet = self._decode(bytes(self._pending))
+                if packet is not None:
+                    packets.append(packet)
+                self._pending.clear()
+            self._dropping = False
+            start = end + 1
+        self._collect(data, start, len(data))
+        self.counts.packets += len(packets)
+        return packets
+
+    def _collect(self, data: bytes, start: int, end: int) -> None:
+        if self._dropping:
+            return
+        if len(self._pending) + end - start > _MAX_ENCODED:
+            self.counts.oversize += 1
+            self._pending.clear()
+            self._dropping = True
+        else:
+            self._pending += data[start:end]
+
+    def _decode(self, encoded: bytes) -> Packet | None:
+        try:
+            payload = cobs.decode(encoded)
+        except cobs.DecodeError:
+            self.counts.cobs_errors += 1
+            return None
+        content, checksum = payload[:-_CRC_BYTES], payload[-_CRC_BYTES:]
+        if len(content) < _PREFIX.size or crc32(content) != int.from_bytes(checksum, "little"):
+            self.counts.crc_errors += 1
+            return None
+        version, kind = _PREFIX.unpack_from(content)
+        if version != PROTOCOL_VERSION:
+            self.counts.wrong_version += 1
+            return None
+        if kind not in _KNOWN_TYPES:
+            self.counts.unknown_type += 1
+        try:
+            return _unpack(kind, content)
+        except ValueError:
+            self.counts.malformed += 1
+            return None
+
+
+def _pack(packet: Packet) -> bytes:
+    match packet:
+        case Scan():
+            return _pack_scan(packet)
+        case Hello():
+            return _pack_hello(packet)
+        case Acknowledge():
+            return _pack_acknowledge(packet)
+        case Command():
+            return _pack_command(packet)
+        case UnknownPacket():
+            return _pack_unknown(packet)
+    raise FieldError("packet", packet, "a Scan, Hello, Acknowledge, Command or UnknownPacket")
+
+
+def _unpack(kind: int, content: bytes) -> Packet:
+    """The packet in `content` (version, type, body); raises ValueError if the body is malformed."""
+    if kind == _SCAN:
+        return _unpack_scan(content)
+    if kind == _HELLO:
+        return _unpack_hello(content)
+    if kind == _ACKNOWLEDGE:
+        return _unpack_acknowledge(content)
+    if kind == _COMMAND:
+        return _unpack_command(content)
+    return UnknownPacket(kind, content[_PREFIX.size :])
+
+
+def _pack_scan(scan: Scan) -> bytes:
+    sample_format = _format_of(scan.samples)
+    head = _SCAN_HEAD.pack(
+        PROTOCOL_VERSION,
+        _SCAN,
+        _member("Scan.channel", scan.channel, Channel),
+        _integer("Scan.flags", scan.flags, 0, _U8),
+        _integer("Scan.counter", scan.counter, 0, _U32),
+        _integer("Scan.device_us", scan.device_us, 0, _U64),
+        sample_format,
+        0,
+        len(scan.samples),
+    )
+    return head + scan.samples.astype(sample_format.dtype.newbyteorder("<")).tobytes()
+
+
+def _unpack_scan(content: bytes) -> Scan:
+    _require(len(content) >= _SCAN_HEAD.size)
+    _, _, channel, flags, counter, device_us, code, _, count = _SCAN_HEAD.unpack_from(content)
+    dtype = SampleFormat(code).dtype
+    _require(1 <= count <= MAX_SAMPLES)
+    _require(len(content) == _SCAN_HEAD.size + count * dtype.itemsize)
+    samples = np.frombuffer(content, dtype.newbyteorder("<"), count, _SCAN_HEAD.size)
+    return Scan(
+        Channel(channel), counter, device_us, ScanFlag(flags), samples.astype(dtype, copy=False)
+    )
+
+
+def _pack_hello(hello: Hello) -> bytes:
+    _check_hello(hello)
+    head = _HELLO_HEAD.pack(
+        PROTOCOL_VERSION,
+        _HELLO,
+        sum(1 << channel for channel in hello.channels),
+        hello.sample_format,
+        hello.samples_per_scan,
+        hello.electrodes,
+        hello.drive_offset,
+        hello.volts_per_count,
+        hello.scan_rate_hz,
+        hello.measure_offset,
+    )
+    return head + _pack_string(hello.device_id) + _pack_string(hello.firmware)
+
+
+def _unpack_hello(content: bytes) -> Hello:
+    _require(len(content) >= _HELLO_HEAD.size)
+    _, _, mask, code, samples, electrodes, drive, volts, rate, measure = _HELLO_HEAD.unpack_from(
+        content
+    )
+    device_id, end = _unpack_string(content, _HELLO_HEAD.size)
+    firmware, end = _unpack_string(content, end)
+    _require(end == len(content))
+    hello = Hello(
+        device_id=device_id,
+        firmware=firmware,
+        channels=tuple(Channel(bit) for bit in range(8) if mask >> bit & 1),
+        electrodes=electrodes,
+        drive_offset=drive,
+        measure_offset=measure,
+        samples_per_scan=samples,
+        sample_format=SampleFormat(code),
+        volts_per_count=volts,
+        scan_rate_hz=rate,
+    )
+    _check_hello(hello)
+    return hello
+
+
+def _check_hello(hello: Hello) -> None:
+    _check_string("Hello.device_id", hello.device_id)
+    _check_string("Hello.firmware", hello.firmware)
+    for channel in hello.channels:
+        _member("Hello.channels", channel, Channel)
+    if not hello.channels or list(hello.channels) != sorted(set(hello.channels)):
+        raise FieldError("Hello.channels", hello.channels, "one or more, ascending, none twice")
+    _integer("Hello.electrodes", hello.electrodes, 2, _U8)
+    _integer("Hello.drive_offset", hello.drive_offset, 1, hello.electrodes - 1)
+    _integer("Hello.measure_offset", hello.measure_offset, 1, hello.electrodes - 1)
+    _integer("Hello.samples_per_scan", hello.samples_per_scan, 1, MAX_SAMPLES)
+    _member("Hello.sample_format", hello.sample_format, SampleFormat)
+    if not (_is_finite(hello.volts_per_count) and hello.volts_per_count > 0):
+        raise FieldError("Hello.volts_per_count", hello.volts_per_count, "finite and above 0 V")
+    if not (_is_finite(hello.scan_rate_hz) and hello.scan_rate_hz >= 0):
+        raise FieldError("Hello.scan_rate_hz", hello.scan_rate_hz, "finite and not below 0 Hz")
+
+
+def _pack_acknowledge(acknowledge: Acknowledge) -> bytes:
+    return _ACKNOWLEDGE_BODY.pack(
+        PROTOCOL_VERSION,
+        _ACKNOWLEDGE,
+        _integer("Acknowledge.request", acknowledge.request, 0, _U8),
+        _integer("Acknowledge.command", acknowledge.command, 0, _U8),
+        _member("Acknowledge.status", acknowledge.status, AckStatus),
+    )
+
+
+def _unpack_acknowledge(content: bytes) -> Acknowledge:
+    _require(len(content) == _ACKNOWLEDGE_BODY.size)
+    _, _, request, command, status = _ACKNOWLEDGE_BODY.unpack(content)
+    return Acknowledge(request, _command_code(command), AckStatus(status))
+
+
+def _pack_command(command: Command) -> bytes:
+    is_set_rate = command.code == CommandCode.SET_RATE
+    if is_set_rate and not (_is_finite(command.rate_hz) and command.rate_hz > 0):
+        raise FieldError("Command.rate_hz", command.rate_hz, "finite and above 0 Hz")
+    if not is_set_rate and command.rate_hz != 0:
+        raise FieldError("Command.rate_hz", command.rate_hz, "0 for commands other than SET_RATE")
+    return _COMMAND_BODY.pack(
+        PROTOCOL_VERSION,
+        _COMMAND,
+        _integer("Command.code", command.code, 0, _U8),
+        _integer("Command.request", command.request, 0, _U8),
+        command.rate_hz,
+    )
+
+
+def _unpack_command(content: bytes) -> Command:
+    _require(len(content) == _COMMAND_BODY.size)
+    _, _, code, request, rate_hz = _COMMAND_BODY.unpack(content)
+    # A bad rate is the device's to refuse, with an acknowledgement; elsewhere it means nothing.
+    return Command(_command_code(code), request, rate_hz if code == CommandCode.SET_RATE else 0.0)
+
+
+def _pack_unknown(packet: UnknownPacket) -> bytes:
+    kind = _integer("UnknownPacket.type", packet.type, 0, _U8)
+    if kind in _KNOWN_TYPES:
+        raise FieldError("UnknownPacket.type", kind, "a type that this version does not define")
+    if len(packet.body) > _MAX_BODY:
+        raise FieldError("UnknownPacket.body", packet.body, f"at most {_MAX_BODY} bytes")
+    return _PREFIX.pack(PROTOCOL_VERSION, kind) + packet.body
+
+
+def _format_of(samples: Samples) -> SampleFormat:
+    if not isinstance(samples, np.ndarray) or samples.ndim != 1:
+        raise FieldError("Scan.samples", samples, "a 1-D NumPy array")
+    if not 1 <= len(samples) <= MAX_SAMPLES:
+        raise FieldError("len(Scan.samples)", len(samples), f"from 1 to {MAX_SAMPLES}")
+    for sample_format in SampleFormat:
+        if samples.dtype == sample_format.dtype:
+            return sample_format
+    raise FieldError("Scan.samples.dtype", samples.dtype, "int16, int32 or float32")
+
+
+def _command_code(code: int) -> int:
+    try:
+        return CommandCode(code)
+    except ValueError:
+        return code
+
+
+def _pack_string(text: str) -> bytes:
+    data = text.encode()
+    return bytes([len(data)]) + data
+
+
+def _unpack_string(content: bytes, start: int) -> tuple[str, int]:
+    _require(start < len(content))
+    end = start + 1 + content[start]
+    _require(end <= len(content))
+    return content[start + 1 : end].decode(), end
+
+
+def _check_string(field: str, text: str) -> None:
+    allowed = f"1 to {MAX_STRING_BYTES} bytes of UTF-8 without control characters"
+    try:
+        size = len(text.encode())
+    except (UnicodeEncodeError, AttributeError):  # a lone surrogate, or no string at all
+        raise FieldError(field, text, allowed) from None
+    # Device names go to terminals and logs: no escape sequences in them (C0, DEL and C1).
+    has_control = any(ord(c) < 0x20 or 0x7F <= ord(c) <= 0x9F for c in text)
+    if not 1 <= size <= MAX_STRING_BYTES or has_control:
+        raise FieldError(field, text, allowed)
+
+
+def _integer(field: str, value: int, low: int, high: int) -> int:
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = low - 1
+    if not low <= number <= high:
+        raise FieldError(field, value, f"an integer from {low} to {high}")
+    return number
+
+
+def _member(
+    field: str, value: int, kind: type[Channel] | type[SampleFormat] | type[AckStatus]
+) -> int:
+    try:
+        return int(kind(value))
+    except ValueError:
+        allowed = ", ".join(f"{member.value} ({member.name})" for member in kind)
+        raise FieldError(field, value, f"one of {allowed}") from None
+
+
+def _is_finite(value: float) -> bool:
+    try:
+        return math.isfinite(value)
+    except (TypeError, OverflowError):  # not a number, or an int beyond every float
+        return False
+
+
+def _require(condition: bool) -> None:
+    if not condition:
+        raise ValueError("the body has the wrong length")

@@ -1,0 +1,163 @@
+"""The packets of wire protocol v1 as values: what a device and a host can say to each other.
+
+The classes here only hold fields; `codec` turns them into bytes and back. Byte layouts, ranges
+and timing are specified in `firmware_protocol/PROTOCOL.md`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Samples: TypeAlias = NDArray[np.int16] | NDArray[np.int32] | NDArray[np.float32]
+
+
+class Channel(IntEnum):
+    """One of the two stacked skins."""
+
+    MAGNITUDE = 0
+    STRUCTURE = 1
+
+
+class SampleFormat(IntEnum):
+    """How a sample is written, always little-endian."""
+
+    INT16 = 1
+    INT32 = 2
+    FLOAT32 = 3
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """The NumPy type, in this machine's byte order, that holds these samples exactly."""
+        return _DTYPES[self]
+
+
+_DTYPES: dict[SampleFormat, np.dtype[Any]] = {
+    SampleFormat.INT16: np.dtype(np.int16),
+    SampleFormat.INT32: np.dtype(np.int32),
+    SampleFormat.FLOAT32: np.dtype(np.float32),
+}
+
+
+class ScanFlag(IntFlag):
+    """What the device knows about the quality of a scan; bits unknown here are kept."""
+
+    SATURATED = 1  # at least one sample is at the converter's limit
+    LATE = 2  # the scan took longer, or left later, than the scan rate allows
+    SIMULATED = 4  # no sensor made these samples
+
+
+class CommandCode(IntEnum):
+    """What a host can ask of a device."""
+
+    IDENTIFY = 1
+    START = 2
+    STOP = 3
+    SET_RATE = 4
+    ZERO_COUNTERS = 5
+
+
+class AckStatus(IntEnum):
+    """What became of a command."""
+
+    OK = 0
+    UNKNOWN_COMMAND = 1
+    BAD_ARGUMENT = 2
+    BUSY = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """One channel's voltages of one scan.
+
+    `counter` (u32, wraps to 0) is shared by the scans of both channels that belong together.
+    `device_us` (u64) is the device's clock, in µs, when the scan's first sample was taken.
+    `samples` is 1-D, 1 to 1024 values of int16, int32 or float32; decoded ones are read-only.
+    """
+
+    channel: Channel
+    counter: int
+    device_us: int
+    flags: ScanFlag
+    samples: Samples
+
+    def volts(self, volts_per_count: float) -> NDArray[np.float64]:
+        """The samples in volts, given the scale that the device's `Hello` states."""
+        return self.samples.astype(np.float64) * volts_per_count
+
+    def _header(self) -> tuple[int, ...]:
+        return (self.channel, self.counter, self.device_us, self.flags)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Scan):
+            return NotImplemented
+        # Compared as bytes, so that a NaN equals itself and every bit of it counts.
+        return (
+            self._header() == other._header()
+            and self.samples.dtype == other.samples.dtype
+            and self.samples.shape == other.samples.shape
+            and self.samples.tobytes() == other.samples.tobytes()
+        )
+
+    def __hash__(self) -> int:
+        return hash(self._header())
+
+
+@dataclass(frozen=True, slots=True)
+class Hello:
+    """What a device is and what its scans mean, sent every second on each of its ports.
+
+    `channels` are those that this port carries, ascending. Drive k injects into electrode k and
+    draws from k + `drive_offset`; a sample is V(m) - V(m + `measure_offset`). A sample times
+    `volts_per_count` is in volts, for every sample format. `scan_rate_hz` is 0 when an external
+    trigger paces the scans.
+    """
+
+    device_id: str
+    firmware: str
+    channels: tuple[Channel, ...]
+    electrodes: int
+    drive_offset: int
+    measure_offset: int
+    samples_per_scan: int
+    sample_format: SampleFormat
+    volts_per_count: float
+    scan_rate_hz: float
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A host's request; the device answers with an `Acknowledge` of the same `request`.
+
+    `code` is a `CommandCode` where this version knows it and a plain int where it does not, so
+    that a device can answer `AckStatus.UNKNOWN_COMMAND`. `rate_hz` belongs to `SET_RATE` alone; a
+    received one may be any float, and a device answers `AckStatus.BAD_ARGUMENT` to a bad one.
+    """
+
+    code: int
+    request: int
+    rate_hz: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Acknowledge:
+    """A device's answer to a command; `request` and `command` are copied from it."""
+
+    request: int
+    command: int
+    status: AckStatus
+
+
+@dataclass(frozen=True, slots=True)
+class UnknownPacket:
+    """An intact packet of this protocol version whose type is not known here; ignore it."""
+
+    type: int
+    body: bytes
+
+
+Packet: TypeAlias = Scan | Hello | Acknowledge | Command | UnknownPacket
