@@ -14,19 +14,25 @@ them. Needs pyzmq, msgpack and numpy, and nothing of the daemon.
 
 from tactomo_client.control import request
 from tactomo_client.errors import ClientError, ControlError, MessageError, StreamTimeout
+from tactomo_client.frame import Contact, Frame
 from tactomo_client.messages import (
     DEFAULT_CONTROL,
     DEFAULT_STREAM,
     DEFAULT_TWIN_CONTROL,
 )
+from tactomo_client.subscription import Subscription, subscribe
 
 __all__ = [
     "DEFAULT_CONTROL",
     "DEFAULT_STREAM",
     "DEFAULT_TWIN_CONTROL",
     "ClientError",
+    "Contact",
     "ControlError",
+    "Frame",
     "MessageError",
     "StreamTimeout",
+    "Subscription",
     "request",
+    "subscribe",
 ]

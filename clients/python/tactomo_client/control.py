@@ -35,8 +35,8 @@ def request(
     # A socket per command: after an unanswered request a REQ socket cannot send another.
     socket: zmq.Socket[bytes]
     with zmq.Context.instance().socket(zmq.REQ) as socket:
-        socket.linger = 0
-        socket.maxmsgsize = MAX_MESSAGE_BYTES
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
         try:
             socket.connect(address)
         except zmq.ZMQError as error:

@@ -1,0 +1,190 @@
+"""What a subscriber receives: a `Frame`, one dual scan's outcome, and the `Contact`s in it.
+
+Both are immutable. A value that is not known is None, never 0 or NaN: a skin whose magnitude
+channel is out still reports where it is touched, with `magnitude` and `pressure_kpa` None.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactomo_client.errors import MessageError
+from tactomo_client.messages import MAP, Message, array_from_wire, clock_id
+
+Image = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """One pressed area. It keeps its `id` for as long as it is followed from frame to frame."""
+
+    id: int
+    x_mm: float
+    """Centre, from the middle of the skin to the right, seen from the pressed side."""
+    y_mm: float
+    """Centre, from the middle of the skin upwards."""
+    area_mm2: float
+    magnitude: float | None
+    """|Δσ|/σ₀ inside the contact: how much the conductivity changed, a ratio."""
+    magnitude_sigma: float | None
+    """Standard uncertainty of `magnitude`."""
+    pressure_kpa: float | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """What the skin felt at one instant, and how far to trust it.
+
+    The images are float32 arrays of shape (ny, nx), read-only; `map[iy, ix]` is the value at the
+    node `iy` from the bottom and `ix` from the left, whose first and last positions are in
+    `y_mm` and `x_mm`. An image is None when it could not be computed, or when the subscription is
+    to contacts alone.
+    """
+
+    sensor: str
+    session: str
+    """Changes when the daemon restarts; contact ids and `sequence` start anew then."""
+    sequence: int
+    """Counts the messages of this kind; a gap means that frames were missed."""
+    scan_counter: int
+    acquired_realtime_ns: int
+    """When the daemon's computer had read the scan's last byte, nanoseconds since 1970 (UTC)."""
+    acquired_monotonic_ns: int
+    """The same instant on that computer's monotonic clock."""
+    device_us: int | None
+    """The device's own clock, microseconds."""
+    tier: str | None
+    """How much model the frame was given: quiet, tikhonov, levelset, ..."""
+    tier_reason: str | None
+    flags: frozenset[str]
+    """What to be wary of, such as ``misfit_high``; empty when all is well. See STREAM.md."""
+    misfit: float | None
+    """Rms of what the model left unexplained, in units of the noise: about 1 is good."""
+    contacts: tuple[Contact, ...]
+    map: Image | None
+    """|Δσ|/σ₀ of the magnitude channel, a ratio."""
+    pressure_kpa: Image | None
+    structure: Image | None
+    """Pressed (1) or not (0), with everything between for in between."""
+    x_mm: tuple[float, float] | None
+    y_mm: tuple[float, float] | None
+    _age_at_receipt_ns: int
+    _received_ns: int
+    _stale_after_s: float
+
+    @property
+    def age_s(self) -> float:
+        """Seconds from the arrival of the scan's last byte at the daemon until now."""
+        since_receipt_ns = time.monotonic_ns() - self._received_ns
+        return (self._age_at_receipt_ns + since_receipt_ns) * 1e-9
+
+    @property
+    def is_stale(self) -> bool:
+        """Whether this frame is older than the subscription's `stale_after_s`."""
+        return self.age_s > self._stale_after_s
+
+
+def frame_from_message(message: Message, received_ns: int, stale_after_s: float) -> Frame:
+    """Return the frame in a `map` or `contacts` message that came at `received_ns` (monotonic).
+
+    Raises:
+        MessageError: a field is missing or of the wrong type.
+
+    """
+    fields = message.fields
+    has_images = message.kind == MAP
+    misfit = fields["misfit"]
+    contacts = fields.get("contacts")
+    if not isinstance(contacts, list):
+        raise MessageError("field 'contacts' is not a list")
+    return Frame(
+        sensor=message.sensor,
+        session=fields["session"],
+        sequence=fields["sequence"],
+        scan_counter=_integer(fields, "scan_counter"),
+        acquired_realtime_ns=_integer(fields, "acquired_realtime_ns"),
+        acquired_monotonic_ns=_integer(fields, "acquired_monotonic_ns"),
+        device_us=fields["device_us"],
+        tier=fields["tier"],
+        tier_reason=fields["tier_reason"],
+        flags=frozenset(fields["flags"]),
+        misfit=None if misfit is None else float(misfit),
+        contacts=tuple(_contact(contact) for contact in contacts),
+        map=_image(fields, "map") if has_images else None,
+        pressure_kpa=_image(fields, "pressure_kpa") if has_images else None,
+        structure=_image(fields, "structure") if has_images else None,
+        x_mm=_extent(fields, "x_mm") if has_images else None,
+        y_mm=_extent(fields, "y_mm") if has_images else None,
+        _age_at_receipt_ns=age_at_receipt_ns(fields, received_ns),
+        _received_ns=received_ns,
+        _stale_after_s=stale_after_s,
+    )
+
+
+def age_at_receipt_ns(fields: dict[str, Any], received_ns: int) -> int:
+    """Return the age in ns of a message that came at `received_ns` (monotonic).
+
+    Exact where publisher and subscriber read the same clock; otherwise the age at publication,
+    which leaves out the time that the message was on its way.
+    """
+    acquired_ns: int | None = fields["acquired_monotonic_ns"]
+    age_at_publication_ns: int | None = fields["age_ns"]
+    if acquired_ns is not None and clock_id() and fields.get("clock_id") == clock_id():
+        return max(0, received_ns - acquired_ns)
+    return max(0, age_at_publication_ns or 0)
+
+
+def _contact(value: object) -> Contact:
+    if not isinstance(value, dict):
+        raise MessageError("a contact is not a map")
+    return Contact(
+        id=_integer(value, "id"),
+        x_mm=_number(value, "x_mm"),
+        y_mm=_number(value, "y_mm"),
+        area_mm2=_number(value, "area_mm2"),
+        magnitude=_number_or_none(value, "magnitude"),
+        magnitude_sigma=_number_or_none(value, "magnitude_sigma"),
+        pressure_kpa=_number_or_none(value, "pressure_kpa"),
+    )
+
+
+def _image(fields: dict[str, Any], name: str) -> Image | None:
+    if fields.get(name) is None:
+        return None
+    image = array_from_wire(fields[name])
+    if image.ndim != 2 or image.dtype != np.float32:
+        raise MessageError(f"field {name!r} is not a two-dimensional array of float32")
+    return image
+
+
+def _extent(fields: dict[str, Any], name: str) -> tuple[float, float]:
+    value = fields.get(name)
+    if not isinstance(value, list) or len(value) != 2:
+        raise MessageError(f"field {name!r} is not [first, last]")
+    ends = {"first": value[0], "last": value[1]}
+    return _number(ends, "first"), _number(ends, "last")
+
+
+def _integer(fields: Mapping[str, object], name: str) -> int:
+    value = fields.get(name)
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise MessageError(f"field {name!r} is not an integer")
+    return value
+
+
+def _number(fields: Mapping[str, object], name: str) -> float:
+    value = fields.get(name)
+    if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
+        raise MessageError(f"field {name!r} is not a finite number")
+    return float(value)
+
+
+def _number_or_none(fields: Mapping[str, object], name: str) -> float | None:
+    return None if fields.get(name) is None else _number(fields, name)

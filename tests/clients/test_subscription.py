@@ -1,0 +1,294 @@
+"""Subscriptions against a real XPUB socket, in this process and in another."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from tactomo_client import (
+    Contact,
+    ControlError,
+    Frame,
+    MessageError,
+    StreamTimeout,
+    Subscription,
+    subscribe,
+)
+from tactomo_client.fake import FakeSensor
+
+CONTACT = Contact(
+    id=3,
+    x_mm=10.0,
+    y_mm=-20.0,
+    area_mm2=700.0,
+    magnitude=0.15,
+    magnitude_sigma=0.01,
+    pressure_kpa=170.0,
+)
+RAMP = np.tile(np.linspace(0, 1, 51, dtype=np.float32), (51, 1))
+
+
+def wait_for(condition: Callable[[], object], timeout_s: float = 10.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, "it never happened"
+        time.sleep(0.005)
+
+
+def newest_sequence(frames: Subscription) -> int:
+    frame = frames.latest()
+    return 0 if frame is None else frame.sequence
+
+
+def test_a_frame_arrives_typed(sensor: FakeSensor) -> None:
+    with subscribe("left", address=sensor.address, timeout_s=10) as frames:
+        assert sensor.wait_for_subscriber() == b"left/map\0"
+        sensor.publish([CONTACT], map=RAMP, pressure_kpa=200 * RAMP, flags=["misfit_high"])
+        frame = next(frames)
+    assert (frame.sensor, frame.session, frame.sequence) == ("left", sensor.session, 1)
+    assert frame.scan_counter == 1
+    assert frame.flags == {"misfit_high"}
+    assert (frame.tier, frame.misfit) == ("levelset", 1.0)
+    assert frame.contacts == (CONTACT,)
+    assert frame.map is not None
+    assert frame.pressure_kpa is not None
+    np.testing.assert_array_equal(frame.map, RAMP)
+    np.testing.assert_array_equal(frame.pressure_kpa, 200 * RAMP)
+    assert frame.structure is None
+    assert (frame.x_mm, frame.y_mm) == ((-75.0, 75.0), (-75.0, 75.0))
+
+
+def test_frames_cannot_be_changed(sensor: FakeSensor) -> None:
+    with subscribe("left", address=sensor.address, timeout_s=10) as frames:
+        sensor.wait_for_subscriber()
+        sensor.publish(map=RAMP)
+        frame = next(frames)
+    assert frame.map is not None
+    with pytest.raises(ValueError, match="read-only"):
+        frame.map[0, 0] = 1
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        frame.sequence = 2  # type: ignore[misc]
+
+
+def test_contacts_alone_need_no_images(sensor: FakeSensor) -> None:
+    unknown = dataclasses.replace(CONTACT, magnitude=None, magnitude_sigma=None, pressure_kpa=None)
+    with subscribe("left", address=sensor.address, kind="contacts", timeout_s=10) as frames:
+        assert sensor.wait_for_subscriber() == b"left/contacts\0"
+        sensor.publish([unknown])
+        frame = next(frames)
+    assert frame.map is None
+    assert frame.contacts == (unknown,)
+
+
+def test_one_sensor_does_not_hear_another() -> None:
+    with FakeSensor("left2") as other, subscribe("left", address=other.address) as frames:
+        other.wait_for_subscriber()
+        other.publish([CONTACT])
+        other.sensor = "left"
+        other.publish()
+        assert next(frames).contacts == ()
+
+
+def test_every_frame_comes_in_order_and_gaps_are_counted(sensor: FakeSensor) -> None:
+    with subscribe("left", address=sensor.address, timeout_s=10) as frames:
+        sensor.wait_for_subscriber()
+        for sequence in (1, 2, 3, 7):
+            sensor.publish(sequence=sequence)
+        assert [next(frames).sequence for _ in range(4)] == [1, 2, 3, 7]
+        assert frames.missed == 3
+
+
+def test_latest_only_skips_what_a_busy_caller_missed(sensor: FakeSensor) -> None:
+    with subscribe("left", address=sensor.address, latest_only=True, timeout_s=10) as frames:
+        sensor.wait_for_subscriber()
+        for _ in range(200):
+            sensor.publish(map=RAMP)
+        wait_for(lambda: newest_sequence(frames) == 200)
+        for _ in range(200):
+            sensor.publish(map=RAMP)
+        first = next(frames).sequence
+        wait_for(lambda: newest_sequence(frames) == 400)
+        assert frames.missed > 0
+        assert first > 201
+
+
+def test_latest_never_waits_and_keeps_the_last_frame(sensor: FakeSensor) -> None:
+    with subscribe("left", address=sensor.address) as frames:
+        assert frames.latest() is None
+        assert frames.is_stale
+        sensor.wait_for_subscriber()
+        sensor.publish()
+        sensor.publish()
+        wait_for(lambda: newest_sequence(frames) == 2)
+        assert newest_sequence(frames) == 2
+
+
+def test_malformed_messages_are_counted_and_skipped(sensor: FakeSensor) -> None:
+    good = {"scan_counter": 1, "contacts": [], "x_mm": [-75.0, 75.0], "y_mm": [-75.0, 75.0]}
+    contact = dataclasses.asdict(CONTACT)
+    bad: list[dict[str, object]] = [
+        {"map": {"shape": [51, 51], "dtype": "<f4", "data": b"short"}},
+        {"map": np.zeros(51, np.float32)},
+        {"map": np.zeros((51, 51), np.float64)},
+        {"contacts": None},
+        {"contacts": [7]},
+        {"contacts": [contact | {"id": "one"}]},
+        {"contacts": [contact | {"x_mm": float("nan")}]},
+        {"scan_counter": "1"},
+        {"acquired_monotonic_ns": None},
+        {"x_mm": [1]},
+    ]
+    with subscribe("left", address=sensor.address, timeout_s=10) as frames:
+        sensor.wait_for_subscriber()
+        sensor.send(b"left/map\0")
+        sensor.send(b"left/map\0\xc1")
+        for change in bad:
+            sensor.publish_message("map", good | change)
+        sensor.publish([CONTACT])
+        assert next(frames).contacts == (CONTACT,)
+        assert frames.malformed == 2 + len(bad)
+
+
+def test_a_restarted_daemon_is_heard_again_and_seen(sensor: FakeSensor) -> None:
+    with subscribe("left", address=sensor.address, timeout_s=30) as frames:
+        sensor.wait_for_subscriber()
+        sensor.publish(sequence=50)
+        assert next(frames).session == sensor.session
+        sensor.close()
+        with FakeSensor("left", sensor.address) as restarted:
+            # zmq renews a subscription from within the subscriber's own calls, so keep calling.
+            def heard_again() -> bool:
+                restarted.publish()
+                return newest_sequence(frames) < 50
+
+            wait_for(heard_again)
+            newest = frames.latest()
+    assert newest is not None
+    assert newest.session == restarted.session != sensor.session
+    assert frames.missed == 0
+
+
+def test_timeout_says_what_to_do(sensor: FakeSensor) -> None:
+    with subscribe("left", address=sensor.address, timeout_s=0.05) as frames:
+        with pytest.raises(StreamTimeout, match=r"no map of sensor 'left'.*tactomo status"):
+            next(frames)
+        assert issubclass(StreamTimeout, TimeoutError)
+
+
+def test_malformed_messages_do_not_put_off_the_timeout(sensor: FakeSensor) -> None:
+    with subscribe("left", address=sensor.address, timeout_s=0.2) as frames:
+        sensor.wait_for_subscriber()
+        sensor.send(b"left/map\0")
+        with pytest.raises(StreamTimeout):
+            next(frames)
+        assert frames.malformed == 1
+
+
+def test_age_is_exact_on_one_computer(sensor: FakeSensor) -> None:
+    with subscribe("left", address=sensor.address, stale_after_s=5, timeout_s=10) as frames:
+        sensor.wait_for_subscriber()
+        now_ns = time.monotonic_ns()
+        sensor.publish(acquired_monotonic_ns=now_ns - 9_000_000_000, age_ns=0)
+        sensor.publish(acquired_monotonic_ns=now_ns, age_ns=0)
+        old, new = next(frames), next(frames)
+        elapsed_s = (time.monotonic_ns() - now_ns) * 1e-9
+        assert new.age_s == pytest.approx(elapsed_s, abs=0.5)
+        assert old.age_s - new.age_s == pytest.approx(9.0, abs=0.5)
+        assert old.is_stale
+        assert not new.is_stale
+
+
+def test_age_from_another_computer_starts_at_the_age_at_publication(sensor: FakeSensor) -> None:
+    with subscribe("left", address=sensor.address, stale_after_s=5, timeout_s=10) as frames:
+        sensor.wait_for_subscriber()
+        for age_ns in (7_000_000_000, 3_000_000):
+            sensor.publish(clock_id="elsewhere", acquired_monotonic_ns=17, age_ns=age_ns)
+        old, new = next(frames), next(frames)
+        assert old.is_stale
+        assert not new.is_stale
+        assert 0.003 <= new.age_s < 5
+
+
+def test_a_frame_grows_old(sensor: FakeSensor) -> None:
+    with subscribe("left", address=sensor.address, stale_after_s=0.3, timeout_s=10) as frames:
+        sensor.wait_for_subscriber()
+        sensor.publish()
+        frame = next(frames)
+        wait_for(lambda: frame.is_stale)
+        assert frames.is_stale
+        sensor.publish()
+        next(frames)
+        assert not frames.is_stale
+
+
+def test_closing_ends_the_iteration(sensor: FakeSensor) -> None:
+    frames = subscribe("left", address=sensor.address)
+    sensor.wait_for_subscriber()
+    sensor.publish()
+    seen: list[Frame] = []
+    for frame in frames:
+        seen.append(frame)
+        frames.close()
+    assert len(seen) == 1
+    frames.close()
+
+
+def test_an_abandoned_subscription_closes_itself(sensor: FakeSensor) -> None:
+    for _ in range(2):
+        frames = subscribe("left", address=sensor.address)
+        sensor.wait_for_subscriber()
+        alive = frames._closed
+        del frames
+        gc.collect()
+        assert not alive.alive
+
+
+def test_ctrl_c_interrupts_the_wait(sensor: FakeSensor) -> None:
+    script = (
+        "from tactomo_client import subscribe\n"
+        "try:\n"
+        f"    for frame in subscribe('left', address={sensor.address!r}):\n"
+        "        print(frame.sequence, flush=True)\n"
+        "except KeyboardInterrupt:\n"
+        "    print('interrupted', flush=True)\n"
+    )
+    child = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    assert child.stdout is not None
+    try:
+        sensor.wait_for_subscriber(60)
+        sensor.publish()
+        assert child.stdout.readline() == "1\n"
+        child.send_signal(signal.SIGINT)
+        assert child.communicate(timeout=30)[0] == "interrupted\n"
+    finally:
+        child.kill()
+        child.communicate()
+
+
+def test_what_cannot_be_subscribed_to_is_named() -> None:
+    with pytest.raises(MessageError, match="not a sensor name"):
+        subscribe("left forearm")
+    with pytest.raises(MessageError, match="kind='map' or 'contacts'"):
+        subscribe("left", kind="scan")  # type: ignore[arg-type]
+    with pytest.raises(ControlError, match="cannot connect to '5560'"):
+        subscribe("left", address="5560")
+
+
+def test_the_client_needs_nothing_but_three_packages() -> None:
+    script = (
+        "import sys, tactomo_client\n"
+        "ours = {n for n in sys.modules if n.partition('.')[0].startswith('tactomo')}\n"
+        "print(sorted(n for n in ours if n.partition('.')[0] != 'tactomo_client'))\n"
+        "foreign = {n.partition('.')[0] for n, m in sys.modules.items()\n"
+        "           if 'site-packages' in (getattr(m, '__file__', None) or '')}\n"
+        "print(sorted(n for n in foreign if not n.startswith('_')))\n"
+    )
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert run.stdout == "[]\n['msgpack', 'numpy', 'zmq']\n", run.stdout + run.stderr
