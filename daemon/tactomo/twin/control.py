@@ -1,0 +1,180 @@
+"""The twin's control socket: press, release and break things while it runs.
+
+One MessagePack request, one reply, in the same envelope as the daemon's control socket, so that
+`tactomo_client.request` speaks to both. `COMMANDS` names every command with its arguments; each
+argument is checked before anything happens, and a refusal says which one is wrong and what is
+allowed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, Literal
+
+import zmq
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from tactomo_client.errors import MessageError
+from tactomo_client.messages import (
+    MAX_MESSAGE_BYTES,
+    decode_request,
+    encode_error,
+    encode_reply,
+)
+
+from tactomo.errors import AddressError, CommandError
+from tactomo.twin.scene import Indenter, Scene, explain
+
+Handler = Callable[[Any], Mapping[str, Any]]
+PressId = Annotated[str, Field(min_length=1, max_length=64)]
+
+
+class Arguments(BaseModel):
+    """Arguments of a command; what is not listed is refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Nothing(Arguments):
+    """No arguments."""
+
+
+class PressArguments(Indenter):
+    """Press, or move the press of the same id."""
+
+    id: PressId = "finger"
+
+
+class ReleaseArguments(Arguments):
+    """Lift one live press."""
+
+    id: PressId = "finger"
+
+
+class PlayArguments(Arguments):
+    """Start the scripted scene over, or play the one that is given."""
+
+    scene: Scene | None = None
+
+
+class NoiseArguments(Arguments):
+    """Change the converter's noise, in volts rms."""
+
+    noise_v: float = Field(ge=0.0, le=1e3, allow_inf_nan=False)
+
+
+class DriftArguments(Arguments):
+    """Change how the gain drifts; 0 stops it. Leaves out what is not given."""
+
+    walk: float | None = Field(default=None, ge=0.0, le=1.0, allow_inf_nan=False)
+    creep: float | None = Field(default=None, ge=-0.5, le=0.5, allow_inf_nan=False)
+
+
+class MuteArguments(Arguments):
+    """Send nothing of one channel for a while."""
+
+    channel: Literal["magnitude", "structure"]
+    seconds: float = Field(gt=0.0, le=86_400.0, allow_inf_nan=False)
+
+
+class GarbageArguments(Arguments):
+    """Send random bytes on one port."""
+
+    port: int = Field(default=0, ge=0, le=1)
+    count: int = Field(default=64, ge=1, le=65_536)
+
+
+class PortArguments(Arguments):
+    """One port by its number; all of them when it is left out."""
+
+    port: int | None = Field(default=None, ge=0, le=1)
+
+
+COMMANDS: Mapping[str, type[BaseModel]] = {
+    "status": Nothing,
+    "scene": Nothing,
+    "press": PressArguments,
+    "release": ReleaseArguments,
+    "clear": Nothing,
+    "play": PlayArguments,
+    "noise": NoiseArguments,
+    "drift": DriftArguments,
+    "mute": MuteArguments,
+    "garbage": GarbageArguments,
+    "unplug": PortArguments,
+    "replug": PortArguments,
+}
+
+
+class ControlSocket:
+    """A bound REP socket that hands checked commands to their handlers. For use by one thread.
+
+    Args:
+        address: where to bind; port 0 takes a free one, see `address`.
+        handlers: a handler for every name in COMMANDS; it gets the checked arguments.
+
+    Raises:
+        AddressError: the address is in use, or is no address.
+
+    """
+
+    def __init__(self, address: str, handlers: Mapping[str, Handler]) -> None:
+        self._handlers = handlers
+        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REP)
+        self._socket.linger = 0
+        self._socket.maxmsgsize = MAX_MESSAGE_BYTES
+        try:
+            self._socket.bind(address)
+        except zmq.ZMQError as error:
+            self._socket.close()
+            raise AddressError(
+                f"cannot bind the twin's control socket to {address}: {error.strerror}",
+                "stop the program that uses it, or give another one with --control",
+            ) from error
+        self.address: str = self._socket.last_endpoint.decode().rstrip("\0")
+
+    @property
+    def socket(self) -> zmq.Socket[bytes]:
+        """What to poll for requests."""
+        return self._socket
+
+    def answer(self) -> None:
+        """Answer every request that waits; returns at once when there is none."""
+        while self._socket.poll(0):
+            self._socket.send(self._reply(self._socket.recv()))
+
+    def close(self) -> None:
+        """Unbind."""
+        self._socket.close()
+
+    def _reply(self, data: bytes) -> bytes:
+        try:
+            command, arguments = decode_request(data)
+            return encode_reply(self._obey(command, arguments))
+        except (MessageError, CommandError) as error:
+            return encode_error(error.name, error.cause, error.next_step)
+
+    def _obey(self, command: str, arguments: dict[str, Any]) -> Mapping[str, Any]:
+        if command not in COMMANDS:
+            raise CommandError(
+                f"the twin does not know the command {command!r}",
+                f"known commands: {', '.join(COMMANDS)}",
+                name="unknown_command",
+            )
+        try:
+            checked = COMMANDS[command].model_validate(arguments)
+        except ValidationError as error:
+            raise CommandError(
+                f"{command}: {explain(error)}", describe_arguments(command), name="bad_argument"
+            ) from error
+        return self._handlers[command](checked)
+
+
+def describe_arguments(command: str) -> str:
+    """Return the arguments of a command with their defaults, as people read it."""
+    fields = COMMANDS[command].model_fields
+    if not fields:
+        return f"{command} takes no arguments"
+    named = [
+        name if field.is_required() else f"{name}={field.default}" for name, field in fields.items()
+    ]
+    return f"{command} takes {', '.join(named)}"

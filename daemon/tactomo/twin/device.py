@@ -1,0 +1,371 @@
+"""The whole twin: skin, firmware, lines and control socket, and the two threads they need.
+
+One thread keeps time: it answers the host and the control socket and sends what is due. A second
+one computes voltages, because a forward solve must not make a hello or an acknowledgement late.
+They share nothing but futures: the timing thread submits a list of presses and is woken when the
+voltages are there.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+import socket
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import zmq
+from numpy.typing import NDArray
+from tactomo_client.messages import DEFAULT_TWIN_CONTROL
+from tactomo_models import Press, SensorDescription, SkinSimulator
+from tactomo_protocol import Channel
+from threadpoolctl import threadpool_limits
+
+from tactomo.errors import CommandError, ConfigError, TactomoError
+from tactomo.twin.control import (
+    ControlSocket,
+    DriftArguments,
+    GarbageArguments,
+    Handler,
+    MuteArguments,
+    NoiseArguments,
+    Nothing,
+    PlayArguments,
+    PortArguments,
+    PressArguments,
+    ReleaseArguments,
+)
+from tactomo.twin.converter import Converter, Drift
+from tactomo.twin.firmware import (
+    RATE_HZ_MAX,
+    RATE_HZ_MIN,
+    Firmware,
+    Identity,
+    Port,
+    Voltages,
+)
+from tactomo.twin.line import SerialLine
+from tactomo.twin.scene import Scene
+from tactomo.twin.surface import Surface
+
+# How often a line that nobody has open is looked at; its hang-up cannot be waited on.
+HANGUP_CHECK_S = 0.02
+# Room above the largest unloaded voltage before the converter clips.
+HEADROOM = 8.0
+# Noise of the converter where none is given, as a share of the largest unloaded voltage.
+NOISE_SHARE = 2e-5
+
+
+class SkinModel(Protocol):
+    """What the twin needs of a forward model; `tactomo_models.SkinSimulator` is one."""
+
+    def voltages(self, presses: Sequence[Press]) -> Mapping[str, NDArray[np.float64]]:
+        """Return the noise-free volts, (M,), of each channel of the sensor under these presses."""
+
+
+@dataclass(frozen=True)
+class TwinConfig:
+    """How the twin is set up.
+
+    Attributes:
+        description: the sensor that it simulates.
+        ports: 1 for one line that carries every channel, 2 for a line for each.
+        rate_hz: scans a second, at first; the host may change it.
+        noise_v: noise in volts rms; None for a usual converter's.
+        drift: how the gains drift.
+        seed: equal seeds give equal noise and drift.
+        scene: a scripted scene; it starts with the first scan that a host can receive.
+        control: address of the control socket; port 0 takes a free one.
+        link_folder: where to keep links with stable names to the lines.
+
+    """
+
+    description: SensorDescription
+    ports: int = 1
+    rate_hz: float = 20.0
+    noise_v: float | None = None
+    drift: Drift = field(default_factory=Drift)
+    seed: int = 0
+    scene: Scene | None = None
+    control: str = DEFAULT_TWIN_CONTROL
+    link_folder: Path | None = None
+
+    def __post_init__(self) -> None:
+        channels = len(self.description.modalities)
+        if self.ports not in (1, 2) or self.ports > channels:
+            raise ConfigError(
+                f"{self.description.name} has {channels} channel(s), so not {self.ports} ports",
+                "give 1 port, or 2 for a sensor of two channels",
+            )
+        if not RATE_HZ_MIN <= self.rate_hz <= RATE_HZ_MAX:
+            raise ConfigError(
+                f"a rate of {self.rate_hz:g} Hz is out of range",
+                f"give {RATE_HZ_MIN:g} to {RATE_HZ_MAX:g} scans a second",
+            )
+        if self.noise_v is not None and not 0.0 <= self.noise_v < float("inf"):
+            raise ConfigError(
+                f"noise of {self.noise_v:g} V is out of range", "give 0 V or more, in volts rms"
+            )
+
+
+class Twin:
+    """A simulated sensor; its lines and its control socket are there from construction on.
+
+    Args:
+        config: its set-up.
+        skin: the forward model; by default the description's own, on its fine mesh.
+
+    Raises:
+        AddressError: the control socket cannot be bound.
+        TactomoError: the links cannot be made.
+
+    """
+
+    def __init__(self, config: TwinConfig, skin: SkinModel | None = None) -> None:
+        self.config = config
+        self._skin: SkinModel = skin or SkinSimulator(config.description)
+        self._surface = Surface(config.scene)
+        self._converter = self._make_converter()
+        self._control = ControlSocket(config.control, self._handlers())
+        try:
+            ports = _make_ports(config)
+        except TactomoError:
+            self._control.close()
+            raise
+        self._powered_s = time.monotonic()
+        self._firmware = Firmware(
+            identity=_identity(config.description),
+            ports=ports,
+            sample=self._sample,
+            converter=self._converter,
+            rate_hz=config.rate_hz,
+            clock=self._clock,
+        )
+        self._wake_receiver, self._wake_sender = socket.socketpair()
+        self._wake_receiver.setblocking(False)
+        self._solver = ThreadPoolExecutor(max_workers=1, thread_name_prefix="twin-skin")
+        self._thread = threading.Thread(target=self._run, name="twin-firmware")
+        self._stopping = threading.Event()
+        self._failure: BaseException | None = None
+
+    @property
+    def ports(self) -> tuple[str, ...]:
+        """What the host opens: one path a line, magnitude first."""
+        return tuple(port.line.path for port in self._firmware.ports)
+
+    @property
+    def control(self) -> str:
+        """Address of the control socket."""
+        return self._control.address
+
+    def start(self) -> None:
+        """Power up."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Power down, close the lines and the control socket; may be called twice."""
+        self._stopping.set()
+        self._wake()
+        if self._thread.ident is None:  # never started: the closing falls to us
+            self._thread.start()
+        self.wait()
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Wait until the twin has stopped and tell whether it has; raise, once, what failed."""
+        self._thread.join(timeout_s)
+        failure, self._failure = self._failure, None
+        if failure is not None:
+            raise failure
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        try:
+            with threadpool_limits(limits=1):  # the daemon needs the other cores
+                while not self._stopping.is_set():
+                    self._rest()
+                    self._control.answer()
+                    self._firmware.step()
+        except BaseException as error:  # handed to whoever waits for this thread
+            self._failure = error
+        finally:
+            self._solver.shutdown(cancel_futures=True)
+            for port in self._firmware.ports:
+                port.line.close()
+            self._control.close()
+            self._wake_receiver.close()
+            self._wake_sender.close()
+
+    def _rest(self) -> None:
+        """Wait until something is due, or the host, a client or the solver has something."""
+        poller = zmq.Poller()
+        poller.register(self._control.socket, zmq.POLLIN)
+        poller.register(self._wake_receiver, zmq.POLLIN)
+        timeout_s = self._firmware.due_in_s()
+        for port in self._firmware.ports:
+            if port.line.is_open:
+                poller.register(port.line.fileno(), zmq.POLLIN)
+            else:
+                timeout_s = min(timeout_s, HANGUP_CHECK_S)
+        poller.poll(math.ceil(timeout_s * 1e3))
+        with contextlib.suppress(BlockingIOError):
+            self._wake_receiver.recv(4096)
+
+    def _wake(self) -> None:
+        with contextlib.suppress(OSError):  # closed: the thread has ended
+            self._wake_sender.send(b"\0")
+
+    def _clock(self) -> float:
+        return time.monotonic() - self._powered_s
+
+    def _sample(self, time_s: float) -> Future[Voltages]:
+        """Start computing the voltages of the skin as it is at device time `time_s`."""
+        if not self._surface.is_playing and any(p.line.is_open for p in self._firmware.ports):
+            self._surface.play(time_s)
+        presses = [indenter.press() for indenter in self._surface.presses_at(time_s).values()]
+        future: Future[Voltages] = self._solver.submit(self._skin.voltages, presses)
+        future.add_done_callback(lambda _: self._wake())
+        return future
+
+    def _make_converter(self) -> Converter:
+        unloaded = self._skin.voltages([])
+        largest_v = max(float(np.max(np.abs(volts))) for volts in unloaded.values())
+        noise_v = self.config.noise_v
+        return Converter(
+            full_scale_v=HEADROOM * largest_v,
+            noise_v=NOISE_SHARE * largest_v if noise_v is None else noise_v,
+            drift=self.config.drift,
+            seed=self.config.seed,
+        )
+
+    def _handlers(self) -> dict[str, Handler]:
+        return {
+            "status": self._status,
+            "scene": self._scene,
+            "press": self._press,
+            "release": self._release,
+            "clear": self._clear,
+            "play": self._play,
+            "noise": self._set_noise,
+            "drift": self._set_drift,
+            "mute": self._mute,
+            "garbage": self._garbage,
+            "unplug": self._unplug,
+            "replug": self._replug,
+        }
+
+    def _status(self, _: Nothing) -> dict[str, Any]:
+        firmware = self._firmware
+        return {
+            "device_id": firmware.identity.device_id,
+            "sensor": self.config.description.name,
+            "rate_hz": firmware.rate_hz,
+            "counter": firmware.counter,
+            "late_scans": firmware.late,
+            "noise_v": self._converter.noise_v,
+            "volts_per_count": self._converter.volts_per_count,
+            "uptime_s": self._clock(),
+            "ports": [_describe_port(port) for port in firmware.ports],
+        }
+
+    def _scene(self, _: Nothing) -> dict[str, Any]:
+        presses = self._surface.presses_at(self._clock())
+        return {
+            "presses": [
+                {"id": name, **indenter.model_dump(exclude={"id"})}
+                for name, indenter in presses.items()
+            ]
+        }
+
+    def _press(self, arguments: PressArguments) -> dict[str, Any]:
+        self._surface.press(arguments.id, arguments)
+        return {}
+
+    def _release(self, arguments: ReleaseArguments) -> dict[str, Any]:
+        return {"released": self._surface.release(arguments.id)}
+
+    def _clear(self, _: Nothing) -> dict[str, Any]:
+        self._surface.clear()
+        return {}
+
+    def _play(self, arguments: PlayArguments) -> dict[str, Any]:
+        self._surface.script = arguments.scene or self._surface.script
+        if self._surface.script is None:
+            raise CommandError("the twin has no scripted scene", "give one as `scene`")
+        self._surface.play(self._clock())
+        return {"length_s": self._surface.script.length_s}
+
+    def _set_noise(self, arguments: NoiseArguments) -> dict[str, Any]:
+        self._converter.noise_v = arguments.noise_v
+        return {}
+
+    def _set_drift(self, arguments: DriftArguments) -> dict[str, Any]:
+        given = arguments.model_dump(exclude_none=True)
+        self._converter.drift = dataclasses.replace(self._converter.drift, **given)
+        return {}
+
+    def _mute(self, arguments: MuteArguments) -> dict[str, Any]:
+        self._firmware.mute(Channel[arguments.channel.upper()], arguments.seconds)
+        return {}
+
+    def _garbage(self, arguments: GarbageArguments) -> dict[str, Any]:
+        for port in self._some_ports(arguments.port):
+            self._firmware.babble(port, arguments.count)
+        return {}
+
+    def _unplug(self, arguments: PortArguments) -> dict[str, Any]:
+        for port in self._some_ports(arguments.port):
+            port.line.unplug()
+        return {}
+
+    def _replug(self, arguments: PortArguments) -> dict[str, Any]:
+        for port in self._some_ports(arguments.port):
+            port.line.plug()
+        return {"ports": list(self.ports)}
+
+    def _some_ports(self, number: int | None) -> Sequence[Port]:
+        ports = self._firmware.ports
+        if number is None:
+            return ports
+        if number >= len(ports):
+            raise CommandError(f"there is no port {number}", f"the last one is {len(ports) - 1}")
+        return [ports[number]]
+
+
+def _identity(description: SensorDescription) -> Identity:
+    return Identity(
+        device_id=f"twin-{description.name}"[:64],
+        firmware=f"tactomo-twin {version('tactomo')}",
+        electrodes=description.electrode_count,
+        drive_offset=description.pattern.drive_offset,
+        measure_offset=description.pattern.measure_offset,
+        measurements=description.measurements,
+    )
+
+
+def _make_ports(config: TwinConfig) -> list[Port]:
+    channels = tuple(Channel[name.upper()] for name in config.description.modalities)
+    wiring = {"skin": channels} if config.ports == 1 else {c.name.lower(): (c,) for c in channels}
+    return [Port(SerialLine(name, config.link_folder), carried) for name, carried in wiring.items()]
+
+
+def _describe_port(port: Port) -> dict[str, Any]:
+    line = port.line
+    return {
+        "name": line.name,
+        "path": line.path,
+        "channels": [channel.name.lower() for channel in port.channels],
+        "plugged": line.is_plugged,
+        "open": line.is_open,
+        "streaming": port.is_streaming,
+        "sent": line.sent,
+        "dropped": line.dropped,
+        "unheard": line.unheard,
+    }

@@ -1,0 +1,220 @@
+"""The simulated firmware: what runs on the microcontroller of a real skin.
+
+It keeps the device's clock and scan counter, samples the skin at a fixed rate, says hello every
+second and answers commands, all in wire protocol v1. It knows nothing of sockets or threads:
+`Firmware.step` does what is due and returns.
+
+A scan carries the time at which the skin was *sampled*, and shows the skin as it was then. The
+forward model may need longer than a scan period; then the scan goes out late, with its true time
+and the LATE flag, and the next one is sampled afterwards. Missed scans are not made up, and the scan
+counter counts those that were made.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from tactomo_protocol import (
+    Acknowledge,
+    AckStatus,
+    Channel,
+    Command,
+    CommandCode,
+    Decoder,
+    Hello,
+    SampleFormat,
+    Scan,
+    ScanFlag,
+    encode,
+)
+
+from tactomo.twin.converter import Converter
+from tactomo.twin.line import SerialLine
+
+HELLO_PERIOD_S = 1.0
+RATE_HZ_MIN, RATE_HZ_MAX = 0.1, 500.0
+
+Voltages = Mapping[str, NDArray[np.float64]]
+
+
+@dataclass(slots=True)
+class Port:
+    """One line of the device with the channels that it carries."""
+
+    line: SerialLine
+    channels: tuple[Channel, ...]
+    decoder: Decoder = field(default_factory=Decoder)
+    is_streaming: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """What the device says of itself in every hello."""
+
+    device_id: str
+    firmware: str
+    electrodes: int
+    drive_offset: int
+    measure_offset: int
+    measurements: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Sample:
+    """A scan in the making: sampled at `time_s`, its voltages still being computed."""
+
+    time_s: float
+    voltages: Future[Voltages]
+
+
+class Firmware:
+    """The device behind its lines. For use by one thread.
+
+    Args:
+        identity: what it says of itself.
+        ports: its lines.
+        sample: starts computing the skin's voltages at a device time in seconds.
+        converter: volts to counts.
+        rate_hz: scans a second.
+        clock: seconds since power-up.
+
+    """
+
+    def __init__(
+        self,
+        identity: Identity,
+        ports: Sequence[Port],
+        sample: Callable[[float], Future[Voltages]],
+        converter: Converter,
+        rate_hz: float,
+        clock: Callable[[], float],
+    ) -> None:
+        self.identity = identity
+        self.ports = tuple(ports)
+        self.rate_hz = rate_hz
+        self.counter = 0
+        self.late = 0
+        self._sample = sample
+        self._converter = converter
+        self._clock = clock
+        self._pending: _Sample | None = None
+        self._next_sample_s = 0.0
+        self._next_hello_s = 0.0
+        self._mute_until_s: dict[Channel, float] = {}
+
+    def due_in_s(self) -> float:
+        """Return the seconds until there is something to do by the clock; 0 when overdue."""
+        next_s = self._next_hello_s
+        if self._pending is None and self._is_streaming:
+            next_s = min(next_s, self._next_sample_s)
+        return max(0.0, next_s - self._clock())
+
+    def step(self) -> None:
+        """Do what is due: answer commands, say hello, sample, send."""
+        for port in self.ports:
+            for packet in port.decoder.feed(port.line.receive()):
+                if isinstance(packet, Command):
+                    self._obey(port, packet)
+        if self._clock() >= self._next_hello_s:
+            self._next_hello_s = self._clock() + HELLO_PERIOD_S
+            self._greet(self.ports)
+        self._begin_scan()
+        self._finish_scan()
+
+    def mute(self, channel: Channel, seconds: float) -> None:
+        """Send nothing of one channel for a while, as a sheet whose board hangs would."""
+        self._mute_until_s[channel] = self._clock() + seconds
+
+    def babble(self, port: Port, count: int) -> None:
+        """Send `count` random bytes on one line, as a loose contact or a wrong baud rate would."""
+        port.line.send(random.randbytes(count))
+
+    @property
+    def _is_streaming(self) -> bool:
+        return any(port.is_streaming for port in self.ports)
+
+    def _begin_scan(self) -> None:
+        if self._pending is not None or not self._is_streaming:
+            return
+        now_s = self._clock()
+        if now_s < self._next_sample_s:
+            return
+        # The grid of instants is kept while the solves keep up with it; what was missed is missed.
+        self._next_sample_s = max(self._next_sample_s + 1.0 / self.rate_hz, now_s)
+        self._pending = _Sample(now_s, self._sample(now_s))
+
+    def _finish_scan(self) -> None:
+        if self._pending is None or not self._pending.voltages.done():
+            return
+        time_s, voltages = self._pending.time_s, self._pending.voltages.result()
+        self._pending = None
+        flags = ScanFlag.SIMULATED
+        if self._clock() - time_s > 1.0 / self.rate_hz:
+            flags |= ScanFlag.LATE
+            self.late += 1
+        for port in self.ports:
+            for channel in port.channels:
+                if port.is_streaming and self._mute_until_s.get(channel, 0.0) <= self._clock():
+                    port.line.send(encode(self._scan(channel, time_s, flags, voltages)))
+        self.counter = (self.counter + 1) % 2**32
+
+    def _scan(self, channel: Channel, time_s: float, flags: ScanFlag, voltages: Voltages) -> Scan:
+        counts, saturated = self._converter.convert(
+            voltages[channel.name.lower()], channel=channel, counter=self.counter, time_s=time_s
+        )
+        return Scan(
+            channel=channel,
+            counter=self.counter,
+            device_us=round(time_s * 1e6),
+            flags=flags | ScanFlag.SATURATED if saturated else flags,
+            samples=counts,
+        )
+
+    def _obey(self, port: Port, command: Command) -> None:
+        """Carry out one command and acknowledge it on the line that it came from."""
+        status = AckStatus.OK
+        if command.code == CommandCode.START:
+            if not self._is_streaming:
+                self._next_sample_s = self._clock()
+            port.is_streaming = True
+        elif command.code == CommandCode.STOP:
+            port.is_streaming = False
+        elif command.code == CommandCode.ZERO_COUNTERS:
+            self.counter = 0
+        elif command.code == CommandCode.SET_RATE:
+            status = self._set_rate(command.rate_hz)
+        elif command.code != CommandCode.IDENTIFY:
+            status = AckStatus.UNKNOWN_COMMAND
+        port.line.send(encode(Acknowledge(command.request, command.code, status)))
+        if command.code == CommandCode.IDENTIFY:
+            self._greet([port])
+
+    def _set_rate(self, rate_hz: float) -> AckStatus:
+        if not RATE_HZ_MIN <= rate_hz <= RATE_HZ_MAX:
+            return AckStatus.BAD_ARGUMENT
+        self.rate_hz = rate_hz
+        self._next_hello_s = self._next_sample_s = self._clock()
+        return AckStatus.OK
+
+    def _greet(self, ports: Sequence[Port]) -> None:
+        for port in ports:
+            port.line.send(encode(self._hello(port)))
+
+    def _hello(self, port: Port) -> Hello:
+        return Hello(
+            device_id=self.identity.device_id,
+            firmware=self.identity.firmware,
+            channels=port.channels,
+            electrodes=self.identity.electrodes,
+            drive_offset=self.identity.drive_offset,
+            measure_offset=self.identity.measure_offset,
+            samples_per_scan=self.identity.measurements,
+            sample_format=SampleFormat.INT32,
+            volts_per_count=self._converter.volts_per_count,
+            scan_rate_hz=self.rate_hz,
+        )

@@ -1,0 +1,123 @@
+"""A skin that is quick to compute, and a host at the other end of the twin's lines."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+import serial
+from numpy.typing import NDArray
+from tactomo.twin import SkinModel, Twin, TwinConfig
+from tactomo_client import request
+from tactomo_models import Press, load_description
+from tactomo_protocol import Command, CommandCode, Decoder, Packet, Scan, encode
+
+MEASUREMENTS = 208
+PATIENCE_S = 30.0
+
+
+class FlatSkin:
+    """Every voltage of a channel is the same and tells the sum of the pressures.
+
+    0.1 V unloaded; 1 mV more a kPa on the magnitude channel, 2 mV on the structure channel.
+    """
+
+    def __init__(self, seconds: float = 0.0) -> None:
+        self.seconds = seconds
+
+    def voltages(self, presses: Sequence[Press]) -> dict[str, NDArray[np.float64]]:
+        time.sleep(self.seconds)
+        kpa = sum(press.pressure_kpa for press in presses)
+        return {
+            "magnitude": np.full(MEASUREMENTS, 0.1 + 1e-3 * kpa),
+            "structure": np.full(MEASUREMENTS, 0.1 + 2e-3 * kpa),
+        }
+
+
+class Host:
+    """Reads and writes the twin's ports as a daemon would."""
+
+    def __init__(self, paths: Sequence[str]) -> None:
+        self.ports = [serial.Serial(path, timeout=0) for path in paths]
+        self.decoders = [Decoder() for _ in paths]
+        self.packets: list[list[Packet]] = [[] for _ in paths]
+
+    def send(self, code: int, request: int = 1, rate_hz: float = 0.0, port: int = 0) -> None:
+        self.ports[port].write(encode(Command(code, request, rate_hz)))
+
+    def start(self) -> None:
+        for port in range(len(self.ports)):
+            self.send(CommandCode.START, port=port)
+
+    def read(self) -> None:
+        for port, decoder, packets in zip(self.ports, self.decoders, self.packets, strict=True):
+            packets += decoder.feed(port.read(65_536))
+
+    def wait_for(self, condition: Callable[[], Any]) -> Any:
+        """Read until the condition holds and return its value."""
+        return wait_for(condition, self.read)
+
+    def kind(self, kind: type[Any], port: int = 0) -> list[Any]:
+        return [packet for packet in self.packets[port] if isinstance(packet, kind)]
+
+    def scans(self, port: int = 0) -> list[Scan]:
+        return self.kind(Scan, port)
+
+    def close(self) -> None:
+        for port in self.ports:
+            port.close()
+
+
+def wait_for(condition: Callable[[], Any], meanwhile: Callable[[], object] = lambda: None) -> Any:
+    end = time.monotonic() + PATIENCE_S
+    while time.monotonic() < end:
+        meanwhile()
+        value = condition()
+        if value:
+            return value
+        time.sleep(0.002)
+    raise AssertionError(f"did not happen within {PATIENCE_S} s")
+
+
+class Bench:
+    """A running twin and the ways to reach it."""
+
+    def __init__(self, twin: Twin) -> None:
+        self.twin = twin
+        self.hosts: list[Host] = []
+
+    def host(self, paths: Sequence[str] | None = None) -> Host:
+        self.hosts.append(Host(paths or self.twin.ports))
+        return self.hosts[-1]
+
+    def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
+        return request(command, self.twin.control, timeout_s=PATIENCE_S, **arguments)
+
+
+@pytest.fixture(name="wait_for")
+def _wait_for() -> Callable[..., Any]:
+    """Wait for a condition and return its value."""
+    return wait_for
+
+
+@pytest.fixture
+def bench() -> Iterator[Callable[..., Bench]]:
+    """Start twins of the paper's sensor on a flat skin; stops them afterwards."""
+    running: list[Bench] = []
+
+    def start(skin: SkinModel | None = None, solve_s: float = 0.0, **config: Any) -> Bench:
+        config = {"control": "tcp://127.0.0.1:0", "noise_v": 0.0, "rate_hz": 100.0, **config}
+        description = load_description("paper_square")
+        started = Bench(Twin(TwinConfig(description, **config), skin or FlatSkin(solve_s)))
+        running.append(started)
+        started.twin.start()
+        return started
+
+    yield start
+    for one in running:
+        for host in one.hosts:
+            host.close()
+        one.twin.stop()
