@@ -1,0 +1,312 @@
+"""Properties of the codec: round trip, survival of any bytes, and damage that stays local."""
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from zlib import crc32
+
+import numpy as np
+import pytest
+from cobs import cobs
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tactomo_protocol import (
+    MAX_FRAME_BYTES,
+    MAX_SAMPLES,
+    Acknowledge,
+    AckStatus,
+    Channel,
+    Command,
+    CommandCode,
+    Decoder,
+    Hello,
+    Packet,
+    SampleFormat,
+    Scan,
+    ScanFlag,
+    UnknownPacket,
+    encode,
+)
+
+U8 = st.integers(0, 2**8 - 1)
+POSITIVE = st.floats(0, exclude_min=True, allow_nan=False, allow_infinity=False)
+
+
+@st.composite
+def scans(draw: st.DrawFn, max_samples: int = MAX_SAMPLES) -> Scan:
+    dtype = draw(st.sampled_from(SampleFormat)).dtype
+    count = draw(st.one_of(st.integers(1, min(12, max_samples)), st.integers(1, max_samples)))
+    # Any bits at all, so that every NaN is among them; runs of one value make long COBS blocks.
+    size = count * dtype.itemsize
+    data = draw(
+        st.one_of(st.binary(min_size=size, max_size=size), U8.map(lambda b: bytes([b]) * size))
+    )
+    return Scan(
+        channel=draw(st.sampled_from(Channel)),
+        counter=draw(st.integers(0, 2**32 - 1)),
+        device_us=draw(st.integers(0, 2**64 - 1)),
+        flags=ScanFlag(draw(U8)),
+        samples=np.frombuffer(data, dtype),
+    )
+
+
+def names() -> st.SearchStrategy[str]:
+    """Strings that a hello may carry: categories Cc and Cs are the controls and surrogates."""
+    alphabet = st.characters(exclude_categories=["Cc", "Cs"])
+    return st.text(alphabet, min_size=1, max_size=64).filter(lambda s: len(s.encode()) <= 64)
+
+
+@st.composite
+def hellos(draw: st.DrawFn) -> Hello:
+    electrodes = draw(st.integers(2, 255))
+    offsets = st.integers(1, electrodes - 1)
+    channels = draw(st.sets(st.sampled_from(Channel), min_size=1))
+    return Hello(
+        device_id=draw(names()),
+        firmware=draw(names()),
+        channels=tuple(sorted(channels)),
+        electrodes=electrodes,
+        drive_offset=draw(offsets),
+        measure_offset=draw(offsets),
+        samples_per_scan=draw(st.integers(1, MAX_SAMPLES)),
+        sample_format=draw(st.sampled_from(SampleFormat)),
+        volts_per_count=draw(POSITIVE),
+        scan_rate_hz=draw(st.just(0.0) | POSITIVE),
+    )
+
+
+COMMANDS = st.builds(
+    Command,
+    U8.filter(lambda code: code != CommandCode.SET_RATE),
+    U8,
+) | st.builds(Command, st.just(CommandCode.SET_RATE), U8, POSITIVE)
+ACKNOWLEDGES = st.builds(Acknowledge, U8, U8, st.sampled_from(AckStatus))
+UNKNOWNS = st.builds(
+    UnknownPacket, U8.filter(lambda kind: kind not in (1, 2, 3, 0x81)), st.binary(max_size=300)
+)
+PACKETS: st.SearchStrategy[Packet] = st.one_of(scans(), hellos(), COMMANDS, ACKNOWLEDGES, UNKNOWNS)
+SMALL_PACKETS: st.SearchStrategy[Packet] = st.one_of(
+    scans(max_samples=4), hellos(), COMMANDS, ACKNOWLEDGES
+)
+
+
+def chunked(data: st.DataObject, stream: bytes) -> Iterable[bytes]:
+    cuts = sorted(data.draw(st.lists(st.integers(0, len(stream)), max_size=20)))
+    return [stream[i:j] for i, j in zip([0, *cuts], [*cuts, len(stream)], strict=True)]
+
+
+def feed_all(decoder: Decoder, chunks: Iterable[bytes]) -> list[Packet]:
+    return [packet for chunk in chunks for packet in decoder.feed(chunk)]
+
+
+@settings(deadline=None)
+@given(st.data(), st.lists(PACKETS, max_size=8))
+def test_any_packets_round_trip_in_any_chunks(data: st.DataObject, packets: list[Packet]) -> None:
+    frames = [encode(packet) for packet in packets]
+    assert all(0 not in frame[1:-1] for frame in frames)
+    assert all(len(frame) <= MAX_FRAME_BYTES for frame in frames)
+    decoder = Decoder()
+    assert feed_all(decoder, chunked(data, b"".join(frames))) == packets
+    assert decoder.counts.packets == len(packets)
+    assert decoder.counts.corrupt == 0
+    assert decoder.counts.unknown_type == sum(isinstance(p, UnknownPacket) for p in packets)
+
+
+@settings(deadline=None)
+@given(st.lists(SMALL_PACKETS, min_size=1, max_size=4))
+def test_byte_by_byte_is_the_same(packets: list[Packet]) -> None:
+    stream = b"".join(map(encode, packets))
+    assert feed_all(Decoder(), (stream[i : i + 1] for i in range(len(stream)))) == packets
+
+
+def framed(content: bytes) -> bytes:
+    """A frame whose checksum is right, around content that need not be."""
+    return b"\0" + bytes(cobs.encode(content + crc32(content).to_bytes(4, "little"))) + b"\0"
+
+
+def contents() -> st.SearchStrategy[bytes]:
+    """Plausible to implausible contents: random ones of each type, and true ones with a change."""
+    random = st.builds(
+        lambda kind, body: bytes([1, kind]) + body, st.sampled_from([1, 2, 3, 0x81, 9]), st.binary()
+    )
+    true = PACKETS.map(lambda packet: bytes(cobs.decode(encode(packet)[1:-1])[:-4]))
+    altered = st.builds(
+        lambda content, at, with_, cut: (
+            content[: at % len(content)] + with_ + content[at % len(content) + cut :]
+        ),
+        true,
+        st.integers(0, 60),
+        st.binary(max_size=4),
+        st.integers(0, 4),
+    )
+    return st.one_of(random, altered)
+
+
+ANY_STREAM = st.lists(
+    st.one_of(
+        st.binary(),
+        contents().map(framed),
+        st.integers(1, 2 * MAX_FRAME_BYTES).map(lambda n: b"\x01" * n),
+        st.integers(1, 9).map(bytes),
+    ),
+    max_size=6,
+).map(b"".join)
+
+
+@settings(deadline=None, max_examples=300)
+@given(st.data(), ANY_STREAM)
+def test_any_bytes_decode_without_an_exception_and_alike_in_any_chunks(
+    data: st.DataObject, stream: bytes
+) -> None:
+    whole, parts = Decoder(), Decoder()
+    packets = whole.feed(stream)
+    again = feed_all(parts, chunked(data, stream))
+    assert [repr(p) for p in packets] == [repr(p) for p in again]  # repr: a rate may be NaN
+    assert whole.counts == parts.counts
+    assert whole.counts.packets == len(packets)
+    frames = sum(bool(part) for part in stream.split(b"\0"))
+    assert whole.counts.packets + whole.counts.corrupt <= frames
+
+
+def is_for_the_device_to_refuse(packet: Packet) -> bool:
+    """A bad rate must reach the device, which says so; a host cannot send one."""
+    return (
+        isinstance(packet, Command)
+        and packet.code == CommandCode.SET_RATE
+        and not 0 < packet.rate_hz < math.inf
+    )
+
+
+@settings(deadline=None, max_examples=300)
+@given(contents())
+def test_whatever_decodes_is_a_packet_that_can_be_sent(content: bytes) -> None:
+    decoder = Decoder()
+    for packet in decoder.feed(framed(content)):
+        assert is_for_the_device_to_refuse(packet) or Decoder().feed(encode(packet)) == [packet]
+    assert decoder.counts.packets + decoder.counts.corrupt == 1
+
+
+# --- damage -----------------------------------------------------------------------------------
+#
+# A stream is a list of cells, each a byte that remembers the frame it belongs to and its place in
+# it. Damage replaces, inserts and removes cells. A frame is untouched if its cells, both its
+# delimiters among them, still stand side by side.
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    byte: int
+    frame: int | None = None  # None: put there by the damage
+    place: int = 0
+
+
+def cells_of(frames: Sequence[bytes]) -> list[Cell]:
+    return [Cell(b, f, i) for f, frame in enumerate(frames) for i, b in enumerate(frame)]
+
+
+def untouched(cells: Sequence[Cell], frames: Sequence[bytes]) -> list[int]:
+    """The frames that stand whole in `cells`."""
+    starts = {cell.frame: i for i, cell in enumerate(cells) if cell.place == 0}
+    return [
+        f
+        for f, frame in enumerate(frames)
+        if f in starts and list(cells[starts[f] : starts[f] + len(frame)]) == cells_of_one(f, frame)
+    ]
+
+
+def cells_of_one(index: int, frame: bytes) -> list[Cell]:
+    return [Cell(byte, index, place) for place, byte in enumerate(frame)]
+
+
+def garbage() -> st.SearchStrategy[bytes]:
+    long_run = st.integers(1, 2 * MAX_FRAME_BYTES).map(lambda n: b"\x01" * n)
+    return st.one_of(st.binary(min_size=1, max_size=30), st.just(b"\0"), long_run)
+
+
+@st.composite
+def damaged(draw: st.DrawFn, cells: list[Cell]) -> list[Cell]:
+    """One flip, insertion, deletion, zeroing or truncation, often at the edge of a frame."""
+    edges = [i for i, cell in enumerate(cells) if cell.place == 0 and cell.frame is not None]
+    anywhere = st.integers(0, len(cells))
+    near_edge = st.builds(
+        lambda edge, by: min(max(edge + by, 0), len(cells)),
+        st.sampled_from(edges or [0]),
+        st.integers(-3, 3),
+    )
+    at = draw(st.one_of(anywhere, near_edge))
+    count = draw(st.one_of(st.integers(1, 4), st.integers(1, 80)))
+    before, hit, after = cells[:at], cells[at : at + count], cells[at + count :]
+    kind = draw(st.sampled_from(["flip", "insert", "delete", "zero", "truncate"]))
+    if kind == "flip":
+        mask = draw(st.integers(1, 255))
+        return before + [Cell(cell.byte ^ mask) for cell in hit] + after
+    if kind == "insert":
+        return before + [Cell(byte) for byte in draw(garbage())] + hit + after
+    if kind == "delete":
+        return before + after
+    if kind == "zero":
+        return before + [cell if cell.byte == 0 else Cell(0) for cell in hit] + after
+    return before
+
+
+def is_subsequence(part: Iterable[Packet], whole: Iterable[Packet]) -> bool:
+    rest = iter(whole)
+    return all(any(candidate == packet for candidate in rest) for packet in part)
+
+
+@settings(deadline=None, max_examples=400)
+@given(st.data(), st.lists(SMALL_PACKETS, min_size=1, max_size=6), st.integers(1, 4))
+def test_damage_loses_only_what_it_touches_and_invents_nothing(
+    data: st.DataObject, sent: list[Packet], times: int
+) -> None:
+    frames = [encode(packet) for packet in sent]
+    cells = cells_of(frames)
+    for _ in range(times):
+        cells = data.draw(damaged(cells))
+    stream = bytes(cell.byte for cell in cells)
+    decoded = feed_all(Decoder(), chunked(data, stream))
+    whole = [sent[f] for f in untouched(cells, frames)]
+    assert is_subsequence(decoded, sent), "a packet was invented or reordered"
+    assert is_subsequence(whole, decoded), "a packet that was not touched is lost"
+
+
+A, B, C = (
+    Scan(Channel.MAGNITUDE, n, 50_000 * n, ScanFlag(0), np.array([n, -n], dtype=np.int16))
+    for n in (1, 2, 3)
+)
+
+
+@pytest.mark.parametrize(
+    ("stream", "decoded"),
+    [
+        (encode(A)[:-1] + encode(B) + encode(C), [A, B, C]),
+        (encode(A) + encode(B)[1:] + encode(C), [A, B, C]),
+        (encode(A)[:-1] + encode(B)[1:] + encode(C), [C]),
+        (encode(A) + b"\x07junk" + encode(B) + encode(C), [A, B, C]),
+        (encode(A) + b"\x07ju\0nk" + encode(B) + encode(C), [A, B, C]),
+        (encode(A) + b"\x01" * 20_000 + encode(B) + encode(C), [A, B, C]),
+        (encode(A)[:-4] + encode(B) + encode(C), [B, C]),
+        (encode(A)[1:] + encode(B) + encode(C), [B, C]),
+    ],
+    ids=[
+        "trailing delimiter deleted",
+        "leading delimiter deleted",
+        "both delimiters between two frames deleted",
+        "garbage between two frames",
+        "garbage with a zero between two frames",
+        "garbage longer than a frame between two frames",
+        "end of a frame deleted",
+        "first delimiter of all deleted",
+    ],
+)
+def test_damage_at_delimiters(stream: bytes, decoded: list[Packet]) -> None:
+    """The corner cases of the property above, by name."""
+    assert Decoder().feed(stream) == decoded
+
+
+def test_every_single_byte_error_costs_that_packet_alone() -> None:
+    before, hit, after = encode(A), encode(B), encode(C)
+    for at, right in enumerate(hit):
+        for wrong in set(range(256)) - {right}:
+            damaged = hit[:at] + bytes([wrong]) + hit[at + 1 :]
+            assert Decoder().feed(before + damaged + after) == [A, C], (at, wrong)
