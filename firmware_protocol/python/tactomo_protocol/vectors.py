@@ -351,6 +351,9 @@ def _refused_frames(first: Scan, second: Scan, a: bytes, b: bytes) -> Iterator[_
     yield between("hello_not_utf8", "a byte that no UTF-8 holds", _changed(hello, 26, 0xFF))
     yield between("hello_escape", "a control character in a name", _changed(hello, 26, 0x1B))
     yield between("hello_string_beyond", "a length past the end", _changed(hello, 25, 60))
+    yield between("hello_firmware_beyond", "as above, in the last string", _changed(hello, 35, 6))
+    yield between("hello_firmware_empty", "a string of no bytes", _changed(hello, 35, 0)[:36])
+    yield between("hello_trailing_byte", "longer than its strings", hello + b"\x01")
     yield between("command_short", "its last byte is missing", start[:-1])
     yield between("acknowledge_status_4", "no such status", b"\x01\x03\x07\x02\x04")
     yield _Stream(
