@@ -1,0 +1,154 @@
+"""The daemon's configuration: a TOML file, and flags that override it.
+
+Every key has a default but `ports`. Errors name the file, the key, its value and what is allowed.
+`deploy/daemon.example.toml` shows every key with its meaning.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+from urllib.parse import urlsplit
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import ErrorDetails
+from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM, MessageError
+from tactomo_client.messages import check_sensor_name
+
+from tactomo.errors import ConfigError
+from tactomo.log import LogFormat, LogLevel
+
+MAX_PORTS = 2
+
+
+def _sensor_name(name: str) -> str:
+    try:
+        return check_sensor_name(name)
+    except MessageError as error:
+        raise ValueError(error.next_step) from error
+
+
+def _local_endpoint(endpoint: str) -> str:
+    """Accept ``ipc://PATH`` and ``tcp://LOOPBACK:PORT``, where port 0 means any free one."""
+    if endpoint.startswith("ipc://") and len(endpoint) > len("ipc://"):
+        return endpoint
+    try:
+        parts = urlsplit(endpoint)
+        is_tcp = parts.scheme == "tcp" and parts.hostname and parts.port is not None
+    except ValueError:  # a port that is no number or is out of range
+        is_tcp = False
+    if not is_tcp or parts.path:
+        raise ValueError("use tcp://127.0.0.1:PORT, with port 0 for any free one, or ipc://PATH")
+    if not _is_loopback(parts.hostname or ""):
+        raise ValueError(
+            f"{parts.hostname} can be reached from other computers, and anybody there could read "
+            "the stream or command the daemon; use 127.0.0.1 or ipc://PATH"
+        )
+    return endpoint
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+Endpoint = Annotated[str, AfterValidator(_local_endpoint)]
+TierName = Literal["auto", "quiet", "tikhonov", "levelset"]
+BudgetMs = Annotated[float, Field(gt=0, le=10_000)]
+
+
+class DaemonConfig(BaseModel):
+    """What one daemon serves: one sensor, read over one port or two."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    name: Annotated[str, AfterValidator(_sensor_name)] = "skin"
+    """This sensor's name in every topic, such as ``left_forearm``."""
+    description: str = "paper_square"
+    """A shipped sensor description's name, or the path of a TOML file."""
+    ports: Annotated[tuple[str, ...], Field(min_length=1, max_length=MAX_PORTS)]
+    """Device paths or pyserial URLs: one that carries both channels, or one for each."""
+    baud: Annotated[int, Field(ge=1200, le=12_000_000)] = 921_600
+    stream: Endpoint = DEFAULT_STREAM
+    control: Endpoint = DEFAULT_CONTROL
+    tier: TierName = "auto"
+    budget_ms: BudgetMs | None = None
+    """Time that one reconstruction may take; None leaves it to the tier."""
+    tare_scans: Annotated[int, Field(ge=2, le=10_000)] = 20
+    """Dual scans averaged into a reference."""
+    sync_wait_ms: Annotated[float, Field(ge=0, le=1000)] = 30.0
+    """How long a scan waits for the other channel's scan of the same instant."""
+    lossless: bool = False
+    """Reconstruct every dual scan, however late, instead of the newest one."""
+    record: Path | None = None
+    """Start recording to this file at once."""
+    record_maps: bool = False
+    """Put maps and contacts into recordings, beside the raw bytes."""
+    exit_at_end: bool = False
+    """Stop once every replayed port has reached the end of its recording."""
+    log_level: LogLevel = "info"
+    log_format: LogFormat = "auto"
+
+    @model_validator(mode="after")
+    def _ports_differ(self) -> Self:
+        if len(set(self.ports)) != len(self.ports):
+            raise ValueError("ports: the two ports are the same one")
+        return self
+
+
+def load_config(path: str | Path | None = None, **overrides: Any) -> DaemonConfig:
+    """Read a configuration file and apply flags to it.
+
+    Args:
+        path: a TOML file; None for defaults and flags alone.
+        **overrides: values by key that win over the file's; None means "not given".
+
+    Raises:
+        ConfigError: the file cannot be read or is not TOML, or a key is unknown, missing or
+            out of range.
+
+    """
+    given = {key: value for key, value in overrides.items() if value is not None}
+    values = {} if path is None else _read_toml(Path(path))
+    try:
+        return DaemonConfig.model_validate({**values, **given})
+    except ValidationError as error:
+        complaints = [f"{_source(item, path, given)}: {explain(item)}" for item in error.errors()]
+        raise ConfigError(
+            "\n".join(complaints), f"known keys: {', '.join(DaemonConfig.model_fields)}"
+        ) from error
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise ConfigError(
+            f"cannot read {path}: {error.strerror}", "give the path of a TOML file"
+        ) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(
+            f"{path} is not valid TOML: {error}",
+            "compare it with deploy/daemon.example.toml",
+        ) from error
+
+
+def _source(item: ErrorDetails, path: str | Path | None, given: Mapping[str, Any]) -> str:
+    is_flag = path is None or (item["loc"] and item["loc"][0] in given)
+    return "command line" if is_flag else str(path)
+
+
+def explain(item: ErrorDetails) -> str:
+    """Turn one complaint of pydantic's into "key = value: what is allowed"."""
+    key = ".".join(str(part) for part in item["loc"])
+    if item["type"] == "extra_forbidden":
+        return f"unknown key {key}"
+    if item["type"] == "missing":
+        return f"{key} is missing"
+    message = item["msg"].removeprefix("Value error, ")
+    return f"{key} = {item['input']!r}: {message}" if key else message

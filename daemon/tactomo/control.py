@@ -1,0 +1,174 @@
+"""The control thread: the only one that touches the control socket.
+
+Requests come from anybody on this computer, so each is bounded in size and checked whole before
+anything happens. A command whose outcome takes time (`tare`) is answered when it is known, and
+holds up no other client meanwhile.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from typing import Annotated, Any, Final
+
+import zmq
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from tactomo_client import MessageError
+from tactomo_client.messages import decode_request, encode_error, encode_reply
+
+from tactomo.config import BudgetMs, TierName, explain
+from tactomo.endpoint import bind
+from tactomo.errors import CommandError, TactomoError
+
+MAX_REQUEST_BYTES: Final = 64 * 1024
+POLL_MS: Final = 50
+POLL_WHILE_PENDING_MS: Final = 10
+MAX_PENDING: Final = 64
+LINGER_MS: Final = 100
+
+Result = Mapping[str, Any]
+Handler = Callable[[Any], Result | Future[Result]]
+
+
+class Arguments(BaseModel):
+    """Arguments of a command; what is not listed is refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class Nothing(Arguments):
+    """No arguments."""
+
+
+class RecordStart(Arguments):
+    """Where to record to; a name is chosen where none is given."""
+
+    path: Annotated[str, Field(min_length=1, max_length=4096)] | None = None
+
+
+class SetTier(Arguments):
+    """How much model frames get from now on."""
+
+    tier: TierName
+
+
+class SetBudget(Arguments):
+    """How long a frame may take from now on; nil leaves it to the tier."""
+
+    budget_ms: BudgetMs | None
+
+
+COMMANDS: Final[Mapping[str, type[Arguments]]] = {
+    "status": Nothing,
+    "tare": Nothing,
+    "record_start": RecordStart,
+    "record_stop": Nothing,
+    "set_tier": SetTier,
+    "set_budget": SetBudget,
+}
+
+
+class Control:
+    """Answers commands. `open` it, `start` its thread, `stop` it.
+
+    Args:
+        handlers: one for each of COMMANDS; called by the thread with the checked arguments.
+        on_idle: called by the thread several times a second.
+
+    Attributes:
+        address: where it is bound, once open.
+
+    """
+
+    def __init__(self, handlers: Mapping[str, Handler], on_idle: Callable[[], None]) -> None:
+        self.address = ""
+        self._handlers = handlers
+        self._on_idle = on_idle
+        self._pending: list[tuple[list[bytes], Future[Result]]] = []
+        self._socket: zmq.Socket[bytes]
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="control")
+
+    def open(self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str) -> None:
+        """Bind the control socket; raise AddressError where the address cannot be had."""
+        self._socket = context.socket(zmq.ROUTER)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_REQUEST_BYTES)
+        self.address = bind(self._socket, endpoint, "control")
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread and close the socket; what is pending gets an answer."""
+        self._stopping.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        self._socket.close(LINGER_MS)
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the thread runs."""
+        return self._thread.is_alive()
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            if self._socket.poll(POLL_WHILE_PENDING_MS if self._pending else POLL_MS):
+                self._receive()
+            self._answer_pending()
+            self._on_idle()
+        for _, future in self._pending:
+            if not future.done():
+                future.set_exception(CommandError("the daemon stops", "start it again"))
+        self._answer_pending()
+
+    def _receive(self) -> None:
+        # The envelope (identity, then an empty part) is handed back as it came.
+        *envelope, data = self._socket.recv_multipart()
+        try:
+            outcome = self._obey(*decode_request(data))
+        except (MessageError, TactomoError) as error:
+            self._send(envelope, encode_error(error.name, error.cause, error.next_step))
+            return
+        if isinstance(outcome, Future):
+            self._pending.append((envelope, outcome))
+        else:
+            self._send(envelope, encode_reply(outcome))
+
+    def _obey(self, command: str, arguments: dict[str, Any]) -> Result | Future[Result]:
+        if command not in COMMANDS:
+            raise CommandError(
+                f"unknown command {command[:40]!r}",
+                f"known: {', '.join(COMMANDS)}",
+                "unknown_command",
+            )
+        if len(self._pending) >= MAX_PENDING:
+            raise CommandError("too many commands wait for their answer", "try again later")
+        try:
+            checked = COMMANDS[command].model_validate(arguments)
+        except ValidationError as error:
+            complaints = "; ".join(explain(item) for item in error.errors())
+            known = ", ".join(COMMANDS[command].model_fields) or "none"
+            raise CommandError(
+                f"{command}: {complaints}", f"its arguments: {known}", "bad_argument"
+            ) from error
+        return self._handlers[command](checked)
+
+    def _answer_pending(self) -> None:
+        waiting = []
+        for envelope, future in self._pending:
+            if not future.done():
+                waiting.append((envelope, future))
+                continue
+            try:
+                self._send(envelope, encode_reply(future.result()))
+            except TactomoError as error:
+                self._send(envelope, encode_error(error.name, error.cause, error.next_step))
+        self._pending = waiting
+
+    def _send(self, envelope: list[bytes], reply: bytes) -> None:
+        # Somebody who asks and never reads fills their own queue; they do not hold up the others.
+        with contextlib.suppress(zmq.Again):
+            self._socket.send_multipart([*envelope, reply], zmq.DONTWAIT)

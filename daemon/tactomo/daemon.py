@@ -1,0 +1,310 @@
+"""The daemon: ports, pipeline, publisher, control and recorder, put together and kept running.
+
+Threads, each with what it alone touches, and what it hands on:
+
+============  ==========================  =========================================================
+thread        owns                        hands on
+============  ==========================  =========================================================
+port-0, -1    a serial port, a decoder    scans to the pipeline, bytes to the recorder
+pipeline      sync, the reconstructor     messages to the publisher, marks to the recorder
+control       the control socket          commands to the pipeline; starts and stops the recorder
+recorder-N    the file of recording N     nothing
+publisher     the stream's socket         sent messages to the recorder, if they are asked for
+============  ==========================  =========================================================
+
+They stop in this order, so nobody hands anything to one that has gone, but for the publisher's
+last messages, which no recording misses. Numerical libraries are held to one thread while a daemon
+runs: on arrays of this size their pools cost more latency than they save, and the processor is
+shared with everything else on the robot.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+import time
+import uuid
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+import structlog
+import zmq
+from platformdirs import user_data_path
+from tactomo_client.messages import EVENT, STATUS
+from tactomo_models import (
+    Reconstructor,
+    SensorDescription,
+    Tier,
+    load_description,
+    load_or_build_artifact,
+)
+from tactomo_protocol import Channel
+from threadpoolctl import threadpool_limits
+
+from tactomo.config import DaemonConfig
+from tactomo.control import Control, Nothing, RecordStart, SetBudget, SetTier
+from tactomo.errors import ConfigError
+from tactomo.events import Severity
+from tactomo.imaging import Imaging
+from tactomo.pipeline import Pipeline, Replay
+from tactomo.port import PortReader
+from tactomo.protocol_replay import parse_replay_url
+from tactomo.publisher import Publisher
+from tactomo.recorder import Recorder, message_entry
+from tactomo.recording import REPLAY_SCHEME, Origin
+from tactomo.status import Status
+
+WATCH_S: Final = 0.1
+
+log = structlog.get_logger()
+
+
+class Daemon:
+    """One sensor's daemon, to be run in this process.
+
+    Args:
+        config: what it serves.
+        reconstructor: what makes maps of voltages; by default the description's own, with an
+            artifact that is built if need be.
+
+    Raises:
+        ModelError: the description or the artifact cannot be used.
+        ConfigError: the ports are not all live, or not all of one recording.
+        RecordingError, PortError: a replay URL leads to no recording.
+
+    Attributes:
+        session: identity of this run, as in every message.
+
+    """
+
+    def __init__(self, config: DaemonConfig, *, reconstructor: Reconstructor | None = None) -> None:
+        self.config = config
+        self.session = uuid.uuid4().hex
+        self._undo = contextlib.ExitStack()
+        self._stop_asked = threading.Event()
+        description = load_description(config.description)
+        replay = read_replay(config.ports)
+        channels = tuple(c for c in Channel if c.name.lower() in description.modalities)
+        self._recorder = Recorder(_origin(config, description), self._on_event)
+        self._publisher = Publisher(
+            config.name, self.session, self._status_fields, self._record_message
+        )
+        self._imaging = Imaging(
+            description,
+            reconstructor or _make_reconstructor(config, description),
+            config.tare_scans,
+            self._recorder,
+            self._publisher,
+            self._on_event,
+        )
+        self._pipeline = Pipeline(
+            self._imaging,
+            channels,
+            len(config.ports),
+            round(config.sync_wait_ms * 1e6),
+            config.lossless,
+            replay,
+            self._on_event,
+        )
+        self._ports = [
+            PortReader(
+                index,
+                url,
+                config.baud,
+                description,
+                self._recorder,
+                self._pipeline.deliver,
+                self._on_event,
+            )
+            for index, url in enumerate(config.ports)
+        ]
+        self._control = Control(
+            {
+                "status": lambda _: self.status(),
+                "tare": lambda _: self._pipeline.tare(),
+                "record_start": self._record_start,
+                "record_stop": self._record_stop,
+                "set_tier": self._set_tier,
+                "set_budget": self._set_budget,
+            },
+            on_idle=self._recorder.check,
+        )
+        self._status = Status(
+            description, self._ports, self._pipeline, self._imaging, self._recorder
+        )
+
+        self._threads: list[Publisher | Control | Pipeline | PortReader] = [
+            self._publisher,
+            self._control,
+            self._pipeline,
+            *self._ports,
+        ]
+
+    @property
+    def stream_address(self) -> str:
+        """Where the stream is bound, once started."""
+        return self._publisher.address
+
+    @property
+    def control_address(self) -> str:
+        """Where the control socket is bound, once started."""
+        return self._control.address
+
+    def start(self) -> None:
+        """Open everything and start all threads; on failure, what was opened is closed again.
+
+        Raises:
+            PortError: a port cannot be used; one that vanishes later is waited for instead.
+            AddressError: an address is in use.
+            RecordingError: the recording cannot be created.
+
+        """
+        with contextlib.ExitStack() as undo:
+            self._open(undo)
+            self._undo = undo.pop_all()
+        log.info(
+            "ready",
+            sensor=self.config.name,
+            stream=self.stream_address,
+            control=self.control_address,
+            ports=list(self.config.ports),
+        )
+
+    def stop(self) -> None:
+        """Stop all threads and close everything; may be called twice."""
+        self._stop_asked.set()
+        self._undo.close()
+
+    def wait(self) -> int:
+        """Wait until the daemon is to stop, and return the exit status that it deserves."""
+        while not self._stop_asked.wait(WATCH_S):
+            if self.config.exit_at_end and self._pipeline.finished.is_set():
+                break
+            if not all(
+                part.is_alive for part in self._threads
+            ):  # its traceback is on standard error
+                log.error("thread_died", next_step="please report the traceback above")
+                return 1
+        return 0
+
+    def run(self) -> int:
+        """Start, serve until SIGTERM or SIGINT, and stop; returns the process's exit status.
+
+        For the main thread. Raises what `start` raises.
+        """
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: self._stop_asked.set())
+        self.start()
+        try:
+            return self.wait()
+        finally:
+            self.stop()
+            log.info("stopped")
+
+    def status(self) -> dict[str, Any]:
+        """Return the fields of a `status` message as of now, envelope included."""
+        envelope = self._publisher.envelope(STATUS, self._publisher.header)
+        return {"sensor": self.config.name, "kind": STATUS, **envelope, **self._status_fields()}
+
+    def _open(self, undo: contextlib.ExitStack) -> None:
+        """Open and start each part, what is downstream first; `undo` goes the other way."""
+        config = self.config
+        undo.enter_context(threadpool_limits(1))
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        undo.callback(context.term)
+        self._publisher.open(context, config.stream)
+        undo.callback(self._publisher.stop)
+        undo.callback(self._recorder.close)
+        self._control.open(context, config.control)
+        undo.callback(self._control.stop)
+        undo.callback(self._pipeline.stop)
+        for port in self._ports:
+            port.open()
+            undo.callback(port.stop)
+        if config.record is not None:
+            self._recorder.start(config.record, config.record_maps)
+        for part in self._threads:
+            part.start()
+
+    def _record_start(self, arguments: RecordStart) -> Mapping[str, Any]:
+        path = Path(arguments.path) if arguments.path else _new_recording(self.config.name)
+        return {"path": str(self._recorder.start(path, self.config.record_maps))}
+
+    def _record_stop(self, _: Nothing) -> Mapping[str, Any]:
+        path, length = self._recorder.stop()
+        return {"path": str(path), "bytes": length}
+
+    def _set_tier(self, arguments: SetTier) -> Mapping[str, Any]:
+        self._pipeline.set_tier(Tier(arguments.tier))
+        return {"tier": arguments.tier}
+
+    def _set_budget(self, arguments: SetBudget) -> Mapping[str, Any]:
+        self._pipeline.set_budget(arguments.budget_ms)
+        return {"budget_ms": arguments.budget_ms}
+
+    def _status_fields(self) -> Mapping[str, Any]:
+        return self._status.fields(self._publisher.latency, self._publisher.subscribers)
+
+    def _record_message(self, kind: str, data: bytes) -> None:
+        active = self._recorder.active
+        if active is not None and active.with_maps:
+            active.add(message_entry(kind, data, time.monotonic_ns(), time.time_ns()))
+
+    def _on_event(self, name: str, severity: Severity, detail: str, next_step: str = "") -> None:
+        extra = {"next_step": next_step} if next_step else {}
+        getattr(log, severity)(name, detail=detail, **extra)
+        fields = {"name": name, "severity": severity, "detail": detail, "next_step": next_step}
+        self._publisher.publish(EVENT, fields)
+
+
+def read_replay(urls: Sequence[str]) -> Replay | None:
+    """Return what the recording says that the ports replay; None where they are live.
+
+    Raises:
+        ConfigError: only some of the ports are replayed, or not all from one recording.
+        RecordingError, PortError: a URL leads to no recording.
+
+    """
+    replayed = [url for url in urls if url.startswith(f"{REPLAY_SCHEME}://")]
+    if not replayed:
+        return None
+    parsed = [parse_replay_url(url) for url in replayed]
+    recording, _, speed = parsed[0]
+    others = {(other.path, other_speed) for other, _, other_speed in parsed}
+    if len(replayed) < len(urls) or len(others) > 1:
+        raise ConfigError(
+            f"the ports {', '.join(urls)} do not replay one recording",
+            "replay all ports from one file at one speed, or none",
+        )
+    # A part of the ports cannot give the dual scans that all of them gave.
+    is_whole = len(urls) == len(recording.origin.ports)
+    return Replay(
+        marks=recording.marks() if is_whole else [],
+        reference=recording.first_reference(),
+        is_paced=speed > 0,
+    )
+
+
+def _make_reconstructor(config: DaemonConfig, description: SensorDescription) -> Reconstructor:
+    log.info("loading", sensor_model=description.name)
+    budget_s = None if config.budget_ms is None else config.budget_ms * 1e-3
+    artifact = load_or_build_artifact(description)
+    return Reconstructor(description, artifact, tier=Tier(config.tier), budget_s=budget_s)
+
+
+def _origin(config: DaemonConfig, description: SensorDescription) -> Origin:
+    return Origin(
+        sensor=config.name,
+        description=config.description,
+        description_sha256=description.sha256,
+        ports=config.ports,
+        version=version("tactomo"),
+    )
+
+
+def _new_recording(sensor: str) -> Path:
+    stamp = time.strftime("%Y%m%dT%H%M%S")
+    return user_data_path("tactomo") / "recordings" / f"{sensor}-{stamp}.mcap"

@@ -1,0 +1,154 @@
+"""What the daemon publishes, as the fields of STREAM.md: SI units in, millimetres and kPa out."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from tactomo_client.messages import array_to_wire
+from tactomo_models import Contact, Reconstruction, SensorDescription
+from tactomo_protocol import Channel, Hello
+
+from tactomo.port import ChannelScan, PortReader
+
+NO_FRAME_YET: Final[dict[str, Any]] = {
+    "acquired_realtime_ns": None,
+    "acquired_monotonic_ns": None,
+    "device_us": None,
+    "tier": None,
+    "tier_reason": None,
+    "flags": [],
+    "misfit": None,
+}
+
+
+def scan_header(last: ChannelScan) -> dict[str, Any]:
+    """Return the envelope's part that says when a dual scan was acquired."""
+    return {
+        **NO_FRAME_YET,
+        "acquired_realtime_ns": last.realtime_ns,
+        "acquired_monotonic_ns": last.monotonic_ns,
+        "device_us": last.device_us,
+    }
+
+
+def frame_header(last: ChannelScan, frame: Reconstruction, flags: set[str]) -> dict[str, Any]:
+    """Return the same with what the reconstruction says about itself."""
+    return {
+        **scan_header(last),
+        "tier": str(frame.tier),
+        "tier_reason": frame.reason,
+        "flags": sorted(flags),
+        "misfit": _finite(frame.misfit),
+    }
+
+
+def scan_fields(counter: int, volts: dict[Channel, NDArray[np.float64]]) -> dict[str, Any]:
+    """Return the fields of a `scan` message."""
+    return {
+        "scan_counter": counter,
+        "magnitude": _array(volts.get(Channel.MAGNITUDE)),
+        "structure": _array(volts.get(Channel.STRUCTURE)),
+    }
+
+
+def contacts_fields(counter: int, frame: Reconstruction) -> dict[str, Any]:
+    """Return the fields of a `contacts` message."""
+    return {"scan_counter": counter, "contacts": [_contact(c) for c in frame.contacts]}
+
+
+def map_fields(
+    counter: int, frame: Reconstruction, description: SensorDescription
+) -> dict[str, Any]:
+    """Return the fields of a `map` message."""
+    return {
+        **contacts_fields(counter, frame),
+        "map": _array(frame.map),
+        "pressure_kpa": _array(frame.pressure_kpa),
+        "structure": _array(frame.structure),
+        "x_mm": _ends_mm(description.map_x_m),
+        "y_mm": _ends_mm(description.map_y_m),
+        "magnitude_max": magnitude_max(description),
+    }
+
+
+def description_fields(description: SensorDescription) -> dict[str, Any]:
+    """Return what `status` says about the sensor."""
+    width_m, height_m = description.width_m, description.height_m
+    frame_m = 2 * description.sheet.frame_width_m
+    response = description.magnitude.response if description.magnitude else None
+    return {
+        "model": description.name,
+        "sha256": description.sha256,
+        "shape": description.sheet.shape,
+        "width_mm": width_m * 1e3,
+        "height_mm": height_m * 1e3,
+        "sensing_width_mm": (width_m - frame_m) * 1e3,
+        "sensing_height_mm": (height_m - frame_m) * 1e3,
+        "electrodes_mm": (description.electrode_centres_m * 1e3).tolist(),
+        "modalities": list(description.modalities),
+        "magnitude_max": magnitude_max(description),
+        "pressure_max_kpa": max(response.pressure_kpa) if response else None,
+        "magnitude_response": response
+        and {
+            "pressure_kpa": list(response.pressure_kpa),
+            "relative_change": list(response.relative_change),
+        },
+    }
+
+
+def port_fields(port: PortReader) -> dict[str, Any]:
+    """Return what `status` says about a port."""
+    return {
+        "url": port.url,
+        "connected": port.is_open,
+        "device": port.hello and _device(port.hello),
+        "refusal": port.refusal,
+        "bytes": port.bytes_read,
+        "packets": port.counts.packets,
+        "corrupt": port.counts.corrupt,
+    }
+
+
+def magnitude_max(description: SensorDescription) -> float | None:
+    """Return the top of a sensible colour scale for the map, a ratio."""
+    if description.magnitude is None:
+        return None
+    return max(abs(change) for change in description.magnitude.response.relative_change)
+
+
+def _device(hello: Hello) -> dict[str, Any]:
+    return {
+        "device_id": hello.device_id,
+        "firmware": hello.firmware,
+        "channels": [channel.name.lower() for channel in hello.channels],
+        "electrodes": hello.electrodes,
+        "samples_per_scan": hello.samples_per_scan,
+        "scan_rate_hz": hello.scan_rate_hz,
+    }
+
+
+def _contact(contact: Contact) -> dict[str, Any]:
+    return {
+        "id": contact.id,
+        "x_mm": contact.x_m * 1e3,
+        "y_mm": contact.y_m * 1e3,
+        "area_mm2": contact.area_m2 * 1e6,
+        "magnitude": _finite(contact.magnitude),
+        "magnitude_sigma": _finite(contact.magnitude_sigma),
+        "pressure_kpa": _finite(contact.pressure_kpa),
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _array(array: NDArray[Any] | None) -> dict[str, Any] | None:
+    return None if array is None else array_to_wire(array)
+
+
+def _ends_mm(positions_m: NDArray[np.float64]) -> list[float]:
+    return [float(positions_m[0]) * 1e3, float(positions_m[-1]) * 1e3]

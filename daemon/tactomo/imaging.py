@@ -1,0 +1,255 @@
+"""One dual scan to one frame: check, reconstruct, publish, and mark it in the recording.
+
+For use by the pipeline thread; nothing in here waits. What others may read (`reference`, `stages`,
+...) is written by that thread alone.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from concurrent.futures import Future
+from typing import Any, Final
+
+import numpy as np
+import structlog
+from numpy.typing import NDArray
+from tactomo_client.messages import CONTACTS, MAP, SCAN
+from tactomo_models import Reconstruction, Reconstructor, Reference, SensorDescription, Tier
+from tactomo_protocol import Channel, ScanFlag
+
+from tactomo.errors import CommandError
+from tactomo.events import OnEvent, RateLimit
+from tactomo.frames import contacts_fields, frame_header, map_fields, scan_fields, scan_header
+from tactomo.publisher import Publisher
+from tactomo.recorder import ActiveRecording, Recorder, mark_entry, reference_entry
+from tactomo.recording import Mark, ScanKey
+from tactomo.sync import DualScan
+from tactomo.tare import Tare
+from tactomo.timing import Durations, Rate
+
+NO_DATA_S: Final = 3.0
+"""How long a tare on command waits for usable dual scans before it gives up."""
+
+Volts = dict[Channel, NDArray[np.float64]]
+
+log = structlog.get_logger()
+
+
+class Imaging:
+    """Reconstructs dual scans against a reference that it takes itself.
+
+    Attributes:
+        reference: what changes are measured against; None before the first tare.
+        reference_realtime_ns: when it was taken.
+        stages: how long each stage takes.
+        frame_rate: how often a frame is published.
+        last_monotonic_ns: arrival of the newest dual scan; 0 before the first.
+
+    """
+
+    def __init__(
+        self,
+        description: SensorDescription,
+        reconstructor: Reconstructor,
+        tare_scans: int,
+        recorder: Recorder,
+        publisher: Publisher,
+        on_event: OnEvent,
+    ) -> None:
+        self.reference: Reference | None = None
+        self.reference_realtime_ns = 0
+        self.stages: dict[str, Durations] = {}
+        self.frame_rate = Rate()
+        self.last_monotonic_ns = 0
+        self._description = description
+        self._channels = tuple(c for c in Channel if c.name.lower() in description.modalities)
+        self._reconstructor = reconstructor
+        self._tare_scans = tare_scans
+        self._recorder = recorder
+        self._publisher = publisher
+        self._on_event = on_event
+        self._tare: Tare | None = None
+        self._tare_deadline_s = 0.0
+        self._marked: ActiveRecording | None = None  # the recording that gets marks
+        self._failure_limit = RateLimit()
+
+    @property
+    def is_taring(self) -> bool:
+        """Whether a reference is being taken."""
+        return self._tare is not None
+
+    @property
+    def tier(self) -> Tier:
+        """The tier that is asked for."""
+        return self._reconstructor.tier
+
+    @tier.setter
+    def tier(self, tier: Tier) -> None:
+        self._reconstructor.tier = tier
+
+    @property
+    def budget_ms(self) -> float | None:
+        """The time that a frame may take; None for the tier's own."""
+        budget_s = self._reconstructor.budget_s
+        return None if budget_s is None else budget_s * 1e3
+
+    @budget_ms.setter
+    def budget_ms(self, budget_ms: float | None) -> None:
+        self._reconstructor.budget_s = None if budget_ms is None else budget_ms * 1e-3
+
+    def use_reference(self, reference: Reference, realtime_ns: int) -> None:
+        """Measure changes against `reference` from the next dual scan on."""
+        self._reconstructor.set_reference(reference)
+        self.reference, self.reference_realtime_ns = reference, realtime_ns
+        if self._marked is not None:
+            self._marked.add(reference_entry(reference, time.monotonic_ns(), realtime_ns))
+
+    def start_tare(self, answer: Future[Mapping[str, Any]] | None = None) -> None:
+        """Take a reference from the dual scans to come; `answer` gets its `scans`, or why not."""
+        self._tare = self._tare or Tare(self._tare_scans)
+        self._tare_deadline_s = time.monotonic() + NO_DATA_S
+        if answer is not None:
+            self._tare.answers.append(answer)
+
+    def check_tare(self) -> None:
+        """Give up a tare on command for which nothing comes."""
+        if self._tare and self._tare.answers and time.monotonic() > self._tare_deadline_s:
+            self._refuse_tare(
+                self._tare,
+                CommandError(
+                    f"no usable dual scan for {NO_DATA_S:g} s",
+                    "`tactomo status` shows what the ports say",
+                    "no_data",
+                ),
+            )
+
+    def process(self, dual: DualScan, lost: set[Channel]) -> None:
+        """Turn one dual scan into a frame; `lost` are the channels that are not to be expected."""
+        mark = dual.mark
+        if mark is not None:
+            self._obey(mark)
+        self._follow_recording(dual)
+        volts, flags = usable_volts(dual)
+        self._publish_scan(dual, volts)
+        frame = self._reconstruct(volts)
+        if frame is not None:
+            self._publish_frame(dual, frame, flags | set(frame.flags.names()))
+        if self._marked is not None and dual.recording == self._marked.number:
+            keys = tuple(ScanKey(s.channel, s.counter, s.device_us) for s in dual.scans)
+            done = Mark(keys, str(self.tier), self.budget_ms)
+            self._marked.add(mark_entry(done, time.monotonic_ns(), time.time_ns()))
+        self._go_on_taring(volts, lost)
+
+    def _obey(self, mark: Mark) -> None:
+        """Put in force what was in force when this dual scan was recorded."""
+        if self.tier != mark.tier:
+            self.tier = Tier(mark.tier)
+        if self.budget_ms != mark.budget_ms:
+            self.budget_ms = mark.budget_ms
+        if mark.reference is not None:
+            self.use_reference(mark.reference, time.time_ns())
+
+    def _follow_recording(self, dual: DualScan) -> None:
+        """Begin to mark frames with the first dual scan that a recording holds whole.
+
+        Frames depend on those before them; from here on, a replay can do the same from the start.
+        """
+        active = self._recorder.active
+        if active is self._marked:
+            return
+        if active is None:
+            self._marked = None
+        elif dual.recording == active.number:
+            self._marked = active
+            self._reconstructor.reset()
+            if self.reference is not None:
+                entry = reference_entry(self.reference, time.monotonic_ns(), time.time_ns())
+                active.add(entry)
+
+    def _reconstruct(self, volts: Volts) -> Reconstruction | None:
+        started_s = time.perf_counter()
+        try:
+            frame = self._reconstructor.reconstruct(
+                volts.get(Channel.MAGNITUDE), volts.get(Channel.STRUCTURE)
+            )
+        except Exception as error:  # a robot is better off with the next frame than with none
+            self._reconstructor.reset()
+            if self._failure_limit.allows():
+                log.exception("reconstruction_failed")
+                self._on_event(
+                    "reconstruction_failed",
+                    "error",
+                    f"{type(error).__name__}: {error}",
+                    "this is a mistake in tactomo: please report it with a recording",
+                )
+            return None
+        self._time("reconstruct", time.perf_counter() - started_s)
+        for stage, seconds in frame.stage_s.items():
+            self._time(stage, seconds)
+        return frame
+
+    def _publish_scan(self, dual: DualScan, volts: Volts) -> None:
+        header = scan_header(dual.last)
+        self.last_monotonic_ns = dual.last.monotonic_ns
+        if self._publisher.wants(SCAN):
+            self._publisher.publish(SCAN, scan_fields(dual.counter, volts), header)
+
+    def _publish_frame(self, dual: DualScan, frame: Reconstruction, flags: set[str]) -> None:
+        started_s = time.perf_counter()
+        header = frame_header(dual.last, frame, flags)
+        self._publisher.header = header
+        self._publisher.publish(CONTACTS, contacts_fields(dual.counter, frame), header)
+        active = self._recorder.active
+        if self._publisher.wants(MAP) or (active is not None and active.with_maps):
+            fields = map_fields(dual.counter, frame, self._description)
+            self._publisher.publish(MAP, fields, header)
+        self.frame_rate.add(time.monotonic_ns())
+        self._time("publish", time.perf_counter() - started_s)
+
+    def _go_on_taring(self, volts: Volts, lost: set[Channel]) -> None:
+        tare = self._tare
+        if tare is None:
+            return
+        if volts:
+            self._tare_deadline_s = time.monotonic() + NO_DATA_S
+        needed = [channel for channel in self._channels if channel not in lost]
+        if not tare.add(volts, needed):
+            return
+        try:
+            reference = tare.reference()
+        except CommandError as refusal:
+            self._refuse_tare(tare, refusal)
+            return
+        self._tare = None
+        self.use_reference(reference, time.time_ns())
+        for answer in tare.answers:
+            answer.set_result({"scans": reference.scans})
+        self._on_event("tared", "info", f"{reference.scans} dual scans")
+
+    def _refuse_tare(self, tare: Tare, refusal: CommandError) -> None:
+        self._tare = None
+        for answer in tare.answers:
+            answer.set_exception(refusal)
+        self._on_event("tare_refused", "warning", refusal.cause, refusal.next_step)
+        if self.reference is None:
+            self.start_tare()  # without a reference there is nothing else to do
+
+    def _time(self, stage: str, seconds: float) -> None:
+        if stage not in self.stages:  # a new dictionary, for those who iterate over the old one
+            self.stages = {**self.stages, stage: Durations()}
+        self.stages[stage].add(seconds)
+
+
+def usable_volts(dual: DualScan) -> tuple[Volts, set[str]]:
+    """Return the voltages that may be used, and flags that say what is wrong with the others."""
+    volts: Volts = {}
+    flags: set[str] = set()
+    for scan in dual.scans:
+        if scan.flags & ScanFlag.SATURATED:
+            flags.add("invalid_voltage")
+        if np.isfinite(scan.volts).all():
+            volts[scan.channel] = scan.volts
+        else:
+            flags.add("invalid_voltage")
+    return volts, flags

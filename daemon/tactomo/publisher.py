@@ -1,0 +1,207 @@
+"""The publisher thread: the only one that touches the stream's socket.
+
+Other threads hand it messages by a queue and wake it through a pipe, so that it can wait for them
+and for subscriptions at once. It never waits for a subscriber: what does not fit into a slow one's
+queue is lost to that one alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from typing import Any, Final, NamedTuple
+
+import zmq
+from tactomo_client.messages import CONTACTS, EVENT, STATUS, clock_id, encode_message, topic
+
+from tactomo.endpoint import bind
+from tactomo.frames import NO_FRAME_YET
+from tactomo.timing import Durations
+
+STATUS_PERIOD_S: Final = 1.0
+LINGER_MS: Final = 200
+"""How long messages that were sent may take to leave when the daemon stops."""
+QUEUED_PER_SUBSCRIBER: Final = 64
+MAX_SUBSCRIPTION_BYTES: Final = 1024
+MAX_QUEUED: Final = 1024
+
+
+class _Outgoing(NamedTuple):
+    kind: str
+    header: Mapping[str, Any]
+    fields: Mapping[str, Any]
+
+
+class Publisher:
+    """Numbers, stamps and sends messages; publishes the status every second.
+
+    `open` it, `start` its thread, `stop` it.
+
+    Args:
+        sensor: the name in every topic.
+        session: identity of this run of the daemon.
+        status: returns the current fields of a `status` message; called by the thread.
+        on_sent: called by the thread with kind and bytes of each frame's message just sent.
+
+    Attributes:
+        address: where it is bound, once open.
+        header: the newest frame's; written by the pipeline thread, sent with status and events.
+        latency: from the last byte of a dual scan to the sending of its contacts.
+
+    """
+
+    def __init__(
+        self,
+        sensor: str,
+        session: str,
+        status: Callable[[], Mapping[str, Any]],
+        on_sent: Callable[[str, bytes], None],
+    ) -> None:
+        self.address = ""
+        self.header: Mapping[str, Any] = NO_FRAME_YET
+        self.latency = Durations()
+        self._sensor = sensor
+        self._session = session
+        self._status = status
+        self._on_sent = on_sent
+        self._sequence: Counter[str] = Counter()  # written by this thread, read by control's
+        self._subscriptions: Counter[bytes] = Counter()  # this thread's own
+        self._prefixes: frozenset[bytes] = frozenset()  # a copy for the other threads
+        self._last_status = b""
+        self._queue: deque[_Outgoing] = deque(maxlen=MAX_QUEUED)
+        self._stopping = threading.Event()
+        self._socket: zmq.Socket[bytes]
+        self._wake_reader = self._wake_writer = -1
+        self._thread = threading.Thread(target=self._run, name="publisher")
+
+    @property
+    def subscribers(self) -> int:
+        """Subscriptions in force."""
+        return sum(self._subscriptions.values())
+
+    def open(self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str) -> None:
+        """Bind the stream's socket; raise AddressError where the address cannot be had."""
+        self._socket = _make_socket(context)
+        self.address = bind(self._socket, endpoint, "stream")
+        self._wake_reader, self._wake_writer = os.pipe()
+        os.set_blocking(self._wake_reader, False)
+        os.set_blocking(self._wake_writer, False)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Send what waits, end the thread and close the socket."""
+        self._stopping.set()
+        self._wake()
+        if self._thread.is_alive():
+            self._thread.join()
+        self._socket.close(LINGER_MS)
+        for descriptor in (self._wake_reader, self._wake_writer):
+            os.close(descriptor)
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the thread runs."""
+        return self._thread.is_alive()
+
+    def wants(self, kind: str) -> bool:
+        """Whether anybody subscribes to this kind of message; for any thread."""
+        name = topic(self._sensor, kind)
+        return any(name.startswith(prefix) for prefix in self._prefixes)
+
+    def publish(
+        self, kind: str, fields: Mapping[str, Any], header: Mapping[str, Any] | None = None
+    ) -> None:
+        """Hand over a message; for any thread, and never waits.
+
+        Args:
+            kind: one of the stream's kinds.
+            fields: the kind's own.
+            header: acquisition, tier, flags and misfit; by default the newest frame's.
+
+        """
+        self._queue.append(_Outgoing(kind, self.header if header is None else header, fields))
+        self._wake()
+
+    def envelope(self, kind: str, header: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the envelope of the last message of a kind, its age as of now; for any thread."""
+        acquired_ns = header["acquired_monotonic_ns"]
+        return {
+            "session": self._session,
+            "sequence": self._sequence[kind],
+            **header,
+            "clock_id": clock_id(),
+            "age_ns": None if acquired_ns is None else time.monotonic_ns() - acquired_ns,
+        }
+
+    def _run(self) -> None:
+        poller = zmq.Poller()
+        poller.register(self._socket, zmq.POLLIN)
+        poller.register(self._wake_reader, zmq.POLLIN)
+        status_at_s = time.monotonic()
+        while not self._stopping.is_set():
+            wait_s = max(0.0, status_at_s - time.monotonic())
+            for ready, _ in poller.poll(math.ceil(wait_s * 1e3)):
+                if ready is self._socket:
+                    self._read_subscriptions()
+                else:
+                    os.read(self._wake_reader, 4096)
+            self._send_queued()
+            if time.monotonic() >= status_at_s:
+                status_at_s += STATUS_PERIOD_S
+                self._send_status()
+        self._send_queued()
+
+    def _send_queued(self) -> None:
+        while self._queue:
+            self._send(self._queue.popleft())
+
+    def _send(self, message: _Outgoing) -> bytes:
+        self._sequence[message.kind] += 1
+        envelope = self.envelope(message.kind, message.header)
+        data = encode_message(self._sensor, message.kind, {**envelope, **message.fields})
+        self._socket.send(data, zmq.DONTWAIT)
+        if message.kind == CONTACTS and envelope["age_ns"] is not None:
+            self.latency.add(envelope["age_ns"] * 1e-9)
+        if message.kind not in (STATUS, EVENT):
+            self._on_sent(message.kind, data)
+        return data
+
+    def _send_status(self) -> None:
+        self._last_status = self._send(_Outgoing(STATUS, self.header, self._status()))
+
+    def _read_subscriptions(self) -> None:
+        """Take note of who comes and goes; a newcomer to the status gets the last one at once."""
+        repeat = False
+        while self._socket.poll(0):
+            message = self._socket.recv()
+            joins, prefix = message[:1] == b"\1", message[1:]
+            if joins:
+                self._subscriptions[prefix] += 1
+                repeat = repeat or topic(self._sensor, STATUS).startswith(prefix)
+            elif message[:1] == b"\0":
+                self._subscriptions[prefix] -= 1
+        self._subscriptions = +self._subscriptions
+        self._prefixes = frozenset(self._subscriptions)
+        if repeat and self._last_status:
+            self._socket.send(self._last_status, zmq.DONTWAIT)
+
+    def _wake(self) -> None:
+        with contextlib.suppress(BlockingIOError):  # full of reasons to wake up already
+            os.write(self._wake_writer, b"\0")
+
+
+def _make_socket(context: zmq.Context[zmq.Socket[bytes]]) -> zmq.Socket[bytes]:
+    socket = context.socket(zmq.XPUB)
+    # Every single subscription and its end is reported, not only the first and the last of many.
+    socket.setsockopt(zmq.XPUB_VERBOSER, 1)
+    socket.setsockopt(zmq.SNDHWM, QUEUED_PER_SUBSCRIBER)
+    socket.setsockopt(zmq.MAXMSGSIZE, MAX_SUBSCRIPTION_BYTES)
+    return socket

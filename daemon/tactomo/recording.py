@@ -1,0 +1,292 @@
+"""Recordings: what the ports said, with times, in one MCAP file; its layout, and reading it.
+
+Messages are in the order in which they were written, and that order is what counts:
+
+=============  ==========  =======================================================================
+topic          encoding    message
+=============  ==========  =======================================================================
+port/N         raw         bytes of port N exactly as read; the first ones start at a delimiter
+port/N/hello   raw         one whole frame: the hello in force when the recording began
+reference      msgpack     the reference that holds from here on: volts and noise of each channel
+frame          msgpack     a dual scan that the daemon reconstructed: channel, counter and device
+                           time of each of its scans, the tier and the time budget in force
+map, contacts  stream      messages exactly as published, if asked for
+=============  ==========  =======================================================================
+
+`log_time` is a steady clock: the wall clock when the recording began plus the monotonic time
+since. `publish_time` is the wall clock itself. The metadata record ``tactomo`` says which sensor
+it was.
+
+The file of a daemon that was killed ends somewhere in its last chunk. Everything here reads with
+MCAP's streaming reader, so such a file opens like any other, up to its last complete chunk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Final, NamedTuple
+from urllib.parse import quote
+
+import msgpack  # type: ignore[import-untyped]
+from mcap.exceptions import InvalidMagic
+from mcap.records import Channel as McapChannel
+from mcap.records import Footer, Header, McapRecord, Message, Metadata
+from mcap.stream_reader import StreamReader
+from tactomo_client.messages import array_from_wire
+from tactomo_models import Reference
+from tactomo_protocol import Channel, Decoder, Hello, Scan
+
+from tactomo.errors import RecordingError
+
+PROFILE: Final = "tactomo"
+REFERENCE_ARRAYS: Final = ("magnitude", "structure", "magnitude_noise", "structure_noise")
+REPLAY_SCHEME: Final = "replay"
+_MAX_RECORD_BYTES: Final = 64 << 20
+
+
+class ScanKey(NamedTuple):
+    """What tells one channel's scan from every other one in a recording."""
+
+    channel: Channel
+    counter: int
+    device_us: int
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """One dual scan that the daemon reconstructed, and with what."""
+
+    scans: tuple[ScanKey, ...]
+    tier: str
+    budget_ms: float | None
+    reference: Reference | None = None
+    """A reference to be put in force just before it."""
+
+
+class Chunk(NamedTuple):
+    """Bytes that one read of a port returned, and when, on the recording's steady clock."""
+
+    clock_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """What a recording is of."""
+
+    sensor: str
+    description: str
+    """The shipped description's name, or its path on the computer that recorded."""
+    description_sha256: str
+    ports: tuple[str, ...]
+    version: str
+
+
+@dataclass(slots=True)
+class Summary:
+    """What is in a recording, counted by reading all of it."""
+
+    origin: Origin
+    file_bytes: int
+    is_complete: bool = False
+    """False where the file ends in the middle: its writer was killed, or the disk was full."""
+    start_ns: int = 0
+    """When the first byte was read, nanoseconds since 1970, on the steady clock."""
+    end_ns: int = 0
+    port_bytes: dict[int, int] = field(default_factory=dict)
+    scans: dict[Channel, int] = field(default_factory=dict)
+    hellos: list[Hello] = field(default_factory=list)
+    """The distinct ones, in the order in which they were heard."""
+    corrupt: int = 0
+    """Frames on the ports that yielded no packet."""
+    frames: int = 0
+    """Dual scans that the daemon reconstructed while it recorded."""
+    references: int = 0
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds from the first bytes read to the last ones."""
+        return (self.end_ns - self.start_ns) * 1e-9
+
+
+class Recording:
+    """A recording opened for reading; every call reads the file anew, from its start."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.origin = _read_origin(path)
+
+    @cached_property
+    def summary(self) -> Summary:
+        """What is in it, counted by reading all of it once."""
+        return _summarise(self.path, self.origin)
+
+    @cached_property
+    def start_ns(self) -> int:
+        """When the first bytes were read from any port, on the steady clock; 0 if none were."""
+        times = (m.log_time for topic, m in _messages(self.path) if topic.startswith("port/"))
+        return next(times, 0)
+
+    def chunks(self, port: int) -> Iterator[Chunk]:
+        """Yield what port `port` said; before all else the hello in force, if it was known."""
+        topics = (f"port/{port}", f"port/{port}/hello")
+        for topic, message in _messages(self.path):
+            if topic in topics:
+                yield Chunk(message.log_time, message.data)
+
+    def marks(self) -> list[Mark]:
+        """Return the dual scans that were reconstructed, each with the reference before it."""
+        marks: list[Mark] = []
+        reference: Reference | None = None
+        for topic, message in _messages(self.path):
+            if topic == "reference":
+                reference = _read_reference(message.data)
+            elif topic == "frame":
+                marks.append(replace(_read_mark(message.data), reference=reference))
+                reference = None
+        return marks
+
+    def first_reference(self) -> Reference | None:
+        """Return the reference in force when the recording began; None where none was taken."""
+        data = (m.data for topic, m in _messages(self.path) if topic == "reference")
+        first = next(data, None)
+        return None if first is None else _read_reference(first)
+
+    def replay_urls(self, speed: float = 1.0) -> tuple[str, ...]:
+        """Return the serial URLs that say again what each port said.
+
+        Args:
+            speed: 1 as recorded, 10 ten times as fast, 0 as fast as it is taken.
+
+        """
+        path = quote(str(self.path.resolve()))
+        ports = range(len(self.origin.ports))
+        return tuple(f"{REPLAY_SCHEME}://{path}?port={n}&speed={speed:g}" for n in ports)
+
+
+def open_recording(path: str | Path) -> Recording:
+    """Open a recording.
+
+    Raises:
+        RecordingError: there is no such file, or it is no recording of tactomo's. A file that is
+            cut off is no error: see `Summary.is_complete`.
+
+    """
+    return Recording(Path(path))
+
+
+def _summarise(path: Path, origin: Origin) -> Summary:
+    """Read a whole recording; its decoders are the daemon's own."""
+    summary = Summary(origin, path.stat().st_size)
+    decoders = [Decoder() for _ in origin.ports]
+    for topic, record in _records(path):
+        if isinstance(record, Footer):
+            summary.is_complete = True
+        elif isinstance(record, Message):
+            kind, _, rest = topic.partition("/")
+            summary.frames += kind == "frame"
+            summary.references += kind == "reference"
+            if kind == "port":
+                number, _, extra = rest.partition("/")
+                if not extra:
+                    _count_bytes(summary, int(number), record)
+                _count_packets(summary, decoders[int(number)], record.data)
+    summary.corrupt = sum(decoder.counts.corrupt for decoder in decoders)
+    return summary
+
+
+def _count_bytes(summary: Summary, port: int, message: Message) -> None:
+    summary.port_bytes[port] = summary.port_bytes.get(port, 0) + len(message.data)
+    summary.start_ns = summary.start_ns or message.log_time
+    summary.end_ns = max(summary.end_ns, message.log_time)
+
+
+def _count_packets(summary: Summary, decoder: Decoder, data: bytes) -> None:
+    for packet in decoder.feed(data):
+        if isinstance(packet, Scan):
+            summary.scans[packet.channel] = summary.scans.get(packet.channel, 0) + 1
+        elif isinstance(packet, Hello) and packet not in summary.hellos:
+            summary.hellos.append(packet)
+
+
+def _read_origin(path: Path) -> Origin:
+    header = metadata = None
+    for _, record in _records(path):
+        if isinstance(record, Header):
+            header = record
+        elif isinstance(record, Metadata) and record.name == PROFILE:
+            metadata = record.metadata
+            break
+    if header is None or header.profile != PROFILE or metadata is None:
+        raise _not_a_recording(path, "was not made by tactomo")
+    ports = tuple(metadata.get("ports", "").split("\n"))
+    return Origin(
+        sensor=metadata.get("sensor", ""),
+        description=metadata.get("description", ""),
+        description_sha256=metadata.get("description_sha256", ""),
+        ports=ports,
+        version=metadata.get("version", ""),
+    )
+
+
+def _messages(path: Path) -> Iterator[tuple[str, Message]]:
+    for topic, record in _records(path):
+        if isinstance(record, Message):
+            yield topic, record
+
+
+def _records(path: Path) -> Iterator[tuple[str, McapRecord]]:
+    """Yield the file's records up to its end or to the first damage; messages with their topic."""
+    topics: dict[int, str] = {}
+    try:
+        file = path.open("rb")
+    except OSError as error:
+        raise RecordingError(
+            f"cannot open the recording {path}: {error.strerror}", "give the path of a .mcap file"
+        ) from error
+    with file:
+        reader = StreamReader(file, validate_crcs=True, record_size_limit=_MAX_RECORD_BYTES)
+        records = iter(reader.records)
+        while True:
+            try:
+                record = next(records)
+            except StopIteration:
+                return
+            except InvalidMagic as error:
+                if topics:  # it is the closing one that is cut off
+                    return
+                raise _not_a_recording(path, "is not an MCAP file") from error
+            except OSError as error:
+                raise RecordingError(
+                    f"cannot read the recording {path}: {error.strerror}", "check the disk"
+                ) from error
+            except Exception:  # damage can fail in any layer: struct, zstd, utf-8, CRC
+                return
+            if isinstance(record, McapChannel):
+                topics[record.id] = record.topic
+            yield topics.get(getattr(record, "channel_id", 0), ""), record
+
+
+def _not_a_recording(path: Path, reason: str) -> RecordingError:
+    return RecordingError(
+        f"{path} {reason}",
+        "record one with `tactomo record`, or make one of .npz scans with `tactomo import`",
+    )
+
+
+def _read_reference(data: bytes) -> Reference:
+    fields = msgpack.unpackb(data)
+    arrays = {
+        name: None if fields[name] is None else array_from_wire(fields[name])
+        for name in REFERENCE_ARRAYS
+    }
+    return Reference(scans=fields["scans"], **arrays)
+
+
+def _read_mark(data: bytes) -> Mark:
+    fields = msgpack.unpackb(data)
+    scans = tuple(ScanKey(Channel(c), counter, device) for c, counter, device in fields["scans"])
+    return Mark(scans=scans, tier=fields["tier"], budget_ms=fields["budget_ms"])

@@ -1,0 +1,101 @@
+"""What a `status` message says: how each part of the daemon is, gathered when it is asked for."""
+
+from __future__ import annotations
+
+import time
+from importlib.metadata import version
+from typing import Any, Final
+
+from tactomo_models import SensorDescription
+from tactomo_protocol import Channel
+
+from tactomo.frames import description_fields, port_fields
+from tactomo.imaging import Imaging
+from tactomo.pipeline import Pipeline
+from tactomo.port import PortReader
+from tactomo.recorder import Recorder
+from tactomo.recording import REPLAY_SCHEME
+from tactomo.timing import Durations
+
+STALE_S: Final = 1.0
+"""How old the newest dual scan may be before the daemon says that there are no data any more."""
+
+
+class Status:
+    """Reads the other parts, from any thread; nothing is written to them."""
+
+    def __init__(
+        self,
+        description: SensorDescription,
+        ports: list[PortReader],
+        pipeline: Pipeline,
+        imaging: Imaging,
+        recorder: Recorder,
+    ) -> None:
+        self._description = description_fields(description)
+        self._ports = ports
+        self._pipeline = pipeline
+        self._imaging = imaging
+        self._recorder = recorder
+        self._started_s = time.monotonic()
+
+    def fields(self, latency: Durations, subscribers: int) -> dict[str, Any]:
+        """Return the fields of a `status` message; the publisher's part is handed in."""
+        pipeline, imaging = self._pipeline, self._imaging
+        active = self._recorder.active
+        reference = imaging.reference
+        stages = {stage: times.percentiles_ms() for stage, times in imaging.stages.items()}
+        return {
+            "version": version("tactomo"),
+            "state": self.state(),
+            "uptime_s": time.monotonic() - self._started_s,
+            "description": self._description,
+            "source": {"kind": source(self._ports)},
+            "ports": [port_fields(port) for port in self._ports],
+            "rates": self._rates(),
+            "dropped_scans": pipeline.dropped + pipeline.overflowed,
+            "incomplete_scans": pipeline.incomplete,
+            "late_scans": pipeline.late,
+            "reference": reference
+            and {
+                "scans": reference.scans,
+                "taken_realtime_ns": imaging.reference_realtime_ns,
+            },
+            "stage_ms": {stage: times for stage, times in stages.items() if times},
+            "latency_ms": latency.percentiles_ms(),
+            "tier_requested": str(imaging.tier),
+            "budget_ms": imaging.budget_ms,
+            "recording": active and {"path": str(active.path), "bytes": active.bytes_written},
+            "subscribers": subscribers,
+        }
+
+    def state(self) -> str:
+        """Return the daemon's state in one word."""
+        last_ns = self._imaging.last_monotonic_ns
+        if not last_ns:
+            return "waiting_for_data"
+        if time.monotonic_ns() - last_ns > STALE_S * 1e9:
+            return "stale"
+        return "taring" if self._imaging.is_taring else "running"
+
+    def _rates(self) -> dict[str, float | None]:
+        rates = self._pipeline.scan_rates
+        return {
+            **{
+                f"{channel.name.lower()}_hz": rates[channel].per_second()
+                if channel in rates
+                else None
+                for channel in Channel
+            },
+            "frames_hz": self._imaging.frame_rate.per_second(),
+        }
+
+
+def source(ports: list[PortReader]) -> str:
+    """Return what the scans come from."""
+    if any(port.url.startswith(f"{REPLAY_SCHEME}:") for port in ports):
+        return "replay"
+    names = [port.hello.device_id for port in ports if port.hello is not None]
+    if not names:
+        return "unknown"
+    return "twin" if all(name.startswith("twin") for name in names) else "device"

@@ -1,0 +1,58 @@
+"""Small measures of how long things take and how often they come, kept while the daemon runs.
+
+Each is written by one thread and may be read by any other: a reader sees a few values old or new,
+which a percentile does not mind.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Final
+
+import numpy as np
+
+RING: Final = 256
+RATE_WINDOW_NS: Final = 3_000_000_000
+
+
+class Durations:
+    """The last 256 durations of one thing."""
+
+    def __init__(self) -> None:
+        self._seconds = np.full(RING, np.nan)
+        self._count = 0
+
+    def add(self, seconds: float) -> None:
+        """Take note of one."""
+        self._seconds[self._count % RING] = seconds
+        self._count += 1
+
+    def percentiles_ms(self) -> dict[str, float] | None:
+        """Return p50 and p99 in milliseconds; None before the first one."""
+        known = self._seconds[: min(self._count, RING)]
+        if not known.size:
+            return None
+        p50, p99 = np.percentile(known, (50, 99)) * 1e3
+        return {"p50": float(p50), "p99": float(p99)}
+
+
+class Rate:
+    """How often something comes, over the last seconds."""
+
+    def __init__(self) -> None:
+        self._times_ns = np.zeros(RING, dtype=np.int64)
+        self._count = 0
+
+    def add(self, monotonic_ns: int) -> None:
+        """Take note of one that came at that time."""
+        self._times_ns[self._count % RING] = monotonic_ns
+        self._count += 1
+
+    def per_second(self) -> float:
+        """Return the rate in Hz; 0 when nothing came for a while."""
+        since_ns = time.monotonic_ns() - RATE_WINDOW_NS
+        recent = self._times_ns[self._times_ns > since_ns]
+        if recent.size < 2:
+            return 0.0
+        span_ns = int(recent.max() - recent.min())
+        return (recent.size - 1) / span_ns * 1e9 if span_ns else 0.0
