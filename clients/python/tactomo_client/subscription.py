@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from types import TracebackType
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import zmq
 
@@ -84,7 +84,9 @@ class Subscription(Iterator[Frame]):
         self.missed = 0
         self.malformed = 0
         self._newest: Frame | None = None
-        self._socket = _connect(address, topic(sensor, kind), latest_only)
+        prefix = topic(sensor, kind)
+        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
+        connect_subscriber(self._socket, address, [prefix], latest_only=latest_only)
         self._closed = weakref.finalize(self, self._socket.close)
 
     def __next__(self) -> Frame:
@@ -152,22 +154,26 @@ class Subscription(Iterator[Frame]):
         )
 
 
-def _connect(address: str, prefix: bytes, latest_only: bool) -> zmq.Socket[bytes]:
-    socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
+def connect_subscriber(
+    socket: zmq.Socket[Any], address: str, topics: Iterable[bytes], *, latest_only: bool = False
+) -> None:
+    """Set up a SUB socket (a plain or an asyncio one) as STREAM.md recommends, and connect it.
+
+    Raises:
+        ControlError: `address` is not an address; the socket is closed then.
+
+    """
     socket.setsockopt(zmq.LINGER, 0)
     socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
-    # A daemon that restarts should be heard again at once, not after zmq's growing delays.
-    socket.setsockopt(zmq.RECONNECT_IVL, 100)
-    socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
-    # A daemon whose computer lost power never closes its connection; heartbeats notice.
+    # A computer that lost power never closes its connections; heartbeats notice.
     socket.setsockopt(zmq.HEARTBEAT_IVL, 1000)
     socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, 3000)
     if latest_only:
         socket.setsockopt(zmq.CONFLATE, 1)
-    socket.setsockopt(zmq.SUBSCRIBE, prefix)
+    for prefix in topics:
+        socket.setsockopt(zmq.SUBSCRIBE, prefix)
     try:
         socket.connect(address)
     except zmq.ZMQError as error:
         socket.close()
         raise bad_address(address, error) from error
-    return socket

@@ -1,0 +1,208 @@
+"""One open page: sends it the newest frame it has room for, and does what it asks.
+
+Newest wins, for each page by itself: a page confirms each frame, at most two are on their way to
+it, and when it has room again it gets the newest one, not the next. So a page on a slow link sees
+fewer frames, none of them old, and no other page notices.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import uuid
+from collections.abc import Mapping
+from typing import Any
+
+from aiohttp import WSMessage, WSMsgType, web
+from tactomo_client import ClientError, ControlError
+
+from tactomo_viewer.feed import Feed
+from tactomo_viewer.link import ControlLink
+from tactomo_viewer.wire import frame_message, json_text
+
+MAX_UNCONFIRMED = 2
+MAX_ANSWERS = 16
+ALIVE_S = 1.0
+PRESS_TIMEOUT_S = 2.0
+# What a page may ask of the daemon: the arguments it may give and how long the answer may take.
+DAEMON_COMMANDS: Mapping[str, tuple[frozenset[str], float]] = {
+    "tare": (frozenset(), 15.0),
+    "set_tier": (frozenset({"tier"}), 5.0),
+    "record_start": (frozenset(), 5.0),
+    "record_stop": (frozenset(), 5.0),
+}
+PRESS_ARGUMENTS = ("x_mm", "y_mm", "pressure_kpa", "radius_mm", "shape")
+
+
+class Browser:
+    """One websocket. `wake` it whenever there may be something new to send."""
+
+    def __init__(
+        self,
+        socket: web.WebSocketResponse,
+        feed: Feed,
+        daemon: ControlLink | None,
+        twin: ControlLink | None,
+    ) -> None:
+        self._socket = socket
+        self._feed = feed
+        self._daemon = daemon
+        self._twin = twin
+        self._name = uuid.uuid4().hex[:8]
+        self._changed = asyncio.Event()
+        self._unconfirmed = 0
+        self._sent: dict[str, object] = {}  # by kind, what was sent last
+        self._last_event = 0
+        self._presses: set[str] = set()  # to be released when the page goes away
+        self._answers: set[asyncio.Task[None]] = set()
+        self.twin_answers = False
+
+    def wake(self) -> None:
+        """Have another look at what there is to send."""
+        self._changed.set()
+
+    async def run(self) -> None:
+        """Serve the page until it closes."""
+        self.wake()
+        sender = asyncio.create_task(self._send_newest())
+        try:
+            async for message in self._socket:
+                await self._take(message)
+        finally:
+            sender.cancel()
+            # Commands under way are finished first: a release must not overtake its press.
+            await asyncio.gather(sender, *self._answers, return_exceptions=True)
+            await self._release_all()
+
+    # To the page
+
+    async def _send_newest(self) -> None:
+        with contextlib.suppress(ConnectionError):  # the page has gone; run() notices
+            while True:
+                try:
+                    await asyncio.wait_for(self._changed.wait(), ALIVE_S)
+                except TimeoutError:
+                    await self._send("alive")  # so that the page can tell silence from a hang
+                self._changed.clear()
+                await self._send_texts()
+                frame = self._feed.frame
+                if (
+                    frame is not None
+                    and self._unconfirmed < MAX_UNCONFIRMED
+                    and self._is_new(frame)
+                ):
+                    self._unconfirmed += 1
+                    await self._socket.send_bytes(frame_message(frame))
+
+    async def _send_texts(self) -> None:
+        if self._sent.get("twin") != self.twin_answers:
+            self._sent["twin"] = self.twin_answers
+            await self._send("twin", answers=self.twin_answers)
+        status = self._feed.status
+        if status is not None and self._is_new(status):
+            await self._send("status", age_ms=status.age_s * 1e3, status=status.fields)
+        for event in [e for e in self._feed.events if e.number > self._last_event]:
+            self._last_event = event.number
+            await self._send("event", event=event.fields)
+
+    def _is_new(self, item: object) -> bool:
+        kind = type(item).__name__
+        if self._sent.get(kind) is item:
+            return False
+        self._sent[kind] = item
+        return True
+
+    async def _send(self, kind: str, **fields: Any) -> None:
+        await self._socket.send_str(json_text({"type": kind, **fields}))
+
+    # From the page
+
+    async def _take(self, message: WSMessage) -> None:
+        asked = _asked(message)
+        if asked.get("type") == "confirm":
+            self._unconfirmed = max(0, self._unconfirmed - 1)
+            self.wake()
+        elif asked:
+            # At most so many at once: a page that asks faster than it is answered has to wait.
+            while len(self._answers) >= MAX_ANSWERS:
+                await asyncio.wait(self._answers, return_when=asyncio.FIRST_COMPLETED)
+            task = asyncio.create_task(self._answer(asked))
+            self._answers.add(task)
+            task.add_done_callback(self._answers.discard)
+
+    async def _answer(self, asked: dict[str, Any]) -> None:
+        try:
+            outcome: dict[str, Any] = {"ok": True, "result": await self._obey(asked)}
+        except ClientError as error:
+            texts = {"name": error.name, "cause": error.cause, "next_step": error.next_step}
+            outcome = {"ok": False, "error": texts}
+        request = asked.get("request")
+        with contextlib.suppress(ConnectionError):
+            await self._send(
+                "reply", request=request if isinstance(request, int) else None, **outcome
+            )
+
+    async def _obey(self, asked: dict[str, Any]) -> dict[str, Any]:
+        kind, press = asked.get("type"), f"page-{self._name}-{asked.get('press')}"[:64]
+        if kind == "command":
+            return await self._command(asked.get("command"), asked.get("arguments", {}))
+        if kind == "press":
+            if asked.get("hold"):  # it stays, even when the page goes away
+                self._presses.discard(press)
+            else:
+                self._presses.add(press)
+            arguments = {name: asked[name] for name in PRESS_ARGUMENTS if name in asked}
+            return await self._ask_twin("press", {"id": press, **arguments})
+        if kind == "release":
+            self._presses.discard(press)
+            return await self._ask_twin("release", {"id": press})
+        if kind == "clear":
+            self._presses.clear()
+            return await self._ask_twin("clear", {})
+        raise ControlError("the page asked for something unknown", name="unknown_command")
+
+    async def _command(self, command: object, arguments: object) -> dict[str, Any]:
+        if not isinstance(command, str) or command not in DAEMON_COMMANDS:
+            raise ControlError(f"a page may not command {command!r}", name="unknown_command")
+        allowed, timeout_s = DAEMON_COMMANDS[command]
+        if not isinstance(arguments, dict) or not arguments.keys() <= allowed:
+            raise ControlError(
+                f"a page may not give {command} these arguments", name="bad_argument"
+            )
+        if self._daemon is None:
+            raise _read_only()
+        return await self._daemon.request(command, arguments, timeout_s)
+
+    async def _ask_twin(self, command: str, arguments: dict[str, Any]) -> dict[str, Any]:
+        if self._twin is None:
+            raise ControlError(
+                "there is no simulated skin to press",
+                "give the viewer a twin's control socket with --twin",
+                name="no_twin",
+            )
+        return await self._twin.request(command, arguments, PRESS_TIMEOUT_S)
+
+    async def _release_all(self) -> None:
+        for press in self._presses:
+            with contextlib.suppress(ClientError):
+                await self._ask_twin("release", {"id": press})
+
+
+def _asked(message: WSMessage) -> dict[str, Any]:
+    """Return what a page asks, or an empty map if it cannot be made out."""
+    if message.type is not WSMsgType.TEXT:
+        return {}
+    try:
+        asked = json.loads(message.data)
+    except (ValueError, RecursionError):
+        return {}
+    return asked if isinstance(asked, dict) else {}
+
+
+def _read_only() -> ControlError:
+    return ControlError(
+        "this viewer only shows, because it is served beyond its own computer",
+        "open it on that computer, for example through `ssh -L 8750:127.0.0.1:8750`",
+        name="read_only",
+    )

@@ -1,0 +1,82 @@
+// What is wrong, if anything, in words: the banner over the map, and the flags.
+
+const DAEMON_GONE_MS = 3000;  // a daemon sends its status every second
+const STALE_MS = 500;
+const STALE_SCANS = 3;        // of a slow sensor: so many scans late
+
+const FLAGS = {
+  magnitude_missing: ["Magnitude channel missing", "No scans of the magnitude channel: where it is touched is known, how hard is not."],
+  structure_missing: ["Structure channel missing", "No scans of the structure channel: shapes come from the magnitude channel alone."],
+  no_reference: ["No reference", "Not tared yet: press Tare while nothing touches the skin."],
+  misfit_high: ["Misfit high", "The model does not explain the data. Has the reference aged? Tare. Is a wire loose?"],
+  not_converged: ["Not converged", "The reconstruction ran out of its time; this map is the best so far."],
+  invalid_voltage: ["Invalid voltage", "Some voltages were saturated or not numbers, and were left out."],
+};
+
+/** A flag's name and meaning for people. */
+export function explainFlag(flag) {
+  return FLAGS[flag] ?? [flag.replaceAll("_", " "), ""];
+}
+
+/** The age of a frame or status in ms; the server's part and the time since it came. */
+export function ageOf(item, now) {
+  return item ? item.age_ms + (now - item.receivedAt) : Infinity;
+}
+
+/**
+ * The banner as {name, level, title, detail}, or null when all is well. What hides everything else
+ * comes first. `state` has hello, link, frame, status, openedAt.
+ */
+export function verdict(state, now) {
+  const { link, frame, status, hello } = state;
+  if (!link.isOpen) {
+    if (!hello && now < 1500) return null;
+    return banner("viewer-gone", "error", "The viewer's server is gone.",
+      "Trying to reach it again; if it was stopped, start it with `tactomo viewer`.");
+  }
+  if (!status) {
+    if (now - state.openedAt < 1500) return null;
+    return banner("no-daemon", "warning", "Waiting for the daemon.",
+      `Nothing from sensor “${hello?.sensor ?? "?"}” at ${hello?.stream ?? "?"} yet; is it running under this name? Start it with \`tactomo daemon\`.`);
+  }
+  const silent = ageOf(status, now);
+  if (silent > DAEMON_GONE_MS) {
+    return banner("daemon-gone", "error", "The daemon is gone.",
+      `Last heard ${seconds(silent)} ago; the page goes on by itself when it is back.`);
+  }
+  const { fields } = status;
+  if (fields.state === "taring") {
+    return banner("taring", "info", "Taring.", "Measuring the unloaded skin: do not touch it.");
+  }
+  if (fields.state === "waiting_for_data") {
+    return banner("no-data", "warning", "No data yet.", portsInWords(fields.ports));
+  }
+  const age = ageOf(frame, now);
+  if (age > staleAfter(fields)) {
+    const since = frame ? `The newest scan is ${seconds(age)} old. ` : "";
+    return banner("stale", "error", "Stale.", since + portsInWords(fields.ports));
+  }
+  if (frame.flags.includes("no_reference")) {
+    return banner("no-reference", "warning", "No reference.", explainFlag("no_reference")[1]);
+  }
+  return null;
+}
+
+function banner(name, level, title, detail) {
+  return { name, level, title, detail };
+}
+
+function staleAfter({ ports }) {
+  const rates = (ports ?? []).map((port) => port.device?.scan_rate_hz).filter((hz) => hz > 0);
+  return Math.max(STALE_MS, (STALE_SCANS * 1000) / Math.min(...rates, Infinity));
+}
+
+function portsInWords(ports) {
+  const closed = (ports ?? []).filter((port) => !port.connected).map((port) => port.url);
+  if (closed.length) return `Not connected: ${closed.join(", ")}.`;
+  return ports?.length ? "The port is open, but no scans come." : "";
+}
+
+function seconds(ms) {
+  return `${(ms / 1000).toFixed(ms < 9950 ? 1 : 0)} s`;
+}

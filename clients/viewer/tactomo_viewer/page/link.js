@@ -1,0 +1,97 @@
+// The websocket to the viewer's server: opens it, opens it again, and takes messages apart.
+
+const RETRY_MS = 500;
+const SILENT_MS = 4000;  // the server says something every second
+
+export class Link {
+  /** `onFrame(frame)` and `onMessage(message)` are called as they come, `onChange()` on open and close. */
+  constructor({ onFrame, onMessage, onChange }) {
+    Object.assign(this, { onFrame, onMessage, onChange });
+    this.isOpen = false;
+    this.lastHeard = performance.now();
+    this.waiting = new Map();  // number of a request -> what to do with its reply
+    this.requests = 0;
+    this.#open();
+    setInterval(() => this.#check(), 1000);
+  }
+
+  /** Send something without asking for an answer; false when it cannot be sent. */
+  send(message) {
+    if (!this.isOpen) return false;
+    this.socket.send(JSON.stringify(message));
+    return true;
+  }
+
+  /** Send something and resolve to its reply, {ok, result} or {ok: false, error}. */
+  ask(message) {
+    return new Promise((resolve) => {
+      const request = ++this.requests;
+      if (this.send({ ...message, request })) this.waiting.set(request, resolve);
+      else resolve(gone());
+    });
+  }
+
+  #open() {
+    const scheme = location.protocol === "https:" ? "wss" : "ws";
+    const socket = new WebSocket(`${scheme}://${location.host}/socket`);
+    this.socket = socket;
+    socket.binaryType = "arraybuffer";
+    socket.onopen = () => {
+      this.isOpen = true;
+      this.lastHeard = performance.now();
+      this.onChange();
+    };
+    socket.onmessage = ({ data }) => this.#take(data);
+    socket.onclose = () => this.#closed(socket);
+  }
+
+  #take(data) {
+    this.lastHeard = performance.now();
+    if (typeof data !== "string") {
+      this.send({ type: "confirm" });
+      this.onFrame(parseFrame(data));
+      return;
+    }
+    const message = JSON.parse(data);
+    if (message.type !== "reply") {
+      this.onMessage(message);
+      return;
+    }
+    this.waiting.get(message.request)?.(message);
+    this.waiting.delete(message.request);
+  }
+
+  #closed(socket) {
+    if (socket !== this.socket) return;
+    this.isOpen = false;
+    for (const resolve of this.waiting.values()) resolve(gone());
+    this.waiting.clear();
+    this.onChange();
+    setTimeout(() => this.#open(), RETRY_MS);
+  }
+
+  // A server that hangs, or a computer that left the network, never closes the connection.
+  #check() {
+    if (this.isOpen && performance.now() - this.lastHeard > SILENT_MS) {
+      this.socket.close();
+      this.#closed(this.socket);
+    }
+  }
+}
+
+function gone() {
+  return { ok: false, error: { cause: "the viewer's server is gone", next_step: "" } };
+}
+
+/** Take a binary message apart: its header with `images` by name, each {values, nx, ny}. */
+export function parseFrame(buffer) {
+  const length = new DataView(buffer).getUint32(0, true);
+  const frame = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
+  let offset = 4 + length;
+  const images = {};
+  for (const { name, shape: [ny, nx] } of frame.images) {
+    images[name] = { values: new Float32Array(buffer, offset, ny * nx), nx, ny };
+    offset += 4 * ny * nx;
+  }
+  return { ...frame, images, receivedAt: performance.now() };
+}

@@ -1,0 +1,411 @@
+// Draws a frame on the canvas: the sheet with its image, outline, contacts and presses; axes in
+// millimetres; the colour bar. Knows where each millimetre lies, and says so to others.
+
+import { SIZE, colourTable } from "./colormap.js";
+import { contour, upsample } from "./grid.js";
+
+const FINER = 5;           // intervals of the smooth image for each one of the map
+const OUTLINE_FINER = 3;
+const ELECTRODE_MM = [6, 2.4];  // drawn size: along the rim, across it
+const NARROW_PX = 520;     // below this the colour bar lies under the map
+
+export class MapView {
+  constructor(canvas) {
+    this.canvas = canvas;
+    this.context = canvas.getContext("2d");
+    this.picture = document.createElement("canvas");  // the image, one pixel a node
+    this.sheet = { shape: "rectangle", x: [-75, 75], y: [-75, 75], sensing: null, electrodes: [] };
+    this.tables = {};
+    this.resize();
+  }
+
+  /** Take the sheet's geometry from the description in a status message. */
+  describe(description) {
+    const [w, h] = [description.width_mm, description.height_mm];
+    if (!(w > 0 && h > 0)) return;
+    const sensing = [description.sensing_width_mm, description.sensing_height_mm];
+    this.sheet = {
+      shape: description.shape === "disc" ? "disc" : "rectangle",
+      x: [-w / 2, w / 2],
+      y: [-h / 2, h / 2],
+      sensing: sensing[0] > 0 && sensing[1] > 0 ? sensing : null,
+      electrodes: Array.isArray(description.electrodes_mm) ? description.electrodes_mm : [],
+    };
+    this.resize();
+  }
+
+  /** Fit the canvas into the room there is; call when that or the sheet changed. */
+  resize() {
+    const { canvas, sheet } = this;
+    const room = canvas.parentElement.clientWidth;
+    const narrow = room < NARROW_PX;
+    const margin = narrow
+      ? { left: 40, right: 14, top: 14, bottom: 88 }
+      : { left: 52, right: 92, top: 18, bottom: 46 };
+    const [wide, high] = [sheet.x[1] - sheet.x[0], sheet.y[1] - sheet.y[0]];
+    const tallest = Math.max(260, window.innerHeight - (narrow ? 220 : 190));
+    const scale = Math.max(0.2, Math.min(
+      (room - margin.left - margin.right) / wide,
+      (tallest - margin.top - margin.bottom) / high,
+    ));
+    const [w, h] = [wide * scale, high * scale];
+    // On a wide page what is left over is shared out, so that the map stands in the middle.
+    const left = margin.left + Math.max(0, (room - margin.left - margin.right - w) / 2);
+    this.plot = { left, top: margin.top, width: w, height: h, scale, narrow };
+    const size = [room, Math.ceil(margin.top + h + margin.bottom)];
+    const ratio = window.devicePixelRatio || 1;
+    canvas.style.height = `${size[1]}px`;
+    canvas.width = Math.round(size[0] * ratio);
+    canvas.height = Math.round(size[1] * ratio);
+    this.size = size;
+    this.ratio = ratio;
+    canvas.dataset.xMm = sheet.x.join(" ");
+    canvas.dataset.yMm = sheet.y.join(" ");
+  }
+
+  /** The place of a point of the skin on the canvas, CSS pixels from its upper left corner. */
+  mmToPixel(x, y) {
+    const { left, top, scale } = this.plot;
+    return [left + (x - this.sheet.x[0]) * scale, top + (this.sheet.y[1] - y) * scale];
+  }
+
+  /** The point of the skin, in mm, at a place on the canvas. */
+  pixelToMm(px, py) {
+    const { left, top, scale } = this.plot;
+    return [this.sheet.x[0] + (px - left) / scale, this.sheet.y[1] - (py - top) / scale];
+  }
+
+  /** Whether a point in mm lies on the sheet. */
+  isOnSheet(x, y) {
+    const { shape, x: [x0, x1], y: [y0, y1] } = this.sheet;
+    return shape === "disc"
+      ? Math.hypot(x, y) <= x1
+      : x >= x0 && x <= x1 && y >= y0 && y <= y1;
+  }
+
+  /**
+   * Draw everything. `scene` has: frame (or null), image (what to colour, or null), scale (its top),
+   * unit (for the colour bar), label(contact), notice (text on the map), colormap, smooth, outline,
+   * presses (list of {x, y, size, shape, pressure}), cursor ([x, y] or null).
+   */
+  draw(scene) {
+    const c = this.context;
+    this.theme = theme(this.canvas);
+    c.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
+    c.clearRect(0, 0, ...this.size);
+    this.#axes(c);
+    c.save();
+    this.#sheetPath(c);
+    c.clip();
+    this.#image(c, scene);
+    c.restore();
+    this.#rim(c);
+    if (scene.outline && scene.frame?.images.structure) this.#outline(c, scene.frame);
+    for (const press of scene.presses) this.#press(c, press);
+    if (scene.cursor) this.#cursor(c, scene.cursor);
+    for (const contact of scene.frame?.contacts ?? []) this.#contact(c, contact, scene.label(contact));
+    if (scene.notice) this.#notice(c, scene.notice);
+    if (scene.image) this.#colourBar(c, scene);
+  }
+
+  #table(name) {
+    return (this.tables[name] ??= colourTable(name));
+  }
+
+  #sheetPath(c) {
+    const { left, top, width, height } = this.plot;
+    c.beginPath();
+    if (this.sheet.shape === "disc") c.arc(left + width / 2, top + height / 2, width / 2, 0, 7);
+    else c.rect(left, top, width, height);
+  }
+
+  #image(c, { image, frame, scale, colormap, smooth }) {
+    const table = this.#table(colormap);
+    const structure = frame?.images.structure;
+    c.fillStyle = image || !structure ? rgb(table, 0) : this.theme.sheet;
+    c.fillRect(this.plot.left, this.plot.top, this.plot.width, this.plot.height);
+    const source = image ?? structure;
+    if (!source) return;
+    const nodes = smooth ? upsample(source, FINER) : source;
+    const paint = image
+      ? (pixels, at, value) => {
+          const level = 3 * Math.max(0, Math.min(SIZE - 1, Math.round((value / scale) * (SIZE - 1)))) || 0;
+          pixels[at] = table[level];
+          pixels[at + 1] = table[level + 1];
+          pixels[at + 2] = table[level + 2];
+          pixels[at + 3] = 255;
+        }
+      : (pixels, at, value) => {
+          pixels.set(this.theme.pressed, at);
+          pixels[at + 3] = 200 * Math.max(0, Math.min(1, value)) || 0;
+        };
+    const pixels = c.createImageData(nodes.nx, nodes.ny);
+    for (let iy = 0; iy < nodes.ny; iy++) {
+      for (let ix = 0; ix < nodes.nx; ix++) {
+        const at = 4 * ((nodes.ny - 1 - iy) * nodes.nx + ix);
+        paint(pixels.data, at, nodes.values[iy * nodes.nx + ix]);
+      }
+    }
+    this.picture.width = nodes.nx;
+    this.picture.height = nodes.ny;
+    this.picture.getContext("2d").putImageData(pixels, 0, 0);
+    const [x0, x1] = frame.x_mm;
+    const [y0, y1] = frame.y_mm;
+    const [dx, dy] = [(x1 - x0) / (nodes.nx - 1) / 2, (y1 - y0) / (nodes.ny - 1) / 2];
+    const [left, top] = this.mmToPixel(x0 - dx, y1 + dy);  // a node is the middle of its pixel
+    const [right, bottom] = this.mmToPixel(x1 + dx, y0 - dy);
+    c.imageSmoothingEnabled = smooth;
+    c.imageSmoothingQuality = "high";
+    c.drawImage(this.picture, left, top, right - left, bottom - top);
+  }
+
+  #outline(c, frame) {
+    const fine = upsample(frame.images.structure, OUTLINE_FINER);
+    const [x0, x1] = frame.x_mm;
+    const [y0, y1] = frame.y_mm;
+    const segments = contour(fine, 0.5);
+    c.beginPath();
+    for (let i = 0; i < segments.length; i += 2) {
+      const point = this.mmToPixel(
+        x0 + ((x1 - x0) * segments[i]) / (fine.nx - 1),
+        y0 + ((y1 - y0) * segments[i + 1]) / (fine.ny - 1),
+      );
+      if (i % 4 === 0) c.moveTo(...point);
+      else c.lineTo(...point);
+    }
+    c.lineCap = "round";
+    halo(c, 2, "#ffffff", "rgba(0, 0, 0, 0.65)");
+  }
+
+  #contact(c, contact, label) {
+    const [x, y] = this.mmToPixel(contact.x_mm, contact.y_mm);
+    c.beginPath();
+    c.arc(x, y, 2.5, 0, 7);
+    halo(c, 2, "#ffffff", "rgba(0, 0, 0, 0.7)");
+    c.font = `600 12px ${this.theme.font}`;
+    const number = String(contact.id);
+    const numberWidth = Math.max(20, c.measureText(number).width + 10);
+    const width = numberWidth + c.measureText(label).width + 14;
+    const { left, top, width: w } = this.plot;
+    const bx = Math.min(Math.max(x + 10, left + 2), left + w - width - 2);
+    const by = y - 34 < top ? y + 12 : y - 34;
+    c.beginPath();
+    c.roundRect(bx, by, width, 22, 11);
+    c.fillStyle = "rgba(10, 12, 20, 0.82)";
+    c.fill();
+    c.beginPath();
+    c.roundRect(bx, by, numberWidth, 22, 11);
+    c.fillStyle = "#ffffff";
+    c.fill();
+    c.textBaseline = "middle";
+    c.textAlign = "center";
+    c.fillStyle = "#10131c";
+    c.fillText(number, bx + numberWidth / 2, by + 11.5);
+    c.textAlign = "left";
+    c.fillStyle = "#ffffff";
+    c.fillText(label, bx + numberWidth + 6, by + 11.5);
+  }
+
+  #press(c, { x, y, size, shape }) {
+    const [px, py] = this.mmToPixel(x, y);
+    const r = (size / 2) * this.plot.scale;
+    c.beginPath();
+    if (shape === "rectangle") c.rect(px - r, py - r, 2 * r, 2 * r);
+    else c.arc(px, py, r, 0, 7);
+    c.setLineDash([5, 4]);
+    halo(c, 1.5, "#6fe3ff", "rgba(0, 0, 0, 0.55)");
+    c.setLineDash([]);
+  }
+
+  #cursor(c, [x, y]) {
+    const [px, py] = this.mmToPixel(x, y);
+    c.beginPath();
+    for (const [dx, dy] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) {
+      c.moveTo(px + 4 * dx, py + 4 * dy);
+      c.lineTo(px + 13 * dx, py + 13 * dy);
+    }
+    halo(c, 1.5, "#6fe3ff", "rgba(0, 0, 0, 0.55)");
+  }
+
+  #notice(c, text) {
+    const { left, top, width, height } = this.plot;
+    c.font = `600 13px ${this.theme.font}`;
+    const w = Math.min(width - 16, c.measureText(text).width + 24);
+    const [x, y] = [left + (width - w) / 2, top + height - 38];
+    c.beginPath();
+    c.roundRect(x, y, w, 28, 14);
+    c.fillStyle = "rgba(10, 12, 20, 0.82)";
+    c.fill();
+    c.fillStyle = "#ffd479";
+    c.textAlign = "center";
+    c.textBaseline = "middle";
+    c.fillText(text, left + width / 2, y + 14.5, w - 20);
+  }
+
+  #rim(c) {
+    const { theme, sheet, plot } = this;
+    this.#sheetPath(c);
+    c.lineWidth = 1.5;
+    c.strokeStyle = theme.axis;
+    c.stroke();
+    if (sheet.sensing) {
+      const [w, h] = sheet.sensing.map((size) => size * plot.scale);
+      c.beginPath();
+      if (sheet.shape === "disc") c.arc(...this.mmToPixel(0, 0), w / 2, 0, 7);
+      else c.rect(plot.left + (plot.width - w) / 2, plot.top + (plot.height - h) / 2, w, h);
+      c.setLineDash([2, 5]);
+      c.lineWidth = 1;
+      c.strokeStyle = "rgba(255, 255, 255, 0.4)";
+      c.stroke();
+      c.setLineDash([]);
+    }
+    sheet.electrodes.forEach(([x, y], i) => this.#electrode(c, x, y, i));
+  }
+
+  // A bar on the rim, along the side on which it lies, and its number inside.
+  #electrode(c, x, y, i) {
+    const { sheet: { shape, x: [, x1], y: [, y1] }, plot } = this;
+    const onSide = Math.abs(x) / x1 > Math.abs(y) / y1;
+    if (!plot.narrow) {
+      const inwards = 1 - 13 / (plot.scale * Math.hypot(x, y));
+      const at = shape === "disc" ? [x * inwards, y * inwards]
+        : onSide ? [x - (Math.sign(x) * 13) / plot.scale, y] : [x, y - (Math.sign(y) * 12) / plot.scale];
+      c.font = `10px ${this.theme.font}`;
+      c.fillStyle = "rgba(255, 255, 255, 0.55)";
+      c.textAlign = "center";
+      c.textBaseline = "middle";
+      c.fillText(String(i), ...this.mmToPixel(...at));
+    }
+    const angle = shape === "disc" ? Math.PI / 2 - Math.atan2(y, x) : onSide ? Math.PI / 2 : 0;
+    const [along, across] = ELECTRODE_MM.map((mm) => mm * plot.scale);
+    c.save();
+    c.translate(...this.mmToPixel(x, y));
+    c.rotate(angle);
+    c.beginPath();
+    c.roundRect(-along / 2, -across / 2, along, across, across / 2);
+    c.fillStyle = this.theme.electrode;
+    c.fill();
+    c.lineWidth = 1;
+    c.strokeStyle = this.theme.background;
+    c.stroke();
+    c.restore();
+  }
+
+  #axes(c) {
+    const { theme, plot: { left, top, width, height }, sheet } = this;
+    c.strokeStyle = theme.axis;
+    c.fillStyle = theme.text;
+    c.font = `12px ${theme.font}`;
+    c.lineWidth = 1;
+    c.textAlign = "center";
+    c.textBaseline = "top";
+    for (const x of ticks(sheet.x[0], sheet.x[1], 6)) {
+      const [px] = this.mmToPixel(x, 0);
+      line(c, px, top + height + 5, px, top + height + 10);
+      c.fillText(number(x), px, top + height + 13);
+    }
+    c.textAlign = "right";
+    c.textBaseline = "middle";
+    for (const y of ticks(sheet.y[0], sheet.y[1], 6)) {
+      const [, py] = this.mmToPixel(0, y);
+      line(c, left - 10, py, left - 5, py);
+      c.fillText(number(y), left - 13, py + 0.5);
+    }
+    c.fillStyle = theme.dim;
+    c.textAlign = "center";
+    c.textBaseline = "top";
+    c.fillText("x (mm)", left + width / 2, top + height + 29);
+    if (this.plot.narrow) return;
+    c.save();
+    c.translate(left - 46, top + height / 2);
+    c.rotate(-Math.PI / 2);
+    c.textBaseline = "middle";
+    c.fillText("y (mm)", 0, 0);
+    c.restore();
+  }
+
+  #colourBar(c, { colormap, scale, unit }) {
+    const { theme, plot } = this;
+    const table = this.#table(colormap);
+    const { left, top, width, height, narrow } = plot;
+    const bar = narrow
+      ? { x: left, y: top + height + 54, w: width, h: 12 }
+      : { x: left + width + 26, y: top, w: 14, h: height };
+    const gradient = narrow
+      ? c.createLinearGradient(bar.x, 0, bar.x + bar.w, 0)
+      : c.createLinearGradient(0, bar.y + bar.h, 0, bar.y);
+    for (let i = 0; i <= 32; i++) gradient.addColorStop(i / 32, rgb(table, Math.round((i / 32) * 255)));
+    c.beginPath();
+    c.roundRect(bar.x, bar.y, bar.w, bar.h, 3);
+    c.fillStyle = gradient;
+    c.fill();
+    c.lineWidth = 1;
+    c.strokeStyle = theme.axis;
+    c.stroke();
+    c.fillStyle = theme.text;
+    c.font = `12px ${theme.font}`;
+    c.textBaseline = narrow ? "top" : "middle";
+    c.textAlign = narrow ? "center" : "left";
+    const marks = ticks(0, scale, 5);
+    marks.forEach((value, i) => {
+      const isLast = i === marks.length - 1;
+      if (narrow && isLast) c.textAlign = "right";
+      if (narrow) c.fillText(isLast ? `${number(value)} ${unit}` : number(value), bar.x + (value / scale) * bar.w + (isLast ? 10 : 0), bar.y + 16);
+      else c.fillText(number(value), bar.x + bar.w + 6, bar.y + bar.h * (1 - value / scale) + 0.5);
+    });
+    if (narrow) return;
+    c.fillStyle = theme.dim;
+    c.textAlign = "left";
+    c.textBaseline = "top";
+    c.fillText(unit, bar.x - 2, bar.y + bar.h + 13);
+  }
+}
+
+function theme(element) {
+  const style = getComputedStyle(element);
+  const of = (name) => style.getPropertyValue(`--${name}`).trim();
+  return {
+    background: of("card"),
+    text: of("text"),
+    dim: of("dim"),
+    axis: of("axis"),
+    electrode: of("electrode"),
+    sheet: of("sheet"),
+    pressed: of("pressed").split(" ").map(Number),
+    font: style.fontFamily,
+  };
+}
+
+function halo(c, width, inner, outer) {
+  c.lineWidth = width + 2.5;
+  c.strokeStyle = outer;
+  c.stroke();
+  c.lineWidth = width;
+  c.strokeStyle = inner;
+  c.stroke();
+}
+
+function line(c, x0, y0, x1, y1) {
+  c.beginPath();
+  c.moveTo(x0, y0);
+  c.lineTo(x1, y1);
+  c.stroke();
+}
+
+function rgb(table, level) {
+  return `rgb(${table[3 * level]}, ${table[3 * level + 1]}, ${table[3 * level + 2]})`;
+}
+
+/** Round values from low to high, about `count` of them. */
+function ticks(low, high, count) {
+  const raw = (high - low) / count;
+  const power = 10 ** Math.floor(Math.log10(raw));
+  const step = power * ([1, 2, 2.5, 5, 10].find((s) => s * power >= raw) ?? 10);
+  const values = [];
+  for (let i = Math.ceil(low / step - 1e-9); i * step <= high + step * 1e-9; i++) values.push(i * step);
+  return values;
+}
+
+function number(value) {
+  return String(Math.round(value * 1000) / 1000).replace("-", "−");
+}

@@ -1,0 +1,177 @@
+// The panels beside the map: what the newest frame, status and events say, as text.
+
+import { explainFlag } from "./health.js";
+
+const EVENTS_SHOWN = 50;
+const SOURCES = { twin: "simulated skin", device: "device", replay: "replay" };
+const STATES = { waiting_for_data: "no data yet", taring: "taring", running: "running", stale: "stale" };
+
+export const byId = (id) => document.getElementById(id);
+
+/** A number to so many decimals with a true minus sign, or a dash when there is none. */
+export function fixed(value, decimals) {
+  if (value === null || value === undefined || !Number.isFinite(value)) return "–";
+  const text = value.toFixed(decimals);
+  return (Number(text) === 0 ? text.replace("-", "") : text).replace("-", "−");
+}
+
+export function showContacts(contacts, unit, value) {
+  byId("value-head").textContent = unit === "kpa" ? "kPa" : "Δσ/σ₀ %";
+  byId("count").textContent = contacts.length || "";
+  byId("no-contacts").hidden = contacts.length > 0;
+  const body = byId("contacts").tBodies[0];
+  fit(body, contacts.length, () => {
+    const row = document.createElement("tr");
+    for (let i = 0; i < 5; i++) row.append(document.createElement(i ? "td" : "th"));
+    row.cells[0].scope = "row";
+    return row;
+  });
+  contacts.forEach((contact, i) => {
+    const row = body.rows[i];
+    Object.assign(row.dataset, { id: contact.id, xMm: contact.x_mm, yMm: contact.y_mm });
+    const texts = [
+      String(contact.id), fixed(contact.x_mm, 1), fixed(contact.y_mm, 1),
+      fixed(contact.area_mm2, 0), value(contact),
+    ];
+    texts.forEach((text, column) => setText(row.cells[column], text));
+  });
+}
+
+export function showState(name, text = STATES[name] ?? String(name)) {
+  byId("state").dataset.state = name;
+  setText(byId("state"), text);
+}
+
+/** The newest frame's quality; flags of a frame that is out of date say nothing about now. */
+export function showQuality(frame, trusted) {
+  setText(byId("misfit"), frame.misfit === null ? "–" : `${fixed(frame.misfit, 1)} σ`);
+  setText(byId("tier"), frame.tier ?? "–");
+  setText(byId("tier-reason"), frame.tier_reason ?? "");
+  const list = byId("quality");
+  const key = trusted ? frame.flags.join() : "not known";
+  if (list.dataset.flags === key) return;
+  list.dataset.flags = key;
+  const chips = !trusted ? [chip("not known", "The newest frame is out of date.", "warn")]
+    : frame.flags.length ? frame.flags.map((flag) => chip(...explainFlag(flag), "warn"))
+    : [chip("good", "Nothing to be wary of.", "good")];
+  list.replaceChildren(...chips);
+}
+
+function chip(text, title, kind) {
+  const item = element("li", text);
+  item.className = `chip ${kind}`;
+  item.title = title;
+  return item;
+}
+
+export function showStatus(status) {
+  const { description, source } = status;
+  setText(byId("model"), description?.model ?? "");
+  byId("source").hidden = !SOURCES[source?.kind];
+  setText(byId("source"), SOURCES[source?.kind] ?? "");
+  showStages(status.stage_ms ?? {});
+  showChannels(status);
+  const { reference, recording } = status;
+  setText(byId("reference"), reference
+    ? `Reference of ${reference.scans} scans, taken ${clock(reference.taken_realtime_ns)}.`
+    : "No reference yet.");
+  const record = byId("record");
+  record.setAttribute("aria-pressed", String(Boolean(recording)));
+  setText(record, recording ? `Stop · ${bytes(recording.bytes)}` : "Record");
+  record.title = recording ? recording.path : "Record what the ports say to a file";
+  const choice = byId("tier-choice");
+  if (document.activeElement !== choice && status.tier_requested) choice.value = status.tier_requested;
+}
+
+function showStages(stages) {
+  const rows = Object.entries(stages);
+  const longest = Math.max(1, ...rows.map(([, times]) => times?.p99 ?? 0));
+  const box = byId("stages");
+  fit(box, rows.length, () => {
+    const row = element("div");
+    const bar = element("span");
+    bar.className = "bar";
+    bar.append(element("i"), element("i"));
+    row.append(element("span"), bar, element("span"));
+    return row;
+  });
+  rows.forEach(([name, times], i) => {
+    const [label, bar, text] = box.children[i].children;
+    setText(label, name.replaceAll("_", " "));
+    setText(text, `${fixed(times?.p50, 1)}, ${fixed(times?.p99, 1)} ms`);
+    bar.children[0].style.width = `${(100 * (times?.p99 ?? 0)) / longest}%`;
+    bar.children[1].style.width = `${(100 * (times?.p50 ?? 0)) / longest}%`;
+  });
+}
+
+function showChannels({ ports, rates, dropped_scans: dropped, incomplete_scans: incomplete }) {
+  const lines = [];
+  for (const name of ["magnitude", "structure"]) {
+    const hz = rates?.[`${name}_hz`];
+    if (hz === null || hz === undefined) continue;
+    lines.push([hz > 0 ? "good" : "bad", name, hz > 0 ? `${fixed(hz, 1)} scans/s` : "no scans"]);
+  }
+  for (const port of ports ?? []) {
+    const device = port.device ? `${port.device.device_id}, ` : "";
+    const corrupt = port.corrupt ? `, ${port.corrupt} corrupt` : "";
+    lines.push([
+      port.connected ? (port.corrupt ? "warn" : "good") : "bad", port.url,
+      port.connected ? `${device}${bytes(port.bytes)}${corrupt}` : "not connected",
+    ]);
+  }
+  if (incomplete) lines.push(["warn", "incomplete dual scans", String(incomplete)]);
+  if (dropped) lines.push(["warn", "dropped dual scans", String(dropped)]);
+  const list = byId("channels");
+  fit(list, lines.length, () => {
+    const item = element("li");
+    item.append(element("span"), element("span"), element("span"));
+    item.children[0].className = "dot";
+    return item;
+  });
+  lines.forEach(([kind, name, text], i) => {
+    const [dot, label, value] = list.children[i].children;
+    dot.dataset.kind = kind;
+    dot.title = kind;
+    setText(label, name);
+    setText(value, text);
+  });
+}
+
+export function showEvent(event) {
+  const item = element("li");
+  item.dataset.severity = event.severity;
+  item.dataset.name = event.name;
+  const when = element("time", clock(event.acquired_realtime_ns));
+  const name = element("strong", String(event.name).replaceAll("_", " "));
+  item.append(when, name, element("span", [event.detail, event.next_step].filter(Boolean).join(" ")));
+  const list = byId("events");
+  list.prepend(item);
+  while (list.children.length > EVENTS_SHOWN) list.lastChild.remove();
+  byId("no-events").hidden = true;
+}
+
+function fit(parent, count, make) {
+  while (parent.children.length > count) parent.lastElementChild.remove();
+  while (parent.children.length < count) parent.append(make());
+}
+
+function element(tag, text = "") {
+  const made = document.createElement(tag);
+  made.textContent = text;
+  return made;
+}
+
+// Untouched text keeps its selection and spares screen readers.
+export function setText(node, text) {
+  if (node.textContent !== text) node.textContent = text;
+}
+
+function clock(realtimeNs) {
+  return realtimeNs ? new Date(realtimeNs / 1e6).toLocaleTimeString() : "";
+}
+
+function bytes(count) {
+  if (!(count >= 1000)) return `${count ?? 0} B`;
+  const power = Math.min(3, Math.floor(Math.log10(count) / 3));
+  return `${fixed(count / 1000 ** power, 1)} ${["B", "kB", "MB", "GB"][power]}`;
+}

@@ -1,0 +1,157 @@
+// Pressing the simulated skin: each finger, the mouse and the space bar is one press, with an id of
+// its own. A press that moves is sent again at most once at a time, always with its newest place.
+
+const STEP_MM = { plain: 1, shift: 10 };
+
+export class Touch {
+  /** `indenter()` says with what is pressed: {pressure, size, shape}; `onPress(press)` hears of new ones. */
+  constructor({ view, link, indenter, onChange, onPress }) {
+    Object.assign(this, { view, link, indenter, onChange, onPress });
+    this.enabled = false;
+    this.hold = false;
+    this.held = [];
+    this.down = new Map();  // pointer (or "keyboard") -> press
+    this.cursor = null;
+    this.count = 0;
+    const { canvas } = view;
+    canvas.addEventListener("pointerdown", (event) => this.#pointerDown(event));
+    canvas.addEventListener("pointermove", (event) => this.#pointerMove(event));
+    for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) {
+      canvas.addEventListener(name, (event) => this.#release(event.pointerId, this.hold || event.shiftKey));
+    }
+    canvas.addEventListener("keydown", (event) => this.#keyDown(event));
+    canvas.addEventListener("keyup", (event) => {
+      if (event.key === " ") this.#release("keyboard", this.hold || event.shiftKey);
+    });
+    canvas.addEventListener("blur", () => {
+      this.cursor = null;
+      this.#release("keyboard", false);
+      this.onChange();
+    });
+    canvas.addEventListener("contextmenu", (event) => {
+      if (this.down.size) event.preventDefault();  // a long touch is a press, not a menu
+    });
+  }
+
+  /** All presses of this page, to be drawn. */
+  get presses() {
+    return [...this.held, ...this.down.values()];
+  }
+
+  /** Allow or stop pressing; the presses are forgotten when it stops (the server releases them). */
+  enable(enabled) {
+    if (enabled === this.enabled) return;
+    this.enabled = enabled;
+    this.view.canvas.classList.toggle("pressable", enabled);
+    this.view.canvas.role = enabled ? "application" : "img";
+    if (!enabled) {
+      this.down.clear();
+      this.held = [];
+      this.onChange();
+    }
+  }
+
+  /** Lift everything, the script's and other pages' live presses too. */
+  clear() {
+    this.down.clear();
+    this.held = [];
+    this.onChange();
+    return this.link.ask({ type: "clear" });
+  }
+
+  /** The indenter changed: so do the presses that are down. */
+  refresh() {
+    for (const press of this.down.values()) this.#send(Object.assign(press, this.indenter()));
+  }
+
+  #pointerDown(event) {
+    const point = this.#point(event);
+    if (!this.enabled || event.button !== 0 || !this.view.isOnSheet(...point)) return;
+    event.preventDefault();
+    this.view.canvas.focus({ preventScroll: true, focusVisible: false });
+    this.cursor = null;
+    this.view.canvas.setPointerCapture(event.pointerId);
+    this.#start(event.pointerId, point);
+  }
+
+  #pointerMove(event) {
+    const press = this.down.get(event.pointerId);
+    if (press) this.#move(press, this.#point(event));
+  }
+
+  #keyDown(event) {
+    if (!this.enabled || event.ctrlKey || event.altKey || event.metaKey) return;
+    const step = event.shiftKey ? STEP_MM.shift : STEP_MM.plain;
+    const by = {
+      ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, step], ArrowDown: [0, -step],
+    }[event.key];
+    if (by) {
+      const [x, y] = this.cursor ?? [0, 0];
+      const next = [x + by[0], y + by[1]];
+      if (this.view.isOnSheet(...next)) this.cursor = next;
+      const press = this.down.get("keyboard");
+      if (press && this.cursor) this.#move(press, this.cursor);
+    } else if (event.key === " ") {
+      this.cursor ??= [0, 0];
+      if (!this.down.has("keyboard")) this.#start("keyboard", this.cursor);
+    } else if (event.key === "Escape") {
+      for (const pointer of [...this.down.keys()]) this.#release(pointer, false);
+    } else {
+      return;
+    }
+    event.preventDefault();
+    this.onChange();
+  }
+
+  #point({ clientX, clientY }) {
+    const box = this.view.canvas.getBoundingClientRect();
+    return this.view.pixelToMm(clientX - box.left, clientY - box.top);
+  }
+
+  #start(pointer, [x, y]) {
+    const press = { id: String(++this.count), x, y, ...this.indenter(), held: false };
+    this.down.set(pointer, press);
+    this.#send(press);
+    this.onPress(press);
+    this.onChange();
+  }
+
+  #move(press, [x, y]) {
+    if (!this.view.isOnSheet(x, y)) return;
+    Object.assign(press, { x, y });
+    this.#send(press);
+    this.onChange();
+  }
+
+  #release(pointer, keep) {
+    const press = this.down.get(pointer);
+    if (!press) return;
+    this.down.delete(pointer);
+    press.held = keep;
+    press.lifted = !keep;
+    if (keep) this.held.push(press);
+    if (keep) this.#send(press);
+    else this.link.send({ type: "release", press: press.id });
+    this.onChange();
+  }
+
+  async #send(press) {
+    press.dirty = true;
+    if (press.sending) return;
+    press.sending = true;
+    while (press.dirty && !press.lifted) {
+      press.dirty = false;
+      await this.link.ask({
+        type: "press",
+        press: press.id,
+        x_mm: press.x,
+        y_mm: press.y,
+        pressure_kpa: press.pressure,
+        radius_mm: press.size / 2,
+        shape: press.shape,
+        hold: press.held,
+      });
+    }
+    press.sending = false;
+  }
+}

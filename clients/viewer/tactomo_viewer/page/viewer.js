@@ -1,0 +1,349 @@
+// The page's main part: takes what the link brings, and has it drawn once a screen refresh.
+
+import { ageOf, verdict } from "./health.js";
+import { Link } from "./link.js";
+import { MapView } from "./map_view.js";
+import { byId, fixed, setText, showContacts, showEvent, showQuality, showState, showStatus } from "./panels.js";
+import { Touch } from "./touch.js";
+
+const PANEL_MS = 100;       // how often the texts beside the map change
+const FALLBACK_TOP = { kpa: 300, percent: 30 };
+const PAINTED = 120;        // frames that rate and latency are taken over
+
+const state = {
+  hello: null,
+  openedAt: 0,
+  frame: null,              // the newest
+  drawn: null,              // the one on the canvas
+  status: null,             // {fields, age_ms, receivedAt}
+  twinAnswers: false,
+  painted: [],              // {at, latency} of the last frames, ms
+  fitted: { kpa: 0, percent: 0 },
+  awaited: null,            // the press whose picture is awaited
+};
+
+const view = new MapView(byId("map"));
+const link = new Link({ onFrame, onMessage, onChange: onLink });
+state.link = link;
+const touch = new Touch({
+  view, link, indenter,
+  onChange: () => redraw(),
+  onPress: (press) => {
+    if (!contactNear(press)) state.awaited = { ...press, at: performance.now() };
+  },
+});
+
+// For those who drive this page from outside, such as its tests.
+window.tactomo = {
+  mmToPixel: (x, y) => view.mmToPixel(x, y),
+  pixelToMm: (x, y) => view.pixelToMm(x, y),
+  state,
+};
+
+// What comes
+
+function onFrame(frame) {
+  if (state.drawn?.session !== frame.session) state.fitted = { kpa: 0, percent: 0 };
+  state.frame = frame;
+  redraw();
+}
+
+function onMessage(message) {
+  const handlers = {
+    hello: () => {
+      state.hello = message;
+      setText(byId("sensor"), message.sensor);
+      document.title = `${message.sensor} · tactomo`;
+      byId("events").replaceChildren();  // the server sends the recent ones again
+    },
+    status: () => {
+      state.status = { fields: message.status, age_ms: message.age_ms, receivedAt: performance.now() };
+      describe(message.status.description);
+      showStatus(message.status);
+    },
+    event: () => showEvent(message.event),
+    twin: () => { state.twinAnswers = message.answers; },
+  };
+  handlers[message.type]?.();
+  refresh();
+}
+
+function onLink() {
+  state.openedAt = performance.now();
+  if (!link.isOpen) state.twinAnswers = false;
+  refresh();
+}
+
+let described = "";
+
+function describe(description) {
+  const key = JSON.stringify(description ?? null);
+  if (key === described || !description) return;
+  described = key;
+  view.describe(description);
+  byId("pressure").max = Math.max(300, description.pressure_max_kpa ?? 0);
+  const hasPressure = description.pressure_max_kpa !== null;
+  if (!hasPressure) choose("unit", "percent");
+  document.querySelector("input[name=unit][value=kpa]").disabled = !hasPressure;
+  redraw();
+}
+
+// Drawing
+
+let scheduled = false;
+
+function redraw() {
+  if (scheduled) return;
+  scheduled = true;
+  requestAnimationFrame(() => {
+    scheduled = false;
+    draw();
+  });
+}
+
+function draw() {
+  const { frame } = state;
+  const unit = chosen("unit");
+  const image = imageIn(frame, unit);
+  view.draw({
+    frame,
+    image,
+    scale: image ? scaleTop(image, unit) : 1,
+    unit: unit === "kpa" ? "kPa" : "Δσ/σ₀ %",
+    label: (contact) => valueText(contact, unit) || "touched",
+    notice: frame && !image ? noticeFor(frame, unit) : "",
+    colormap: byId("colormap").value,
+    smooth: byId("smooth").checked,
+    outline: byId("outline").checked,
+    presses: touch.presses,
+    cursor: touch.cursor,
+  });
+  if (frame === state.drawn) return;
+  state.drawn = frame;
+  notePainted(frame);
+}
+
+function notePainted(frame) {
+  const now = performance.now();
+  state.painted.push({ at: now, latency: ageOf(frame, now) });
+  if (state.painted.length > PAINTED) state.painted.shift();
+  const { awaited } = state;
+  if (awaited && contactNear(awaited)) {
+    setText(byId("press-latency"), `${fixed(now - awaited.at, 0)} ms`);
+    byId("press-latency").parentElement.hidden = false;
+    state.awaited = null;
+  }
+}
+
+function imageIn(frame, unit) {
+  if (!frame) return null;
+  if (unit === "kpa") return frame.images.pressure_kpa ?? null;
+  const { map } = frame.images;
+  return map ? { ...map, values: map.values.map((value) => 100 * value) } : null;
+}
+
+function noticeFor(frame, unit) {
+  if (frame.images.map && unit === "kpa") return "No pressure in this frame: choose Δσ/σ₀";
+  return frame.images.structure ? "Magnitude missing: only where, not how hard" : "No map in this frame";
+}
+
+// "sensor": the range that the sensor has. "fit": the largest value lately, slowly forgotten.
+function scaleTop(image, unit) {
+  const description = state.status?.fields.description ?? {};
+  const top = unit === "kpa" ? description.pressure_max_kpa : 100 * description.magnitude_max;
+  const full = top > 0 ? top : FALLBACK_TOP[unit];
+  if (chosen("scale") === "sensor") return full;
+  let largest = 0;
+  for (const value of image.values) if (value > largest) largest = value;
+  state.fitted[unit] = Math.max(largest, 0.98 * state.fitted[unit], full / 50);
+  return state.fitted[unit];
+}
+
+// Values
+
+function valueText(contact, unit) {
+  const { magnitude, magnitude_sigma: sigma, pressure_kpa: kpa } = contact;
+  if (unit === "percent") {
+    if (magnitude === null) return "";
+    return `${fixed(100 * magnitude, 1)}${sigma === null ? "" : ` ± ${fixed(100 * sigma, 1)}`} %`;
+  }
+  if (kpa === null) return "";
+  const spread = pressureSpread(magnitude, sigma);
+  return `${fixed(kpa, 0)}${spread === null ? "" : ` ± ${fixed(spread, spread < 1 ? 1 : 0)}`} kPa`;
+}
+
+// The pressure's uncertainty: the magnitude's, through the sensor's response.
+function pressureSpread(magnitude, sigma) {
+  const response = state.status?.fields.description?.magnitude_response;
+  if (!response || magnitude === null || sigma === null) return null;
+  const changes = response.relative_change.map(Math.abs);
+  const at = (value) => {
+    const above = changes.findIndex((change) => change >= value);
+    if (above <= 0) return response.pressure_kpa[above < 0 ? changes.length - 1 : 0];
+    const t = (value - changes[above - 1]) / (changes[above] - changes[above - 1]);
+    return response.pressure_kpa[above - 1] +
+      t * (response.pressure_kpa[above] - response.pressure_kpa[above - 1]);
+  };
+  return (at(magnitude + sigma) - at(Math.max(0, magnitude - sigma))) / 2;
+}
+
+function contactNear({ x, y, size }) {
+  return state.drawn?.contacts.some(
+    (contact) => Math.hypot(contact.x_mm - x, contact.y_mm - y) < size / 2 + 5,
+  );
+}
+
+// Texts and banner
+
+function refresh() {
+  const now = performance.now();
+  const found = verdict(state, now);
+  showBanner(found);
+  const trusted = !found || found.level === "info" || found.name === "no-reference";
+  byId("map").classList.toggle("stale", !trusted);
+  document.body.dataset.health = found?.name ?? "good";
+  const linked = link.isOpen && state.status && ageOf(state.status, now) < 3000;
+  if (!linked) showState("gone", found ? "disconnected" : "connecting");
+  else if (found?.name === "stale") showState("stale");
+  else showState(state.status.fields.state);
+  for (const id of ["tare", "record", "tier-choice"]) {
+    byId(id).disabled = !linked || Boolean(state.hello?.read_only);
+  }
+  const canPress = link.isOpen && state.twinAnswers && state.status?.fields.source?.kind === "twin";
+  if (canPress) byId("press-card").hidden = false;
+  byId("press-controls").disabled = !canPress;
+  touch.enable(Boolean(canPress));
+  setText(byId("map-help"), canPress
+    ? "Press with the mouse, with fingers, or with the arrow keys and the space bar. Shift holds the press."
+    : "");
+  showNumbers(now, trusted);
+}
+
+let bannerShown = "";
+
+function showBanner(found) {
+  const box = byId("banner");
+  box.hidden = !found;
+  if (!found) {
+    bannerShown = "";
+    return;
+  }
+  // A counting clock in it must not be read out anew every time.
+  const key = found.name + found.title;
+  if (key !== bannerShown) {
+    bannerShown = key;
+    box.dataset.name = found.name;
+    box.dataset.level = found.level;
+    box.querySelector("strong").textContent = found.title;
+  }
+  const detail = box.querySelector("span");
+  detail.ariaLive = "off";
+  setText(detail, found.detail);
+}
+
+function showNumbers(now, trusted) {
+  const { frame, painted } = state;
+  const recent = painted.filter(({ at }) => now - at < 2000);
+  const rate = recent.length > 1 ? (1000 * (recent.length - 1)) / (recent.at(-1).at - recent[0].at) : 0;
+  setText(byId("rate"), rate ? `${fixed(rate, 1)} /s` : "–");
+  const latencies = recent.map(({ latency }) => latency).sort((a, b) => a - b);
+  const median = latencies[Math.floor(latencies.length / 2)];
+  setText(byId("latency"), latencies.length ? `${fixed(median, 0)} ms` : "–");
+  byId("latency").title = latencies.length
+    ? `scan read to picture drawn, half of the frames; the slowest of the last 2 s: ${fixed(latencies.at(-1), 0)} ms`
+    : "";
+  const age = ageOf(frame, now);
+  setText(byId("age"), age < 1e3 ? `${fixed(age, 0)} ms` : age < 1e6 ? `${fixed(age / 1e3, 1)} s` : "–");
+  byId("age").classList.toggle("bad", !trusted);
+  if (!frame) return;
+  const unit = chosen("unit");
+  showContacts(trusted ? frame.contacts : [], unit, (contact) => valueText(contact, unit).replace(/ (kPa|%)$/, "") || "–");
+  setText(byId("no-contacts"), trusted ? "Nothing pressed." : "Not known.");
+  showQuality(frame, trusted);
+  byId("map").ariaLabel = trusted
+    ? `Pressure map, ${frame.contacts.length || "no"} contact${frame.contacts.length === 1 ? "" : "s"}`
+    : "Pressure map, out of date";
+}
+
+// Controls
+
+function indenter() {
+  return {
+    pressure: Number(byId("pressure").value),
+    size: Number(byId("size").value),
+    shape: byId("shape").value,
+  };
+}
+
+function showIndenter() {
+  setText(byId("pressure-value"), `${byId("pressure").value} kPa`);
+  setText(byId("size-value"), `${byId("size").value} mm`);
+  touch.refresh();
+  redraw();
+}
+
+async function command(name, args = {}, done = () => "") {
+  const reply = await link.ask({ type: "command", command: name, arguments: args });
+  const text = reply.ok
+    ? done(reply.result)
+    : [reply.error.cause, reply.error.next_step].filter(Boolean).join("; ");
+  say(text, reply.ok);
+}
+
+let silence = 0;
+
+function say(text, ok) {
+  const box = byId("message");
+  box.textContent = text;
+  box.classList.toggle("bad", !ok);
+  clearTimeout(silence);
+  silence = setTimeout(() => { box.textContent = ""; }, 7000);
+}
+
+function chosen(name) {
+  return document.querySelector(`input[name=${name}]:checked`).value;
+}
+
+function choose(name, value) {
+  document.querySelector(`input[name=${name}][value=${value}]`).checked = true;
+}
+
+byId("tare").onclick = () =>
+  command("tare", {}, ({ scans }) => `Tared: the reference is the mean of ${scans} scans.`);
+byId("record").onclick = () =>
+  state.status?.fields.recording
+    ? command("record_stop", {}, ({ path }) => `Recorded to ${path}`)
+    : command("record_start", {}, ({ path }) => `Recording to ${path}`);
+byId("tier-choice").onchange = ({ target }) =>
+  command("set_tier", { tier: target.value }, ({ tier }) => `Tier: ${tier}`);
+byId("clear").onclick = () => touch.clear();
+byId("hold").onchange = ({ target }) => { touch.hold = target.checked; };
+for (const id of ["pressure", "size", "shape"]) byId(id).oninput = showIndenter;
+for (const input of document.querySelectorAll(".toolbar input, .toolbar select")) {
+  input.addEventListener("change", () => { redraw(); refresh(); });
+}
+
+byId("map").addEventListener("pointermove", ({ offsetX, offsetY }) => {
+  const [x, y] = view.pixelToMm(offsetX, offsetY);
+  setText(byId("readout"), view.isOnSheet(x, y) ? readout(x, y) : "");
+});
+byId("map").addEventListener("pointerleave", () => setText(byId("readout"), ""));
+
+function readout(x, y) {
+  const unit = chosen("unit");
+  const image = imageIn(state.frame, unit);
+  const place = `x ${fixed(x, 0)}, y ${fixed(y, 0)} mm`;
+  if (!image) return place;
+  const { x_mm: [x0, x1], y_mm: [y0, y1] } = state.frame;
+  const ix = Math.round(((x - x0) / (x1 - x0)) * (image.nx - 1));
+  const iy = Math.round(((y - y0) / (y1 - y0)) * (image.ny - 1));
+  const value = image.values[iy * image.nx + ix];
+  return Number.isFinite(value) ? `${place}: ${fixed(value, unit === "kpa" ? 0 : 1)} ${unit === "kpa" ? "kPa" : "%"}` : place;
+}
+
+new ResizeObserver(() => { view.resize(); redraw(); }).observe(byId("map").parentElement);
+addEventListener("resize", () => { view.resize(); redraw(); });
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+setInterval(refresh, PANEL_MS);
+showIndenter();
+redraw();

@@ -1,0 +1,229 @@
+"""The web server: the page's files, one websocket per open page, and who may use it.
+
+The page can press the skin and command the daemon, so no other web page may pose as it. A request
+must name this computer in `Host` by an IP address, by `localhost` or by the name it is served under
+(a foreign name that was made to point here is refused), and a websocket must come from a page that
+was served here (`Origin`). Served beyond this computer, the viewer only shows.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ipaddress
+import signal
+from collections.abc import AsyncIterator
+from importlib import resources
+from urllib.parse import urlsplit
+
+from aiohttp import WSCloseCode, web
+from aiohttp.typedefs import Handler, Middleware
+from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM, ClientError
+
+from tactomo_viewer.browser import Browser
+from tactomo_viewer.feed import Feed
+from tactomo_viewer.link import ControlLink
+from tactomo_viewer.wire import json_text
+
+DEFAULT_HOST = "127.0.0.1"
+DEFAULT_PORT = 8750
+
+TWIN_POLL_S = 1.0
+MAX_QUESTION_BYTES = 16 * 1024
+PAGE_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
+HEADERS = {
+    "Cache-Control": "no-cache",
+    "Content-Security-Policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+        "img-src 'self' data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+
+
+class ViewerError(ClientError):
+    """The viewer cannot be served as asked."""
+
+
+def serve(
+    sensor: str,
+    stream: str = DEFAULT_STREAM,
+    control: str = DEFAULT_CONTROL,
+    twin: str | None = None,
+    host: str = DEFAULT_HOST,
+    port: int = DEFAULT_PORT,
+) -> None:
+    """Serve the viewer until SIGINT or SIGTERM; prints its URL on stdout once it can be opened.
+
+    Args:
+        sensor: the sensor's name in the daemon's configuration.
+        stream: the daemon's stream.
+        control: the daemon's control socket.
+        twin: the twin's control socket, where there is a twin.
+        host: the address to listen on; on any but a loopback one the viewer only shows.
+        port: the port to listen on; 0 takes a free one.
+
+    Raises:
+        ViewerError: the address cannot be listened on.
+        ClientError: `sensor` is no sensor's name, or `stream` no address.
+
+    """
+    asyncio.run(_serve(make_app(sensor, stream, control, twin, host), host, port))
+
+
+async def _serve(app: web.Application, host: str, port: int) -> None:
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
+    await runner.setup()
+    try:
+        try:
+            await web.TCPSite(runner, host, port).start()
+        except (OSError, OverflowError) as error:
+            raise ViewerError(
+                f"cannot listen on {host} port {port}: {getattr(error, 'strerror', None) or error}",
+                "stop the program that uses it, or choose another with --port (0: any free one)",
+                name="cannot_listen",
+            ) from error
+        print(f"viewer: {_url(runner)}", flush=True)
+        await stop.wait()
+    finally:
+        await runner.cleanup()
+
+
+def _url(runner: web.AppRunner) -> str:
+    host, port = runner.addresses[0][:2]
+    return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
+
+
+def make_app(
+    sensor: str,
+    stream: str = DEFAULT_STREAM,
+    control: str = DEFAULT_CONTROL,
+    twin: str | None = None,
+    host: str = DEFAULT_HOST,
+) -> web.Application:
+    """Return the viewer as an aiohttp application; arguments as for `serve`."""
+    viewer = _Viewer(sensor, stream, control, twin, host)
+    app = web.Application(middlewares=[_only_for(host)])
+    app.cleanup_ctx.append(viewer.running)
+    app.on_shutdown.append(viewer.say_goodbye)
+    app.router.add_get("/socket", viewer.socket)
+    for file in (resources.files("tactomo_viewer") / "page").iterdir():
+        path = "/" if file.name == "index.html" else f"/{file.name}"
+        app.router.add_get(
+            path, _file(file.read_bytes(), PAGE_TYPES["." + file.name.split(".")[-1]])
+        )
+    return app
+
+
+class _Viewer:
+    """What all open pages share: one feed, one link to the daemon and one to the twin."""
+
+    def __init__(self, sensor: str, stream: str, control: str, twin: str | None, host: str) -> None:
+        may_command = is_loopback(host)
+        self._about = {"sensor": sensor, "stream": stream, "read_only": not may_command}
+        self._browsers: set[Browser] = set()
+        self._sockets: set[web.WebSocketResponse] = set()
+        self._daemon = ControlLink(control) if may_command else None
+        self._twin = ControlLink(twin) if may_command and twin else None
+        self._twin_answers = False
+        self._sensor, self._stream = sensor, stream
+        self._feed: Feed
+
+    async def running(self, _: web.Application) -> AsyncIterator[None]:
+        self._feed = Feed(self._sensor, self._stream, self._wake)
+        tasks = [asyncio.create_task(self._feed.run()), asyncio.create_task(self._watch_twin())]
+        yield
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        for link in (self._daemon, self._twin):
+            if link is not None:
+                link.close()
+
+    async def socket(self, request: web.Request) -> web.StreamResponse:
+        socket = web.WebSocketResponse(
+            heartbeat=10.0, max_msg_size=MAX_QUESTION_BYTES, compress=False
+        )
+        await socket.prepare(request)
+        await socket.send_str(json_text({"type": "hello", **self._about}))
+        browser = Browser(socket, self._feed, self._daemon, self._twin)
+        browser.twin_answers = self._twin_answers
+        self._browsers.add(browser)
+        self._sockets.add(socket)
+        try:
+            await browser.run()
+        finally:
+            self._browsers.discard(browser)
+            self._sockets.discard(socket)
+        return socket
+
+    async def say_goodbye(self, _: web.Application) -> None:
+        closing = [s.close(code=WSCloseCode.GOING_AWAY) for s in self._sockets]
+        await asyncio.gather(*closing, return_exceptions=True)
+
+    def _wake(self) -> None:
+        for browser in self._browsers:
+            browser.wake()
+
+    async def _watch_twin(self) -> None:
+        while self._twin is not None:
+            try:
+                await self._twin.request("scene", {}, timeout_s=2.0)
+                answers = True
+            except ClientError:
+                answers = False
+            if answers != self._twin_answers:
+                self._twin_answers = answers
+                for browser in self._browsers:
+                    browser.twin_answers = answers
+                self._wake()
+            await asyncio.sleep(TWIN_POLL_S)
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether only this computer can reach what listens on `host`."""
+    with contextlib.suppress(ValueError):
+        return ipaddress.ip_address(host).is_loopback
+    return host == "localhost"
+
+
+def _only_for(served_host: str) -> Middleware:
+    """Return the middleware that turns away whoever poses as the page, and adds the headers."""
+
+    @web.middleware
+    async def check(request: web.Request, handler: Handler) -> web.StreamResponse:
+        if not _names_this_computer(request.host, served_host):
+            raise web.HTTPForbidden(text=f"not served under the name {request.host!r}\n")
+        origin = request.headers.get("Origin")
+        if request.path == "/socket" and (
+            origin is None or urlsplit(origin).netloc.lower() != request.host.lower()
+        ):
+            raise web.HTTPForbidden(text="a page from elsewhere may not use this viewer\n")
+        response = await handler(request)
+        if not response.prepared:
+            response.headers.update(HEADERS)
+        return response
+
+    return check
+
+
+def _names_this_computer(host_header: str, served_host: str) -> bool:
+    try:
+        name = urlsplit(f"//{host_header}").hostname or ""
+    except ValueError:
+        return False
+    with contextlib.suppress(ValueError):
+        ipaddress.ip_address(name)
+        return True
+    return name in ("localhost", served_host.lower())
+
+
+def _file(content: bytes, content_type: str) -> Handler:
+    async def send(_: web.Request) -> web.Response:
+        return web.Response(body=content, content_type=content_type, charset="utf-8")
+
+    return send
