@@ -43,7 +43,7 @@ def test_the_channels_have_noise_and_drift_of_their_own() -> None:
     converter = Converter(1.0, 1e-3, Drift(walk=1e-3, creep=0.0))
     assert not np.array_equal(volts_of(converter), volts_of(converter, channel=1))
     converter.noise_v = 0.0
-    gains = [np.mean(volts_of(converter, 0, 500.0, c) / VOLTS) for c in (0, 1)]
+    gains = [float(np.mean(volts_of(converter, 0, 500.0, c) / VOLTS)) for c in (0, 1)]
     assert abs(gains[0] - gains[1]) > 1e-4
 
 

@@ -21,8 +21,9 @@ from tactomo_client.messages import (
     encode_reply,
 )
 
-from tactomo.errors import AddressError, CommandError
-from tactomo.twin.scene import Indenter, Scene, explain
+from tactomo.endpoint import bind
+from tactomo.errors import CommandError
+from tactomo.twin.scene import Indenter, Scene, complaints
 
 Handler = Callable[[Any], Mapping[str, Any]]
 PressId = Annotated[str, Field(min_length=1, max_length=64)]
@@ -120,17 +121,9 @@ class ControlSocket:
     def __init__(self, address: str, handlers: Mapping[str, Handler]) -> None:
         self._handlers = handlers
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REP)
-        self._socket.linger = 0
-        self._socket.maxmsgsize = MAX_MESSAGE_BYTES
-        try:
-            self._socket.bind(address)
-        except zmq.ZMQError as error:
-            self._socket.close()
-            raise AddressError(
-                f"cannot bind the twin's control socket to {address}: {error.strerror}",
-                "stop the program that uses it, or give another one with --control",
-            ) from error
-        self.address: str = self._socket.last_endpoint.decode().rstrip("\0")
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
+        self.address = bind(self._socket, address, "control")
 
     @property
     def socket(self) -> zmq.Socket[bytes]:
@@ -164,7 +157,7 @@ class ControlSocket:
             checked = COMMANDS[command].model_validate(arguments)
         except ValidationError as error:
             raise CommandError(
-                f"{command}: {explain(error)}", describe_arguments(command), name="bad_argument"
+                f"{command}: {complaints(error)}", describe_arguments(command), name="bad_argument"
             ) from error
         return self._handlers[command](checked)
 

@@ -24,11 +24,13 @@ from typing import Any, Protocol
 import numpy as np
 import zmq
 from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
 from tactomo_client.messages import DEFAULT_TWIN_CONTROL
 from tactomo_models import Press, SensorDescription, SkinSimulator
 from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
 
+from tactomo.config import Endpoint
 from tactomo.errors import CommandError, ConfigError, TactomoError
 from tactomo.twin.control import (
     ControlSocket,
@@ -53,7 +55,7 @@ from tactomo.twin.firmware import (
     Voltages,
 )
 from tactomo.twin.line import SerialLine
-from tactomo.twin.scene import Scene
+from tactomo.twin.scene import Scene, complaints
 from tactomo.twin.surface import Surface
 
 # How often a line that nobody has open is looked at; its hang-up cannot be waited on.
@@ -99,6 +101,10 @@ class TwinConfig:
     link_folder: Path | None = None
 
     def __post_init__(self) -> None:
+        try:
+            TypeAdapter(Endpoint).validate_python(self.control)
+        except ValidationError as error:
+            raise ConfigError(f"control = {self.control!r}", complaints(error)) from error
         channels = len(self.description.modalities)
         if self.ports not in (1, 2) or self.ports > channels:
             raise ConfigError(

@@ -6,8 +6,8 @@ second and answers commands, all in wire protocol v1. It knows nothing of socket
 
 A scan carries the time at which the skin was *sampled*, and shows the skin as it was then. The
 forward model may need longer than a scan period; then the scan goes out late, with its true time
-and the LATE flag, and the next one is sampled afterwards. Missed scans are not made up, and the scan
-counter counts those that were made.
+and the LATE flag, and the next one is sampled afterwards. Missed scans are not made up, and the
+scan counter counts those that were made.
 """
 
 from __future__ import annotations

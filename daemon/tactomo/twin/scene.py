@@ -27,9 +27,9 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
-from pydantic_core import ErrorDetails
 from tactomo_models import Press
 
+from tactomo.config import explain
 from tactomo.errors import ConfigError
 
 Millimetres = Annotated[float, Field(ge=-1000.0, le=1000.0, allow_inf_nan=False)]
@@ -187,21 +187,9 @@ def load_scene(path: str | Path) -> Scene:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is not valid TOML: {error}", "correct the file") from error
     except ValidationError as error:
-        raise ConfigError(f"{path}: {explain(error)}", "correct the file") from error
+        raise ConfigError(f"{path}: {complaints(error)}", "correct the file") from error
 
 
-def explain(error: ValidationError) -> str:
-    """Return the complaints of a validation, each as "key = value: what is allowed"."""
-    return "; ".join(_explain_one(item) for item in error.errors())
-
-
-def _explain_one(item: ErrorDetails) -> str:
-    key = ".".join(str(part) for part in item["loc"])
-    if item["type"] == "extra_forbidden":
-        return f"unknown key {key}"
-    if item["type"] == "missing":
-        return f"{key} is missing"
-    message = item["msg"].removeprefix("Value error, ")
-    if not key or isinstance(item["input"], dict):
-        return f"{key}: {message}" if key else message
-    return f"{key} = {item['input']!r}: {message}"
+def complaints(error: ValidationError) -> str:
+    """Return what a validation complains of, each as "key = value: what is allowed"."""
+    return "; ".join(explain(item) for item in error.errors())

@@ -1,0 +1,98 @@
+"""The application object that every module of commands registers with, and shared options."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+import typer
+from typer.core import TyperGroup
+
+DEFAULT_NAME = "skin"
+DEFAULT_DESCRIPTION = "paper_square"
+DEFAULT_STREAM = "tcp://127.0.0.1:5560"
+DEFAULT_CONTROL = "tcp://127.0.0.1:5561"
+DEFAULT_TWIN_CONTROL = "tcp://127.0.0.1:5562"
+DEFAULT_VIEWER_PORT = 8750
+
+RUN = "Run"
+STEER = "Steer a running daemon"
+FILES = "Recordings and files"
+BUILD = "Models and measures"
+
+ORDER = (
+    *("demo", "daemon", "twin", "viewer"),
+    *("status", "watch", "tare", "record", "tier", "poke"),
+    *("info", "import", "replay", "reconstruct", "plot"),
+    *("models", "bench"),
+)
+
+
+class _Ordered(TyperGroup):
+    """Lists the commands as a newcomer meets them, not as the modules are imported."""
+
+    def list_commands(self, ctx: typer.Context) -> list[str]:  # type: ignore[override]
+        return sorted(super().list_commands(ctx), key=ORDER.index)
+
+
+app = typer.Typer(
+    name="tactomo",
+    cls=_Ordered,
+    help=(
+        "Tactile tomography: reads stacked EIT skins, reconstructs what presses on them, and "
+        "streams pressure maps and contacts.\n\n"
+        "New here? `tactomo demo` starts a simulated skin that you can press in the browser."
+    ),
+    epilog="`tactomo COMMAND --help` explains a command with examples.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+SensorName: TypeAlias = Annotated[
+    str, typer.Option("--sensor", "-s", help="The sensor's name in the stream.")
+]
+Description: TypeAlias = Annotated[
+    str,
+    typer.Option(
+        "--description",
+        "-d",
+        help="What the sensor is made of: a shipped name or a TOML file.",
+    ),
+]
+StreamAddress: TypeAlias = Annotated[
+    str, typer.Option("--stream", help="Address of the daemon's stream.")
+]
+ControlAddress: TypeAlias = Annotated[
+    str, typer.Option("--control", help="Address of the daemon's control socket.")
+]
+JsonOutput: TypeAlias = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
+Announce: TypeAlias = Annotated[
+    bool,
+    typer.Option(
+        "--announce", help="Print one line of JSON with the addresses when ready, for programs."
+    ),
+]
+RecordingFile: TypeAlias = Annotated[Path, typer.Argument(help="A recording (.mcap).")]
+
+
+def examples(*lines: str) -> str:
+    """Return an epilog that lists example commands, each on a line of its own."""
+    return "**Examples**\n\n" + "\n\n".join(f"`{line}`" for line in lines)
+
+
+@app.callback(invoke_without_command=True)
+def _start(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    if version:
+        from importlib.metadata import version as version_of
+
+        typer.echo(f"tactomo {version_of('tactomo')}")
+        raise typer.Exit
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+        raise typer.Exit(2)

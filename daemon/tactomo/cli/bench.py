@@ -1,0 +1,392 @@
+"""`tactomo bench`: how fast all this is on the machine at hand.
+
+Two measurements. *Live*: a twin and a daemon as processes of their own, and this process as the
+subscriber; latency is from the moment at which the daemon has read the last byte of a dual scan to
+the arrival of its contacts here, by the clock that both processes share. *Methods*: the time that
+one reconstruction takes, one thread, cold (no frame before it) and warm (a still scene).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tactomo.cli.app import BUILD, DEFAULT_DESCRIPTION, Description, JsonOutput, app, examples
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from tactomo_models import Reconstructor, SensorDescription
+
+    from tactomo.cli.children import Family
+
+SENSOR = "bench"
+SETTLE_S = 1.5
+START_S = 60.0
+REFERENCE_SCANS = 20
+NOISE_SHARE = 2e-5
+# Places in shares of half the sheet's size, all of them within a disc, too.
+PLACES = ((0.0, 0.1), (-0.45, -0.4), (0.5, -0.35), (0.1, 0.55))
+
+
+@dataclass(frozen=True)
+class Phase:
+    """What was measured live while one thing was pressed."""
+
+    scene: str
+    frames: int
+    frames_per_s: float
+    latency_p50_ms: float
+    latency_p99_ms: float
+    stage_ms: dict[str, dict[str, float]]
+    tiers: dict[str, int]
+
+
+@dataclass(frozen=True)
+class MethodTime:
+    """How long one method takes for one frame of one scene."""
+
+    method: str
+    contacts: int
+    cold_p50_ms: float
+    cold_p99_ms: float
+    warm_p50_ms: float
+    warm_p99_ms: float
+
+
+@dataclass
+class Results:
+    """Everything that was measured, and on what."""
+
+    machine: str
+    description: str
+    live: list[Phase] = field(default_factory=list)
+    late_scans: int | None = None
+    dropped_scans: int | None = None
+    methods: list[MethodTime] = field(default_factory=list)
+
+
+@app.command(
+    rich_help_panel=BUILD,
+    epilog=examples(
+        "tactomo bench",
+        "tactomo bench --seconds 20 --ports 1",
+        "tactomo bench --replay grasp.mcap",
+        "tactomo bench --no-live --json > times.json",
+    ),
+)
+def bench(
+    description: Description = DEFAULT_DESCRIPTION,
+    seconds: Annotated[float, typer.Option(min=1.0, help="Time of each live scene.")] = 6.0,
+    ports: Annotated[int, typer.Option(min=1, max=2, help="Lines of the twin.")] = 2,
+    rate: Annotated[float, typer.Option(help="Dual scans a second of the twin.")] = 20.0,
+    replay: Annotated[
+        Path | None, typer.Option(help="Measure on this recording instead of a twin.")
+    ] = None,
+    live: Annotated[bool, typer.Option(help="Measure latency from port to subscriber.")] = True,
+    methods: Annotated[bool, typer.Option(help="Measure the time of each method.")] = True,
+    as_json: JsonOutput = False,
+) -> None:
+    """Measure latency, rate and time per frame on this machine.
+
+    Starts a twin and a daemon of its own on free addresses, so a running demo is not disturbed
+    (but shares the processor). Takes about a minute.
+    """
+    from rich.console import Console
+
+    progress = Console(stderr=True)
+    results = Results(_machine(), description)
+    with progress.status("starting") as shown:
+        if live and replay is not None:
+            _measure_replay(results, replay, shown.update)
+        elif live:
+            _measure_twin(results, ports, rate, seconds, shown.update)
+        if methods:
+            results.methods = list(_measure_methods(description, shown.update))
+    if as_json:
+        typer.echo(json.dumps(asdict(results), indent=2))
+    else:
+        _print(results)
+
+
+def _measure_twin(
+    results: Results, ports: int, rate: float, seconds: float, tell: Callable[[str], None]
+) -> None:
+    """Press a twin in several ways and measure each."""
+    from tactomo_client import request
+    from tactomo_models import load_description
+
+    with _sockets() as at, _family() as family:
+        size = load_description(results.description)
+        spots = [_spot(size, place) for place in PLACES]
+        options = ("--description", results.description)
+        family.start("models build", "models", "build", *options).wait_done()
+        skin = family.start(
+            *("twin", "twin", *options, "--ports", str(ports), "--rate", str(rate)),
+            *("--control", at("twin"), "--announce"),
+        ).wait_ready()
+        lines = [word for path in skin["ports"] for word in ("--port", path)]
+        _start_daemon(family, at, *options, *lines)
+
+        def press(count: int) -> None:
+            request("clear", skin["control"])
+            for number, (x_mm, y_mm) in enumerate(spots[:count]):
+                request("press", skin["control"], id=str(number), x_mm=x_mm, y_mm=y_mm)
+
+        def slide(share: float) -> None:
+            x_mm, y_mm = _spot(size, (1.2 * share - 0.6, 0.2))
+            request("press", skin["control"], id="0", x_mm=x_mm, y_mm=y_mm)
+
+        with _Stream(at("stream")) as stream:
+            stream.wait_for_reference()
+            for scene, count, moves in (
+                ("nothing pressed", 0, None),
+                ("one contact, still", 1, None),
+                ("one contact, sliding", 1, slide),
+                ("three contacts, still", 3, None),
+            ):
+                tell(f"live: {scene}")
+                press(count)
+                stream.skip(SETTLE_S)
+                results.live.append(stream.measure(scene, seconds, at("control"), moves))
+        results.late_scans = request("status", skin["control"])["late_scans"]
+        results.dropped_scans = request("status", at("control"))["dropped_scans"]
+
+
+def _measure_replay(results: Results, recording: Path, tell: Callable[[str], None]) -> None:
+    """Measure a recording at its own speed."""
+    from tactomo.recording import open_recording
+
+    summary = open_recording(recording).summary
+    results.description = summary.origin.description
+    with _sockets() as at, _family() as family:
+        tell(f"live: replaying {summary.duration_s:.0f} s of {recording.name}")
+        options = ("--stream", at("stream"), "--control", at("control"), "--sensor", SENSOR)
+        family.start("replay", "replay", str(recording), "--stay", *options).wait_ready()
+        with _Stream(at("stream")) as stream:
+            wait_s = max(1.0, summary.duration_s - 0.5)
+            results.live.append(stream.measure(recording.name, wait_s, at("control"), None))
+
+
+def _start_daemon(family: Family, at: Callable[[str], str], *options: str) -> None:
+    family.start(
+        *("daemon", "daemon", "--sensor", SENSOR, *options),
+        *("--stream", at("stream"), "--control", at("control")),
+    ).wait_ready()
+
+
+class _Stream:
+    """A subscriber to contacts that takes the time of every message."""
+
+    def __init__(self, address: str) -> None:
+        from tactomo_client import subscribe
+
+        self._frames = subscribe(SENSOR, address=address, kind="contacts", timeout_s=START_S)
+
+    def __enter__(self) -> _Stream:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._frames.close()
+
+    def wait_for_reference(self) -> None:
+        """Wait for the first frame that has something to be measured against."""
+        for frame in self._frames:
+            if "no_reference" not in frame.flags:
+                return
+
+    def skip(self, seconds: float) -> None:
+        """Let frames pass."""
+        for _ in self._during(seconds):
+            pass
+
+    def measure(
+        self, scene: str, seconds: float, control: str, moves: Callable[[float], None] | None
+    ) -> Phase:
+        """Measure for `seconds`; `moves` is told after each frame what share has passed."""
+        import numpy as np
+        from tactomo_client import request
+
+        ages_ms: list[float] = []
+        tiers: dict[str, int] = {}
+        begin_s = time.monotonic()
+        for frame in self._during(seconds):
+            ages_ms.append(frame.age_s * 1e3)
+            tiers[str(frame.tier)] = tiers.get(str(frame.tier), 0) + 1
+            if moves is not None:
+                moves(min(1.0, (time.monotonic() - begin_s) / seconds))
+        passed_s = time.monotonic() - begin_s
+        p50, p99 = np.percentile(ages_ms, (50, 99)).tolist()
+        stages = request("status", control)["stage_ms"]
+        return Phase(scene, len(ages_ms), len(ages_ms) / passed_s, p50, p99, stages, tiers)
+
+    def _during(self, seconds: float) -> Iterator[Any]:
+        end_s = time.monotonic() + seconds
+        for frame in self._frames:
+            yield frame
+            if time.monotonic() >= end_s:
+                return
+
+
+def _measure_methods(name: str, tell: Callable[[str], None]) -> Iterator[MethodTime]:
+    """Time every tier on simulated scans of one to four contacts, in this process."""
+    import numpy as np
+    from tactomo_models import (
+        Reconstructor,
+        Reference,
+        SkinSimulator,
+        Tier,
+        load_description,
+        load_or_build_artifact,
+    )
+    from threadpoolctl import threadpool_limits
+
+    tell("methods: building the models")
+    description = load_description(name)
+    artifact = load_or_build_artifact(description)
+    skin = SkinSimulator(description)
+    noise = np.random.default_rng(0)
+    with threadpool_limits(1):
+        reconstructor = Reconstructor(description, artifact)
+        empty = _noisy(skin.voltages([]), noise, REFERENCE_SCANS)
+        reference = Reference.from_scans(empty.get("magnitude"), empty.get("structure"))
+        for tier in Tier:
+            for contacts in (0, 1, 2, 4) if tier is Tier.AUTO else (1, 4):
+                if tier is Tier.QUIET:
+                    contacts = 0 if contacts == 1 else contacts
+                    if contacts:
+                        continue
+                tell(f"methods: {tier}, {contacts} contact(s)")
+                presses = [_press(description, place) for place in PLACES[:contacts]]
+                scans = _noisy(skin.voltages(presses), noise, 12)
+                reconstructor.tier = tier
+                reconstructor.set_reference(reference)
+                yield _time_method(str(tier), contacts, reconstructor, scans)
+
+
+def _time_method(
+    method: str, contacts: int, reconstructor: Reconstructor, scans: dict[str, NDArray[np.float64]]
+) -> MethodTime:
+    import numpy as np
+
+    def times_ms(forget: bool) -> Any:
+        times = []
+        for number in range(len(next(iter(scans.values())))):
+            if forget:
+                reconstructor.reset()
+            begin_s = time.perf_counter()
+            reconstructor.reconstruct(
+                *(scans[name][number] if name in scans else None for name in MODALITIES)
+            )
+            times.append((time.perf_counter() - begin_s) * 1e3)
+        return np.percentile(times, (50, 99)).tolist()
+
+    times_ms(forget=False)  # load what is loaded on first use
+    cold, warm = times_ms(forget=True), times_ms(forget=False)
+    return MethodTime(method, contacts, *cold, *warm)
+
+
+MODALITIES = ("magnitude", "structure")
+
+
+def _noisy(
+    volts: dict[Any, NDArray[np.float64]], noise: np.random.Generator, count: int
+) -> dict[str, NDArray[np.float64]]:
+    """Return `count` noisy copies of each channel's voltages, (count, M)."""
+    scans = {}
+    for name, clean in volts.items():
+        size = NOISE_SHARE * abs(clean).max()
+        scans[str(name)] = clean + size * noise.standard_normal((count, len(clean)))
+    return scans
+
+
+def _spot(description: SensorDescription, place: tuple[float, float]) -> tuple[float, float]:
+    """Return the millimetres of a place that is given in shares of half the sheet's size."""
+    return place[0] * description.width_m * 500.0, place[1] * description.height_m * 500.0
+
+
+def _press(description: SensorDescription, place: tuple[float, float]) -> Any:
+    from tactomo_models import Press
+
+    x_mm, y_mm = _spot(description, place)
+    radius_m = 0.1 * description.width_m
+    return Press(x_m=x_mm * 1e-3, y_m=y_mm * 1e-3, pressure_kpa=180.0, radius_m=radius_m)
+
+
+def _print(results: Results) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    console.print(f"[bold]{results.machine}[/], sensor {results.description}")
+    if results.live:
+        table = Table(
+            title="live: last byte read to contacts in another process (twin, not hardware)"
+        )
+        for name in ("scene", "frames/s", "p50 ms", "p99 ms", "tiers", "reconstruct p50/p99 ms"):
+            table.add_column(name, justify="left" if name in ("scene", "tiers") else "right")
+        for phase in results.live:
+            stage = phase.stage_ms.get("reconstruct", {})
+            table.add_row(
+                phase.scene,
+                f"{phase.frames_per_s:.1f}",
+                f"{phase.latency_p50_ms:.1f}",
+                f"{phase.latency_p99_ms:.1f}",
+                ", ".join(f"{tier} {count}" for tier, count in phase.tiers.items()),
+                f"{stage.get('p50', float('nan')):.1f} / {stage.get('p99', float('nan')):.1f}",
+            )
+        console.print(table)
+        if results.late_scans is not None:
+            console.print(
+                f"late scans of the twin: {results.late_scans}; "
+                f"dual scans dropped by the daemon: {results.dropped_scans}"
+            )
+    if results.methods:
+        table = Table(title="one reconstruction, one thread")
+        for name in ("method", "contacts", "cold p50", "cold p99", "warm p50", "warm p99 (ms)"):
+            table.add_column(name, justify="right")
+        for row in results.methods:
+            times = (row.cold_p50_ms, row.cold_p99_ms, row.warm_p50_ms, row.warm_p99_ms)
+            table.add_row(row.method, str(row.contacts), *(f"{ms:.1f}" for ms in times))
+        console.print(table)
+
+
+def _machine() -> str:
+    """Return the processor, its cores that we may use, and the versions that matter."""
+    import numpy as np
+
+    model = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        names = [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
+        model = names[0].partition(": ")[2] if names else model
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return f"{model}, {cores} cores, Python {platform.python_version()}, NumPy {np.__version__}"
+
+
+class _sockets:  # noqa: N801 - reads as a statement
+    """A folder for sockets: addresses that nobody else has."""
+
+    def __enter__(self) -> Callable[[str], str]:
+        import tempfile
+
+        self._folder = tempfile.TemporaryDirectory(prefix="tactomo-")
+        return lambda name: f"ipc://{self._folder.name}/{name}"
+
+    def __exit__(self, *_: object) -> None:
+        self._folder.cleanup()
+
+
+def _family() -> Family:
+    from tactomo.cli.children import Family, interrupt_on_sigterm
+
+    interrupt_on_sigterm()
+    return Family()

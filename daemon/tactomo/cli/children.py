@@ -1,0 +1,249 @@
+"""Programs of ours that one command starts, watches and stops together.
+
+Each child is a `tactomo` command of its own process. It says on one line when it is ready, the last
+of what else it prints is kept for the case that it fails, and it ends when this process does (see
+`lifeline`).
+"""
+
+from __future__ import annotations
+
+import collections
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any, Self
+
+from tactomo.cli.lifeline import VARIABLE
+from tactomo.errors import TactomoError
+
+VIEWER_SAYS = "viewer: "
+KEPT_LINES = 12
+STOP_S = 2.0
+START_S = 180.0
+
+
+class ChildError(TactomoError):
+    """A child process ended by itself, or did not become ready."""
+
+    name = "child_failed"
+
+
+class Child:
+    """One running `tactomo` command.
+
+    Args:
+        name: what it is called in errors.
+        arguments: its command line, without the program's name.
+        ended: where it puts itself when it ends, for whoever waits for any child.
+        verbose: pass on what it prints.
+
+    """
+
+    def __init__(
+        self, name: str, arguments: list[str], ended: queue.SimpleQueue[Child], verbose: bool
+    ) -> None:
+        self.name = name
+        self._verbose = verbose
+        self._lines: collections.deque[str] = collections.deque(maxlen=KEPT_LINES)
+        self._ready: Mapping[str, Any] | None = None
+        self._changed = threading.Event()
+        self._ended = ended
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "tactomo.cli", *arguments],
+            stdin=subprocess.PIPE,  # the lifeline
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            env={**os.environ, VARIABLE: "stdin"},
+            start_new_session=True,  # Ctrl-C is for this process, which then stops them in order
+        )
+        self._reader = threading.Thread(target=self._read, name=f"output of {name}", daemon=True)
+        self._reader.start()
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the process has not ended."""
+        return self._process.poll() is None
+
+    @property
+    def is_lasting(self) -> bool:
+        """Whether it has said that it is ready, as programs do that are to keep running."""
+        return self._ready is not None
+
+    @property
+    def status(self) -> int:
+        """Exit status of the process; waits for its end."""
+        return self._process.wait()
+
+    def wait_ready(self) -> Mapping[str, Any]:
+        """Return what the child announced when it was ready.
+
+        Raises:
+            ChildError: it ended before, or takes too long.
+
+        """
+        if not self._changed.wait(START_S):
+            raise ChildError(f"the {self.name} was not ready after {START_S:g} s", self._told())
+        if self._ready is None:
+            raise self.failure()
+        return self._ready
+
+    def wait_done(self) -> None:
+        """Wait until a child that does one thing has done it.
+
+        Raises:
+            ChildError: it failed.
+
+        """
+        if self.status != 0:
+            self._reader.join()
+            raise self.failure()
+
+    def failure(self) -> ChildError:
+        """Return the error that says how the child ended and what it said last."""
+        return ChildError(f"the {self.name} stopped (exit status {self.status})", self._told())
+
+    def ask_to_stop(self) -> None:
+        """Send SIGTERM; does not wait."""
+        if self.is_running:
+            self._process.terminate()
+
+    def stop(self, deadline_s: float) -> None:
+        """Wait for the end until `deadline_s` (monotonic), then kill."""
+        try:
+            self._process.wait(max(0.0, deadline_s - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._reader.join()
+        for pipe in (self._process.stdin, self._process.stdout):
+            if pipe is not None:
+                pipe.close()
+
+    def _told(self) -> str:
+        return "it said last:\n  " + "\n  ".join(self._lines or ["(nothing)"])
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            ready = _announcement(line)
+            if ready is None:
+                self._tell(_readable(line))
+            else:
+                self._ready = ready
+                self._changed.set()
+        self._process.wait()
+        self._changed.set()
+        self._ended.put(self)
+
+    def _tell(self, line: str) -> None:
+        self._lines.append(line)
+        if self._verbose:
+            print(f"{self.name}: {line}", file=sys.stderr, flush=True)
+
+
+class Family:
+    """Children that are stopped together when the block ends, however it ends.
+
+    Args:
+        verbose: pass on what they print.
+
+    """
+
+    def __init__(self, verbose: bool = False) -> None:
+        self._verbose = verbose
+        self._children: list[Child] = []
+        self._ended: queue.SimpleQueue[Child] = queue.SimpleQueue()
+
+    def start(self, name: str, *arguments: str) -> Child:
+        """Start one child."""
+        self._children.append(Child(name, list(arguments), self._ended, self._verbose))
+        return self._children[-1]
+
+    def wait_for_an_end(self) -> Child:
+        """Wait until a child has ended that has not done what it was for, and return it."""
+        while (child := self._ended.get()).status == 0 and not child.is_lasting:
+            pass
+        return child
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        with no_interruption():
+            deadline_s = time.monotonic() + STOP_S
+            for child in reversed(self._children):
+                child.ask_to_stop()
+            for child in reversed(self._children):
+                child.stop(deadline_s)
+
+
+class no_interruption:  # noqa: N801 - reads as a statement
+    """A block during which Ctrl-C and SIGTERM are ignored: what stops everything must finish."""
+
+    def __enter__(self) -> None:
+        self._before = {
+            number: signal.signal(number, signal.SIG_IGN)
+            for number in (signal.SIGINT, signal.SIGTERM)
+        }
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+
+def interrupt_on_sigterm() -> None:
+    """Let SIGTERM unwind the main thread as Ctrl-C does."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, interrupt)
+
+
+def announce(addresses: Mapping[str, object]) -> None:
+    """Print the one line that tells other programs that this one is ready."""
+    print(json.dumps({"ready": True, **addresses}), flush=True)
+
+
+def _announcement(line: str) -> Mapping[str, Any] | None:
+    """Return what a line says if it says that a program is ready, otherwise None.
+
+    The twin announces itself, the daemon logs it, and the viewer, which is also served without
+    tactomo, prints its URL.
+    """
+    if line.startswith(VIEWER_SAYS):
+        return {"url": line.removeprefix(VIEWER_SAYS).strip()}
+    fields = _json(line)
+    return fields if fields.get("ready") is True or fields.get("event") == "ready" else None
+
+
+def _readable(line: str) -> str:
+    """Return a line of a JSON log as text, and any other line as it is."""
+    fields = _json(line)
+    if "event" not in fields:
+        return line.rstrip()
+    head = f"{fields.pop('level', 'info')}: {fields.pop('event')}"
+    fields.pop("timestamp", None)
+    return " ".join([head, *(f"{name}={value}" for name, value in fields.items())])
+
+
+def _json(line: str) -> dict[str, Any]:
+    try:
+        value = json.loads(line) if line.startswith("{") else {}
+    except ValueError:
+        value = {}
+    return value if isinstance(value, dict) else {}

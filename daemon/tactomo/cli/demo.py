@@ -1,0 +1,203 @@
+"""`tactomo demo`: a simulated skin, the daemon and the viewer, started and stopped together."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+import webbrowser
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tactomo.cli.app import (
+    DEFAULT_CONTROL,
+    DEFAULT_DESCRIPTION,
+    DEFAULT_NAME,
+    DEFAULT_STREAM,
+    DEFAULT_TWIN_CONTROL,
+    DEFAULT_VIEWER_PORT,
+    RUN,
+    Announce,
+    ControlAddress,
+    Description,
+    SensorName,
+    StreamAddress,
+    app,
+    examples,
+)
+
+if TYPE_CHECKING:
+    from tactomo.cli.children import Family
+
+
+@app.command(
+    rich_help_panel=RUN,
+    epilog=examples(
+        "tactomo demo",
+        "tactomo demo --scene deploy/scenes/two_fingers_merge.toml",
+        "tactomo demo --ports 1 --noise-uv 50",
+        "tactomo demo --replay grasp.mcap",
+    ),
+)
+def demo(
+    sensor: SensorName = DEFAULT_NAME,
+    description: Description = DEFAULT_DESCRIPTION,
+    ports: Annotated[
+        int, typer.Option(min=1, max=2, help="One line for both channels, or a line for each.")
+    ] = 2,
+    rate: Annotated[float, typer.Option(help="Dual scans a second.")] = 20.0,
+    scene: Annotated[
+        Path | None, typer.Option(help="A scripted scene (TOML) that presses by itself.")
+    ] = None,
+    noise_uv: Annotated[
+        float | None, typer.Option(min=0.0, help="Converter noise, µV rms.")
+    ] = None,
+    record: Annotated[Path | None, typer.Option(help="Record what the ports say.")] = None,
+    replay: Annotated[
+        Path | None, typer.Option(help="Show this recording instead of a simulated skin.")
+    ] = None,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port of the page; 0 takes a free one.")
+    ] = DEFAULT_VIEWER_PORT,
+    stream: StreamAddress = DEFAULT_STREAM,
+    control: ControlAddress = DEFAULT_CONTROL,
+    twin_control: Annotated[
+        str, typer.Option(help="Address of the twin's control socket.")
+    ] = DEFAULT_TWIN_CONTROL,
+    browser: Annotated[bool, typer.Option(help="Open the page, where there is a desktop.")] = True,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Show what the three programs log.")
+    ] = False,
+    announce: Announce = False,
+) -> None:
+    """Start a skin to press in the browser: simulated sensor, daemon and viewer in one command.
+
+    The first start builds the sensor's models, which takes a moment. Ctrl-C stops everything.
+    With tcp addresses of port 0 it takes free ports and prints them.
+    """
+    if replay is not None:
+        show_replay(
+            replay, sensor=None, stream=stream, control=control, viewer_port=port,
+            browser=browser, verbose=verbose, announce=announce,
+        )  # fmt: skip
+        return
+    twin_options = [
+        *("--description", description, "--ports", str(ports), "--rate", str(rate)),
+        *("--control", twin_control),
+        *_optional("--scene", scene),
+        *_optional("--noise-uv", noise_uv),
+    ]
+    daemon_options = [
+        *("--sensor", sensor, "--description", description),
+        *("--stream", stream, "--control", control),
+        *_optional("--record", record),
+    ]
+    with tempfile.TemporaryDirectory(prefix="tactomo-") as folder, _family(verbose) as family:
+        # On a first start the daemon's models take as long to build as the twin's: do both at once.
+        builder = family.start("models build", "models", "build", "--description", description)
+        skin = family.start("twin", "twin", "--link", folder, "--announce", *twin_options)
+        simulated = skin.wait_ready()
+        builder.wait_done()
+        lines = [word for path in simulated["ports"] for word in ("--port", path)]
+        daemon = family.start("daemon", "daemon", *daemon_options, *lines)
+        addresses = {"twin": simulated["control"], **daemon.wait_ready()}
+        _show(family, addresses, port, browser, announce)
+
+
+def show_replay(
+    recording: Path,
+    speed: str = "1.0",
+    sensor: str | None = None,
+    description: str | None = None,
+    stream: str = DEFAULT_STREAM,
+    control: str = DEFAULT_CONTROL,
+    viewer_port: int = DEFAULT_VIEWER_PORT,
+    browser: bool = True,
+    verbose: bool = False,
+    announce: bool = False,
+) -> None:
+    """Play a recording through a daemon and show it in the viewer until Ctrl-C."""
+    from tactomo.recording import open_recording
+
+    name = sensor or open_recording(recording).summary.origin.sensor or DEFAULT_NAME
+    with _family(verbose) as family:
+        daemon = family.start(
+            *("replay", "replay", str(recording), "--speed", speed, "--sensor", name),
+            *("--stream", stream, "--control", control, "--stay"),
+            *_optional("--description", description),
+        )
+        _show(family, daemon.wait_ready(), viewer_port, browser, announce)
+
+
+def _show(
+    family: Family, addresses: Mapping[str, Any], port: int, browser: bool, announce: bool
+) -> None:
+    """Start the viewer, tell the user where everything is, and stay until something ends."""
+    viewer = family.start(
+        *("viewer", "viewer", "--port", str(port), "--sensor", addresses["sensor"]),
+        *("--stream", addresses["stream"], "--control", addresses["control"]),
+        *_optional("--twin", addresses.get("twin")),
+    )
+    from tactomo.cli.children import announce as tell
+
+    addresses = {**addresses, "viewer": viewer.wait_ready()["url"]}
+    if announce:
+        tell(addresses)
+    else:
+        _print_box(addresses)
+    if browser and _has_desktop():
+        webbrowser.open(addresses["viewer"])
+    try:
+        raise family.wait_for_an_end().failure()
+    except KeyboardInterrupt:
+        print("stopping", file=sys.stderr)
+
+
+def _print_box(addresses: Mapping[str, Any]) -> None:
+    from rich.console import Console
+    from rich.panel import Panel
+
+    name = addresses["sensor"]
+    at_control = _flag("--control", addresses["control"], DEFAULT_CONTROL)
+    at_stream = _flag("--stream", addresses["stream"], DEFAULT_STREAM)
+    named = _flag("--sensor", name, DEFAULT_NAME)
+    lines = [f"open      [bold link={addresses['viewer']}]{addresses['viewer']}[/]"]
+    if "twin" in addresses:
+        at_twin = _flag("--control", addresses["twin"], DEFAULT_TWIN_CONTROL)
+        lines += [
+            "          and press the skin there with the mouse",
+            f"press     tactomo poke press x_mm=10 y_mm=-20{at_twin}",
+        ]
+    lines += [
+        f"watch     tactomo watch{named}{at_stream}",
+        f"health    tactomo status{at_control}",
+        f"tare      tactomo tare{at_control}",
+        f"record    tactomo record press.mcap --seconds 10{at_control}",
+        f'Python    for frame in tactomo_client.subscribe("{name}"): print(frame.contacts)',
+        "",
+        "Ctrl-C stops everything",
+    ]
+    Console().print(Panel("\n".join(lines), title=f"tactomo: {name} is running", expand=False))
+
+
+def _flag(name: str, value: str, default: str) -> str:
+    return "" if value == default else f" {name} {value}"
+
+
+def _optional(name: str, value: object) -> list[str]:
+    return [] if value is None else [name, str(value)]
+
+
+def _has_desktop() -> bool:
+    has_display = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+    return sys.stdout.isatty() and (has_display or sys.platform == "darwin")
+
+
+def _family(verbose: bool) -> Family:
+    from tactomo.cli.children import Family, interrupt_on_sigterm
+
+    interrupt_on_sigterm()
+    return Family(verbose)

@@ -1,0 +1,22 @@
+"""Which errors are the user's to mend, and how they are told: cause and next step, no traceback."""
+
+from __future__ import annotations
+
+import sys
+
+
+def explain(error: BaseException) -> str | None:
+    """Return what to tell the user about an error, or None if it is a mistake of ours.
+
+    Every package of ours has one class from which its deliberate errors derive. Only packages that
+    are loaded already can have raised one, so none is imported to find out.
+    """
+    for module, name in (
+        ("tactomo.errors", "TactomoError"),
+        ("tactomo_client.errors", "ClientError"),
+        ("tactomo_models.errors", "ModelError"),
+    ):
+        kind = getattr(sys.modules.get(module), name, None)
+        if kind is not None and isinstance(error, kind):
+            return str(error)
+    return None

@@ -1,0 +1,239 @@
+"""`tactomo info`, `import` and `reconstruct`: what can be done with files alone."""
+
+from __future__ import annotations
+
+import json
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from tactomo.cli.app import DEFAULT_DESCRIPTION, FILES, JsonOutput, app, examples
+
+if TYPE_CHECKING:
+    from tactomo_models import SensorDescription
+
+    from tactomo.recording import Recording
+
+DescriptionOption = Annotated[
+    str,
+    typer.Option(
+        "--sensor",
+        "--description",
+        "-d",
+        help="What the sensor is made of: a shipped name or a TOML file.",
+    ),
+]
+
+
+@app.command(
+    rich_help_panel=FILES,
+    epilog=examples("tactomo info grasp.mcap", "tactomo info paper_square", "tactomo info my.toml"),
+)
+def info(
+    what: Annotated[
+        str,
+        typer.Argument(
+            help="A recording (.mcap), a built artifact (.npz), or a sensor description: a shipped "
+            "name or a TOML file."
+        ),
+    ],
+    as_json: JsonOutput = False,
+) -> None:
+    """Describe a recording, a built artifact or a sensor description."""
+    facts = _facts(what)
+    if as_json:
+        typer.echo(json.dumps(facts, indent=2))
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=what, show_header=False)
+    for name, value in facts.items():
+        table.add_row(f"[bold]{name}[/]", _words(value))
+    Console().print(table)
+
+
+def _facts(what: str) -> dict[str, Any]:
+    suffix = Path(what).suffix.lower()
+    if suffix == ".mcap":
+        from tactomo.recording import open_recording
+
+        return _recording_facts(open_recording(what))
+    if suffix == ".npz":
+        from tactomo_models import Artifact
+
+        return _artifact_facts(Artifact.load(Path(what)))
+    from tactomo_models import load_description
+
+    return _description_facts(load_description(what))
+
+
+def _recording_facts(recording: Recording) -> dict[str, Any]:
+    summary = recording.summary
+    return {
+        "sensor": summary.origin.sensor,
+        "description": summary.origin.description,
+        "began": datetime.fromtimestamp(summary.start_ns * 1e-9).isoformat(" ", "seconds"),
+        "seconds": round(summary.duration_s, 3),
+        "bytes": summary.file_bytes,
+        "complete": summary.is_complete,
+        "ports": {
+            url: f"{summary.port_bytes.get(number, 0)} bytes"
+            for number, url in enumerate(summary.origin.ports)
+        },
+        "scans": {channel.name.lower(): count for channel, count in summary.scans.items()},
+        "devices": [f"{hello.device_id}, {hello.firmware}" for hello in summary.hellos],
+        "corrupt packets": summary.corrupt,
+        "reconstructed frames": summary.frames,
+        "references": summary.references,
+        "recorded by": f"tactomo {summary.origin.version}",
+    }
+
+
+def _description_facts(description: SensorDescription) -> dict[str, Any]:
+    sheet = description.sheet
+    magnitude = description.magnitude
+    return {
+        "name": description.name,
+        "title": description.title,
+        "sheet": f"{sheet.shape}, {sheet.width_m * 1e3:g} x {description.height_m * 1e3:g} mm",
+        "electrodes": description.electrode_count,
+        "voltages a scan": description.measurements,
+        "pattern": f"drive (k, k+{description.pattern.drive_offset}), "
+        f"measure (m, m+{description.pattern.measure_offset})",
+        "channels": ", ".join(description.modalities),
+        "map": f"{description.map.nodes_x} x {description.map.nodes_y} nodes",
+        "answers to": "no pressure calibration"
+        if magnitude is None
+        else f"{magnitude.response.pressure_kpa[-1]:g} kPa at most",
+        "sha256 of its physics": description.sha256,
+    }
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, dict):
+        return "\n".join(f"{name}: {each}" for name, each in value.items()) or "none"
+    if isinstance(value, list):
+        return "\n".join(str(each) for each in value) or "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no, it was cut off"
+    return str(value)
+
+
+@app.command(
+    "import",
+    rich_help_panel=FILES,
+    epilog=examples(
+        "tactomo import tank.npz tank.mcap --sensor tank_disc --reference-frames 0:20",
+        "tactomo import presses.npz presses.mcap --rate 20",
+    ),
+)
+def import_scans(
+    scans: Annotated[Path, typer.Argument(metavar="IN.npz", help="Scans, see above.")],
+    recording: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="The recording to write.")],
+    sensor: DescriptionOption = DEFAULT_DESCRIPTION,
+    channel: Annotated[
+        Literal["magnitude", "structure"] | None,
+        typer.Option(help="Which channel single-ended volts are. [the sensor's only one]"),
+    ] = None,
+    reference_frames: Annotated[
+        str | None,
+        typer.Option(metavar="FIRST:END", help="Unloaded frames to be the reference, from 0."),
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option(min=0.01, help="Scans a second. [the file's own times, t]")
+    ] = None,
+    name: Annotated[str, typer.Option("--name", help="The sensor's name in the stream.")] = "skin",
+) -> None:
+    """Turn measured scans (.npz) into a recording that replays through the daemon.
+
+    Reads the layout of `tactomo reconstruct` (magnitude, structure and their references), and
+    single-ended readings as EIT instruments save them: `volts` (T, injections, electrodes) with
+    `injection` (injections, 2) and `t`. Those become differences of neighbouring electrodes in the
+    description's order; of complex volts the real part counts.
+    """
+    from rich.progress import track
+    from tactomo_models import load_description
+    from tactomo_protocol import Channel
+
+    from tactomo.cli.imported import read_scans
+    from tactomo.recorder import write_recording
+
+    reference = _frames(reference_frames)
+    description = load_description(sensor)
+    known = None if channel is None else Channel[channel.upper()]
+    read = read_scans(scans, description, known)
+    times_s = read.times(rate)
+    mean_rate_hz = (len(times_s) - 1) / times_s[-1] if times_s[-1] > 0 else 0.0
+    total = read.count * len(read.volts)
+    length = write_recording(
+        recording,
+        read.hello(description, float(mean_rate_hz)),
+        track(read.packets(times_s), "importing", total, transient=True),
+        sensor=name,
+        description=_portable(sensor),
+        description_sha256=description.sha256,
+        reference=read.reference_of(reference),
+    )
+    for note in read.notes:
+        typer.echo(note)
+    typer.echo(
+        f"{recording}: {read.count} scans in {times_s[-1]:.1f} s "
+        f"({mean_rate_hz:.1f}/s), {length / 1e6:.2f} MB"
+    )
+
+
+def _portable(description: str) -> str:
+    """Return a description's name as it is, and its path made absolute."""
+    path = Path(description)
+    return str(path.absolute()) if path.exists() else description
+
+
+def _frames(text: str | None) -> slice | None:
+    """Return the slice that "0:20" means."""
+    if text is None:
+        return None
+    first, colon, end = text.partition(":")
+    try:
+        if not colon:
+            raise ValueError
+        frames = slice(int(first or 0), int(end) if end else None)
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is not FIRST:END, such as 0:20") from None
+    return frames
+
+
+@app.command(
+    rich_help_panel=FILES,
+    epilog=examples(
+        "tactomo reconstruct scans.npz maps.npz",
+        "tactomo reconstruct scans.npz maps.npz --method tikhonov --sensor my_skin.toml",
+    ),
+)
+def reconstruct(
+    scans: Annotated[Path, typer.Argument(metavar="IN.npz", help="Scans and references.")],
+    maps: Annotated[Path, typer.Argument(metavar="OUT.npz", help="The file to write.")],
+    method: Annotated[str, typer.Option(help="auto, or one method for every frame.")] = "auto",
+    sensor: DescriptionOption = DEFAULT_DESCRIPTION,
+) -> None:
+    """Reconstruct a file of scans, without a daemon.
+
+    IN holds `magnitude` and `structure` (T, M) volts and `magnitude_reference`,
+    `structure_reference` (M,); structure may be missing. OUT gets `map` (T, ny, nx), the relative
+    conductivity change; `structure` (T, ny, nx) from 0 to 1; `misfit`, `flags` and `seconds` (T,);
+    and the contacts as flat arrays `contact_frame`, `contact_x_mm`, `contact_y_mm`,
+    `contact_area_mm2`, `contact_magnitude`, `contact_sigma`.
+    """
+    from rich.progress import Progress
+    from tactomo_models.batch import reconstruct_file
+
+    with Progress(transient=True) as progress:
+        task = progress.add_task("reconstructing", total=None)
+
+        def show(done: int, total: int) -> None:
+            progress.update(task, completed=done, total=total)
+
+        reconstruct_file(scans, maps, method=method, description=sensor, progress=show)
+    typer.echo(f"wrote {maps}")

@@ -1,0 +1,263 @@
+"""Scans from .npz files of other programs, as volts in the order of a sensor description.
+
+Two layouts are read, told apart by their arrays:
+
+batch
+    what `tactomo reconstruct` takes: `magnitude` and/or `structure` (T, M) volts in the
+    description's order; optionally `magnitude_reference`, `structure_reference` (M,) and `t` (T,)
+    seconds. A frame that is all NaN is a scan that did not arrive.
+
+single-ended
+    what impedance tomography instruments save: `volts` (T, injections, electrodes), complex or
+    real, each electrode against ground; `injection` (injections, 2), source and sink, numbered
+    from 0 or from 1; optionally `t` (T,) seconds.
+
+A single-ended scan becomes differences V(m) - V(m + offset), and of complex volts the *real part*
+is taken. The field's own unit is the volt in phase with the current; in a mostly resistive body the
+quadrature part comes from stray capacitance and adds noise but no contrast, and a modulus would
+lose the sign. The share that is left out is told, so that a file whose phase was never calibrated
+does not pass unnoticed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+from tactomo_models import Reference, SensorDescription
+from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag
+
+from tactomo.errors import TactomoError
+
+FloatArray = NDArray[np.float64]
+# Share of the quadrature part above which the real part is not the whole story.
+MAX_QUADRATURE = 0.3
+
+
+class ImportFileError(TactomoError):
+    """A file whose scans cannot be imported."""
+
+    name = "cannot_import"
+
+
+@dataclass(frozen=True)
+class Scans:
+    """Scans of one sensor.
+
+    Attributes:
+        volts: (T, M) volts of each channel there is, in the description's order.
+        time_s: (T,) seconds, rising, from 0; None where the file does not say.
+        reference: (M,) volts of each channel whose unloaded scan the file holds.
+        notes: what a user should know about how the file was read.
+
+    """
+
+    volts: Mapping[Channel, FloatArray]
+    time_s: FloatArray | None
+    reference: Mapping[Channel, FloatArray] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def count(self) -> int:
+        """Number of dual scans, T."""
+        return len(next(iter(self.volts.values())))
+
+    def times(self, rate_hz: float | None) -> FloatArray:
+        """Return when each scan was taken, (T,) seconds from 0: by rate, or the file's own.
+
+        Raises:
+            ImportFileError: neither is known.
+
+        """
+        if rate_hz is not None:
+            return np.arange(self.count) / rate_hz
+        if self.time_s is None:
+            raise ImportFileError("the file does not say when its scans were taken", "give --rate")
+        return self.time_s
+
+    def reference_of(self, frames: slice | None) -> Reference | None:
+        """Return the mean of `frames` as the reference, or else the file's own, or None."""
+        if frames is not None:
+            chosen = {name: self._chosen(channel, frames) for name, channel in _CHANNELS.items()}
+            return Reference.from_scans(**chosen)
+        if not self.reference:
+            return None
+        own = {name: self.reference.get(channel) for name, channel in _CHANNELS.items()}
+        return Reference(**own, magnitude_noise=None, structure_noise=None, scans=1)
+
+    def _chosen(self, channel: Channel, frames: slice) -> FloatArray | None:
+        volts = self.volts.get(channel)
+        if volts is None:
+            return None
+        if len(volts[frames]) < 2:
+            raise ImportFileError(
+                f"the reference frames are {len(volts[frames])} of the {len(volts)} scans",
+                "give at least two, such as --reference-frames 0:20",
+            )
+        return volts[frames]
+
+    def packets(self, times_s: FloatArray) -> Iterator[tuple[float, Scan]]:
+        """Yield every scan with its time in seconds, as the device would have sent it."""
+        for counter, time_s in enumerate(times_s):
+            for channel, volts in self.volts.items():
+                if not np.all(np.isnan(volts[counter])):
+                    yield (
+                        float(time_s),
+                        Scan(
+                            channel=channel,
+                            counter=counter,
+                            device_us=round(float(time_s) * 1e6),
+                            flags=ScanFlag(0),
+                            samples=volts[counter].astype(np.float32),
+                        ),
+                    )
+
+    def hello(self, description: SensorDescription, rate_hz: float) -> Hello:
+        """Return what the device that took these scans would have said of itself."""
+        return Hello(
+            device_id="import",
+            firmware="tactomo import",
+            channels=tuple(sorted(self.volts)),
+            electrodes=description.electrode_count,
+            drive_offset=description.pattern.drive_offset,
+            measure_offset=description.pattern.measure_offset,
+            samples_per_scan=description.measurements,
+            sample_format=SampleFormat.FLOAT32,
+            volts_per_count=1.0,
+            scan_rate_hz=rate_hz,
+        )
+
+
+_CHANNELS = {channel.name.lower(): channel for channel in Channel}
+
+
+def read_scans(path: Path, description: SensorDescription, channel: Channel | None) -> Scans:
+    """Read the scans in an .npz file.
+
+    Args:
+        path: the file.
+        description: the sensor, whose pattern the voltages follow.
+        channel: which channel a file of one channel holds; None for the sensor's only one.
+
+    Raises:
+        ImportFileError: the file is neither layout, or does not fit the sensor.
+
+    """
+    arrays = _load(path)
+    if "volts" in arrays and "injection" in arrays:
+        return _single_ended(path, arrays, description, channel or _only_channel(description))
+    if any(name in arrays for name in _CHANNELS):
+        return _batch(path, arrays, description)
+    raise ImportFileError(
+        f"{path} holds {', '.join(arrays) or 'nothing'}",
+        "it must hold `magnitude` and/or `structure` (T, M), or `volts` (T, injections, "
+        "electrodes) and `injection` (injections, 2)",
+    )
+
+
+def _load(path: Path) -> dict[str, NDArray[Any]]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except OSError as error:
+        raise ImportFileError(
+            f"cannot read {path}: {error.strerror or error}", "give the path of an .npz file"
+        ) from error
+    except (ValueError, BadZipFile, AttributeError) as error:  # text, .npy, pickled objects
+        raise ImportFileError(f"{path} is not an .npz file of numbers", "save it anew") from error
+
+
+def _only_channel(description: SensorDescription) -> Channel:
+    if len(description.modalities) != 1:
+        raise ImportFileError(
+            f"{description.name} has two channels and the file does not say which this is",
+            "give --channel magnitude or --channel structure",
+        )
+    return _CHANNELS[description.modalities[0]]
+
+
+def _batch(path: Path, arrays: dict[str, NDArray[Any]], description: SensorDescription) -> Scans:
+    volts: dict[Channel, FloatArray] = {}
+    reference: dict[Channel, FloatArray] = {}
+    for name, channel in _CHANNELS.items():
+        if name in arrays and not np.all(np.isnan(arrays[name])):
+            volts[channel] = _checked(path, name, arrays[name], (-1, description.measurements))
+            key = f"{name}_reference"
+            if key in arrays:
+                reference[channel] = _checked(path, key, arrays[key], (description.measurements,))
+    if len({len(each) for each in volts.values()}) != 1:
+        raise ImportFileError(f"{path}: magnitude and structure differ in length", "cut the longer")
+    if any(name.lower() not in description.modalities for name in (c.name for c in volts)):
+        raise ImportFileError(
+            f"{path} holds a channel that {description.name} does not have",
+            "give another description with --sensor",
+        )
+    return Scans(volts, _times(path, arrays, len(next(iter(volts.values())))), reference)
+
+
+def _single_ended(
+    path: Path, arrays: dict[str, NDArray[Any]], description: SensorDescription, channel: Channel
+) -> Scans:
+    injection = _checked(path, "injection", arrays["injection"], (-1, 2)).astype(int)
+    electrodes = description.electrode_count
+    raw = arrays["volts"]
+    if raw.shape[1:] != (len(injection), electrodes) or raw.dtype.kind not in "fciu":
+        raise ImportFileError(
+            f"{path}: volts is {raw.dtype} {raw.shape}",
+            f"it must be numbers (T, {len(injection)}, {electrodes}) for {description.name}",
+        )
+    rows, signs = _injection_rows(path, injection - injection.min(), description)
+    plus, minus = description.pairs.measure.T
+    differences = signs * (raw[:, rows, plus] - raw[:, rows, minus])
+    quadrature = float(np.linalg.norm(differences.imag) / np.linalg.norm(differences))
+    notes = () if raw.dtype.kind != "c" else (f"real part taken; {quadrature:.0%} is quadrature",)
+    if quadrature > MAX_QUADRATURE:
+        raise ImportFileError(
+            f"{path}: {quadrature:.0%} of the signal is out of phase with the current",
+            "multiply volts by the phase factor of a resistor's reading, then import again",
+        )
+    volts = np.asarray(differences.real, dtype=np.float64)
+    return Scans({channel: volts}, _times(path, arrays, len(raw)), notes=notes)
+
+
+def _injection_rows(
+    path: Path, injection: NDArray[np.int_], description: SensorDescription
+) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+    """Return, for each voltage, its row in the file and the sign of the current there."""
+    where = {(sink, source): (row, -1) for row, (source, sink) in enumerate(injection.tolist())}
+    where |= {(source, sink): (row, 1) for row, (source, sink) in enumerate(injection.tolist())}
+    wanted = [tuple(pair) for pair in description.pairs.drive.tolist()]
+    missing = sorted(set(wanted) - where.keys())
+    if missing:
+        raise ImportFileError(
+            f"{path} has no injection {missing[0]}, which the pattern of {description.name} needs",
+            "give the description of the sensor that was measured with --sensor",
+        )
+    rows, signs = np.array([where[pair] for pair in wanted]).T
+    return rows, signs
+
+
+def _times(path: Path, arrays: dict[str, NDArray[Any]], count: int) -> FloatArray | None:
+    if "t" not in arrays:
+        return None
+    time_s = _checked(path, "t", arrays["t"], (count,))
+    if np.any(np.diff(time_s) < 0):
+        raise ImportFileError(f"{path}: t does not rise", "sort the frames, or give --rate")
+    return np.asarray(time_s - time_s[0])
+
+
+def _checked(path: Path, name: str, array: NDArray[Any], shape: tuple[int, ...]) -> FloatArray:
+    fits = array.ndim == len(shape) and all(
+        wanted in (-1, actual) for wanted, actual in zip(shape, array.shape, strict=True)
+    )
+    if not fits or array.dtype.kind not in "fiu" or array.size == 0:
+        wanted = str(shape).replace("-1", "T")
+        raise ImportFileError(
+            f"{path}: {name} is {array.dtype} {array.shape}", f"it must be real numbers {wanted}"
+        )
+    return array.astype(np.float64)

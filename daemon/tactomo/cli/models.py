@@ -1,0 +1,57 @@
+"""`tactomo models`: build what a sensor's reconstruction needs, ahead of time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tactomo.cli.app import BUILD, DEFAULT_DESCRIPTION, app, examples
+from tactomo.cli.files import DescriptionOption
+
+models_app = typer.Typer(
+    help="Build and list the models of sensors.",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+)
+app.add_typer(models_app, name="models", rich_help_panel=BUILD)
+
+
+@models_app.command(
+    epilog=examples(
+        "tactomo models build",
+        "tactomo models build --sensor my_skin.toml",
+        "tactomo models build --sensor my_skin.toml --output my_skin.npz",
+    ),
+)
+def build(
+    sensor: DescriptionOption = DEFAULT_DESCRIPTION,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="[the cache, where the daemon looks]")
+    ] = None,
+) -> None:
+    """Build the models of a sensor description: forward model, Jacobian, Tikhonov matrix.
+
+    The daemon does this by itself when they are missing; building ahead spares its first start.
+    They are bound to the description by a hash: after a change of geometry, build again.
+    """
+    from tactomo_models import load_description, load_or_build_artifact
+
+    description = load_description(sensor)
+    from rich.console import Console
+
+    with Console(stderr=True).status(f"building the models of {description.name}"):
+        artifact = load_or_build_artifact(description, path=output)
+    typer.echo(f"{description.name}: models ready ({artifact})")
+
+
+@models_app.command(name="list")
+def list_sensors() -> None:
+    """List the sensor descriptions that come with tactomo."""
+    from tactomo_models import load_description
+    from tactomo_models.description import shipped_descriptions
+
+    for name in shipped_descriptions():
+        typer.echo(f"{name}  {load_description(name).title}")

@@ -1,0 +1,322 @@
+"""`tactomo daemon`, `twin`, `viewer` and `replay`: the programs that keep running."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from tactomo.cli.app import (
+    DEFAULT_CONTROL,
+    DEFAULT_DESCRIPTION,
+    DEFAULT_NAME,
+    DEFAULT_STREAM,
+    DEFAULT_TWIN_CONTROL,
+    DEFAULT_VIEWER_PORT,
+    FILES,
+    RUN,
+    Announce,
+    ControlAddress,
+    Description,
+    RecordingFile,
+    SensorName,
+    StreamAddress,
+    app,
+    examples,
+)
+
+if TYPE_CHECKING:
+    from tactomo.config import DaemonConfig
+
+TierName = Literal["auto", "quiet", "tikhonov", "levelset"]
+LogLevel = Literal["debug", "info", "warning", "error"]
+LogFormat = Literal["auto", "text", "json"]
+
+
+@app.command(
+    rich_help_panel=RUN,
+    epilog=examples(
+        "tactomo daemon --port /dev/ttyACM0",
+        "tactomo daemon --sensor left_forearm --port /dev/ttyACM0 --port /dev/ttyACM1",
+        "tactomo daemon /etc/tactomo/left_forearm.toml --tier tikhonov",
+    ),
+)
+def daemon(
+    config: Annotated[
+        Path | None, typer.Argument(help="Configuration (TOML); flags win over it.")
+    ] = None,
+    sensor: Annotated[
+        str | None, typer.Option("--sensor", "-s", help="The sensor's name in the stream. [skin]")
+    ] = None,
+    description: Annotated[
+        str | None,
+        typer.Option(
+            "--description", "-d", help="A shipped sensor's name or a TOML file. [paper_square]"
+        ),
+    ] = None,
+    port: Annotated[
+        list[str] | None,
+        typer.Option("--port", "-p", help="Serial device or pyserial URL; twice for two boards."),
+    ] = None,
+    baud: Annotated[
+        int | None, typer.Option(help="Of a real UART; USB takes any. [921600]")
+    ] = None,
+    stream: Annotated[
+        str | None, typer.Option(help=f"Where to publish. [{DEFAULT_STREAM}]")
+    ] = None,
+    control: Annotated[
+        str | None, typer.Option(help=f"Where to take commands. [{DEFAULT_CONTROL}]")
+    ] = None,
+    tier: Annotated[
+        TierName | None, typer.Option(help="How much model a frame gets. [auto]")
+    ] = None,
+    budget_ms: Annotated[
+        float | None, typer.Option(help="Time that one reconstruction may take. [the tier's own]")
+    ] = None,
+    tare_scans: Annotated[
+        int | None, typer.Option(help="Dual scans averaged into the reference. [20]")
+    ] = None,
+    sync_wait_ms: Annotated[
+        float | None, typer.Option(help="How long one channel waits for the other. [30]")
+    ] = None,
+    lossless: Annotated[
+        bool, typer.Option("--lossless", help="Reconstruct every dual scan, however late.")
+    ] = False,
+    record: Annotated[Path | None, typer.Option(help="Record to this file from the start.")] = None,
+    record_maps: Annotated[
+        bool, typer.Option("--record-maps", help="Put maps and contacts into recordings, too.")
+    ] = False,
+    exit_at_end: Annotated[
+        bool, typer.Option("--exit-at-end", help="Stop when every replayed port has ended.")
+    ] = False,
+    log_level: Annotated[
+        LogLevel | None, typer.Option(help="The least severe that is logged. [info]")
+    ] = None,
+    log_format: Annotated[
+        LogFormat | None,
+        typer.Option(help="[auto: text on a terminal, one JSON object a line elsewhere]"),
+    ] = None,
+) -> None:
+    """Read a skin's ports, reconstruct, and publish maps and contacts until stopped.
+
+    At the start the skin must be free for a second: the first scans become the reference that
+    changes are measured against. `tactomo tare` takes a new one at any time.
+    """
+    from tactomo.config import load_config
+
+    settings = load_config(
+        config,
+        name=sensor,
+        description=description,
+        ports=tuple(port) if port else None,
+        baud=baud,
+        stream=stream,
+        control=control,
+        tier=tier,
+        budget_ms=budget_ms,
+        tare_scans=tare_scans,
+        sync_wait_ms=sync_wait_ms,
+        lossless=lossless or None,
+        record=record,
+        record_maps=record_maps or None,
+        exit_at_end=exit_at_end or None,
+        log_level=log_level,
+        log_format=log_format,
+    )
+    raise typer.Exit(_run_daemon(settings))
+
+
+@app.command(
+    rich_help_panel=RUN,
+    epilog=examples(
+        "tactomo twin --link /tmp/skin",
+        "tactomo twin --ports 1 --scene deploy/scenes/sliding_finger.toml",
+        "tactomo poke press x_mm=10 y_mm=-20",
+    ),
+)
+def twin(
+    description: Description = DEFAULT_DESCRIPTION,
+    ports: Annotated[
+        int, typer.Option(min=1, max=2, help="One line for both channels, or a line for each.")
+    ] = 2,
+    rate: Annotated[float, typer.Option(help="Dual scans a second.")] = 20.0,
+    scene: Annotated[
+        Path | None,
+        typer.Option(help="A scripted scene (TOML); starts with the first scan that is received."),
+    ] = None,
+    link: Annotated[
+        Path | None,
+        typer.Option(help="Folder for links with stable names: magnitude and structure, or skin."),
+    ] = None,
+    noise_uv: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="Converter noise, µV rms. [a 94 dB converter's]"),
+    ] = None,
+    drift: Annotated[
+        float, typer.Option(min=0.0, help="Random walk of the gains: relative rms after 1 s.")
+    ] = 2e-6,
+    creep: Annotated[
+        float, typer.Option(help="Relative change of the gains over the first minutes.")
+    ] = 2e-5,
+    unevenness: Annotated[
+        float, typer.Option(min=0.0, max=0.5, help="Of the sheet's conductivity; 0.05 is 5 %.")
+    ] = 0.0,
+    seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal noise and drift.")] = 0,
+    control: Annotated[
+        str, typer.Option("--control", help="Where to take presses and faults.")
+    ] = DEFAULT_TWIN_CONTROL,
+    announce: Announce = False,
+) -> None:
+    """Simulate a skin behind simulated firmware, on real pseudo-terminals, until stopped.
+
+    It speaks the same wire protocol as a real device, so a daemon (or your own program) opens its
+    ports as it would open /dev/ttyACM0. `tactomo poke` presses and disturbs it while it runs:
+    press, release, mute a channel, send garbage, unplug and replug.
+    """
+    from tactomo_models import SkinSimulator, load_description
+
+    from tactomo.cli.children import announce as tell
+    from tactomo.cli.children import interrupt_on_sigterm
+    from tactomo.twin import Drift, Twin, TwinConfig, load_scene
+
+    interrupt_on_sigterm()
+    sensor = load_description(description)
+    config = TwinConfig(
+        sensor,
+        ports=ports,
+        rate_hz=rate,
+        noise_v=None if noise_uv is None else noise_uv * 1e-6,
+        drift=Drift(walk=drift, creep=creep),
+        seed=seed,
+        scene=None if scene is None else load_scene(scene),
+        control=control,
+        link_folder=link,
+    )
+    running = Twin(config, SkinSimulator(sensor, unevenness=unevenness, seed=seed))
+    running.start()
+    try:
+        for path in running.ports:
+            typer.echo(f"port     {path}")
+        typer.echo(f"control  {running.control}")
+        if announce:
+            tell({"ports": running.ports, "control": running.control})
+        running.wait()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        running.stop()
+
+
+@app.command(
+    rich_help_panel=RUN,
+    epilog=examples(
+        "tactomo viewer --sensor left_forearm",
+        "tactomo viewer --twin tcp://127.0.0.1:5562",
+        "ssh -L 8750:127.0.0.1:8750 robot tactomo viewer",
+    ),
+)
+def viewer(
+    sensor: SensorName = DEFAULT_NAME,
+    stream: StreamAddress = DEFAULT_STREAM,
+    control: ControlAddress = DEFAULT_CONTROL,
+    twin: Annotated[
+        str | None, typer.Option(help="The twin's control socket, to press the skin by mouse.")
+    ] = None,
+    host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port of the page; 0 takes a free one.")
+    ] = DEFAULT_VIEWER_PORT,
+) -> None:
+    """Serve a web page that shows the maps and contacts of a running daemon."""
+    from tactomo_viewer import serve
+
+    serve(sensor, stream=stream, control=control, twin=twin, host=host, port=port)
+
+
+@app.command(
+    rich_help_panel=FILES,
+    epilog=examples(
+        "tactomo replay grasp.mcap --viewer",
+        "tactomo replay grasp.mcap --speed 0.25",
+        "tactomo replay grasp.mcap --speed max",
+    ),
+)
+def replay(
+    recording: RecordingFile,
+    speed: Annotated[
+        str, typer.Option(help="Factor of the recorded speed, or max: as fast as reconstructed.")
+    ] = "1.0",
+    with_viewer: Annotated[
+        bool, typer.Option("--viewer", help="Serve the viewer, too, and stay at the end.")
+    ] = False,
+    sensor: Annotated[
+        str | None, typer.Option("--sensor", "-s", help="Name in the stream. [the recorded one]")
+    ] = None,
+    description: Annotated[
+        str | None, typer.Option("--description", "-d", help="[the recorded one]")
+    ] = None,
+    tier: Annotated[TierName, typer.Option(help="How much model a frame gets.")] = "auto",
+    stream: StreamAddress = DEFAULT_STREAM,
+    control: ControlAddress = DEFAULT_CONTROL,
+    viewer_port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port of the viewer's page.")
+    ] = DEFAULT_VIEWER_PORT,
+    stay: Annotated[
+        bool, typer.Option("--stay", help="Keep running after the recording's end.")
+    ] = False,
+) -> None:
+    """Play a recording through the daemon, which cannot tell it from a device.
+
+    The bytes come back by a mock serial port and take the same way as live ones: the maps equal
+    those of the live run. Without --viewer and --stay it ends with the recording.
+    """
+    from tactomo.recording import open_recording
+
+    opened = open_recording(recording)
+    origin = opened.summary.origin
+    if with_viewer:
+        from tactomo.cli.demo import show_replay
+
+        show_replay(recording, speed, sensor, description, stream, control, viewer_port)
+        return
+    from tactomo.config import load_config
+
+    factor = _speed(speed)
+    settings = load_config(
+        name=sensor or origin.sensor or None,
+        description=description or origin.description or None,
+        ports=opened.replay_urls(factor),
+        tier=tier,
+        stream=stream,
+        control=control,
+        lossless=True if factor == 0 else None,
+        exit_at_end=not stay,
+    )
+    if not opened.summary.is_complete:
+        typer.echo(
+            f"{recording} was cut off: playing the {opened.summary.duration_s:.1f} s that are "
+            "there",
+            err=True,
+        )
+    raise typer.Exit(_run_daemon(settings))
+
+
+def _run_daemon(settings: DaemonConfig) -> int:
+    """Serve until the daemon is stopped, and return its exit status."""
+    from tactomo.daemon import Daemon
+    from tactomo.log import configure_logging
+
+    configure_logging(settings.log_level, settings.log_format)
+    return Daemon(settings).run()
+
+
+def _speed(text: str) -> float:
+    """Return the factor; 0 for "max"."""
+    try:
+        factor = 0.0 if text == "max" else float(text)
+    except ValueError:
+        factor = -1.0
+    if not 0.0 <= factor < float("inf"):
+        raise typer.BadParameter(f"--speed {text}: give a factor above 0, or max")
+    return factor

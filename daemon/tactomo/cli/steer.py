@@ -1,0 +1,273 @@
+"""`tactomo status`, `tare`, `record`, `tier` and `poke`: one request to a running program each."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from tactomo.cli.app import (
+    DEFAULT_CONTROL,
+    DEFAULT_TWIN_CONTROL,
+    STEER,
+    ControlAddress,
+    JsonOutput,
+    app,
+    examples,
+)
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+TARE_TIMEOUT_S = 30.0
+
+
+@app.command(
+    rich_help_panel=STEER,
+    epilog=examples("tactomo status", "tactomo status --json | jq .latency_ms"),
+)
+def status(control: ControlAddress = DEFAULT_CONTROL, as_json: JsonOutput = False) -> None:
+    """Show how the daemon is: ports, rates, latency, the time of each stage, what was lost."""
+    from tactomo_client import request
+
+    answer = request("status", control)
+    if as_json:
+        typer.echo(json.dumps(answer, indent=2, default=str))
+        return
+    from rich.console import Console
+
+    Console().print(status_table(answer))
+
+
+@app.command(
+    rich_help_panel=STEER,
+    epilog=examples("tactomo tare"),
+)
+def tare(control: ControlAddress = DEFAULT_CONTROL) -> None:
+    """Take a new reference: the next scans of the *unloaded* skin count as "nothing pressed".
+
+    Leave the skin alone for a second, then run this. Needed after mounting the skin, after a
+    change of temperature, and when contacts show up where nobody presses.
+    """
+    from tactomo_client import request
+
+    answer = request("tare", control, timeout_s=TARE_TIMEOUT_S)
+    typer.echo(f"new reference from {answer.get('scans', '?')} dual scans")
+
+
+@app.command(
+    rich_help_panel=STEER,
+    epilog=examples(
+        "tactomo record grasp.mcap --seconds 10",
+        "tactomo record start grasp.mcap",
+        "tactomo record start        (the daemon chooses a name)",
+        "tactomo record stop",
+    ),
+)
+def record(
+    what: Annotated[
+        str,
+        typer.Argument(
+            metavar="start|stop|FILE",
+            help="Start a recording and return, stop it, or record FILE while this runs.",
+        ),
+    ],
+    path: Annotated[Path | None, typer.Argument(help="For `start`: the file.")] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option(min=0.1, help="For FILE: how long; until Ctrl-C when left out."),
+    ] = None,
+    control: ControlAddress = DEFAULT_CONTROL,
+) -> None:
+    """Record what the ports say (every byte, with its time) into an MCAP file.
+
+    The daemon writes the file, so it keeps recording when this command ends, and the path is one
+    on the daemon's computer. `tactomo replay` plays it again.
+    """
+    from tactomo_client import request
+
+    if what not in ("start", "stop"):
+        if path is not None:
+            raise typer.BadParameter("give one file, or `start FILE`")
+        _record_for(Path(what), seconds, control)
+        return
+    if seconds is not None:
+        raise typer.BadParameter("--seconds goes with FILE, not with start or stop")
+    if what == "stop":
+        if path is not None:
+            raise typer.BadParameter("stop takes no file")
+        _tell_recorded(request("record_stop", control, timeout_s=10.0))
+        return
+    arguments = {} if path is None else {"path": str(path.absolute())}
+    answer = request("record_start", control, timeout_s=10.0, **arguments)
+    typer.echo(f"recording to {answer['path']}")
+
+
+@app.command(
+    rich_help_panel=STEER,
+    epilog=examples("tactomo tier levelset", "tactomo tier auto --budget-ms 20"),
+)
+def tier(
+    name: Annotated[
+        Literal["auto", "quiet", "tikhonov", "levelset"],
+        typer.Argument(help="The tier; auto chooses one for each frame."),
+    ],
+    budget_ms: Annotated[
+        float | None, typer.Option(min=0.1, help="Time that one reconstruction may take.")
+    ] = None,
+    control: ControlAddress = DEFAULT_CONTROL,
+) -> None:
+    """Choose how much model a frame is given, while the daemon runs."""
+    from tactomo_client import request
+
+    answer = request("set_tier", control, tier=name)
+    if budget_ms is not None:
+        request("set_budget", control, budget_ms=budget_ms)
+    typer.echo(f"tier {answer.get('tier', name)}")
+
+
+@app.command(
+    rich_help_panel=STEER,
+    epilog=examples(
+        "tactomo poke press x_mm=10 y_mm=-20 pressure_kpa=180",
+        "tactomo poke release",
+        "tactomo poke mute channel=structure seconds=3",
+        "tactomo poke garbage count=500",
+        "tactomo poke unplug",
+        "tactomo poke replug",
+        "tactomo poke status",
+    ),
+)
+def poke(
+    command: Annotated[str, typer.Argument(help="A command of the twin, see below.")],
+    arguments: Annotated[
+        list[str] | None, typer.Argument(metavar="[NAME=VALUE]...", help="Its arguments.")
+    ] = None,
+    control: Annotated[
+        str, typer.Option("--control", help="Address of the twin's control socket.")
+    ] = DEFAULT_TWIN_CONTROL,
+) -> None:
+    """Press, move, release and break a running twin, as a test of your own robot would.
+
+    `press` (x_mm, y_mm, id, radius_mm, pressure_kpa, shape; the same id again moves it),
+    `release` (id), `clear`, `scene` (what presses now), `play` (the scripted scene from its start),
+    `noise` (noise_v), `drift` (walk, creep), `mute` (channel, seconds), `garbage` (count, port),
+    `unplug` and `replug` (port), `status`.
+    """
+    from tactomo_client import request
+
+    answer = request(command, control, **dict(_named(argument) for argument in arguments or []))
+    if answer:
+        typer.echo(json.dumps(answer, indent=2))
+
+
+def status_table(status: dict[str, Any]) -> Table:
+    """Return a status message as a table for people; what it does not know shows as "-"."""
+    from rich.table import Table
+
+    table = Table(title=f"{status['sensor']}: {status['state']}", show_header=False)
+    for name, value in _status_rows(status):
+        table.add_row(f"[bold]{name}[/]", value)
+    return table
+
+
+def _status_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
+    rates = status.get("rates") or {}
+    latency = status.get("latency_ms") or {}
+    recording = status.get("recording")
+    reference = status.get("reference") or {}
+    description = status.get("description") or {}
+    rows = [
+        ("daemon", f"{status.get('version')}, up {status.get('uptime_s', 0.0):.0f} s"),
+        ("sensor", f"{description.get('model')} ({', '.join(description.get('modalities', []))})"),
+        ("source", str((status.get("source") or {}).get("kind"))),
+        *(("port", _port_line(port)) for port in status.get("ports", [])),
+        (
+            "rates",
+            f"{_number(rates.get('frames_hz'))} frames/s; scans/s: "
+            f"magnitude {_number(rates.get('magnitude_hz'))}, "
+            f"structure {_number(rates.get('structure_hz'))}",
+        ),
+        ("latency", _percentiles(latency)),
+        *(
+            (f"  {stage}", _percentiles(times))
+            for stage, times in (status.get("stage_ms") or {}).items()
+        ),
+        ("tier", f"{status.get('tier') or '-'} (asked for: {status.get('tier_requested')})"),
+        ("flags", ", ".join(status.get("flags", [])) or "none"),
+        ("misfit", _number(status.get("misfit"))),
+        (
+            "lost",
+            f"{status.get('dropped_scans', 0)} dual scans dropped, "
+            f"{status.get('incomplete_scans', 0)} incomplete",
+        ),
+        ("reference", f"{reference['scans']} dual scans" if reference else "none yet"),
+        (
+            "recording",
+            f"{recording['path']} ({recording['bytes'] / 1e6:.1f} MB)" if recording else "off",
+        ),
+        ("subscribers", str(status.get("subscribers", "-"))),
+    ]
+    return rows
+
+
+def _port_line(port: dict[str, Any]) -> str:
+    device = port.get("device") or {}
+    state = "open" if port.get("connected") else "[red]not open[/]"
+    corrupt = port.get("corrupt", 0)
+    return (
+        f"{port.get('url')} ({state}), {device.get('device_id', 'no hello yet')}, "
+        f"{', '.join(device.get('channels', [])) or '-'}; {port.get('packets', 0)} packets, "
+        + (f"[yellow]{corrupt} corrupt[/]" if corrupt else "none corrupt")
+    )
+
+
+def _percentiles(times: dict[str, Any]) -> str:
+    return f"p50 {_number(times.get('p50'))} ms, p99 {_number(times.get('p99'))} ms"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def _record_for(path: Path, seconds: float | None, control: str) -> None:
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from tactomo_client import request
+
+    started = request("record_start", control, timeout_s=10.0, path=str(path.absolute()))
+    size = TextColumn("{task.fields[size]}")
+    columns = (TextColumn("recording"), BarColumn(), TimeElapsedColumn(), size)
+    begin_s = time.monotonic()
+    try:
+        with Progress(*columns, transient=True) as progress:
+            task = progress.add_task(started["path"], total=seconds, size="")
+            while seconds is None or time.monotonic() - begin_s < seconds:
+                recorded = (request("status", control).get("recording") or {}).get("bytes", 0)
+                passed_s = time.monotonic() - begin_s
+                progress.update(task, completed=passed_s, size=f"{recorded / 1e6:.1f} MB")
+                left_s = 0.5 if seconds is None else seconds - passed_s
+                time.sleep(max(0.0, min(0.5, left_s)))
+    except KeyboardInterrupt:
+        pass  # the way to end a recording without --seconds
+    finally:
+        _tell_recorded(request("record_stop", control, timeout_s=10.0))
+
+
+def _tell_recorded(answer: dict[str, Any]) -> None:
+    typer.echo(f"recorded {answer['path']} ({answer['bytes'] / 1e6:.2f} MB)")
+
+
+def _named(argument: str) -> tuple[str, Any]:
+    """Return name and value of "x_mm=10"; the value is a number where it reads as one."""
+    name, equals, text = argument.partition("=")
+    if not equals or not name:
+        raise typer.BadParameter(f"{argument!r} is not NAME=VALUE")
+    for read in (int, float):
+        try:
+            return name, read(text)
+        except ValueError:
+            continue
+    return name, text

@@ -1,0 +1,288 @@
+"""`tactomo watch`: the skin in a terminal, over ssh if need be."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tactomo.cli.app import (
+    DEFAULT_NAME,
+    DEFAULT_STREAM,
+    STEER,
+    SensorName,
+    StreamAddress,
+    app,
+    examples,
+)
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+    from rich.text import Text
+    from tactomo_client import Frame
+
+REFRESH_HZ = 12.0
+STALE_S = 0.5
+GONE_S = 3.0
+# Dark to bright, as perceived brightness: black, violet, red, orange, yellow, white.
+COLOURS = ((0, 0, 4), (87, 16, 110), (188, 55, 84), (249, 142, 9), (252, 255, 164))
+PRESSED_COLOUR = (40, 60, 90)
+UNKNOWN_COLOUR = (30, 30, 30)
+
+
+@app.command(
+    rich_help_panel=STEER,
+    epilog=examples("tactomo watch", "tactomo watch -s left_forearm", "tactomo watch | tee log"),
+)
+def watch(
+    sensor: SensorName = DEFAULT_NAME,
+    stream: StreamAddress = DEFAULT_STREAM,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.0, help="Stop after this long; until Ctrl-C without it.")
+    ] = None,
+) -> None:
+    """Show the pressure map, the contacts and the daemon's health live in the terminal.
+
+    Without a terminal (in a pipe) it prints one line a frame instead. Ctrl-C ends it.
+    """
+    from rich.console import Console
+
+    view = View(sensor, stream)
+    console = Console()
+    end_s = float("inf") if seconds is None else time.monotonic() + seconds
+    try:
+        if console.is_terminal:
+            _show_live(view, console, end_s)
+        else:
+            _print_lines(view, end_s)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        view.close()
+
+
+class View:
+    """The newest frame, status and event of one sensor."""
+
+    def __init__(self, sensor: str, stream: str) -> None:
+        import zmq
+        from tactomo_client.control import bad_address
+        from tactomo_client.messages import EVENT, MAP, STATUS, topic
+
+        self.sensor = sensor
+        self.stream = stream
+        self.frame: Frame | None = None
+        self.status: dict[str, Any] = {}
+        self.status_s = 0.0
+        self.event: dict[str, Any] = {}
+        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        for kind in (MAP, STATUS, EVENT):
+            self._socket.subscribe(topic(sensor, kind))
+        try:
+            self._socket.connect(stream)
+        except zmq.ZMQError as error:
+            self._socket.close()
+            raise bad_address(stream, error) from error
+
+    def update(self, wait_s: float) -> bool:
+        """Take in what has come, waiting for it at most `wait_s`; tell whether a frame came."""
+        from tactomo_client import MessageError
+
+        new = False
+        while self._socket.poll(round(wait_s * 1e3)):
+            wait_s = 0.0
+            try:
+                new |= self._take(self._socket.recv())
+            except MessageError:
+                continue  # another program publishes there; ours will show, or its silence will
+        return new
+
+    def close(self) -> None:
+        """Close the subscription."""
+        self._socket.close()
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether no status has come for so long that the daemon cannot be there."""
+        return time.monotonic() - self.status_s > GONE_S
+
+    def _take(self, data: bytes) -> bool:
+        from tactomo_client.frame import frame_from_message
+        from tactomo_client.messages import MAP, STATUS, decode_message
+
+        message = decode_message(data)
+        if message.kind == MAP:
+            self.frame = frame_from_message(message, time.monotonic_ns(), STALE_S)
+        elif message.kind == STATUS:
+            self.status, self.status_s = message.fields, time.monotonic()
+        else:
+            self.event = message.fields
+        return message.kind == MAP
+
+
+def _show_live(view: View, console: Any, end_s: float) -> None:
+    from rich.live import Live
+
+    with Live(console=console, screen=True, auto_refresh=False) as live:
+        while time.monotonic() < end_s:
+            next_s = time.monotonic() + 1.0 / REFRESH_HZ
+            while (left_s := next_s - time.monotonic()) > 0:
+                view.update(left_s)
+            live.update(_screen(view, console.size.width, console.size.height), refresh=True)
+
+
+def _print_lines(view: View, end_s: float) -> None:
+    silent_s = time.monotonic()
+    while time.monotonic() < end_s:
+        if view.update(min(0.5, max(0.0, end_s - time.monotonic()))):
+            silent_s = time.monotonic()
+            assert view.frame is not None
+            print(frame_line(view.frame), flush=True)
+        elif time.monotonic() - silent_s > 1.0:
+            silent_s = time.monotonic()
+            print(f"no frame of {view.sensor} at {view.stream}", file=sys.stderr, flush=True)
+
+
+def frame_line(frame: Frame) -> str:
+    """Return one frame as a line of text."""
+    pressed = "; ".join(
+        f"#{c.id} ({c.x_mm:+.1f}, {c.y_mm:+.1f}) mm {_pressure(c.pressure_kpa, c.magnitude)}"
+        for c in frame.contacts
+    )
+    flags = f"  [{', '.join(sorted(frame.flags))}]" if frame.flags else ""
+    return f"{frame.scan_counter:8d}  {frame.tier or '-':<9} {pressed or 'nothing pressed'}{flags}"
+
+
+def _screen(view: View, columns: int, rows: int) -> RenderableType:
+    from rich.console import Group
+    from rich.panel import Panel
+    from rich.table import Table
+    from rich.text import Text
+
+    frame = view.frame
+    if frame is None:
+        return Panel(_state_line(view), title=f"tactomo watch {view.sensor}")
+    image = map_text(frame, view.status, max(10, min(columns - 44, 2 * (rows - 6))))
+    body = Table.grid(padding=(0, 2))
+    body.add_row(image, Group(_contact_table(frame), Text(), _health(view, frame)))
+    panel = Panel(
+        body,
+        title=f"tactomo watch {view.sensor}",
+        subtitle="Ctrl-C ends",
+        border_style="red" if view.is_gone or frame.is_stale else "none",
+    )
+    return Group(_state_line(view), panel)
+
+
+def _state_line(view: View) -> Text:
+    from rich.text import Text
+
+    if view.is_gone:
+        return Text(
+            f"no daemon answers at {view.stream} for a sensor {view.sensor!r}: is it running?",
+            "bold red",
+        )
+    state = str(view.status.get("state", "unknown"))
+    if view.frame is not None and view.frame.is_stale:
+        age = f"STALE: the newest frame is {view.frame.age_s:.1f} s old"
+        return Text(f"{age} (the daemon says: {state}) {_event_words(view.event)}", "bold red")
+    return Text(f"{state} {_event_words(view.event)}", "green" if state == "running" else "yellow")
+
+
+def _event_words(event: dict[str, Any]) -> str:
+    return f"| last event: {event['name']} {event.get('detail', '')}" if event else ""
+
+
+def map_text(frame: Frame, status: dict[str, Any], columns: int) -> Text:
+    """Return the map as text of at most `columns` half-block characters in width.
+
+    Each character is two nodes, one above the other. Colour is pressure, or the relative change
+    where the sensor has no pressure calibration; pressed outlines without a value are blue-grey.
+    """
+    import numpy as np
+    from rich.color import Color
+    from rich.style import Style
+    from rich.text import Text
+
+    pixels = _pixels(frame, status)
+    if pixels is None:
+        return Text("no image: " + ", ".join(sorted(frame.flags)))
+    step = -(-pixels.shape[1] // columns)
+    pixels = pixels[::-step, ::step]  # row 0 of a map is its lowest
+    if len(pixels) % 2:
+        pixels = np.concatenate([pixels, np.zeros_like(pixels[:1])])
+    text = Text()
+    for upper, lower in zip(pixels[0::2], pixels[1::2], strict=True):
+        for top, bottom in zip(upper.tolist(), lower.tolist(), strict=True):
+            style = Style(color=Color.from_rgb(*top), bgcolor=Color.from_rgb(*bottom))
+            text.append("▀", style)
+        text.append("\n")
+    return text
+
+
+def _pixels(frame: Frame, status: dict[str, Any]) -> Any:
+    """Return the colours of the map's nodes, (ny, nx, 3), or None where there is no image."""
+    import numpy as np
+
+    description = status.get("description") or {}
+    image, top = frame.pressure_kpa, description.get("pressure_max_kpa") or 300.0
+    if image is None:
+        image, top = frame.map, description.get("magnitude_max") or 0.25
+    if image is None:
+        image, top = frame.structure, 1.0
+    if image is None:
+        return None
+    level = np.clip(np.nan_to_num(image) / top, 0.0, 1.0) * (len(COLOURS) - 1)
+    knots, palette = np.arange(len(COLOURS)), np.array(COLOURS, dtype=float)
+    pixels = np.stack([np.interp(level, knots, palette[:, c]) for c in range(3)], axis=-1)
+    if frame.structure is not None:
+        pressed = (np.nan_to_num(frame.structure) > 0.5) & (level < 0.05)
+        pixels[pressed] = PRESSED_COLOUR
+    known = frame.structure if frame.structure is not None else image
+    pixels[np.isnan(known)] = UNKNOWN_COLOUR
+    return pixels.astype(int)
+
+
+def _contact_table(frame: Frame) -> RenderableType:
+    from rich.table import Table
+    from rich.text import Text
+
+    if not frame.contacts:
+        return Text("nothing pressed", "dim")
+    table = Table(box=None, pad_edge=False)
+    for name in ("#", "x mm", "y mm", "mm²", "pressure"):
+        table.add_column(name, justify="right")
+    for c in frame.contacts:
+        pressure = _pressure(c.pressure_kpa, c.magnitude)
+        table.add_row(str(c.id), f"{c.x_mm:+.1f}", f"{c.y_mm:+.1f}", f"{c.area_mm2:.0f}", pressure)
+    return table
+
+
+def _health(view: View, frame: Frame) -> RenderableType:
+    from rich.table import Table
+
+    rates = view.status.get("rates") or {}
+    latency = view.status.get("latency_ms") or {}
+    rows = {
+        "rate": f"{rates.get('frames_hz') or 0.0:.1f} frames/s",
+        "latency": f"{latency.get('p50') or 0.0:.1f} ms (p99 {latency.get('p99') or 0.0:.1f})",
+        "age": f"{frame.age_s * 1e3:.0f} ms",
+        "tier": frame.tier or "-",
+        "because": frame.tier_reason or "-",
+        "misfit": "-" if frame.misfit is None else f"{frame.misfit:.2f}",
+        "flags": ", ".join(sorted(frame.flags)) or "none",
+        "source": str((view.status.get("source") or {}).get("kind", "-")),
+    }
+    table = Table(box=None, show_header=False, pad_edge=False)
+    for name, value in rows.items():
+        table.add_row(f"[dim]{name}[/]", value)
+    return table
+
+
+def _pressure(pressure_kpa: float | None, magnitude: float | None) -> str:
+    if pressure_kpa is not None:
+        return f"{pressure_kpa:.0f} kPa"
+    return "pressed" if magnitude is None else f"Δσ/σ₀ {magnitude:.3f}"

@@ -1,0 +1,87 @@
+"""The command line's surface: help, usage errors, and that it starts quickly."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from tactomo.cli import app
+from tactomo.cli.app import DEFAULT_CONTROL, DEFAULT_STREAM, DEFAULT_TWIN_CONTROL, ORDER
+from tactomo.config import DaemonConfig
+from tactomo_client import messages
+from typer.main import get_command
+from typer.testing import CliRunner
+
+Run = Callable[..., Any]
+
+
+@pytest.mark.parametrize("command", [*ORDER, "models build", "models list"])
+def test_every_command_explains_itself(command: str) -> None:
+    result = CliRunner().invoke(app, [*command.split(), "--help"], prog_name="tactomo")
+    assert result.exit_code == 0
+    assert f"Usage: tactomo {command}" in result.output
+    if command not in ("models", "models list"):
+        assert "Examples" in result.output
+
+
+def test_nothing_heavy_is_imported_to_show_the_help() -> None:
+    heavy = {"numpy", "scipy", "zmq", "pydantic", "aiohttp", "serial", "skfem", "matplotlib"}
+    program = f"import sys, tactomo.cli; print(sorted({heavy!r} & set(sys.modules)))"
+    result = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=False
+    )
+    assert result.stdout.strip() == "[]", result.stderr
+
+
+def test_without_a_command_it_shows_the_help(tactomo: Run) -> None:
+    result = tactomo()
+    assert result.returncode == 2
+    assert "tactomo demo" in result.stdout + result.stderr
+
+
+def test_version(tactomo: Run) -> None:
+    result = tactomo("--version")
+    assert result.returncode == 0
+    assert result.stdout.startswith("tactomo 0.")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["dance"],
+        ["twin", "--ports", "3"],
+        ["daemon", "--tier", "best"],
+        ["replay"],
+        ["record", "stop", "here.mcap"],
+        ["record", "start", "--seconds", "3"],
+        ["poke", "press", "x_mm"],
+        ["import", "in.npz", "out.mcap", "--reference-frames", "20"],
+    ],
+)
+def test_wrong_usage_exits_with_2(tactomo: Run, arguments: list[str]) -> None:
+    result = tactomo(*arguments)
+    assert result.returncode == 2
+    assert "Traceback" not in result.stderr
+    assert result.stdout == ""
+
+
+def test_the_default_addresses_are_the_clients() -> None:
+    assert messages.DEFAULT_STREAM == DEFAULT_STREAM
+    assert messages.DEFAULT_CONTROL == DEFAULT_CONTROL
+    assert messages.DEFAULT_TWIN_CONTROL == DEFAULT_TWIN_CONTROL
+
+
+def test_every_key_of_the_configuration_has_a_flag_with_its_default() -> None:
+    daemon = get_command(app).commands["daemon"]  # type: ignore[attr-defined]
+    flags = {option.opts[0].lstrip("-"): option for option in daemon.params}
+    renamed = {"name": "sensor", "ports": "port"}
+    for key, field in DaemonConfig.model_fields.items():
+        flag = flags[renamed.get(key, key.replace("_", "-"))]
+        # A flag that is not given must not win over the file, so defaults stand in the help.
+        assert not flag.default
+        if field.default not in (None, False) and not field.is_required():
+            shown = f"{field.default:g}" if isinstance(field.default, float) else field.default
+            assert f"[{shown}" in flag.help

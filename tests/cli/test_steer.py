@@ -1,0 +1,140 @@
+"""`status`, `tare`, `record`, `tier` and `poke` against a control socket."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+Run = Callable[..., Any]
+
+STATUS = {
+    "sensor": "left_forearm",
+    "state": "running",
+    "version": "0.1.0",
+    "uptime_s": 12.0,
+    "description": {"model": "paper_square", "modalities": ["magnitude", "structure"]},
+    "source": {"kind": "twin"},
+    "ports": [
+        {
+            "url": "/dev/ttyACM0",
+            "connected": True,
+            "device": {"device_id": "twin-paper_square", "channels": ["magnitude"]},
+            "packets": 99,
+            "corrupt": 3,
+        },
+        {"url": "/dev/ttyACM1", "connected": False, "device": None},
+    ],
+    "rates": {"magnitude_hz": 20.0, "structure_hz": None, "frames_hz": 19.96},
+    "latency_ms": {"p50": 4.25, "p99": 11.0},
+    "stage_ms": {"reconstruct": {"p50": 3.5, "p99": 9.0}},
+    "tier": "levelset",
+    "tier_requested": "auto",
+    "flags": ["structure_missing"],
+    "misfit": 1.02,
+    "dropped_scans": 2,
+    "incomplete_scans": 7,
+    "reference": {"scans": 20, "taken_realtime_ns": 0},
+    "recording": {"path": "/tmp/a.mcap", "bytes": 2_500_000},
+    "subscribers": 1,
+}
+NEW_DAEMON = {
+    **STATUS,
+    **{"state": "waiting_for_data", "ports": [], "latency_ms": None, "stage_ms": {}},
+    **{"tier": None, "flags": [], "misfit": None, "reference": None, "recording": None},
+}
+
+
+def test_status_shows_what_matters(tactomo: Run, control: Any) -> None:
+    control.answers["status"] = STATUS
+    result = tactomo("status", "--control", control.address, env={"COLUMNS": "200"})
+    assert result.returncode == 0
+    for words in (
+        *("left_forearm: running", "/dev/ttyACM0 (open)", "3 corrupt", "(not open)"),
+        *("p50 4.25 ms", "structure_missing", "19.96 frames/s", "2 dual scans dropped"),
+        *("20 dual scans", "/tmp/a.mcap (2.5 MB)", "levelset (asked for: auto)"),
+    ):
+        assert words in result.stdout
+
+
+def test_status_of_a_daemon_that_has_no_data_yet(tactomo: Run, control: Any) -> None:
+    control.answers["status"] = NEW_DAEMON
+    result = tactomo("status", "--control", control.address)
+    assert result.returncode == 0
+    assert "waiting_for_data" in result.stdout
+
+
+def test_status_as_json(tactomo: Run, control: Any) -> None:
+    control.answers["status"] = STATUS
+    result = tactomo("status", "--control", control.address, "--json")
+    assert json.loads(result.stdout) == STATUS
+
+
+def test_tare_says_what_the_reference_is_made_of(tactomo: Run, control: Any) -> None:
+    control.answers["tare"] = {"scans": 20}
+    result = tactomo("tare", "--control", control.address)
+    assert (result.returncode, result.stdout) == (0, "new reference from 20 dual scans\n")
+
+
+def test_a_refusal_is_one_line_with_cause_and_next_step(tactomo: Run, control: Any) -> None:
+    control.answers["tare"] = ("tare_refused", "somebody presses", "let go and tare again")
+    result = tactomo("tare", "--control", control.address)
+    assert result.returncode == 1
+    assert result.stderr == "tactomo: somebody presses; let go and tare again\n"
+
+
+@pytest.mark.parametrize("command", [["status"], ["record", "stop"], ["poke", "clear"]])
+def test_nobody_there(tactomo: Run, command: list[str]) -> None:
+    result = tactomo(*command, "--control", "ipc:///nowhere/at/all")
+    assert result.returncode == 1
+    assert "nothing answered at ipc:///nowhere/at/all" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_a_wrong_address(tactomo: Run) -> None:
+    result = tactomo("status", "--control", "here")
+    assert result.returncode == 1
+    assert "tcp://127.0.0.1" in result.stderr
+
+
+def test_record_start_gives_an_absolute_path(tactomo: Run, control: Any, tmp_path: Path) -> None:
+    control.answers["record_start"] = {"path": "/x.mcap"}
+    assert tactomo("record", "start", "x.mcap", "--control", control.address).returncode == 0
+    assert tactomo("record", "start", "--control", control.address).returncode == 0
+    assert control.requests == [
+        ("record_start", {"path": str(tmp_path / "x.mcap")}),
+        ("record_start", {}),
+    ]
+
+
+def test_record_a_file_for_some_seconds(tactomo: Run, control: Any) -> None:
+    control.answers["record_start"] = {"path": "/x.mcap"}
+    control.answers["record_stop"] = {"path": "/x.mcap", "bytes": 1_230_000}
+    control.answers["status"] = STATUS
+    result = tactomo("record", "x.mcap", "--seconds", "0.6", "--control", control.address)
+    assert result.returncode == 0
+    assert result.stdout.endswith("recorded /x.mcap (1.23 MB)\n")
+    assert [command for command, _ in control.requests[:2]] == ["record_start", "status"]
+    assert control.requests[-1][0] == "record_stop"
+
+
+def test_tier_and_budget(tactomo: Run, control: Any) -> None:
+    control.answers["set_tier"] = {"tier": "tikhonov"}
+    result = tactomo("tier", "tikhonov", "--budget-ms", "20", "--control", control.address)
+    assert result.returncode == 0
+    assert control.requests == [
+        ("set_tier", {"tier": "tikhonov"}),
+        ("set_budget", {"budget_ms": 20.0}),
+    ]
+
+
+def test_poke_sends_numbers_as_numbers(tactomo: Run, control: Any) -> None:
+    control.answers["mute"] = {"done": True}
+    result = tactomo(
+        "poke", "mute", "channel=structure", "seconds=2.5", "port=1", "--control", control.address
+    )
+    assert json.loads(result.stdout) == {"done": True}
+    assert control.requests == [("mute", {"channel": "structure", "seconds": 2.5, "port": 1})]

@@ -1,0 +1,145 @@
+"""`watch`: in a terminal and in a pipe, with data, with old data and with none."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import select
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from tactomo.cli.watch import PRESSED_COLOUR, map_text
+from tactomo_client import Contact, subscribe
+from tactomo_client.fake import FakeSensor
+
+Run = Callable[..., Any]
+
+CONTACT = Contact(
+    7, x_mm=12.5, y_mm=-20.0, area_mm2=700.0, magnitude=0.1, magnitude_sigma=0.01, pressure_kpa=171
+)
+STATUS = {
+    "state": "running",
+    "rates": {"frames_hz": 19.7},
+    "latency_ms": {"p50": 3.0, "p99": 5.0},
+    "description": {"pressure_max_kpa": 200.0},
+}
+
+
+def images() -> dict[str, Any]:
+    pressure = np.zeros((51, 51), np.float32)
+    pressure[10, 30] = 200.0  # near the bottom, right of the middle
+    structure = (pressure > 0).astype(np.float32)
+    structure[40, 20] = 1.0  # pressed, but not hard enough for a value
+    return {"map": pressure / 1000, "pressure_kpa": pressure, "structure": structure}
+
+
+@pytest.fixture
+def sensor() -> Iterator[FakeSensor]:
+    """Publish a frame and a status twenty times a second."""
+    stop = threading.Event()
+    with FakeSensor("skin") as fake:
+
+        def publish() -> None:
+            while not stop.wait(0.05):
+                fake.publish([CONTACT], **images())
+                fake.publish_message("status", STATUS)
+
+        thread = threading.Thread(target=publish)
+        thread.start()
+        yield fake
+        stop.set()
+        thread.join()
+
+
+def in_a_terminal(*arguments: str, until: str, timeout_s: float = 60.0) -> tuple[str, int]:
+    """Run watch in a terminal of 120 x 40 until it shows something, then press Ctrl-C."""
+    main, side = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tactomo.cli", "watch", *arguments],
+        stdin=side,
+        stdout=side,
+        stderr=side,
+        env={**os.environ, "COLUMNS": "120", "LINES": "40", "TERM": "xterm-256color"},
+    )
+    shown = ""
+    end_s = time.monotonic() + timeout_s
+    while until not in shown and time.monotonic() < end_s and process.poll() is None:
+        if select.select([main], [], [], 0.1)[0]:
+            text = os.read(main, 65_536).decode(errors="replace")
+            shown += re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", text)
+    process.send_signal(signal.SIGINT)
+    while process.poll() is None:
+        if select.select([main], [], [], 0.1)[0]:
+            os.read(main, 65_536)
+    os.close(side)
+    os.close(main)
+    return shown, process.returncode
+
+
+def test_it_shows_map_contacts_and_health_and_ends_by_ctrl_c(sensor: FakeSensor) -> None:
+    shown, status = in_a_terminal("--stream", sensor.address, until="19.7 frames/s")
+    assert status == 0
+    assert "▀" * 51 in shown
+    assert "171 kPa" in shown
+    assert "running" in shown
+
+
+def test_it_says_when_data_are_stale() -> None:
+    with FakeSensor("skin") as fake:
+        thread = threading.Thread(target=lambda: (fake.wait_for_subscriber(), old_frame(fake)))
+        thread.start()
+        shown, _ = in_a_terminal("--stream", fake.address, until="STALE")
+        thread.join()
+    assert "STALE: the newest frame is" in shown
+
+
+def old_frame(fake: FakeSensor) -> None:
+    time.sleep(0.2)
+    fake.publish_message("status", STATUS)
+    fake.publish([], **images(), acquired_monotonic_ns=time.monotonic_ns() - 2_000_000_000)
+
+
+def test_it_says_when_no_daemon_is_there() -> None:
+    shown, status = in_a_terminal("--stream", "ipc:///nowhere/at/all", until="no daemon answers")
+    assert "is it running?" in shown
+    assert status == 0
+
+
+def test_in_a_pipe_it_prints_a_line_a_frame(tactomo: Run, sensor: FakeSensor) -> None:
+    result = tactomo("watch", "--stream", sensor.address, "--seconds", "2")
+    assert result.returncode == 0
+    assert "#7 (+12.5, -20.0) mm 171 kPa" in result.stdout
+    assert result.stdout.count("\n") > 5
+
+
+def test_in_a_pipe_it_says_that_nothing_comes(tactomo: Run) -> None:
+    result = tactomo("watch", "--stream", "ipc:///nowhere/at/all", "--seconds", "1.5")
+    assert (result.returncode, result.stdout) == (0, "")
+    assert "no frame of skin" in result.stderr
+
+
+def test_the_picture_is_the_right_way_up() -> None:
+    with FakeSensor("skin") as fake, subscribe("skin", address=fake.address) as frames:
+        fake.wait_for_subscriber()
+        fake.publish([CONTACT], **images())
+        text = map_text(next(frames), STATUS, 51)
+    lines = text.split("\n")
+    assert [len(line) for line in lines][:26] == [51] * 26
+    cells = {
+        (row, column): (span.style.color.triplet, span.style.bgcolor.triplet)
+        for row, line in enumerate(lines)
+        for span in line.spans
+        for column in range(span.start, span.end)
+    }
+    bright = [place for place, colours in cells.items() if any(sum(c) > 500 for c in colours)]
+    pressed = [place for place, colours in cells.items() if PRESSED_COLOUR in map(tuple, colours)]
+    assert bright == [((50 - 10) // 2, 30)]
+    assert pressed == [((50 - 40) // 2, 20)]
