@@ -8,14 +8,13 @@ thread        owns                        hands on
 port-0, -1    a serial port, a decoder    scans to the pipeline, bytes to the recorder
 pipeline      sync, the reconstructor     messages to the publisher, marks to the recorder
 control       the control socket          commands to the pipeline; starts and stops the recorder
+publisher     the stream's socket         what it sent to the recorder, if that is asked for
 recorder-N    the file of recording N     nothing
-publisher     the stream's socket         sent messages to the recorder, if they are asked for
 ============  ==========================  =========================================================
 
-They stop in this order, so nobody hands anything to one that has gone, but for the publisher's
-last messages, which no recording misses. Numerical libraries are held to one thread while a daemon
-runs: on arrays of this size their pools cost more latency than they save, and the processor is
-shared with everything else on the robot.
+They stop in this order, so nobody hands anything to one that has gone. Numerical libraries are
+held to one thread while a daemon runs: on arrays of this size their pools cost more latency than
+they save, and the processor is shared with everything else on the robot.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from typing import Any, Final
 import structlog
 import zmq
 from platformdirs import user_data_path
-from tactomo_client.messages import EVENT, STATUS
+from tactomo_client.messages import EVENT, SCHEMA, STATUS
 from tactomo_models import (
     Reconstructor,
     SensorDescription,
@@ -206,8 +205,9 @@ class Daemon:
 
     def status(self) -> dict[str, Any]:
         """Return the fields of a `status` message as of now, envelope included."""
-        envelope = self._publisher.envelope(STATUS, self._publisher.header)
-        return {"sensor": self.config.name, "kind": STATUS, **envelope, **self._status_fields()}
+        envelope = self._publisher.envelope(STATUS)
+        topic = {"schema": SCHEMA, "sensor": self.config.name, "kind": STATUS}
+        return {**topic, **envelope, **self._status_fields()}
 
     def _open(self, undo: contextlib.ExitStack) -> None:
         """Open and start each part, what is downstream first; `undo` goes the other way."""
@@ -215,9 +215,9 @@ class Daemon:
         undo.enter_context(threadpool_limits(1))
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         undo.callback(context.term)
+        undo.callback(self._recorder.close)
         self._publisher.open(context, config.stream)
         undo.callback(self._publisher.stop)
-        undo.callback(self._recorder.close)
         self._control.open(context, config.control)
         undo.callback(self._control.stop)
         undo.callback(self._pipeline.stop)

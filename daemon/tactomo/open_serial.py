@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 from collections.abc import Iterator
@@ -67,9 +68,12 @@ def _holders(path: str) -> Iterator[int]:
     """Yield the processes that have the device open, as far as this user may see."""
     device = os.path.realpath(path)
     for process in Path("/proc").glob("[0-9]*"):
-        try:
-            links = [os.readlink(descriptor) for descriptor in (process / "fd").iterdir()]
-        except OSError:  # not ours to look at, or gone by now
-            continue
-        if device in links:
+        if device in _open_files(process):
             yield int(process.name)
+
+
+def _open_files(process: Path) -> Iterator[str]:
+    with contextlib.suppress(OSError):  # the process is not ours to look at, or gone by now
+        for descriptor in os.listdir(process / "fd"):
+            with contextlib.suppress(OSError):  # closed by now
+                yield os.readlink(process / "fd" / descriptor)

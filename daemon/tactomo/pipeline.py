@@ -98,6 +98,7 @@ class Pipeline:
         self._on_event = on_event
         self._drop_limit = RateLimit()
         self._dropped_told = 0
+        self._announced: dict[int, tuple[Channel, ...]] = {}  # what each port's device sends
         self._clocks: dict[int, int] = {}  # the newest time on each replayed port that goes on
         self._ended: set[int] = set()
         self._deliveries: queue.Queue[Delivery | None] = queue.Queue(QUEUED_DELIVERIES)
@@ -211,12 +212,22 @@ class Pipeline:
 
     def _join(self, delivery: Delivery) -> list[DualScan]:
         ready: list[DualScan] = []
+        self._note_channels(delivery)
         for scan in delivery.scans:
             self.scan_rates[scan.channel].add(scan.monotonic_ns)
             ready += self._sync.push(scan)
         if self._replay is not None:
             ready += self._follow_clock(delivery, self._replay.is_paced)
         return ready
+
+    def _note_channels(self, delivery: Delivery) -> None:
+        """Do not wait for a channel that no device says it sends."""
+        if delivery.channels is None or self._announced.get(delivery.port) == delivery.channels:
+            return
+        self._announced[delivery.port] = delivery.channels
+        if len(self._announced) == self._ports:
+            announced = {c for channels in self._announced.values() for c in channels}
+            self._sync.lost.update(set(self._channels) - announced)
 
     def _follow_clock(self, delivery: Delivery, is_paced: bool) -> list[DualScan]:
         """Let waits end by the recording's clock."""

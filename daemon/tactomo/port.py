@@ -76,6 +76,8 @@ class Delivery(NamedTuple):
     port: int
     clock_ns: int
     scans: tuple[ChannelScan, ...]
+    channels: tuple[Channel, ...] | None = None
+    """Those that the device says it sends here; None before its first hello."""
     has_ended: bool = False
     """The replay behind the port is at its end: nothing more will come."""
 
@@ -201,7 +203,8 @@ class PortReader:
                     )
                 )
         if packets:
-            self._deliver(Delivery(self.index, clock_ns, tuple(scans)))
+            channels = None if self.hello is None else self.hello.channels
+            self._deliver(Delivery(self.index, clock_ns, tuple(scans), channels))
         self._tell_corrupt()
 
     def _record(self, data: bytes, realtime_ns: int, monotonic_ns: int) -> int:

@@ -33,6 +33,7 @@ MAX_QUEUED: Final = 1024
 
 class _Outgoing(NamedTuple):
     kind: str
+    sequence: int
     header: Mapping[str, Any]
     fields: Mapping[str, Any]
 
@@ -69,7 +70,8 @@ class Publisher:
         self._session = session
         self._status = status
         self._on_sent = on_sent
-        self._sequence: Counter[str] = Counter()  # written by this thread, read by control's
+        self._sequence: Counter[str] = Counter()  # the last one of each kind, under _lock
+        self._lock = threading.Lock()
         self._subscriptions: Counter[bytes] = Counter()  # this thread's own
         self._prefixes: frozenset[bytes] = frozenset()  # a copy for the other threads
         self._last_status = b""
@@ -127,15 +129,25 @@ class Publisher:
             header: acquisition, tier, flags and misfit; by default the newest frame's.
 
         """
-        self._queue.append(_Outgoing(kind, self.header if header is None else header, fields))
-        self._wake()
+        self._queue.append(self._number(kind, self.header if header is None else header, fields))
+        if not self._stopping.is_set():
+            self._wake()
 
-    def envelope(self, kind: str, header: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the envelope of the last message of a kind, its age as of now; for any thread."""
+    def envelope(self, kind: str) -> dict[str, Any]:
+        """Return the envelope of the last message of a kind as of now; for any thread."""
+        return self._stamp(self._sequence[kind], self.header)
+
+    def _number(self, kind: str, header: Mapping[str, Any], fields: Mapping[str, Any]) -> _Outgoing:
+        # Numbered when handed over: should the queue overflow, the gap shows.
+        with self._lock:
+            self._sequence[kind] += 1
+            return _Outgoing(kind, self._sequence[kind], header, fields)
+
+    def _stamp(self, sequence: int, header: Mapping[str, Any]) -> dict[str, Any]:
         acquired_ns = header["acquired_monotonic_ns"]
         return {
             "session": self._session,
-            "sequence": self._sequence[kind],
+            "sequence": sequence,
             **header,
             "clock_id": clock_id(),
             "age_ns": None if acquired_ns is None else time.monotonic_ns() - acquired_ns,
@@ -164,8 +176,7 @@ class Publisher:
             self._send(self._queue.popleft())
 
     def _send(self, message: _Outgoing) -> bytes:
-        self._sequence[message.kind] += 1
-        envelope = self.envelope(message.kind, message.header)
+        envelope = self._stamp(message.sequence, message.header)
         data = encode_message(self._sensor, message.kind, {**envelope, **message.fields})
         self._socket.send(data, zmq.DONTWAIT)
         if message.kind == CONTACTS and envelope["age_ns"] is not None:
@@ -175,7 +186,7 @@ class Publisher:
         return data
 
     def _send_status(self) -> None:
-        self._last_status = self._send(_Outgoing(STATUS, self.header, self._status()))
+        self._last_status = self._send(self._number(STATUS, self.header, self._status()))
 
     def _read_subscriptions(self) -> None:
         """Take note of who comes and goes; a newcomer to the status gets the last one at once."""

@@ -6,6 +6,7 @@ the computer is. The reconstructor is quick and remembers the frame before, as t
 
 from __future__ import annotations
 
+import itertools
 import os
 import pty
 import time
@@ -18,9 +19,11 @@ from typing import Any
 import numpy as np
 import pytest
 import zmq
+from mcap.reader import make_reader
 from numpy.typing import NDArray
 from tactomo.config import load_config
 from tactomo.daemon import Daemon
+from tactomo.recording import open_recording
 from tactomo_client import request
 from tactomo_client.messages import KINDS, Message, decode_message, topic
 from tactomo_models import Contact, Flag, Reconstruction, Reference, Tier
@@ -41,6 +44,7 @@ MEASUREMENTS = 208
 VOLTS_PER_COUNT = 1e-6
 REST = np.linspace(0.05, 0.2, MEASUREMENTS)
 BOTH = (Channel.MAGNITUDE, Channel.STRUCTURE)
+NO_FLAGS = ScanFlag(0)
 
 HELLO = Hello(
     device_id="bench-1",
@@ -118,7 +122,7 @@ def scan(
     channel: Channel,
     counter: int,
     volts: NDArray[np.float64] | None = None,
-    flags: ScanFlag = ScanFlag(0),
+    flags: ScanFlag = NO_FLAGS,
     device_us: int | None = None,
 ) -> Scan:
     """Return a scan; its voltages differ a little from scan to scan, as noise would have it."""
@@ -270,6 +274,10 @@ class Bench:
     def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
         return request(command, self.daemon.control_address, PATIENCE_S, **arguments)
 
+    def until(self, condition: Callable[[], Any]) -> Any:
+        """Wait for the condition and return its value."""
+        return wait_until(condition)
+
     def tare(self) -> None:
         """Say hello and send the scans of the first reference."""
         self.skin.introduce()
@@ -318,3 +326,50 @@ def bench(tmp_path: Path) -> Iterator[Callable[..., Any]]:
         listener.socket.close()
     for skin in skins:
         skin.close()
+
+
+class Heard:
+    """What a replay published, from the first message to the last: recorded, so none is missed."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with path.open("rb") as file:
+            records = list(make_reader(file).iter_messages(log_time_order=False))
+        self._messages = [
+            decode_message(message.data)
+            for _, channel, message in records
+            if channel.topic in ("map", "contacts")
+        ]
+
+    def of(self, kind: str) -> list[dict[str, Any]]:
+        return [message.fields for message in self._messages if message.kind == kind]
+
+
+@pytest.fixture
+def replay(tmp_path: Path) -> Callable[..., Any]:
+    """Replay a recording to its end: ``replay(path, speed=0, **config)`` returns what was said."""
+    count = itertools.count()
+
+    def run(path: Path, speed: float = 0, **config: Any) -> Heard:
+        out = tmp_path / f"replayed-{next(count)}.mcap"
+        settings = {
+            "name": "left",
+            "ports": open_recording(path).replay_urls(speed),
+            "stream": "tcp://127.0.0.1:0",
+            "control": "tcp://127.0.0.1:0",
+            "tare_scans": 3,
+            "exit_at_end": True,
+            "record": out,
+            "record_maps": True,
+            **config,
+        }
+        memory: Any = Memory()
+        daemon = Daemon(load_config(None, **settings), reconstructor=memory)
+        daemon.start()
+        try:
+            assert daemon.wait() == 0
+        finally:
+            daemon.stop()
+        return Heard(out)
+
+    return run

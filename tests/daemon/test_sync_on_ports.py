@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 from tactomo_client.messages import array_from_wire
+from tactomo_protocol import Channel, Scan, ScanFlag
 
 Start = Callable[..., Any]
 
@@ -19,4 +21,98 @@ def test_both_channels_of_one_instant_become_one_frame(bench: Start, ports: int)
     assert frame["flags"] == []
     assert array_from_wire(frame["map"])[0, 0] == pytest.approx(0.2, abs=1e-3)
     assert frame["device_us"] == b.skin.counter * 50_000
-    assert b.ask("status")["incomplete_scans"] == 0
+    status = b.ask("status")
+    assert status["incomplete_scans"] == 0
+    assert [port["device"]["device_id"] for port in status["ports"]] == ["bench-1"] * ports
+
+
+@pytest.mark.parametrize("ports", [1, 2])
+def test_the_order_in_which_the_channels_come_does_not_matter(bench: Start, ports: int) -> None:
+    b = bench(ports=ports)
+    b.tare()
+    frame = b.step(channels=(Channel.STRUCTURE, Channel.MAGNITUDE))
+    assert frame["flags"] == []
+
+
+@pytest.mark.parametrize(
+    ("present", "flag"),
+    [(Channel.MAGNITUDE, "structure_missing"), (Channel.STRUCTURE, "magnitude_missing")],
+)
+def test_one_channel_missing_is_flagged_and_the_maps_go_on(
+    bench: Start, present: Channel, flag: str
+) -> None:
+    b = bench(ports=2)
+    b.tare()
+    frame = b.step(load=0.1, channels=(present,))
+    assert frame["flags"] == [flag]
+    assert array_from_wire(frame["map"])[0, 0] == pytest.approx(0.1, abs=1e-3)
+    assert b.step()["flags"] == []  # both again
+    assert b.ask("status")["incomplete_scans"] == 1
+
+
+def test_a_channel_that_stays_out_is_lost_and_comes_back(bench: Start) -> None:
+    # A wait that would be noticed if every frame had to pay for it.
+    b = bench(ports=2, sync_wait_ms=300)
+    b.tare()
+    while not any(e["name"] == "channel_lost" for e in b.listener.of("event")):
+        b.step(channels=(Channel.MAGNITUDE,))
+    frame = b.step(channels=(Channel.MAGNITUDE,))
+    assert frame["age_ns"] < 250e6  # not waited for any more
+    # The first pair is what shows that the channel is back: it may still be sent on alone.
+    b.step()
+    b.listener.event("channel_back")
+    assert b.step()["flags"] == []
+
+
+def test_a_scan_that_comes_too_late_is_counted_and_left_out(bench: Start) -> None:
+    b = bench(ports=2, sync_wait_ms=20)
+    b.tare()
+    counter = b.skin.counter + 1
+    assert b.step(channels=(Channel.MAGNITUDE,))["flags"] == ["structure_missing"]
+    b.skin.scan(channels=(Channel.STRUCTURE,), counter=counter)
+    b.step()
+    assert b.ask("status")["late_scans"] == 1
+
+
+@pytest.mark.parametrize("ports", [1, 2])
+def test_counters_that_start_again_are_followed(bench: Start, ports: int) -> None:
+    b = bench(ports=ports)
+    b.skin.counter = 1000
+    b.tare()
+    b.step()
+    b.step(counter=0, device_us=0)
+    b.listener.event("device_restarted")
+    assert b.step(load=0.1)["flags"] == []
+
+
+def test_counters_wrap_after_32_bits(bench: Start) -> None:
+    b = bench()
+    b.skin.counter = 2**32 - 5
+    b.tare()
+    b.step(counter=2**32 - 1)
+    assert b.step(counter=0)["flags"] == []
+    assert b.step(counter=1)["flags"] == []
+    assert all(event["name"] == "tared" for event in b.listener.of("event"))
+
+
+def test_a_saturated_scan_is_used_and_flagged(bench: Start) -> None:
+    b = bench()
+    b.tare()
+    frame = b.step(flags=ScanFlag.SATURATED)
+    assert frame["flags"] == ["invalid_voltage"]
+    assert frame["map"] is not None
+
+
+def test_voltages_that_are_no_numbers_are_left_out(bench: Start) -> None:
+    b = bench()
+    b.tare()
+    line = b.skin.lines[0]
+    counter = b.skin.counter + 1
+    good = np.full(208, 1e5, np.float32)
+    bad = good.copy()
+    bad[17] = np.nan
+    line.say(
+        Scan(Channel.MAGNITUDE, counter, 0, ScanFlag(0), good),
+        Scan(Channel.STRUCTURE, counter, 0, ScanFlag(0), bad),
+    )
+    assert b.listener.frame(counter)["flags"] == ["invalid_voltage", "structure_missing"]

@@ -1,0 +1,82 @@
+"""A configuration that cannot be used is refused with the file, the key and what is allowed."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+from tactomo.config import DaemonConfig, load_config
+from tactomo.errors import ConfigError
+
+EXAMPLE = Path(__file__).parents[2] / "deploy" / "daemon.example.toml"
+
+
+def config_file(folder: Path, text: str) -> Path:
+    path = folder / "skin.toml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("ports = [", "not valid TOML"),
+        ("name = 'left'", "ports is missing"),
+        ("ports = ['a']\nprot = 1", "unknown key prot"),
+        ("ports = []", "ports = []"),
+        ("ports = ['a', 'b', 'c']", "at most 2"),
+        ("ports = ['a', 'a']", "the two ports are the same"),
+        ("ports = 'a'", "ports = 'a'"),
+        ("ports = ['a']\nbaud = 'fast'", "baud = 'fast'"),
+        ("ports = ['a']\ntare_scans = 1", "greater than or equal to 2"),
+        ("ports = ['a']\nsync_wait_ms = nan", "sync_wait_ms = nan"),
+        ("ports = ['a']\nbudget_ms = 0", "greater than 0"),
+        ("ports = ['a']\ntier = 'best'", "'auto', 'quiet', 'tikhonov' or 'levelset'"),
+        ("ports = ['a']\nname = 'left arm'", "letters, digits"),
+        ("ports = ['a']\nstream = 'tcp://0.0.0.0:5560'", "can be reached from other computers"),
+        ("ports = ['a']\nstream = 'tcp://*:5560'", "can be reached from other computers"),
+        ("ports = ['a']\ncontrol = 'tcp://127.0.0.1'", "use tcp://127.0.0.1:PORT"),
+        ("ports = ['a']\ncontrol = 'tcp://127.0.0.1:99999'", "use tcp://127.0.0.1:PORT"),
+        ("ports = ['a']\ncontrol = 'udp://127.0.0.1:1'", "use tcp://127.0.0.1:PORT"),
+    ],
+)
+def test_a_bad_file_is_refused_with_the_reason(tmp_path: Path, text: str, said: str) -> None:
+    path = config_file(tmp_path, text)
+    with pytest.raises(ConfigError, match=r".") as caught:
+        load_config(path)
+    assert str(path) in caught.value.cause
+    assert said in caught.value.cause
+    assert caught.value.next_step
+
+
+def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="No such file"):
+        load_config(tmp_path / "none.toml")
+
+
+def test_flags_win_and_are_blamed_themselves(tmp_path: Path) -> None:
+    path = config_file(tmp_path, "ports = ['a']\ntare_scans = 7\nbaud = 9600")
+    assert load_config(path, tare_scans=9, baud=None) == DaemonConfig(
+        ports=("a",), tare_scans=9, baud=9600
+    )
+    with pytest.raises(ConfigError, match="command line: tare_scans = 0"):
+        load_config(path, tare_scans=0)
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    ["tcp://127.0.0.1:0", "tcp://localhost:5560", "tcp://[::1]:5560", "ipc:///run/tactomo/left"],
+)
+def test_endpoints_on_this_computer_are_accepted(endpoint: str) -> None:
+    assert load_config(ports=["a"], stream=endpoint).stream == endpoint
+
+
+def test_the_example_shows_every_key_and_loads() -> None:
+    load_config(EXAMPLE)
+    text = EXAMPLE.read_text()
+    # Keys without a value in the example are there as comments.
+    commented = [line.removeprefix("# ") for line in text.splitlines() if " = " in line]
+    shown = {line.partition(" = ")[0] for line in commented}
+    assert set(DaemonConfig.model_fields) <= shown
+    assert tomllib.loads(text)

@@ -1,0 +1,165 @@
+"""What subscribers get: envelopes, late joiners, slow readers, and nothing that nobody wants."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import zmq
+from tactomo_client import subscribe
+from tactomo_client.messages import array_from_wire, decode_message, topic
+
+Start = Callable[..., Any]
+
+
+def test_every_message_carries_the_envelope(bench: Start) -> None:
+    b = bench()
+    before_ns = time.monotonic_ns()
+    b.tare()
+    b.step(load=0.1)
+    frame = b.listener.of("map")[-1]
+    assert before_ns < frame["acquired_monotonic_ns"] < time.monotonic_ns()
+    assert abs(frame["acquired_realtime_ns"] - time.time_ns()) < 60e9
+    assert 0 < frame["age_ns"] < 10e9
+    assert frame["tier"] == "tikhonov"
+    assert frame["misfit"] == 1.0
+    for kind in ("map", "contacts", "scan", "status", "event"):
+        messages = b.listener.of(kind)
+        assert {m["session"] for m in messages} == {b.daemon.session}
+        sequence = [m["sequence"] for m in messages]
+        assert sequence == list(range(sequence[0], sequence[0] + len(sequence)))
+
+
+def test_frames_before_the_first_reference_say_so(bench: Start) -> None:
+    b = bench()
+    b.skin.introduce()
+    frame = b.step()
+    assert frame["flags"] == ["no_reference"]
+    assert frame["map"] is None
+    assert frame["contacts"] == []
+
+
+def test_the_client_reads_maps_and_contacts(bench: Start) -> None:
+    b = bench()
+    b.tare()
+    with (
+        subscribe("left", address=b.daemon.stream_address, timeout_s=30) as maps,
+        subscribe("left", address=b.daemon.stream_address, kind="contacts", timeout_s=30) as few,
+    ):
+        b.until(lambda: b.ask("status")["subscribers"] == 7)
+        b.step(load=0.1)
+        frame = next(maps)
+        assert frame.map is not None
+        assert frame.map.shape == (51, 51)
+        assert frame.x_mm == pytest.approx((-75, 75))
+        (contact,) = next(few).contacts
+        assert (contact.x_mm, contact.y_mm) == pytest.approx((10, -20))
+        assert contact.area_mm2 == pytest.approx(700)
+        assert contact.pressure_kpa is None
+        assert frame.contacts == (contact,)
+
+
+def test_the_scan_topic_carries_the_voltages_in_volts(bench: Start) -> None:
+    b = bench()
+    b.tare()
+    counter = b.skin.scan()
+    scan = b.listener.wait("scan", lambda s: s["scan_counter"] == counter)
+    assert array_from_wire(scan["magnitude"]) == pytest.approx(
+        np.linspace(0.05, 0.2, 208), abs=2e-5
+    )
+    assert (scan["tier"], scan["misfit"]) == (None, None)
+
+
+def test_a_late_joiner_gets_the_status_at_once(bench: Start) -> None:
+    b = bench()
+    b.tare()
+    b.until(lambda: len(b.listener.of("status")) >= 2)
+    # The next one is due in a second; a repetition comes at once and has the number of the last.
+    last = b.listener.of("status")[-1]["sequence"]
+    with zmq.Context.instance().socket(zmq.SUB) as socket:
+        socket.linger = 0
+        socket.setsockopt(zmq.SUBSCRIBE, topic("left", "status"))
+        socket.connect(b.daemon.stream_address)
+        assert socket.poll(30_000)
+        assert decode_message(socket.recv()).fields["sequence"] == last
+    b.until(lambda: b.ask("status")["subscribers"] == 5)
+
+
+def test_a_map_is_made_for_subscribers_alone(bench: Start) -> None:
+    b = bench()
+    b.tare()
+    # Unsubscribe from maps; contacts and the rest go on.
+    b.listener.socket.setsockopt(zmq.UNSUBSCRIBE, topic("left", "map"))
+    b.until(lambda: b.ask("status")["subscribers"] == 4)
+    counter = b.skin.scan()
+    b.listener.wait("contacts", lambda c: c["scan_counter"] == counter)
+    maps = len(b.listener.of("map"))
+    b.listener.socket.setsockopt(zmq.SUBSCRIBE, topic("left", "map"))
+    b.until(lambda: b.ask("status")["subscribers"] == 5)
+    b.step()
+    assert [m["sequence"] for m in b.listener.of("map")] == list(range(1, maps + 2))
+
+
+def test_a_stalled_subscriber_slows_nobody(bench: Start) -> None:
+    b = bench()
+    b.tare()
+    with zmq.Context.instance().socket(zmq.SUB) as stalled:
+        stalled.linger = 0
+        stalled.setsockopt(zmq.RCVHWM, 1)
+        stalled.setsockopt(zmq.RCVBUF, 4096)
+        stalled.setsockopt(zmq.SUBSCRIBE, b"")
+        stalled.connect(b.daemon.stream_address)
+        b.until(lambda: b.ask("status")["subscribers"] == 6)
+        start = b.skin.counter
+        for _ in range(400):  # some 12 MB of maps, far more than the stalled one is kept
+            b.step(load=0.1)
+        maps = [m for m in b.listener.of("map") if m["scan_counter"] > start]
+        assert len(maps) == 400
+        assert np.percentile([m["age_ns"] for m in maps], 50) < 50e6
+
+
+def test_the_newest_scan_wins_when_the_reconstruction_lags(bench: Start) -> None:
+    b = bench(seconds=0.05)
+    b.tare()
+    start = b.skin.counter
+    for _ in range(40):
+        b.skin.scan()
+    frame = b.listener.frame(b.skin.counter)
+    assert frame["age_ns"] < 10e9
+    frames = [m for m in b.listener.of("map") if m["scan_counter"] > start]
+    assert len(frames) < 40
+    b.listener.event("scans_dropped")
+    assert b.ask("status")["dropped_scans"] == 40 - len(frames)
+
+
+def test_every_scan_is_reconstructed_if_asked_for(bench: Start) -> None:
+    b = bench(seconds=0.02, lossless=True)
+    b.tare()
+    start = b.skin.counter
+    for _ in range(40):
+        b.skin.scan()
+    b.listener.frame(b.skin.counter)
+    counters = [m["scan_counter"] for m in b.listener.of("map") if m["scan_counter"] > start]
+    assert counters == list(range(start + 1, start + 41))
+    assert b.ask("status")["dropped_scans"] == 0
+
+
+def test_a_reconstruction_that_fails_costs_its_frame_alone(
+    bench: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    b = bench()
+    b.tare()
+    memory = b.daemon._imaging._reconstructor
+    reconstruct = memory.reconstruct
+
+    def fail_once(*volts: Any) -> Any:
+        memory.reconstruct = reconstruct
+        raise ZeroDivisionError("a mistake")
+
+    memory.reconstruct = fail_once
+    b.skin.scan()
+    assert "ZeroDivisionError" in b.listener.event("reconstruction_failed")["detail"]
+    assert b.step(load=0.1)["map"] is not None

@@ -1,0 +1,182 @@
+"""What can go wrong at a port: noise, unplugging, the wrong device, somebody else's port."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tactomo.config import load_config
+from tactomo.daemon import Daemon
+from tactomo.errors import PortBusyError, PortError
+from tactomo_protocol import Acknowledge, AckStatus, Channel, CommandCode, Scan, ScanFlag
+
+Start = Callable[..., Any]
+
+
+def daemon_on(port: Path) -> Daemon:
+    memory: Any = object()
+    local = "tcp://127.0.0.1:0"
+    return Daemon(
+        load_config(None, ports=[str(port)], stream=local, control=local), reconstructor=memory
+    )
+
+
+def test_garbage_is_counted_and_told_and_costs_nothing_else(bench: Start) -> None:
+    b = bench()
+    b.tare()
+    b.skin.lines[0].say(b"\x00" + os.urandom(300).replace(b"\x00", b"\x01") + b"\x00")
+    event = b.listener.event("corrupt_packets")
+    assert event["severity"] == "warning"
+    assert b.step()["flags"] == []
+    (port,) = b.ask("status")["ports"]
+    assert port["corrupt"] == 1
+    assert port["connected"]
+
+
+def test_a_flood_of_garbage_makes_few_events(bench: Start) -> None:
+    b = bench()
+    b.tare()
+    for _ in range(200):
+        b.skin.lines[0].say(b"\x00garbage\x00")
+    b.step()
+    assert b.ask("status")["ports"][0]["corrupt"] == 200
+    assert 1 <= sum(e["name"] == "corrupt_packets" for e in b.listener.of("event")) <= 3
+
+
+@pytest.mark.parametrize("ports", [1, 2])
+def test_an_unplugged_port_is_waited_for_and_started_again(bench: Start, ports: int) -> None:
+    b = bench(ports=ports)
+    b.tare()
+    line = b.skin.lines[0]
+    line.unplug()
+    assert b.listener.event("port_lost")["severity"] == "error"
+    assert not b.ask("status")["ports"][0]["connected"]
+    line.plug()
+    b.listener.event("port_back")
+    line.introduce()
+    frame = b.step(load=0.1)
+    assert frame["flags"] == []  # the reference held
+    assert frame["map"] is not None
+
+
+def test_the_other_port_goes_on_while_one_is_unplugged(bench: Start) -> None:
+    b = bench(ports=2)
+    b.tare()
+    b.skin.line_of(Channel.STRUCTURE).unplug()
+    b.listener.event("port_lost")
+    frame = b.step(load=0.1, channels=(Channel.MAGNITUDE,))
+    assert frame["flags"] == ["structure_missing"]
+
+
+def test_a_device_that_is_there_already_needs_no_introduction(bench: Start) -> None:
+    b = bench()
+    line = b.skin.lines[0]
+    line.say(b"the end of a packet that began before\x00")  # attached in the middle
+    line.say(line.hello)
+    for _ in range(3):
+        b.step()
+    b.listener.event("tared")
+    assert b.ask("status")["ports"][0]["corrupt"] == 0
+
+
+def test_a_silent_device_is_asked_again(bench: Start) -> None:
+    b = bench()
+    codes: list[int] = []
+
+    def asked_twice() -> bool:
+        codes.extend(command.code for command in b.skin.lines[0].heard())
+        return codes.count(CommandCode.IDENTIFY) >= 2 and codes.count(CommandCode.START) >= 2
+
+    b.listener.wait("status", lambda _: asked_twice())
+
+
+@pytest.mark.parametrize(
+    ("differs", "said"),
+    [
+        ({"electrodes": 8}, "electrodes 8, not 16"),
+        ({"samples_per_scan": 192}, "samples_per_scan 192, not 208"),
+        ({"drive_offset": 8}, "drive_offset 8, not 1"),
+    ],
+)
+def test_the_wrong_device_is_refused_and_not_reconstructed(
+    bench: Start, differs: dict[str, int], said: str
+) -> None:
+    b = bench()
+    line = b.skin.lines[0]
+    right = line.hello
+    line.hello = replace(right, **differs)
+    line.introduce()
+    assert said in b.listener.event("device_refused")["detail"]
+    b.skin.scan()
+    line.hello = right
+    line.say(right)
+    b.step()
+    assert [frame["scan_counter"] for frame in b.listener.of("map")] == [2]
+    assert b.ask("status")["ports"][0]["refusal"] == ""
+
+
+def test_a_command_that_the_device_refuses_is_told(bench: Start) -> None:
+    b = bench()
+    b.tare()
+    b.skin.lines[0].say(Acknowledge(3, CommandCode.START, AckStatus.BUSY))
+    assert "BUSY" in b.listener.event("command_refused")["detail"]
+
+
+def test_scans_of_another_length_than_announced_are_not_used(bench: Start) -> None:
+    b = bench()
+    b.tare()
+    line = b.skin.lines[0]
+    line.say(Scan(Channel.MAGNITUDE, 99, 0, ScanFlag(0), np.zeros(10, np.int32)))
+    assert b.step()["flags"] == []
+    assert 99 not in [frame["scan_counter"] for frame in b.listener.of("map")]
+
+
+def test_a_busy_port_is_named_with_its_holder(bench: Start, tmp_path: Path) -> None:
+    b = bench()
+    path = b.skin.lines[0].path
+    with pytest.raises(PortBusyError, match=f"pid {os.getpid()}") as caught:
+        daemon_on(path).start()
+    assert caught.value.next_step
+
+
+def test_a_port_held_by_another_process_is_busy(bench: Start, tmp_path: Path) -> None:
+    master, slave = os.openpty()
+    name = os.ttyname(slave)
+    os.close(slave)
+    holder = subprocess.Popen(
+        [
+            sys.executable,
+            "-c",
+            f"import fcntl, sys; f = open({name!r}, 'rb'); fcntl.flock(f, fcntl.LOCK_EX); "
+            "print('held', flush=True); sys.stdin.read()",
+        ],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    try:
+        assert holder.stdout is not None
+        holder.stdout.readline()
+        with pytest.raises(PortBusyError, match=f"pid {holder.pid}"):
+            daemon_on(Path(name)).start()
+    finally:
+        holder.communicate()
+        os.close(master)
+
+
+@pytest.mark.parametrize("kind", ["absent", "file", "folder", "url"])
+def test_what_is_no_port_is_refused_at_once(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "port"
+    if kind == "file":
+        path.write_text("not a device")
+    if kind == "folder":
+        path.mkdir()
+    with pytest.raises(PortError) as caught:
+        daemon_on(path if kind != "url" else Path("nonsense:/1")).start()
+    assert caught.value.next_step
