@@ -15,7 +15,14 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 from tactomo_client.messages import CONTACTS, MAP, SCAN
-from tactomo_models import Reconstruction, Reconstructor, Reference, SensorDescription, Tier
+from tactomo_models import (
+    ModelError,
+    Reconstruction,
+    Reconstructor,
+    Reference,
+    SensorDescription,
+    Tier,
+)
 from tactomo_protocol import Channel, ScanFlag
 
 from tactomo.errors import CommandError
@@ -130,11 +137,11 @@ class Imaging:
         if mark is not None:
             self._obey(mark)
         self._follow_recording(dual)
-        volts, flags = usable_volts(dual)
+        volts = {scan.channel: scan.volts for scan in dual.scans}
         self._publish_scan(dual, volts)
         frame = self._reconstruct(volts)
         if frame is not None:
-            self._publish_frame(dual, frame, flags | set(frame.flags.names()))
+            self._publish_frame(dual, frame)
         if self._marked is not None and dual.recording == self._marked.number:
             keys = tuple(ScanKey(s.channel, s.counter, s.device_us) for s in dual.scans)
             done = Mark(keys, str(self.tier), self.budget_ms)
@@ -195,8 +202,11 @@ class Imaging:
         if self._publisher.wants(SCAN):
             self._publisher.publish(SCAN, scan_fields(dual.counter, volts), header)
 
-    def _publish_frame(self, dual: DualScan, frame: Reconstruction, flags: set[str]) -> None:
+    def _publish_frame(self, dual: DualScan, frame: Reconstruction) -> None:
         started_s = time.perf_counter()
+        flags = set(frame.flags.names())
+        if any(scan.flags & ScanFlag.SATURATED for scan in dual.scans):
+            flags.add("invalid_voltage")
         header = frame_header(dual.last, frame, flags)
         self._publisher.header = header
         self._publisher.publish(CONTACTS, contacts_fields(dual.counter, frame), header)
@@ -221,6 +231,9 @@ class Imaging:
         except CommandError as refusal:
             self._refuse_tare(tare, refusal)
             return
+        except ModelError as error:
+            self._refuse_tare(tare, CommandError(str(error), "", "tare_refused"))
+            return
         self._tare = None
         self.use_reference(reference, time.time_ns())
         for answer in tare.answers:
@@ -239,17 +252,3 @@ class Imaging:
         if stage not in self.stages:  # a new dictionary, for those who iterate over the old one
             self.stages = {**self.stages, stage: Durations()}
         self.stages[stage].add(seconds)
-
-
-def usable_volts(dual: DualScan) -> tuple[Volts, set[str]]:
-    """Return the voltages that may be used, and flags that say what is wrong with the others."""
-    volts: Volts = {}
-    flags: set[str] = set()
-    for scan in dual.scans:
-        if scan.flags & ScanFlag.SATURATED:
-            flags.add("invalid_voltage")
-        if np.isfinite(scan.volts).all():
-            volts[scan.channel] = scan.volts
-        else:
-            flags.add("invalid_voltage")
-    return volts, flags

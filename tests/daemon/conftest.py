@@ -243,7 +243,9 @@ class Memory:
             (structure, self.reference.structure),
         ):
             if volts is not None and rest is not None:
-                change += float(np.mean(volts / rest - 1))
+                valid = np.isfinite(volts)
+                flags |= Flag(0) if valid.all() else Flag.INVALID_VOLTAGE
+                change += float(np.mean((volts / rest - 1)[valid]))
         self._before = (0.5 * self._before + change).astype(np.float32)
         return self._result(self._before, flags)
 
@@ -373,3 +375,23 @@ def replay(tmp_path: Path) -> Callable[..., Any]:
         return Heard(out)
 
     return run
+
+
+@pytest.fixture
+def connect() -> Iterator[Callable[..., Any]]:
+    """Connect a bare socket: ``connect(zmq.SUB, address, prefix)``; it is closed later."""
+    sockets: list[zmq.Socket[bytes]] = []
+
+    def open_socket(kind: int, address: str, prefix: bytes | None = None, rcvhwm: int = 0) -> Any:
+        socket: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
+        sockets.append(socket)
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.RCVHWM, rcvhwm)
+        if prefix is not None:
+            socket.setsockopt(zmq.SUBSCRIBE, prefix)
+        socket.connect(address)
+        return socket
+
+    yield open_socket
+    for socket in sockets:
+        socket.close()

@@ -160,31 +160,27 @@ def test_what_cannot_be_done_is_refused_by_name(
         msgpack.packb({"schema": 1, "command": "status", "arguments": [1]}),
     ],
 )
-def test_malformed_requests_get_an_answer(bench: Start, body: bytes) -> None:
+def test_malformed_requests_get_an_answer(bench: Start, connect: Start, body: bytes) -> None:
     b = bench()
-    with zmq.Context.instance().socket(zmq.REQ) as socket:
-        socket.linger = 0
-        socket.connect(b.daemon.control_address)
-        socket.send(body)
-        assert socket.poll(30_000)
-        with pytest.raises(ControlError) as caught:
-            decode_reply(socket.recv())
+    socket = connect(zmq.REQ, b.daemon.control_address)
+    socket.send(body)
+    assert socket.poll(30_000)
+    with pytest.raises(ControlError) as caught:
+        decode_reply(socket.recv())
     assert caught.value.name == "malformed_message"
     assert b.ask("status")
 
 
-def test_a_dealer_and_a_request_that_is_too_large(bench: Start) -> None:
+def test_a_dealer_and_a_request_that_is_too_large(bench: Start, connect: Start) -> None:
     b = bench()
-    with zmq.Context.instance().socket(zmq.DEALER) as socket:
-        socket.linger = 0
-        socket.connect(b.daemon.control_address)
-        socket.send_multipart([b"", encode_request("status", {})])
-        assert socket.poll(30_000)
-        empty, reply = socket.recv_multipart()
-        assert empty == b""
-        assert decode_reply(reply)["state"]
-        socket.send_multipart([b"", b"x" * 1_000_000])  # cut off, not answered
-        assert not socket.poll(200)
+    socket = connect(zmq.DEALER, b.daemon.control_address)
+    socket.send_multipart([b"", encode_request("status", {})])
+    assert socket.poll(30_000)
+    empty, reply = socket.recv_multipart()
+    assert empty == b""
+    assert decode_reply(reply)["state"]
+    socket.send_multipart([b"", b"x" * 1_000_000])  # cut off, not answered
+    assert not socket.poll(200)
     assert b.ask("status")
 
 

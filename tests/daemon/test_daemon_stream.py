@@ -73,18 +73,16 @@ def test_the_scan_topic_carries_the_voltages_in_volts(bench: Start) -> None:
     assert (scan["tier"], scan["misfit"]) == (None, None)
 
 
-def test_a_late_joiner_gets_the_status_at_once(bench: Start) -> None:
+def test_a_late_joiner_gets_the_status_at_once(bench: Start, connect: Start) -> None:
     b = bench()
     b.tare()
     b.until(lambda: len(b.listener.of("status")) >= 2)
     # The next one is due in a second; a repetition comes at once and has the number of the last.
     last = b.listener.of("status")[-1]["sequence"]
-    with zmq.Context.instance().socket(zmq.SUB) as socket:
-        socket.linger = 0
-        socket.setsockopt(zmq.SUBSCRIBE, topic("left", "status"))
-        socket.connect(b.daemon.stream_address)
-        assert socket.poll(30_000)
-        assert decode_message(socket.recv()).fields["sequence"] == last
+    socket = connect(zmq.SUB, b.daemon.stream_address, topic("left", "status"))
+    assert socket.poll(30_000)
+    assert decode_message(socket.recv()).fields["sequence"] == last
+    socket.close()
     b.until(lambda: b.ask("status")["subscribers"] == 5)
 
 
@@ -103,22 +101,17 @@ def test_a_map_is_made_for_subscribers_alone(bench: Start) -> None:
     assert [m["sequence"] for m in b.listener.of("map")] == list(range(1, maps + 2))
 
 
-def test_a_stalled_subscriber_slows_nobody(bench: Start) -> None:
+def test_a_stalled_subscriber_slows_nobody(bench: Start, connect: Start) -> None:
     b = bench()
     b.tare()
-    with zmq.Context.instance().socket(zmq.SUB) as stalled:
-        stalled.linger = 0
-        stalled.setsockopt(zmq.RCVHWM, 1)
-        stalled.setsockopt(zmq.RCVBUF, 4096)
-        stalled.setsockopt(zmq.SUBSCRIBE, b"")
-        stalled.connect(b.daemon.stream_address)
-        b.until(lambda: b.ask("status")["subscribers"] == 6)
-        start = b.skin.counter
-        for _ in range(400):  # some 12 MB of maps, far more than the stalled one is kept
-            b.step(load=0.1)
-        maps = [m for m in b.listener.of("map") if m["scan_counter"] > start]
-        assert len(maps) == 400
-        assert np.percentile([m["age_ns"] for m in maps], 50) < 50e6
+    connect(zmq.SUB, b.daemon.stream_address, b"", rcvhwm=1)
+    b.until(lambda: b.ask("status")["subscribers"] == 6)
+    start = b.skin.counter
+    for _ in range(400):  # some 12 MB of maps, far more than the stalled one is kept
+        b.step(load=0.1)
+    maps = [m for m in b.listener.of("map") if m["scan_counter"] > start]
+    assert len(maps) == 400
+    assert np.percentile([m["age_ns"] for m in maps], 50) < 50e6
 
 
 def test_the_newest_scan_wins_when_the_reconstruction_lags(bench: Start) -> None:

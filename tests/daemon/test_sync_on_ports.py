@@ -103,7 +103,9 @@ def test_a_saturated_scan_is_used_and_flagged(bench: Start) -> None:
     assert frame["map"] is not None
 
 
-def test_voltages_that_are_no_numbers_are_left_out(bench: Start) -> None:
+def test_voltages_that_are_no_numbers_are_left_to_the_models_and_never_tared(
+    bench: Start,
+) -> None:
     b = bench()
     b.tare()
     line = b.skin.lines[0]
@@ -111,8 +113,12 @@ def test_voltages_that_are_no_numbers_are_left_out(bench: Start) -> None:
     good = np.full(208, 1e5, np.float32)
     bad = good.copy()
     bad[17] = np.nan
-    line.say(
-        Scan(Channel.MAGNITUDE, counter, 0, ScanFlag(0), good),
-        Scan(Channel.STRUCTURE, counter, 0, ScanFlag(0), bad),
-    )
-    assert b.listener.frame(counter)["flags"] == ["invalid_voltage", "structure_missing"]
+    answer = b.daemon._pipeline.tare()
+    for number in range(counter, counter + 3):
+        line.say(
+            Scan(Channel.MAGNITUDE, number, 0, ScanFlag(0), good),
+            Scan(Channel.STRUCTURE, number, 0, ScanFlag(0), bad),
+        )
+        assert b.listener.frame(number)["flags"] == ["invalid_voltage"]
+    assert "not numbers" in str(answer.exception(30))
+    assert b.ask("status")["reference"]["scans"] == 3
