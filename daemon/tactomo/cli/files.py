@@ -62,9 +62,7 @@ def _facts(what: str) -> dict[str, Any]:
 
         return _recording_facts(open_recording(what))
     if suffix == ".npz":
-        from tactomo_models import Artifact
-
-        return _artifact_facts(Artifact.load(Path(what)))
+        return _array_facts(Path(what))
     from tactomo_models import load_description
 
     return _description_facts(load_description(what))
@@ -90,6 +88,19 @@ def _recording_facts(recording: Recording) -> dict[str, Any]:
         "references": summary.references,
         "recorded by": f"tactomo {summary.origin.version}",
     }
+
+
+def _array_facts(path: Path) -> dict[str, Any]:
+    """Describe a built artifact, or any other file of arrays, by what is in it."""
+    from tactomo.cli.imported import load_arrays
+
+    arrays = load_arrays(path)
+    facts = {name: array.item() for name, array in arrays.items() if array.ndim == 0}
+    kind = "artifact" if {"sha256", "sensor", "jacobian"} <= arrays.keys() else "arrays"
+    shapes = {
+        name: f"{array.dtype} {array.shape}" for name, array in arrays.items() if array.ndim > 0
+    }
+    return {"kind": kind, "bytes": path.stat().st_size, **facts, "arrays": shapes}
 
 
 def _description_facts(description: SensorDescription) -> dict[str, Any]:

@@ -148,7 +148,7 @@ def read_scans(path: Path, description: SensorDescription, channel: Channel | No
         ImportFileError: the file is neither layout, or does not fit the sensor.
 
     """
-    arrays = _load(path)
+    arrays = load_arrays(path)
     if "volts" in arrays and "injection" in arrays:
         return _single_ended(path, arrays, description, channel or _only_channel(description))
     if any(name in arrays for name in _CHANNELS):
@@ -160,7 +160,13 @@ def read_scans(path: Path, description: SensorDescription, channel: Channel | No
     )
 
 
-def _load(path: Path) -> dict[str, NDArray[Any]]:
+def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an .npz file by name.
+
+    Raises:
+        ImportFileError: it cannot be read or is none.
+
+    """
     try:
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}

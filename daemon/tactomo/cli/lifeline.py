@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 import threading
 
 VARIABLE = "TACTOMO_LIFELINE"
+STDIN = 0
 HARD_STOP_S = 3.0
 
 
@@ -23,7 +23,8 @@ def hold_lifeline() -> None:
 
 
 def _wait_for_the_end() -> None:
-    while sys.stdin.buffer.read(4096):
+    # The descriptor itself: a thread inside sys.stdin would hold its lock when Python shuts down.
+    while os.read(STDIN, 4096):
         pass
     os.kill(os.getpid(), signal.SIGTERM)
     # Nobody is left to lose patience with a process that does not stop.

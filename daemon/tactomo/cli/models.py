@@ -37,14 +37,24 @@ def build(
     The daemon does this by itself when they are missing; building ahead spares its first start.
     They are bound to the description by a hash: after a change of geometry, build again.
     """
-    from tactomo_models import load_description, load_or_build_artifact
+    from rich.console import Console
+    from tactomo_models import ArtifactError, load_description
+    from tactomo_models.artifact import build_artifact, default_path, load_artifact, save_artifact
 
     description = load_description(sensor)
-    from rich.console import Console
-
-    with Console(stderr=True).status(f"building the models of {description.name}"):
-        artifact = load_or_build_artifact(description, path=output)
-    typer.echo(f"{description.name}: models ready ({artifact})")
+    path = output or default_path(description)
+    try:
+        load_artifact(path, description)
+        typer.echo(f"{path} is up to date")
+        return
+    except ArtifactError:  # missing, damaged, or of another sensor or version: build it
+        pass
+    with Console(stderr=True).status(description.name) as shown:
+        artifact = build_artifact(
+            description, lambda step: shown.update(f"{description.name}: {step}")
+        )
+        save_artifact(artifact, path)
+    typer.echo(f"wrote {path}")
 
 
 @models_app.command(name="list")

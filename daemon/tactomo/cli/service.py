@@ -273,6 +273,7 @@ def replay(
     """
     from tactomo.recording import open_recording
 
+    factor = _speed(speed)
     opened = open_recording(recording)
     origin = opened.summary.origin
     if with_viewer:
@@ -282,7 +283,6 @@ def replay(
         return
     from tactomo.config import load_config
 
-    factor = _speed(speed)
     settings = load_config(
         name=sensor or origin.sensor or None,
         description=description or origin.description or None,

@@ -160,6 +160,7 @@ class Twin:
         self._solver = ThreadPoolExecutor(max_workers=1, thread_name_prefix="twin-skin")
         self._thread = threading.Thread(target=self._run, name="twin-firmware")
         self._stopping = threading.Event()
+        self._ended = threading.Event()
         self._failure: BaseException | None = None
 
     @property
@@ -182,15 +183,17 @@ class Twin:
         self._wake()
         if self._thread.ident is None:  # never started: the closing falls to us
             self._thread.start()
+        self._thread.join()
         self.wait()
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait until the twin has stopped and tell whether it has; raise, once, what failed."""
-        self._thread.join(timeout_s)
+        # Not a join: one that Ctrl-C interrupts takes the thread for ended (Python 3.11, 3.12).
+        ended = self._ended.wait(timeout_s)
         failure, self._failure = self._failure, None
         if failure is not None:
             raise failure
-        return not self._thread.is_alive()
+        return ended
 
     def _run(self) -> None:
         try:
@@ -208,6 +211,7 @@ class Twin:
             self._control.close()
             self._wake_receiver.close()
             self._wake_sender.close()
+            self._ended.set()
 
     def _rest(self) -> None:
         """Wait until something is due, or the host, a client or the solver has something."""

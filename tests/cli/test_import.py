@@ -1,0 +1,198 @@
+"""`import`: scans of other programs become a recording in the sensor's own order."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from tactomo.recording import Recording, open_recording
+from tactomo_models import load_description
+from tactomo_protocol import Channel, Decoder, Scan
+
+Run = Callable[..., Any]
+
+ELECTRODES = 16
+SCIOSPEC = Path(os.environ.get("TACTOMO_DATA", "data")) / "tank_sciospec_20fps.npz"
+
+
+def scans(recording: Recording) -> list[tuple[float, Scan]]:
+    """Every scan of a recording with its time in seconds since the first."""
+    decoder, found = Decoder(), []
+    for clock_ns, data in recording.chunks(0):
+        found += [(clock_ns, p) for p in decoder.feed(data) if isinstance(p, Scan)]
+    return [((clock_ns - found[0][0]) * 1e-9, scan) for clock_ns, scan in found]
+
+
+def potentials(frames: int, seed: int = 0) -> NDArray[np.float64]:
+    """Volts of every electrode against ground for every injection, (T, 16, 16)."""
+    return np.random.default_rng(seed).normal(size=(frames, ELECTRODES, ELECTRODES))
+
+
+def expected(volts: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The 208 differences by their definition, independent of the code's pair tables."""
+    rows = []
+    for k in range(ELECTRODES):
+        for m in range(ELECTRODES):
+            touched = {k, (k + 1) % ELECTRODES} & {m, (m + 1) % ELECTRODES}
+            if not touched:
+                rows.append(volts[:, k, m] - volts[:, k, (m + 1) % ELECTRODES])
+    return np.array(rows).T
+
+
+INJECTION = np.array([(k + 1, (k + 1) % ELECTRODES + 1) for k in range(ELECTRODES)])
+
+
+def test_single_ended_volts_become_differences_in_order(tactomo: Run, tmp_path: Path) -> None:
+    volts = potentials(5)
+    times = 1.7e9 + np.array([0.0, 0.05, 0.1, 0.3, 0.35])
+    complex_volts = volts * (1 + 0.1j)
+    np.savez(tmp_path / "in.npz", t=times, injection=INJECTION, volts=complex_volts)
+    result = tactomo(
+        *("import", "in.npz", "out.mcap", "--sensor", "tank_disc", "--reference-frames", "0:2")
+    )
+    assert result.returncode == 0, result.stderr
+    assert "10% is quadrature" in result.stdout
+    recording = open_recording(tmp_path / "out.mcap")
+    read = scans(recording)
+    assert [time_s for time_s, _ in read] == pytest.approx(times - times[0], abs=1e-6)
+    assert [scan.counter for _, scan in read] == [0, 1, 2, 3, 4]
+    assert {scan.channel for _, scan in read} == {Channel.STRUCTURE}
+    got = np.array([scan.samples for _, scan in read])
+    assert np.allclose(got, expected(volts), rtol=1e-6, atol=1e-6)
+    reference = recording.first_reference()
+    assert reference is not None
+    assert reference.structure == pytest.approx(expected(volts)[:2].mean(axis=0))
+    assert reference.magnitude is None
+    assert recording.summary.origin.description == "tank_disc"
+    assert recording.summary.origin.description_sha256 == load_description("tank_disc").sha256
+
+
+def test_a_reversed_and_shuffled_injection_is_put_right(tactomo: Run, tmp_path: Path) -> None:
+    volts = potentials(3)
+    shuffled = np.random.default_rng(1).permutation(ELECTRODES)
+    injection, turned = INJECTION[shuffled], volts[:, shuffled]
+    injection[::2], turned[:, ::2] = injection[::2, ::-1].copy(), -turned[:, ::2]
+    np.savez(tmp_path / "in.npz", injection=injection, volts=turned)
+    result = tactomo("import", "in.npz", "out.mcap", "--sensor", "tank_disc", "--rate", "10")
+    assert result.returncode == 0, result.stderr
+    read = scans(open_recording(tmp_path / "out.mcap"))
+    got = np.array([scan.samples for _, scan in read])
+    assert np.allclose(got, expected(volts), rtol=1e-6, atol=1e-6)
+    assert [time_s for time_s, _ in read] == pytest.approx([0.0, 0.1, 0.2], abs=1e-6)
+
+
+def test_the_batch_layout_keeps_channels_reference_and_gaps(tactomo: Run, tmp_path: Path) -> None:
+    arrays = {
+        "magnitude": potentials(4).reshape(4, -1)[:, :208],
+        "structure": potentials(4, 1).reshape(4, -1)[:, :208],
+        "magnitude_reference": np.full(208, 0.5),
+        "structure_reference": np.full(208, 0.25),
+    }
+    arrays["structure"][2] = np.nan  # that scan did not arrive
+    np.savez(tmp_path / "in.npz", **arrays)
+    result = tactomo("import", "in.npz", "out.mcap", "--rate", "20", "--name", "left_forearm")
+    assert result.returncode == 0, result.stderr
+    recording = open_recording(tmp_path / "out.mcap")
+    read = [scan for _, scan in scans(recording)]
+    assert [(s.counter, s.channel.name[0]) for s in read] == [
+        *((0, "M"), (0, "S"), (1, "M"), (1, "S"), (2, "M"), (3, "M"), (3, "S")),
+    ]
+    assert read[3].samples == pytest.approx(arrays["structure"][1], rel=1e-6)
+    reference = recording.first_reference()
+    assert reference is not None
+    assert (reference.magnitude[0], reference.structure[0]) == (0.5, 0.25)  # type: ignore[index]
+    assert recording.summary.origin.sensor == "left_forearm"
+
+
+@pytest.mark.parametrize(
+    ("arrays", "options", "says"),
+    [
+        ({"x": np.zeros(3)}, [], "in.npz holds x; it must hold"),
+        ({"magnitude": np.zeros((4, 207))}, ["--rate", "1"], "real numbers (T, 208)"),
+        ({"magnitude": np.zeros((4, 208))}, [], "give --rate"),
+        (
+            {"magnitude": np.zeros((4, 208)), "structure": np.zeros((3, 208))},
+            ["--rate", "1"],
+            "differ in length",
+        ),
+        ({"magnitude": np.zeros((4, 208)), "t": [0, 2, 1, 3]}, [], "t does not rise"),
+        (
+            {"magnitude": np.zeros((4, 208))},
+            ["--rate", "1", "--sensor", "tank_disc"],
+            "a channel that tank_disc does not have",
+        ),
+        ({"injection": INJECTION, "volts": potentials(2)}, ["--rate", "1"], "give --channel"),
+        (
+            {"injection": INJECTION[:15], "volts": potentials(2)[:, :15]},
+            ["--rate", "1", "--sensor", "tank_disc"],
+            "no injection (15, 0)",
+        ),
+        (
+            {"injection": INJECTION, "volts": potentials(2)[:, :, :12]},
+            ["--rate", "1", "--sensor", "tank_disc"],
+            "(T, 16, 16)",
+        ),
+        (
+            {"injection": INJECTION, "volts": potentials(2) * np.exp(1j)},
+            ["--rate", "1", "--sensor", "tank_disc"],
+            "out of phase with the current",
+        ),
+        (
+            {"injection": INJECTION, "volts": potentials(2)},
+            ["--rate", "1", "--sensor", "tank_disc", "--reference-frames", "5:9"],
+            "the reference frames are 0 of the 2 scans",
+        ),
+    ],
+)
+def test_what_cannot_be_imported_is_refused(
+    tactomo: Run, tmp_path: Path, arrays: dict[str, Any], options: list[str], says: str
+) -> None:
+    np.savez(tmp_path / "in.npz", **arrays)
+    result = tactomo("import", "in.npz", "out.mcap", *options)
+    assert result.returncode == 1
+    assert says in result.stderr
+    assert "Traceback" not in result.stderr
+    assert not (tmp_path / "out.mcap").exists()
+
+
+def test_what_is_no_npz_is_refused(tactomo: Run, tmp_path: Path) -> None:
+    (tmp_path / "in.npz").write_text("volts,volts")
+    assert "is not an .npz file" in tactomo("import", "in.npz", "out.mcap").stderr
+    assert "cannot read none.npz" in tactomo("import", "none.npz", "out.mcap").stderr
+
+
+def test_an_existing_recording_is_not_overwritten(tactomo: Run, tmp_path: Path) -> None:
+    np.savez(tmp_path / "in.npz", magnitude=np.ones((4, 208)))
+    (tmp_path / "out.mcap").write_text("precious")
+    result = tactomo("import", "in.npz", "out.mcap", "--rate", "1")
+    assert result.returncode == 1
+    assert "exists already" in result.stderr
+    assert (tmp_path / "out.mcap").read_text() == "precious"
+
+
+def test_info_of_an_imported_recording(tactomo: Run, tmp_path: Path) -> None:
+    np.savez(tmp_path / "in.npz", magnitude=np.ones((4, 208)))
+    tactomo("import", "in.npz", "out.mcap", "--rate", "10")
+    facts = json.loads(tactomo("info", "out.mcap", "--json").stdout)
+    assert facts["scans"] == {"magnitude": 4}
+    assert facts["seconds"] == pytest.approx(0.3)
+    assert facts["complete"] is True
+    assert "magnitude: 4" in tactomo("info", "out.mcap").stdout
+
+
+@pytest.mark.skipif(not SCIOSPEC.exists(), reason="the measured tank is not on this machine")
+def test_a_measured_tank(tactomo: Run, tmp_path: Path) -> None:
+    result = tactomo(
+        *("import", SCIOSPEC, "tank.mcap", "--sensor", "tank_disc", "--reference-frames", "0:20")
+    )
+    assert result.returncode == 0, result.stderr
+    read = scans(open_recording(tmp_path / "tank.mcap"))
+    assert len(read) == 255
+    # Every adjacent voltage of an empty round tank has the sign of the current's way back.
+    assert np.all(read[0][1].samples < 0)

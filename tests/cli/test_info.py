@@ -1,0 +1,53 @@
+"""`info` of what is not a recording, and `models`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+Run = Callable[..., Any]
+
+
+def test_info_of_a_shipped_description(tactomo: Run) -> None:
+    facts = json.loads(tactomo("info", "paper_square", "--json").stdout)
+    assert facts["electrodes"] == 16
+    assert facts["voltages a scan"] == 208
+    assert facts["channels"] == "magnitude, structure"
+
+
+def test_info_of_a_file_of_arrays(tactomo: Run, tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", sensor="x", sha256="y", jacobian=np.zeros((2, 3)))
+    facts = json.loads(tactomo("info", "a.npz", "--json").stdout)
+    assert (facts["kind"], facts["sensor"]) == ("artifact", "x")
+    assert facts["arrays"] == {"jacobian": "float64 (2, 3)"}
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("none.mcap", None, "cannot open the recording none.mcap"),
+        ("text.mcap", "hello", "text.mcap was not made by tactomo"),
+        ("none.npz", None, "cannot read none.npz"),
+        ("bad.toml", "schema = [", "not valid TOML"),
+        ("bad.toml", "schema = 1\ncolour = 2", "unknown key colour"),
+        ("nosuchsensor", None, "paper_square"),
+    ],
+)
+def test_info_of_what_cannot_be_read(
+    tactomo: Run, tmp_path: Path, name: str, content: str | None, says: str
+) -> None:
+    if content is not None:
+        (tmp_path / name).write_text(content)
+    result = tactomo("info", name)
+    assert result.returncode == 1
+    assert says in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_models_list(tactomo: Run) -> None:
+    assert "paper_square" in tactomo("models", "list").stdout

@@ -1,0 +1,183 @@
+"""`twin`, `daemon`, `replay`, `viewer` and `demo` as processes: start, failure, no leftovers."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import pytest
+import serial
+from tactomo.cli.children import ChildError, Family
+from tactomo_client import request
+from tactomo_protocol import Command, CommandCode, Decoder, Scan, encode
+
+Run = Callable[..., Any]
+PATIENCE_S = 90.0
+
+linux = pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks processes up in /proc")
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Start `tactomo ARGUMENTS` and kill what is left of it afterwards."""
+    started: list[subprocess.Popen[str]] = []
+
+    def run(*arguments: object) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "tactomo.cli", *map(str, arguments)],
+            cwd=tmp_path,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        started.append(process)
+        return process
+
+    yield run
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+def announced(stream: IO[str] | None) -> dict[str, Any]:
+    """Return what a process announces on its output."""
+    assert stream is not None
+    seen = []
+    for line in stream:
+        seen.append(line)
+        if line.startswith('{"ready"'):
+            fields: dict[str, Any] = json.loads(line)
+            return fields
+    raise AssertionError("".join(seen))
+
+
+def wait_for(condition: Callable[[], Any]) -> Any:
+    end_s = time.monotonic() + PATIENCE_S
+    while time.monotonic() < end_s:
+        if value := condition():
+            return value
+        time.sleep(0.05)
+    raise AssertionError(f"did not happen within {PATIENCE_S} s")
+
+
+def children_of(pid: int) -> list[int]:
+    """Processes whose parent is `pid`."""
+    found = []
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = status.read_text().rpartition(")")[2].split()
+        except OSError:  # gone by now
+            continue
+        if int(fields[1]) == pid and fields[0] != "Z":
+            found.append(int(status.parent.name))
+    return found
+
+
+def is_running(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
+
+
+def test_a_twin_of_the_papers_sensor(start: Run, tmp_path: Path) -> None:
+    twin = start(
+        *("twin", "--ports", 1, "--link", "dev", "--control", "tcp://127.0.0.1:0"), "--announce"
+    )
+    ready = announced(twin.stdout)
+    assert ready["ports"] == ["dev/skin"]
+    decoder, scans = Decoder(), []
+    with serial.Serial(str(tmp_path / "dev" / "skin"), timeout=0.1) as port:
+        port.write(encode(Command(CommandCode.START, 1)))
+
+        def six_scans() -> bool:
+            scans.extend(p for p in decoder.feed(port.read(4096)) if isinstance(p, Scan))
+            return len(scans) >= 6
+
+        wait_for(six_scans)
+    assert {len(scan.samples) for scan in scans} == {208}
+    assert request("status", ready["control"])["sensor"] == "paper_square"
+    twin.send_signal(signal.SIGTERM)
+    assert twin.wait(PATIENCE_S) == 0
+    assert not os.path.lexists(tmp_path / "dev" / "skin")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["twin", "--description", "nosuch"], "cannot read the sensor description nosuch"),
+        (["twin", "--scene", "none.toml"], "cannot read the scene none.toml"),
+        (["twin", "--description", "tank_disc"], "1 channel"),
+        (["twin", "--rate", "0"], "a rate of 0 Hz"),
+        (["twin", "--control", "tcp://0.0.0.0:5562"], "other computers"),
+        (["daemon"], "ports is missing"),
+        (["daemon", "none.toml"], "cannot read none.toml"),
+        (["daemon", "--port", "/dev/null", "--tare-scans", "1"], "tare_scans = 1"),
+        (["replay", "none.mcap"], "cannot open the recording none.mcap"),
+        (["replay", "none.mcap", "--viewer"], "cannot open the recording none.mcap"),
+        (["demo", "--replay", "none.mcap"], "cannot open the recording none.mcap"),
+        (["viewer", "--stream", "nowhere", "--port", "0"], "nowhere"),
+        (["reconstruct", "none.npz", "out.npz"], "none.npz"),
+        (["plot", "none.mcap"], "cannot open the recording none.mcap"),
+    ],
+)
+def test_what_a_user_can_cause_is_told_without_a_traceback(
+    tactomo: Run, arguments: list[str], says: str
+) -> None:
+    result = tactomo(*arguments)
+    assert result.returncode == 1
+    assert result.stderr.startswith("tactomo: ")
+    assert says in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_a_speed_that_is_none_is_a_usage_error(tactomo: Run, tmp_path: Path) -> None:
+    for speed in ("fast", "-1", "nan"):
+        assert tactomo("replay", "none.mcap", "--speed", speed).returncode == 2
+
+
+def test_a_child_that_fails_takes_the_demo_down_and_its_words_are_shown(tactomo: Run) -> None:
+    result = tactomo("demo", "--description", "nosuch", "--port", "0")
+    assert result.returncode == 1
+    assert "stopped (exit status 1)" in result.stderr
+    assert "cannot read the sensor description nosuch" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+@linux
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+def test_a_demo_leaves_no_process_behind(start: Run, number: signal.Signals) -> None:
+    free = "tcp://127.0.0.1:0"
+    demo = start(
+        *("demo", "--port", 0, "--stream", free, "--control", free, "--twin-control", free)
+    )
+    children = wait_for(lambda: children_of(demo.pid) if len(children_of(demo.pid)) == 2 else None)
+    time.sleep(0.5)  # far enough to have begun, not far enough to be ready
+    demo.send_signal(number)
+    demo.wait(PATIENCE_S)
+    wait_for(lambda: not any(is_running(child) for child in children))
+
+
+def test_a_family_notices_whoever_ends_and_tells_its_last_words() -> None:
+    with Family() as family:
+        viewer = family.start("page", "viewer", "--port", "0", "--stream", "ipc:///nowhere/at/all")
+        url = viewer.wait_ready()["url"]
+        assert url.startswith("http://127.0.0.1:")
+        family.start("list", "models", "list").wait_done()  # has done its work: no reason to stop
+        taken = url.rstrip("/").rpartition(":")[2]
+        late = family.start("second", "viewer", "--port", taken, "--stream", "ipc:///nowhere/at")
+        assert family.wait_for_an_end() is late
+        assert viewer.is_running
+        with pytest.raises(ChildError, match=r"(?s)second stopped \(exit status 1\).*cannot listen"):
+            late.wait_ready()
+    assert not viewer.is_running
+    assert viewer.status == 0
