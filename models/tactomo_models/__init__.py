@@ -1,1 +1,56 @@
-"""."""
+"""The sensor's physics and the reconstruction methods: from scans to pressure maps and contacts.
+
+    description = load_description("paper_square")
+    reconstructor = Reconstructor(description)
+    reconstructor.set_reference(Reference.from_scans(magnitude_scans, structure_scans))
+    frame = reconstructor.reconstruct(magnitude, structure)
+
+Nothing here opens a port or a socket; what the daemon does live and what a researcher does
+offline run this same code.
+"""
+
+from tactomo_models.artifact import (
+    Artifact,
+    build_artifact,
+    default_path,
+    load_artifact,
+    load_or_build_artifact,
+    save_artifact,
+)
+from tactomo_models.contacts import Contact
+from tactomo_models.description import (
+    Modality,
+    SensorDescription,
+    load_description,
+    shipped_descriptions,
+)
+from tactomo_models.errors import ArtifactError, DataError, DescriptionError, ModelError
+from tactomo_models.reconstruct import Flag, Reconstruction, Reconstructor, Tier
+from tactomo_models.reference import Reference
+from tactomo_models.scene import Press
+from tactomo_models.simulator import SkinSimulator
+
+__all__ = [
+    "Artifact",
+    "ArtifactError",
+    "Contact",
+    "DataError",
+    "DescriptionError",
+    "Flag",
+    "Modality",
+    "ModelError",
+    "Press",
+    "Reconstruction",
+    "Reconstructor",
+    "Reference",
+    "SensorDescription",
+    "SkinSimulator",
+    "Tier",
+    "build_artifact",
+    "default_path",
+    "load_artifact",
+    "load_description",
+    "load_or_build_artifact",
+    "save_artifact",
+    "shipped_descriptions",
+]

@@ -1,0 +1,232 @@
+"""From a shape to contacts: separate areas, their place and size, and each one's magnitude.
+
+Once the structure channel has given the shapes, each contact's magnitude is one unknown: K
+unknowns from the magnitude channel's voltages, a small and nearly linear least-squares problem
+whose covariance says how far each may be trusted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.optimize import linear_sum_assignment
+
+from tactomo_models.description import SensorDescription
+from tactomo_models.forward import ForwardModel
+
+FloatArray = NDArray[np.float64]
+
+SMALLEST_AREA_M2 = 20e-6  # below this, a spot is a trace of the fit, not a contact
+FARTHEST_STEP_M = 0.025  # a contact that moved more than this between frames is a new one
+FIT_SOLVES = 3  # forward solves that a fit of magnitudes may take
+TANGENT_REACH = 0.02  # change of conductivity over which the voltages are as good as linear
+CHANGE_LIMITS = (-0.9, 20.0)  # relative conductivity changes that a fit may propose
+
+
+@dataclass(frozen=True)
+class Contact:
+    """One pressed area.
+
+    Attributes:
+        id: its identity over time, counted up from 1.
+        x_m, y_m: its centroid.
+        area_m2: its area.
+        magnitude: relative conductivity change of the magnitude channel, without its sign;
+            NaN if unknown.
+        magnitude_sigma: standard uncertainty of the magnitude.
+        pressure_kpa: NaN if unknown, or below the magnitude channel's onset.
+    """
+
+    id: int
+    x_m: float
+    y_m: float
+    area_m2: float
+    magnitude: float = float("nan")
+    magnitude_sigma: float = float("nan")
+    pressure_kpa: float = float("nan")
+
+
+@dataclass(frozen=True)
+class Areas:
+    """Separate pressed areas.
+
+    Attributes:
+        on_map: (K, nodes_y, nodes_x) share of each map node that each area covers.
+        on_nodes: (K, P) the same at the pressable nodes.
+        centres_m: (K, 2) centroids.
+        areas_m2: (K,).
+    """
+
+    on_map: FloatArray
+    on_nodes: FloatArray
+    centres_m: FloatArray
+    areas_m2: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.areas_m2)
+
+
+class AreaFinder:
+    """Splits an image of what is pressed into separate areas."""
+
+    def __init__(self, forward: ForwardModel) -> None:
+        description = forward.description
+        self._x, self._y = np.meshgrid(description.map_x_m, description.map_y_m)
+        self._cell_m2 = (description.map_x_m[1] - description.map_x_m[0]) * (
+            description.map_y_m[1] - description.map_y_m[0]
+        )
+        x, y = forward.bare.points[:, forward.bare.pressable]
+        column = np.abs(x[:, None] - description.map_x_m).argmin(axis=1)
+        row = np.abs(y[:, None] - description.map_y_m).argmin(axis=1)
+        self._nearest = (row, column)  # map node next to each pressable node
+
+    def find(self, pressed: FloatArray, pressed_nodes: FloatArray) -> Areas:
+        """Find connected areas above one half; what lies around each goes to the nearest.
+
+        Args:
+            pressed: (nodes_y, nodes_x) share pressed, 0 to 1.
+            pressed_nodes: (P,) the same at the pressable nodes.
+        """
+        label, count = ndimage.label(pressed > 0.5, structure=np.ones((3, 3)))
+        if count == 0:
+            none = np.zeros((0, *pressed.shape))
+            return Areas(none, np.zeros((0, len(pressed_nodes))), np.zeros((0, 2)), np.zeros(0))
+        nearest = ndimage.distance_transform_edt(
+            label == 0, return_distances=False, return_indices=True
+        )
+        owner = label[tuple(nearest)]
+        mine = owner[None] == np.arange(1, count + 1)[:, None, None]
+        on_map = mine * pressed
+        areas = on_map.sum(axis=(1, 2)) * self._cell_m2
+        keep = areas >= SMALLEST_AREA_M2
+        on_map, areas = on_map[keep], areas[keep]
+        weight = np.maximum(on_map.sum(axis=(1, 2)), 1e-12)
+        centres = np.stack(
+            [(on_map * axis).sum(axis=(1, 2)) / weight for axis in (self._x, self._y)], axis=1
+        )
+        on_nodes = mine[keep][:, *self._nearest] * pressed_nodes
+        return Areas(on_map, on_nodes, centres, areas)
+
+
+@dataclass(frozen=True)
+class Tangent:
+    """The magnitude channel's voltages around given conductivity changes of K areas.
+
+    Attributes:
+        change: (K,) where it touches.
+        voltages: (M,) relative voltage changes there.
+        jacobian: (M, K) their derivative by the areas' changes.
+    """
+
+    change: FloatArray
+    voltages: FloatArray
+    jacobian: FloatArray
+
+
+@dataclass(frozen=True)
+class Magnitudes:
+    """Relative conductivity changes of K areas, signed, with their standard uncertainties.
+
+    Attributes:
+        change: (K,) relative conductivity changes.
+        sigma: (K,) standard uncertainties.
+        misfit: root mean square of the noise-weighted residual.
+        tangent: what they were computed with; it serves again while the areas stay.
+    """
+
+    change: FloatArray
+    sigma: FloatArray
+    misfit: float
+    tangent: Tangent
+
+
+def fit_magnitudes(
+    forward: ForwardModel,
+    areas: Areas,
+    data: FloatArray,
+    weight: FloatArray,
+    start: Magnitudes | None = None,
+    *,
+    same_areas: bool = False,
+) -> Magnitudes:
+    """Fit each area's conductivity change by Gauss-Newton.
+
+    Args:
+        forward: the model of the sheet.
+        areas: the K areas, at least one.
+        data: (M,) relative voltage changes of the magnitude channel.
+        weight: (M,) their inverse standard deviations.
+        start: an earlier fit of as many areas.
+        same_areas: the earlier fit was of these very areas: where its tangent still holds there
+            is nothing to solve.
+    """
+    change = np.zeros(len(areas)) if start is None else start.change
+    tangent = start.tangent if start is not None and same_areas else None
+    for _ in range(FIT_SOLVES):
+        if tangent is None or np.abs(change - tangent.change).max() > TANGENT_REACH:
+            tangent = _touch(forward, areas, change)
+        J = tangent.jacobian * weight[:, None]
+        covariance = np.linalg.inv(J.T @ J + 1e-9 * np.eye(len(areas)))
+        residual = weight * (tangent.voltages - data)
+        step = -covariance @ (J.T @ residual)
+        change = np.clip(tangent.change + step, *CHANGE_LIMITS)
+        if np.abs(change - tangent.change).max() <= TANGENT_REACH:
+            break
+    misfit = float(np.sqrt(np.mean((residual + J @ (change - tangent.change)) ** 2)))
+    # A model that does not explain the data to their noise knows its unknowns less well, too.
+    sigma = np.sqrt(np.diag(covariance)) * max(1.0, misfit)
+    return Magnitudes(change, sigma, misfit, tangent)
+
+
+def _touch(forward: ForwardModel, areas: Areas, change: FloatArray) -> Tangent:
+    inside = areas.on_nodes.any(axis=0)
+    where = np.flatnonzero(inside)
+    solution = forward.solve(change @ areas.on_nodes, also=inside)
+    bare = forward.bare_voltages
+    jacobian = forward.jacobian(solution, where) @ areas.on_nodes[:, where].T
+    return Tangent(
+        change, (solution.voltages - bare) / np.abs(bare), jacobian / np.abs(bare)[:, None]
+    )
+
+
+class Tracker:
+    """Gives contacts an identity over time: the assignment that moves them least."""
+
+    def __init__(self) -> None:
+        self._centres = np.zeros((0, 2))
+        self._ids: list[int] = []
+        self._next = 1
+
+    def update(self, centres_m: FloatArray) -> list[int]:
+        """Identities of the contacts at `centres_m` (K, 2), kept where one moved only a little."""
+        ids = [0] * len(centres_m)
+        distance = np.linalg.norm(self._centres[:, None] - centres_m[None], axis=2)
+        # Too far costs alike: such a pair is made only where nothing better is left, and dropped.
+        for old, new in zip(
+            *linear_sum_assignment(np.minimum(distance, FARTHEST_STEP_M)), strict=True
+        ):
+            if distance[old, new] < FARTHEST_STEP_M:
+                ids[new] = self._ids[old]
+        for index, known in enumerate(ids):
+            if not known:
+                ids[index] = self._next
+                self._next += 1
+        self._centres, self._ids = centres_m, ids
+        return ids
+
+    def clear(self) -> None:
+        """Forget all contacts; identities are not used again."""
+        self._centres, self._ids = np.zeros((0, 2)), []
+
+
+def pressure_of(
+    description: SensorDescription, magnitude: FloatArray, sigma: FloatArray
+) -> FloatArray:
+    """Pressure (K,) in kPa; NaN where the magnitude is not clearly above zero."""
+    if description.magnitude is None:
+        return np.full(len(magnitude), np.nan)
+    known = magnitude > 2 * sigma
+    return np.where(known, description.magnitude.response.pressure(magnitude), np.nan)

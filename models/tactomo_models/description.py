@@ -1,0 +1,378 @@
+"""The sensor description: what a skin is made of, read from a TOML file.
+
+Nothing about a sensor is hard-coded elsewhere. The shipped descriptions lie in
+`tactomo_models/sensors`; a user with another sheet copies one and changes it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from functools import cached_property
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from tactomo_models.errors import DescriptionError
+from tactomo_models.pattern import Pairs, scan_pairs
+
+Modality = Literal["magnitude", "structure"]
+FloatArray = NDArray[np.float64]
+Metres = Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)]
+Table = Annotated[tuple[float, ...], Field(min_length=2, max_length=64)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Sheet(_Section):
+    """The conductive sheet. A disc has `width_m` as its diameter and no height."""
+
+    shape: Literal["rectangle", "disc"]
+    width_m: Metres
+    height_m: Metres | None = None
+    frame_width_m: Annotated[float, Field(ge=0, le=1)] = 0.0
+    conductivity_s_m: Annotated[float, Field(gt=0, le=1e8)]
+    thickness_m: Annotated[float, Field(gt=0, le=1)]
+
+    @model_validator(mode="after")
+    def _shape_has_its_size(self) -> Self:
+        if self.shape == "rectangle" and self.height_m is None:
+            raise ValueError("height_m is required for a rectangle")
+        if self.shape == "disc" and self.height_m not in (None, self.width_m):
+            raise ValueError("height_m must be left out for a disc: width_m is its diameter")
+        if self.frame_width_m >= min(self.width_m, self.height_m or self.width_m) / 4:
+            raise ValueError("frame_width_m must be below a quarter of the sheet's smaller side")
+        return self
+
+
+class Electrodes(_Section):
+    """Electrodes on the rim: `per_side` and `pitch_m` on a rectangle, `count` on a disc."""
+
+    length_m: Metres
+    contact_impedance_ohm_m: Annotated[float, Field(gt=0, le=1e9)]
+    per_side: Annotated[int, Field(ge=1, le=16)] | None = None
+    pitch_m: Metres | None = None
+    count: Annotated[int, Field(ge=6, le=64)] | None = None
+    first_angle_deg: Annotated[float, Field(ge=-360, le=360)] = -90.0
+
+
+class Pattern(_Section):
+    """Drive pair k is (k, k + drive_offset), measuring pair m is (m, m + measure_offset)."""
+
+    drive_offset: Annotated[int, Field(ge=1, le=32)] = 1
+    measure_offset: Annotated[int, Field(ge=1, le=32)] = 1
+    current_a: Annotated[float, Field(gt=0, le=1)]
+
+
+class MagnitudeResponse(_Section):
+    """Relative conductivity change (sigma - sigma_0) / sigma_0 against pressure in kPa."""
+
+    pressure_kpa: Table
+    relative_change: Table
+
+    @model_validator(mode="after")
+    def _is_a_monotone_table(self) -> Self:
+        _check_table(self.pressure_kpa, self.relative_change, "relative_change", start=0.0)
+        if min(self.relative_change) <= -1:
+            raise ValueError("relative_change must stay above -1: conductivity is positive")
+        return self
+
+    @property
+    def sign(self) -> float:
+        """+1 where pressure raises conductivity, -1 where it lowers it."""
+        return 1.0 if self.relative_change[-1] > 0 else -1.0
+
+    def change(self, pressure_kpa: FloatArray) -> FloatArray:
+        """Relative conductivity change at a pressure, any shape."""
+        return np.asarray(np.interp(pressure_kpa, self.pressure_kpa, self.relative_change))
+
+    def pressure(self, magnitude: FloatArray) -> FloatArray:
+        """Pressure in kPa at which |relative change| is `magnitude`, any shape.
+
+        NaN where the table does not answer: no change at all says only "below the onset".
+        Beyond the table's end the last pressure is returned.
+        """
+        size = np.abs(np.asarray(self.relative_change))
+        onset = int(np.flatnonzero(size > 0)[0]) - 1
+        kpa = np.interp(magnitude, size[onset:], np.asarray(self.pressure_kpa)[onset:])
+        return np.where(np.asarray(magnitude) > 0, kpa, np.nan)
+
+
+class StructureResponse(_Section):
+    """Ratio of the pressed to the unpressed conductivity against pressure in kPa."""
+
+    pressure_kpa: Table
+    conductivity_ratio: Table
+
+    @model_validator(mode="after")
+    def _is_a_monotone_table(self) -> Self:
+        _check_table(self.pressure_kpa, self.conductivity_ratio, "conductivity_ratio", start=1.0)
+        if min(self.conductivity_ratio) <= 0:
+            raise ValueError("conductivity_ratio must be positive")
+        return self
+
+    def ratio(self, pressure_kpa: FloatArray) -> FloatArray:
+        """Conductivity ratio at a pressure, any shape; the logarithm is interpolated."""
+        logs = np.log(self.conductivity_ratio)
+        return np.asarray(np.exp(np.interp(pressure_kpa, self.pressure_kpa, logs)))
+
+
+def _check_table(x: Table, y: Table, name: str, start: float) -> None:
+    if len(x) != len(y):
+        raise ValueError(f"{name} must have as many entries as pressure_kpa ({len(x)})")
+    if x[0] != 0 or any(b <= a for a, b in zip(x, x[1:], strict=False)):
+        raise ValueError("pressure_kpa must start at 0 and rise")
+    steps = np.diff(y)
+    if y[0] != start or not (np.all(steps >= 0) or np.all(steps <= 0)) or y[-1] == y[0]:
+        raise ValueError(f"{name} must start at {start:g} and only rise or only fall")
+
+
+class MagnitudeChannel(_Section):
+    """The channel that answers with the pressure's size."""
+
+    response: MagnitudeResponse
+
+
+class StructureChannel(_Section):
+    """The saturating channel: pressed or not. Give a response, or the saturated ratio alone."""
+
+    response: StructureResponse | None = None
+    conductivity_ratio: Annotated[float, Field(gt=0, le=1e6)] | None = None
+
+    @model_validator(mode="after")
+    def _one_of_the_two(self) -> Self:
+        if (self.response is None) == (self.conductivity_ratio is None):
+            raise ValueError("give either structure.response or structure.conductivity_ratio")
+        if self.saturated_ratio == 1:
+            raise ValueError("conductivity_ratio must differ from 1")
+        return self
+
+    @property
+    def saturated_ratio(self) -> float:
+        """Conductivity of a fully pressed area over that of the bare sheet."""
+        return (
+            self.response.conductivity_ratio[-1]
+            if self.response
+            else self.conductivity_ratio or 1.0
+        )
+
+
+class MapGrid(_Section):
+    """Nodes of the published map along x and y; the outermost lie on the bounding box."""
+
+    nodes_x: Annotated[int, Field(ge=11, le=401)] = 51
+    nodes_y: Annotated[int, Field(ge=11, le=401)] = 51
+
+
+class SensorDescription(_Section):
+    """A whole sensor: sheet, electrodes, pattern, map and the channels' contact response."""
+
+    schema_version: Literal[1] = Field(alias="schema")
+    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,62}$")]
+    title: str = ""
+    sheet: Sheet
+    electrodes: Electrodes
+    pattern: Pattern
+    map: MapGrid = MapGrid()
+    magnitude: MagnitudeChannel | None = None
+    structure: StructureChannel | None = None
+
+    @model_validator(mode="after")
+    def _parts_fit(self) -> Self:
+        if self.magnitude is None and self.structure is None:
+            raise ValueError("give at least one of [magnitude.response] and [structure]")
+        _check_electrodes(self.sheet, self.electrodes)
+        if not 6 <= self.electrode_count <= 64:
+            raise ValueError(f"electrodes: {self.electrode_count} in all; 6 to 64 are supported")
+        for key in ("drive_offset", "measure_offset"):
+            offset = getattr(self.pattern, key)
+            if offset >= self.electrode_count:
+                raise ValueError(
+                    f"pattern.{key} = {offset}: must be below the number of electrodes, "
+                    f"{self.electrode_count}"
+                )
+        return self
+
+    @property
+    def width_m(self) -> float:
+        """Width of the bounding box."""
+        return self.sheet.width_m
+
+    @property
+    def height_m(self) -> float:
+        """Height of the bounding box."""
+        return self.sheet.height_m or self.sheet.width_m
+
+    @property
+    def modalities(self) -> tuple[Modality, ...]:
+        """The channels this sensor has, magnitude first."""
+        both: tuple[Modality, ...] = ("magnitude", "structure")
+        return tuple(name for name in both if getattr(self, name) is not None)
+
+    @property
+    def electrode_count(self) -> int:
+        """Number of electrodes of one sheet."""
+        return self.electrodes.count or 4 * (self.electrodes.per_side or 0)
+
+    @cached_property
+    def pairs(self) -> Pairs:
+        """Drive and measuring pairs of every voltage, in the order of a scan."""
+        return scan_pairs(
+            self.electrode_count, self.pattern.drive_offset, self.pattern.measure_offset
+        )
+
+    @property
+    def measurements(self) -> int:
+        """Voltages in one scan."""
+        return len(self.pairs.drive)
+
+    @property
+    def sheet_conductance_s(self) -> float:
+        """Conductivity times thickness."""
+        return self.sheet.conductivity_s_m * self.sheet.thickness_m
+
+    @cached_property
+    def electrode_ends_m(self) -> FloatArray:
+        """Both ends of every electrode on the rim, counter-clockwise: (electrodes, 2, 2)."""
+        rim = _disc_electrodes if self.sheet.shape == "disc" else _rectangle_electrodes
+        return rim(self)
+
+    @property
+    def electrode_centres_m(self) -> FloatArray:
+        """Centre of every electrode, (electrodes, 2)."""
+        return np.asarray(self.electrode_ends_m.mean(axis=1))
+
+    @cached_property
+    def map_x_m(self) -> FloatArray:
+        """x of the map's columns, (nodes_x,)."""
+        return np.linspace(-self.width_m / 2, self.width_m / 2, self.map.nodes_x)
+
+    @cached_property
+    def map_y_m(self) -> FloatArray:
+        """y of the map's rows, (nodes_y,); row 0 is the lowest."""
+        return np.linspace(-self.height_m / 2, self.height_m / 2, self.map.nodes_y)
+
+    def on_sheet(
+        self, x_m: FloatArray, y_m: FloatArray, margin_m: float = 0.0
+    ) -> NDArray[np.bool_]:
+        """Tell which points lie on the sheet, at least `margin_m` inside its rim."""
+        slack = 1e-9
+        if self.sheet.shape == "disc":
+            inside = np.hypot(x_m, y_m) <= self.width_m / 2 - margin_m + slack
+        else:
+            inside = (np.abs(x_m) <= self.width_m / 2 - margin_m + slack) & (
+                np.abs(y_m) <= self.height_m / 2 - margin_m + slack
+            )
+        return np.asarray(inside)
+
+    @cached_property
+    def sha256(self) -> str:
+        """Hash of what the physics depends on; calibration tables may change without a rebuild."""
+        physics = self.model_dump_json(
+            include={"schema_version", "sheet", "electrodes", "pattern", "map"}
+        )
+        return hashlib.sha256(physics.encode()).hexdigest()
+
+
+def _check_electrodes(sheet: Sheet, electrodes: Electrodes) -> None:
+    if sheet.shape == "disc":
+        if electrodes.count is None or electrodes.per_side or electrodes.pitch_m:
+            raise ValueError("electrodes: a disc takes count, and no per_side or pitch_m")
+        room = np.pi * sheet.width_m / electrodes.count
+    else:
+        if electrodes.per_side is None or electrodes.pitch_m is None or electrodes.count:
+            raise ValueError("electrodes: a rectangle takes per_side and pitch_m, and no count")
+        room = electrodes.pitch_m
+        side = min(sheet.width_m, sheet.height_m or sheet.width_m)
+        needed = electrodes.pitch_m * (electrodes.per_side - 1) + electrodes.length_m
+        if needed > side:
+            raise ValueError(
+                f"electrodes: {electrodes.per_side} of them at pitch_m = {electrodes.pitch_m} "
+                f"need {needed:.4g} m, but the shorter side has {side:.4g} m"
+            )
+    if electrodes.length_m >= room:
+        raise ValueError(
+            f"electrodes.length_m = {electrodes.length_m}: must be below their distance, {room:.4g}"
+        )
+
+
+def _rectangle_electrodes(description: SensorDescription) -> FloatArray:
+    n = description.electrodes.per_side or 0
+    along = (np.arange(n) - (n - 1) / 2) * (description.electrodes.pitch_m or 0)
+    half = description.electrodes.length_m / 2
+    w, h = description.width_m / 2, description.height_m / 2
+    ends = np.stack([along - half, along + half], axis=1)  # (n, 2), in the direction of travel
+    sides = [
+        (ends, np.full_like(ends, -h)),
+        (np.full_like(ends, w), ends),
+        (-ends, np.full_like(ends, h)),
+        (np.full_like(ends, -w), -ends),
+    ]
+    return np.concatenate([np.stack(side, axis=-1) for side in sides])
+
+
+def _disc_electrodes(description: SensorDescription) -> FloatArray:
+    n, radius = description.electrode_count, description.width_m / 2
+    centre = np.radians(description.electrodes.first_angle_deg) + 2 * np.pi * np.arange(n) / n
+    half = description.electrodes.length_m / 2 / radius
+    angle = np.stack([centre - half, centre + half], axis=1)
+    return radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def shipped_descriptions() -> list[str]:
+    """Names of the descriptions that come with tactomo."""
+    folder = resources.files("tactomo_models.sensors")
+    return sorted(
+        f.name.removesuffix(".toml") for f in folder.iterdir() if f.name.endswith(".toml")
+    )
+
+
+def load_description(source: str | Path) -> SensorDescription:
+    """Read a sensor description by its shipped name or from a TOML file.
+
+    Raises:
+        DescriptionError: the file cannot be read, is not TOML, or a key is unknown, missing
+            or out of range; the message names the key, its value and what is allowed.
+    """
+    name = str(source)
+    if name in shipped_descriptions():
+        text = resources.files("tactomo_models.sensors").joinpath(f"{name}.toml").read_text("utf-8")
+    else:
+        text = _read(Path(source))
+    try:
+        return SensorDescription.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise DescriptionError(f"{name} is not valid TOML: {error}") from error
+    except ValidationError as error:
+        raise DescriptionError(
+            "\n".join(_explain(name, item) for item in error.errors())
+        ) from error
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+        raise DescriptionError(
+            f"cannot read the sensor description {path}: {reason}; give the path of a TOML file "
+            f"or one of: {', '.join(shipped_descriptions())}"
+        ) from error
+
+
+def _explain(source: str, item: Any) -> str:
+    """Turn one pydantic complaint into "file: key = value: what is allowed"."""
+    key = ".".join(str(part) for part in item["loc"])
+    if item["type"] == "extra_forbidden":
+        return f"{source}: unknown key {key}; remove it or correct its spelling"
+    if item["type"] == "missing":
+        return f"{source}: {key} is missing"
+    message = item["msg"].removeprefix("Value error, ")
+    value = "" if isinstance(item["input"], dict) else f" = {item['input']!r}"
+    return f"{source}: {key}{value}: {message}" if key else f"{source}: {message}"

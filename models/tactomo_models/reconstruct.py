@@ -1,0 +1,439 @@
+"""From two scans to a map and contacts: the tiers, and the warm start between frames.
+
+A scene is modelled no further than it needs. Nothing pressed: a chi-square test, and no solve.
+Something pressed: the Tikhonov image starts a level set on the structure channel, whose areas
+take one magnitude each from the other channel. The estimate of one frame starts the next, so that
+a still scene costs a comparison and no solve.
+
+The outcome depends on the sequence of frames alone, never on the clock: the compute budget is
+counted in modelled work, so that a recording reconstructs exactly as the live stream did.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from enum import IntFlag, StrEnum, auto
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from tactomo_models.artifact import (
+    MODEL_ERROR,
+    Artifact,
+    central_target,
+    load_or_build_artifact,
+    nominal_noise,
+)
+from tactomo_models.contacts import (
+    AreaFinder,
+    Areas,
+    Contact,
+    Magnitudes,
+    Tracker,
+    fit_magnitudes,
+    pressure_of,
+)
+from tactomo_models.description import Modality, SensorDescription
+from tactomo_models.errors import DataError
+from tactomo_models.forward import ForwardModel
+from tactomo_models.levelset import LevelSet, Shape
+from tactomo_models.reference import Reference, noise_of_reciprocity
+from tactomo_models.tikhonov import noise_figure_weight, tikhonov_matrix
+
+FloatArray = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+DEFAULT_BUDGET_S = 0.05
+CHANGE_ERROR = 0.02  # model error as a share of each voltage change: mesh, shape of the edge
+FALSE_ALARM = 1e-6  # chance that an unpressed frame of pure noise is taken for a pressed one
+MOST_INVALID = 0.25  # share of voltages that may be invalid before the channel is given up
+GOOD_MISFIT = 1.0  # explained to the noise: no further step
+BAD_MISFIT = 3.0  # not explained: start anew, and flag what stays so
+
+
+class Tier(StrEnum):
+    """How much model a scene was given."""
+
+    AUTO = auto()  # as a request only: as much as the scene needs
+    QUIET = auto()  # nothing pressed: a test and no solve
+    TIKHONOV = auto()
+    LEVELSET = auto()  # level set on the structure channel, magnitudes fitted to its areas
+
+
+class Flag(IntFlag):
+    """What stands in the way of trusting a frame."""
+
+    STRUCTURE_MISSING = 1
+    MAGNITUDE_MISSING = 2
+    INVALID_VOLTAGE = 4
+    NO_REFERENCE = 8
+    MISFIT_HIGH = 16
+    NOT_CONVERGED = 32
+
+    def names(self) -> list[str]:
+        """Names of the flags that are set, in lower case, as the stream carries them."""
+        return [flag.name.lower() for flag in self if flag.name]
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """One frame.
+
+    Attributes:
+        map: (nodes_y, nodes_x) |relative conductivity change| of the magnitude channel; None
+            where it cannot be computed.
+        pressure_kpa: (nodes_y, nodes_x); None where it cannot be computed. Nodes pressed below
+            the magnitude channel's onset are 0: see `structure`.
+        structure: (nodes_y, nodes_x) 0 bare to 1 pressed; None where it cannot be computed.
+        contacts: pressed areas.
+        tier: what made this frame.
+        reason: why that tier.
+        misfit: root mean square of the noise-weighted residual; about 1 where all is explained.
+        flags: what stands in the way of trusting it.
+        stage_s: seconds spent in each stage.
+    """
+
+    map: Image | None
+    pressure_kpa: Image | None
+    structure: Image | None
+    contacts: tuple[Contact, ...]
+    tier: Tier
+    reason: str
+    misfit: float
+    flags: Flag = Flag(0)
+    stage_s: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Channel:
+    """What is known of one channel since the last tare.
+
+    Attributes:
+        reference: (M,) volts.
+        variance: (M,) of a relative change, by noise of scan and reference and by model error.
+        tikhonov: (P, M) reconstruction matrix for that noise.
+    """
+
+    reference: FloatArray
+    variance: FloatArray
+    tikhonov: FloatArray
+
+
+@dataclass(frozen=True)
+class _Data:
+    """Relative voltage changes of one scan, with the weight of each; 0 where it is invalid."""
+
+    change: FloatArray
+    weight: FloatArray
+    quiet: bool
+
+
+class Reconstructor:
+    """Turns dual scans into maps and contacts; keeps the warm start between them.
+
+    Args:
+        description: the sensor.
+        artifact: what is precomputed for it; read or built if None.
+        tier: the most that is done; `Tier.AUTO` does what the scene needs.
+        budget_s: compute time a frame may take, on a machine of the 2.5 GHz class.
+
+    Not thread-safe: one thread owns it.
+    """
+
+    def __init__(
+        self,
+        description: SensorDescription,
+        artifact: Artifact | None = None,
+        *,
+        tier: Tier = Tier.AUTO,
+        budget_s: float | None = None,
+    ) -> None:
+        self.description = description
+        self.tier = tier
+        self.budget_s = budget_s
+        self._artifact = artifact or load_or_build_artifact(description)
+        self._forward = ForwardModel(description, self._artifact.bare)
+        self._areas = AreaFinder(self._forward)
+        self._level_set = None
+        if description.structure is not None:
+            self._level_set = LevelSet(self._forward, description.structure.saturated_ratio)
+        self._channels: dict[Modality, _Channel] = {}
+        self._tracker = Tracker()
+        self._shape: Shape | None = None
+        self._magnitudes: Magnitudes | None = None
+        self._fitted_areas: Areas | None = None
+        self._areas_shape: FloatArray | None = None
+        self._stage_s: dict[str, float] = {}
+
+    def set_reference(self, reference: Reference) -> None:
+        """Measure changes against this unpressed scan from now on; forgets the warm start.
+
+        Raises:
+            DataError: a channel has another number of voltages than the sensor.
+        """
+        volts = {"magnitude": reference.magnitude, "structure": reference.structure}
+        noise = {"magnitude": reference.magnitude_noise, "structure": reference.structure_noise}
+        self._channels = {
+            name: self._prepare(name, scan, noise[name], reference.scans)
+            for name in self.description.modalities
+            if (scan := volts[name]) is not None
+        }
+        self.reset()
+
+    def _prepare(
+        self, name: Modality, volts: FloatArray, noise: FloatArray | None, scans: int
+    ) -> _Channel:
+        if volts.shape != (self.description.measurements,):
+            raise DataError(
+                f"the {name} reference has shape {volts.shape}; sensor "
+                f"{self.description.name!r} has {self.description.measurements} voltages a scan"
+            )
+        if noise is None:
+            noise = noise_of_reciprocity(self.description, volts)
+        size = np.maximum(np.abs(volts), 1e-30)
+        if noise is None:
+            relative = nominal_noise(self._forward.bare_voltages)
+        else:
+            relative = np.hypot(noise / size * np.sqrt(1 + 1 / scans), MODEL_ERROR)
+        jacobian = self._artifact.jacobian
+        target = central_target(self.description, self._artifact.bare)
+        weight = noise_figure_weight(jacobian, relative, target)
+        return _Channel(volts, relative**2, tikhonov_matrix(jacobian, relative, weight))
+
+    def reset(self) -> None:
+        """Forget the warm start and which contacts were which."""
+        self._tracker.clear()
+        self._forget_shape()
+
+    def _forget_shape(self) -> None:
+        self._shape = None
+        self._magnitudes = None
+        self._fitted_areas = None
+        self._areas_shape = None
+
+    def reconstruct(
+        self, magnitude: FloatArray | None, structure: FloatArray | None
+    ) -> Reconstruction:
+        """Reconstruct one frame.
+
+        Args:
+            magnitude: (M,) volts; None if that scan is missing.
+            structure: (M,) volts; None if that scan is missing.
+
+        Raises:
+            DataError: a scan has another number of voltages than the sensor.
+        """
+        self._stage_s = {}
+        flags = Flag(0)
+        data: dict[Modality, _Data] = {}
+        with self._timed("data"):
+            for name, scan in (("magnitude", magnitude), ("structure", structure)):
+                if name in self.description.modalities:
+                    flags |= self._take(name, scan, data)  # type: ignore[arg-type]
+        made = self._by_tier(data, flags)
+        return replace(made, stage_s=self._stage_s)
+
+    def _take(self, name: Modality, scan: FloatArray | None, data: dict[Modality, _Data]) -> Flag:
+        """Put a channel's relative changes into `data`, or say by a flag why it has none."""
+        missing = Flag.MAGNITUDE_MISSING if name == "magnitude" else Flag.STRUCTURE_MISSING
+        if scan is None:
+            return missing
+        if scan.shape != (self.description.measurements,):
+            raise DataError(
+                f"a {name} scan has shape {scan.shape}; sensor {self.description.name!r} has "
+                f"{self.description.measurements} voltages a scan"
+            )
+        channel = self._channels.get(name)
+        if channel is None:
+            return missing | Flag.NO_REFERENCE
+        valid = np.isfinite(scan) & np.isfinite(channel.reference) & (channel.reference != 0)
+        flags = Flag(0) if valid.all() else Flag.INVALID_VOLTAGE
+        if np.mean(~valid) > MOST_INVALID or not np.any(scan[valid]):
+            return flags | missing | Flag.INVALID_VOLTAGE
+        change = np.zeros_like(channel.reference)
+        reference = channel.reference[valid]
+        change[valid] = (scan[valid] - reference) / np.abs(reference)
+        variance = channel.variance
+        statistic = float((change**2 / variance)[valid].sum())
+        weight = np.zeros_like(change)
+        weight[valid] = 1 / np.sqrt(variance + (CHANGE_ERROR * change) ** 2)[valid]
+        quiet = statistic < chi2.isf(FALSE_ALARM, int(valid.sum()))
+        data[name] = _Data(change, weight, quiet)
+        return flags
+
+    def _by_tier(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
+        if not data:
+            return Reconstruction(
+                None, None, None, (), Tier.QUIET, "no usable scan", float("nan"), flags
+            )
+        if all(d.quiet for d in data.values()):
+            self._tracker.update(np.zeros((0, 2)))
+            self._forget_shape()
+            return self._quiet(data, flags)
+        if self.tier == Tier.TIKHONOV:
+            return self._tikhonov(data, flags, "as requested")
+        if "structure" not in data:
+            why = "the structure channel is missing" if self._level_set else "no structure channel"
+            return self._tikhonov(data, flags, why)
+        return self._by_level_set(data, flags)
+
+    def _quiet(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
+        blank = np.zeros((self.description.map.nodes_y, self.description.map.nodes_x), np.float32)
+        magnitude = blank if "magnitude" in data else None
+        worst = max(np.sqrt(np.mean((d.weight * d.change) ** 2)) for d in data.values())
+        return Reconstruction(
+            map=magnitude,
+            pressure_kpa=magnitude,
+            structure=blank if "structure" in data else None,
+            contacts=(),
+            tier=Tier.QUIET,
+            reason="no change above the noise",
+            misfit=float(worst),
+            flags=flags,
+        )
+
+    def _tikhonov(self, data: dict[Modality, _Data], flags: Flag, reason: str) -> Reconstruction:
+        """Linear images of both channels; areas above half of the clearest one's peak."""
+        self._forget_shape()
+        with self._timed("tikhonov"):
+            images = {name: self._linear_image(name, d) for name, d in data.items()}
+        with self._timed("contacts"):
+            shown = images.get("structure", images.get("magnitude"))
+            assert shown is not None
+            peak = max(float(shown.max()), 1e-12)
+            pressed = shown / peak
+            areas = self._areas.find(self._on_map(pressed), np.clip(pressed, 0, 1))
+            fitted = self._fit_magnitudes(areas, data)
+            contacts = self._contacts(areas, fitted)
+        misfit = fitted.misfit if fitted else float("nan")
+        linear = images.get("magnitude")
+        return Reconstruction(
+            map=None if linear is None else self._on_map(linear).astype(np.float32),
+            pressure_kpa=None,  # a linear image spreads and pales: no pressure follows from it
+            structure=self._on_map(pressed).astype(np.float32) if "structure" in data else None,
+            contacts=contacts,
+            tier=Tier.TIKHONOV,
+            reason=reason,
+            misfit=misfit,
+            flags=flags | (Flag.MISFIT_HIGH if misfit > BAD_MISFIT else Flag(0)),
+        )
+
+    def _linear_image(self, name: Modality, data: _Data) -> FloatArray:
+        """Tikhonov image (P,) of the change in the channel's own direction; the rest cut off."""
+        channel = self._channels[name]
+        valid = data.weight > 0
+        image = channel.tikhonov @ np.where(valid, data.change, 0.0)
+        return np.asarray(np.maximum(self._sign(name) * image, 0.0))
+
+    def _sign(self, name: Modality) -> float:
+        if name == "magnitude":
+            assert self.description.magnitude is not None
+            return self.description.magnitude.response.sign
+        assert self.description.structure is not None
+        return 1.0 if self.description.structure.saturated_ratio > 1 else -1.0
+
+    def _on_map(self, nodes: FloatArray) -> FloatArray:
+        shape = (self.description.map.nodes_y, self.description.map.nodes_x)
+        return np.asarray(self._artifact.bare.map_weights @ nodes).reshape(shape)
+
+    def _by_level_set(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
+        with self._timed("levelset"):
+            shape, how = self._find_shape(data["structure"])
+        with self._timed("contacts"):
+            pressed = self._on_map(shape.pressed)
+            areas = self._areas_of(shape, pressed)
+            fitted = self._fit_magnitudes(areas, data)
+            contacts = self._contacts(areas, fitted)
+        if shape.misfit > BAD_MISFIT or (fitted and fitted.misfit > BAD_MISFIT):
+            flags |= Flag.MISFIT_HIGH
+        if not shape.converged:
+            flags |= Flag.NOT_CONVERGED
+        magnitude, pressure = None, None
+        if "magnitude" in data:
+            magnitude = _fused(areas, np.array([c.magnitude for c in contacts]), pressed.shape)
+            pressure = _fused(areas, np.array([c.pressure_kpa for c in contacts]), pressed.shape)
+        return Reconstruction(
+            map=magnitude,
+            pressure_kpa=pressure,
+            structure=pressed.astype(np.float32),
+            contacts=contacts,
+            tier=Tier.LEVELSET,
+            reason=how,
+            misfit=shape.misfit,
+            flags=flags,
+        )
+
+    def _areas_of(self, shape: Shape, pressed: FloatArray) -> Areas:
+        """Areas of a shape; those of the frame before while the shape has not moved."""
+        if self._areas_shape is not shape.pressed or self._fitted_areas is None:
+            self._areas_shape = shape.pressed
+            return self._areas.find(pressed, shape.pressed)
+        return self._fitted_areas
+
+    def _find_shape(self, data: _Data) -> tuple[Shape, str]:
+        """Refine the shape of the frame before, and start anew where it does not lead on."""
+        assert self._level_set is not None
+        budget = self.budget_s or DEFAULT_BUDGET_S
+        warm = self._shape
+        shape, how = None, "warm start"
+        if warm is not None:
+            shape = self._level_set.compare(warm, data.change, data.weight)
+            if shape.misfit < BAD_MISFIT:
+                shape = self._level_set.refine(shape, data.change, data.weight, budget, GOOD_MISFIT)
+        if shape is None or shape.misfit >= BAD_MISFIT:
+            image = self._linear_image("structure", data)
+            likeness = image / max(float(image.max()), 1e-12)
+            fresh = self._level_set.start(likeness, data.change, data.weight)
+            if shape is None or fresh.cost < shape.cost:
+                shape, how = fresh, "cold start"
+            shape = self._level_set.refine(shape, data.change, data.weight, budget, GOOD_MISFIT)
+        self._shape = shape
+        return shape, how
+
+    def _fit_magnitudes(self, areas: Areas, data: dict[Modality, _Data]) -> Magnitudes | None:
+        """Fit each area's magnitude, starting from the frame before where the areas are as many."""
+        last, self._magnitudes = self._magnitudes, None
+        if "magnitude" in data and len(areas):
+            same = self._fitted_areas is areas
+            start = last if last and len(last.change) == len(areas) else None
+            change, weight = data["magnitude"].change, data["magnitude"].weight
+            self._magnitudes = fit_magnitudes(
+                self._forward, areas, change, weight, start, same_areas=same
+            )
+        self._fitted_areas = areas
+        return self._magnitudes
+
+    def _contacts(self, areas: Areas, fitted: Magnitudes | None) -> tuple[Contact, ...]:
+        ids = self._tracker.update(areas.centres_m)
+        unknown = np.full(len(areas), np.nan)
+        size, sigma = unknown, unknown
+        if fitted is not None:
+            size, sigma = np.maximum(self._sign("magnitude") * fitted.change, 0.0), fitted.sigma
+        pressure = pressure_of(self.description, size, sigma)
+        return tuple(
+            Contact(
+                ids[k],
+                *map(float, (*areas.centres_m[k], areas.areas_m2[k])),
+                float(size[k]),
+                float(sigma[k]),
+                float(pressure[k]),
+            )
+            for k in range(len(areas))
+        )
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self._stage_s[stage] = self._stage_s.get(stage, 0.0) + time.perf_counter() - start
+
+
+def _fused(areas: Areas, values: FloatArray, shape: tuple[int, ...]) -> Image:
+    """Map on which each area carries its own value; areas of unknown value stay 0."""
+    if len(areas) == 0:
+        return np.zeros(shape, np.float32)
+    return np.einsum("k,kyx->yx", np.nan_to_num(values), areas.on_map).astype(np.float32)

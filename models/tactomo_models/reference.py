@@ -1,0 +1,88 @@
+"""The reference: the unpressed scan that changes are measured against, and its noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactomo_models.description import SensorDescription
+from tactomo_models.errors import DataError
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Voltages of the unpressed skin; None for a channel that is not there.
+
+    Attributes:
+        magnitude: (M,) volts.
+        structure: (M,) volts.
+        magnitude_noise: (M,) standard deviation of one scan, volts; None where unknown.
+        structure_noise: (M,) likewise.
+        scans: how many were averaged.
+    """
+
+    magnitude: FloatArray | None
+    structure: FloatArray | None
+    magnitude_noise: FloatArray | None = None
+    structure_noise: FloatArray | None = None
+    scans: int = 1
+
+    @classmethod
+    def from_scans(cls, magnitude: FloatArray | None, structure: FloatArray | None) -> Reference:
+        """Average scans (n, M) of an unpressed skin and estimate their noise.
+
+        Raises:
+            DataError: there is no scan, or one of the voltages is not a number.
+        """
+        present = [scans for scans in (magnitude, structure) if scans is not None]
+        if not present or any(len(scans) == 0 for scans in present):
+            raise DataError("no scans to take a reference from; wait for data and tare again")
+        if not all(np.isfinite(scans).all() for scans in present):
+            raise DataError("the reference scans hold voltages that are not numbers; tare again")
+        return cls(
+            magnitude=None if magnitude is None else magnitude.mean(axis=0),
+            structure=None if structure is None else structure.mean(axis=0),
+            magnitude_noise=None if magnitude is None else noise_of_scans(magnitude),
+            structure_noise=None if structure is None else noise_of_scans(structure),
+            scans=min(len(scans) for scans in present),
+        )
+
+
+def noise_of_scans(scans: FloatArray) -> FloatArray | None:
+    """Standard deviation (M,) of one scan, from n scans (n, M) at rest; None from a single one.
+
+    A converter's noise is much the same on every measurement while a few scans know each one
+    poorly, so half of the variance is the measurement's own and half the mean of all.
+    """
+    if len(scans) < 2:
+        return None
+    own = scans.var(axis=0, ddof=1)
+    return np.asarray(np.sqrt((own + own.mean()) / 2))
+
+
+def noise_of_reciprocity(description: SensorDescription, scan: FloatArray) -> FloatArray | None:
+    """Standard deviation (M,) from V(k, m) = V(m, k), which any scan must fulfil but for noise.
+
+    None where the pattern has no reciprocal pairs. Electrodes and an uneven sheet do not disturb
+    it; the median keeps a few broken electrodes from doing so.
+    """
+    pairs = description.pairs
+    order = {
+        (*drive, *measure): index
+        for index, (drive, measure) in enumerate(
+            zip(pairs.drive.tolist(), pairs.measure.tolist(), strict=True)
+        )
+    }
+    twins = [
+        (i, order[key[2:] + key[:2]]) for key, i in order.items() if key[2:] + key[:2] in order
+    ]
+    twins = [(i, j) for i, j in twins if i < j]
+    if not twins:
+        return None
+    i, j = np.array(twins).T
+    spread = np.median(np.abs(scan[i] - scan[j])) / 0.6745 / np.sqrt(2)
+    return np.full(description.measurements, float(spread))

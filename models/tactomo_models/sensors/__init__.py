@@ -1,0 +1,1 @@
+"""The sensor descriptions that ship with tactomo."""

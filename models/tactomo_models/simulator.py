@@ -1,0 +1,108 @@
+"""The simulated skin: noise-free voltages of both channels for what presses on it.
+
+It solves on a finer mesh than the one that reconstructs, with other nodes, and its sheet and
+electrodes may be uneven: data must never come from the model that inverts them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactomo_models.description import Modality, SensorDescription
+from tactomo_models.forward import ForwardModel, solve_bare_sheet
+from tactomo_models.mesh import mesh_sheet
+from tactomo_models.scene import Press, strongest
+
+FloatArray = NDArray[np.float64]
+
+
+class SkinSimulator:
+    """Voltages of a pressed skin, in volts.
+
+    Args:
+        description: the sensor.
+        spacing_m: distance of the mesh nodes; two thirds of the map's if None.
+        unevenness: standard deviation of the sheet's smooth conductivity error (0.05 is 5 %).
+        impedance_spread: standard deviation of the logarithm of the contact impedances.
+        seed: of that unevenness.
+    """
+
+    def __init__(
+        self,
+        description: SensorDescription,
+        spacing_m: float | None = None,
+        *,
+        unevenness: float = 0.0,
+        impedance_spread: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        self.description = description
+        self._spacing_m = spacing_m or description.width_m / (description.map.nodes_x - 1) * 2 / 3
+        sheet = mesh_sheet(description, self._spacing_m)
+        rng = np.random.default_rng(seed)
+        x, y = sheet.mesh.p
+        self._background = 1 + unevenness * _smooth_noise(x, y, description.width_m / 4, rng)
+        impedance = np.exp(impedance_spread * rng.standard_normal(description.electrode_count))
+        bare = solve_bare_sheet(description, sheet, self._background, impedance)
+        self._forward = ForwardModel(description, bare)
+        self._background = self._background[bare.pressable]
+        self._x, self._y = bare.points[:, bare.pressable]
+        self._last: tuple[tuple[Press, ...], dict[Modality, FloatArray]] | None = None
+
+    def voltages(self, presses: Sequence[Press]) -> dict[Modality, FloatArray]:
+        """Noise-free voltages (M,) of each channel the sensor has.
+
+        An unchanged scene costs nothing; a moved contact costs milliseconds by its area.
+        """
+        scene = tuple(presses)
+        if self._last is None or self._last[0] != scene:
+            self._last = (scene, {name: self._solve(name, scene) for name in self.modalities})
+        return self._last[1]
+
+    @property
+    def modalities(self) -> tuple[Modality, ...]:
+        """The channels that the sensor has."""
+        return self.description.modalities
+
+    def _solve(self, modality: Modality, scene: tuple[Press, ...]) -> FloatArray:
+        pressure, coverage = strongest(scene, self._x, self._y, self._spacing_m)
+        ratio = conductivity_ratio(self.description, modality, pressure, coverage)
+        change = self._background * (ratio - 1)
+        return self._forward.solve(change).voltages * self._forward.volts_per_unit
+
+
+def conductivity_ratio(
+    description: SensorDescription,
+    modality: Modality,
+    pressure_kpa: FloatArray,
+    coverage: FloatArray,
+) -> FloatArray:
+    """Conductivity over the bare sheet's at each point, same shape.
+
+    A point that an indenter covers in part takes that share of the change's logarithm.
+    """
+    if modality == "magnitude":
+        assert description.magnitude is not None
+        full = 1 + description.magnitude.response.change(pressure_kpa)
+    else:
+        assert description.structure is not None
+        response = description.structure.response
+        saturated = np.where(pressure_kpa > 0, description.structure.saturated_ratio, 1.0)
+        full = response.ratio(pressure_kpa) if response else saturated
+    return np.asarray(full**coverage)
+
+
+def _smooth_noise(
+    x: FloatArray, y: FloatArray, length_m: float, rng: np.random.Generator
+) -> FloatArray:
+    """Random field of unit standard deviation that varies over about `length_m`."""
+    waves = 64
+    direction = rng.normal(scale=1 / length_m, size=(waves, 2))
+    phase = rng.uniform(0, 2 * np.pi, waves)
+    return np.asarray(
+        np.cos(np.outer(x, direction[:, 0]) + np.outer(y, direction[:, 1]) + phase).sum(axis=1)
+        * np.sqrt(2 / waves)
+    )
