@@ -29,7 +29,12 @@ def configure_logging(level: LogLevel = "info", form: LogFormat = "auto") -> Non
     render: list[structlog.typing.Processor] = (
         [
             structlog.processors.TimeStamper(fmt="%H:%M:%S", utc=False),
-            structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty(), pad_event_to=20),
+            structlog.dev.ConsoleRenderer(
+                colors=sys.stderr.isatty(),
+                pad_event_to=20,
+                # The default one prints every local variable, whole matrices among them.
+                exception_formatter=structlog.dev.plain_traceback,
+            ),
         ]
         if as_text
         else [

@@ -168,6 +168,9 @@ class Skin:
             self.line_of(channel).say(scan(channel, self.counter, volts, **details))
         return self.counter
 
+    def wait_until(self, condition: Callable[[], Any]) -> Any:
+        return wait_until(condition)
+
     def close(self) -> None:
         for line in self.lines:
             line.unplug()
@@ -293,17 +296,29 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Callable[..., Any]]:
+def make_skin() -> Iterator[Callable[[Path, int], Any]]:
+    """Make a skin: ``make_skin(folder, ports)``."""
+    skins: list[Skin] = []
+
+    def make(folder: Path, ports: int) -> Skin:
+        skins.append(Skin(folder, ports))
+        return skins[-1]
+
+    yield make
+    for skin in skins:
+        skin.close()
+
+
+@pytest.fixture
+def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Callable[..., Any]]:
     """Start a daemon: ``bench(ports=1, seconds=0.0, **config)``; everything is stopped later."""
     daemons: list[Daemon] = []
-    skins: list[Skin] = []
     listeners: list[Listener] = []
 
     def start(ports: int = 1, seconds: float = 0.0, **config: Any) -> Bench:
-        folder = tmp_path / f"ports-{len(skins)}"
+        folder = tmp_path / f"ports-{len(daemons)}"
         folder.mkdir()
-        skin = Skin(folder, ports)
-        skins.append(skin)
+        skin = make_skin(folder, ports)
         settings = {
             "name": "left",
             "ports": [str(line.path) for line in skin.lines],
@@ -326,8 +341,6 @@ def bench(tmp_path: Path) -> Iterator[Callable[..., Any]]:
         daemon.stop()
     for listener in listeners:
         listener.socket.close()
-    for skin in skins:
-        skin.close()
 
 
 class Heard:
