@@ -21,7 +21,6 @@ FloatArray = NDArray[np.float64]
 
 SMALLEST_AREA_M2 = 20e-6  # below this, a spot is a trace of the fit, not a contact
 FARTHEST_STEP_M = 0.025  # a contact that moved more than this between frames is a new one
-FIT_SOLVES = 3  # forward solves that a fit of magnitudes may take
 TANGENT_REACH = 0.02  # change of conductivity over which the voltages are as good as linear
 CHANGE_LIMITS = (-0.9, 20.0)  # relative conductivity changes that a fit may propose
 
@@ -38,6 +37,7 @@ class Contact:
             NaN if unknown.
         magnitude_sigma: standard uncertainty of the magnitude.
         pressure_kpa: NaN if unknown, or below the magnitude channel's onset.
+
     """
 
     id: int
@@ -58,6 +58,7 @@ class Areas:
         on_nodes: (K, P) the same at the pressable nodes.
         centres_m: (K, 2) centroids.
         areas_m2: (K,).
+
     """
 
     on_map: FloatArray
@@ -89,6 +90,7 @@ class AreaFinder:
         Args:
             pressed: (nodes_y, nodes_x) share pressed, 0 to 1.
             pressed_nodes: (P,) the same at the pressable nodes.
+
         """
         label, count = ndimage.label(pressed > 0.5, structure=np.ones((3, 3)))
         if count == 0:
@@ -119,6 +121,7 @@ class Tangent:
         change: (K,) where it touches.
         voltages: (M,) relative voltage changes there.
         jacobian: (M, K) their derivative by the areas' changes.
+
     """
 
     change: FloatArray
@@ -135,6 +138,7 @@ class Magnitudes:
         sigma: (K,) standard uncertainties.
         misfit: root mean square of the noise-weighted residual.
         tangent: what they were computed with; it serves again while the areas stay.
+
     """
 
     change: FloatArray
@@ -151,6 +155,7 @@ def fit_magnitudes(
     start: Magnitudes | None = None,
     *,
     same_areas: bool = False,
+    solves: int = 3,
 ) -> Magnitudes:
     """Fit each area's conductivity change by Gauss-Newton.
 
@@ -162,10 +167,11 @@ def fit_magnitudes(
         start: an earlier fit of as many areas.
         same_areas: the earlier fit was of these very areas: where its tangent still holds there
             is nothing to solve.
+
     """
     change = np.zeros(len(areas)) if start is None else start.change
     tangent = start.tangent if start is not None and same_areas else None
-    for _ in range(FIT_SOLVES):
+    for _ in range(solves):
         if tangent is None or np.abs(change - tangent.change).max() > TANGENT_REACH:
             tangent = _touch(forward, areas, change)
         J = tangent.jacobian * weight[:, None]

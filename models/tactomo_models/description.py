@@ -250,12 +250,12 @@ class SensorDescription(_Section):
 
     @cached_property
     def map_x_m(self) -> FloatArray:
-        """x of the map's columns, (nodes_x,)."""
+        """X of the map's columns, (nodes_x,)."""
         return np.linspace(-self.width_m / 2, self.width_m / 2, self.map.nodes_x)
 
     @cached_property
     def map_y_m(self) -> FloatArray:
-        """y of the map's rows, (nodes_y,); row 0 is the lowest."""
+        """Y of the map's rows, (nodes_y,); row 0 is the lowest."""
         return np.linspace(-self.height_m / 2, self.height_m / 2, self.map.nodes_y)
 
     def on_sheet(
@@ -339,6 +339,7 @@ def load_description(source: str | Path) -> SensorDescription:
     Raises:
         DescriptionError: the file cannot be read, is not TOML, or a key is unknown, missing
             or out of range; the message names the key, its value and what is allowed.
+
     """
     name = str(source)
     if name in shipped_descriptions():

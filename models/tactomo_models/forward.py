@@ -47,6 +47,7 @@ class BareSheet:
             l and out of the last one.
         transfer: (L, L) electrode potentials for the same currents; the last row and column are 0.
         map_weights: (nodes_y * nodes_x, P) interpolation of pressable nodes onto the map.
+
     """
 
     points: FloatArray
@@ -72,6 +73,7 @@ def solve_bare_sheet(
         sheet: its mesh of N nodes.
         conductivity: (N,) of an uneven sheet, relative to the description's; 1 if None.
         impedance: (L,) contact impedances, relative to the description's; 1 if None.
+
     """
     mesh = sheet.mesh
     system = _assemble(description, sheet, conductivity, impedance)
@@ -175,6 +177,7 @@ class Solution:
         voltages: (M,) in scan order, relative (multiply by `ForwardModel.volts_per_unit`).
         nodes: (n,) positions in `BareSheet.support` where potentials are known.
         potentials: (n, L - 1) potentials there.
+
     """
 
     voltages: FloatArray
@@ -247,6 +250,7 @@ class ForwardModel:
         Args:
             change: (P,) conductivity minus 1 at the pressable nodes.
             also: (P,) nodes where derivatives will be asked for although nothing changed there.
+
         """
         triangles, nodes, local = self._changed(change, also)
         u0 = self.bare.potentials[nodes]
@@ -284,6 +288,7 @@ class ForwardModel:
 
         Returns:
             (M, n), relative volts per relative conductivity (the paper's equation 2).
+
         """
         by_node = self._mean_transposed[where]  # (n, t)
         triangles = np.flatnonzero(by_node.getnnz(axis=0))

@@ -25,7 +25,7 @@ from tactomo_models.forward import ForwardModel, Solution
 FloatArray = NDArray[np.float64]
 
 KERNELS_PER_SIDE = 9
-KERNEL_SPREAD = 0.6  # standard deviation of a Gaussian over the kernels' distance
+KERNEL_SPREAD = 0.7  # standard deviation of a Gaussian over the kernels' distance
 HALF_WIDTH = 0.15  # w of the Heaviside
 RESTING = -0.5  # f where nothing presses: below -HALF_WIDTH, so h is exactly 0
 SETTLED = 1e-3  # share of the cost below which another gain is not worth a step
@@ -48,6 +48,7 @@ class Shape:
         cost: what is minimised, the prior included.
         damping: Levenberg-Marquardt damping that its last step got through with.
         converged: whether the last step changed next to nothing.
+
     """
 
     mu: FloatArray
@@ -72,6 +73,7 @@ class LevelSet:
         forward: the model of the sheet.
         ratio: conductivity of the saturated phase over the bare sheet's: where its estimate
             starts and what it stays near.
+
     """
 
     def __init__(self, forward: ForwardModel, ratio: float) -> None:
@@ -103,7 +105,7 @@ class LevelSet:
         judged = self._judged(
             shape.mu, shape.log_ratio, shape.pressed, shape.solution, data, weight
         )
-        return replace(judged, damping=shape.damping)
+        return replace(judged, damping=1.0 if shape.converged else shape.damping)
 
     def evaluate(
         self, mu: FloatArray, log_ratio: float, data: FloatArray, weight: FloatArray
@@ -157,21 +159,23 @@ class LevelSet:
             shape: where to start; its residual must belong to the same data.
             data: (M,) relative voltage changes.
             weight: (M,) inverse standard deviations of the data, model error included.
-            budget_s: compute time allowed, by a model of the work (see `_work_s`).
+            budget_s: compute time after which no further step is begun, by a model of the work
+                (see `_work_s`); one step is always tried.
             good_enough: misfit at which the data are explained to their noise (discrepancy
                 principle): no further step is taken.
+
         """
-        while budget_s > 0:
-            if shape.misfit <= good_enough:
-                return replace(shape, converged=True)
+        while shape.misfit > good_enough:
             normal, gradient = self._normal_equations(shape, weight)
             budget_s -= _work_s(shape)
             better, budget_s = self._step(shape, normal, gradient, data, weight, budget_s)
-            settled = shape.cost - better.cost < SETTLED * shape.cost and budget_s > 0
+            gain = shape.cost - better.cost
+            # No gain because the budget ended says nothing about a minimum.
+            settled = 0 < gain < SETTLED * shape.cost or better.damping >= WORST_DAMPING
             shape = replace(better, converged=settled)
-            if settled:
-                break
-        return shape
+            if settled or budget_s <= 0:
+                return shape
+        return replace(shape, converged=True)
 
     def _normal_equations(self, shape: Shape, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
         J = self.jacobian(shape, weight)
@@ -190,7 +194,7 @@ class LevelSet:
     ) -> tuple[Shape, float]:
         """Damp until a step leads downhill: the better shape, or the old one, and what is left."""
         damping = shape.damping
-        while budget_s > 0 and damping < WORST_DAMPING:
+        while damping < WORST_DAMPING:
             step = -np.linalg.solve(normal + damping * np.eye(len(normal)), gradient)
             step *= min(1.0, STEP_LIMIT / max(np.abs(step[:-1]).max(), 1e-12))
             ratio = float(np.clip(shape.log_ratio + step[-1], *self._ratio_limits))
@@ -199,7 +203,9 @@ class LevelSet:
             if trial.cost < shape.cost:
                 return replace(trial, damping=max(damping / 5, 1e-3)), budget_s
             damping *= 5
-        return replace(shape, damping=min(damping, WORST_DAMPING / 5)), budget_s
+            if budget_s <= 0:
+                break
+        return replace(shape, damping=damping), budget_s
 
 
 def _work_s(shape: Shape) -> float:

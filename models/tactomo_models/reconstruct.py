@@ -95,6 +95,7 @@ class Reconstruction:
         misfit: root mean square of the noise-weighted residual; about 1 where all is explained.
         flags: what stands in the way of trusting it.
         stage_s: seconds spent in each stage.
+
     """
 
     map: Image | None
@@ -116,6 +117,7 @@ class _Channel:
         reference: (M,) volts.
         variance: (M,) of a relative change, by noise of scan and reference and by model error.
         tikhonov: (P, M) reconstruction matrix for that noise.
+
     """
 
     reference: FloatArray
@@ -142,6 +144,7 @@ class Reconstructor:
         budget_s: compute time a frame may take, on a machine of the 2.5 GHz class.
 
     Not thread-safe: one thread owns it.
+
     """
 
     def __init__(
@@ -174,6 +177,7 @@ class Reconstructor:
 
         Raises:
             DataError: a channel has another number of voltages than the sensor.
+
         """
         volts = {"magnitude": reference.magnitude, "structure": reference.structure}
         noise = {"magnitude": reference.magnitude_noise, "structure": reference.structure_noise}
@@ -226,6 +230,7 @@ class Reconstructor:
 
         Raises:
             DataError: a scan has another number of voltages than the sensor.
+
         """
         self._stage_s = {}
         flags = Flag(0)
@@ -307,7 +312,7 @@ class Reconstructor:
             peak = max(float(shown.max()), 1e-12)
             pressed = shown / peak
             areas = self._areas.find(self._on_map(pressed), np.clip(pressed, 0, 1))
-            fitted = self._fit_magnitudes(areas, data)
+            fitted = self._fit_magnitudes(areas, data, 1)
             contacts = self._contacts(areas, fitted)
         misfit = fitted.misfit if fitted else float("nan")
         linear = images.get("magnitude")
@@ -346,7 +351,7 @@ class Reconstructor:
         with self._timed("contacts"):
             pressed = self._on_map(shape.pressed)
             areas = self._areas_of(shape, pressed)
-            fitted = self._fit_magnitudes(areas, data)
+            fitted = self._fit_magnitudes(areas, data, 3 if shape.converged else 1)
             contacts = self._contacts(areas, fitted)
         if shape.misfit > BAD_MISFIT or (fitted and fitted.misfit > BAD_MISFIT):
             flags |= Flag.MISFIT_HIGH
@@ -377,24 +382,24 @@ class Reconstructor:
     def _find_shape(self, data: _Data) -> tuple[Shape, str]:
         """Refine the shape of the frame before, and start anew where it does not lead on."""
         assert self._level_set is not None
-        budget = self.budget_s or DEFAULT_BUDGET_S
-        warm = self._shape
-        shape, how = None, "warm start"
+        level_set, how = self._level_set, "warm start"
+        warm, shape = self._shape, None
         if warm is not None:
-            shape = self._level_set.compare(warm, data.change, data.weight)
-            if shape.misfit < BAD_MISFIT:
-                shape = self._level_set.refine(shape, data.change, data.weight, budget, GOOD_MISFIT)
-        if shape is None or shape.misfit >= BAD_MISFIT:
+            shape = level_set.compare(warm, data.change, data.weight)
+        if warm is None or shape is None or _leads_nowhere(warm, shape):
             image = self._linear_image("structure", data)
             likeness = image / max(float(image.max()), 1e-12)
-            fresh = self._level_set.start(likeness, data.change, data.weight)
+            fresh = level_set.start(likeness, data.change, data.weight)
             if shape is None or fresh.cost < shape.cost:
                 shape, how = fresh, "cold start"
-            shape = self._level_set.refine(shape, data.change, data.weight, budget, GOOD_MISFIT)
+        budget_s = self.budget_s or DEFAULT_BUDGET_S
+        shape = level_set.refine(shape, data.change, data.weight, budget_s, GOOD_MISFIT)
         self._shape = shape
         return shape, how
 
-    def _fit_magnitudes(self, areas: Areas, data: dict[Modality, _Data]) -> Magnitudes | None:
+    def _fit_magnitudes(
+        self, areas: Areas, data: dict[Modality, _Data], solves: int
+    ) -> Magnitudes | None:
         """Fit each area's magnitude, starting from the frame before where the areas are as many."""
         last, self._magnitudes = self._magnitudes, None
         if "magnitude" in data and len(areas):
@@ -402,7 +407,7 @@ class Reconstructor:
             start = last if last and len(last.change) == len(areas) else None
             change, weight = data["magnitude"].change, data["magnitude"].weight
             self._magnitudes = fit_magnitudes(
-                self._forward, areas, change, weight, start, same_areas=same
+                self._forward, areas, change, weight, start, same_areas=same, solves=solves
             )
         self._fitted_areas = areas
         return self._magnitudes
@@ -430,6 +435,14 @@ class Reconstructor:
         start = time.perf_counter()
         yield
         self._stage_s[stage] = self._stage_s.get(stage, 0.0) + time.perf_counter() - start
+
+
+def _leads_nowhere(before: Shape, now: Shape) -> bool:
+    """Tell whether the last frame's estimate, held against new data, is no start for them."""
+    jumped = now.misfit > max(BAD_MISFIT, 2 * before.misfit)
+    stuck = before.converged and now.misfit > BAD_MISFIT
+    vanished = not np.any(now.pressed > 0.5)
+    return jumped or stuck or vanished
 
 
 def _fused(areas: Areas, values: FloatArray, shape: tuple[int, ...]) -> Image:

@@ -1,0 +1,148 @@
+"""Batch reconstruction: scans from an .npz file to maps and contacts in another (design 6.4)."""
+
+from __future__ import annotations
+
+import time
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactomo_models.description import Modality, SensorDescription
+from tactomo_models.errors import DataError
+from tactomo_models.reconstruct import Reconstruction, Reconstructor
+from tactomo_models.reference import Reference
+
+FloatArray = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+
+
+def reconstruct_file(
+    source: Path,
+    target: Path,
+    reconstructor: Reconstructor,
+    progress: Progress | None = None,
+) -> int:
+    """Reconstruct every frame of `source` into `target`; returns how many there were.
+
+    Args:
+        source: .npz with `magnitude` (T, M), `structure` (T, M), `magnitude_reference` (M,) and
+            `structure_reference` (M,), volts on any common scale. A channel that is missing or
+            all NaN is taken as absent.
+        target: .npz that is written; see DESIGN 6.4 or `tactomo reconstruct --help`.
+        reconstructor: the sensor and method.
+        progress: called with frames done and frames in all.
+
+    Raises:
+        DataError: the input cannot be read, has the wrong shape, or no channel of the sensor;
+            or the output cannot be written.
+
+    """
+    scans, reference = read_scans(source, reconstructor.description)
+    reconstructor.set_reference(reference)
+    total = max(len(channel) for channel in scans.values())
+    frames: list[Reconstruction] = []
+    seconds = np.zeros(total)
+    for index in range(total):
+        start = time.perf_counter()
+        frames.append(
+            reconstructor.reconstruct(
+                *(_scan(scans, name, index) for name in ("magnitude", "structure"))
+            )
+        )
+        seconds[index] = time.perf_counter() - start
+        if progress:
+            progress(index + 1, total)
+    arrays = frame_arrays(frames, reconstructor.description)
+    try:
+        with target.open("wb") as file:
+            np.savez_compressed(file, seconds=seconds, **arrays)
+    except OSError as error:
+        raise DataError(f"cannot write {target}: {error.strerror}") from error
+    return total
+
+
+def _scan(scans: dict[Modality, FloatArray], name: Modality, index: int) -> FloatArray | None:
+    """One scan; None where it is missing: an all-NaN row is a scan that was not taken."""
+    if name not in scans or np.isnan(scans[name][index]).all():
+        return None
+    return scans[name][index]
+
+
+def read_scans(
+    source: Path, description: SensorDescription
+) -> tuple[dict[Modality, FloatArray], Reference]:
+    """Read the scans (T, M) of each channel that is there, and their reference.
+
+    Raises:
+        DataError: the file cannot be read or does not fit the sensor.
+
+    """
+    try:
+        with np.load(source, allow_pickle=False) as stored:
+            arrays: dict[str, Any] = {name: stored[name] for name in stored.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise DataError(f"cannot read {source}: {error}; give an .npz file of scans") from error
+    scans: dict[Modality, FloatArray] = {}
+    references: dict[str, FloatArray] = {}
+    for name in description.modalities:
+        if name in arrays and not _all_nan(arrays[name]):
+            scans[name] = _checked(source, name, arrays[name], (None, description.measurements))
+            key = f"{name}_reference"
+            if key not in arrays:
+                raise DataError(f"{source} has {name} but no {key}: add the unpressed scan")
+            references[name] = _checked(source, key, arrays[key], (description.measurements,))
+    if not scans:
+        raise DataError(
+            f"{source} holds none of the channels of {description.name!r} "
+            f"({', '.join(description.modalities)}); it holds: {', '.join(arrays) or 'nothing'}"
+        )
+    lengths = {name: len(channel) for name, channel in scans.items()}
+    if len(set(lengths.values())) > 1:
+        raise DataError(f"{source}: channels differ in length: {lengths}")
+    return scans, Reference(references.get("magnitude"), references.get("structure"))
+
+
+def _all_nan(array: Any) -> bool:
+    return array.dtype.kind == "f" and bool(np.isnan(array).all())
+
+
+def _checked(source: Path, name: str, array: Any, shape: tuple[int | None, ...]) -> FloatArray:
+    fits = array.ndim == len(shape) and all(
+        want in (None, have) for want, have in zip(shape, array.shape, strict=True)
+    )
+    if array.dtype.kind not in "fiu" or not fits:
+        wanted = " x ".join("T" if n is None else str(n) for n in shape)
+        raise DataError(
+            f"{source}: {name} is {array.dtype} of shape {array.shape}; real numbers of shape "
+            f"{wanted} are needed"
+        )
+    return np.asarray(array, dtype=np.float64)
+
+
+def frame_arrays(
+    frames: list[Reconstruction], description: SensorDescription
+) -> dict[str, NDArray[Any]]:
+    """Stack frames into the arrays of DESIGN 6.4; a map that is absent is NaN throughout."""
+    shape = (description.map.nodes_y, description.map.nodes_x)
+    absent = np.full(shape, np.nan, np.float32)
+    contacts = [(i, contact) for i, frame in enumerate(frames) for contact in frame.contacts]
+
+    def column(values: list[float]) -> FloatArray:
+        return np.array(values, dtype=np.float64)
+
+    return {
+        "map": np.array([absent if f.map is None else f.map for f in frames]),
+        "structure": np.array([absent if f.structure is None else f.structure for f in frames]),
+        "misfit": column([f.misfit for f in frames]),
+        "flags": np.array([int(f.flags) for f in frames], dtype=np.uint32),
+        "contact_frame": np.array([i for i, _ in contacts], dtype=np.int64),
+        "contact_x_mm": column([c.x_m * 1e3 for _, c in contacts]),
+        "contact_y_mm": column([c.y_m * 1e3 for _, c in contacts]),
+        "contact_area_mm2": column([c.area_m2 * 1e6 for _, c in contacts]),
+        "contact_magnitude": column([c.magnitude for _, c in contacts]),
+        "contact_sigma": column([c.magnitude_sigma for _, c in contacts]),
+    }
