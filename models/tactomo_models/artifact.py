@@ -44,7 +44,6 @@ class Artifact:
         jacobian: (M, P) derivative of relative voltage changes by relative conductivity.
         tikhonov: (P, M) reconstruction matrix for the nominal noise.
         regularisation: its lambda, chosen for a noise figure of 1.
-
     """
 
     sensor: str
@@ -67,7 +66,6 @@ def build_artifact(description: SensorDescription, progress: Progress | None = N
     Args:
         description: the sensor to build for.
         progress: called with a short text at the start of each step.
-
     """
     say = progress or (lambda _: None)
     say("meshing the sheet")
@@ -111,7 +109,6 @@ def save_artifact(artifact: Artifact, path: Path) -> None:
 
     Raises:
         ArtifactError: the file cannot be written.
-
     """
     weights = artifact.bare.map_weights.tocsr()
     arrays = {
@@ -148,7 +145,6 @@ def load_artifact(path: Path, description: SensorDescription) -> Artifact:
 
     Raises:
         ArtifactError: it is missing, damaged, of another format, or built for another sensor.
-
     """
     rebuild = f"run: tactomo models build --sensor {description.name}"
     try:
@@ -205,7 +201,6 @@ def load_or_build_artifact(
     Raises:
         ArtifactError: the file is there but damaged or built for another sensor, or it cannot
             be written to a path that was given.
-
     """
     target = path or default_path(description)
     if target.exists():

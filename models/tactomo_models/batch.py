@@ -11,19 +11,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactomo_models.description import Modality, SensorDescription
+from tactomo_models.description import SensorDescription
 from tactomo_models.errors import DataError
-from tactomo_models.reconstruct import Reconstruction, Reconstructor
+from tactomo_models.reconstruct import Reconstruction, Reconstructor, Tier
 from tactomo_models.reference import Reference
 
 FloatArray = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
+METHODS = (Tier.AUTO, Tier.TIKHONOV, Tier.LEVELSET)
+BUDGET_S = 2.0  # a file has no deadline: enough for any scene to converge within its frame
+
 
 def reconstruct_file(
     source: Path,
     target: Path,
-    reconstructor: Reconstructor,
+    *,
+    description: SensorDescription,
+    method: str = Tier.AUTO,
     progress: Progress | None = None,
 ) -> int:
     """Reconstruct every frame of `source` into `target`; returns how many there were.
@@ -33,60 +38,60 @@ def reconstruct_file(
             `structure_reference` (M,), volts on any common scale. A channel that is missing or
             all NaN is taken as absent.
         target: .npz that is written; see DESIGN 6.4 or `tactomo reconstruct --help`.
-        reconstructor: the sensor and method.
+        description: the sensor.
+        method: one of `METHODS`.
         progress: called with frames done and frames in all.
 
     Raises:
         DataError: the input cannot be read, has the wrong shape, or no channel of the sensor;
-            or the output cannot be written.
-
+            the method is unknown; or the output cannot be written.
     """
-    scans, reference = read_scans(source, reconstructor.description)
+    if method not in METHODS:
+        raise DataError(f"unknown method {method!r}; choose one of: {', '.join(METHODS)}")
+    scans, reference = read_scans(source, description)
+    reconstructor = Reconstructor(description, tier=Tier(method), budget_s=BUDGET_S)
     reconstructor.set_reference(reference)
     total = max(len(channel) for channel in scans.values())
     frames: list[Reconstruction] = []
     seconds = np.zeros(total)
     for index in range(total):
+        magnitude, structure = (_scan(scans, n, index) for n in ("magnitude", "structure"))
         start = time.perf_counter()
-        frames.append(
-            reconstructor.reconstruct(
-                *(_scan(scans, name, index) for name in ("magnitude", "structure"))
-            )
-        )
+        frames.append(reconstructor.reconstruct(magnitude, structure))
         seconds[index] = time.perf_counter() - start
         if progress:
             progress(index + 1, total)
-    arrays = frame_arrays(frames, reconstructor.description)
+    arrays: dict[str, Any] = {"seconds": seconds, **frame_arrays(frames, description)}
     try:
         with target.open("wb") as file:
-            np.savez_compressed(file, seconds=seconds, **arrays)
+            np.savez_compressed(file, **arrays)
     except OSError as error:
         raise DataError(f"cannot write {target}: {error.strerror}") from error
     return total
 
 
-def _scan(scans: dict[Modality, FloatArray], name: Modality, index: int) -> FloatArray | None:
+def _scan(scans: dict[str, FloatArray], name: str, index: int) -> FloatArray | None:
     """One scan; None where it is missing: an all-NaN row is a scan that was not taken."""
-    if name not in scans or np.isnan(scans[name][index]).all():
+    channel = scans.get(name)
+    if channel is None or np.isnan(channel[index]).all():
         return None
-    return scans[name][index]
+    return np.asarray(channel[index])
 
 
 def read_scans(
     source: Path, description: SensorDescription
-) -> tuple[dict[Modality, FloatArray], Reference]:
+) -> tuple[dict[str, FloatArray], Reference]:
     """Read the scans (T, M) of each channel that is there, and their reference.
 
     Raises:
         DataError: the file cannot be read or does not fit the sensor.
-
     """
     try:
         with np.load(source, allow_pickle=False) as stored:
             arrays: dict[str, Any] = {name: stored[name] for name in stored.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise DataError(f"cannot read {source}: {error}; give an .npz file of scans") from error
-    scans: dict[Modality, FloatArray] = {}
+    scans: dict[str, FloatArray] = {}
     references: dict[str, FloatArray] = {}
     for name in description.modalities:
         if name in arrays and not _all_nan(arrays[name]):

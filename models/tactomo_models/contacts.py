@@ -37,7 +37,6 @@ class Contact:
             NaN if unknown.
         magnitude_sigma: standard uncertainty of the magnitude.
         pressure_kpa: NaN if unknown, or below the magnitude channel's onset.
-
     """
 
     id: int
@@ -58,7 +57,6 @@ class Areas:
         on_nodes: (K, P) the same at the pressable nodes.
         centres_m: (K, 2) centroids.
         areas_m2: (K,).
-
     """
 
     on_map: FloatArray
@@ -90,7 +88,6 @@ class AreaFinder:
         Args:
             pressed: (nodes_y, nodes_x) share pressed, 0 to 1.
             pressed_nodes: (P,) the same at the pressable nodes.
-
         """
         label, count = ndimage.label(pressed > 0.5, structure=np.ones((3, 3)))
         if count == 0:
@@ -121,7 +118,6 @@ class Tangent:
         change: (K,) where it touches.
         voltages: (M,) relative voltage changes there.
         jacobian: (M, K) their derivative by the areas' changes.
-
     """
 
     change: FloatArray
@@ -138,7 +134,6 @@ class Magnitudes:
         sigma: (K,) standard uncertainties.
         misfit: root mean square of the noise-weighted residual.
         tangent: what they were computed with; it serves again while the areas stay.
-
     """
 
     change: FloatArray
@@ -167,28 +162,29 @@ def fit_magnitudes(
         start: an earlier fit of as many areas.
         same_areas: the earlier fit was of these very areas: where its tangent still holds there
             is nothing to solve.
-
     """
     change = np.zeros(len(areas)) if start is None else start.change
-    tangent = start.tangent if start is not None and same_areas else None
-    for _ in range(solves):
-        if tangent is None or np.abs(change - tangent.change).max() > TANGENT_REACH:
-            tangent = _touch(forward, areas, change)
+    if start is not None and same_areas:
+        tangent = start.tangent
+    else:
+        tangent, solves = _touch(forward, areas, change), solves - 1
+    while True:
         J = tangent.jacobian * weight[:, None]
-        covariance = np.linalg.inv(J.T @ J + 1e-9 * np.eye(len(areas)))
         residual = weight * (tangent.voltages - data)
-        step = -covariance @ (J.T @ residual)
-        change = np.clip(tangent.change + step, *CHANGE_LIMITS)
-        if np.abs(change - tangent.change).max() <= TANGENT_REACH:
+        covariance = np.linalg.inv(J.T @ J + 1e-9 * np.eye(len(areas)))
+        change = np.clip(tangent.change - covariance @ (J.T @ residual), *CHANGE_LIMITS)
+        moved = change - tangent.change
+        if solves <= 0 or np.abs(moved).max() <= TANGENT_REACH:
             break
-    misfit = float(np.sqrt(np.mean((residual + J @ (change - tangent.change)) ** 2)))
+        tangent, solves = _touch(forward, areas, change), solves - 1
+    misfit = float(np.sqrt(np.mean((residual + J @ moved) ** 2)))
     # A model that does not explain the data to their noise knows its unknowns less well, too.
     sigma = np.sqrt(np.diag(covariance)) * max(1.0, misfit)
     return Magnitudes(change, sigma, misfit, tangent)
 
 
 def _touch(forward: ForwardModel, areas: Areas, change: FloatArray) -> Tangent:
-    inside = areas.on_nodes.any(axis=0)
+    inside = np.asarray(areas.on_nodes.any(axis=0))
     where = np.flatnonzero(inside)
     solution = forward.solve(change @ areas.on_nodes, also=inside)
     bare = forward.bare_voltages

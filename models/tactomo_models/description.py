@@ -10,6 +10,7 @@ import hashlib
 import tomllib
 from functools import cached_property
 from importlib import resources
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -126,7 +127,7 @@ class StructureResponse(_Section):
 def _check_table(x: Table, y: Table, name: str, start: float) -> None:
     if len(x) != len(y):
         raise ValueError(f"{name} must have as many entries as pressure_kpa ({len(x)})")
-    if x[0] != 0 or any(b <= a for a, b in zip(x, x[1:], strict=False)):
+    if x[0] != 0 or any(b <= a for a, b in pairwise(x)):
         raise ValueError("pressure_kpa must start at 0 and rise")
     steps = np.diff(y)
     if y[0] != start or not (np.all(steps >= 0) or np.all(steps <= 0)) or y[-1] == y[0]:
@@ -339,7 +340,6 @@ def load_description(source: str | Path) -> SensorDescription:
     Raises:
         DescriptionError: the file cannot be read, is not TOML, or a key is unknown, missing
             or out of range; the message names the key, its value and what is allowed.
-
     """
     name = str(source)
     if name in shipped_descriptions():

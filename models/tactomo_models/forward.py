@@ -47,7 +47,6 @@ class BareSheet:
             l and out of the last one.
         transfer: (L, L) electrode potentials for the same currents; the last row and column are 0.
         map_weights: (nodes_y * nodes_x, P) interpolation of pressable nodes onto the map.
-
     """
 
     points: FloatArray
@@ -73,7 +72,6 @@ def solve_bare_sheet(
         sheet: its mesh of N nodes.
         conductivity: (N,) of an uneven sheet, relative to the description's; 1 if None.
         impedance: (L,) contact impedances, relative to the description's; 1 if None.
-
     """
     mesh = sheet.mesh
     system = _assemble(description, sheet, conductivity, impedance)
@@ -101,7 +99,7 @@ def solve_bare_sheet(
     )
 
 
-@skfem.BilinearForm
+@skfem.BilinearForm  # type: ignore[untyped-decorator]
 def _conduction(u: Any, v: Any, w: Any) -> Any:
     return w["conductivity"] * dot(grad(u), grad(v))
 
@@ -177,7 +175,6 @@ class Solution:
         voltages: (M,) in scan order, relative (multiply by `ForwardModel.volts_per_unit`).
         nodes: (n,) positions in `BareSheet.support` where potentials are known.
         potentials: (n, L - 1) potentials there.
-
     """
 
     voltages: FloatArray
@@ -250,7 +247,6 @@ class ForwardModel:
         Args:
             change: (P,) conductivity minus 1 at the pressable nodes.
             also: (P,) nodes where derivatives will be asked for although nothing changed there.
-
         """
         triangles, nodes, local = self._changed(change, also)
         u0 = self.bare.potentials[nodes]
@@ -288,7 +284,6 @@ class ForwardModel:
 
         Returns:
             (M, n), relative volts per relative conductivity (the paper's equation 2).
-
         """
         by_node = self._mean_transposed[where]  # (n, t)
         triangles = np.flatnonzero(by_node.getnnz(axis=0))

@@ -48,7 +48,6 @@ class Shape:
         cost: what is minimised, the prior included.
         damping: Levenberg-Marquardt damping that its last step got through with.
         converged: whether the last step changed next to nothing.
-
     """
 
     mu: FloatArray
@@ -73,7 +72,6 @@ class LevelSet:
         forward: the model of the sheet.
         ratio: conductivity of the saturated phase over the bare sheet's: where its estimate
             starts and what it stays near.
-
     """
 
     def __init__(self, forward: ForwardModel, ratio: float) -> None:
@@ -90,7 +88,7 @@ class LevelSet:
         )
         self.nominal = float(np.log(ratio))
         self._ratio_sigma = RATIO_SPREAD * abs(self.nominal)
-        self._ratio_limits = sorted((0.1 * self.nominal, 1.5 * self.nominal))
+        self._least_ratio, self._most_ratio = sorted((0.1 * self.nominal, 1.5 * self.nominal))
 
     def start(self, likeness: FloatArray, data: FloatArray, weight: FloatArray) -> Shape:
         """Turn an image (P,) that is 0 where nothing presses and 1 inside contacts into a start."""
@@ -163,7 +161,6 @@ class LevelSet:
                 (see `_work_s`); one step is always tried.
             good_enough: misfit at which the data are explained to their noise (discrepancy
                 principle): no further step is taken.
-
         """
         while shape.misfit > good_enough:
             normal, gradient = self._normal_equations(shape, weight)
@@ -197,7 +194,7 @@ class LevelSet:
         while damping < WORST_DAMPING:
             step = -np.linalg.solve(normal + damping * np.eye(len(normal)), gradient)
             step *= min(1.0, STEP_LIMIT / max(np.abs(step[:-1]).max(), 1e-12))
-            ratio = float(np.clip(shape.log_ratio + step[-1], *self._ratio_limits))
+            ratio = float(np.clip(shape.log_ratio + step[-1], self._least_ratio, self._most_ratio))
             trial = self.evaluate(shape.mu + step[:-1], ratio, data, weight)
             budget_s -= _work_s(trial)
             if trial.cost < shape.cost:

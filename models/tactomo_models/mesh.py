@@ -24,7 +24,6 @@ class SheetMesh:
     Attributes:
         mesh: scikit-fem triangles, coordinates in metres.
         electrode_facets: per electrode, the boundary facets it covers.
-
     """
 
     mesh: skfem.MeshTri
@@ -41,7 +40,6 @@ def mesh_sheet(
         spacing_m: distance of the regular nodes; the map's own spacing if None, so that every
             map node of a rectangle is a mesh node.
         refinements: how often triangles at the electrodes' ends are halved.
-
     """
     disc = description.sheet.shape == "disc"
     mesh = _disc(description, spacing_m) if disc else _rectangle(description, spacing_m)

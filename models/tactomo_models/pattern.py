@@ -13,7 +13,6 @@ class Pairs:
     Attributes:
         drive: (M, 2) electrodes that the current enters and leaves by.
         measure: (M, 2) electrodes whose potential difference, first minus second, is read.
-
     """
 
     drive: NDArray[np.intp]

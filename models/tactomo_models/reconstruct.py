@@ -95,7 +95,6 @@ class Reconstruction:
         misfit: root mean square of the noise-weighted residual; about 1 where all is explained.
         flags: what stands in the way of trusting it.
         stage_s: seconds spent in each stage.
-
     """
 
     map: Image | None
@@ -105,7 +104,7 @@ class Reconstruction:
     tier: Tier
     reason: str
     misfit: float
-    flags: Flag = Flag(0)
+    flags: Flag = field(default_factory=lambda: Flag(0))
     stage_s: dict[str, float] = field(default_factory=dict)
 
 
@@ -117,7 +116,6 @@ class _Channel:
         reference: (M,) volts.
         variance: (M,) of a relative change, by noise of scan and reference and by model error.
         tikhonov: (P, M) reconstruction matrix for that noise.
-
     """
 
     reference: FloatArray
@@ -144,7 +142,6 @@ class Reconstructor:
         budget_s: compute time a frame may take, on a machine of the 2.5 GHz class.
 
     Not thread-safe: one thread owns it.
-
     """
 
     def __init__(
@@ -177,7 +174,6 @@ class Reconstructor:
 
         Raises:
             DataError: a channel has another number of voltages than the sensor.
-
         """
         volts = {"magnitude": reference.magnitude, "structure": reference.structure}
         noise = {"magnitude": reference.magnitude_noise, "structure": reference.structure_noise}
@@ -230,7 +226,6 @@ class Reconstructor:
 
         Raises:
             DataError: a scan has another number of voltages than the sensor.
-
         """
         self._stage_s = {}
         flags = Flag(0)
@@ -238,7 +233,7 @@ class Reconstructor:
         with self._timed("data"):
             for name, scan in (("magnitude", magnitude), ("structure", structure)):
                 if name in self.description.modalities:
-                    flags |= self._take(name, scan, data)  # type: ignore[arg-type]
+                    flags |= self._take(name, scan, data)
         made = self._by_tier(data, flags)
         return replace(made, stage_s=self._stage_s)
 
@@ -421,11 +416,13 @@ class Reconstructor:
         pressure = pressure_of(self.description, size, sigma)
         return tuple(
             Contact(
-                ids[k],
-                *map(float, (*areas.centres_m[k], areas.areas_m2[k])),
-                float(size[k]),
-                float(sigma[k]),
-                float(pressure[k]),
+                id=ids[k],
+                x_m=float(areas.centres_m[k, 0]),
+                y_m=float(areas.centres_m[k, 1]),
+                area_m2=float(areas.areas_m2[k]),
+                magnitude=float(size[k]),
+                magnitude_sigma=float(sigma[k]),
+                pressure_kpa=float(pressure[k]),
             )
             for k in range(len(areas))
         )
@@ -449,4 +446,5 @@ def _fused(areas: Areas, values: FloatArray, shape: tuple[int, ...]) -> Image:
     """Map on which each area carries its own value; areas of unknown value stay 0."""
     if len(areas) == 0:
         return np.zeros(shape, np.float32)
-    return np.einsum("k,kyx->yx", np.nan_to_num(values), areas.on_map).astype(np.float32)
+    fused = np.einsum("k,kyx->yx", np.nan_to_num(values), areas.on_map)
+    return np.asarray(fused, dtype=np.float32)

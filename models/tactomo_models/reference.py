@@ -23,7 +23,6 @@ class Reference:
         magnitude_noise: (M,) standard deviation of one scan, volts; None where unknown.
         structure_noise: (M,) likewise.
         scans: how many were averaged.
-
     """
 
     magnitude: FloatArray | None
@@ -38,7 +37,6 @@ class Reference:
 
         Raises:
             DataError: there is no scan, or one of the voltages is not a number.
-
         """
         present = [scans for scans in (magnitude, structure) if scans is not None]
         if not present or any(len(scans) == 0 for scans in present):

@@ -24,7 +24,6 @@ class Press:
         radius_y_m: half its width along its own y axis; `radius_m` if None.
         angle_rad: turned by this, counter-clockwise.
         shape: an ellipse, a rectangle, or a ring (an ellipse with its inner half left out).
-
     """
 
     x_m: float
@@ -43,7 +42,6 @@ class Press:
             y_m: coordinates of the points.
             edge_m: width over which the share falls from 1 to 0 across the outline: the distance
                 of the points, so that area is kept whatever the grid.
-
         """
         cos, sin = np.cos(self.angle_rad), np.sin(self.angle_rad)
         dx, dy = x_m - self.x_m, y_m - self.y_m

@@ -28,7 +28,6 @@ class SkinSimulator:
         unevenness: standard deviation of the sheet's smooth conductivity error (0.05 is 5 %).
         impedance_spread: standard deviation of the logarithm of the contact impedances.
         seed: of that unevenness.
-
     """
 
     def __init__(

@@ -24,7 +24,6 @@ def tikhonov_matrix(J: FloatArray, noise: FloatArray, weight: float) -> FloatArr
         J: (M, P) derivative of the relative voltage changes by the nodes' conductivity.
         noise: (M,) standard deviations of the relative voltage changes.
         weight: the regularisation parameter lambda.
-
     """
     # (J'N⁻¹J + λ)⁻¹J'N⁻¹ = J'(JJ' + λN)⁻¹, which inverts M x M instead of P x P.
     data_space = J @ J.T + np.diag(weight * noise**2)
@@ -38,7 +37,6 @@ def noise_figure_weight(J: FloatArray, noise: FloatArray, target: FloatArray) ->
         J: (M, P) Jacobian of the relative voltage changes.
         noise: (M,) their standard deviations.
         target: (P,) conductivity change of the target.
-
     """
     whitened = J / noise[:, None]
     left, singular, right = np.linalg.svd(whitened, full_matrices=False)
