@@ -162,6 +162,7 @@ def fit_magnitudes(
         start: an earlier fit of as many areas.
         same_areas: the earlier fit was of these very areas: where its tangent still holds there
             is nothing to solve.
+        solves: forward solves allowed.
     """
     change = np.zeros(len(areas)) if start is None else start.change
     if start is not None and same_areas:
