@@ -1,33 +1,51 @@
-"""The command line as a user runs it: a process with arguments, output and an exit status."""
+"""The command line as a user runs it: arguments, output and an exit status."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import signal
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zmq
+from tactomo.cli import main
 from tactomo_client.messages import decode_request, encode_error, encode_reply
 
-TIMEOUT_S = 90.0
 
-Completed = subprocess.CompletedProcess[str]
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a command."""
+
+    returncode: int
+    stdout: str
+    stderr: str
 
 
 @pytest.fixture
-def tactomo(tmp_path: Path) -> Callable[..., Completed]:
-    """Run `tactomo ARGUMENTS` in an empty folder and return what became of it."""
+def tactomo(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Iterator[Callable[..., Outcome]]:
+    """Run `tactomo ARGUMENTS` in an empty folder, in this process, and say what became of it.
 
-    def run(*arguments: object, **options: Any) -> Completed:
-        command = [sys.executable, "-m", "tactomo.cli", *map(str, arguments)]
-        options = {"cwd": tmp_path, "timeout": TIMEOUT_S, "stdin": subprocess.DEVNULL, **options}
-        return subprocess.run(command, capture_output=True, text=True, check=False, **options)
+    Whatever is not told to the user as an error comes out as an exception here.
+    """
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
 
-    return run
+    def run(*arguments: object) -> Outcome:
+        monkeypatch.setattr("sys.argv", ["tactomo", *map(str, arguments)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as exit_:
+            main()
+        return Outcome(int(exit_.value.code or 0), *capsys.readouterr())
+
+    yield run
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 class ControlServer:
@@ -49,8 +67,9 @@ class ControlServer:
                 command, arguments = decode_request(self._socket.recv())
                 self.requests.append((command, arguments))
                 answer = self.answers.get(command, {})
-                is_error = isinstance(answer, tuple)
-                self._socket.send(encode_error(*answer) if is_error else encode_reply(answer))
+                self._socket.send(
+                    encode_error(*answer) if isinstance(answer, tuple) else encode_reply(answer)
+                )
 
     def close(self) -> None:
         self._stop.set()

@@ -94,7 +94,7 @@ def test_it_shows_map_contacts_and_health_and_ends_by_ctrl_c(sensor: FakeSensor)
 
 def test_it_says_when_data_are_stale() -> None:
     with FakeSensor("skin") as fake:
-        thread = threading.Thread(target=lambda: (fake.wait_for_subscriber(), old_frame(fake)))
+        thread = threading.Thread(target=old_frame, args=[fake])
         thread.start()
         shown, _ = in_a_terminal("--stream", fake.address, until="STALE")
         thread.join()
@@ -102,7 +102,8 @@ def test_it_says_when_data_are_stale() -> None:
 
 
 def old_frame(fake: FakeSensor) -> None:
-    time.sleep(0.2)
+    for _ in ("map", "status", "event"):
+        fake.wait_for_subscriber()
     fake.publish_message("status", STATUS)
     fake.publish([], **images(), acquired_monotonic_ns=time.monotonic_ns() - 2_000_000_000)
 
@@ -133,13 +134,18 @@ def test_the_picture_is_the_right_way_up() -> None:
         text = map_text(next(frames), STATUS, 51)
     lines = text.split("\n")
     assert [len(line) for line in lines][:26] == [51] * 26
-    cells = {
-        (row, column): (span.style.color.triplet, span.style.bgcolor.triplet)
+    cells: dict[tuple[int, int], list[Any]] = {
+        (row, column): [tuple(colour.triplet) for colour in colours(span.style)]
         for row, line in enumerate(lines)
         for span in line.spans
         for column in range(span.start, span.end)
     }
-    bright = [place for place, colours in cells.items() if any(sum(c) > 500 for c in colours)]
-    pressed = [place for place, colours in cells.items() if PRESSED_COLOUR in map(tuple, colours)]
+    bright = [place for place, pair in cells.items() if any(sum(c) > 500 for c in pair)]
+    pressed = [place for place, pair in cells.items() if PRESSED_COLOUR in pair]
     assert bright == [((50 - 10) // 2, 30)]
     assert pressed == [((50 - 40) // 2, 20)]
+
+
+def colours(style: Any) -> list[Any]:
+    """The upper and the lower colour of a half-block."""
+    return [style.color, style.bgcolor]

@@ -12,7 +12,7 @@ import serial
 from numpy.typing import NDArray
 from tactomo.twin import SkinModel, Twin, TwinConfig
 from tactomo_client import request
-from tactomo_models import Press, load_description
+from tactomo_models import Modality, Press, load_description
 from tactomo_protocol import Command, CommandCode, Decoder, Packet, Scan, encode
 
 MEASUREMENTS = 208
@@ -28,7 +28,7 @@ class FlatSkin:
     def __init__(self, seconds: float = 0.0) -> None:
         self.seconds = seconds
 
-    def voltages(self, presses: Sequence[Press]) -> dict[str, NDArray[np.float64]]:
+    def voltages(self, presses: Sequence[Press]) -> dict[Modality, NDArray[np.float64]]:
         time.sleep(self.seconds)
         kpa = sum(press.pressure_kpa for press in presses)
         return {

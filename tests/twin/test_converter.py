@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from tactomo.twin.converter import Converter, Drift
 
 STILL = Drift(walk=0.0, creep=0.0)
@@ -12,9 +13,9 @@ VOLTS = np.linspace(-0.5, 0.5, 208)
 
 def volts_of(
     converter: Converter, counter: int = 0, time_s: float = 0.0, channel: int = 0
-) -> object:
+) -> NDArray[np.float64]:
     counts, _ = converter.convert(VOLTS, channel=channel, counter=counter, time_s=time_s)
-    return counts * converter.volts_per_count
+    return np.asarray(counts * converter.volts_per_count)
 
 
 def test_without_noise_and_drift_only_the_rounding_remains() -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tactomo.errors import AddressError, ConfigError, TactomoError
 from tactomo.twin import Drift, Scene, TwinConfig
 from tactomo_client import ControlError
-from tactomo_models import Press, load_description
+from tactomo_models import Modality, Press, load_description
 from tactomo_protocol import (
     Acknowledge,
     AckStatus,
@@ -136,7 +136,7 @@ def test_a_scan_in_time_is_not_late(bench: Start) -> None:
 
 
 def test_acknowledgements_do_not_wait_for_a_slow_solve(bench: Start) -> None:
-    host = bench(solve_s=2.0, rate_hz=10.0).host()
+    host = bench(solve_s=1.0, rate_hz=10.0).host()
     host.start()
     host.wait_for(lambda: host.kind(Acknowledge))
     host.send(CommandCode.IDENTIFY, request=9)
@@ -331,10 +331,10 @@ def test_a_busy_control_address_is_named(bench: Start) -> None:
 class BreakingSkin:
     """Solves for an unloaded skin only."""
 
-    def voltages(self, presses: Sequence[Press]) -> dict[str, NDArray[np.float64]]:
+    def voltages(self, presses: Sequence[Press]) -> dict[Modality, NDArray[np.float64]]:
         if presses:
             raise ArithmeticError("singular")
-        return {name: np.full(208, 0.1) for name in ("magnitude", "structure")}
+        return {"magnitude": np.full(208, 0.1), "structure": np.full(208, 0.1)}
 
 
 def test_a_skin_that_fails_stops_the_twin_with_its_error(bench: Start) -> None:
@@ -352,7 +352,7 @@ def test_a_skin_that_fails_stops_the_twin_with_its_error(bench: Start) -> None:
     [
         ({"control": "tcp://0.0.0.0:0"}, "other computers"),
         ({"control": "here"}, "use tcp://"),
-        ({"ports": 3}, "3 ports"), 
+        ({"ports": 3}, "3 ports"),
         ({"rate_hz": 0.0}, "rate of 0"),
         ({"noise_v": -1.0}, "noise of"),
     ],

@@ -111,15 +111,12 @@ class Child:
         """Return the error that says how the child ended and what it said last."""
         return ChildError(f"the {self.name} stopped (exit status {self.status})", self._told())
 
-    def ask_to_stop(self) -> None:
-        """Send SIGTERM; does not wait."""
+    def stop(self, patience_s: float) -> None:
+        """Send SIGTERM and wait for the end; after `patience_s` seconds, kill."""
         if self.is_running:
             self._process.terminate()
-
-    def stop(self, deadline_s: float) -> None:
-        """Wait for the end until `deadline_s` (monotonic), then kill."""
         try:
-            self._process.wait(max(0.0, deadline_s - time.monotonic()))
+            self._process.wait(max(0.0, patience_s))
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
@@ -184,11 +181,11 @@ class Family:
         traceback: TracebackType | None,
     ) -> None:
         with no_interruption():
+            # The last one started first: whoever reads stops before what is read from.
             deadline_s = time.monotonic() + STOP_S
-            for child in reversed(self._children):
-                child.ask_to_stop()
-            for child in reversed(self._children):
-                child.stop(deadline_s)
+            for number, child in enumerate(reversed(self._children), start=1):
+                left_s = deadline_s - time.monotonic()
+                child.stop(left_s * number / len(self._children))
 
 
 class no_interruption:  # noqa: N801 - reads as a statement

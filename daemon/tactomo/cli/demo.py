@@ -103,7 +103,7 @@ def demo(
         builder.wait_done()
         lines = [word for path in simulated["ports"] for word in ("--port", path)]
         daemon = family.start("daemon", "daemon", *daemon_options, *lines)
-        addresses = {"twin": simulated["control"], **daemon.wait_ready()}
+        addresses = {**_served(daemon.wait_ready()), "twin": simulated["control"]}
         _show(family, addresses, port, browser, announce)
 
 
@@ -129,7 +129,12 @@ def show_replay(
             *("--stream", stream, "--control", control, "--stay"),
             *_optional("--description", description),
         )
-        _show(family, daemon.wait_ready(), viewer_port, browser, announce)
+        _show(family, _served(daemon.wait_ready()), viewer_port, browser, announce)
+
+
+def _served(ready: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what matters to others of what a daemon logs when it is ready."""
+    return {name: ready[name] for name in ("sensor", "stream", "control", "ports")}
 
 
 def _show(

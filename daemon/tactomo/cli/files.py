@@ -226,7 +226,9 @@ def _frames(text: str | None) -> slice | None:
 def reconstruct(
     scans: Annotated[Path, typer.Argument(metavar="IN.npz", help="Scans and references.")],
     maps: Annotated[Path, typer.Argument(metavar="OUT.npz", help="The file to write.")],
-    method: Annotated[str, typer.Option(help="auto, or one method for every frame.")] = "auto",
+    method: Annotated[
+        str, typer.Option(help="auto, or one for every frame: tikhonov, levelset.")
+    ] = "auto",
     sensor: DescriptionOption = DEFAULT_DESCRIPTION,
 ) -> None:
     """Reconstruct a file of scans, without a daemon.
@@ -238,13 +240,17 @@ def reconstruct(
     `contact_area_mm2`, `contact_magnitude`, `contact_sigma`.
     """
     from rich.progress import Progress
+    from tactomo_models import load_description
     from tactomo_models.batch import reconstruct_file
 
+    description = load_description(sensor)
     with Progress(transient=True) as progress:
         task = progress.add_task("reconstructing", total=None)
 
         def show(done: int, total: int) -> None:
             progress.update(task, completed=done, total=total)
 
-        reconstruct_file(scans, maps, method=method, description=sensor, progress=show)
-    typer.echo(f"wrote {maps}")
+        frames = reconstruct_file(
+            scans, maps, description=description, method=method, progress=show
+        )
+    typer.echo(f"wrote {maps}: {frames} frames")

@@ -115,7 +115,9 @@ def _reconstruct(recording: Recording, description: str) -> list[Point]:
     """Replay a recording through a daemon of our own, into one that has contacts."""
     from tactomo.config import load_config
     from tactomo.daemon import Daemon
+    from tactomo.log import configure_logging
 
+    configure_logging("error")
     with tempfile.TemporaryDirectory(prefix="tactomo-") as folder:
         path = Path(folder) / "contacts.mcap"
         config = load_config(
@@ -128,7 +130,6 @@ def _reconstruct(recording: Recording, description: str) -> list[Point]:
             exit_at_end=True,
             record=path,
             record_maps=True,
-            log_level="error",
         )
         if Daemon(config).run() != 0:
             raise TactomoError(
@@ -166,7 +167,7 @@ def _draw_sheet(figure: Any, points: list[Point], description: SensorDescription
         axes.add_patch(Rectangle((-width / 2, -height / 2), width, height, **style))
     for number, (begin, end) in enumerate(description.electrode_ends_m * 1e3):
         axes.plot(*zip(begin, end, strict=True), color="black", linewidth=4, solid_capstyle="butt")
-        x, y = (begin + end) / 2 * 1.07
+        x, y = (begin + end) / 2 * 1.08
         axes.text(x, y, str(number), ha="center", va="center", fontsize=7, color="0.4")
     for track in _by_contact(points):
         x, y = [point.x_mm for point in track], [point.y_mm for point in track]
@@ -182,7 +183,14 @@ def _draw_sheet(figure: Any, points: list[Point], description: SensorDescription
         zorder=2,
     )
     figure.colorbar(dots, ax=axes, label="time (s)", shrink=0.8)
-    axes.set(xlabel="x (mm)", ylabel="y (mm)", aspect="equal", title="path, dots by area")
+    axes.set(
+        xlim=(-0.57 * width, 0.57 * width),
+        ylim=(-0.57 * height, 0.57 * height),
+        aspect="equal",
+        xlabel="x (mm)",
+        ylabel="y (mm)",
+        title="path, dots by area",
+    )
 
 
 def _draw_traces(figure: Any, points: list[Point]) -> None:

@@ -14,7 +14,7 @@ import math
 import socket
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -23,7 +23,6 @@ from typing import Any, Protocol
 
 import numpy as np
 import zmq
-from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 from tactomo_client.messages import DEFAULT_TWIN_CONTROL
 from tactomo_models import Press, SensorDescription, SkinSimulator
@@ -69,7 +68,7 @@ NOISE_SHARE = 2e-5
 class SkinModel(Protocol):
     """What the twin needs of a forward model; `tactomo_models.SkinSimulator` is one."""
 
-    def voltages(self, presses: Sequence[Press]) -> Mapping[str, NDArray[np.float64]]:
+    def voltages(self, presses: Sequence[Press]) -> Voltages:
         """Return the noise-free volts, (M,), of each channel of the sensor under these presses."""
 
 

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from tactomo_models import Modality
 from tactomo_protocol import (
     Acknowledge,
     AckStatus,
@@ -39,7 +40,11 @@ from tactomo.twin.line import SerialLine
 HELLO_PERIOD_S = 1.0
 RATE_HZ_MIN, RATE_HZ_MAX = 0.1, 500.0
 
-Voltages = Mapping[str, NDArray[np.float64]]
+Voltages = Mapping[Modality, NDArray[np.float64]]
+MODALITIES: Mapping[Channel, Modality] = {
+    Channel.MAGNITUDE: "magnitude",
+    Channel.STRUCTURE: "structure",
+}
 
 
 @dataclass(slots=True)
@@ -165,7 +170,7 @@ class Firmware:
 
     def _scan(self, channel: Channel, time_s: float, flags: ScanFlag, voltages: Voltages) -> Scan:
         counts, saturated = self._converter.convert(
-            voltages[channel.name.lower()], channel=channel, counter=self.counter, time_s=time_s
+            voltages[MODALITIES[channel]], channel=channel, counter=self.counter, time_s=time_s
         )
         return Scan(
             channel=channel,

@@ -1,0 +1,36 @@
+"""`reconstruct`: a file of scans in, a file of maps and contacts out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tactomo_models import Press, SkinSimulator, load_description
+
+Run = Callable[..., Any]
+
+
+def test_a_press_is_found_in_a_file(tactomo: Run, tmp_path: Path) -> None:
+    skin = SkinSimulator(load_description("paper_square"))
+    empty = skin.voltages([])
+    pressed = skin.voltages([Press(x_m=-0.03, y_m=0.03, pressure_kpa=180.0)])
+    scans = {name: np.stack([empty[name], pressed[name]]) for name in empty}
+    references = {f"{name}_reference": volts for name, volts in empty.items()}
+    np.savez(tmp_path / "in.npz", **scans, **references)  # type: ignore[arg-type]
+    result = tactomo("reconstruct", "in.npz", "out.npz")
+    assert result.returncode == 0
+    assert result.stdout.strip() == "wrote out.npz: 2 frames"
+    with np.load(tmp_path / "out.npz") as maps:
+        assert maps["map"].shape == (2, 51, 51)
+        assert maps["contact_frame"].tolist() == [1]
+        assert abs(maps["contact_x_mm"][0] + 30.0) < 3.0
+        assert abs(maps["contact_y_mm"][0] - 30.0) < 3.0
+
+
+def test_an_unknown_method_is_refused(tactomo: Run, tmp_path: Path) -> None:
+    np.savez(tmp_path / "in.npz", magnitude=np.ones((1, 208)), magnitude_reference=np.ones(208))
+    result = tactomo("reconstruct", "in.npz", "out.npz", "--method", "guess")
+    assert result.returncode == 1
+    assert "tikhonov" in result.stderr
