@@ -109,6 +109,7 @@ def port_fields(port: PortReader) -> dict[str, Any]:
         "bytes": port.bytes_read,
         "packets": port.counts.packets,
         "corrupt": port.counts.corrupt,
+        "unused_scans": port.unused,
     }
 
 

@@ -98,6 +98,7 @@ class Pipeline:
         self._on_event = on_event
         self._drop_limit = RateLimit()
         self._dropped_told = 0
+        self._is_excused = False  # the dual scans to be dropped next are not worth a warning
         self._announced: dict[int, tuple[Channel, ...]] = {}  # what each port's device sends
         self._clocks: dict[int, int] = {}  # the newest time on each replayed port that goes on
         self._ended: set[int] = set()
@@ -172,7 +173,10 @@ class Pipeline:
             for dual in ready if self._is_lossless else self._newest(ready):
                 if self._stopping.is_set():
                     break
+                reference = self._imaging.reference
                 self._imaging.process(dual, self._sync.lost)
+                if self._imaging.reference is not reference:
+                    self._is_excused = True
             while not self._commands.empty():
                 self._commands.get()()
             self._imaging.check_tare()
@@ -248,6 +252,8 @@ class Pipeline:
 
     def _newest(self, ready: list[DualScan]) -> list[DualScan]:
         self.dropped += max(0, len(ready) - 1)
+        if ready and self._is_excused:  # a new reference takes a while to prepare for
+            self._is_excused, self._dropped_told = False, self.dropped
         if self.dropped > self._dropped_told and self._drop_limit.allows():
             self._on_event(
                 "scans_dropped",

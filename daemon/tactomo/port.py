@@ -5,7 +5,7 @@ times a second, and starts the device anew once it is back. Whatever bytes come,
 none of them raises.
 
 After `open`, only the thread touches the serial object. What others may read (`bytes_read`,
-`counts`, `hello`, `refusal`, `is_open`, `has_ended`) is written by the thread alone.
+`counts`, `unused`, `hello`, `refusal`, `is_open`, `has_ended`) is written by the thread alone.
 """
 
 from __future__ import annotations
@@ -88,6 +88,8 @@ class PortReader:
     Attributes:
         bytes_read: since the start, over all connections.
         counts: the decoder's counts, likewise.
+        unused: scans that cannot be used: before the first hello, of a device that does not fit
+            the sensor, of another length or of a channel that the sensor does not have.
         hello: the newest one; None before the first.
         refusal: why this device's scans are not used; empty when they are.
         is_open: whether the device is there at present.
@@ -108,6 +110,7 @@ class PortReader:
         self.index = index
         self.url = url
         self.bytes_read = 0
+        self.unused = 0
         self.hello: Hello | None = None
         self.refusal = ""
         self.is_open = False
@@ -241,6 +244,7 @@ class PortReader:
             hello = self.hello
             if hello is not None and not self.refusal and self._fits(packet, hello):
                 return packet.volts(hello.volts_per_count)
+            self.unused += 1
         return None
 
     def _fits(self, scan: Scan, hello: Hello) -> bool:

@@ -51,6 +51,7 @@ class Publisher:
 
     Attributes:
         address: where it is bound, once open.
+        subscribers: subscriptions in force; written by the thread.
         header: the newest frame's; written by the pipeline thread, sent with status and events.
         latency: from the last byte of a dual scan to the sending of its contacts.
 
@@ -64,6 +65,7 @@ class Publisher:
         on_sent: Callable[[str, bytes], None],
     ) -> None:
         self.address = ""
+        self.subscribers = 0
         self.header: Mapping[str, Any] = NO_FRAME_YET
         self.latency = Durations()
         self._sensor = sensor
@@ -80,11 +82,6 @@ class Publisher:
         self._socket: zmq.Socket[bytes]
         self._wake_reader = self._wake_writer = -1
         self._thread = threading.Thread(target=self._run, name="publisher")
-
-    @property
-    def subscribers(self) -> int:
-        """Subscriptions in force."""
-        return sum(self._subscriptions.values())
 
     def open(self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str) -> None:
         """Bind the stream's socket; raise AddressError where the address cannot be had."""
@@ -201,6 +198,7 @@ class Publisher:
                 self._subscriptions[prefix] -= 1
         self._subscriptions = +self._subscriptions
         self._prefixes = frozenset(self._subscriptions)
+        self.subscribers = self._subscriptions.total()
         if repeat and self._last_status:
             self._socket.send(self._last_status, zmq.DONTWAIT)
 

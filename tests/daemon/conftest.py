@@ -11,7 +11,7 @@ import os
 import pty
 import time
 import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -159,13 +159,14 @@ class Skin:
         load: float = 0.0,
         channels: tuple[Channel, ...] = BOTH,
         counter: int | None = None,
+        volts: Mapping[str, NDArray[np.float64]] | None = None,
         **details: Any,
     ) -> int:
-        """Send the next dual scan, every voltage changed by the share `load`."""
+        """Send the next dual scan: `volts`, or the rest with the share `load` more on each."""
         self.counter = self.counter + 1 if counter is None else counter
         for channel in channels:
-            volts = REST * (1 + load)
-            self.line_of(channel).say(scan(channel, self.counter, volts, **details))
+            values = REST * (1 + load) if volts is None else volts[channel.name.lower()]
+            self.line_of(channel).say(scan(channel, self.counter, values, **details))
         return self.counter
 
     def wait_until(self, condition: Callable[[], Any]) -> Any:
@@ -311,11 +312,14 @@ def make_skin() -> Iterator[Callable[[Path, int], Any]]:
 
 @pytest.fixture
 def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Callable[..., Any]]:
-    """Start a daemon: ``bench(ports=1, seconds=0.0, **config)``; everything is stopped later."""
+    """Start a daemon: ``bench(ports=1, **config)``; everything is stopped later.
+
+    It has the reconstructor above, each frame of which takes `seconds`, or the `real` one.
+    """
     daemons: list[Daemon] = []
     listeners: list[Listener] = []
 
-    def start(ports: int = 1, seconds: float = 0.0, **config: Any) -> Bench:
+    def start(ports: int = 1, seconds: float = 0.0, real: bool = False, **config: Any) -> Bench:
         folder = tmp_path / f"ports-{len(daemons)}"
         folder.mkdir()
         skin = make_skin(folder, ports)
@@ -327,7 +331,7 @@ def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Cal
             "tare_scans": 3,
             **config,
         }
-        memory: Any = Memory(seconds)
+        memory: Any = None if real else Memory(seconds)
         daemon = Daemon(load_config(None, **settings), reconstructor=memory)
         daemon.start()
         daemons.append(daemon)
@@ -365,7 +369,7 @@ def replay(tmp_path: Path) -> Callable[..., Any]:
     """Replay a recording to its end: ``replay(path, speed=0, **config)`` returns what was said."""
     count = itertools.count()
 
-    def run(path: Path, speed: float = 0, **config: Any) -> Heard:
+    def run(path: Path, speed: float = 0, real: bool = False, **config: Any) -> Heard:
         out = tmp_path / f"replayed-{next(count)}.mcap"
         settings = {
             "name": "left",
@@ -378,7 +382,7 @@ def replay(tmp_path: Path) -> Callable[..., Any]:
             "record_maps": True,
             **config,
         }
-        memory: Any = Memory()
+        memory: Any = None if real else Memory()
         daemon = Daemon(load_config(None, **settings), reconstructor=memory)
         daemon.start()
         try:

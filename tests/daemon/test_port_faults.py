@@ -119,7 +119,8 @@ def test_the_wrong_device_is_refused_and_not_reconstructed(
     line.say(right)
     b.step()
     assert [frame["scan_counter"] for frame in b.listener.of("map")] == [2]
-    assert b.ask("status")["ports"][0]["refusal"] == ""
+    (port,) = b.ask("status")["ports"]
+    assert (port["refusal"], port["unused_scans"]) == ("", 2)
 
 
 def test_a_command_that_the_device_refuses_is_told(bench: Start) -> None:
@@ -136,6 +137,7 @@ def test_scans_of_another_length_than_announced_are_not_used(bench: Start) -> No
     line.say(Scan(Channel.MAGNITUDE, 99, 0, ScanFlag(0), np.zeros(10, np.int32)))
     assert b.step()["flags"] == []
     assert 99 not in [frame["scan_counter"] for frame in b.listener.of("map")]
+    assert b.ask("status")["ports"][0]["unused_scans"] == 1
 
 
 def test_a_busy_port_is_named_with_its_holder(bench: Start, tmp_path: Path) -> None:

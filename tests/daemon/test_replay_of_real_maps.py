@@ -1,0 +1,57 @@
+"""A recording of pressed skin, replayed: the sensor's own reconstruction, to the last bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tactomo.recording import open_recording
+from tactomo_client.messages import array_from_wire
+from tactomo_models import Press, SkinSimulator, load_description
+from tactomo_protocol import Channel
+
+Start = Callable[..., Any]
+IMAGES = ("map", "pressure_kpa", "structure")
+
+
+def test_the_replay_of_a_pressed_skin_gives_the_same_maps(
+    bench: Start, replay: Start, tmp_path: Path
+) -> None:
+    path = tmp_path / "pressed.mcap"
+    skin = SkinSimulator(load_description("paper_square"))
+    b = bench(ports=2, real=True)
+
+    def press(*presses: Press, channels: tuple[Channel, ...] = tuple(Channel)) -> Any:
+        return b.step(volts=skin.voltages(presses), channels=channels)
+
+    b.skin.introduce()
+    for _ in range(b.daemon.config.tare_scans):
+        press()
+    b.listener.event("tared")
+    press(Press(0.0, 0.03, 180.0))
+    b.ask("record_start", path=str(path))
+    first = b.skin.counter + 1
+    for step in range(4):
+        press(Press(-0.03 + 0.004 * step, 0.02, 180.0))
+    pressed = press(Press(-0.014, 0.02, 180.0), Press(0.04, -0.03, 190.0))
+    press(Press(-0.014, 0.02, 180.0), channels=(Channel.MAGNITUDE,))
+    press()
+    press(Press(0.04, -0.03, 190.0))
+    b.ask("record_stop")
+    live = [frame for frame in b.listener.of("map") if frame["scan_counter"] >= first]
+
+    assert len(pressed["contacts"]) == 2
+    assert {"quiet", "levelset", "tikhonov"} == {frame["tier"] for frame in live}
+    again = replay(path, real=True).of("map")
+    assert len(again) == len(live) == open_recording(path).summary.frames
+    for one, other in zip(live, again, strict=True):
+        for name in ("scan_counter", "tier", "flags", "misfit"):
+            assert one[name] == other[name]
+        for name in IMAGES:
+            assert (one[name] is None) == (other[name] is None)
+            if one[name] is not None:
+                np.testing.assert_array_equal(
+                    array_from_wire(one[name]), array_from_wire(other[name])
+                )
