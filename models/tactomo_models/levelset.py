@@ -98,6 +98,10 @@ class LevelSet:
         mu *= -2 * RESTING / max(float((self.kernels @ mu).max()), 1e-6)
         return self.evaluate(mu, self.nominal, data, weight)
 
+    def function(self, shape: Shape) -> FloatArray:
+        """Level-set function f (P,) of an estimate."""
+        return np.asarray(self.kernels @ shape.mu + RESTING)
+
     def compare(self, shape: Shape, data: FloatArray, weight: FloatArray) -> Shape:
         """Hold an estimate against other data, without a solve."""
         judged = self._judged(
@@ -132,7 +136,7 @@ class LevelSet:
 
     def jacobian(self, shape: Shape, weight: FloatArray) -> FloatArray:
         """Derivative of the weighted residual by the coefficients and the log ratio: (M, K + 1)."""
-        f = self.kernels @ shape.mu + RESTING
+        f = self.function(shape)
         slope = heaviside_slope(f)
         moved = np.flatnonzero((slope > 0) | (shape.pressed > 0))
         pressed = shape.pressed[moved]

@@ -39,6 +39,7 @@ from tactomo_models.contacts import (
 )
 from tactomo_models.description import Modality, SensorDescription
 from tactomo_models.errors import DataError
+from tactomo_models.following import ShapeFollower
 from tactomo_models.forward import ForwardModel
 from tactomo_models.levelset import LevelSet, Shape
 from tactomo_models.reference import Reference, noise_of_reciprocity
@@ -51,8 +52,7 @@ DEFAULT_BUDGET_S = 0.05
 CHANGE_ERROR = 0.02  # model error as a share of each voltage change: mesh, shape of the edge
 FALSE_ALARM = 1e-6  # chance that an unpressed frame of pure noise is taken for a pressed one
 MOST_INVALID = 0.25  # share of voltages that may be invalid before the channel is given up
-GOOD_MISFIT = 1.0  # explained to the noise: no further step
-BAD_MISFIT = 3.0  # not explained: start anew, and flag what stays so
+BAD_MISFIT = 2.0  # the data are not explained: what is shown may be wrong
 
 
 class Tier(StrEnum):
@@ -158,12 +158,12 @@ class Reconstructor:
         self._artifact = artifact or load_or_build_artifact(description)
         self._forward = ForwardModel(description, self._artifact.bare)
         self._areas = AreaFinder(self._forward)
-        self._level_set = None
+        self._follower = None
         if description.structure is not None:
-            self._level_set = LevelSet(self._forward, description.structure.saturated_ratio)
+            level_set = LevelSet(self._forward, description.structure.saturated_ratio)
+            self._follower = ShapeFollower(level_set, self._structure_image)
         self._channels: dict[Modality, _Channel] = {}
         self._tracker = Tracker()
-        self._shape: Shape | None = None
         self._magnitudes: Magnitudes | None = None
         self._fitted_areas: Areas | None = None
         self._areas_shape: FloatArray | None = None
@@ -210,7 +210,8 @@ class Reconstructor:
         self._forget_shape()
 
     def _forget_shape(self) -> None:
-        self._shape = None
+        if self._follower:
+            self._follower.forget()
         self._magnitudes = None
         self._fitted_areas = None
         self._areas_shape = None
@@ -277,7 +278,7 @@ class Reconstructor:
         if self.tier == Tier.TIKHONOV:
             return self._tikhonov(data, flags, "as requested")
         if "structure" not in data:
-            why = "the structure channel is missing" if self._level_set else "no structure channel"
+            why = "the structure channel is missing" if self._follower else "no structure channel"
             return self._tikhonov(data, flags, why)
         return self._by_level_set(data, flags)
 
@@ -300,7 +301,7 @@ class Reconstructor:
         """Linear images of both channels; areas above half of the clearest one's peak."""
         self._forget_shape()
         with self._timed("tikhonov"):
-            images = {name: self._linear_image(name, d) for name, d in data.items()}
+            images = {name: self._linear_image(name, d.change) for name, d in data.items()}
         with self._timed("contacts"):
             shown = images.get("structure", images.get("magnitude"))
             assert shown is not None
@@ -322,12 +323,13 @@ class Reconstructor:
             flags=flags | (Flag.MISFIT_HIGH if misfit > BAD_MISFIT else Flag(0)),
         )
 
-    def _linear_image(self, name: Modality, data: _Data) -> FloatArray:
+    def _linear_image(self, name: Modality, change: FloatArray) -> FloatArray:
         """Tikhonov image (P,) of the change in the channel's own direction; the rest cut off."""
-        channel = self._channels[name]
-        valid = data.weight > 0
-        image = channel.tikhonov @ np.where(valid, data.change, 0.0)
+        image = self._channels[name].tikhonov @ change
         return np.asarray(np.maximum(self._sign(name) * image, 0.0))
+
+    def _structure_image(self, change: FloatArray) -> FloatArray:
+        return self._linear_image("structure", change)
 
     def _sign(self, name: Modality) -> float:
         if name == "magnitude":
@@ -341,8 +343,10 @@ class Reconstructor:
         return np.asarray(self._artifact.bare.map_weights @ nodes).reshape(shape)
 
     def _by_level_set(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
+        assert self._follower is not None
         with self._timed("levelset"):
-            shape, how = self._find_shape(data["structure"])
+            structure, budget_s = data["structure"], self.budget_s or DEFAULT_BUDGET_S
+            shape, how = self._follower.follow(structure.change, structure.weight, budget_s)
         with self._timed("contacts"):
             pressed = self._on_map(shape.pressed)
             areas = self._areas_of(shape, pressed)
@@ -373,24 +377,6 @@ class Reconstructor:
             self._areas_shape = shape.pressed
             return self._areas.find(pressed, shape.pressed)
         return self._fitted_areas
-
-    def _find_shape(self, data: _Data) -> tuple[Shape, str]:
-        """Refine the shape of the frame before, and start anew where it does not lead on."""
-        assert self._level_set is not None
-        level_set, how = self._level_set, "warm start"
-        warm, shape = self._shape, None
-        if warm is not None:
-            shape = level_set.compare(warm, data.change, data.weight)
-        if warm is None or shape is None or _leads_nowhere(warm, shape):
-            image = self._linear_image("structure", data)
-            likeness = image / max(float(image.max()), 1e-12)
-            fresh = level_set.start(likeness, data.change, data.weight)
-            if shape is None or fresh.cost < shape.cost:
-                shape, how = fresh, "cold start"
-        budget_s = self.budget_s or DEFAULT_BUDGET_S
-        shape = level_set.refine(shape, data.change, data.weight, budget_s, GOOD_MISFIT)
-        self._shape = shape
-        return shape, how
 
     def _fit_magnitudes(
         self, areas: Areas, data: dict[Modality, _Data], solves: int
@@ -432,14 +418,6 @@ class Reconstructor:
         start = time.perf_counter()
         yield
         self._stage_s[stage] = self._stage_s.get(stage, 0.0) + time.perf_counter() - start
-
-
-def _leads_nowhere(before: Shape, now: Shape) -> bool:
-    """Tell whether the last frame's estimate, held against new data, is no start for them."""
-    jumped = now.misfit > max(BAD_MISFIT, 2 * before.misfit)
-    stuck = before.converged and now.misfit > BAD_MISFIT
-    vanished = not np.any(now.pressed > 0.5)
-    return jumped or stuck or vanished
 
 
 def _fused(areas: Areas, values: FloatArray, shape: tuple[int, ...]) -> Image:
