@@ -3,7 +3,7 @@
 Two measurements. *Live*: a twin and a daemon as processes of their own, and this process as the
 subscriber; latency is from the moment at which the daemon has read the last byte of a dual scan to
 the arrival of its contacts here, by the clock that both processes share. *Methods*: the time that
-one reconstruction takes, one thread, cold (no frame before it) and warm (a still scene).
+one reconstruction takes, one thread: cold, with no frame before it, and warm, in a still scene.
 """
 
 from __future__ import annotations
@@ -24,14 +24,23 @@ from tactomo.cli.app import BUILD, DEFAULT_DESCRIPTION, Description, JsonOutput,
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+    from rich.table import Table
     from tactomo_models import Reconstructor, SensorDescription
 
     from tactomo.cli.children import Family
 
 SENSOR = "bench"
 SETTLE_S = 1.5
+STATUS_S = 13.0  # at 20 dual scans a second: as far back as the stage times in a status go
 START_S = 60.0
 REFERENCE_SCANS = 20
+SETTLE_SCANS, TIMED_SCANS = 10, 20
+MODALITIES = ("magnitude", "structure")
+METHODS = (
+    *(("auto", contacts) for contacts in (0, 1, 2, 4)),
+    *(("tikhonov", contacts) for contacts in (1, 4)),
+    *(("levelset", contacts) for contacts in (1, 4)),
+)
 NOISE_SHARE = 2e-5
 # Places in shares of half the sheet's size, all of them within a disc, too.
 PLACES = ((0.0, 0.1), (-0.45, -0.4), (0.5, -0.35), (0.1, 0.55))
@@ -85,7 +94,9 @@ class Results:
 )
 def bench(
     description: Description = DEFAULT_DESCRIPTION,
-    seconds: Annotated[float, typer.Option(min=1.0, help="Time of each live scene.")] = 6.0,
+    seconds: Annotated[
+        float, typer.Option(min=1.0, help="Time of each of the four live scenes.")
+    ] = STATUS_S,
     ports: Annotated[int, typer.Option(min=1, max=2, help="Lines of the twin.")] = 2,
     rate: Annotated[float, typer.Option(help="Dual scans a second of the twin.")] = 20.0,
     replay: Annotated[
@@ -98,7 +109,7 @@ def bench(
     """Measure latency, rate and time per frame on this machine.
 
     Starts a twin and a daemon of its own on free addresses, so a running demo is not disturbed
-    (but shares the processor). Takes about a minute.
+    (but shares the processor). Takes about two minutes.
     """
     from rich.console import Console
 
@@ -258,18 +269,13 @@ def _measure_methods(name: str, tell: Callable[[str], None]) -> Iterator[MethodT
         reconstructor = Reconstructor(description, artifact)
         empty = _noisy(skin.voltages([]), noise, REFERENCE_SCANS)
         reference = Reference.from_scans(empty.get("magnitude"), empty.get("structure"))
-        for tier in Tier:
-            for contacts in (0, 1, 2, 4) if tier is Tier.AUTO else (1, 4):
-                if tier is Tier.QUIET:
-                    contacts = 0 if contacts == 1 else contacts
-                    if contacts:
-                        continue
-                tell(f"methods: {tier}, {contacts} contact(s)")
-                presses = [_press(description, place) for place in PLACES[:contacts]]
-                scans = _noisy(skin.voltages(presses), noise, 12)
-                reconstructor.tier = tier
-                reconstructor.set_reference(reference)
-                yield _time_method(str(tier), contacts, reconstructor, scans)
+        for method, contacts in METHODS:
+            tell(f"methods: {method}, {contacts} contact(s)")
+            presses = [_press(description, place) for place in PLACES[:contacts]]
+            scans = _noisy(skin.voltages(presses), noise, SETTLE_SCANS + TIMED_SCANS)
+            reconstructor.tier = Tier(method)
+            reconstructor.set_reference(reference)
+            yield _time_method(method, contacts, reconstructor, scans)
 
 
 def _time_method(
@@ -277,24 +283,21 @@ def _time_method(
 ) -> MethodTime:
     import numpy as np
 
-    def times_ms(forget: bool) -> Any:
-        times = []
-        for number in range(len(next(iter(scans.values())))):
-            if forget:
-                reconstructor.reset()
-            begin_s = time.perf_counter()
-            reconstructor.reconstruct(
-                *(scans[name][number] if name in scans else None for name in MODALITIES)
-            )
-            times.append((time.perf_counter() - begin_s) * 1e3)
-        return np.percentile(times, (50, 99)).tolist()
+    def time_ms(number: int) -> float:
+        begin_s = time.perf_counter()
+        reconstructor.reconstruct(
+            *(scans[name][number] if name in scans else None for name in MODALITIES)
+        )
+        return (time.perf_counter() - begin_s) * 1e3
 
-    times_ms(forget=False)  # load what is loaded on first use
-    cold, warm = times_ms(forget=True), times_ms(forget=False)
-    return MethodTime(method, contacts, *cold, *warm)
+    def cold_ms(number: int) -> float:
+        reconstructor.reset()
+        return time_ms(number)
 
-
-MODALITIES = ("magnitude", "structure")
+    cold = [cold_ms(number) for number in range(SETTLE_SCANS, SETTLE_SCANS + TIMED_SCANS)]
+    warm = [time_ms(number) for number in range(SETTLE_SCANS + TIMED_SCANS)][SETTLE_SCANS:]
+    percentiles = [np.percentile(times, (50, 99)).tolist() for times in (cold, warm)]
+    return MethodTime(method, contacts, *percentiles[0], *percentiles[1])
 
 
 def _noisy(
@@ -328,22 +331,8 @@ def _print(results: Results) -> None:
     console = Console()
     console.print(f"[bold]{results.machine}[/], sensor {results.description}")
     if results.live:
-        table = Table(
-            title="live: last byte read to contacts in another process (twin, not hardware)"
-        )
-        for name in ("scene", "frames/s", "p50 ms", "p99 ms", "tiers", "reconstruct p50/p99 ms"):
-            table.add_column(name, justify="left" if name in ("scene", "tiers") else "right")
-        for phase in results.live:
-            stage = phase.stage_ms.get("reconstruct", {})
-            table.add_row(
-                phase.scene,
-                f"{phase.frames_per_s:.1f}",
-                f"{phase.latency_p50_ms:.1f}",
-                f"{phase.latency_p99_ms:.1f}",
-                ", ".join(f"{tier} {count}" for tier, count in phase.tiers.items()),
-                f"{stage.get('p50', float('nan')):.1f} / {stage.get('p99', float('nan')):.1f}",
-            )
-        console.print(table)
+        console.print(_live_table(results.live))
+        console.print(_stage_table(results.live))
         if results.late_scans is not None:
             console.print(
                 f"late scans of the twin: {results.late_scans}; "
@@ -357,6 +346,38 @@ def _print(results: Results) -> None:
             times = (row.cold_p50_ms, row.cold_p99_ms, row.warm_p50_ms, row.warm_p99_ms)
             table.add_row(row.method, str(row.contacts), *(f"{ms:.1f}" for ms in times))
         console.print(table)
+
+
+def _live_table(phases: list[Phase]) -> Table:
+    from rich.table import Table
+
+    table = Table(title="live, simulated sensor: last byte read to contacts in another process")
+    for name in ("scene", "frames/s", "p50 ms", "p99 ms", "frames by tier"):
+        table.add_column(name, justify="left" if name in ("scene", "frames by tier") else "right")
+    for phase in phases:
+        table.add_row(
+            phase.scene,
+            f"{phase.frames_per_s:.1f}",
+            f"{phase.latency_p50_ms:.1f}",
+            f"{phase.latency_p99_ms:.1f}",
+            ", ".join(f"{tier} {count}" for tier, count in phase.tiers.items()),
+        )
+    return table
+
+
+def _stage_table(phases: list[Phase]) -> Table:
+    """Return the daemon's own account of its newest 256 frames at the end of each scene."""
+    from rich.table import Table
+
+    table = Table(title="stages of the daemon, p50 / p99 ms")
+    table.add_column("stage")
+    for phase in phases:
+        table.add_column(phase.scene, justify="right")
+    for stage in dict.fromkeys(stage for phase in phases for stage in phase.stage_ms):
+        times = (phase.stage_ms.get(stage) for phase in phases)
+        cells = (f"{t['p50']:.1f} / {t['p99']:.1f}" if t else "-" for t in times)
+        table.add_row(stage, *cells)
+    return table
 
 
 def _machine() -> str:
