@@ -22,6 +22,7 @@ Imager = Callable[[FloatArray], FloatArray]
 
 GOOD_MISFIT = 1.0  # explained to the noise: no further step
 SUSPECT_MISFIT = 1.5  # a minimum this bad may be the wrong one: others are tried
+CUT_HEIGHTS = (0.8, 0.65, 0.5)  # of the linear image's peak, where an outline may start
 SLACK = 1.1  # a settled shape is left alone while its misfit stays within this
 
 
@@ -75,8 +76,22 @@ class ShapeFollower:
         return shape, how
 
     def _cold(self, change: FloatArray, weight: FloatArray) -> Shape:
+        """Cut the linear image at the height that explains the data best.
+
+        The image of a contact is as wide as the sensor is blind there, so no single height will
+        do. Small shapes come first: they are the cheaper ones to solve.
+        """
         image = self._imager(change)
-        return self._level_set.start(image / max(float(image.max()), 1e-12), change, weight)
+        likeness = image / max(float(image.max()), 1e-12)
+        best = None
+        for height in CUT_HEIGHTS:
+            cut = 0.5 + 0.5 * (likeness - height) / (1 - height)
+            shape = self._level_set.start(cut, change, weight)
+            if best is not None and shape.cost > best.cost:
+                break
+            best = shape
+        assert best is not None
+        return best
 
     def _grown(self, shape: Shape, change: FloatArray, weight: FloatArray) -> Shape:
         """Add to a shape what the linear image of its residual shows."""
