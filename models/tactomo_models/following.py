@@ -87,11 +87,10 @@ class ShapeFollower:
         for height in CUT_HEIGHTS:
             cut = 0.5 + 0.5 * (likeness - height) / (1 - height)
             shape = self._level_set.start(cut, change, weight)
-            if best is not None and shape.cost > best.cost:
+            if shape is None or (best is not None and shape.cost > best.cost):
                 break
             best = shape
-        assert best is not None
-        return best
+        return best or self._level_set.nothing(change, weight)
 
     def _grown(self, shape: Shape, change: FloatArray, weight: FloatArray) -> Shape:
         """Add to a shape what the linear image of its residual shows."""
@@ -99,7 +98,7 @@ class ShapeFollower:
         image = self._imager(left)
         known = np.clip((self._level_set.function(shape) + 1) / 2, (1 + RESTING) / 2, 1)
         likeness = np.maximum(known, image / max(float(image.max()), 1e-12))
-        return self._level_set.start(likeness, change, weight)
+        return self._level_set.start(likeness, change, weight) or shape
 
     def _best_start(
         self, shape: Shape, change: FloatArray, weight: FloatArray
@@ -123,6 +122,7 @@ class ShapeFollower:
             else:
                 self._challenger = self._cold(change, weight)
             self._challenges += 1
+            return shape, how  # a start costs solves enough for one frame
         rival = self._level_set.compare(self._challenger, change, weight)
         rival = self._level_set.refine(rival, change, weight, budget_s, GOOD_MISFIT)
         self._challenger = None if rival.converged else rival

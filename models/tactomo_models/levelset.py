@@ -28,6 +28,7 @@ KERNELS_PER_SIDE = 9
 KERNEL_SPREAD = 0.7  # standard deviation of a Gaussian over the kernels' distance
 HALF_WIDTH = 0.15  # w of the Heaviside
 RESTING = -0.5  # f where nothing presses: below -HALF_WIDTH, so h is exactly 0
+MOST_PRESSED = 1000  # nodes that one solve may change: some 50 ms, two fifths of a sheet
 SETTLED = 1e-3  # share of the cost below which another gain is not worth a step
 WORST_DAMPING = 1e6  # no step downhill even at this: a minimum
 STEP_LIMIT = 0.5  # largest change of a coefficient in one step
@@ -90,8 +91,11 @@ class LevelSet:
         self._ratio_sigma = RATIO_SPREAD * abs(self.nominal)
         self._least_ratio, self._most_ratio = sorted((0.1 * self.nominal, 1.5 * self.nominal))
 
-    def start(self, likeness: FloatArray, data: FloatArray, weight: FloatArray) -> Shape:
-        """Turn an image (P,) that is 0 where nothing presses and 1 inside contacts into a start."""
+    def start(self, likeness: FloatArray, data: FloatArray, weight: FloatArray) -> Shape | None:
+        """Turn an image (P,) that is 0 where nothing presses and 1 inside contacts into a start.
+
+        None where it covers too much of the sheet to be solved in time.
+        """
         f = np.clip(2 * likeness - 1, RESTING, -RESTING)
         mu = self._projection @ (f - RESTING)
         # Gaussians round off small contacts; a start that presses nothing has no derivative.
@@ -109,11 +113,23 @@ class LevelSet:
         )
         return replace(judged, damping=1.0 if shape.converged else shape.damping)
 
+    def nothing(self, data: FloatArray, weight: FloatArray) -> Shape:
+        """Estimate that nothing is pressed."""
+        none = np.zeros(self.kernels.shape[1])
+        shape = self.evaluate(none, self.nominal, data, weight)
+        assert shape is not None
+        return shape
+
     def evaluate(
         self, mu: FloatArray, log_ratio: float, data: FloatArray, weight: FloatArray
-    ) -> Shape:
-        """Solve the forward model for given coefficients and compare it with the data."""
+    ) -> Shape | None:
+        """Solve the forward model for given coefficients and compare it with the data.
+
+        None where so much would be pressed that no deadline could be kept.
+        """
         f = self.kernels @ mu + RESTING
+        if np.count_nonzero(f > -HALF_WIDTH) > MOST_PRESSED:
+            return None
         pressed = heaviside(f)
         change = np.expm1(pressed * log_ratio)
         solution = self.forward.solve(change, also=np.abs(f) < HALF_WIDTH)
@@ -200,8 +216,8 @@ class LevelSet:
             step *= min(1.0, STEP_LIMIT / max(np.abs(step[:-1]).max(), 1e-12))
             ratio = float(np.clip(shape.log_ratio + step[-1], self._least_ratio, self._most_ratio))
             trial = self.evaluate(shape.mu + step[:-1], ratio, data, weight)
-            budget_s -= _work_s(trial)
-            if trial.cost < shape.cost:
+            budget_s -= _work_s(trial) if trial else 0.0
+            if trial is not None and trial.cost < shape.cost:
                 return replace(trial, damping=max(damping / 5, 1e-3)), budget_s
             damping *= 5
             if budget_s <= 0:

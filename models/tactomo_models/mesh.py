@@ -11,6 +11,7 @@ import numpy as np
 import skfem
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
+from scipy.spatial.distance import pdist
 
 from tactomo_models.description import SensorDescription
 
@@ -39,16 +40,17 @@ def mesh_sheet(
         description: the sensor.
         spacing_m: distance of the regular nodes; the map's own spacing if None, so that every
             map node of a rectangle is a mesh node.
-        refinements: how often triangles at the electrodes' ends are halved.
+        refinements: how often triangles at the electrodes' ends are halved; more often where
+            electrodes or the gaps between them are narrower than the nodes' distance.
     """
     disc = description.sheet.shape == "disc"
     mesh = _disc(description, spacing_m) if disc else _rectangle(description, spacing_m)
     ends = description.electrode_ends_m.reshape(-1, 2)
-    for _ in range(refinements):
+    for _ in range(max(refinements, _needed_refinements(mesh, ends, description))):
         mesh = mesh.refined(_triangles_near(mesh, ends))
         if disc:
             mesh = _on_circle(mesh, description.width_m / 2)
-    mesh = _snap(mesh, ends, description)
+    mesh = _snap(mesh, ends)
     return SheetMesh(mesh, _electrode_facets(mesh, description))
 
 
@@ -109,15 +111,28 @@ def _on_circle(mesh: skfem.MeshTri, radius_m: float) -> skfem.MeshTri:
     return skfem.MeshTri(points, mesh.t)
 
 
-def _snap(mesh: skfem.MeshTri, ends: FloatArray, description: SensorDescription) -> skfem.MeshTri:
-    """Move the nearest boundary node onto each electrode end; corners of a sheet stay."""
+def _needed_refinements(
+    mesh: skfem.MeshTri, ends: FloatArray, description: SensorDescription
+) -> int:
+    """Halvings after which rim edges at electrode ends are half as long as the narrowest gap.
+
+    The nearest rim node of each end then lies on its own side and belongs to no other end.
+    """
+    marks = ends
+    if description.sheet.shape == "rectangle":
+        half = np.array([description.width_m, description.height_m]) / 2
+        marks = np.vstack([ends, half * [[-1, -1], [1, -1], [1, 1], [-1, 1]]])
+    gaps = pdist(marks)
+    narrowest = gaps[gaps > 1e-9 * description.width_m].min()  # an end may lie on a corner
+    edge = mesh.p[:, mesh.facets[:, mesh.boundary_facets()]]
+    longest = np.linalg.norm(edge[:, 0] - edge[:, 1], axis=0).max()
+    return int(np.ceil(np.log2(2 * longest / narrowest)))
+
+
+def _snap(mesh: skfem.MeshTri, ends: FloatArray) -> skfem.MeshTri:
+    """Move the nearest boundary node onto each electrode end."""
     points = mesh.p.copy()
     rim = mesh.boundary_nodes()
-    if description.sheet.shape == "rectangle":
-        corner = np.isclose(np.abs(points[0, rim]), description.width_m / 2) & np.isclose(
-            np.abs(points[1, rim]), description.height_m / 2
-        )
-        rim = rim[~corner]
     for end in ends:
         nearest = rim[np.argmin(np.linalg.norm(points[:, rim] - end[:, None], axis=0))]
         points[:, nearest] = end
@@ -135,7 +150,8 @@ def _electrode_facets(
         along = end - start
         length = np.linalg.norm(along)
         offset = middle - centre[:, None]
-        on = (np.abs(along @ offset) / length < length / 2) & (
+        # A hair less than half: a facet round the corner may begin where the electrode ends.
+        on = (np.abs(along @ offset) / length < (1 - 1e-9) * length / 2) & (
             np.linalg.norm(offset, axis=0) < length
         )
         found.append(facets[on])

@@ -49,7 +49,8 @@ FloatArray = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 DEFAULT_BUDGET_S = 0.05
-CHANGE_ERROR = 0.02  # model error as a share of each voltage change: mesh, shape of the edge
+CHANGE_ERROR = 0.02  # least model error as a share of each voltage change: mesh, outline
+MOST_MISMATCH = 0.5  # of the reference with the model, beyond which it is not this sensor's
 FALSE_ALARM = 1e-6  # chance that an unpressed frame of pure noise is taken for a pressed one
 MOST_INVALID = 0.25  # share of voltages that may be invalid before the channel is given up
 BAD_MISFIT = 2.0  # the data are not explained: what is shown may be wrong
@@ -73,6 +74,7 @@ class Flag(IntFlag):
     NO_REFERENCE = 8
     MISFIT_HIGH = 16
     NOT_CONVERGED = 32
+    REFERENCE_MISMATCH = 64  # tared under load, other electrodes' order, or another sensor
 
     def names(self) -> list[str]:
         """Names of the flags that are set, in lower case, as the stream carries them."""
@@ -115,11 +117,13 @@ class _Channel:
     Attributes:
         reference: (M,) volts.
         variance: (M,) of a relative change, by noise of scan and reference and by model error.
+        mismatch: typical relative error of the model's prediction of the reference.
         tikhonov: (P, M) reconstruction matrix for that noise.
     """
 
     reference: FloatArray
     variance: FloatArray
+    mismatch: float
     tikhonov: FloatArray
 
 
@@ -202,7 +206,12 @@ class Reconstructor:
         jacobian = self._artifact.jacobian
         target = central_target(self.description, self._artifact.bare)
         weight = noise_figure_weight(jacobian, relative, target)
-        return _Channel(volts, relative**2, tikhonov_matrix(jacobian, relative, weight))
+        return _Channel(
+            reference=volts,
+            variance=relative**2,
+            mismatch=_mismatch(volts, self._forward.bare_voltages),
+            tikhonov=tikhonov_matrix(jacobian, relative, weight),
+        )
 
     def reset(self) -> None:
         """Forget the warm start and which contacts were which."""
@@ -253,6 +262,8 @@ class Reconstructor:
             return missing | Flag.NO_REFERENCE
         valid = np.isfinite(scan) & np.isfinite(channel.reference) & (channel.reference != 0)
         flags = Flag(0) if valid.all() else Flag.INVALID_VOLTAGE
+        if channel.mismatch > MOST_MISMATCH:
+            flags |= Flag.REFERENCE_MISMATCH
         if np.mean(~valid) > MOST_INVALID or not np.any(scan[valid]):
             return flags | missing | Flag.INVALID_VOLTAGE
         change = np.zeros_like(channel.reference)
@@ -261,7 +272,9 @@ class Reconstructor:
         variance = channel.variance
         statistic = float((change**2 / variance)[valid].sum())
         weight = np.zeros_like(change)
-        weight[valid] = 1 / np.sqrt(variance + (CHANGE_ERROR * change) ** 2)[valid]
+        # A model that is wrong about the reference is as wrong about the changes.
+        share = max(CHANGE_ERROR, channel.mismatch)
+        weight[valid] = 1 / np.sqrt(variance + (share * change) ** 2)[valid]
         quiet = statistic < chi2.isf(FALSE_ALARM, int(valid.sum()))
         data[name] = _Data(change, weight, quiet)
         return flags
@@ -418,6 +431,16 @@ class Reconstructor:
         start = time.perf_counter()
         yield
         self._stage_s[stage] = self._stage_s.get(stage, 0.0) + time.perf_counter() - start
+
+
+def _mismatch(reference: FloatArray, predicted: FloatArray) -> float:
+    """Typical relative error of a model that may be off by a common factor; 1 where none fits."""
+    ratio = reference / predicted
+    middle = float(np.median(ratio))
+    if not np.isfinite(middle) or middle == 0:
+        return 1.0
+    # 0.6745 standard deviations hold half of a normal distribution.
+    return float(np.median(np.abs(ratio / middle - 1))) / 0.6745
 
 
 def _fused(areas: Areas, values: FloatArray, shape: tuple[int, ...]) -> Image:
