@@ -280,7 +280,6 @@ class PortReader:
 
     def _lose(self, reason: str) -> None:
         self._close()
-        self._decoder.feed(b"\0")  # what came of the last packet is all that ever will
         self._tail = b""
         if not self._stopping.is_set():
             self._on_event(

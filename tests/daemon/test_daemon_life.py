@@ -23,6 +23,8 @@ from tactomo_client import request
 
 Start = Callable[..., Any]
 
+PYTHONPATH = os.environ.get("PYTHONPATH", "")
+
 # What `tactomo daemon` does, with a reconstructor that needs no artifact.
 PROGRAM = """
 import sys
@@ -60,7 +62,7 @@ class Process:
             [sys.executable, "-c", PROGRAM, str(path)],
             stderr=subprocess.PIPE,
             text=True,
-            env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
+            env={**os.environ, "PYTHONPATH": f"{Path(__file__).parent}:{PYTHONPATH}"},
         )
         assert self.popen.stderr is not None
         self.ready: dict[str, Any] = {}

@@ -15,7 +15,7 @@ from tactomo.recorder import write_recording
 from tactomo.recording import open_recording
 from tactomo_client.messages import array_from_wire
 from tactomo_models import Reference
-from tactomo_protocol import Channel, Scan, ScanFlag
+from tactomo_protocol import Channel, Scan, ScanFlag, encode
 
 Start = Callable[..., Any]
 Replay = Callable[..., Any]
@@ -71,6 +71,25 @@ def test_a_replay_gives_the_maps_of_the_live_run(
     path = tmp_path / "life.mcap"
     live = record_a_life(bench(ports=ports), path)
     assert_same(live, maps(replay(path, speed=speed).of("map")))
+
+
+def test_a_recording_that_begins_in_the_middle_of_a_packet_has_it_whole(
+    bench: Start, replay: Replay, tmp_path: Path
+) -> None:
+    path = tmp_path / "skin.mcap"
+    b = bench()
+    b.tare()
+    samples = np.full(208, 100_000, np.int32)
+    frames = b"".join(encode(Scan(c, 500, 0, ScanFlag(0), samples)) for c in Channel)
+    (port,) = b.ask("status")["ports"]
+    b.skin.lines[0].say(frames[:400])
+    b.until(lambda: b.ask("status")["ports"][0]["bytes"] == port["bytes"] + 400)
+    b.ask("record_start", path=str(path))
+    b.skin.lines[0].say(frames[400:])
+    live = b.listener.frame(500)
+    b.ask("record_stop")
+    assert open_recording(path).summary.corrupt == 0
+    assert_same(maps([live]), maps(replay(path).of("map")))
 
 
 def test_a_replay_leaves_out_what_the_live_run_dropped(
