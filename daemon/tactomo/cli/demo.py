@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
+import time
 import webbrowser
 from collections.abc import Mapping
 from pathlib import Path
@@ -31,6 +32,8 @@ from tactomo.cli.app import (
 
 if TYPE_CHECKING:
     from tactomo.cli.children import Family
+
+TARE_PATIENCE_S = 10.0
 
 
 @app.command(
@@ -104,7 +107,17 @@ def demo(
         lines = [word for path in simulated["ports"] for word in ("--port", path)]
         daemon = family.start("daemon", "daemon", *daemon_options, *lines)
         addresses = {**_served(daemon.wait_ready()), "twin": simulated["control"]}
+        _wait_tared(addresses["control"])
         _show(family, addresses, port, browser, announce)
+
+
+def _wait_tared(control: str) -> None:
+    """Wait until the daemon has its reference: a press before that would become part of it."""
+    from tactomo_client import request
+
+    deadline = time.monotonic() + TARE_PATIENCE_S
+    while request("status", control)["state"] != "running" and time.monotonic() < deadline:
+        time.sleep(0.05)
 
 
 def show_replay(

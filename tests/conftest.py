@@ -1,0 +1,61 @@
+"""Fixtures that several folders share: a real browser."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from selenium import webdriver
+from selenium.common.exceptions import WebDriverException
+from selenium.webdriver.chrome.service import Service
+
+CHROMIUM_OPTIONS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-dev-shm-usage",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--force-device-scale-factor=1",
+    "--window-size=1280,900",
+)
+
+
+@pytest.fixture(scope="session")
+def _chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[webdriver.Chrome]:
+    program = shutil.which("chromium") or shutil.which("chromium-browser")
+    program = program or shutil.which("google-chrome")
+    driver = shutil.which("chromedriver")
+    if program is None or driver is None:
+        pytest.skip("needs Chromium and chromedriver on the PATH")
+    options = webdriver.ChromeOptions()
+    options.binary_location = program
+    for option in CHROMIUM_OPTIONS:
+        options.add_argument(option)
+    profile: Path = tmp_path_factory.mktemp("chromium")
+    options.add_argument(f"--user-data-dir={profile}")
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    try:
+        browser = webdriver.Chrome(options, Service(driver))
+    except WebDriverException as error:
+        pytest.skip(f"Chromium does not start: {error.msg}")
+    yield browser
+    browser.quit()
+
+
+@pytest.fixture
+def browser(_chromium: webdriver.Chrome) -> Iterator[webdriver.Chrome]:
+    """A headless Chromium, 1280 × 900, showing an empty page. Mark the test `browser`.
+
+    `browser.get_log("browser")` has what pages wrote to the console since the test began.
+    """
+    _chromium.get_log("browser")  # type: ignore[no-untyped-call]  # reading empties it
+    yield _chromium
+    _chromium.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    _chromium.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+    _chromium.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": False})
+    _chromium.get("about:blank")

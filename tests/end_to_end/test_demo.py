@@ -1,0 +1,132 @@
+"""The demo as a person meets it: the page, the mouse, a script, and Ctrl-C."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from selenium.webdriver import ActionChains, Chrome
+from selenium.webdriver.common.by import By
+from whole_system import PATIENCE_S, SENSOR, Demo, repository, running_demo, wait_for
+
+
+@pytest.mark.browser
+def test_a_press_by_mouse_becomes_a_contact_at_that_place(demo: Demo, browser: Chrome) -> None:
+    demo.clear()
+    browser.get(demo.page)
+    wait_for(lambda: "kPa" in browser.page_source, "the page")
+    canvas = browser.find_element(By.ID, "map")
+    wait_for(
+        lambda: browser.execute_script("return window.tactomo?.mmToPixel(0, 0)"),
+        "a first frame",
+    )
+    x, y = browser.execute_script("return window.tactomo.mmToPixel(30, -25)")
+    size = canvas.size
+    mouse = ActionChains(browser)
+    # The driver counts from the element's middle.
+    mouse.move_to_element_with_offset(
+        canvas, round(x - size["width"] / 2), round(y - size["height"] / 2)
+    ).click_and_hold().perform()
+
+    def found() -> tuple[float, float] | None:
+        rows = browser.find_elements(By.CSS_SELECTOR, "#contacts [data-id]")
+        if len(rows) != 1:
+            return None
+        place = (rows[0].get_attribute("data-x-mm"), rows[0].get_attribute("data-y-mm"))
+        return None if None in place else (float(place[0] or 0), float(place[1] or 0))
+
+    def is_near() -> bool:
+        place = found()
+        return place is not None and abs(place[0] - 30) < 3 and abs(place[1] + 25) < 3
+
+    try:
+        wait_for(is_near, f"a contact at (30, -25) mm; there is {found()}")
+    finally:
+        mouse.release().perform()
+    wait_for(
+        lambda: not browser.find_elements(By.CSS_SELECTOR, "#contacts [data-id]"), "the release"
+    )
+
+
+def test_a_script_of_pyzmq_and_msgpack_alone_prints_contacts(demo: Demo, tmp_path: Path) -> None:
+    """Written from the stream's documentation: this test imports nothing of ours."""
+    script = tmp_path / "contacts.py"
+    script.write_text(f"""
+import msgpack, zmq
+socket = zmq.Context().socket(zmq.SUB)
+socket.connect({demo.stream!r})
+socket.subscribe(b"{SENSOR}/contacts\\0")
+while True:
+    topic, _, body = socket.recv().partition(b"\\0")
+    message = msgpack.unpackb(body)
+    for contact in message["contacts"]:
+        print(round(contact["x_mm"]), round(contact["y_mm"]), contact["pressure_kpa"])
+        raise SystemExit
+""")
+    demo.clear()
+    demo.press(-40.0, 40.0)
+    done = subprocess.run(
+        [sys.executable, "-I", script], capture_output=True, text=True, timeout=PATIENCE_S
+    )
+    demo.clear()
+    assert done.returncode == 0, done.stderr
+    x_mm, y_mm, _ = done.stdout.split()
+    assert abs(int(x_mm) + 40) < 5
+    assert abs(int(y_mm) - 40) < 5
+
+
+def test_the_readme_subscribes_in_six_lines(demo: Demo, tmp_path: Path) -> None:
+    readme = (repository() / "README.md").read_text("utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", readme, flags=re.DOTALL)
+    code = next(block for block in blocks if "subscribe" in block)
+    assert len(code.strip().splitlines()) <= 6
+    code = code.replace("subscribe(", f"subscribe(address={demo.stream!r}, sensor=", 1)
+    code = re.sub(r'sensor="\w+"', f'sensor="{SENSOR}"', code)
+    demo.press(20.0, 0.0)
+    script = tmp_path / "six_lines.py"
+    script.write_text(code)
+    with subprocess.Popen(
+        [sys.executable, "-u", script], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        process.kill()
+    demo.clear()
+    assert "kPa" in line
+
+
+def children_of(pid: int) -> list[int]:
+    found = []
+    for entry in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = entry.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(fields[1]) == pid:
+            found.append(int(entry.parent.name))
+    return found
+
+
+def is_gone(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return True
+    return state == "Z"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_a_demo_that_ends_leaves_no_process_behind(number: signal.Signals) -> None:
+    with running_demo("--ports", "1") as demo:
+        children = children_of(demo.process.pid)
+        assert len(children) == 3
+        os.kill(demo.process.pid, number)
+        wait_for(lambda: all(is_gone(pid) for pid in children), "the children to end")
+        wait_for(lambda: demo.process.poll() is not None, "the demo to end")
+    if number != signal.SIGKILL:
+        assert demo.process.returncode in (0, 130)

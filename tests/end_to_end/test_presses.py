@@ -1,0 +1,105 @@
+"""A press on the virtual skin, from the pseudo-terminal to a subscriber."""
+
+from __future__ import annotations
+
+import math
+import time
+from itertools import islice
+
+import pytest
+from tactomo_client import Frame, request, subscribe
+from whole_system import PATIENCE_S, SENSOR, Demo
+
+Places = list[tuple[float, float]]
+
+SCENES: list[Places] = [
+    [(0.0, 0.0)],
+    [(52.0, 5.0)],
+    [(-10.0, -50.0)],
+    [(-30.0, 25.0), (35.0, -20.0)],
+]
+
+
+def distance_mm(frame: Frame, place: tuple[float, float]) -> float:
+    return min(
+        (math.dist((contact.x_mm, contact.y_mm), place) for contact in frame.contacts),
+        default=math.inf,
+    )
+
+
+def is_settled(frame: Frame, places: Places) -> bool:
+    return not frame.flags and len(frame.contacts) == len(places)
+
+
+def settled_frame(demo: Demo, places: Places) -> Frame:
+    """First unflagged frame with as many contacts as there are presses."""
+    deadline = time.monotonic() + PATIENCE_S
+    with subscribe(SENSOR, address=demo.stream, timeout_s=PATIENCE_S) as frames:
+        for frame in frames:
+            if is_settled(frame, places):
+                return frame
+            assert time.monotonic() < deadline, f"{frame.contacts} {frame.flags}"
+    raise AssertionError("the stream ended")
+
+
+@pytest.mark.parametrize("places", SCENES, ids=["centre", "right edge", "bottom edge", "two"])
+def test_every_press_is_found_within_3_mm_with_its_pressure(any_demo: Demo, places: Places) -> None:
+    any_demo.clear()
+    settled_frame(any_demo, [])
+    for number, (x_mm, y_mm) in enumerate(places):
+        any_demo.press(x_mm, y_mm, id=str(number), pressure_kpa=180, radius_mm=15)
+    frame = settled_frame(any_demo, places)
+    for place in places:
+        assert distance_mm(frame, place) < 3.0
+    for contact in frame.contacts:
+        assert contact.pressure_kpa == pytest.approx(180, abs=20)
+        assert contact.area_mm2 == pytest.approx(math.pi * 15**2, rel=0.35)
+    assert frame.map is not None
+    assert frame.map.shape == (51, 51)
+    assert frame.map.max() > 0.1
+
+
+def test_a_contact_keeps_its_identity_while_it_slides(any_demo: Demo) -> None:
+    any_demo.clear()
+    settled_frame(any_demo, [])
+    any_demo.press(-20.0, 10.0, id="finger")
+    first = settled_frame(any_demo, [(-20.0, 10.0)]).contacts[0]
+    for x_mm in range(-20, 21, 2):
+        any_demo.press(float(x_mm), 10.0, id="finger")
+        time.sleep(0.05)
+    with subscribe(SENSOR, address=any_demo.stream, timeout_s=PATIENCE_S) as frames:
+        for frame in islice(frames, 400):
+            if is_settled(frame, [(20.0, 10.0)]) and distance_mm(frame, (20.0, 10.0)) < 3:
+                break
+        else:
+            pytest.fail("the contact did not arrive")
+    assert [contact.id for contact in frame.contacts] == [first.id]
+
+
+def test_a_lost_channel_is_flagged_and_the_other_goes_on(any_demo: Demo) -> None:
+    any_demo.clear()
+    settled_frame(any_demo, [])
+    any_demo.press(10.0, -10.0)
+    settled_frame(any_demo, [(10.0, -10.0)])
+    request("mute", any_demo.twin, channel="structure", seconds=3)
+    with subscribe(SENSOR, address=any_demo.stream, timeout_s=PATIENCE_S) as frames:
+        for frame in frames:
+            if "structure_missing" in frame.flags:
+                break
+    assert frame.map is not None, "the magnitude channel's image goes on"
+    assert frame.structure is None
+    assert frame.tier == "tikhonov"
+    settled_frame(any_demo, [(10.0, -10.0)])  # and both again once it is back
+
+
+def test_tare_under_load_makes_it_the_new_zero(any_demo: Demo) -> None:
+    any_demo.clear()
+    settled_frame(any_demo, [])
+    any_demo.press(0.0, 0.0)
+    settled_frame(any_demo, [(0.0, 0.0)])
+    request("tare", any_demo.control, timeout_s=PATIENCE_S)
+    settled_frame(any_demo, [])
+    any_demo.clear()
+    time.sleep(0.5)
+    request("tare", any_demo.control, timeout_s=PATIENCE_S)
+    settled_frame(any_demo, [])

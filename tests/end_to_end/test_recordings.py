@@ -1,0 +1,130 @@
+"""Recordings: a replay gives the live maps again, and a measured stream goes the same way."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from tactomo_client import Frame, request, subscribe
+from tactomo_client.messages import MAP, decode_message
+from whole_system import ANYWHERE, PATIENCE_S, SENSOR, Demo, repository, wait_for
+
+TANK = repository().parent / "shared" / "data" / "tank_sciospec_20fps.npz"
+
+
+def tactomo(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "tactomo.cli", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+def maps_in(recording: Path) -> dict[int, dict[str, Any]]:
+    """Maps of a recording by their scan counter."""
+    found = {}
+    with recording.open("rb") as file:
+        for _, channel, message in make_reader(file).iter_messages():
+            if channel.topic.endswith("/map"):
+                decoded = decode_message(message.data)
+                assert decoded.kind == MAP
+                found[decoded.fields["scan_counter"]] = decoded.fields
+    return found
+
+
+class Listener(threading.Thread):
+    """Keeps every map that a demo publishes, by its scan counter."""
+
+    def __init__(self, demo: Demo) -> None:
+        super().__init__(daemon=True)
+        self.frames: dict[int, Frame] = {}
+        self._subscription = subscribe(SENSOR, address=demo.stream, timeout_s=PATIENCE_S)
+        self._done = threading.Event()
+
+    def run(self) -> None:
+        for frame in self._subscription:
+            self.frames[frame.scan_counter] = frame
+            if self._done.is_set():
+                break
+
+    def stop(self) -> None:
+        self._done.set()
+        self.join(PATIENCE_S)
+        self._subscription.close()
+
+
+def test_a_replay_gives_the_maps_of_the_live_run(demo: Demo, tmp_path: Path) -> None:
+    live, again = tmp_path / "live.mcap", tmp_path / "again.mcap"
+    demo.press(15.0, 20.0, id="a")  # begun under load: the reference must come along
+    wait_for(lambda: request("status", demo.control)["tier"] == "levelset", "a contact")
+    listener = Listener(demo)
+    listener.start()
+    request("record_start", demo.control, path=str(live))
+    for x_mm, y_mm in ((15.0, 20.0), (0.0, 0.0), (-40.0, -35.0)):
+        demo.press(x_mm, y_mm, id="a", pressure_kpa=170)
+        time.sleep(0.6)
+    demo.press(40.0, -40.0, id="b", shape="rectangle")
+    time.sleep(0.6)
+    demo.clear()
+    time.sleep(0.4)
+    request("record_stop", demo.control)
+    listener.stop()
+    replayed = tactomo(
+        *("daemon", "--port", f"replay://{live}?port=0&speed=0"),
+        *("--port", f"replay://{live}?port=1&speed=0", "--record", again, "--record-maps"),
+        *("--exit-at-end", "--stream", ANYWHERE, "--control", ANYWHERE),
+    )
+    assert replayed.returncode == 0, replayed.stderr
+    replays = maps_in(again)
+    assert len(replays) > 20
+    assert any(fields["contacts"] for fields in replays.values())
+    for counter, got in replays.items():
+        expected = listener.frames[counter]
+        assert got["tier"] == expected.tier
+        assert expected.map is not None
+        assert expected.structure is not None
+        np.testing.assert_allclose(array(got["map"]), expected.map, atol=1e-6)
+        np.testing.assert_allclose(array(got["structure"]), expected.structure, atol=1e-6)
+        assert [c["x_mm"] for c in got["contacts"]] == pytest.approx(
+            [c.x_mm for c in expected.contacts], abs=1e-6
+        )
+
+
+def array(wire: Any) -> Any:
+    return np.frombuffer(wire["data"], wire["dtype"]).reshape(wire["shape"])
+
+
+@pytest.mark.skipif(not TANK.exists(), reason="the measured stream is not part of the project")
+def test_a_measured_stream_is_imported_replayed_and_located(tmp_path: Path) -> None:
+    recording, again = tmp_path / "tank.mcap", tmp_path / "again.mcap"
+    imported = tactomo(
+        *("import", TANK, recording, "--sensor", "tank_disc", "--reference-frames", "0:20")
+    )
+    assert imported.returncode == 0, imported.stderr
+    replayed = tactomo(
+        *(
+            "daemon",
+            "--description",
+            "tank_disc",
+            "--port",
+            f"replay://{recording}?port=0&speed=0",
+        ),
+        *("--record", again, "--record-maps", "--exit-at-end"),
+        *("--stream", ANYWHERE, "--control", ANYWHERE),
+    )
+    assert replayed.returncode == 0, replayed.stderr
+    maps = maps_in(again)
+    assert len(maps) == 255
+    frames = [maps[counter] for counter in sorted(maps)]
+    assert all(not frame["contacts"] for frame in frames[:20]), "the tank is empty at first"
+    moving = [frame["contacts"] for frame in frames[130:200]]
+    assert all(len(contacts) == 1 for contacts in moving), "one cup"
+    angle = np.unwrap([math.atan2(contacts[0]["y_mm"], contacts[0]["x_mm"]) for contacts in moving])
+    # The hand leads it around the tank, counter-clockwise, by well over half a turn.
+    assert angle[-1] - angle[0] > math.pi
+    assert np.diff(angle).min() > -0.2
