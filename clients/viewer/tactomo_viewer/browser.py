@@ -71,9 +71,10 @@ class Browser:
                 await self._take(message)
         finally:
             sender.cancel()
-            # Commands under way are finished first: a release must not overtake its press.
-            await asyncio.gather(sender, *self._answers, return_exceptions=True)
-            await self._release_all()
+            # A lost connection may cancel this handler, at any moment: what is pressed is lifted
+            # all the same.
+            self._leaving = asyncio.create_task(self._leave())
+            await asyncio.shield(self._leaving)
 
     # To the page
 
@@ -81,7 +82,8 @@ class Browser:
         with contextlib.suppress(ConnectionError):  # the page has gone; run() notices
             while True:
                 try:
-                    await asyncio.wait_for(self._changed.wait(), ALIVE_S)
+                    async with asyncio.timeout(ALIVE_S):
+                        await self._changed.wait()
                 except TimeoutError:
                     await self._send("alive")  # so that the page can tell silence from a hang
                 self._changed.clear()
@@ -175,6 +177,8 @@ class Browser:
         return await self._daemon.request(command, arguments, timeout_s)
 
     async def _ask_twin(self, command: str, arguments: dict[str, Any]) -> dict[str, Any]:
+        if self._daemon is None:
+            raise _read_only()
         if self._twin is None:
             raise ControlError(
                 "there is no simulated skin to press",
@@ -183,7 +187,9 @@ class Browser:
             )
         return await self._twin.request(command, arguments, PRESS_TIMEOUT_S)
 
-    async def _release_all(self) -> None:
+    async def _leave(self) -> None:
+        # Commands under way are finished first: a release must not overtake its press.
+        await asyncio.gather(*self._answers, return_exceptions=True)
         for press in self._presses:
             with contextlib.suppress(ClientError):
                 await self._ask_twin("release", {"id": press})

@@ -1,5 +1,5 @@
 // Perceptually uniform colour maps, as polynomials of degree 6 fitted to matplotlib's inferno and
-// viridis (Matt Zucker, CC0), good to a few levels of 255.
+// viridis (Matt Zucker, CC0), within 9 levels of 255.
 
 const COEFFICIENTS = {
   inferno: [

@@ -13,6 +13,8 @@ export class Link {
     this.requests = 0;
     this.#open();
     setInterval(() => this.#check(), 1000);
+    // A page that was left may be kept, asleep, for the way back: it must let go of the skin.
+    addEventListener("pagehide", () => this.socket.close());
   }
 
   /** Send something without asking for an answer; false when it cannot be sent. */

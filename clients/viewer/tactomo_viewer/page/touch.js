@@ -28,6 +28,9 @@ export class Touch {
       this.#release("keyboard", false);
       this.onChange();
     });
+    document.addEventListener("visibilitychange", () => {
+      if (document.hidden) this.#releaseAll();
+    });
     canvas.addEventListener("contextmenu", (event) => {
       if (this.down.size) event.preventDefault();  // a long touch is a press, not a menu
     });
@@ -95,7 +98,7 @@ export class Touch {
       this.cursor ??= [0, 0];
       if (!this.down.has("keyboard")) this.#start("keyboard", this.cursor);
     } else if (event.key === "Escape") {
-      for (const pointer of [...this.down.keys()]) this.#release(pointer, false);
+      this.#releaseAll();
     } else {
       return;
     }
@@ -133,6 +136,10 @@ export class Touch {
     if (keep) this.#send(press);
     else this.link.send({ type: "release", press: press.id });
     this.onChange();
+  }
+
+  #releaseAll() {
+    for (const pointer of [...this.down.keys()]) this.#release(pointer, false);
   }
 
   async #send(press) {

@@ -35,6 +35,7 @@ const touch = new Touch({
 
 // For those who drive this page from outside, such as its tests.
 window.tactomo = {
+  touch,
   mmToPixel: (x, y) => view.mmToPixel(x, y),
   pixelToMm: (x, y) => view.pixelToMm(x, y),
   state,
@@ -201,7 +202,7 @@ function refresh() {
   showBanner(found);
   const trusted = !found || found.level === "info" || found.name === "no-reference";
   byId("map").classList.toggle("stale", !trusted);
-  document.body.dataset.health = found?.name ?? "good";
+  document.body.dataset.health = found?.name ?? (state.status ? "good" : "connecting");
   const linked = link.isOpen && state.status && ageOf(state.status, now) < 3000;
   if (!linked) showState("gone", found ? "disconnected" : "connecting");
   else if (found?.name === "stale") showState("stale");

@@ -1,0 +1,642 @@
+"""The page in a real browser: what it draws, what a press becomes, what it says when things stop.
+
+The skin is a thread that publishes twenty frames a second on a real socket, the twin a control
+socket that notes what it is asked; between them and the browser is the viewer as it is shipped, in
+a process of its own.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
+from types import TracebackType
+from typing import Any, Self
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from selenium import webdriver
+from selenium.webdriver import Keys
+from selenium.webdriver.common.by import By
+from selenium.webdriver.remote.webelement import WebElement
+from tactomo_client import Contact, ControlError
+from tactomo_client.fake import FakeControl, FakeSensor
+
+pytestmark = pytest.mark.browser
+
+NODES_MM = np.linspace(-75, 75, 51)
+DESCRIPTION: dict[str, Any] = {
+    "model": "paper_square",
+    "shape": "rectangle",
+    "width_mm": 150.0,
+    "height_mm": 150.0,
+    "sensing_width_mm": 138.0,
+    "sensing_height_mm": 138.0,
+    "electrodes_mm": [[-54.0, -75.0], [75.0, -54.0]],
+    "magnitude_max": 0.45,
+    "pressure_max_kpa": 300.0,
+    "magnitude_response": {
+        "pressure_kpa": [0.0, 130.0, 140.0, 200.0, 300.0],
+        "relative_change": [0.0, 0.0, 0.03, 0.25, 0.45],
+    },
+}
+
+
+def blob(x_mm: float, y_mm: float, value: float, nodes_mm: Any = NODES_MM) -> NDArray[np.float32]:
+    """Return an image that is `value` within 12 mm of a place and 0 elsewhere."""
+    x, y = np.meshgrid(nodes_mm, nodes_mm)
+    return np.where(np.hypot(x - x_mm, y - y_mm) < 12, value, 0).astype(np.float32)
+
+
+class Skin(AbstractContextManager["Skin"]):
+    """A sensor that goes on publishing what its attributes say."""
+
+    def __init__(self, address: str = "tcp://127.0.0.1:*") -> None:
+        self.contacts: list[Contact] = []
+        self.frame: dict[str, Any] = {}
+        self.status: dict[str, Any] = {
+            "state": "running",
+            "description": DESCRIPTION,
+            "source": {"kind": "twin"},
+            "ports": [{"url": "/dev/ttySKIN", "connected": True, "bytes": 1}],
+        }
+        self.events: list[dict[str, Any]] = []
+        self.sends_frames = True
+        self._stop = threading.Event()
+        self._sensor = FakeSensor("left", address)
+        self.address = self._sensor.address
+        self._thread = threading.Thread(target=self._run, name="skin")
+
+    def press(self, x_mm: float, y_mm: float, kpa: float = 200, magnitude: float = 0.25) -> None:
+        """Show one contact, as the daemon would."""
+        self.contacts = [Contact(1, x_mm, y_mm, 452.0, magnitude, 0.01, kpa)]
+        self.frame = {
+            "map": blob(x_mm, y_mm, magnitude),
+            "pressure_kpa": blob(x_mm, y_mm, kpa),
+            "structure": blob(x_mm, y_mm, 1),
+        }
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None = None,
+        error: BaseException | None = None,
+        traceback: TracebackType | None = None,
+    ) -> None:
+        self._stop.set()
+        self._thread.join()
+        self._sensor.close()
+
+    def _run(self) -> None:
+        tick = 0
+        while not self._stop.wait(0.05):
+            if tick % 5 == 0:
+                self._sensor.publish_message("status", self.status)
+            while self.events:
+                self._sensor.publish_message("event", self.events.pop(0))
+            if self.sends_frames:
+                self._sensor.publish(self.contacts, **self.frame)
+            tick += 1
+
+
+class Page:
+    """The open page, and the viewer behind it."""
+
+    def __init__(
+        self, browser: webdriver.Chrome, skin: Skin, daemon: FakeControl, twin: FakeControl
+    ) -> None:
+        self.browser = browser
+        self.skin = skin
+        self.daemon = daemon
+        self.twin = twin
+        self.port = 0
+
+    def serve(self) -> None:
+        """Start the viewer; a second time at the same port."""
+        arguments = ["left", "--stream", self.skin.address, "--control", self.daemon.address]
+        arguments += ["--twin", self.twin.address, "--port", str(self.port)]
+        self.viewer = subprocess.Popen(
+            [sys.executable, "-m", "tactomo_viewer", *arguments], stdout=subprocess.PIPE, text=True
+        )
+        assert self.viewer.stdout is not None
+        url = self.viewer.stdout.readline().split()[-1]
+        self.port = int(url.rstrip("/").rpartition(":")[2])
+
+    def stop_viewer(self) -> None:
+        self.viewer.terminate()
+        self.viewer.communicate(timeout=30)
+
+    def open(self, **emulated: Any) -> None:
+        """Open the page and wait until it shows the skin; `emulated`: width, height, mobile."""
+        if emulated:
+            metrics = {"deviceScaleFactor": 1, "mobile": False, **emulated}
+            self.browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+        self.browser.get(f"http://127.0.0.1:{self.port}/")
+        wait_for(lambda: self.health == "good")
+        wait_for(lambda: self.js("return Boolean(tactomo.state.drawn)"))
+
+    @property
+    def health(self) -> str:
+        """Name of the banner, `good` when there is none."""
+        return str(self.js("return document.body.dataset.health"))
+
+    @property
+    def banner(self) -> str:
+        return self["banner"].text
+
+    def __getitem__(self, element: str) -> WebElement:
+        return self.browser.find_element(By.ID, element)
+
+    def js(self, script: str, *arguments: Any) -> Any:
+        return self.browser.execute_script(script, *arguments)
+
+    def module(self, expression: str, file: str) -> Any:
+        """Evaluate an expression with `m`, one of the page's modules."""
+        return self.browser.execute_async_script(
+            f"const done = arguments[0]; import('/{file}').then((m) => done({expression}))"
+        )
+
+    def colour(self, x_mm: float, y_mm: float) -> list[int]:
+        """Return red, green and blue on the canvas at a place on the skin."""
+        script = """
+            const canvas = document.getElementById('map');
+            const [x, y] = tactomo.mmToPixel(arguments[0], arguments[1]);
+            const ratio = canvas.width / canvas.clientWidth;
+            const context = canvas.getContext('2d');
+            return [...context.getImageData(x * ratio, y * ratio, 1, 1).data].slice(0, 3)"""
+        return [int(level) for level in self.js(script, x_mm, y_mm)]
+
+    def client_point(self, x_mm: float, y_mm: float) -> tuple[float, float]:
+        """Return where a place on the skin is in the browser's window."""
+        script = """
+            const box = document.getElementById('map').getBoundingClientRect();
+            const [x, y] = tactomo.mmToPixel(arguments[0], arguments[1]);
+            return [box.left + x, box.top + y]"""
+        x, y = self.js(script, x_mm, y_mm)
+        return x, y
+
+    def mouse(self, kind: str, x_mm: float, y_mm: float, modifiers: int = 0) -> None:
+        """Send a mouse event (Pressed, Moved with the button down, or Released) at a place."""
+        x, y = self.client_point(x_mm, y_mm)
+        button = {"button": "left", "buttons": int(kind != "Released"), "clickCount": 1}
+        event = {"type": f"mouse{kind}", "x": round(x), "y": round(y), "modifiers": modifiers}
+        self.browser.execute_cdp_cmd("Input.dispatchMouseEvent", event | button)
+
+    def click(self, x_mm: float, y_mm: float, modifiers: int = 0) -> None:
+        self.mouse("Pressed", x_mm, y_mm, modifiers)
+        self.mouse("Released", x_mm, y_mm, modifiers)
+
+    def wait_until_pressable(self) -> None:
+        wait_for(lambda: "pressable" in (self["map"].get_attribute("class") or ""))
+
+    def presses(self, command: str = "press") -> list[dict[str, Any]]:
+        """Return the arguments of the presses (or releases) that reached the twin."""
+        return [arguments for name, arguments in self.twin.requests if name == command]
+
+
+def wait_for(condition: Callable[[], object], timeout_s: float = 30.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, "it never happened"
+        time.sleep(0.03)
+
+
+@pytest.fixture
+def page(browser: webdriver.Chrome) -> Iterator[Page]:
+    with Skin() as skin, FakeControl() as daemon, FakeControl() as twin:
+        page = Page(browser, skin, daemon, twin)
+        page.serve()
+        yield page
+        browser.get("about:blank")
+        page.stop_viewer()
+
+
+@pytest.fixture
+def quiet_console(page: Page) -> Iterator[None]:
+    """Check that the page wrote nothing to the console."""
+    yield
+    written = page.browser.get_log("browser")  # type: ignore[no-untyped-call]
+    ours = [entry for entry in written if entry["source"] != "rendering"]  # advice about canvases
+    assert ours == []
+
+
+# What it draws
+
+
+@pytest.mark.usefixtures("quiet_console")
+@pytest.mark.parametrize("smooth", [True, False])
+def test_a_press_is_bright_where_it_is(page: Page, smooth: bool) -> None:
+    page.skin.press(36, -48)
+    page.open()
+    if not smooth:
+        page["smooth"].click()
+    wait_for(lambda: sum(page.colour(30, -48)) > 350)
+    for x_mm, y_mm in ((-36, -48), (36, 48), (-36, 48), (0, 0), (36, -26), (58, -48)):
+        assert sum(page.colour(x_mm, y_mm)) < 60, (x_mm, y_mm)
+
+
+def test_the_outline_runs_around_the_press(page: Page) -> None:
+    page.skin.press(36, -48)
+    page.skin.frame |= {"map": None, "pressure_kpa": None}
+    page.open()
+    wait_for(lambda: page.colour(30, -48)[1] > 120)  # the structure is drawn instead of a map
+    white = [r for r in np.arange(4, 20, 0.2) if min(page.colour(36 - r, -48)) > 200]
+    assert white
+    assert 9 <= min(white) <= max(white) <= 13
+    page["outline"].click()
+    wait_for(lambda: not any(min(page.colour(36 - r, -48)) > 200 for r in white))
+
+
+def test_the_outline_is_where_the_level_is(page: Page) -> None:
+    page.open()
+    segments = page.module(
+        "m.contour(m.upsample({nx: 21, ny: 31, values: Float32Array.from({length: 651}, (_, i) =>"
+        " 8 - Math.hypot(i % 21 - 10, Math.floor(i / 21) - 12))}, 4), 0)",
+        "grid.js",
+    )
+    points = np.array(segments).reshape(-1, 2) / 4 - (10, 12)
+    assert len(points) > 100
+    np.testing.assert_allclose(np.hypot(*points.T), 8, atol=0.1)
+
+
+@pytest.mark.parametrize("name", ["inferno", "viridis"])
+def test_the_colours_are_the_well_known_ones(page: Page, name: str) -> None:
+    page.open()
+    table = page.module(f"[...m.colourTable('{name}')]", "colormap.js")
+    expected = 255 * mpl.colormaps[name](np.arange(256))[:, :3]
+    np.testing.assert_allclose(np.reshape(table, (256, 3)), expected, atol=9)
+
+
+@pytest.mark.usefixtures("quiet_console")
+def test_contacts_are_listed_with_value_and_uncertainty(page: Page) -> None:
+    page.skin.press(36, -48, kpa=173.0, magnitude=0.151)
+    page.open()
+    rows = "return [...document.querySelectorAll('#contacts tbody tr')].map(r => ({...r.dataset}))"
+    wait_for(lambda: page.js(rows) == [{"id": "1", "xMm": "36", "yMm": "-48"}])
+    row = page["contacts"].find_element(By.CSS_SELECTOR, "tbody tr")
+    # 0.01 of magnitude is 60 kPa / 0.22 * 0.01 = 2.7 kPa, by the sensor's response
+    assert row.text.split() == ["1", "36.0", "−48.0", "452", "173", "±", "3"]
+    page.browser.find_element(By.CSS_SELECTOR, "input[value=percent]").click()
+    wait_for(lambda: row.text.split() == ["1", "36.0", "−48.0", "452", "15.1", "±", "1.0"])
+    page.skin.contacts = []
+    wait_for(lambda: page.js(rows) == [])
+    assert page["no-contacts"].text == "Nothing pressed."
+
+
+def test_rate_latency_tier_and_quality_are_told(page: Page) -> None:
+    page.skin.frame = {"tier_reason": "two contacts", "flags": ["misfit_high"], "misfit": 3.21}
+    page.open()
+    wait_for(lambda: page["quality"].text == "Misfit high")
+    wait_for(lambda: page["rate"].text.endswith("/s"))
+    wait_for(lambda: page["latency"].text.endswith("ms"))
+    assert page["tier"].text == "levelset"
+    assert page["tier-reason"].text == "two contacts"
+    assert page["misfit"].text == "3.2 σ"
+    page.skin.frame = {}
+    wait_for(lambda: page["quality"].text == "good")
+
+
+def test_without_magnitudes_it_says_so(page: Page) -> None:
+    page.skin.press(0, 0)
+    page.skin.contacts = [Contact(1, 0, 0, 452.0, None, None, None)]
+    page.skin.frame |= {"map": None, "pressure_kpa": None, "flags": ["magnitude_missing"]}
+    page.open()
+    wait_for(lambda: page["quality"].text == "Magnitude channel missing")
+    assert page["contacts"].find_element(By.CSS_SELECTOR, "tbody tr").text.endswith(" –")
+
+
+def test_status_is_shown_part_by_part(page: Page) -> None:
+    page.skin.status |= {
+        "stage_ms": {"level_set": {"p50": 21.2, "p99": 44.0}},
+        "rates": {"magnitude_hz": 0.0, "structure_hz": 19.96, "frames_hz": 20.0},
+        "reference": {"scans": 20, "taken_realtime_ns": time.time_ns()},
+        "recording": {"path": "/data/a.mcap", "bytes": 1_500_000},
+        "incomplete_scans": 3,
+    }
+    page.open()
+    wait_for(lambda: "21.2, 44.0 ms" in page["stages"].text)
+    channels = page["channels"].text.split("\n")
+    assert channels[:2] == ["magnitude", "no scans"]
+    assert "20.0 scans/s" in channels
+    assert "/dev/ttySKIN" in channels
+    assert page["reference"].text.startswith("Reference of 20 scans")
+    assert page["record"].text == "Stop · 1.5 MB"
+    assert page["source"].text == "simulated skin"
+
+
+def test_foreign_text_stays_text(page: Page) -> None:
+    nasty = "<img src=x onerror=document.title='broken'>"
+    page.skin.status["description"] = DESCRIPTION | {"model": nasty}
+    page.open()
+    page.skin.events = [{"name": nasty, "severity": "info", "detail": nasty, "next_step": ""}]
+    wait_for(lambda: nasty in page["events"].text)
+    assert page["model"].text == nasty
+    assert page.browser.title == "left · tactomo"
+
+
+# What a press becomes
+
+
+@pytest.mark.usefixtures("quiet_console")
+def test_the_mouse_presses_where_it_points(page: Page) -> None:
+    page.open()
+    page.wait_until_pressable()
+    page.js(
+        "for (const [id, value] of [['pressure', 220], ['size', 20]]) {"
+        " const e = document.getElementById(id); e.value = value; e.oninput(); }"
+    )
+    page.mouse("Pressed", 36, -48)
+    wait_for(page.presses)
+    first = page.presses()[0]
+    half_pixel_mm = 0.5 / page.js("return tactomo.mmToPixel(1, 0)[0] - tactomo.mmToPixel(0, 0)[0]")
+    assert first["x_mm"] == pytest.approx(36, abs=1.01 * half_pixel_mm)
+    assert first["y_mm"] == pytest.approx(-48, abs=1.01 * half_pixel_mm)
+    assert (first["pressure_kpa"], first["radius_mm"], first["shape"]) == (220, 10, "ellipse")
+    page.mouse("Moved", -20, 10)
+    wait_for(lambda: page.presses()[-1]["x_mm"] == pytest.approx(-20, abs=1))
+    assert page.presses()[-1]["y_mm"] == pytest.approx(10, abs=1)
+    assert page.presses("release") == []
+    page.mouse("Released", -20, 10)
+    wait_for(lambda: page.presses("release"))
+    assert {press["id"] for press in page.presses()} == {page.presses("release")[0]["id"]}
+
+
+def test_a_press_keeps_its_place_on_a_scrolled_narrow_page(page: Page) -> None:
+    page.open(width=390, height=500, mobile=True)
+    page.js("scrollTo(0, 150)")
+    wait_for(lambda: page.js("return scrollY") > 100)
+    page.wait_until_pressable()
+    page.click(20, -30)
+    wait_for(page.presses)
+    assert page.presses()[0]["x_mm"] == pytest.approx(20, abs=0.5)
+    assert page.presses()[0]["y_mm"] == pytest.approx(-30, abs=0.5)
+
+
+def test_outside_the_sheet_nothing_is_pressed(page: Page) -> None:
+    disc = {"shape": "disc", "width_mm": 100.0, "height_mm": 100.0}
+    page.skin.status["description"] = DESCRIPTION | disc
+    page.open()
+    wait_for(lambda: page["map"].get_attribute("data-x-mm") == "-50 50")
+    page.wait_until_pressable()
+    page.click(45, 45)  # in the bounding box, not on the disc
+    page.click(30, -30)
+    wait_for(lambda: page.presses("release"))
+    assert [round(press["x_mm"]) for press in page.presses()] == [30]
+
+
+def test_shift_holds_a_press_and_clear_lifts_it(page: Page) -> None:
+    page.open()
+    page.wait_until_pressable()
+    page.click(10, 20, modifiers=8)
+    wait_for(lambda: page.js("return !tactomo.touch.down.size && tactomo.touch.held.length === 1"))
+    page.click(-30, 0)
+    wait_for(lambda: page.presses("release"))
+    held, lifted = page.presses()[0]["id"], page.presses()[-1]["id"]
+    assert [release["id"] for release in page.presses("release")] == [lifted]
+    assert held != lifted
+    page["clear"].click()
+    wait_for(lambda: ("clear", {}) in page.twin.requests)
+    assert page.js("return tactomo.touch.held.length") == 0
+
+
+def test_two_fingers_are_two_presses(page: Page) -> None:
+    page.open()
+    page.wait_until_pressable()
+    page.browser.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": True})
+
+    def touch(kind: str, *places: tuple[float, float]) -> None:
+        corners = [page.client_point(*place) for place in places]
+        points = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(corners)]
+        arguments = {"type": kind, "touchPoints": points}
+        page.browser.execute_cdp_cmd("Input.dispatchTouchEvent", arguments)
+
+    touch("touchStart", (-40, 30))
+    touch("touchStart", (-40, 30), (40, -30))
+    wait_for(lambda: len({press["id"] for press in page.presses()}) == 2)
+    touch("touchMove", (-40, 30), (20, -10))
+    wait_for(lambda: round(page.presses()[-1]["x_mm"]) == 20)
+    places = {press["id"]: (round(press["x_mm"]), round(press["y_mm"])) for press in page.presses()}
+    assert sorted(places.values()) == [(-40, 30), (20, -10)]
+    touch("touchEnd")
+    wait_for(lambda: {r["id"] for r in page.presses("release")} == set(places))
+
+
+def test_the_keyboard_presses(page: Page) -> None:
+    page.open()
+    page.wait_until_pressable()
+    page["map"].send_keys(Keys.SHIFT, Keys.ARROW_RIGHT, Keys.ARROW_RIGHT, Keys.ARROW_UP, Keys.SHIFT)
+    page["map"].send_keys(Keys.ARROW_LEFT, " ")
+    wait_for(lambda: page.presses("release"))
+    assert (page.presses()[0]["x_mm"], page.presses()[0]["y_mm"]) == (19, 10)
+
+
+@pytest.mark.parametrize("source", ["device", "replay"])
+def test_only_a_simulated_skin_can_be_pressed(page: Page, source: str) -> None:
+    page.skin.status["source"] = {"kind": source}
+    page.open()
+    wait_for(lambda: page.js("return tactomo.state.twinAnswers"))
+    assert not page["press-card"].is_displayed()
+    page.click(0, 0)
+    page.skin.status["source"] = {"kind": "twin"}
+    page.wait_until_pressable()
+    page.click(30, 0)
+    wait_for(page.presses)
+    assert [round(press["x_mm"]) for press in page.presses()] == [30]
+
+
+def test_leaving_the_page_lifts_the_finger_and_coming_back_is_fine(page: Page) -> None:
+    page.open()
+    page.wait_until_pressable()
+    page.mouse("Pressed", 36, -48)
+    wait_for(page.presses)
+    page.browser.get("about:blank")
+    wait_for(lambda: page.presses("release"))
+    page.browser.back()
+    wait_for(lambda: page.health == "good")
+    assert page.js("return tactomo.touch.presses.length") == 0
+    page.skin.press(36, -48)
+    wait_for(lambda: sum(page.colour(30, -48)) > 350)
+
+
+# Buttons
+
+
+def test_a_refused_tare_says_why(page: Page) -> None:
+    page.daemon.answers["tare"] = ControlError("somebody presses", "lift it", "tare_refused")
+    page.open()
+    page["tare"].click()
+    wait_for(lambda: page["message"].text == "somebody presses; lift it")
+    page.daemon.answers["tare"] = {"scans": 20}
+    page["tare"].click()
+    wait_for(lambda: "20 scans" in page["message"].text)
+
+
+def test_recording_starts_and_stops(page: Page) -> None:
+    page.daemon.answers |= {"record_start": {"path": "/a.mcap"}, "record_stop": {"path": "/a.mcap"}}
+    page.open()
+    page["record"].click()
+    wait_for(lambda: page["message"].text == "Recording to /a.mcap")
+    page.skin.status |= {"recording": {"path": "/a.mcap", "bytes": 12}}
+    wait_for(lambda: page["record"].get_attribute("aria-pressed") == "true")
+    page["record"].click()
+    wait_for(lambda: ("record_stop", {}) in page.daemon.requests)
+    assert [command for command, _ in page.daemon.requests] == ["record_start", "record_stop"]
+
+
+def test_the_tier_can_be_chosen(page: Page) -> None:
+    page.daemon.answers["set_tier"] = {"tier": "quiet"}
+    page.open()
+    page["tier-choice"].find_element(By.XPATH, "./option[text()='quiet']").click()
+    wait_for(lambda: page.daemon.requests)
+    assert page.daemon.requests == [("set_tier", {"tier": "quiet"})]
+
+
+# When things stop
+
+
+def test_stale_data_are_told_and_come_back(page: Page) -> None:
+    page.skin.press(36, -48)
+    page.open()
+    wait_for(lambda: page["count"].text == "1")
+    page.skin.sends_frames = False
+    wait_for(lambda: page.health == "stale")
+    assert page.banner.startswith("Stale. The newest scan is ")
+    assert page["state"].text == "stale"
+    assert page["map"].get_attribute("class") == "pressable stale"
+    wait_for(lambda: page["no-contacts"].text == "Not known.")  # and not "Nothing pressed."
+    page.skin.status |= {"ports": [{"url": "/dev/ttySKIN", "connected": False}]}
+    wait_for(lambda: page.banner.endswith("Not connected: /dev/ttySKIN."))
+    page.skin.sends_frames = True
+    wait_for(lambda: page.health == "good")
+    assert not page["banner"].is_displayed()
+    assert page["map"].get_attribute("class") == "pressable"
+
+
+def test_a_daemon_that_is_gone_is_told_and_comes_back(page: Page) -> None:
+    page.open()
+    page.skin.__exit__()
+    wait_for(lambda: page.health == "daemon-gone")
+    assert page.banner.startswith("The daemon is gone. Last heard ")
+    assert not page["tare"].is_enabled()
+    with Skin(page.skin.address) as again:
+        again.press(-30, 30)
+        wait_for(lambda: page.health == "good")
+        wait_for(lambda: sum(page.colour(-36, 30)) > 350)
+        assert page["tare"].is_enabled()
+
+
+def test_a_viewer_that_is_gone_is_told_and_comes_back(page: Page) -> None:
+    page.open()
+    page.stop_viewer()
+    wait_for(lambda: page.health == "viewer-gone")
+    assert page.banner.startswith("The viewer's server is gone.")
+    page.serve()
+    wait_for(lambda: page.health == "good")
+    page.skin.press(36, -48)
+    wait_for(lambda: sum(page.colour(30, -48)) > 350)
+
+
+def test_a_viewer_that_hangs_is_noticed(page: Page) -> None:
+    page.open()
+    page.viewer.send_signal(19)  # SIGSTOP: the connection stays, nothing comes
+    try:
+        wait_for(lambda: page.health == "viewer-gone")
+    finally:
+        page.viewer.send_signal(18)
+    wait_for(lambda: page.health == "good")
+
+
+@pytest.mark.parametrize(
+    ("status", "health", "text"),
+    [
+        ({"state": "taring"}, "taring", "do not touch"),
+        ({"state": "waiting_for_data"}, "no-data", "no scans come"),
+    ],
+)
+def test_what_the_daemon_does_is_told(
+    page: Page, status: dict[str, Any], health: str, text: str
+) -> None:
+    page.open()
+    page.skin.status |= status
+    wait_for(lambda: page.health == health)
+    assert text in page.banner
+
+
+def test_a_missing_reference_is_told(page: Page) -> None:
+    page.open()
+    page.skin.frame = {"flags": ["no_reference"]}
+    wait_for(lambda: page.health == "no-reference")
+    assert "press Tare" in page.banner
+
+
+def test_a_daemon_that_never_came_is_waited_for(page: Page) -> None:
+    page.skin.__exit__()
+    page.browser.get(f"http://127.0.0.1:{page.port}/")
+    wait_for(lambda: page.health == "no-daemon")
+    assert f"“left” at {page.skin.address}" in page.banner
+    with Skin(page.skin.address):
+        wait_for(lambda: page.health == "good")
+
+
+# For everybody
+
+
+@pytest.mark.parametrize("width", [320, 390, 768, 1024, 1280, 1920])
+def test_nothing_sticks_out_at_any_width(page: Page, width: int) -> None:
+    page.skin.press(60, 60)
+    page.open(width=width, height=800)
+    assert page.js("return document.documentElement.scrollWidth") <= width
+    right = page.js("return tactomo.mmToPixel(75, 0)[0]")
+    assert 150 < right < page.js("return document.getElementById('map').clientWidth")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_every_text_stands_out(page: Page, scheme: str) -> None:
+    features = [{"name": "prefers-color-scheme", "value": scheme}]
+    page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+    page.skin.press(0, 0)
+    page.open()
+    ratio = {
+        (ink, paper): page.js(CONTRAST, ink, paper)
+        for ink, paper in (
+            *(("--text", paper) for paper in ("--page", "--card")),
+            *(("--dim", paper) for paper in ("--page", "--card")),
+            *((f"--{kind}", f"--{kind}-tint") for kind in ("good", "warn", "bad")),
+            ("--accent", "--info-tint"),
+            ("--on-accent", "--accent"),
+        )
+    }
+    assert {pair: value for pair, value in ratio.items() if value < 4.5} == {}  # WCAG AA
+
+
+CONTRAST = """
+const style = getComputedStyle(document.documentElement);
+const luminance = (name) => {
+  const hex = style.getPropertyValue(name).trim().slice(1);
+  const [r, g, b] = [0, 2, 4].map((i) => parseInt(hex.slice(i, i + 2), 16) / 255)
+    .map((c) => c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4);
+  return 0.2126 * r + 0.7152 * g + 0.0722 * b;
+};
+const [a, b] = [luminance(arguments[0]), luminance(arguments[1])];
+return (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
+"""
+
+
+def test_every_control_has_a_name(page: Page) -> None:
+    page.open()
+    page.wait_until_pressable()
+    nodes = page.browser.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]
+    roles = {"button", "slider", "combobox", "checkbox", "radio", "application", "img", "table"}
+    controls = [node for node in nodes if node.get("role", {}).get("value") in roles]
+    assert len(controls) >= 15
+    nameless = [json.dumps(node["role"]) for node in controls if not node["name"].get("value")]
+    assert nameless == []

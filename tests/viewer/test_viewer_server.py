@@ -1,0 +1,494 @@
+"""The viewer's server, seen from a page's websocket: real sockets on all its sides."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import asynccontextmanager
+from importlib import resources
+from typing import Any, ParamSpec
+
+import aiohttp
+import numpy as np
+import pytest
+from aiohttp.test_utils import TestClient, TestServer
+from tactomo_client import ClientError, Contact, ControlError
+from tactomo_client.fake import FakeControl, FakeSensor
+from tactomo_viewer import ViewerError, make_app, serve
+
+CONTACT = Contact(2, 12.0, -30.0, 707.0, 0.18, 0.01, None)
+RAMP = np.tile(np.linspace(0, 1, 51, dtype=np.float32), (51, 1))
+NOBODY = "tcp://127.0.0.1:1"
+
+P = ParamSpec("P")
+Message = dict[str, Any]
+
+
+def on_loop(test: Callable[P, Coroutine[Any, Any, None]]) -> Callable[P, None]:
+    @functools.wraps(test)
+    def run(*args: P.args, **kwargs: P.kwargs) -> None:
+        asyncio.run(asyncio.wait_for(test(*args, **kwargs), 90))
+
+    return run
+
+
+class Page:
+    """An open page: reads what comes and confirms frames as `link.js` does."""
+
+    def __init__(self, socket: aiohttp.ClientWebSocketResponse, confirms: bool = True) -> None:
+        self.socket = socket
+        self.confirms = confirms
+        self.frames: list[int] = []
+        self.hello: Message = {}
+
+    async def next(self, kind: str) -> Message:
+        """Return the next message of this kind."""
+        while True:
+            message = await self.socket.receive(timeout=30)
+            assert message.type in (aiohttp.WSMsgType.TEXT, aiohttp.WSMsgType.BINARY), message
+            content = parse(message.data)
+            if content["type"] == "frame":
+                self.frames.append(content["sequence"])
+                if self.confirms:
+                    await self.socket.send_json({"type": "confirm"})
+            if content["type"] == kind:
+                return content
+
+    async def frame(self, sequence: int) -> Message:
+        """Return the frame of this number."""
+        while (frame := await self.next("frame"))["sequence"] != sequence:
+            pass
+        return frame
+
+    async def ask(self, **question: Any) -> Message:
+        """Ask something and return the reply."""
+        await self.socket.send_json({"request": 7, **question})
+        while (reply := await self.next("reply"))["request"] != 7:
+            pass
+        return reply
+
+
+def parse(data: str | bytes) -> Message:
+    if isinstance(data, str):
+        message: Message = json.loads(data)
+        return message
+    length = int.from_bytes(data[:4], "little")
+    assert length % 4 == 0
+    frame: Message = json.loads(data[4 : 4 + length])
+    values = data[4 + length :]
+    for image in frame["images"]:
+        size = 4 * image["shape"][0] * image["shape"][1]
+        frame[image["name"]] = np.frombuffer(values[:size], "<f4").reshape(image["shape"])
+        values = values[size:]
+    assert not values
+    return frame | {"type": "frame"}
+
+
+class Viewer:
+    """A viewer served at an ephemeral port."""
+
+    def __init__(self, client: TestClient[Any, Any]) -> None:
+        self.client = client
+
+    @property
+    def origin(self) -> str:
+        return str(self.client.make_url("/")).rstrip("/")
+
+    @asynccontextmanager
+    async def page(self, confirms: bool = True) -> AsyncIterator[Page]:
+        async with self.client.ws_connect("/socket", origin=self.origin) as websocket:
+            page = Page(websocket, confirms)
+            page.hello = await page.next("hello")
+            yield page
+
+
+@asynccontextmanager
+async def viewer_of(
+    sensor: FakeSensor, control: str = NOBODY, twin: str | None = None, host: str = "127.0.0.1"
+) -> AsyncIterator[Viewer]:
+    app = make_app("left", sensor.address, control, twin, host)
+    async with TestClient(TestServer(app)) as client:
+        topics = {await asyncio.to_thread(sensor.wait_for_subscriber) for _ in range(3)}
+        assert topics == {b"left/map\0", b"left/status\0", b"left/event\0"}
+        yield Viewer(client)
+
+
+@pytest.fixture
+def sensor() -> FakeSensor:
+    return FakeSensor("left")
+
+
+@pytest.fixture(autouse=True)
+def _close_sensor(sensor: FakeSensor) -> Any:
+    yield
+    sensor.close()
+
+
+# What the page gets
+
+
+@on_loop
+async def test_a_frame_comes_whole(sensor: FakeSensor) -> None:
+    async with viewer_of(sensor) as viewer, viewer.page() as page:
+        structure = RAMP.T > 0.5
+        sensor.publish(
+            [CONTACT],
+            map=RAMP,
+            structure=structure.astype(np.float32),
+            flags=["misfit_high"],
+            misfit=float("nan"),
+        )
+        frame = await page.frame(1)
+        assert [image["name"] for image in frame["images"]] == ["map", "structure"]
+        np.testing.assert_array_equal(frame["map"], RAMP)
+        np.testing.assert_array_equal(frame["structure"], structure)
+        assert frame["contacts"][0]["x_mm"] == 12.0
+        assert frame["contacts"][0]["pressure_kpa"] is None
+        assert frame["flags"] == ["misfit_high"]
+        assert frame["misfit"] is None
+        assert (frame["x_mm"], frame["y_mm"]) == ([-75, 75], [-75, 75])
+        assert 0 <= frame["age_ms"] < 20_000
+
+
+@on_loop
+async def test_the_age_is_the_one_at_sending(sensor: FakeSensor) -> None:
+    async with viewer_of(sensor) as viewer:
+        sensor.publish(clock_id="elsewhere", age_ns=2_000_000_000)
+        await asyncio.sleep(0.3)
+        async with viewer.page() as page:
+            assert (await page.frame(1))["age_ms"] >= 2200
+
+
+@on_loop
+async def test_a_newcomer_gets_what_there_is(sensor: FakeSensor) -> None:
+    async with viewer_of(sensor) as viewer:
+        async with viewer.page() as first:
+            sensor.publish_message("status", {"state": "running", "loss": float("inf")})
+            for name in ("tared", "channel_lost"):
+                sensor.publish_message("event", {"name": name, "severity": "info"})
+            sensor.publish(map=RAMP)
+            await first.frame(1)
+        async with viewer.page() as second:
+            assert (await second.next("status"))["status"]["loss"] is None
+            assert (await second.next("event"))["event"]["name"] == "tared"
+            assert (await second.next("event"))["event"]["name"] == "channel_lost"
+            await second.frame(1)
+
+
+@on_loop
+async def test_silence_is_told_from_a_hang(sensor: FakeSensor) -> None:
+    async with viewer_of(sensor) as viewer, viewer.page() as page:
+        await page.next("alive")
+        await page.next("alive")
+
+
+@on_loop
+async def test_malformed_messages_are_skipped(sensor: FakeSensor) -> None:
+    async with viewer_of(sensor) as viewer, viewer.page() as page:
+        sensor.send(b"left/map\0\xc1")
+        sensor.send(b"left/status\0")
+        sensor.publish_message("map", {"contacts": 7})
+        sensor.publish(map=RAMP)
+        await page.frame(2)
+        assert page.frames == [2]
+
+
+@on_loop
+async def test_a_slow_page_gets_few_frames_and_none_of_them_old(sensor: FakeSensor) -> None:
+    async with (
+        viewer_of(sensor) as viewer,
+        viewer.page(confirms=False) as slow,
+        viewer.page() as quick,
+    ):
+        for sequence in range(1, 31):
+            sensor.publish(map=RAMP)
+            await quick.frame(sequence)
+        assert quick.frames == list(range(1, 31))
+        assert (await slow.next("frame"))["sequence"] == 1
+        assert (await slow.next("frame"))["sequence"] == 2
+        await slow.socket.send_json({"type": "confirm"})
+        assert (await slow.next("frame"))["sequence"] == 30
+
+
+# What the page may do
+
+
+@on_loop
+async def test_commands_reach_the_daemon(sensor: FakeSensor) -> None:
+    with FakeControl({"tare": {"scans": 20}, "set_tier": {"tier": "quiet"}}) as daemon:
+        async with viewer_of(sensor, daemon.address) as viewer, viewer.page() as page:
+            reply = await page.ask(type="command", command="tare")
+            assert (reply["ok"], reply["result"]) == (True, {"scans": 20})
+            await page.ask(type="command", command="set_tier", arguments={"tier": "quiet"})
+            await page.ask(type="command", command="record_start", arguments={})
+            await page.ask(type="command", command="record_stop")
+    assert daemon.requests == [
+        ("tare", {}),
+        ("set_tier", {"tier": "quiet"}),
+        ("record_start", {}),
+        ("record_stop", {}),
+    ]
+
+
+@on_loop
+async def test_a_refusal_reaches_the_page(sensor: FakeSensor) -> None:
+    refusal = ControlError("somebody presses", "lift it", "tare_refused")
+    with FakeControl({"tare": refusal}) as daemon:
+        async with viewer_of(sensor, daemon.address) as viewer, viewer.page() as page:
+            reply = await page.ask(type="command", command="tare")
+    assert reply["ok"] is False
+    assert reply["error"] == {
+        "name": "tare_refused",
+        "cause": "somebody presses",
+        "next_step": "lift it",
+    }
+
+
+@pytest.mark.parametrize(
+    ("question", "name"),
+    [
+        ({"type": "command", "command": "shutdown"}, "unknown_command"),
+        ({"type": "command", "command": ["tare"]}, "unknown_command"),
+        ({"type": "command", "command": "record_start", "arguments": {"path": "/etc/x"}}, None),
+        ({"type": "command", "command": "tare", "arguments": 3}, "bad_argument"),
+        ({"type": "dance"}, "unknown_command"),
+        ({"type": "press", "press": "1", "x_mm": 0, "y_mm": 0}, "no_twin"),
+    ],
+)
+@on_loop
+async def test_what_a_page_may_not_do_is_refused(
+    sensor: FakeSensor, question: Message, name: str | None
+) -> None:
+    with FakeControl() as daemon:
+        async with viewer_of(sensor, daemon.address) as viewer, viewer.page() as page:
+            reply = await page.ask(**question)
+    assert reply["ok"] is False
+    assert reply["error"]["name"] == (name or "bad_argument")
+    assert daemon.requests == []
+
+
+@on_loop
+async def test_no_question_breaks_the_socket(sensor: FakeSensor) -> None:
+    async with viewer_of(sensor) as viewer, viewer.page() as page:
+        for text in ("", "{", "[]", "7", "null", "[" * 10_000, '{"type": "press", "press": {}}'):
+            await page.socket.send_str(text)
+        await page.socket.send_str('{"type": "command", "command": "\\ud800"}')
+        await page.socket.send_bytes(b"\0\xff")
+        sensor.publish(map=RAMP)
+        await page.frame(1)
+
+
+# Pressing
+
+
+@on_loop
+async def test_presses_reach_the_twin_in_order(sensor: FakeSensor) -> None:
+    with FakeControl() as twin:
+        async with viewer_of(sensor, twin=twin.address) as viewer, viewer.page() as page:
+            assert (await page.next("twin"))["answers"] is True
+            finger = {"pressure_kpa": 180, "radius_mm": 15, "shape": "ring"}
+            for x_mm in (1.5, 2.5):
+                await page.socket.send_json(
+                    {"type": "press", "press": "1", "x_mm": x_mm, "y_mm": -3, **finger}
+                )
+            assert (await page.ask(type="release", press="1"))["ok"] is True
+            assert (await page.ask(type="clear"))["ok"] is True
+    asked = [request for request in twin.requests if request[0] != "scene"]
+    assert [command for command, _ in asked] == ["press", "press", "release", "clear"]
+    names = {arguments.pop("id") for command, arguments in asked[:3]}
+    assert len(names) == 1
+    assert [arguments for _, arguments in asked] == [
+        {"x_mm": 1.5, "y_mm": -3, **finger},
+        {"x_mm": 2.5, "y_mm": -3, **finger},
+        {},
+        {},
+    ]
+
+
+@on_loop
+async def test_a_page_that_goes_away_lifts_its_presses_but_not_the_held_ones(
+    sensor: FakeSensor,
+) -> None:
+    with FakeControl() as twin:
+        async with viewer_of(sensor, twin=twin.address) as viewer, viewer.page() as other:
+            await other.ask(type="press", press="1", x_mm=9, y_mm=9)
+            async with viewer.page() as page:
+                await page.ask(type="press", press="1", x_mm=1, y_mm=1)
+                await page.ask(type="press", press="2", x_mm=2, y_mm=2)
+                await page.ask(type="press", press="2", x_mm=2, y_mm=2, hold=True)
+            released: list[str] = []
+            while not released:
+                await asyncio.sleep(0.01)
+                released = [a["id"] for command, a in twin.requests if command == "release"]
+            names = {a["x_mm"]: a["id"] for command, a in twin.requests if command == "press"}
+            assert released == [names[1]]
+            assert len(set(names.values())) == 3
+
+
+@on_loop
+async def test_the_page_hears_when_the_twin_comes_and_goes(sensor: FakeSensor) -> None:
+    twin = FakeControl()
+    async with viewer_of(sensor, twin=twin.address) as viewer, viewer.page() as page:
+        assert (await page.next("twin"))["answers"] is True
+        twin.close()
+        assert (await page.next("twin"))["answers"] is False
+        with FakeControl(address=twin.address):
+            assert (await page.next("twin"))["answers"] is True
+
+
+@on_loop
+async def test_served_to_others_it_only_shows(sensor: FakeSensor) -> None:
+    with FakeControl() as daemon, FakeControl() as twin:
+        async with (
+            viewer_of(sensor, daemon.address, twin.address, host="0.0.0.0") as viewer,
+            viewer.page() as page,
+        ):
+            assert page.hello["read_only"] is True
+            reply = await page.ask(type="command", command="tare")
+            assert reply["error"]["name"] == "read_only"
+            reply = await page.ask(type="press", press="1", x_mm=0, y_mm=0)
+            assert reply["error"]["name"] == "read_only"
+            sensor.publish(map=RAMP)
+            await page.frame(1)
+    assert daemon.requests == twin.requests == []
+
+
+# Who may ask
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        (None, 200),
+        ("localhost:8750", 200),
+        ("[::1]:8750", 200),
+        ("192.168.7.2", 200),
+        ("evil.example", 403),
+        ("127.0.0.1.evil.example:8750", 403),
+        ("localhost.evil.example", 403),
+        ("[", 403),
+    ],
+)
+@on_loop
+async def test_a_foreign_name_is_turned_away(
+    sensor: FakeSensor, host: str | None, status: int
+) -> None:
+    async with viewer_of(sensor) as viewer:
+        headers = {} if host is None else {"Host": host}
+        async with viewer.client.get("/", headers=headers) as response:
+            assert response.status == status
+
+
+@pytest.mark.parametrize("origin", [None, "null", "https://evil.example", "http://127.0.0.1:1"])
+@on_loop
+async def test_a_page_from_elsewhere_gets_no_socket(sensor: FakeSensor, origin: str | None) -> None:
+    async with viewer_of(sensor) as viewer:
+        with pytest.raises(aiohttp.WSServerHandshakeError) as caught:
+            await viewer.client.ws_connect("/socket", origin=origin)
+        assert caught.value.status == 403
+
+
+@on_loop
+async def test_the_page_brings_everything_itself(sensor: FakeSensor) -> None:
+    names = [file.name for file in (resources.files("tactomo_viewer") / "page").iterdir()]
+    assert {"index.html", "viewer.js", "viewer.css"} <= set(names)
+    async with viewer_of(sensor) as viewer:
+        for name in names:
+            async with viewer.client.get("/" if name == "index.html" else f"/{name}") as response:
+                assert response.status == 200
+                assert "script-src 'self'" in response.headers["Content-Security-Policy"]
+                text = await response.text()
+            foreign = re.findall(r"https?://[^\s'\"]+", text)
+            assert set(foreign) <= {"http://www.w3.org/2000/svg"}
+            for wanted in re.findall(r"""(?:from |src=|href=)["']\.?/?([\w.]+\.\w+)["']""", text):
+                assert wanted in names
+
+
+# Starting and stopping
+
+
+def start(*arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "tactomo_viewer", "left", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_it_prints_its_address_and_stops_when_told(number: signal.Signals) -> None:
+    viewer = start("--stream", NOBODY, "--port", "0")
+    assert viewer.stdout is not None
+    try:
+        line = viewer.stdout.readline()
+        assert re.fullmatch(r"viewer: http://127\.0\.0\.1:[1-9]\d*/\n", line)
+        os.kill(viewer.pid, number)
+        output, errors = viewer.communicate(timeout=20)
+        assert (viewer.returncode, output, errors) == (0, "", "")
+    finally:
+        viewer.kill()
+        viewer.communicate()
+
+
+def test_open_pages_do_not_hold_up_the_end(sensor: FakeSensor) -> None:
+    viewer = start("--stream", sensor.address, "--port", "0")
+    assert viewer.stdout is not None
+    try:
+        url = viewer.stdout.readline().split()[-1]
+
+        async def stop_under_a_page() -> None:
+            async with (
+                aiohttp.ClientSession() as session,
+                session.ws_connect(url + "socket", origin=url.rstrip("/")) as websocket,
+            ):
+                await websocket.receive()
+                viewer.terminate()
+                while not websocket.closed:
+                    await websocket.receive(timeout=20)
+                assert websocket.close_code == aiohttp.WSCloseCode.GOING_AWAY
+
+        asyncio.run(stop_under_a_page())
+        assert viewer.wait(20) == 0
+    finally:
+        viewer.kill()
+        viewer.communicate()
+
+
+def test_a_port_in_use_says_what_to_do() -> None:
+    with socket.socket() as holder:
+        holder.bind(("127.0.0.1", 0))
+        holder.listen()
+        port = holder.getsockname()[1]
+        with pytest.raises(ViewerError, match=rf"cannot listen on 127.0.0.1 port {port}.*--port"):
+            serve("left", NOBODY, port=port)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--stream", "nonsense"), "cannot connect to 'nonsense'"),
+        (("--host", "203.0.113.1"), "cannot listen on 203.0.113.1"),
+    ],
+)
+def test_a_mistake_is_explained_without_a_traceback(
+    arguments: tuple[str, ...], message: str
+) -> None:
+    viewer = start("--port", "0", *arguments)
+    _, errors = viewer.communicate(timeout=60)
+    assert viewer.returncode == 1
+    assert message in errors
+    assert "Traceback" not in errors
+
+
+def test_a_wrong_sensor_name_is_named() -> None:
+    with pytest.raises(ClientError, match="'left arm' is not a sensor name"):
+        serve("left arm", NOBODY, port=0)
