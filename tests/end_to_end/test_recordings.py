@@ -30,7 +30,7 @@ def maps_in(recording: Path) -> dict[int, dict[str, Any]]:
     found = {}
     with recording.open("rb") as file:
         for _, channel, message in make_reader(file).iter_messages():
-            if channel.topic.endswith("/map"):
+            if channel.topic == MAP:
                 decoded = decode_message(message.data)
                 assert decoded.kind == MAP
                 found[decoded.fields["scan_counter"]] = decoded.fields
