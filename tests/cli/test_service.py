@@ -179,3 +179,30 @@ def test_a_family_notices_whoever_ends_and_tells_its_last_words() -> None:
             late.wait_ready()
     assert not viewer.is_running
     assert viewer.status == 0
+
+
+PARENT = """
+import time
+from tactomo.cli.children import Family
+with Family() as family:
+    viewer = family.start("viewer", "viewer", "--port", "0", "--stream", "ipc:///nowhere/at/all")
+    viewer.wait_ready()
+    print(viewer.pid, flush=True)
+    time.sleep(600)
+"""
+
+
+@linux
+def test_a_child_that_is_ready_ends_with_a_parent_that_is_killed() -> None:
+    with subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE) as parent:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        assert is_running(child)
+        parent.kill()
+    wait_for(lambda: not is_running(child))
+
+
+def test_a_verbose_family_passes_on_what_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+    with Family(verbose=True) as family:
+        family.start("list", "models", "list").wait_done()
+    assert "list: paper_square" in capsys.readouterr().err

@@ -21,7 +21,9 @@ from tactomo_protocol import (
     AckStatus,
     Channel,
     CommandCode,
+    Decoder,
     Hello,
+    Packet,
     Scan,
     ScanFlag,
 )
@@ -124,6 +126,51 @@ def test_a_scan_that_takes_longer_is_late_and_says_so(bench: Start) -> None:
     steps = np.diff([s.device_us for s in host.scans() if s.channel == Channel.MAGNITUDE])
     assert np.all(steps >= 150_000)  # sampled anew after each solve, not queued up
     assert [scan.counter for scan in host.scans()[0:6:2]] == [0, 1, 2]
+
+
+class StallingSkin:
+    """Needs half a second for its first solve after the unloaded one, then no time."""
+
+    def __init__(self) -> None:
+        self.solves = 0
+
+    def voltages(self, presses: Sequence[Press]) -> dict[Modality, NDArray[np.float64]]:
+        self.solves += 1
+        if self.solves == 2:
+            time.sleep(0.5)
+        return {"magnitude": np.full(208, 0.1), "structure": np.full(208, 0.1)}
+
+
+def test_scans_missed_in_a_stall_are_not_made_up(bench: Start) -> None:
+    host = bench(StallingSkin(), rate_hz=100.0).host()
+    host.start()
+    host.wait_for(lambda: len(host.scans()) >= 60)
+    stamps_us = np.array([s.device_us for s in host.scans() if s.channel == Channel.MAGNITUDE])
+    assert stamps_us[1] - stamps_us[0] >= 500_000
+    soon_after = np.count_nonzero(stamps_us[1:] < stamps_us[1] + 100_000)
+    assert soon_after <= 12  # ten a tenth of a second; 60 if the stall were made up for
+
+
+def test_each_port_starts_by_itself(bench: Start) -> None:
+    host = bench(ports=2).host()
+    host.send(CommandCode.START, port=0)
+    host.wait_for(lambda: len(host.scans(0)) >= 20 and host.kind(Hello, 1))
+    assert host.scans(1) == []
+
+
+def test_a_program_that_knows_nothing_of_terminals_reads_the_bytes_as_they_are(
+    bench: Start,
+) -> None:
+    descriptor = os.open(bench().twin.ports[0], os.O_RDONLY | os.O_NOCTTY)
+    decoder = Decoder()
+    try:
+        packets: list[Packet] = []
+        while not packets:
+            packets = decoder.feed(os.read(descriptor, 4096))
+    finally:
+        os.close(descriptor)
+    assert isinstance(packets[0], Hello)
+    assert decoder.counts.corrupt == 0
 
 
 def test_a_scan_in_time_is_not_late(bench: Start) -> None:

@@ -69,6 +69,11 @@ class Child:
         self._reader.start()
 
     @property
+    def pid(self) -> int:
+        """Identity of the process."""
+        return self._process.pid
+
+    @property
     def is_running(self) -> bool:
         """Whether the process has not ended."""
         return self._process.poll() is None
