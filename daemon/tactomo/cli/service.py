@@ -151,7 +151,7 @@ def twin(
     ] = None,
     noise_uv: Annotated[
         float | None,
-        typer.Option(min=0.0, help="Converter noise, µV rms. [a 94 dB converter's]"),
+        typer.Option(min=0.0, help="Converter noise, µV rms. [60 dB below the signal]"),
     ] = None,
     drift: Annotated[
         float, typer.Option(min=0.0, help="Random walk of the gains: relative rms after 1 s.")
@@ -161,7 +161,7 @@ def twin(
     ] = 2e-5,
     unevenness: Annotated[
         float, typer.Option(min=0.0, max=0.5, help="Of the sheet's conductivity; 0.05 is 5 %.")
-    ] = 0.0,
+    ] = 0.03,
     seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal noise and drift.")] = 0,
     control: Annotated[
         str, typer.Option("--control", help="Where to take presses and faults.")
@@ -193,7 +193,9 @@ def twin(
         control=control,
         link_folder=link,
     )
-    running = Twin(config, SkinSimulator(sensor, unevenness=unevenness, seed=seed))
+    # Contact impedances of pressed-on electrodes differ; the daemon's model must live with that.
+    skin = SkinSimulator(sensor, unevenness=unevenness, impedance_spread=0.1, seed=seed)
+    running = Twin(config, skin)
     running.start()
     try:
         for path in running.ports:
