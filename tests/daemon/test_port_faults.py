@@ -20,12 +20,19 @@ from tactomo_protocol import Acknowledge, AckStatus, Channel, CommandCode, Scan,
 Start = Callable[..., Any]
 
 
-def daemon_on(port: Path) -> Daemon:
+def refusal(port: str | Path) -> PortError:
+    """Return the error with which a daemon refuses to start on a port."""
     memory: Any = object()
     local = "tcp://127.0.0.1:0"
-    return Daemon(
-        load_config(None, ports=[str(port)], stream=local, control=local), reconstructor=memory
-    )
+    config = load_config(None, ports=[str(port)], stream=local, control=local)
+    daemon = Daemon(config, reconstructor=memory)
+    try:
+        with pytest.raises(PortError) as caught:
+            daemon.start()
+    finally:
+        daemon.stop()
+    assert caught.value.next_step
+    return caught.value
 
 
 def test_garbage_is_counted_and_told_and_costs_nothing_else(bench: Start) -> None:
@@ -140,15 +147,13 @@ def test_scans_of_another_length_than_announced_are_not_used(bench: Start) -> No
     assert b.ask("status")["ports"][0]["unused_scans"] == 1
 
 
-def test_a_busy_port_is_named_with_its_holder(bench: Start, tmp_path: Path) -> None:
-    b = bench()
-    path = b.skin.lines[0].path
-    with pytest.raises(PortBusyError, match=f"pid {os.getpid()}") as caught:
-        daemon_on(path).start()
-    assert caught.value.next_step
+def test_a_port_that_this_process_holds_is_busy(bench: Start) -> None:
+    error = refusal(bench().skin.lines[0].path)
+    assert isinstance(error, PortBusyError)
+    assert f"pid {os.getpid()}" in error.cause
 
 
-def test_a_port_held_by_another_process_is_busy(bench: Start, tmp_path: Path) -> None:
+def test_a_port_held_by_another_process_is_busy() -> None:
     master, slave = os.openpty()
     name = os.ttyname(slave)
     os.close(slave)
@@ -165,20 +170,28 @@ def test_a_port_held_by_another_process_is_busy(bench: Start, tmp_path: Path) ->
     try:
         assert holder.stdout is not None
         holder.stdout.readline()
-        with pytest.raises(PortBusyError, match=f"pid {holder.pid}"):
-            daemon_on(Path(name)).start()
+        error = refusal(Path(name))
     finally:
         holder.communicate()
         os.close(master)
+    assert isinstance(error, PortBusyError)
+    assert f"pid {holder.pid}" in error.cause
 
 
-@pytest.mark.parametrize("kind", ["absent", "file", "folder", "url"])
-def test_what_is_no_port_is_refused_at_once(tmp_path: Path, kind: str) -> None:
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("absent", "does not exist"),
+        ("file", "is not a serial device"),
+        ("folder", "cannot open"),
+        ("url", "cannot open"),
+    ],
+)
+def test_what_is_no_port_is_refused_at_once(tmp_path: Path, kind: str, said: str) -> None:
     path = tmp_path / "port"
     if kind == "file":
         path.write_text("not a device")
     if kind == "folder":
         path.mkdir()
-    with pytest.raises(PortError) as caught:
-        daemon_on(path if kind != "url" else Path("nonsense:/1")).start()
-    assert caught.value.next_step
+    error = refusal("nonsense://1" if kind == "url" else path)
+    assert said in error.cause
