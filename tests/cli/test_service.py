@@ -14,9 +14,13 @@ from typing import IO, Any
 
 import pytest
 import serial
+from tactomo.cli import app
 from tactomo.cli.children import ChildError, Family
+from tactomo.twin import TwinConfig
 from tactomo_client import request
+from tactomo_models import load_description
 from tactomo_protocol import Command, CommandCode, Decoder, Scan, encode
+from typer.main import get_command
 
 Run = Callable[..., Any]
 PATIENCE_S = 90.0
@@ -109,6 +113,25 @@ def test_a_twin_of_the_papers_sensor(start: Run, tmp_path: Path) -> None:
     twin.send_signal(signal.SIGTERM)
     assert twin.wait(PATIENCE_S) == 0
     assert not os.path.lexists(tmp_path / "dev" / "skin")
+
+
+def test_a_twin_whose_control_address_is_taken_says_what_to_do(tactomo: Run, control: Any) -> None:
+    result = tactomo("twin", "--link", "dev", "--control", control.address)
+    assert result.returncode == 1
+    assert "is in use; stop the twin or demo that runs already" in result.stderr
+
+
+def test_the_twins_defaults_are_those_of_its_configuration() -> None:
+    options = {option.name: option.default for option in twin_command().params}
+    usual = TwinConfig(load_description("paper_square"))
+    assert options["rate"] == usual.rate_hz
+    assert (options["drift"], options["creep"]) == (usual.drift.walk, usual.drift.creep)
+    assert (options["unevenness"], options["seed"]) == (usual.unevenness, usual.seed)
+    assert options["control"] == usual.control
+
+
+def twin_command() -> Any:
+    return get_command(app).commands["twin"]  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(

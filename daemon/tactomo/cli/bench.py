@@ -41,7 +41,6 @@ METHODS = (
     *(("tikhonov", contacts) for contacts in (1, 4)),
     *(("levelset", contacts) for contacts in (1, 4)),
 )
-NOISE_SHARE = 2e-5
 # Places in shares of half the sheet's size, all of them within a disc, too.
 PLACES = ((0.0, 0.1), (-0.45, -0.4), (0.5, -0.35), (0.1, 0.55))
 
@@ -77,6 +76,7 @@ class Results:
 
     machine: str
     description: str
+    source: str
     live: list[Phase] = field(default_factory=list)
     late_scans: int | None = None
     dropped_scans: int | None = None
@@ -114,7 +114,7 @@ def bench(
     from rich.console import Console
 
     progress = Console(stderr=True)
-    results = Results(_machine(), description)
+    results = Results(_machine(), description, "a twin" if replay is None else replay.name)
     with progress.status("starting") as shown:
         if live and replay is not None:
             _measure_replay(results, replay, shown.update)
@@ -253,17 +253,18 @@ def _measure_methods(name: str, tell: Callable[[str], None]) -> Iterator[MethodT
     from tactomo_models import (
         Reconstructor,
         Reference,
-        SkinSimulator,
         Tier,
         load_description,
         load_or_build_artifact,
     )
     from threadpoolctl import threadpool_limits
 
+    from tactomo.twin import make_skin
+
     tell("methods: building the models")
     description = load_description(name)
     artifact = load_or_build_artifact(description)
-    skin = SkinSimulator(description)
+    skin = make_skin(description)
     noise = np.random.default_rng(0)
     with threadpool_limits(1):
         reconstructor = Reconstructor(description, artifact)
@@ -303,7 +304,9 @@ def _time_method(
 def _noisy(
     volts: dict[Any, NDArray[np.float64]], noise: np.random.Generator, count: int
 ) -> dict[str, NDArray[np.float64]]:
-    """Return `count` noisy copies of each channel's voltages, (count, M)."""
+    """Return `count` copies of each channel's voltages, (count, M), with the twin's noise."""
+    from tactomo.twin.device import NOISE_SHARE
+
     scans = {}
     for name, clean in volts.items():
         size = NOISE_SHARE * abs(clean).max()
@@ -331,7 +334,7 @@ def _print(results: Results) -> None:
     console = Console()
     console.print(f"[bold]{results.machine}[/], sensor {results.description}")
     if results.live:
-        console.print(_live_table(results.live))
+        console.print(_live_table(results))
         console.print(_stage_table(results.live))
         if results.late_scans is not None:
             console.print(
@@ -348,13 +351,16 @@ def _print(results: Results) -> None:
         console.print(table)
 
 
-def _live_table(phases: list[Phase]) -> Table:
+def _live_table(results: Results) -> Table:
     from rich.table import Table
 
-    table = Table(title="live, simulated sensor: last byte read to contacts in another process")
+    table = Table(
+        title=f"live, of {results.source}: last byte read to contacts in another process",
+        min_width=80,
+    )
     for name in ("scene", "frames/s", "p50 ms", "p99 ms", "frames by tier"):
         table.add_column(name, justify="left" if name in ("scene", "frames by tier") else "right")
-    for phase in phases:
+    for phase in results.live:
         table.add_row(
             phase.scene,
             f"{phase.frames_per_s:.1f}",
@@ -369,7 +375,7 @@ def _stage_table(phases: list[Phase]) -> Table:
     """Return the daemon's own account of its newest 256 frames at the end of each scene."""
     from rich.table import Table
 
-    table = Table(title="stages of the daemon, p50 / p99 ms")
+    table = Table(title="stages of the daemon, p50 / p99 ms", min_width=80)
     table.add_column("stage")
     for phase in phases:
         table.add_column(phase.scene, justify="right")

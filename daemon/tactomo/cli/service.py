@@ -174,28 +174,26 @@ def twin(
     ports as it would open /dev/ttyACM0. `tactomo poke` presses and disturbs it while it runs:
     press, release, mute a channel, send garbage, unplug and replug.
     """
-    from tactomo_models import SkinSimulator, load_description
+    from tactomo_models import load_description
 
     from tactomo.cli.children import announce as tell
     from tactomo.cli.children import interrupt_on_sigterm
     from tactomo.twin import Drift, Twin, TwinConfig, load_scene
 
     interrupt_on_sigterm()
-    sensor = load_description(description)
     config = TwinConfig(
-        sensor,
+        load_description(description),
         ports=ports,
         rate_hz=rate,
         noise_v=None if noise_uv is None else noise_uv * 1e-6,
         drift=Drift(walk=drift, creep=creep),
+        unevenness=unevenness,
         seed=seed,
         scene=None if scene is None else load_scene(scene),
         control=control,
         link_folder=link,
     )
-    # Contact impedances of pressed-on electrodes differ; the daemon's model must live with that.
-    skin = SkinSimulator(sensor, unevenness=unevenness, impedance_spread=0.1, seed=seed)
-    running = Twin(config, skin)
+    running = Twin(config)
     running.start()
     try:
         for path in running.ports:

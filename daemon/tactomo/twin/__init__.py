@@ -16,7 +16,7 @@ control socket) and `device`, which puts them together.
 """
 
 from tactomo.twin.converter import Drift
-from tactomo.twin.device import SkinModel, Twin, TwinConfig
+from tactomo.twin.device import SkinModel, Twin, TwinConfig, make_skin
 from tactomo.twin.scene import Indenter, Scene, ScriptedPress, Waypoint, load_scene
 
 __all__ = [
@@ -29,4 +29,5 @@ __all__ = [
     "TwinConfig",
     "Waypoint",
     "load_scene",
+    "make_skin",
 ]

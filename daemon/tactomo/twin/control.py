@@ -22,11 +22,16 @@ from tactomo_client.messages import (
 )
 
 from tactomo.endpoint import bind
-from tactomo.errors import CommandError
+from tactomo.errors import AddressError, CommandError
 from tactomo.twin.scene import Indenter, Scene, complaints
 
 Handler = Callable[[Any], Mapping[str, Any]]
 PressId = Annotated[str, Field(min_length=1, max_length=64)]
+
+ANOTHER_ADDRESS = (
+    "stop the twin or demo that runs already, or give another address: "
+    "`tactomo twin --control`, `tactomo demo --twin-control`"
+)
 
 
 class Arguments(BaseModel):
@@ -123,7 +128,10 @@ class ControlSocket:
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REP)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
-        self.address = bind(self._socket, address, "control")
+        try:
+            self.address = bind(self._socket, address, "control")
+        except AddressError as error:
+            raise AddressError(error.cause, ANOTHER_ADDRESS, error.name) from error
 
     @property
     def socket(self) -> zmq.Socket[bytes]:

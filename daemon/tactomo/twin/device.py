@@ -30,7 +30,7 @@ from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
 
 from tactomo.config import Endpoint
-from tactomo.errors import CommandError, ConfigError, TactomoError
+from tactomo.errors import CommandError, ConfigError
 from tactomo.twin.control import (
     ControlSocket,
     DriftArguments,
@@ -64,6 +64,10 @@ HEADROOM = 8.0
 # Noise of the converter where none is given, as a share of the largest unloaded voltage: 60 dB
 # below the root mean square of all of them on the paper's sensor, as a good EIT device has it.
 NOISE_SHARE = 2.5e-4
+# Of a sheet as one buys it: standard deviation of its conductivity, a ratio.
+UNEVENNESS = 0.03
+# Contact impedances of pressed-on electrodes differ; the daemon's model must live with that.
+IMPEDANCE_SPREAD = 0.1
 
 
 class SkinModel(Protocol):
@@ -71,6 +75,15 @@ class SkinModel(Protocol):
 
     def voltages(self, presses: Sequence[Press]) -> Voltages:
         """Return the noise-free volts, (M,), of each channel of the sensor under these presses."""
+
+
+def make_skin(
+    description: SensorDescription, unevenness: float = UNEVENNESS, seed: int = 0
+) -> SkinSimulator:
+    """Return the forward model of a skin as real ones are: not quite even, electrodes neither."""
+    return SkinSimulator(
+        description, unevenness=unevenness, impedance_spread=IMPEDANCE_SPREAD, seed=seed
+    )
 
 
 @dataclass(frozen=True)
@@ -83,7 +96,8 @@ class TwinConfig:
         rate_hz: scans a second, at first; the host may change it.
         noise_v: noise in volts rms; None for a usual converter's.
         drift: how the gains drift.
-        seed: equal seeds give equal noise and drift.
+        unevenness: standard deviation of the sheet's conductivity, a ratio.
+        seed: equal seeds give equal noise, drift and unevenness.
         scene: a scripted scene; it starts with the first scan that a host can receive.
         control: address of the control socket; port 0 takes a free one.
         link_folder: where to keep links with stable names to the lines.
@@ -95,6 +109,7 @@ class TwinConfig:
     rate_hz: float = 20.0
     noise_v: float | None = None
     drift: Drift = field(default_factory=Drift)
+    unevenness: float = UNEVENNESS
     seed: int = 0
     scene: Scene | None = None
     control: str = DEFAULT_TWIN_CONTROL
@@ -127,7 +142,8 @@ class Twin:
 
     Args:
         config: its set-up.
-        skin: the forward model; by default the description's own, on its fine mesh.
+        skin: the forward model; by default the description's own, on a fine mesh, which takes
+            seconds to make.
 
     Raises:
         AddressError: the control socket cannot be bound.
@@ -137,15 +153,18 @@ class Twin:
 
     def __init__(self, config: TwinConfig, skin: SkinModel | None = None) -> None:
         self.config = config
-        self._skin: SkinModel = skin or SkinSimulator(config.description)
         self._surface = Surface(config.scene)
+        with contextlib.ExitStack() as undo:
+            # What may be taken comes first: nobody likes to wait for a mesh to be told that.
+            self._control = ControlSocket(config.control, self._handlers())
+            undo.callback(self._control.close)
+            ports = []
+            for line, channels in _wiring(config).items():
+                ports.append(Port(SerialLine(line, config.link_folder), channels))
+                undo.callback(ports[-1].line.close)
+            self._skin = skin or make_skin(config.description, config.unevenness, config.seed)
+            undo.pop_all()
         self._converter = self._make_converter()
-        self._control = ControlSocket(config.control, self._handlers())
-        try:
-            ports = _make_ports(config)
-        except TactomoError:
-            self._control.close()
-            raise
         self._powered_s = time.monotonic()
         self._firmware = Firmware(
             identity=_identity(config.description),
@@ -360,10 +379,10 @@ def _identity(description: SensorDescription) -> Identity:
     )
 
 
-def _make_ports(config: TwinConfig) -> list[Port]:
+def _wiring(config: TwinConfig) -> dict[str, tuple[Channel, ...]]:
+    """Return the channels that each line carries, by the line's name."""
     channels = tuple(Channel[name.upper()] for name in config.description.modalities)
-    wiring = {"skin": channels} if config.ports == 1 else {c.name.lower(): (c,) for c in channels}
-    return [Port(SerialLine(name, config.link_folder), carried) for name, carried in wiring.items()]
+    return {"skin": channels} if config.ports == 1 else {c.name.lower(): (c,) for c in channels}
 
 
 def _describe_port(port: Port) -> dict[str, Any]:
