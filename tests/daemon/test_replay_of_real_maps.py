@@ -20,7 +20,7 @@ def test_the_replay_of_a_pressed_skin_gives_the_same_maps(
     bench: Start, replay: Start, tmp_path: Path
 ) -> None:
     path = tmp_path / "pressed.mcap"
-    skin = SkinSimulator(load_description("paper_square"))
+    skin = SkinSimulator(load_description("paper_square"), spacing_m=0.008)  # coarse, but quick
     b = bench(ports=2, real=True)
 
     def press(*presses: Press, channels: tuple[Channel, ...] = tuple(Channel)) -> Any:
