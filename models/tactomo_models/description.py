@@ -24,11 +24,12 @@ from tactomo_models.pattern import Pairs, scan_pairs
 Modality = Literal["magnitude", "structure"]
 FloatArray = NDArray[np.float64]
 Metres = Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)]
-Table = Annotated[tuple[float, ...], Field(min_length=2, max_length=64)]
+# TOML has lists where a frozen model has tuples; what is in them is as strict as the rest.
+Table = Annotated[tuple[float, ...], Field(min_length=2, max_length=64, strict=False)]
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
 class Sheet(_Section):
@@ -46,9 +47,15 @@ class Sheet(_Section):
         if self.shape == "rectangle" and self.height_m is None:
             raise ValueError("height_m is required for a rectangle")
         if self.shape == "disc" and self.height_m not in (None, self.width_m):
-            raise ValueError("height_m must be left out for a disc: width_m is its diameter")
-        if self.frame_width_m >= min(self.width_m, self.height_m or self.width_m) / 4:
-            raise ValueError("frame_width_m must be below a quarter of the sheet's smaller side")
+            raise ValueError(
+                f"height_m = {self.height_m}: must be left out for a disc, width_m is its diameter"
+            )
+        limit = min(self.width_m, self.height_m or self.width_m) / 4
+        if self.frame_width_m >= limit:
+            raise ValueError(
+                f"frame_width_m = {self.frame_width_m}: must be below a quarter of the sheet's "
+                f"smaller side, {limit:.4g}"
+            )
         return self
 
 
@@ -81,7 +88,10 @@ class MagnitudeResponse(_Section):
     def _is_a_monotone_table(self) -> Self:
         _check_table(self.pressure_kpa, self.relative_change, "relative_change", start=0.0)
         if min(self.relative_change) <= -1:
-            raise ValueError("relative_change must stay above -1: conductivity is positive")
+            raise ValueError(
+                f"relative_change = {list(self.relative_change)}: must stay above -1, "
+                "conductivity is positive"
+            )
         return self
 
     @property
@@ -115,7 +125,9 @@ class StructureResponse(_Section):
     def _is_a_monotone_table(self) -> Self:
         _check_table(self.pressure_kpa, self.conductivity_ratio, "conductivity_ratio", start=1.0)
         if min(self.conductivity_ratio) <= 0:
-            raise ValueError("conductivity_ratio must be positive")
+            raise ValueError(
+                f"conductivity_ratio = {list(self.conductivity_ratio)}: must stay above 0"
+            )
         return self
 
     def ratio(self, pressure_kpa: FloatArray) -> FloatArray:
@@ -126,12 +138,12 @@ class StructureResponse(_Section):
 
 def _check_table(x: Table, y: Table, name: str, start: float) -> None:
     if len(x) != len(y):
-        raise ValueError(f"{name} must have as many entries as pressure_kpa ({len(x)})")
+        raise ValueError(f"{name} = {list(y)}: must have as many entries as pressure_kpa, {len(x)}")
     if x[0] != 0 or any(b <= a for a, b in pairwise(x)):
-        raise ValueError("pressure_kpa must start at 0 and rise")
+        raise ValueError(f"pressure_kpa = {list(x)}: must start at 0 and rise")
     steps = np.diff(y)
     if y[0] != start or not (np.all(steps >= 0) or np.all(steps <= 0)) or y[-1] == y[0]:
-        raise ValueError(f"{name} must start at {start:g} and only rise or only fall")
+        raise ValueError(f"{name} = {list(y)}: must start at {start:g} and only rise or only fall")
 
 
 class MagnitudeChannel(_Section):
@@ -149,9 +161,9 @@ class StructureChannel(_Section):
     @model_validator(mode="after")
     def _one_of_the_two(self) -> Self:
         if (self.response is None) == (self.conductivity_ratio is None):
-            raise ValueError("give either structure.response or structure.conductivity_ratio")
+            raise ValueError("response or conductivity_ratio: give one of the two")
         if self.saturated_ratio == 1:
-            raise ValueError("conductivity_ratio must differ from 1")
+            raise ValueError("conductivity_ratio = 1: must differ from 1")
         return self
 
     @property
@@ -370,10 +382,10 @@ def _read(path: Path) -> str:
 def _explain(source: str, item: Any) -> str:
     """Turn one pydantic complaint into "file: key = value: what is allowed"."""
     key = ".".join(str(part) for part in item["loc"])
+    if item["type"] == "value_error":  # from a section's own check: its text opens with the key
+        return f"{source}: {key}{'.' if key else ''}{item['msg'].removeprefix('Value error, ')}"
     if item["type"] == "extra_forbidden":
         return f"{source}: unknown key {key}; remove it or correct its spelling"
     if item["type"] == "missing":
         return f"{source}: {key} is missing"
-    message = item["msg"].removeprefix("Value error, ")
-    value = "" if isinstance(item["input"], dict) else f" = {item['input']!r}"
-    return f"{source}: {key}{value}: {message}" if key else f"{source}: {message}"
+    return f"{source}: {key} = {item['input']!r}: {item['msg']}"
