@@ -515,6 +515,9 @@ def test_stale_data_are_told_and_come_back(page: Page) -> None:
     wait_for(lambda: page["no-contacts"].text == "Not known.")  # and not "Nothing pressed."
     page.skin.status |= {"ports": [{"url": "/dev/ttySKIN", "connected": False}]}
     wait_for(lambda: page.banner.endswith("Not connected: /dev/ttySKIN."))
+    refusing = {"url": "/dev/ttySKIN", "connected": True, "refusal": "it has 8 electrodes"}
+    page.skin.status |= {"ports": [refusing]}
+    wait_for(lambda: "does not fit the sensor's description: it has 8 electrodes" in page.banner)
     page.skin.sends_frames = True
     wait_for(lambda: page.health == "good")
     assert not page["banner"].is_displayed()
@@ -576,6 +579,7 @@ def test_a_missing_reference_is_told(page: Page) -> None:
     page.skin.frame = {"flags": ["no_reference"]}
     wait_for(lambda: page.health == "no-reference")
     assert "press Tare" in page.banner
+    assert page["no-contacts"].text == "Not known."
 
 
 def test_a_daemon_that_never_came_is_waited_for(page: Page) -> None:

@@ -8,9 +8,10 @@ const FLAGS = {
   magnitude_missing: ["Magnitude channel missing", "No scans of the magnitude channel: where it is touched is known, how hard is not."],
   structure_missing: ["Structure channel missing", "No scans of the structure channel: shapes come from the magnitude channel alone."],
   no_reference: ["No reference", "Not tared yet: press Tare while nothing touches the skin."],
+  reference_mismatch: ["Reference doubtful", "The reference does not look like this sensor unloaded: tare while nothing touches it. Is it the right sensor, its electrodes in order?"],
   misfit_high: ["Misfit high", "The model does not explain the data. Has the reference aged? Tare. Is a wire loose?"],
   not_converged: ["Not converged", "The reconstruction ran out of its time; this map is the best so far."],
-  invalid_voltage: ["Invalid voltage", "Some voltages were saturated or not numbers, and were left out."],
+  invalid_voltage: ["Invalid voltage", "Some voltages were not numbers and were left out, or the converter was saturated."],
 };
 
 /** A flag's name and meaning for people. */
@@ -72,6 +73,8 @@ function staleAfter({ ports }) {
 }
 
 function portsInWords(ports) {
+  const refused = (ports ?? []).find((port) => port.refusal);
+  if (refused) return `${refused.url}: the device does not fit the sensor's description: ${refused.refusal}.`;
   const closed = (ports ?? []).filter((port) => !port.connected).map((port) => port.url);
   if (closed.length) return `Not connected: ${closed.join(", ")}.`;
   return ports?.length ? "The port is open, but no scans come." : "";

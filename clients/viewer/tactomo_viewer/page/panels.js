@@ -112,12 +112,7 @@ function showChannels({ ports, rates, dropped_scans: dropped, incomplete_scans: 
     lines.push([hz > 0 ? "good" : "bad", name, hz > 0 ? `${fixed(hz, 1)} scans/s` : "no scans"]);
   }
   for (const port of ports ?? []) {
-    const device = port.device ? `${port.device.device_id}, ` : "";
-    const corrupt = port.corrupt ? `, ${port.corrupt} corrupt` : "";
-    lines.push([
-      port.connected ? (port.corrupt ? "warn" : "good") : "bad", port.url,
-      port.connected ? `${device}${bytes(port.bytes)}${corrupt}` : "not connected",
-    ]);
+    lines.push(portLine(port));
   }
   if (incomplete) lines.push(["warn", "incomplete dual scans", String(incomplete)]);
   if (dropped) lines.push(["warn", "dropped dual scans", String(dropped)]);
@@ -135,6 +130,13 @@ function showChannels({ ports, rates, dropped_scans: dropped, incomplete_scans: 
     setText(label, name);
     setText(value, text);
   });
+}
+
+function portLine({ url, connected, refusal, device, bytes: received, corrupt }) {
+  if (!connected) return ["bad", url, "not connected"];
+  if (refusal) return ["bad", url, refusal];
+  const parts = [device?.device_id, bytes(received), corrupt ? `${corrupt} corrupt` : ""];
+  return [corrupt ? "warn" : "good", url, parts.filter(Boolean).join(", ")];
 }
 
 export function showEvent(event) {

@@ -112,7 +112,7 @@ function draw() {
     scale: image ? scaleTop(image, unit) : 1,
     unit: unit === "kpa" ? "kPa" : "Δσ/σ₀ %",
     label: (contact) => valueText(contact, unit) || "touched",
-    notice: frame && !image ? noticeFor(frame, unit) : "",
+    notice: noticeFor(frame, image, unit),
     colormap: byId("colormap").value,
     smooth: byId("smooth").checked,
     outline: byId("outline").checked,
@@ -143,7 +143,9 @@ function imageIn(frame, unit) {
   return map ? { ...map, values: map.values.map((value) => 100 * value) } : null;
 }
 
-function noticeFor(frame, unit) {
+function noticeFor(frame, image, unit) {
+  const isInviting = touch.enabled && touch.count === 0 && !frame?.contacts.length;
+  if (!frame || image) return isInviting ? "Press here" : "";
   if (frame.images.map && unit === "kpa") return "No pressure in this frame: choose Δσ/σ₀";
   return frame.images.structure ? "Magnitude missing: only where, not how hard" : "No map in this frame";
 }
@@ -258,12 +260,14 @@ function showNumbers(now, trusted) {
   byId("age").classList.toggle("bad", !trusted);
   if (!frame) return;
   const unit = chosen("unit");
-  showContacts(trusted ? frame.contacts : [], unit, (contact) => valueText(contact, unit).replace(/ (kPa|%)$/, "") || "–");
-  setText(byId("no-contacts"), trusted ? "Nothing pressed." : "Not known.");
+  const known = trusted && !frame.flags.includes("no_reference");
+  const contacts = known ? [...frame.contacts].sort((a, b) => a.id - b.id) : [];
+  showContacts(contacts, unit, (contact) => valueText(contact, unit).replace(/ (kPa|%)$/, "") || "–");
+  setText(byId("no-contacts"), known ? "Nothing pressed." : "Not known.");
   showQuality(frame, trusted);
-  byId("map").ariaLabel = trusted
+  byId("map").ariaLabel = known
     ? `Pressure map, ${frame.contacts.length || "no"} contact${frame.contacts.length === 1 ? "" : "s"}`
-    : "Pressure map, out of date";
+    : "Pressure map, not known";
 }
 
 // Controls
