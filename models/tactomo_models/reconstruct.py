@@ -52,8 +52,10 @@ DEFAULT_BUDGET_S = 0.05
 CHANGE_ERROR = 0.02  # least model error as a share of each voltage change: mesh, outline
 MOST_MISMATCH = 0.5  # of the reference with the model, beyond which it is not this sensor's
 FALSE_ALARM = 1e-6  # chance that an unpressed frame of pure noise is taken for a pressed one
+UNUSABLE = 1e3  # relative error of a voltage whose reference is zero or no number
 MOST_INVALID = 0.25  # share of voltages that may be invalid before the channel is given up
 BAD_MISFIT = 2.0  # the data are not explained: what is shown may be wrong
+WRONG_WAY = 5.0  # standard uncertainties by which a conductivity may change against its sign
 
 
 class Tier(StrEnum):
@@ -135,6 +137,11 @@ class _Data:
     weight: FloatArray
     quiet: bool
 
+    @property
+    def misfit(self) -> float:
+        """Misfit of a model in which nothing is pressed."""
+        return float(np.sqrt(np.mean((self.weight * self.change) ** 2)))
+
 
 class Reconstructor:
     """Turns dual scans into maps and contacts; keeps the warm start between them.
@@ -198,11 +205,13 @@ class Reconstructor:
             )
         if noise is None:
             noise = noise_of_reciprocity(self.description, volts)
-        size = np.maximum(np.abs(volts), 1e-30)
         if noise is None:
             relative = nominal_noise(self._forward.bare_voltages)
         else:
-            relative = np.hypot(noise / size * np.sqrt(1 + 1 / scans), MODEL_ERROR)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                relative = np.hypot(noise / np.abs(volts) * np.sqrt(1 + 1 / scans), MODEL_ERROR)
+        usable = np.isfinite(volts) & np.isfinite(relative)
+        relative = np.where(usable, relative, UNUSABLE)
         jacobian = self._artifact.jacobian
         target = central_target(self.description, self._artifact.bare)
         weight = noise_figure_weight(jacobian, relative, target)
@@ -298,7 +307,6 @@ class Reconstructor:
     def _quiet(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
         blank = np.zeros((self.description.map.nodes_y, self.description.map.nodes_x), np.float32)
         magnitude = blank if "magnitude" in data else None
-        worst = max(np.sqrt(np.mean((d.weight * d.change) ** 2)) for d in data.values())
         return Reconstruction(
             map=magnitude,
             pressure_kpa=magnitude,
@@ -306,7 +314,7 @@ class Reconstructor:
             contacts=(),
             tier=Tier.QUIET,
             reason="no change above the noise",
-            misfit=float(worst),
+            misfit=max(d.misfit for d in data.values()),
             flags=flags,
         )
 
@@ -323,7 +331,8 @@ class Reconstructor:
             areas = self._areas.find(self._on_map(pressed), np.clip(pressed, 0, 1))
             fitted = self._fit_magnitudes(areas, data, 1)
             contacts = self._contacts(areas, fitted)
-        misfit = fitted.misfit if fitted else float("nan")
+        if self._magnitude_unexplained(data, fitted):
+            flags |= Flag.MISFIT_HIGH
         linear = images.get("magnitude")
         return Reconstruction(
             map=None if linear is None else self._on_map(linear).astype(np.float32),
@@ -332,8 +341,8 @@ class Reconstructor:
             contacts=contacts,
             tier=Tier.TIKHONOV,
             reason=reason,
-            misfit=misfit,
-            flags=flags | (Flag.MISFIT_HIGH if misfit > BAD_MISFIT else Flag(0)),
+            misfit=fitted.misfit if fitted else float("nan"),
+            flags=flags,
         )
 
     def _linear_image(self, name: Modality, change: FloatArray) -> FloatArray:
@@ -365,7 +374,7 @@ class Reconstructor:
             areas = self._areas_of(shape, pressed)
             fitted = self._fit_magnitudes(areas, data, 3 if shape.converged else 1)
             contacts = self._contacts(areas, fitted)
-        if shape.misfit > BAD_MISFIT or (fitted and fitted.misfit > BAD_MISFIT):
+        if shape.misfit > BAD_MISFIT or self._magnitude_unexplained(data, fitted):
             flags |= Flag.MISFIT_HIGH
         if not shape.converged:
             flags |= Flag.NOT_CONVERGED
@@ -383,6 +392,21 @@ class Reconstructor:
             misfit=shape.misfit,
             flags=flags,
         )
+
+    def _magnitude_unexplained(
+        self, data: dict[Modality, _Data], fitted: Magnitudes | None
+    ) -> bool:
+        """Tell whether the contacts shown leave the magnitude channel's changes unexplained.
+
+        They do where there is a change and no area for it, and where an area's conductivity goes
+        the way that no pressure takes it: what is shown for that is a magnitude of 0.
+        """
+        if "magnitude" not in data:
+            return False
+        if fitted is None:
+            return data["magnitude"].misfit > BAD_MISFIT
+        wrong_way = self._sign("magnitude") * fitted.change < -WRONG_WAY * fitted.sigma
+        return fitted.misfit > BAD_MISFIT or bool(wrong_way.any())
 
     def _areas_of(self, shape: Shape, pressed: FloatArray) -> Areas:
         """Areas of a shape; those of the frame before while the shape has not moved."""
@@ -436,8 +460,9 @@ class Reconstructor:
 def _mismatch(reference: FloatArray, predicted: FloatArray) -> float:
     """Typical relative error of a model that may be off by a common factor; 1 where none fits."""
     ratio = reference / predicted
-    middle = float(np.median(ratio))
-    if not np.isfinite(middle) or middle == 0:
+    ratio = ratio[np.isfinite(ratio)]
+    middle = float(np.median(ratio)) if len(ratio) else 0.0
+    if middle == 0:
         return 1.0
     # 0.6745 standard deviations hold half of a normal distribution.
     return float(np.median(np.abs(ratio / middle - 1))) / 0.6745

@@ -12,6 +12,8 @@ from tactomo_models.errors import DataError
 
 FloatArray = NDArray[np.float64]
 
+TRUSTED_SCANS = 20  # a variance from as many is known to a third
+
 
 @dataclass(frozen=True)
 class Reference:
@@ -56,12 +58,13 @@ def noise_of_scans(scans: FloatArray) -> FloatArray | None:
     """Standard deviation (M,) of one scan, from n scans (n, M) at rest; None from a single one.
 
     A converter's noise is much the same on every measurement while a few scans know each one
-    poorly, so half of the variance is the measurement's own and half the mean of all.
+    poorly, so the mean of all counts as much as `TRUSTED_SCANS` scans of the measurement's own.
     """
     if len(scans) < 2:
         return None
     own = scans.var(axis=0, ddof=1)
-    return np.asarray(np.sqrt((own + own.mean()) / 2))
+    share = len(scans) / (len(scans) + TRUSTED_SCANS)
+    return np.asarray(np.sqrt(share * own + (1 - share) * own.mean()))
 
 
 def noise_of_reciprocity(description: SensorDescription, scan: FloatArray) -> FloatArray | None:
@@ -84,5 +87,9 @@ def noise_of_reciprocity(description: SensorDescription, scan: FloatArray) -> Fl
     if not twins:
         return None
     i, j = np.array(twins).T
-    spread = np.median(np.abs(scan[i] - scan[j])) / 0.6745 / np.sqrt(2)
+    differences = np.abs(scan[i] - scan[j])
+    differences = differences[np.isfinite(differences)]
+    if len(differences) == 0:
+        return None
+    spread = np.median(differences) / 0.6745 / np.sqrt(2)
     return np.full(description.measurements, float(spread))
