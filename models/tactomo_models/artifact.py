@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import zipfile
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -131,7 +132,8 @@ def save_artifact(artifact: Artifact, path: Path) -> None:
             np.savez(file, **arrays)
         part.replace(path)
     except OSError as error:
-        part.unlink(missing_ok=True)
+        with suppress(OSError):
+            part.unlink()
         raise ArtifactError(
             f"cannot write {path}: {error.strerror}; free some space or name another path"
         ) from error
@@ -148,7 +150,8 @@ def load_artifact(path: Path, description: SensorDescription) -> Artifact:
     """
     rebuild = f"run: tactomo models build --sensor {description.name}"
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        # numpy leaves a file open that turns out to be no archive
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         version, sha256 = int(arrays["format"]), str(arrays["sha256"])
         if version != FORMAT:

@@ -87,7 +87,7 @@ def read_scans(
         DataError: the file cannot be read or does not fit the sensor.
     """
     try:
-        with np.load(source, allow_pickle=False) as stored:
+        with source.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays: dict[str, Any] = {name: stored[name] for name in stored.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise DataError(f"cannot read {source}: {error}; give an .npz file of scans") from error

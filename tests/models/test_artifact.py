@@ -1,0 +1,113 @@
+"""Built artifacts: kept and read back whole, and refused where they do not belong."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tactomo_models import (
+    Artifact,
+    ArtifactError,
+    SensorDescription,
+    build_artifact,
+    default_path,
+    load_artifact,
+    load_or_build_artifact,
+    save_artifact,
+)
+from tactomo_models.artifact import central_target, nominal_noise
+from tactomo_models.forward import ForwardModel
+from tactomo_models.tikhonov import tikhonov_matrix
+
+
+@pytest.fixture(scope="module")
+def built(small: SensorDescription) -> Artifact:
+    return build_artifact(small)
+
+
+def test_an_artifact_comes_back_as_it_was(
+    built: Artifact, small: SensorDescription, tmp_path: Path
+) -> None:
+    file = tmp_path / "new folder" / "small.npz"
+    save_artifact(built, file)
+    read = load_artifact(file, small)
+    assert read.regularisation == built.regularisation
+    for name in ("jacobian", "tikhonov"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(built, name))
+    np.testing.assert_array_equal(read.bare.green, built.bare.green)
+    assert (read.bare.map_weights != built.bare.map_weights).nnz == 0
+    assert [entry.name for entry in file.parent.iterdir()] == ["small.npz"]
+
+
+def test_an_artifact_of_another_sensor_is_refused(
+    built: Artifact, paper: SensorDescription, tmp_path: Path
+) -> None:
+    file = tmp_path / "small.npz"
+    save_artifact(built, file)
+    with pytest.raises(ArtifactError, match=r"built for.*'small'.*'paper_square'.*models build"):
+        load_artifact(file, paper)
+    with pytest.raises(ArtifactError):
+        load_or_build_artifact(paper, file)
+
+
+@pytest.mark.parametrize("damage", ["cut", "empty", "text", "pickle", "other arrays", "future"])
+def test_a_damaged_or_foreign_file_is_refused(
+    built: Artifact, small: SensorDescription, tmp_path: Path, damage: str
+) -> None:
+    file = tmp_path / "artifact.npz"
+    save_artifact(built, file)
+    whole = file.read_bytes()
+    if damage == "other arrays":
+        np.savez(file, a=np.zeros(3))
+    elif damage == "future":
+        with np.load(file) as stored:
+            np.savez(file, **{**dict(stored), "format": np.array(99)})
+    else:
+        content = {"cut": whole[: len(whole) // 2], "empty": b"", "text": b"not an artifact"}
+        file.write_bytes(content.get(damage, pickle.dumps({"sha256": small.sha256})))
+    with pytest.raises(ArtifactError, match="tactomo models build"):
+        load_artifact(file, small)
+
+
+def test_a_missing_one_is_built_and_kept(small: SensorDescription) -> None:
+    steps: list[str] = []
+    load_or_build_artifact(small, progress=steps.append)
+    assert steps
+    assert default_path(small).exists()
+    steps.clear()
+    load_or_build_artifact(small, progress=steps.append)
+    assert not steps
+
+
+def test_a_cache_that_cannot_be_written_does_not_stop_anybody(
+    small: SensorDescription, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("a file where a folder should be")
+    monkeypatch.setenv("CACHE_DIRECTORY", str(blocked))
+    assert load_or_build_artifact(small).sensor == "small"
+    with pytest.raises(ArtifactError, match="cannot write"):
+        load_or_build_artifact(small, blocked / "asked_for.npz")
+
+
+def test_tikhonov_is_equation_4_on_whitened_data(built: Artifact, small: SensorDescription) -> None:
+    J, weight = built.jacobian, built.regularisation
+    noise = nominal_noise(ForwardModel(small, built.bare).bare_voltages)
+    whitened = J / noise[:, None]
+    by_nodes = np.linalg.solve(
+        whitened.T @ whitened + weight * np.eye(J.shape[1]), whitened.T / noise
+    )
+    np.testing.assert_allclose(
+        built.tikhonov, by_nodes, rtol=1e-5, atol=1e-9 * np.abs(by_nodes).max()
+    )
+    np.testing.assert_array_equal(built.tikhonov, tikhonov_matrix(J, noise, weight))
+
+
+def test_the_noise_figure_is_1(artifact: Artifact, paper: SensorDescription) -> None:
+    noise = nominal_noise(ForwardModel(paper, artifact.bare).bare_voltages)
+    signal = (artifact.jacobian / noise[:, None]) @ central_target(paper, artifact.bare)
+    matrix = artifact.tikhonov * noise  # takes whitened data
+    image_snr = np.mean(np.abs(matrix @ signal)) / np.sqrt(np.mean((matrix**2).sum(axis=1)))
+    assert np.mean(np.abs(signal)) / image_snr == pytest.approx(1, rel=0.01)

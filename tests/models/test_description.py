@@ -1,0 +1,110 @@
+"""Sensor descriptions: the shipped ones, the order of a scan, and errors that say what to do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tactomo_models import DescriptionError, SensorDescription, load_description
+from tactomo_models.description import MagnitudeResponse, shipped_descriptions
+from tactomo_models.pattern import scan_pairs
+
+
+@pytest.mark.parametrize("name", shipped_descriptions())
+def test_shipped_descriptions_load(name: str) -> None:
+    assert load_description(name).name == name
+
+
+def test_the_paper_sensor_is_the_one_of_the_paper(paper: SensorDescription) -> None:
+    assert paper.measurements == 208
+    assert paper.electrode_count == 16
+    assert (len(paper.map_x_m), len(paper.map_y_m)) == (51, 51)
+    centres_mm = (paper.electrode_centres_m * 1e3).round(6).tolist()
+    # Electrode 0 is the left one of the bottom side; counter-clockwise from there.
+    assert centres_mm[0] == [-54, -75]
+    assert centres_mm[3:5] == [[54, -75], [75, -54]]
+    assert centres_mm[8] == [54, 75]
+    assert centres_mm[15] == [-75, -54]
+
+
+def test_a_scan_is_drive_major_without_touching_pairs() -> None:
+    pairs = scan_pairs(16)
+    assert pairs.drive[:13].tolist() == [[0, 1]] * 13
+    assert pairs.measure[:13].tolist() == [[m, (m + 1) % 16] for m in range(2, 15)]
+    assert pairs.measure[13:16].tolist() == [[3, 4], [4, 5], [5, 6]]
+
+
+def test_opposite_drive_gives_192_voltages() -> None:
+    assert len(scan_pairs(16, drive_offset=8).drive) == 192
+
+
+@given(st.floats(0.001, 0.999), st.sampled_from([1.0, -1.0]))
+def test_pressure_inverts_the_response(share: float, sign: float) -> None:
+    response = MagnitudeResponse(
+        pressure_kpa=(0, 130, 140, 200), relative_change=(0, 0, 0.03 * sign, 0.25 * sign)
+    )
+    pressure = 130 + 70 * share
+    change = response.change(np.array([pressure]))
+    assert response.pressure(np.abs(change)) == pytest.approx(pressure, rel=1e-9)
+    assert response.sign == sign
+
+
+def test_no_change_tells_no_pressure(paper: SensorDescription) -> None:
+    assert paper.magnitude is not None
+    assert np.isnan(paper.magnitude.response.pressure(np.zeros(1))).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("width_m = 0.06", "width_m = -1"), ["sheet.width_m", "-1", "greater than 0"]),
+        (("width_m = 0.06", "width_m = nan"), ["sheet.width_m", "nan", "finite"]),
+        (("width_m = 0.06", 'width_m = "wide"'), ["sheet.width_m", "wide", "number"]),
+        (("width_m = 0.06", ""), ["sheet.width_m is missing"]),
+        (("thickness_m", "thicness_m"), ["sheet.thicness_m", "unknown key"]),
+        (('"rectangle"', '"hexagon"'), ["sheet.shape", "hexagon", "'rectangle' or 'disc'"]),
+        (("height_m = 0.05", ""), ["height_m is required"]),
+        (("length_m = 0.006", "length_m = 0.03"), ["length_m", "0.03", "below"]),
+        (("pitch_m = 0.02", "pitch_m = 0.09"), ["pitch_m", "0.05"]),
+        (('"rectangle"\nwidth_m = 0.06\nheight_m = 0.05', '"disc"\nwidth_m = 0.06'), ["count"]),
+        (("[pattern]", "[pattern]\ndrive_offset = 8"), ["pattern.drive_offset = 8", "below"]),
+        (("0.0, 0.0, 0.25]", "0.0, 0.3, 0.25]"), ["relative_change", "only rise or only fall"]),
+        (("0.0, 0.0, 0.25]", "0.0, 0.25]"), ["as many entries"]),
+        (("conductivity_ratio = 100.0", "conductivity_ratio = 1.0"), ["differ from 1"]),
+        (("schema = 1", "schema = 2"), ["schema", "2", "1"]),
+        (('name = "small"', 'name = "Über Skin"'), ["name", "Über Skin"]),
+        (("schema = 1", "schema = = 1"), ["not valid TOML"]),
+    ],
+)
+def test_an_error_names_the_key_the_value_and_what_is_allowed(
+    tmp_path: Path, small_text: str, change: tuple[str, str], said: list[str]
+) -> None:
+    assert change[0] in small_text
+    file = tmp_path / "sensor.toml"
+    file.write_text(small_text.replace(*change))
+    with pytest.raises(DescriptionError) as caught:
+        load_description(file)
+    for part in ["sensor.toml", *said]:
+        assert part in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [None, b"\xff\xfe\x00"])
+def test_an_unreadable_file_is_named(tmp_path: Path, content: bytes | None) -> None:
+    file = tmp_path / "missing.toml"
+    if content is not None:
+        file.write_bytes(content)
+    with pytest.raises(DescriptionError, match=r"missing\.toml.*paper_square"):
+        load_description(file)
+
+
+def test_the_hash_follows_the_physics_alone(tmp_path: Path, small_text: str) -> None:
+    def hash_of(text: str) -> str:
+        (tmp_path / "sensor.toml").write_text(text)
+        return load_description(tmp_path / "sensor.toml").sha256
+
+    original = hash_of(small_text)
+    assert hash_of(small_text.replace("0.0, 0.0, 0.25]", "0.0, 0.1, 0.25]")) == original
+    assert hash_of(small_text.replace("pitch_m = 0.02", "pitch_m = 0.021")) != original

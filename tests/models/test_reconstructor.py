@@ -1,0 +1,275 @@
+"""Tiers, warm start and honesty, on data simulated with another mesh, an uneven sheet and noise."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from noisy_skin import Skin
+from tactomo_models import (
+    Artifact,
+    Contact,
+    DataError,
+    Flag,
+    Press,
+    Reconstruction,
+    Reconstructor,
+    Reference,
+    SensorDescription,
+    SkinSimulator,
+    Tier,
+    load_description,
+)
+from tactomo_models.forward import ForwardModel
+
+CENTRE = Press(0.0, 0.0, 180.0)
+
+
+def press_mm(x_mm: float, y_mm: float, pressure_kpa: float = 180.0) -> Press:
+    return Press(x_mm / 1e3, y_mm / 1e3, pressure_kpa)
+
+
+def settle(
+    reconstructor: Reconstructor, skin: Skin, *presses: Press, frames: int = 12
+) -> Reconstruction:
+    for _ in range(frames):
+        frame = reconstructor.reconstruct(**skin.scan(*presses))
+    return frame
+
+
+def error_mm(contact: Contact, press: Press) -> float:
+    return 1e3 * math.dist((contact.x_m, contact.y_m), (press.x_m, press.y_m))
+
+
+def nearest(frame: Reconstruction, press: Press) -> Contact:
+    return min(frame.contacts, key=lambda contact: error_mm(contact, press))
+
+
+@pytest.fixture
+def solves(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Counts forward solves."""
+    counted: list[int] = []
+    solve = ForwardModel.solve
+
+    def counting(self: ForwardModel, *arguments: object, **options: object) -> object:
+        counted.append(1)
+        return solve(self, *arguments, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(ForwardModel, "solve", counting)
+    return counted
+
+
+@pytest.mark.parametrize(
+    "place", [(0, 0), (50, 0), (0, -52), (-45, 45), (25, -20)], ids=lambda place: str(place)
+)
+def test_one_press_is_found_with_its_pressure(
+    reconstructor: Reconstructor, skin: Skin, place: tuple[float, float]
+) -> None:
+    press = press_mm(*place)
+    frame = settle(reconstructor, skin, press)
+    assert frame.tier is Tier.LEVELSET
+    assert frame.flags == Flag(0)
+    assert frame.misfit < 1.5
+    (contact,) = frame.contacts
+    assert error_mm(contact, press) < 1.5
+    assert contact.pressure_kpa == pytest.approx(180, abs=15)
+    assert contact.area_m2 == pytest.approx(math.pi * 0.015**2, rel=0.25)
+    assert frame.map is not None
+    assert frame.map.dtype == np.float32
+    assert frame.map.shape == (51, 51)
+    assert np.unravel_index(frame.map.argmax(), frame.map.shape) == pytest.approx(
+        (25 + place[1] / 3, 25 + place[0] / 3), abs=4.5
+    )
+
+
+def test_several_presses_stay_separate(reconstructor: Reconstructor, skin: Skin) -> None:
+    presses = [press_mm(-35, 30, 150), press_mm(30, -30, 190), press_mm(35, 35, 170)]
+    frame = settle(reconstructor, skin, *presses, frames=20)
+    assert len(frame.contacts) == 3
+    for press in presses:
+        contact = nearest(frame, press)
+        assert error_mm(contact, press) < 2
+        assert contact.pressure_kpa == pytest.approx(press.pressure_kpa, abs=20)
+
+
+def test_nothing_pressed_takes_a_test_and_no_solve(
+    reconstructor: Reconstructor, skin: Skin, solves: list[int]
+) -> None:
+    frames = [reconstructor.reconstruct(**skin.scan()) for _ in range(300)]
+    assert {frame.tier for frame in frames} == {Tier.QUIET}
+    assert not solves
+    assert all(frame.map is not None and not frame.map.any() for frame in frames)
+
+
+def test_a_still_scene_takes_no_further_solve(
+    reconstructor: Reconstructor, skin: Skin, solves: list[int]
+) -> None:
+    settle(reconstructor, skin, CENTRE)
+    before = len(solves)
+    frame = settle(reconstructor, skin, CENTRE, frames=20)
+    assert len(solves) - before <= 2
+    assert len(frame.contacts) == 1
+
+
+def test_contacts_land_slide_jump_and_lift(reconstructor: Reconstructor, skin: Skin) -> None:
+    stays, slides = press_mm(40, 40), press_mm(-40, -40)
+    (first,) = settle(reconstructor, skin, stays).contacts
+    both = settle(reconstructor, skin, stays, slides)
+    assert len(both.contacts) == 2
+    assert nearest(both, stays).id == first.id
+    second = nearest(both, slides).id
+    for step in range(1, 11):
+        moved = press_mm(-40 + 4 * step, -40)
+        frame = settle(reconstructor, skin, stays, moved, frames=3)
+    assert nearest(frame, moved).id == second
+    assert error_mm(nearest(frame, moved), moved) < 2
+    jumped = press_mm(-45, 20)
+    frame = settle(reconstructor, skin, stays, jumped)
+    assert error_mm(nearest(frame, jumped), jumped) < 2
+    assert nearest(frame, jumped).id not in (first.id, second)
+    assert nearest(frame, stays).id == first.id
+    (left,) = settle(reconstructor, skin, stays).contacts
+    assert left.id == first.id
+    assert settle(reconstructor, skin, frames=1).tier is Tier.QUIET
+
+
+def test_a_press_below_the_onset_is_touched_with_unknown_pressure(
+    reconstructor: Reconstructor, skin: Skin
+) -> None:
+    frame = settle(reconstructor, skin, press_mm(20, 20, 110))
+    (contact,) = frame.contacts
+    assert error_mm(contact, press_mm(20, 20)) < 2
+    assert math.isnan(contact.pressure_kpa)
+    assert frame.structure is not None
+    assert frame.structure.max() > 0.9
+    assert frame.pressure_kpa is not None
+    assert not frame.pressure_kpa.any()
+
+
+def test_without_structure_the_linear_image_goes_on_flagged(
+    reconstructor: Reconstructor, skin: Skin
+) -> None:
+    press = press_mm(30, 30, 195)
+    frame = reconstructor.reconstruct(skin.scan(press)["magnitude"], None)
+    assert frame.flags == Flag.STRUCTURE_MISSING
+    assert frame.flags.names() == ["structure_missing"]
+    assert frame.tier is Tier.TIKHONOV
+    assert frame.structure is None
+    assert frame.map is not None
+    assert error_mm(nearest(frame, press), press) < 12
+
+
+def test_without_magnitude_the_outline_goes_on_flagged(
+    reconstructor: Reconstructor, skin: Skin
+) -> None:
+    for _ in range(5):
+        frame = reconstructor.reconstruct(None, skin.scan(CENTRE)["structure"])
+    assert frame.flags == Flag.MAGNITUDE_MISSING
+    assert frame.map is None
+    assert frame.structure is not None
+    (contact,) = frame.contacts
+    assert error_mm(contact, CENTRE) < 2
+    assert math.isnan(contact.magnitude)
+
+
+def test_without_anything_there_is_no_map(reconstructor: Reconstructor) -> None:
+    frame = reconstructor.reconstruct(None, None)
+    assert frame.map is None
+    assert frame.structure is None
+    assert frame.flags == Flag.MAGNITUDE_MISSING | Flag.STRUCTURE_MISSING
+
+
+def test_without_a_reference_there_is_no_map(
+    paper: SensorDescription, artifact: Artifact, skin: Skin
+) -> None:
+    frame = Reconstructor(paper, artifact).reconstruct(**skin.scan(CENTRE))
+    assert Flag.NO_REFERENCE in frame.flags
+    assert frame.map is None
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_few_invalid_voltages_are_left_out_and_flagged(
+    reconstructor: Reconstructor, skin: Skin, bad: float
+) -> None:
+    for _ in range(8):
+        scans = skin.scan(CENTRE)
+        scans["structure"][[3, 50, 120]] = bad
+        scans["magnitude"][7] = bad
+        frame = reconstructor.reconstruct(**scans)
+    assert Flag.INVALID_VOLTAGE in frame.flags
+    (contact,) = frame.contacts
+    assert error_mm(contact, CENTRE) < 2
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, 0.0])
+def test_a_dead_channel_is_given_up(reconstructor: Reconstructor, skin: Skin, value: float) -> None:
+    frame = reconstructor.reconstruct(skin.scan()["magnitude"], np.full(208, value))
+    assert Flag.STRUCTURE_MISSING | Flag.INVALID_VOLTAGE in frame.flags
+    assert frame.structure is None
+
+
+def test_a_scan_of_the_wrong_length_is_refused(reconstructor: Reconstructor) -> None:
+    with pytest.raises(DataError, match=r"\(192,\).*208"):
+        reconstructor.reconstruct(np.zeros(192), None)
+
+
+@pytest.mark.parametrize("voltages", ["opposite electrodes' order", "shifted by five"])
+def test_a_reference_of_another_sensor_is_flagged(
+    paper: SensorDescription, artifact: Artifact, skin: Skin, voltages: str
+) -> None:
+    good = skin.reference()
+    assert good.structure is not None
+    wrong = good.structure[::-1] if voltages.startswith("opp") else np.roll(good.structure, 5)
+    reconstructor = Reconstructor(paper, artifact)
+    reconstructor.set_reference(Reference(None, np.ascontiguousarray(wrong)))
+    frame = reconstructor.reconstruct(None, skin.scan()["structure"])
+    assert Flag.REFERENCE_MISMATCH in frame.flags
+
+
+def test_the_same_frames_give_the_same_maps(
+    paper: SensorDescription, artifact: Artifact, skin: Skin
+) -> None:
+    reference = skin.reference()
+    scans = [skin.scan(press_mm(5 * i, -10)) for i in range(6)]
+    runs = []
+    for _ in range(2):
+        reconstructor = Reconstructor(paper, artifact)
+        reconstructor.set_reference(reference)
+        runs.append([reconstructor.reconstruct(**scan) for scan in scans])
+    for first, second in zip(*runs, strict=True):
+        np.testing.assert_array_equal(first.map, second.map)
+        assert first.contacts == second.contacts
+
+
+def test_a_sheet_whose_conductivity_falls_is_no_different(
+    paper: SensorDescription, artifact: Artifact
+) -> None:
+    assert paper.magnitude is not None
+    response = paper.magnitude.response
+    falling = response.model_copy(
+        update={"relative_change": tuple(-change for change in response.relative_change)}
+    )
+    sensor = paper.model_copy(
+        update={"magnitude": paper.magnitude.model_copy(update={"response": falling})}
+    )
+    skin = Skin(SkinSimulator(sensor, spacing_m=0.0025))
+    reconstructor = Reconstructor(sensor, artifact)
+    reconstructor.set_reference(skin.reference())
+    (contact,) = settle(reconstructor, skin, press_mm(20, 10)).contacts
+    assert contact.magnitude > 0.1
+    assert contact.pressure_kpa == pytest.approx(180, abs=15)
+
+
+def test_an_insulating_object_in_a_disc_is_found() -> None:
+    tank = load_description("tank_disc")
+    skin = Skin(SkinSimulator(tank, spacing_m=0.0045))
+    reconstructor = Reconstructor(tank)
+    reconstructor.set_reference(skin.reference())
+    cup = Press(0.03, -0.04, 1.0, 0.018)
+    for _ in range(6):
+        frame = reconstructor.reconstruct(None, skin.scan(cup)["structure"])
+    assert frame.flags == Flag(0)
+    (contact,) = frame.contacts
+    assert error_mm(contact, cup) < 3
+    assert frame.map is None, "a single channel that saturates has no magnitude"

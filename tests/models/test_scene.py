@@ -1,0 +1,68 @@
+"""What presses: areas are kept, and contacts keep their identity."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tactomo_models import Press
+from tactomo_models.contacts import FARTHEST_STEP_M, Tracker
+
+STEP_M = 0.001
+AXIS_M = np.arange(-0.06, 0.06, STEP_M)
+X, Y = np.meshgrid(AXIS_M, AXIS_M)
+
+
+@given(
+    st.floats(-0.02, 0.02),
+    st.floats(-0.02, 0.02),
+    st.floats(0.006, 0.02),
+    st.floats(0.006, 0.02),
+    st.floats(0, math.pi),
+    st.sampled_from(["ellipse", "rectangle", "ring"]),
+)
+def test_an_indenter_covers_its_area_wherever_it_stands(
+    x: float, y: float, a: float, b: float, angle: float, shape: str
+) -> None:
+    press = Press(x, y, 100.0, a, b, angle, shape)  # type: ignore[arg-type]
+    area = {"ellipse": math.pi, "rectangle": 4.0, "ring": math.pi * 3 / 4}[shape] * a * b
+    covered = press.coverage(X, Y, STEP_M)
+    assert covered.sum() * STEP_M**2 == pytest.approx(area, rel=0.06)
+    assert (covered * X).sum() / covered.sum() == pytest.approx(x, abs=3e-4)
+
+
+def test_a_ring_is_open_in_the_middle() -> None:
+    press = Press(0.0, 0.0, 100.0, 0.02, shape="ring")
+    assert press.coverage(np.array([0.0, 0.015]), np.zeros(2), STEP_M).tolist() == [0.0, 1.0]
+
+
+places = st.lists(st.tuples(st.floats(-0.07, 0.07), st.floats(-0.07, 0.07)), max_size=6)
+
+
+@given(places)
+def test_contacts_that_stand_still_keep_their_identity(centres: list[tuple[float, float]]) -> None:
+    tracker = Tracker()
+    at = np.array(centres).reshape(-1, 2)
+    first = tracker.update(at)
+    assert len(set(first)) == len(first)
+    again = tracker.update(at)
+    assert sorted(again) == sorted(first)
+
+
+@given(places, places)
+def test_no_identity_is_given_twice(
+    before: list[tuple[float, float]], after: list[tuple[float, float]]
+) -> None:
+    tracker = Tracker()
+    old = tracker.update(np.array(before).reshape(-1, 2))
+    new = tracker.update(np.array(after).reshape(-1, 2))
+    assert len(set(new)) == len(new)
+    for identity, place in zip(new, after, strict=True):
+        if identity in old:
+            moved = math.dist(place, before[old.index(identity)])
+            assert moved < FARTHEST_STEP_M
+        else:
+            assert identity > max(old, default=0)
