@@ -35,6 +35,7 @@ from platformdirs import user_data_path
 from tactomo_client.messages import EVENT, SCHEMA, STATUS
 from tactomo_models import (
     Reconstructor,
+    Reference,
     SensorDescription,
     Tier,
     load_description,
@@ -53,7 +54,7 @@ from tactomo.port import PortReader
 from tactomo.protocol_replay import parse_replay_url
 from tactomo.publisher import Publisher
 from tactomo.recorder import Recorder, message_entry
-from tactomo.recording import REPLAY_SCHEME, Origin
+from tactomo.recording import REPLAY_SCHEME, Origin, Recording
 from tactomo.status import Status
 
 WATCH_S: Final = 0.1
@@ -85,7 +86,7 @@ class Daemon:
         self._undo = contextlib.ExitStack()
         self._stop_asked = threading.Event()
         description = load_description(config.description)
-        replay = read_replay(config.ports)
+        replay = read_replay(config.ports, description)
         channels = tuple(c for c in Channel if c.name.lower() in description.modalities)
         self._recorder = Recorder(_origin(config, description), self._on_event)
         self._publisher = Publisher(
@@ -260,11 +261,12 @@ class Daemon:
         self._publisher.publish(EVENT, fields)
 
 
-def read_replay(urls: Sequence[str]) -> Replay | None:
+def read_replay(urls: Sequence[str], description: SensorDescription) -> Replay | None:
     """Return what the recording says that the ports replay; None where they are live.
 
     Raises:
-        ConfigError: only some of the ports are replayed, or not all from one recording.
+        ConfigError: only some of the ports are replayed, or not all from one recording, or that
+            is of another sensor.
         RecordingError, PortError: a URL leads to no recording.
 
     """
@@ -279,13 +281,28 @@ def read_replay(urls: Sequence[str]) -> Replay | None:
             f"the ports {', '.join(urls)} do not replay one recording",
             "replay all ports from one file at one speed, or none",
         )
+    reference = recording.first_reference()
+    if reference is not None:
+        _check_reference(reference, recording, description)
     # A part of the ports cannot give the dual scans that all of them gave.
     is_whole = len(urls) == len(recording.origin.ports)
     return Replay(
         marks=recording.marks() if is_whole else [],
-        reference=recording.first_reference(),
+        reference=reference,
         is_paced=speed > 0,
     )
+
+
+def _check_reference(
+    reference: Reference, recording: Recording, description: SensorDescription
+) -> None:
+    lengths = {len(v) for v in (reference.magnitude, reference.structure) if v is not None}
+    if lengths != {description.measurements}:
+        raise ConfigError(
+            f"{recording.path} has {' or '.join(map(str, sorted(lengths)))} voltages a scan, "
+            f"{description.name} has {description.measurements}",
+            f"replay it with the description it was recorded with, {recording.origin.description}",
+        )
 
 
 def _make_reconstructor(config: DaemonConfig, description: SensorDescription) -> Reconstructor:

@@ -86,6 +86,10 @@ class Imaging:
         """Whether a reference is being taken."""
         return self._tare is not None
 
+    def has_reference(self, channel: Channel) -> bool:
+        """Whether there is something to measure this channel's changes against."""
+        return getattr(self.reference, channel.name.lower(), None) is not None
+
     @property
     def tier(self) -> Tier:
         """The tier that is asked for."""
@@ -221,9 +225,10 @@ class Imaging:
         tare = self._tare
         if tare is None:
             return
-        if volts:
-            self._tare_deadline_s = time.monotonic() + NO_DATA_S
-        needed = [channel for channel in self._channels if channel not in lost]
+        needed = {channel for channel in self._channels if channel not in lost}
+        if not needed or not needed <= volts.keys():
+            return
+        self._tare_deadline_s = time.monotonic() + NO_DATA_S
         if not tare.add(volts, needed):
             return
         try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import termios
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -17,6 +18,8 @@ from tactomo.protocol_replay import register
 READ_TIMEOUT_S: Final = 0.1
 """How long a read waits for its first byte, so how soon a reader notices that it should stop."""
 WRITE_TIMEOUT_S: Final = 0.5
+# pyserial lets termios.error through where a device vanishes while it is being set up.
+OPEN_FAILURES: Final = (OSError, ValueError, termios.error)
 
 
 def open_serial(url: str, baud: int) -> serial.Serial:
@@ -39,11 +42,11 @@ def open_serial(url: str, baud: int) -> serial.Serial:
         )
     except TactomoError:
         raise
-    except (OSError, ValueError) as error:
+    except OPEN_FAILURES as error:
         raise _explain(url, baud, error) from error
 
 
-def _explain(url: str, baud: int, error: OSError | ValueError) -> PortError:
+def _explain(url: str, baud: int, error: Exception) -> PortError:
     number = getattr(error, "errno", None)
     if number in (errno.EAGAIN, errno.EBUSY):
         pids = list(_holders(url))

@@ -275,7 +275,12 @@ class Pipeline:
                 "check that channel's cable; if its scans come late, raise sync_wait_ms",
             )
         for channel in sorted(lost - self._sync.lost):
-            self._on_event("channel_back", "info", f"{channel.name.lower()} scans come again")
+            self._on_event(
+                "channel_back",
+                "info",
+                f"{channel.name.lower()} scans come again",
+                "" if self._imaging.has_reference(channel) else "tare: it has no reference yet",
+            )
         if self._sync.resets > resets:
             self._on_event(
                 "device_restarted",

@@ -217,7 +217,7 @@ class Recorder:
                 "stop it with record_stop first",
                 "already_recording",
             )
-        path = path.expanduser().absolute()
+        path = path.absolute()
         writer = _create(path, self._origin)
         self._number += 1
         self.active = ActiveRecording(self._number, path, writer, with_maps)
@@ -280,9 +280,9 @@ def _create(path: Path, origin: Origin) -> RecordingWriter:
         raise RecordingError(
             f"{path} exists already", "give another path", "cannot_write"
         ) from error
-    except OSError as error:
+    except (OSError, ValueError) as error:  # ValueError: a NUL byte in the path
         raise RecordingError(
-            f"cannot create {path}: {error.strerror}",
+            f"cannot create {path}: {getattr(error, 'strerror', None) or error}",
             "give a path in a folder that you may write to",
             "cannot_write",
         ) from error

@@ -259,11 +259,7 @@ def _records(path: Path) -> Iterator[tuple[str, McapRecord]]:
                 if topics:  # it is the closing one that is cut off
                     return
                 raise _not_a_recording(path, "is not an MCAP file") from error
-            except OSError as error:
-                raise RecordingError(
-                    f"cannot read the recording {path}: {error.strerror}", "check the disk"
-                ) from error
-            except Exception:  # damage can fail in any layer: struct, zstd, utf-8, CRC
+            except Exception:  # damage can fail in any layer: disk, struct, zstd, utf-8, CRC
                 return
             if isinstance(record, McapChannel):
                 topics[record.id] = record.topic

@@ -34,15 +34,10 @@ class Tare:
         self._volts: dict[Channel, list[Volts]] = {}
 
     def add(self, volts: dict[Channel, Volts], needed: Collection[Channel]) -> bool:
-        """Take one dual scan that has every needed channel; others are passed over.
-
-        Returns whether there are enough now.
-        """
-        if needed and set(needed) <= volts.keys():
-            for channel, values in volts.items():
-                self._volts.setdefault(channel, []).append(values)
-        counts = [len(self._volts.get(channel, ())) for channel in needed]
-        return bool(counts) and min(counts) >= self._wanted
+        """Take one dual scan; returns whether there are enough of every needed channel now."""
+        for channel, values in volts.items():
+            self._volts.setdefault(channel, []).append(values)
+        return all(len(self._volts.get(channel, ())) >= self._wanted for channel in needed)
 
     def reference(self) -> Reference:
         """Return the reference; raise CommandError where the scans moved too much for one."""

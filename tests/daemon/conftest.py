@@ -23,6 +23,7 @@ from mcap.reader import make_reader
 from numpy.typing import NDArray
 from tactomo.config import load_config
 from tactomo.daemon import Daemon
+from tactomo.log import configure_logging
 from tactomo.recording import open_recording
 from tactomo_client import request
 from tactomo_client.messages import KINDS, Message, decode_message, topic
@@ -294,6 +295,12 @@ class Bench:
     def step(self, load: float = 0.0, **details: Any) -> dict[str, Any]:
         """Send one dual scan and wait for its map."""
         return self.listener.frame(self.skin.scan(load, **details))
+
+
+@pytest.fixture(autouse=True)
+def _readable_logs() -> None:
+    """Log as the daemon does: structlog's own default shows every variable of a traceback."""
+    configure_logging("info", "text")
 
 
 @pytest.fixture

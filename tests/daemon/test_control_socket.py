@@ -134,6 +134,8 @@ def test_tier_and_budget_hold_from_the_next_frame(bench: Start) -> None:
         ("set_budget", {"budget_ms": "fast"}, "bad_argument"),
         ("record_start", {"path": 7}, "bad_argument"),
         ("record_start", {"path": "/proc/none/skin.mcap"}, "cannot_write"),
+        ("record_start", {"path": "/tmp/a\0b"}, "cannot_write"),
+        ("record_start", {"path": "/proc/" + "x" * 300}, "cannot_write"),
         ("record_stop", {}, "not_recording"),
     ],
 )

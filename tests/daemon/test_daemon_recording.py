@@ -303,6 +303,14 @@ def test_an_imported_reference_is_used_from_the_first_scan(replay: Replay, tmp_p
     assert frames[0]["flags"] == ["structure_missing"]
 
 
+def test_a_recording_of_another_sensor_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "tank.mcap"
+    imported(path, Reference.from_scans(np.ones((2, 192)), None))
+    memory: Any = object()
+    with pytest.raises(ConfigError, match="192 voltages a scan, paper_square has 208"):
+        Daemon(load_config(ports=[f"replay://{path}"]), reconstructor=memory)
+
+
 def test_replay_keeps_the_recordings_time(replay: Replay, tmp_path: Path) -> None:
     path = tmp_path / "tank.mcap"
     imported(path)

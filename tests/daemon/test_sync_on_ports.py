@@ -64,6 +64,20 @@ def test_a_channel_that_stays_out_is_lost_and_comes_back(bench: Start) -> None:
     assert b.step()["flags"] == []
 
 
+def test_a_channel_that_comes_after_the_tare_says_that_it_has_no_reference(bench: Start) -> None:
+    b = bench(ports=2)
+    magnitude, structure = b.skin.lines
+    both = structure.hello
+    structure.hello = magnitude.hello
+    b.skin.introduce()  # nobody announces the structure channel, so nobody waits for it
+    structure.hello = both
+    for _ in range(3):
+        b.step(channels=(Channel.MAGNITUDE,))
+    b.listener.event("tared")
+    b.step(channels=(Channel.STRUCTURE, Channel.MAGNITUDE))
+    assert b.listener.event("channel_back")["next_step"].startswith("tare")
+
+
 def test_a_scan_that_comes_too_late_is_counted_and_left_out(bench: Start) -> None:
     b = bench(ports=2, sync_wait_ms=20)
     b.tare()
