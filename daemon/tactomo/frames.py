@@ -105,7 +105,7 @@ def port_fields(port: PortReader) -> dict[str, Any]:
         "url": port.url,
         "connected": port.is_open,
         "device": port.hello and _device(port.hello),
-        "refusal": port.refusal,
+        "refusal": port.refusal or None,
         "bytes": port.bytes_read,
         "packets": port.counts.packets,
         "corrupt": port.counts.corrupt,

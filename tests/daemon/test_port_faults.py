@@ -127,7 +127,7 @@ def test_the_wrong_device_is_refused_and_not_reconstructed(
     b.step()
     assert [frame["scan_counter"] for frame in b.listener.of("map")] == [2]
     (port,) = b.ask("status")["ports"]
-    assert (port["refusal"], port["unused_scans"]) == ("", 2)
+    assert (port["refusal"], port["unused_scans"]) == (None, 2)
 
 
 def test_a_command_that_the_device_refuses_is_told(bench: Start) -> None:
