@@ -17,6 +17,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from pydantic_core import ErrorDetails
 from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM, MessageError
 from tactomo_client.messages import check_sensor_name
+from tactomo_models.errors import explain
 
 from tactomo.errors import ConfigError
 from tactomo.log import LogFormat, LogLevel
@@ -141,14 +142,3 @@ def _read_toml(path: Path) -> dict[str, Any]:
 def _source(item: ErrorDetails, path: str | Path | None, given: Mapping[str, Any]) -> str:
     is_flag = path is None or (item["loc"] and item["loc"][0] in given)
     return "command line" if is_flag else str(path)
-
-
-def explain(item: ErrorDetails) -> str:
-    """Turn one complaint of pydantic's into "key = value: what is allowed"."""
-    key = ".".join(str(part) for part in item["loc"])
-    if item["type"] == "extra_forbidden":
-        return f"unknown key {key}"
-    if item["type"] == "missing":
-        return f"{key} is missing"
-    message = item["msg"].removeprefix("Value error, ")
-    return f"{key} = {item['input']!r}: {message}" if key else message

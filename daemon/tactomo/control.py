@@ -17,8 +17,9 @@ import zmq
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from tactomo_client import MessageError
 from tactomo_client.messages import decode_request, encode_error, encode_reply
+from tactomo_models.errors import explain
 
-from tactomo.config import BudgetMs, TierName, explain
+from tactomo.config import BudgetMs, TierName
 from tactomo.endpoint import bind
 from tactomo.errors import CommandError, TactomoError
 

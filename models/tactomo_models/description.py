@@ -12,13 +12,13 @@ from functools import cached_property
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from tactomo_models.errors import DescriptionError
+from tactomo_models.errors import DescriptionError, explain
 from tactomo_models.pattern import Pairs, scan_pairs
 
 Modality = Literal["magnitude", "structure"]
@@ -364,7 +364,7 @@ def load_description(source: str | Path) -> SensorDescription:
         raise DescriptionError(f"{name} is not valid TOML: {error}") from error
     except ValidationError as error:
         raise DescriptionError(
-            "\n".join(_explain(name, item) for item in error.errors())
+            "\n".join(f"{name}: {explain(item)}" for item in error.errors())
         ) from error
 
 
@@ -377,15 +377,3 @@ def _read(path: Path) -> str:
             f"cannot read the sensor description {path}: {reason}; give the path of a TOML file "
             f"or one of: {', '.join(shipped_descriptions())}"
         ) from error
-
-
-def _explain(source: str, item: Any) -> str:
-    """Turn one pydantic complaint into "file: key = value: what is allowed"."""
-    key = ".".join(str(part) for part in item["loc"])
-    if item["type"] == "value_error":  # from a section's own check: its text opens with the key
-        return f"{source}: {key}{'.' if key else ''}{item['msg'].removeprefix('Value error, ')}"
-    if item["type"] == "extra_forbidden":
-        return f"{source}: unknown key {key}; remove it or correct its spelling"
-    if item["type"] == "missing":
-        return f"{source}: {key} is missing"
-    return f"{source}: {key} = {item['input']!r}: {item['msg']}"

@@ -7,6 +7,11 @@ ModelError
  └── DataError          voltages of the wrong shape or kind
 """
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
+
 
 class ModelError(Exception):
     """Base of everything that tactomo_models raises on purpose."""
@@ -22,3 +27,18 @@ class ArtifactError(ModelError):
 
 class DataError(ModelError):
     """Voltages of the wrong shape or kind."""
+
+
+def explain(item: "ErrorDetails") -> str:
+    """Turn one of pydantic's complaints about a file into "key = value: what is allowed"."""
+    key = ".".join(str(part) for part in item["loc"])
+    message = item["msg"].removeprefix("Value error, ")
+    if item["type"] == "extra_forbidden":
+        return f"unknown key {key}"
+    if item["type"] == "missing":
+        return f"{key} is missing"
+    if not key:
+        return message
+    if isinstance(item["input"], dict):  # from a section's own check: its text opens with the key
+        return f"{key}.{message}"
+    return f"{key} = {item['input']!r}: {message}"

@@ -28,8 +28,8 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from tactomo_models import Press
+from tactomo_models.errors import explain
 
-from tactomo.config import explain
 from tactomo.errors import ConfigError
 
 Millimetres = Annotated[float, Field(ge=-1000.0, le=1000.0, allow_inf_nan=False)]
