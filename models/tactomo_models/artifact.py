@@ -7,7 +7,6 @@ the description it was built for. One that was built for another sensor is refus
 from __future__ import annotations
 
 import os
-import zipfile
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -18,8 +17,9 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from platformdirs import user_cache_path
 
+from tactomo_models.archive import read_arrays
 from tactomo_models.description import SensorDescription
-from tactomo_models.errors import ArtifactError
+from tactomo_models.errors import ArtifactError, DataError
 from tactomo_models.forward import BareSheet, ForwardModel, solve_bare_sheet
 from tactomo_models.mesh import mesh_sheet
 from tactomo_models.tikhonov import noise_figure_weight, tikhonov_matrix
@@ -150,9 +150,7 @@ def load_artifact(path: Path, description: SensorDescription) -> Artifact:
     """
     rebuild = f"run: tactomo models build --sensor {description.name}"
     try:
-        # numpy leaves a file open that turns out to be no archive
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
+        arrays = read_arrays(path)
         version, sha256 = int(arrays["format"]), str(arrays["sha256"])
         if version != FORMAT:
             raise ArtifactError(
@@ -166,7 +164,7 @@ def load_artifact(path: Path, description: SensorDescription) -> Artifact:
         return _from_arrays(arrays, description)
     except FileNotFoundError as error:
         raise ArtifactError(f"no artifact at {path}; {rebuild}") from error
-    except (OSError, KeyError, ValueError, EOFError, TypeError, zipfile.BadZipFile) as error:
+    except (OSError, KeyError, ValueError, TypeError, DataError) as error:
         raise ArtifactError(f"{path} is damaged or no artifact ({error}); {rebuild}") from error
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tactomo_models.archive import read_arrays
 from tactomo_models.description import SensorDescription
 from tactomo_models.errors import DataError
 from tactomo_models.reconstruct import Reconstruction, Reconstructor, Tier
-from tactomo_models.reference import Reference
+from tactomo_models.reference import Reference, noise_of_reciprocity
 
 FloatArray = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -87,10 +87,11 @@ def read_scans(
         DataError: the file cannot be read or does not fit the sensor.
     """
     try:
-        with source.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            arrays: dict[str, Any] = {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise DataError(f"cannot read {source}: {error}; give an .npz file of scans") from error
+        arrays = read_arrays(source)
+    except OSError as error:
+        raise DataError(
+            f"cannot read {source}: {error.strerror}; give an .npz file of scans"
+        ) from error
     scans: dict[str, FloatArray] = {}
     references: dict[str, FloatArray] = {}
     for name in description.modalities:
@@ -108,7 +109,23 @@ def read_scans(
     lengths = {name: len(channel) for name, channel in scans.items()}
     if len(set(lengths.values())) > 1:
         raise DataError(f"{source}: channels differ in length: {lengths}")
-    return scans, Reference(references.get("magnitude"), references.get("structure"))
+    # The file does not say how noisy the scans are, nor of how many the reference is the mean.
+    noise = {name: noise_of_reciprocity(description, channel) for name, channel in scans.items()}
+    rest = {name: noise_of_reciprocity(description, scan) for name, scan in references.items()}
+    return scans, Reference(
+        magnitude=references.get("magnitude"),
+        structure=references.get("structure"),
+        magnitude_noise=noise.get("magnitude"),
+        structure_noise=noise.get("structure"),
+        scans=min(_averaged(noise[name], rest[name]) for name in scans),
+    )
+
+
+def _averaged(noise: FloatArray | None, rest: FloatArray | None) -> int:
+    """Scans that a reference of this noise must be the mean of, by the noise of one scan."""
+    if noise is None or rest is None:
+        return 1
+    return int(np.clip((noise.max() / max(rest.max(), 1e-30)) ** 2, 1, 1e6))
 
 
 def _all_nan(array: Any) -> bool:

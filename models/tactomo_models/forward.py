@@ -24,6 +24,7 @@ import scipy.sparse.linalg as spla
 import skfem
 from numpy.typing import NDArray
 from skfem.helpers import dot, grad
+from threadpoolctl import threadpool_limits
 
 from tactomo_models.description import SensorDescription
 from tactomo_models.mesh import SheetMesh, mesh_sheet
@@ -75,7 +76,6 @@ def solve_bare_sheet(
     """
     mesh = sheet.mesh
     system = _assemble(description, sheet, conductivity, impedance)
-    factor = spla.splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
     inside = description.on_sheet(mesh.p[0], mesh.p[1], description.sheet.frame_width_m)
     pressable = np.flatnonzero(inside)
     touched = np.isin(mesh.t, pressable).any(axis=0)
@@ -84,7 +84,10 @@ def solve_bare_sheet(
     nodes = mesh.p.shape[1]
     injected = np.zeros((system.shape[0], electrodes - 1))
     injected[nodes:] = np.eye(electrodes - 1)
-    fields = factor.solve(injected)
+    with threadpool_limits(1):  # SuperLU's panels are too small to share: more threads only spin
+        factor = spla.splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        fields = factor.solve(injected)
+        green = _green(factor, support, system.shape[0])
     transfer = np.zeros((electrodes, electrodes))
     transfer[:-1, :-1] = fields[nodes:]
     return BareSheet(
@@ -92,7 +95,7 @@ def solve_bare_sheet(
         triangles=mesh.t.astype(np.intp),
         pressable=pressable,
         support=support,
-        green=_green(factor, support, system.shape[0]),
+        green=green,
         potentials=fields[support],
         transfer=transfer,
         map_weights=_map_weights(description, mesh)[:, pressable].tocsr(),

@@ -67,11 +67,11 @@ def noise_of_scans(scans: FloatArray) -> FloatArray | None:
     return np.asarray(np.sqrt(share * own + (1 - share) * own.mean()))
 
 
-def noise_of_reciprocity(description: SensorDescription, scan: FloatArray) -> FloatArray | None:
-    """Standard deviation (M,) from V(k, m) = V(m, k), which any scan must fulfil but for noise.
+def noise_of_reciprocity(description: SensorDescription, scans: FloatArray) -> FloatArray | None:
+    """Standard deviation (M,) of one scan, from scans (M,) or (n, M), pressed or not.
 
-    None where the pattern has no reciprocal pairs. Electrodes and an uneven sheet do not disturb
-    it; the median keeps a few broken electrodes from doing so.
+    V(k, m) = V(m, k) but for noise. Electrodes and an uneven sheet do not disturb it; the median
+    keeps a few broken electrodes from doing so. None where the pattern has no reciprocal pairs.
     """
     pairs = description.pairs
     order = {
@@ -87,9 +87,9 @@ def noise_of_reciprocity(description: SensorDescription, scan: FloatArray) -> Fl
     if not twins:
         return None
     i, j = np.array(twins).T
-    differences = np.abs(scan[i] - scan[j])
+    differences = np.abs(scans[..., i] - scans[..., j])
     differences = differences[np.isfinite(differences)]
-    if len(differences) == 0:
+    if differences.size == 0:
         return None
     spread = np.median(differences) / 0.6745 / np.sqrt(2)
     return np.full(description.measurements, float(spread))
