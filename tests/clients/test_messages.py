@@ -151,6 +151,7 @@ def test_no_array_map_breaks_the_decoder(shape: object, dtype: object, data: obj
     [
         {"shape": [2**40], "dtype": "<f4", "data": b""},
         {"shape": [MAX_ARRAY_VALUES, MAX_ARRAY_VALUES, 0], "dtype": "<f4", "data": b"\0"},
+        {"shape": [2, MAX_ARRAY_VALUES], "dtype": "|u1", "data": bytes(2 * MAX_ARRAY_VALUES)},
         {"shape": [True], "dtype": "|u1", "data": b"\0"},
         {"shape": [-1], "dtype": "|u1", "data": b"\0"},
         {"shape": [], "dtype": "|u1", "data": b"\0"},
@@ -199,6 +200,13 @@ def test_topic_and_body_must_agree() -> None:
     body = encode_message("left", "map", HEADER).partition(b"\0")[2]
     with pytest.raises(MessageError, match="disagree"):
         decode_message(b"right/map\0" + body)
+
+
+@pytest.mark.parametrize("sensor", ["le ft", "", "ä", "a/b"])
+def test_a_topic_that_nobody_may_use_is_refused(sensor: str) -> None:
+    body = msgpack.packb({"schema": 1, "sensor": sensor, "kind": "map"} | HEADER)
+    with pytest.raises(MessageError):
+        decode_message(f"{sensor}/map".encode() + b"\0" + body)
 
 
 @pytest.mark.parametrize("sensor", ["", "a/b", "a\0", "ä", "a" * 65, ".hidden", None])

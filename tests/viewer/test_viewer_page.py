@@ -244,6 +244,21 @@ def test_a_press_is_bright_where_it_is(page: Page, smooth: bool) -> None:
         assert sum(page.colour(x_mm, y_mm)) < 60, (x_mm, y_mm)
 
 
+@pytest.mark.parametrize(("ix", "iy"), [(47, 5), (3, 45)])
+def test_each_node_is_the_middle_of_its_pixel(page: Page, ix: int, iy: int) -> None:
+    image = np.zeros((51, 51), np.float32)
+    image[iy, ix] = 300
+    page.skin.frame = {"pressure_kpa": image}
+    page.open()
+    page["smooth"].click()
+    x_mm, y_mm = NODES_MM[ix], NODES_MM[iy]
+    wait_for(lambda: sum(page.colour(x_mm, y_mm)) > 350)
+    for dx, dy in ((1.2, 1.2), (-1.2, 1.2), (1.2, -1.2), (-1.2, -1.2)):
+        assert sum(page.colour(x_mm + dx, y_mm + dy)) > 350, (dx, dy)
+    for dx, dy in ((1.8, 0), (-1.8, 0), (0, 1.8), (0, -1.8)):
+        assert sum(page.colour(x_mm + dx, y_mm + dy)) < 60, (dx, dy)
+
+
 def test_the_outline_runs_around_the_press(page: Page) -> None:
     page.skin.press(36, -48)
     page.skin.frame |= {"map": None, "pressure_kpa": None}
@@ -266,6 +281,9 @@ def test_the_outline_is_where_the_level_is(page: Page) -> None:
     points = np.array(segments).reshape(-1, 2) / 4 - (10, 12)
     assert len(points) > 100
     np.testing.assert_allclose(np.hypot(*points.T), 8, atol=0.1)
+    # It is closed: each end of a segment is the end of one other segment.
+    _, ends = np.unique(points.round(6), axis=0, return_counts=True)
+    assert set(ends) == {2}
 
 
 @pytest.mark.parametrize("name", ["inferno", "viridis"])
@@ -370,6 +388,20 @@ def test_the_mouse_presses_where_it_points(page: Page) -> None:
     assert {press["id"] for press in page.presses()} == {page.presses("release")[0]["id"]}
 
 
+def test_where_a_quick_finger_ends_up_arrives(page: Page) -> None:
+    page.open()
+    page.wait_until_pressable()
+    page.js("""
+        const canvas = document.getElementById('map');
+        const box = canvas.getBoundingClientRect();
+        for (const [kind, mm] of [['down', 0], ['move', 10], ['move', 20], ['move', 30]]) {
+          const [x, y] = tactomo.mmToPixel(mm, 0);
+          const place = {clientX: box.left + x, clientY: box.top + y};
+          canvas.dispatchEvent(new PointerEvent('pointer' + kind, {pointerId: 1, button: 0, ...place}));
+        }""")
+    wait_for(lambda: [round(press["x_mm"]) for press in page.presses()] == [0, 30])
+
+
 def test_a_press_keeps_its_place_on_a_scrolled_narrow_page(page: Page) -> None:
     page.open(width=390, height=500, mobile=True)
     page.js("scrollTo(0, 150)")
@@ -465,6 +497,12 @@ def test_leaving_the_page_lifts_the_finger_and_coming_back_is_fine(page: Page) -
     assert page.js("return tactomo.touch.presses.length") == 0
     page.skin.press(36, -48)
     wait_for(lambda: sum(page.colour(30, -48)) > 350)
+
+
+def test_a_page_that_is_put_away_lets_go_and_starts_afresh(page: Page) -> None:
+    page.open()
+    page.js("tactomo.state.hello.old = true; dispatchEvent(new Event('pagehide'))")
+    wait_for(lambda: page.health == "good" and not page.js("return tactomo.state.hello.old"))
 
 
 # Buttons
