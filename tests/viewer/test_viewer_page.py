@@ -396,8 +396,8 @@ def test_where_a_quick_finger_ends_up_arrives(page: Page) -> None:
         const box = canvas.getBoundingClientRect();
         for (const [kind, mm] of [['down', 0], ['move', 10], ['move', 20], ['move', 30]]) {
           const [x, y] = tactomo.mmToPixel(mm, 0);
-          const place = {clientX: box.left + x, clientY: box.top + y};
-          canvas.dispatchEvent(new PointerEvent('pointer' + kind, {pointerId: 1, button: 0, ...place}));
+          const place = {clientX: box.left + x, clientY: box.top + y, pointerId: 1, button: 0};
+          canvas.dispatchEvent(new PointerEvent('pointer' + kind, place));
         }""")
     wait_for(lambda: [round(press["x_mm"]) for press in page.presses()] == [0, 30])
 
