@@ -328,7 +328,9 @@ class Reconstructor:
             assert shown is not None
             peak = max(float(shown.max()), 1e-12)
             pressed = shown / peak
-            areas = self._areas.find(self._on_map(pressed), np.clip(pressed, 0, 1))
+            # The rest of the image is blur: a contact there would be as large as the sheet.
+            inside = np.where(pressed > 0.5, 1.0, 0.0)
+            areas = self._areas.find(self._on_map(inside), inside)
             fitted = self._fit_magnitudes(areas, data, 1)
             contacts = self._contacts(areas, fitted)
         if self._magnitude_unexplained(data, fitted):
