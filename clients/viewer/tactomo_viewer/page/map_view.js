@@ -85,7 +85,8 @@ export class MapView {
 
   /**
    * Draw everything. `scene` has: frame (or null), image (what to colour, or null), scale (its top),
-   * unit (for the colour bar), label(contact), notice (text on the map), colormap, smooth, outline,
+   * unit (for the colour bar), label(contact), notice (what is missing), hint (what to do),
+   * colormap, smooth, outline,
    * presses (list of {x, y, size, shape, pressure}), cursor ([x, y] or null).
    */
   draw(scene) {
@@ -105,6 +106,7 @@ export class MapView {
     if (scene.cursor) this.#cursor(c, scene.cursor);
     for (const contact of scene.frame?.contacts ?? []) this.#contact(c, contact, scene.label(contact));
     if (scene.notice) this.#notice(c, scene.notice);
+    if (scene.hint) this.#hint(c, scene.hint);
     if (scene.image) this.#colourBar(c, scene);
   }
 
@@ -240,6 +242,14 @@ export class MapView {
     c.textAlign = "center";
     c.textBaseline = "middle";
     c.fillText(text, left + width / 2, y + 14.5, w - 20);
+  }
+
+  #hint(c, text) {
+    c.font = `15px ${this.theme.font}`;
+    c.fillStyle = "rgba(255, 255, 255, 0.6)";
+    c.textAlign = "center";
+    c.textBaseline = "middle";
+    c.fillText(text, ...this.mmToPixel(0, 0));
   }
 
   #rim(c) {

@@ -50,8 +50,8 @@ export class Touch {
     if (!enabled) {
       this.down.clear();
       this.held = [];
-      this.onChange();
     }
+    this.onChange();
   }
 
   /** Lift everything, the script's and other pages' live presses too. */

@@ -112,7 +112,8 @@ function draw() {
     scale: image ? scaleTop(image, unit) : 1,
     unit: unit === "kpa" ? "kPa" : "Δσ/σ₀ %",
     label: (contact) => valueText(contact, unit) || "touched",
-    notice: noticeFor(frame, image, unit),
+    notice: frame && !image ? noticeFor(frame, unit) : "",
+    hint: touch.enabled && touch.count === 0 && !frame?.contacts.length ? "Press the skin" : "",
     colormap: byId("colormap").value,
     smooth: byId("smooth").checked,
     outline: byId("outline").checked,
@@ -143,9 +144,7 @@ function imageIn(frame, unit) {
   return map ? { ...map, values: map.values.map((value) => 100 * value) } : null;
 }
 
-function noticeFor(frame, image, unit) {
-  const isInviting = touch.enabled && touch.count === 0 && !frame?.contacts.length;
-  if (!frame || image) return isInviting ? "Press here" : "";
+function noticeFor(frame, unit) {
   if (frame.images.map && unit === "kpa") return "No pressure in this frame: choose Δσ/σ₀";
   return frame.images.structure ? "Magnitude missing: only where, not how hard" : "No map in this frame";
 }
@@ -215,7 +214,7 @@ function refresh() {
   const canPress = link.isOpen && state.twinAnswers && state.status?.fields.source?.kind === "twin";
   if (canPress) byId("press-card").hidden = false;
   byId("press-controls").disabled = !canPress;
-  touch.enable(Boolean(canPress));
+  touch.enable(Boolean(canPress));  // redraws when that changes
   setText(byId("map-help"), canPress
     ? "Press with the mouse, with fingers, or with the arrow keys and the space bar. Shift holds the press."
     : "");
