@@ -21,10 +21,8 @@ def test_a_press_by_mouse_becomes_a_contact_at_that_place(demo: Demo, browser: C
     browser.get(demo.page)
     wait_for(lambda: "kPa" in browser.page_source, "the page")
     canvas = browser.find_element(By.ID, "map")
-    wait_for(
-        lambda: browser.execute_script("return window.tactomo?.mmToPixel(0, 0)"),
-        "a first frame",
-    )
+    # The page takes presses once it knows that a twin answers.
+    wait_for(lambda: browser.find_elements(By.CSS_SELECTOR, "#map.pressable"), "the twin")
     x, y = browser.execute_script("return window.tactomo.mmToPixel(30, -25)")
     size = canvas.size
     mouse = ActionChains(browser)
