@@ -46,7 +46,9 @@ def mesh_sheet(
     disc = description.sheet.shape == "disc"
     mesh = _disc(description, spacing_m) if disc else _rectangle(description, spacing_m)
     ends = description.electrode_ends_m.reshape(-1, 2)
-    for _ in range(max(refinements, _needed_refinements(mesh, ends, description))):
+    if not disc:  # the rim of a disc begins with a node at every end
+        refinements = max(refinements, _needed_refinements(mesh, ends, description))
+    for _ in range(refinements):
         mesh = mesh.refined(_triangles_near(mesh, ends))
         if disc:
             mesh = _on_circle(mesh, description.width_m / 2)
@@ -118,15 +120,12 @@ def _needed_refinements(
 
     The nearest rim node of each end then lies on its own side and belongs to no other end.
     """
-    marks = ends
-    if description.sheet.shape == "rectangle":
-        half = np.array([description.width_m, description.height_m]) / 2
-        marks = np.vstack([ends, half * [[-1, -1], [1, -1], [1, 1], [-1, 1]]])
-    gaps = pdist(marks)
+    half = np.array([description.width_m, description.height_m]) / 2
+    gaps = pdist(np.vstack([ends, half * [[-1, -1], [1, -1], [1, 1], [-1, 1]]]))
     narrowest = gaps[gaps > 1e-9 * description.width_m].min()  # an end may lie on a corner
     edge = mesh.p[:, mesh.facets[:, mesh.boundary_facets()]]
     longest = np.linalg.norm(edge[:, 0] - edge[:, 1], axis=0).max()
-    return int(np.ceil(np.log2(2 * longest / narrowest)))
+    return int(np.ceil(np.log2(2 * longest / narrowest) - 1e-9))
 
 
 def _snap(mesh: skfem.MeshTri, ends: FloatArray) -> skfem.MeshTri:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 from noisy_skin import Skin
 from tactomo_models import (
     Artifact,
@@ -14,6 +16,10 @@ from tactomo_models import (
     build_artifact,
     load_description,
 )
+from threadpoolctl import threadpool_limits
+
+settings.register_profile("models", deadline=None)  # nothing here depends on the wall clock
+settings.load_profile("models")
 
 # A small sheet that solves in a blink, for what does not depend on the paper's sensor.
 SMALL = """
@@ -81,6 +87,13 @@ def reconstructor(paper: SensorDescription, artifact: Artifact, skin: Skin) -> R
     made = Reconstructor(paper, artifact)
     made.set_reference(skin.reference())
     return made
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_thread() -> Iterator[None]:
+    """As the daemon runs; more threads only get into each other's way on a busy machine."""
+    with threadpool_limits(1):
+        yield
 
 
 @pytest.fixture(autouse=True)
