@@ -159,7 +159,9 @@ def _map_weights(description: SensorDescription, mesh: skfem.MeshTri) -> sp.csr_
     # A hair inside, so that points on the rim are not lost to rounding or to the disc's facets.
     points = np.stack([x.ravel(), y.ravel()]) * (1 - 1e-9)
     on = np.flatnonzero(_inside_mesh(mesh, points))
-    weights = skfem.Basis(mesh, skfem.ElementTriP1()).probes(points[:, on])
+    weights = skfem.Basis(mesh, skfem.ElementTriP1()).probes(points[:, on]).tocsr()
+    weights.data[weights.data < 1e-7] = 0  # a trace of other corners; rounding puts some below 0
+    weights.eliminate_zeros()
     rows = sp.csr_matrix((np.ones(len(on)), (on, np.arange(len(on)))), (x.size, len(on)))
     return (rows @ weights).tocsr()
 

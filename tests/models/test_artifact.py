@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import pickle
+import resource
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from tactomo_models import (
     Artifact,
     ArtifactError,
@@ -52,7 +55,9 @@ def test_an_artifact_of_another_sensor_is_refused(
         load_or_build_artifact(paper, file)
 
 
-@pytest.mark.parametrize("damage", ["cut", "empty", "text", "pickle", "other arrays", "future"])
+@pytest.mark.parametrize(
+    "damage", ["cut", "empty", "text", "pickle", "one array", "other arrays", "future", "a folder"]
+)
 def test_a_damaged_or_foreign_file_is_refused(
     built: Artifact, small: SensorDescription, tmp_path: Path, damage: str
 ) -> None:
@@ -61,6 +66,12 @@ def test_a_damaged_or_foreign_file_is_refused(
     whole = file.read_bytes()
     if damage == "other arrays":
         np.savez(file, a=np.zeros(3))
+    elif damage == "one array":
+        with file.open("wb") as opened:
+            np.save(opened, np.zeros(3))
+    elif damage == "a folder":
+        file.unlink()
+        file.mkdir()
     elif damage == "future":
         with np.load(file) as stored:
             np.savez(file, **{**dict(stored), "format": np.array(99)})
@@ -69,6 +80,56 @@ def test_a_damaged_or_foreign_file_is_refused(
         file.write_bytes(content.get(damage, pickle.dumps({"sha256": small.sha256})))
     with pytest.raises(ArtifactError, match="tactomo models build"):
         load_artifact(file, small)
+
+
+@settings(max_examples=60)
+@given(st.data())
+def test_a_flipped_bit_is_refused_or_harmless(
+    built: Artifact,
+    small: SensorDescription,
+    tmp_path_factory: pytest.TempPathFactory,
+    data: st.DataObject,
+) -> None:
+    """No other exception, and never other numbers: headers and directory are tried most."""
+    file = tmp_path_factory.mktemp("flip") / "small.npz"
+    save_artifact(built, file)
+    content = bytearray(file.read_bytes())
+    last = len(content) - 1
+    ends = st.one_of(st.integers(0, 300), st.integers(last - 1500, last))
+    at = data.draw(st.one_of(ends, st.integers(0, last)))
+    content[at] ^= 1 << data.draw(st.integers(0, 7))
+    file.write_bytes(content)
+    try:
+        read = load_artifact(file, small)
+    except ArtifactError:
+        return
+    finally:
+        file.unlink()
+    np.testing.assert_array_equal(read.jacobian, built.jacobian)
+    np.testing.assert_array_equal(read.bare.green, built.bare.green)
+
+
+def test_a_disk_that_fills_up_leaves_nothing_under_the_name(
+    built: Artifact, small: SensorDescription, tmp_path: Path
+) -> None:
+    folder = tmp_path / "full"
+    folder.mkdir()
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+    try:
+        with pytest.raises(ArtifactError, match=r"cannot write .*small\.npz.*free some space"):
+            save_artifact(built, folder / "small.npz")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(folder.iterdir())
+    save_artifact(built, folder / "small.npz")
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, before[1]))
+    try:
+        with pytest.raises(ArtifactError):
+            save_artifact(built, folder / "small.npz")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert load_artifact(folder / "small.npz", small).sensor == "small", "the old one stays"
 
 
 def test_a_missing_one_is_built_and_kept(small: SensorDescription) -> None:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import io
+import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from noisy_skin import Skin
-from tactomo_models import DataError, Press, SensorDescription
-from tactomo_models.batch import reconstruct_file
+from tactomo_models import DataError, Flag, Press, SensorDescription, SkinSimulator
+from tactomo_models.batch import read_scans, reconstruct_file
 
 PRESSES = [(), (Press(0.02, 0.01, 180.0),), (Press(-0.03, 0.0, 160.0), Press(0.035, 0.03, 190.0))]
 
@@ -101,6 +105,91 @@ def test_bad_input_is_refused_with_what_is_needed(
             run(tmp_path, paper, content)
     with pytest.raises(DataError, match="unknown method"):
         run(tmp_path, paper, arrays, "magic")
-    (tmp_path / "text.npz").write_text("not numpy")
-    with pytest.raises(DataError, match="cannot read"):
-        reconstruct_file(tmp_path / "text.npz", tmp_path / "out.npz", description=paper)
+    with pytest.raises(DataError, match=r"cannot write.*no folder"):
+        reconstruct_file(tmp_path / "in.npz", tmp_path / "no folder" / "x", description=paper)
+
+
+@pytest.mark.parametrize("content", ["missing", "text", "one array", "pickle", "other files"])
+def test_a_file_that_is_no_archive_of_numbers_is_refused(
+    tmp_path: Path, paper: SensorDescription, content: str
+) -> None:
+    file = tmp_path / "in.npz"
+    if content == "text":
+        file.write_text("not numpy")
+    elif content == "one array":
+        with file.open("wb") as opened:
+            np.save(opened, np.zeros((3, 208)))
+    elif content == "pickle":
+        np.savez(file, magnitude=np.array([{}, None], dtype=object))
+    elif content == "other files":
+        with zipfile.ZipFile(file, "w") as archive:
+            archive.writestr("magnitude", "1, 2, 3")
+    with pytest.raises(DataError, match=r"cannot read .*in\.npz"):
+        reconstruct_file(file, tmp_path / "out.npz", description=paper)
+
+
+@given(st.data())
+def test_a_damaged_archive_is_refused_or_read_as_it_was(
+    paper: SensorDescription, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    volts = np.linspace(1, 2, 208)
+    written = io.BytesIO()
+    np.savez_compressed(written, structure=volts[None], structure_reference=volts)
+    content = bytearray(written.getvalue())
+    content[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))
+    file = tmp_path_factory.mktemp("flip") / "in.npz"
+    file.write_bytes(content)
+    try:
+        scans, reference = read_scans(file, paper)
+    except DataError:
+        return
+    np.testing.assert_array_equal(scans["structure"], volts[None])
+    np.testing.assert_array_equal(reference.structure, volts)
+
+
+def test_progress_is_told_frame_by_frame(
+    tmp_path: Path, paper: SensorDescription, arrays: dict[str, Any]
+) -> None:
+    told: list[tuple[int, int]] = []
+    np.savez(tmp_path / "in.npz", **arrays)
+    reconstruct_file(
+        tmp_path / "in.npz",
+        tmp_path / "out.npz",
+        description=paper,
+        progress=lambda done, total: told.append((done, total)),
+    )
+    assert told == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_a_scan_that_was_not_taken_is_flagged_and_the_others_go_on(
+    tmp_path: Path, paper: SensorDescription, arrays: dict[str, Any]
+) -> None:
+    arrays["structure"][1] = np.nan
+    arrays["magnitude"][2] = np.nan
+    out = run(tmp_path, paper, arrays)
+    names = [Flag(int(flags)).names() for flags in out["flags"]]
+    assert names == [[], ["structure_missing"], ["magnitude_missing"]]
+    assert np.isnan(out["structure"][1]).all()
+    assert np.isnan(out["map"][2]).all()
+    assert np.isnan(out["contact_magnitude"][out["contact_frame"] == 2]).all()
+
+
+@pytest.mark.parametrize("averaged", [1, 20, "without noise"])
+def test_the_noise_is_that_of_the_scans_however_good_the_reference(
+    tmp_path: Path, paper: SensorDescription, simulator: SkinSimulator, averaged: int | str
+) -> None:
+    """A file does not say how its reference was made; noise must not look like pressing."""
+    skin = Skin(simulator, noise_share=0.01)
+    rest = Skin(simulator, noise_share=0.0).reference(1)
+    if isinstance(averaged, int):
+        rest = skin.reference(averaged)
+    scans = [skin.scan(*presses) for presses in [(), (), PRESSES[1], PRESSES[2], (), ()]]
+    out = run(
+        tmp_path,
+        paper,
+        {name: np.array([scan[name] for scan in scans]) for name in scans[0]}
+        | {"magnitude_reference": rest.magnitude, "structure_reference": rest.structure},
+    )
+    assert np.bincount(out["contact_frame"], minlength=6).tolist() == [0, 0, 1, 2, 0, 0]
+    assert not out["flags"].any()
+    assert out["misfit"].max() < 1.3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +64,27 @@ def test_no_change_tells_no_pressure(paper: SensorDescription) -> None:
         (("width_m = 0.06", "width_m = -1"), ["sheet.width_m", "-1", "greater than 0"]),
         (("width_m = 0.06", "width_m = nan"), ["sheet.width_m", "nan", "finite"]),
         (("width_m = 0.06", 'width_m = "wide"'), ["sheet.width_m", "wide", "number"]),
+        (("width_m = 0.06", "width_m = inf"), ["sheet.width_m", "inf", "finite"]),
+        (("width_m = 0.06", "width_m = true"), ["sheet.width_m", "True", "number"]),
+        (("width_m = 0.06", 'width_m = "0.06"'), ["sheet.width_m", "'0.06'", "number"]),
+        (("per_side = 2", "per_side = 2.5"), ["electrodes.per_side = 2.5", "integer"]),
+        (("per_side = 2", "per_side = 1"), ["electrodes: 4", "6 to 64"]),
+        (("per_side = 2", "per_side = 2\ncount = 8"), ["electrodes", "no count"]),
+        (("current_a = 1e-4", "current_a = 1e-4\ndrive_offset = 0"), ["pattern.drive_offset = 0"]),
+        (("nodes_x = 21", "nodes_x = 5"), ["map.nodes_x = 5", "11"]),
+        (
+            ("thickness_m", "frame_width_m = 0.02\nthickness_m"),
+            ["sheet.frame_width_m = 0.02", "0.0125"],
+        ),
+        (("[0.0, 100.0, 200.0]", "[0.0, 200.0, 100.0]"), ["pressure_kpa", "200.0, 100.0", "rise"]),
+        (("[0.0, 100.0, 200.0]", "[1.0, 100.0, 200.0]"), ["pressure_kpa", "start at 0"]),
+        (("0.0, 0.0, 0.25]", "0.0, 0.0, nan]"), ["relative_change.2 = nan", "finite"]),
+        (("0.0, 0.0, 0.25]", "0.0, 0.0, 0.0]"), ["relative_change", "only rise"]),
+        (("0.0, 0.0, 0.25]", "0.0, 0.0, -1.5]"), ["relative_change", "-1.5", "above -1"]),
+        (("0.0, 0.0, 0.25]", "0.1, 0.2, 0.25]"), ["relative_change", "start at 0"]),
+        (("[magnitude.response]", "[magnitude.reponse]"), ["unknown key magnitude.reponse"]),
+        (("conductivity_ratio = 100.0", "conductivity_ratio = 0"), ["greater than 0"]),
+        (("conductivity_ratio = 100.0", ""), ["structure.response or conductivity_ratio"]),
         (("width_m = 0.06", ""), ["sheet.width_m is missing"]),
         (("thickness_m", "thicness_m"), ["sheet.thicness_m", "unknown key"]),
         (('"rectangle"', '"hexagon"'), ["sheet.shape", "hexagon", "'rectangle' or 'disc'"]),
@@ -98,6 +120,66 @@ def test_an_unreadable_file_is_named(tmp_path: Path, content: bytes | None) -> N
         file.write_bytes(content)
     with pytest.raises(DescriptionError, match=r"missing\.toml.*paper_square"):
         load_description(file)
+
+
+def test_a_folder_and_an_unknown_name_are_named(tmp_path: Path) -> None:
+    for source in (tmp_path, "paper_sqare"):
+        with pytest.raises(DescriptionError, match=f"{source}.*paper_square, tank_disc"):
+            load_description(source)
+
+
+def test_every_complaint_is_made_at_once(tmp_path: Path, small_text: str) -> None:
+    file = tmp_path / "sensor.toml"
+    file.write_text(small_text.replace("width_m", "widht_m").replace("current_a = 1e-4", ""))
+    with pytest.raises(DescriptionError) as caught:
+        load_description(file)
+    said = str(caught.value)
+    for key in ("sheet.width_m is missing", "unknown key sheet.widht_m", "pattern.current_a"):
+        assert key in said
+
+
+def test_a_disc_takes_a_count_and_no_pitch(tmp_path: Path) -> None:
+    text = (resources.files("tactomo_models.sensors") / "tank_disc.toml").read_text("utf-8")
+    file = tmp_path / "disc.toml"
+    for key, wrong, said in [
+        (
+            "count = 16",
+            "count = 16\npitch_m = 0.01",
+            "a disc takes count, and no per_side or pitch_m",
+        ),
+        ("count = 16", "per_side = 4", "a disc takes count"),
+        ("count = 16", "count = 5", "electrodes.count = 5"),
+        ("count = 16", "count = 80", "electrodes.count = 80"),
+        ("length_m = 0.008", "length_m = 0.05", r"electrodes.length_m = 0.05.*below.*0.03927"),
+        ("width_m = 0.200", "width_m = 0.2\nheight_m = 0.1", r"sheet.height_m = 0.1.*left out"),
+    ]:
+        assert key in text
+        file.write_text(text.replace(key, wrong))
+        with pytest.raises(DescriptionError, match=said):
+            load_description(file)
+
+
+def test_electrodes_of_a_disc_go_counter_clockwise_from_the_bottom() -> None:
+    centres_mm = load_description("tank_disc").electrode_centres_m * 1e3
+    assert centres_mm[0] == pytest.approx([0, -100], abs=0.2)
+    assert centres_mm[4] == pytest.approx([100, 0], abs=0.2)
+    assert centres_mm[8] == pytest.approx([0, 100], abs=0.2)
+
+
+@given(st.integers(6, 32), st.integers(1, 31), st.integers(1, 31))
+def test_a_scan_holds_every_pair_but_those_that_touch(
+    electrodes: int, drive_offset: int, measure_offset: int
+) -> None:
+    drive_offset, measure_offset = drive_offset % electrodes or 1, measure_offset % electrodes or 1
+    pairs = scan_pairs(electrodes, drive_offset, measure_offset)
+    listed = list(zip(pairs.drive[:, 0].tolist(), pairs.measure[:, 0].tolist(), strict=True))
+    wanted = [
+        (k, m)
+        for k in range(electrodes)
+        for m in range(electrodes)
+        if not {k, (k + drive_offset) % electrodes} & {m, (m + measure_offset) % electrodes}
+    ]
+    assert listed == wanted
 
 
 def test_the_hash_follows_the_physics_alone(tmp_path: Path, small_text: str) -> None:

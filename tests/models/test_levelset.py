@@ -47,7 +47,7 @@ def test_the_level_set_jacobian_passes_a_taylor_test(level_set: LevelSet) -> Non
     at = level_set.evaluate(here.mu, here.log_ratio, data, weight)
     assert at is not None
     slope = level_set.jacobian(at, weight)
-    direction = rng.standard_normal(slope.shape[1])
+    direction = rng.standard_normal(len(here.mu) + 1)
     steps = 10.0 ** -np.arange(3, 6)
     left = []
     for step in steps:
