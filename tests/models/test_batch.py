@@ -193,3 +193,4 @@ def test_the_noise_is_that_of_the_scans_however_good_the_reference(
     assert np.bincount(out["contact_frame"], minlength=6).tolist() == [0, 0, 1, 2, 0, 0]
     assert not out["flags"].any()
     assert out["misfit"].max() < 1.3
+    assert out["misfit"][[0, 1, 4, 5]].mean() == pytest.approx(1, abs=0.15)

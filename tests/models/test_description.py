@@ -182,11 +182,31 @@ def test_a_scan_holds_every_pair_but_those_that_touch(
     assert listed == wanted
 
 
-def test_the_hash_follows_the_physics_alone(tmp_path: Path, small_text: str) -> None:
+@pytest.mark.parametrize(
+    ("change", "rebuild"),
+    [
+        (("pitch_m = 0.02", "pitch_m = 0.021"), True),
+        (("length_m = 0.006", "length_m = 0.005"), True),
+        (("ohm_m = 10.0", "ohm_m = 11.0"), True),
+        (("width_m = 0.06", "width_m = 0.061"), True),
+        (("thickness_m", "frame_width_m = 0.001\nthickness_m"), True),
+        (("[pattern]", "[pattern]\nmeasure_offset = 2"), True),
+        (("nodes_x = 21", "nodes_x = 23"), True),
+        (("width_m = 0.06", "width_m = 0.060"), False),
+        (("0.0, 0.0, 0.25]", "0.0, 0.1, 0.25]"), False),
+        (("conductivity_ratio = 100.0", "conductivity_ratio = 50.0"), False),
+        (('name = "small"', 'name = "other"'), False),
+        (('name = "small"', 'title = "Skin"\nname = "small"'), False),
+    ],
+)
+def test_the_hash_follows_the_physics_alone(
+    tmp_path: Path, small_text: str, change: tuple[str, str], rebuild: bool
+) -> None:
+    assert change[0] in small_text
+
     def hash_of(text: str) -> str:
         (tmp_path / "sensor.toml").write_text(text)
         return load_description(tmp_path / "sensor.toml").sha256
 
-    original = hash_of(small_text)
-    assert hash_of(small_text.replace("0.0, 0.0, 0.25]", "0.0, 0.1, 0.25]")) == original
-    assert hash_of(small_text.replace("pitch_m = 0.02", "pitch_m = 0.021")) != original
+    changed = hash_of(small_text.replace(*change))
+    assert (changed != hash_of(small_text)) == rebuild

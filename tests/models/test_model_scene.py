@@ -66,3 +66,25 @@ def test_no_identity_is_given_twice(
             assert moved < FARTHEST_STEP_M
         else:
             assert identity > max(old, default=0)
+
+
+@given(places, places)
+def test_identities_are_not_used_again_after_a_tare(
+    before: list[tuple[float, float]], after: list[tuple[float, float]]
+) -> None:
+    tracker = Tracker()
+    old = tracker.update(np.array(before).reshape(-1, 2))
+    tracker.clear()
+    new = tracker.update(np.array(after).reshape(-1, 2))
+    assert not set(old) & set(new)
+
+
+@given(st.permutations(range(5)), st.floats(-0.004, 0.004), st.floats(-0.004, 0.004))
+def test_identities_follow_contacts_and_not_their_order(
+    order: list[int], dx: float, dy: float
+) -> None:
+    at = np.array([[-0.05, -0.05], [0.05, -0.05], [0.05, 0.05], [-0.05, 0.05], [0.0, 0.0]])
+    tracker = Tracker()
+    first = tracker.update(at)
+    again = tracker.update(at[order] + (dx, dy))
+    assert again == [first[index] for index in order]
