@@ -75,21 +75,15 @@ def solve_bare_sheet(
         impedance: (L,) contact impedances, relative to the description's; 1 if None.
     """
     mesh = sheet.mesh
-    system = _assemble(description, sheet, conductivity, impedance)
+    # The integral of a linear conductivity over a triangle is that of its corners' mean.
+    nodal = np.ones(mesh.p.shape[1]) if conductivity is None else conductivity
+    factor, fields = _factorise(description, sheet, nodal[mesh.t].mean(axis=0), impedance)
     inside = description.on_sheet(mesh.p[0], mesh.p[1], description.sheet.frame_width_m)
     pressable = np.flatnonzero(inside)
     touched = np.isin(mesh.t, pressable).any(axis=0)
     support = np.unique(mesh.t[:, touched])
-    electrodes = description.electrode_count
-    nodes = mesh.p.shape[1]
-    injected = np.zeros((system.shape[0], electrodes - 1))
-    injected[nodes:] = np.eye(electrodes - 1)
-    with threadpool_limits(1):  # SuperLU's panels are too small to share: more threads only spin
-        factor = spla.splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-        fields = factor.solve(injected)
-        green = _green(factor, support, system.shape[0])
-    transfer = np.zeros((electrodes, electrodes))
-    transfer[:-1, :-1] = fields[nodes:]
+    with threadpool_limits(1):
+        green = _green(factor, support, len(fields))
     return BareSheet(
         points=mesh.p,
         triangles=mesh.t.astype(np.intp),
@@ -97,9 +91,72 @@ def solve_bare_sheet(
         support=support,
         green=green,
         potentials=fields[support],
-        transfer=transfer,
+        transfer=_transfer(description, fields),
         map_weights=_map_weights(description, mesh)[:, pressable].tocsr(),
     )
+
+
+def transfer_resistances(
+    description: SensorDescription,
+    sheet: SheetMesh,
+    conductivity: FloatArray,
+    impedance: FloatArray | None = None,
+) -> FloatArray:
+    """Solve a sheet of any conductivity directly: a fraction of a second, no Green's function.
+
+    Args:
+        description: the sensor.
+        sheet: its mesh of T triangles.
+        conductivity: (T,) of each triangle, relative to the bare sheet's.
+        impedance: (L,) contact impedances, relative to the description's; 1 if None.
+
+    Returns:
+        (L, L) electrode potentials for a unit current into each electrode and out of the last;
+        see `scan_voltages`.
+    """
+    return _transfer(description, _factorise(description, sheet, conductivity, impedance)[1])
+
+
+def scan_voltages(description: SensorDescription, transfer: FloatArray) -> FloatArray:
+    """Voltages (M,) in scan order that transfer resistances (L, L) lead to, relative.
+
+    Multiply by `volts_per_unit` for volts.
+    """
+    drive, measure = description.pairs.drive.T, description.pairs.measure.T
+    into = transfer[measure[0], drive[0]] - transfer[measure[1], drive[0]]
+    out_of = transfer[measure[0], drive[1]] - transfer[measure[1], drive[1]]
+    return np.asarray(into - out_of)
+
+
+def volts_per_unit(description: SensorDescription) -> float:
+    """Volts of a relative voltage of 1: the drive current over the bare sheet's conductance."""
+    return description.pattern.current_a / description.sheet_conductance_s
+
+
+def _factorise(
+    description: SensorDescription,
+    sheet: SheetMesh,
+    conductivity: FloatArray,
+    impedance: FloatArray | None,
+) -> tuple[spla.SuperLU, FloatArray]:
+    """Factor of the system, and its solutions (unknowns, L - 1) for a current into each electrode.
+
+    The last electrode is what the currents leave by: its potential is 0 and no unknown.
+    """
+    system = _assemble(description, sheet, conductivity, impedance)
+    unknown = description.electrode_count - 1
+    injected = np.zeros((system.shape[0], unknown))
+    injected[-unknown:] = np.eye(unknown)
+    with threadpool_limits(1):  # SuperLU's panels are too small to share: more threads only spin
+        factor = spla.splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        return factor, factor.solve(injected)
+
+
+def _transfer(description: SensorDescription, fields: FloatArray) -> FloatArray:
+    electrodes = description.electrode_count
+    transfer = np.zeros((electrodes, electrodes))
+    transfer[:-1, :-1] = fields[1 - electrodes :]
+    return transfer
 
 
 @skfem.BilinearForm  # type: ignore[untyped-decorator]
@@ -110,15 +167,14 @@ def _conduction(u: Any, v: Any, w: Any) -> Any:
 def _assemble(
     description: SensorDescription,
     sheet: SheetMesh,
-    conductivity: FloatArray | None,
+    conductivity: FloatArray,
     impedance: FloatArray | None,
 ) -> sp.csc_matrix:
     """Symmetric positive definite system of node potentials and all but the last electrode's."""
     mesh = sheet.mesh
     nodes, electrodes = mesh.p.shape[1], description.electrode_count
     basis = skfem.Basis(mesh, skfem.ElementTriP1())
-    nodal = np.ones(nodes) if conductivity is None else conductivity
-    stiffness = _conduction.assemble(basis, conductivity=basis.interpolate(nodal))
+    stiffness = _conduction.assemble(basis, conductivity=conductivity[:, None])
     # Contact impedance, made relative to the sheet: an extra length of conductor, in metres.
     contact_m = np.full(
         electrodes,
@@ -126,21 +182,29 @@ def _assemble(
     )
     if impedance is not None:
         contact_m *= impedance
-    coupling = sp.lil_matrix((nodes, electrodes))
+    rows, columns, values = [], [], []  # of the electrodes' terms
     lengths = np.zeros(electrodes)
     for index, facets in enumerate(sheet.electrode_facets):
         ends = mesh.facets[:, facets]
         length = np.linalg.norm(mesh.p[:, ends[0]] - mesh.p[:, ends[1]], axis=0)
         lengths[index] = length.sum()
         for i, j in ((0, 0), (1, 1), (0, 1), (1, 0)):
-            values = length * (1 / 3 if i == j else 1 / 6) / contact_m[index]
-            stiffness += sp.coo_matrix((values, (ends[i], ends[j])), (nodes, nodes))
+            rows.append(ends[i])
+            columns.append(ends[j])
+            values.append(length * (1 / 3 if i == j else 1 / 6) / contact_m[index])
         for end in ends:
-            np.add.at(row := np.zeros(nodes), end, -length / 2 / contact_m[index])
-            coupling[:, index] += row[:, None]
-    coupling = coupling.tocsr()[:, :-1]
-    potentials = sp.diags((lengths / contact_m)[:-1])
-    return sp.bmat([[stiffness, coupling], [coupling.T, potentials]], format="csc")
+            potential = np.full_like(end, nodes + index)
+            rows += [end, potential]
+            columns += [potential, end]
+            values += [-length / 2 / contact_m[index]] * 2
+    potentials = nodes + np.arange(electrodes)
+    rows.append(potentials)
+    columns.append(potentials)
+    values.append(lengths / contact_m)
+    size = nodes + electrodes
+    terms = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    stiffness.resize(size, size)
+    return (stiffness + sp.csr_matrix(terms, (size, size)))[:-1, :-1].tocsc()
 
 
 def _green(factor: spla.SuperLU, support: IntArray, size: int) -> FloatArray:
@@ -194,8 +258,6 @@ class ForwardModel:
         self.description = description
         self.bare = bare
         electrodes = description.electrode_count
-        self._drive = _pair_matrix(description.pairs.drive, electrodes)
-        self._measure = _pair_matrix(description.pairs.measure, electrodes)
         # Pairs recur in many voltages; fields are formed once for each of them.
         self._pairs, index = np.unique(
             np.sort(np.concatenate([description.pairs.drive, description.pairs.measure]), axis=1),
@@ -208,8 +270,8 @@ class ForwardModel:
         count = description.measurements
         self._of_drive, self._of_measure = index[:count], index[count:]
         self._pair_sign = sign[:count] * sign[count:]
-        self.volts_per_unit = description.pattern.current_a / description.sheet_conductance_s
-        self.bare_voltages = self._voltages(bare.transfer)
+        self.volts_per_unit = volts_per_unit(description)
+        self.bare_voltages = scan_voltages(description, bare.transfer)
         self._index_triangles()
 
     def _index_triangles(self) -> None:
@@ -243,9 +305,6 @@ class ForwardModel:
         )
         self._mean_transposed = self._mean.T.tocsr()
 
-    def _voltages(self, transfer: FloatArray) -> FloatArray:
-        return np.asarray(np.einsum("ml,lk,mk->m", self._measure, transfer, self._drive))
-
     def solve(self, change: FloatArray, also: NDArray[np.bool_] | None = None) -> Solution:
         """Solve for a pressed sheet.
 
@@ -267,7 +326,7 @@ class ForwardModel:
         potentials = np.linalg.solve(system.T, u0)
         transfer = self.bare.transfer.copy()
         transfer[:-1, :-1] -= u0.T @ (update @ potentials)
-        return Solution(self._voltages(transfer), nodes, potentials)
+        return Solution(scan_voltages(self.description, transfer), nodes, potentials)
 
     def _changed(
         self, change: FloatArray, also: NDArray[np.bool_] | None
