@@ -10,13 +10,14 @@ import ipaddress
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Self
 from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM, MessageError
 from tactomo_client.messages import check_sensor_name
+from tactomo_models import METHODS
 from tactomo_models.errors import explain
 
 from tactomo.errors import ConfigError
@@ -58,8 +59,14 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
+def _method(name: str) -> str:
+    if name not in METHODS:
+        raise ValueError(f"use one of: {', '.join(METHODS)}")
+    return name
+
+
 Endpoint = Annotated[str, AfterValidator(_local_endpoint)]
-TierName = Literal["auto", "quiet", "tikhonov", "levelset"]
+TierName = Annotated[str, AfterValidator(_method)]
 BudgetMs = Annotated[float, Field(gt=0, le=10_000)]
 
 

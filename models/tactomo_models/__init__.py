@@ -25,12 +25,13 @@ from tactomo_models.description import (
     shipped_descriptions,
 )
 from tactomo_models.errors import ArtifactError, DataError, DescriptionError, ModelError
-from tactomo_models.reconstruct import Flag, Reconstruction, Reconstructor, Tier
+from tactomo_models.reconstruct import METHODS, Flag, Reconstruction, Reconstructor, Tier
 from tactomo_models.reference import Reference
 from tactomo_models.scene import Press
 from tactomo_models.simulator import SkinSimulator
 
 __all__ = [
+    "METHODS",
     "Artifact",
     "ArtifactError",
     "Contact",

@@ -9,17 +9,17 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from tactomo_models.archive import read_arrays
 from tactomo_models.description import SensorDescription
 from tactomo_models.errors import DataError
-from tactomo_models.reconstruct import Reconstruction, Reconstructor, Tier
+from tactomo_models.reconstruct import METHODS, Reconstruction, Reconstructor, Tier
 from tactomo_models.reference import Reference, noise_of_reciprocity
 
 FloatArray = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
-METHODS = (Tier.AUTO, Tier.TIKHONOV, Tier.LEVELSET)
 BUDGET_S = 2.0  # a file has no deadline: enough for any scene to converge within its frame
 
 
@@ -54,13 +54,14 @@ def reconstruct_file(
     total = max(len(channel) for channel in scans.values())
     frames: list[Reconstruction] = []
     seconds = np.zeros(total)
-    for index in range(total):
-        magnitude, structure = (_scan(scans, n, index) for n in ("magnitude", "structure"))
-        start = time.perf_counter()
-        frames.append(reconstructor.reconstruct(magnitude, structure))
-        seconds[index] = time.perf_counter() - start
-        if progress:
-            progress(index + 1, total)
+    with threadpool_limits(1):  # as the daemon runs, so that `seconds` are what a robot would see
+        for index in range(total):
+            magnitude, structure = (_scan(scans, n, index) for n in ("magnitude", "structure"))
+            start = time.perf_counter()
+            frames.append(reconstructor.reconstruct(magnitude, structure))
+            seconds[index] = time.perf_counter() - start
+            if progress:
+                progress(index + 1, total)
     arrays: dict[str, Any] = {"seconds": seconds, **frame_arrays(frames, description)}
     try:
         with target.open("wb") as file:

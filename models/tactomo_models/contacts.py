@@ -7,7 +7,7 @@ whose covariance says how far each may be trusted.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ FloatArray = NDArray[np.float64]
 SMALLEST_AREA_M2 = 20e-6  # below this, a spot is a trace of the fit, not a contact
 FARTHEST_STEP_M = 0.025  # a contact that moved more than this between frames is a new one
 TANGENT_REACH = 0.02  # change of conductivity over which the voltages are as good as linear
+LINEAR_ERROR = 0.6  # of a magnitude in a linear image's outline, share of itself: two in three fit
 CHANGE_LIMITS = (-0.9, 20.0)  # relative conductivity changes that a fit may propose
 
 
@@ -169,19 +170,53 @@ def fit_magnitudes(
         tangent = start.tangent
     else:
         tangent, solves = _touch(forward, areas, change), solves - 1
-    while True:
-        J = tangent.jacobian * weight[:, None]
-        residual = weight * (tangent.voltages - data)
-        covariance = np.linalg.inv(J.T @ J + 1e-9 * np.eye(len(areas)))
-        change = np.clip(tangent.change - covariance @ (J.T @ residual), *CHANGE_LIMITS)
-        moved = change - tangent.change
-        if solves <= 0 or np.abs(moved).max() <= TANGENT_REACH:
-            break
-        tangent, solves = _touch(forward, areas, change), solves - 1
-    misfit = float(np.sqrt(np.mean((residual + J @ moved) ** 2)))
+    fitted = _step(tangent, data, weight)
+    while solves > 0 and np.abs(fitted.change - tangent.change).max() > TANGENT_REACH:
+        tangent, solves = _touch(forward, areas, fitted.change), solves - 1
+        fitted = _step(tangent, data, weight)
+    return fitted
+
+
+def _step(tangent: Tangent, data: FloatArray, weight: FloatArray) -> Magnitudes:
+    """One step of Gauss-Newton."""
+    J = tangent.jacobian * weight[:, None]
+    residual = weight * (tangent.voltages - data)
+    covariance = np.linalg.inv(J.T @ J + 1e-9 * np.eye(J.shape[1]))
+    change = np.clip(tangent.change - covariance @ (J.T @ residual), *CHANGE_LIMITS)
+    misfit = float(np.sqrt(np.mean((residual + J @ (change - tangent.change)) ** 2)))
     # A model that does not explain the data to their noise knows its unknowns less well, too.
     sigma = np.sqrt(np.diag(covariance)) * max(1.0, misfit)
     return Magnitudes(change, sigma, misfit, tangent)
+
+
+def bare_tangent(jacobian_by_node: FloatArray, areas: Areas) -> Tangent:
+    """Tangent at the bare sheet: no forward solve.
+
+    Args:
+        jacobian_by_node: (P, M) derivative of the relative voltage changes, a row for each node.
+        areas: the K areas.
+    """
+    voltages = jacobian_by_node.shape[1]
+    columns = np.empty((voltages, len(areas)))
+    for k, share in enumerate(areas.on_nodes):
+        inside = np.flatnonzero(share)
+        columns[:, k] = share[inside] @ jacobian_by_node[inside]
+    return Tangent(np.zeros(len(areas)), np.zeros(voltages), columns)
+
+
+def linear_magnitudes(tangent: Tangent, data: FloatArray, weight: FloatArray) -> Magnitudes:
+    """Fit each area's conductivity change in one step, for areas that a linear image shows.
+
+    Its outline is a guess, and a magnitude goes by the area: that is most of the uncertainty.
+
+    Args:
+        tangent: at the bare sheet, of K areas.
+        data: (M,) relative voltage changes of the magnitude channel.
+        weight: (M,) their inverse standard deviations.
+    """
+    fitted = _step(tangent, data, weight)
+    sigma = np.hypot(fitted.sigma, LINEAR_ERROR * np.abs(fitted.change))
+    return replace(fitted, sigma=sigma)
 
 
 def _touch(forward: ForwardModel, areas: Areas, change: FloatArray) -> Tangent:

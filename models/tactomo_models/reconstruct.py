@@ -16,6 +16,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from enum import IntFlag, StrEnum, auto
+from functools import cache
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +36,9 @@ from tactomo_models.contacts import (
     Contact,
     Magnitudes,
     Tracker,
+    bare_tangent,
     fit_magnitudes,
+    linear_magnitudes,
     pressure_of,
 )
 from tactomo_models.description import Modality, SensorDescription
@@ -43,7 +47,7 @@ from tactomo_models.following import ShapeFollower
 from tactomo_models.forward import ForwardModel
 from tactomo_models.levelset import LevelSet, Shape
 from tactomo_models.reference import Reference, noise_of_reciprocity
-from tactomo_models.tikhonov import noise_figure_weight, tikhonov_matrix
+from tactomo_models.tikhonov import EVEN, noise_figure_weight, noser_spread, tikhonov_matrix
 
 FloatArray = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -63,8 +67,13 @@ class Tier(StrEnum):
 
     AUTO = auto()  # as a request only: as much as the scene needs
     QUIET = auto()  # nothing pressed: a test and no solve
-    TIKHONOV = auto()
+    TIKHONOV = auto()  # one linear step, every node alike
+    NOSER = auto()  # one linear step, nodes weighted by how well they are seen
     LEVELSET = auto()  # level set on the structure channel, magnitudes fitted to its areas
+
+
+METHODS: Final = tuple(tier for tier in Tier if tier is not Tier.QUIET)  # that may be asked for
+LINEAR: Final = (Tier.TIKHONOV, Tier.NOSER)
 
 
 class Flag(IntFlag):
@@ -117,16 +126,21 @@ class _Channel:
     """What is known of one channel since the last tare.
 
     Attributes:
-        reference: (M,) volts.
+        reference: (M,) volts; 0 where it is invalid.
+        valid: (M,) where there is a reference to measure changes against.
+        per_volt: (M,) relative change that a volt makes; 0 where the reference is invalid.
         variance: (M,) of a relative change, by noise of scan and reference and by model error.
         mismatch: typical relative error of the model's prediction of the reference.
-        tikhonov: (P, M) reconstruction matrix for that noise.
+        matrices: (P, M) reconstruction matrix of each linear method for that noise, in single
+            precision: the rounding is far below the noise, and the product is bound by memory.
     """
 
     reference: FloatArray
+    valid: NDArray[np.bool_]
+    per_volt: FloatArray
     variance: FloatArray
     mismatch: float
-    tikhonov: FloatArray
+    matrices: dict[Tier, Image]
 
 
 @dataclass(frozen=True)
@@ -169,6 +183,7 @@ class Reconstructor:
         self._artifact = artifact or load_or_build_artifact(description)
         self._forward = ForwardModel(description, self._artifact.bare)
         self._areas = AreaFinder(self._forward)
+        self._jacobian_by_node = np.ascontiguousarray(self._artifact.jacobian.T)
         self._follower = None
         if description.structure is not None:
             level_set = LevelSet(self._forward, description.structure.saturated_ratio)
@@ -212,15 +227,23 @@ class Reconstructor:
                 relative = np.hypot(noise / np.abs(volts) * np.sqrt(1 + 1 / scans), MODEL_ERROR)
         usable = np.isfinite(volts) & np.isfinite(relative)
         relative = np.where(usable, relative, UNUSABLE)
-        jacobian = self._artifact.jacobian
-        target = central_target(self.description, self._artifact.bare)
-        weight = noise_figure_weight(jacobian, relative, target)
+        valid = usable & (volts != 0)
+        reference = np.where(valid, volts, 0.0)
         return _Channel(
-            reference=volts,
+            reference=reference,
+            valid=valid,
+            per_volt=np.divide(1, np.abs(reference), out=np.zeros_like(reference), where=valid),
             variance=relative**2,
             mismatch=_mismatch(volts, self._forward.bare_voltages),
-            tikhonov=tikhonov_matrix(jacobian, relative, weight),
+            matrices={method: self._matrix(method, relative) for method in LINEAR},
         )
+
+    def _matrix(self, method: Tier, noise: FloatArray) -> Image:
+        jacobian = self._artifact.jacobian
+        target = central_target(self.description, self._artifact.bare)
+        spread = noser_spread(jacobian, noise) if method is Tier.NOSER else EVEN
+        weight = noise_figure_weight(jacobian, noise, target, spread)
+        return tikhonov_matrix(jacobian, noise, weight, spread).astype(np.float32)
 
     def reset(self) -> None:
         """Forget the warm start and which contacts were which."""
@@ -269,22 +292,19 @@ class Reconstructor:
         channel = self._channels.get(name)
         if channel is None:
             return missing | Flag.NO_REFERENCE
-        valid = np.isfinite(scan) & np.isfinite(channel.reference) & (channel.reference != 0)
-        flags = Flag(0) if valid.all() else Flag.INVALID_VOLTAGE
+        valid = np.isfinite(scan) & channel.valid
+        count = int(np.count_nonzero(valid))
+        flags = Flag(0) if count == len(scan) else Flag.INVALID_VOLTAGE
         if channel.mismatch > MOST_MISMATCH:
             flags |= Flag.REFERENCE_MISMATCH
-        if np.mean(~valid) > MOST_INVALID or not np.any(scan[valid]):
+        if count < (1 - MOST_INVALID) * len(scan) or not scan[valid].any():
             return flags | missing | Flag.INVALID_VOLTAGE
-        change = np.zeros_like(channel.reference)
-        reference = channel.reference[valid]
-        change[valid] = (scan[valid] - reference) / np.abs(reference)
-        variance = channel.variance
-        statistic = float((change**2 / variance)[valid].sum())
-        weight = np.zeros_like(change)
+        change = np.where(valid, scan - channel.reference, 0.0) * channel.per_volt
+        square = change * change
         # A model that is wrong about the reference is as wrong about the changes.
         share = max(CHANGE_ERROR, channel.mismatch)
-        weight[valid] = 1 / np.sqrt(variance + (share * change) ** 2)[valid]
-        quiet = statistic < chi2.isf(FALSE_ALARM, int(valid.sum()))
+        weight = valid / np.sqrt(channel.variance + share**2 * square)
+        quiet = float((square / channel.variance).sum()) < _noise_limit(count)
         data[name] = _Data(change, weight, quiet)
         return flags
 
@@ -297,11 +317,11 @@ class Reconstructor:
             self._tracker.update(np.zeros((0, 2)))
             self._forget_shape()
             return self._quiet(data, flags)
-        if self.tier == Tier.TIKHONOV:
-            return self._tikhonov(data, flags, "as requested")
+        if self.tier in LINEAR:
+            return self._linear(data, flags, self.tier, "as requested")
         if "structure" not in data:
             why = "the structure channel is missing" if self._follower else "no structure channel"
-            return self._tikhonov(data, flags, why)
+            return self._linear(data, flags, Tier.TIKHONOV, why)
         return self._by_level_set(data, flags)
 
     def _quiet(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
@@ -318,11 +338,13 @@ class Reconstructor:
             flags=flags,
         )
 
-    def _tikhonov(self, data: dict[Modality, _Data], flags: Flag, reason: str) -> Reconstruction:
+    def _linear(
+        self, data: dict[Modality, _Data], flags: Flag, method: Tier, reason: str
+    ) -> Reconstruction:
         """Linear images of both channels; areas above half of the clearest one's peak."""
         self._forget_shape()
-        with self._timed("tikhonov"):
-            images = {name: self._linear_image(name, d.change) for name, d in data.items()}
+        with self._timed(method):
+            images = {name: self._linear_image(name, d.change, method) for name, d in data.items()}
         with self._timed("contacts"):
             shown = images.get("structure", images.get("magnitude"))
             assert shown is not None
@@ -331,7 +353,7 @@ class Reconstructor:
             # The rest of the image is blur: a contact there would be as large as the sheet.
             inside = np.where(pressed > 0.5, 1.0, 0.0)
             areas = self._areas.find(self._on_map(inside), inside)
-            fitted = self._fit_magnitudes(areas, data, 1)
+            fitted = self._linear_magnitudes(areas, data)
             contacts = self._contacts(areas, fitted)
         if self._magnitude_unexplained(data, fitted):
             flags |= Flag.MISFIT_HIGH
@@ -341,19 +363,27 @@ class Reconstructor:
             pressure_kpa=None,  # a linear image spreads and pales: no pressure follows from it
             structure=self._on_map(pressed).astype(np.float32) if "structure" in data else None,
             contacts=contacts,
-            tier=Tier.TIKHONOV,
+            tier=method,
             reason=reason,
             misfit=fitted.misfit if fitted else float("nan"),
             flags=flags,
         )
 
-    def _linear_image(self, name: Modality, change: FloatArray) -> FloatArray:
-        """Tikhonov image (P,) of the change in the channel's own direction; the rest cut off."""
-        image = self._channels[name].tikhonov @ change
-        return np.asarray(np.maximum(self._sign(name) * image, 0.0))
+    def _linear_image(self, name: Modality, change: FloatArray, method: Tier) -> Image:
+        """Linear image (P,) of the change in the channel's own direction; the rest cut off."""
+        signed = self._sign(name) * change
+        image = self._channels[name].matrices[method] @ signed.astype(np.float32)
+        return np.maximum(image, 0.0, out=image)
 
     def _structure_image(self, change: FloatArray) -> FloatArray:
-        return self._linear_image("structure", change)
+        return self._linear_image("structure", change, Tier.TIKHONOV).astype(np.float64)
+
+    def _linear_magnitudes(self, areas: Areas, data: dict[Modality, _Data]) -> Magnitudes | None:
+        """Magnitudes of a linear method: no forward solve, the bare sheet's Jacobian says all."""
+        if "magnitude" not in data or not len(areas):
+            return None
+        tangent = bare_tangent(self._jacobian_by_node, areas)
+        return linear_magnitudes(tangent, data["magnitude"].change, data["magnitude"].weight)
 
     def _sign(self, name: Modality) -> float:
         if name == "magnitude":
@@ -362,7 +392,7 @@ class Reconstructor:
         assert self.description.structure is not None
         return 1.0 if self.description.structure.saturated_ratio > 1 else -1.0
 
-    def _on_map(self, nodes: FloatArray) -> FloatArray:
+    def _on_map(self, nodes: FloatArray | Image) -> FloatArray:
         shape = (self.description.map.nodes_y, self.description.map.nodes_x)
         return np.asarray(self._artifact.bare.map_weights @ nodes).reshape(shape)
 
@@ -457,6 +487,12 @@ class Reconstructor:
         start = time.perf_counter()
         yield
         self._stage_s[stage] = self._stage_s.get(stage, 0.0) + time.perf_counter() - start
+
+
+@cache
+def _noise_limit(count: int) -> float:
+    """Sum of squares that noise alone in so many voltages stays below, but for false alarms."""
+    return float(chi2.isf(FALSE_ALARM, count))
 
 
 def _mismatch(reference: FloatArray, predicted: FloatArray) -> float:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 from tactomo.cli import app
-from tactomo.cli.app import DEFAULT_CONTROL, DEFAULT_STREAM, DEFAULT_TWIN_CONTROL, ORDER
+from tactomo.cli.app import DEFAULT_CONTROL, DEFAULT_STREAM, DEFAULT_TWIN_CONTROL, ORDER, Method
 from tactomo.config import DaemonConfig
 from tactomo_client import messages
+from tactomo_models import METHODS
 from typer.main import get_command
 from typer.testing import CliRunner
 
@@ -71,6 +72,13 @@ def test_the_default_addresses_are_the_clients() -> None:
     assert messages.DEFAULT_STREAM == DEFAULT_STREAM
     assert messages.DEFAULT_CONTROL == DEFAULT_CONTROL
     assert messages.DEFAULT_TWIN_CONTROL == DEFAULT_TWIN_CONTROL
+
+
+def test_the_methods_are_the_models() -> None:
+    assert get_args(Method) == METHODS
+    for command in ("reconstruct", "daemon", "tier"):
+        shown = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200"})
+        assert all(method in shown.output for method in METHODS)
 
 
 def test_every_key_of_the_configuration_has_a_flag_with_its_default() -> None:

@@ -125,13 +125,13 @@ def test_the_tier_that_was_in_force_is_again(bench: Start, replay: Replay, tmp_p
     path = tmp_path / "tier.mcap"
     b = bench(record=path, tier="auto")
     b.tare()
-    b.ask("set_tier", tier="quiet")
+    b.ask("set_tier", tier="noser")
     b.ask("set_budget", budget_ms=12)
     b.until(lambda: b.ask("status")["budget_ms"] == 12)
     b.step()
     b.daemon.stop()
     marks = open_recording(path).marks()
-    assert [mark.tier for mark in marks] == ["auto"] * 3 + ["quiet"]
+    assert [mark.tier for mark in marks] == ["auto"] * 3 + ["noser"]
     assert marks[-1].budget_ms == 12
     again = replay(path).path
     assert [(m.tier, m.budget_ms) for m in open_recording(again).marks()] == [

@@ -11,7 +11,7 @@ import pytest
 import tactomo
 import tactomo.control
 import tactomo.twin.control
-from tactomo_models import Flag
+from tactomo_models import METHODS, Flag, Tier
 
 DOCUMENT = (Path(__file__).parents[2] / "clients" / "STREAM.md").read_text("utf-8")
 
@@ -50,6 +50,15 @@ def test_every_field_is_in_a_table_and_every_row_is_sent(bench: Callable[..., An
 
 def test_every_flag_is_explained() -> None:
     assert table("## Flags", "Flag") == {flag.name.lower() for flag in Flag if flag.name}
+
+
+def test_every_method_can_be_asked_for_by_its_name() -> None:
+    asked = re.search(r"^\| `set_tier` \| `tier` \(str\): (.*?)\|", DOCUMENT, re.M)
+    made = re.search(r"^\| `tier` \|.*?How much model the frame was given: (.*)\|", DOCUMENT, re.M)
+    assert asked
+    assert made
+    assert re.findall(r"`(\S+)`", asked[1]) == list(METHODS)
+    assert re.findall(r"`(\S+)`", made[1]) == [tier for tier in Tier if tier is not Tier.AUTO]
 
 
 def test_every_event_is_listed() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
 import typer
 from typer.core import TyperGroup
@@ -51,6 +51,8 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
+# The models' METHODS, which are not imported for a command line that only shows its help.
+Method: TypeAlias = Literal["auto", "tikhonov", "noser", "levelset"]
 SensorName: TypeAlias = Annotated[
     str, typer.Option("--sensor", "-s", help="The sensor's name in the stream.")
 ]

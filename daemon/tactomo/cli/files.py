@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from tactomo.cli.app import DEFAULT_DESCRIPTION, FILES, JsonOutput, app, examples
+from tactomo.cli.app import DEFAULT_DESCRIPTION, FILES, JsonOutput, Method, app, examples
 
 if TYPE_CHECKING:
     from tactomo_models import SensorDescription
@@ -227,7 +227,7 @@ def reconstruct(
     scans: Annotated[Path, typer.Argument(metavar="IN.npz", help="Scans and references.")],
     maps: Annotated[Path, typer.Argument(metavar="OUT.npz", help="The file to write.")],
     method: Annotated[
-        str, typer.Option(help="auto, or one for every frame: tikhonov, levelset.")
+        Method, typer.Option(help="One for every frame, or auto: what each frame needs.")
     ] = "auto",
     sensor: DescriptionOption = DEFAULT_DESCRIPTION,
 ) -> None:

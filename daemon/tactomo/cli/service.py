@@ -19,6 +19,7 @@ from tactomo.cli.app import (
     Announce,
     ControlAddress,
     Description,
+    Method,
     RecordingFile,
     SensorName,
     StreamAddress,
@@ -29,7 +30,6 @@ from tactomo.cli.app import (
 if TYPE_CHECKING:
     from tactomo.config import DaemonConfig
 
-TierName = Literal["auto", "quiet", "tikhonov", "levelset"]
 LogLevel = Literal["debug", "info", "warning", "error"]
 LogFormat = Literal["auto", "text", "json"]
 
@@ -68,9 +68,7 @@ def daemon(
     control: Annotated[
         str | None, typer.Option(help=f"Where to take commands. [{DEFAULT_CONTROL}]")
     ] = None,
-    tier: Annotated[
-        TierName | None, typer.Option(help="How much model a frame gets. [auto]")
-    ] = None,
+    tier: Annotated[Method | None, typer.Option(help="How much model a frame gets. [auto]")] = None,
     budget_ms: Annotated[
         float | None, typer.Option(help="Time that one reconstruction may take. [the tier's own]")
     ] = None,
@@ -256,7 +254,7 @@ def replay(
     description: Annotated[
         str | None, typer.Option("--description", "-d", help="[the recorded one]")
     ] = None,
-    tier: Annotated[TierName, typer.Option(help="How much model a frame gets.")] = "auto",
+    tier: Annotated[Method, typer.Option(help="How much model a frame gets.")] = "auto",
     stream: StreamAddress = DEFAULT_STREAM,
     control: ControlAddress = DEFAULT_CONTROL,
     viewer_port: Annotated[

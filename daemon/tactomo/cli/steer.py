@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,6 +15,7 @@ from tactomo.cli.app import (
     STEER,
     ControlAddress,
     JsonOutput,
+    Method,
     app,
     examples,
 )
@@ -112,7 +113,7 @@ def record(
 )
 def tier(
     name: Annotated[
-        Literal["auto", "quiet", "tikhonov", "levelset"],
+        Method,
         typer.Argument(help="The tier; auto chooses one for each frame."),
     ],
     budget_ms: Annotated[
