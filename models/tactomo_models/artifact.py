@@ -96,13 +96,17 @@ def central_target(description: SensorDescription, bare: BareSheet) -> FloatArra
     return np.asarray((np.hypot(x, y) < radius).astype(float))
 
 
-def default_path(description: SensorDescription) -> Path:
-    """Where an artifact is kept unless told otherwise: the user's cache.
+def cache_folder() -> Path:
+    """Where things are kept that can be computed again: the user's cache.
 
     A service finds its own folder in $CACHE_DIRECTORY, which systemd sets.
     """
-    folder = os.environ.get("CACHE_DIRECTORY") or user_cache_path("tactomo")
-    return Path(folder) / f"{description.name}-{description.sha256[:12]}.npz"
+    return Path(os.environ.get("CACHE_DIRECTORY") or user_cache_path("tactomo"))
+
+
+def default_path(description: SensorDescription) -> Path:
+    """Where an artifact is kept unless told otherwise."""
+    return cache_folder() / f"{description.name}-{description.sha256[:12]}.npz"
 
 
 def save_artifact(artifact: Artifact, path: Path) -> None:

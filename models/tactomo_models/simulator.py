@@ -44,7 +44,7 @@ class SkinSimulator:
         sheet = mesh_sheet(description, self._spacing_m)
         rng = np.random.default_rng(seed)
         x, y = sheet.mesh.p
-        self._background = 1 + unevenness * _smooth_noise(x, y, description.width_m / 4, rng)
+        self._background = 1 + unevenness * smooth_noise(x, y, description.width_m / 4, rng)
         impedance = np.exp(impedance_spread * rng.standard_normal(description.electrode_count))
         bare = solve_bare_sheet(description, sheet, self._background, impedance)
         self._forward = ForwardModel(description, bare)
@@ -95,7 +95,7 @@ def conductivity_ratio(
     return np.asarray(full**coverage)
 
 
-def _smooth_noise(
+def smooth_noise(
     x: FloatArray, y: FloatArray, length_m: float, rng: np.random.Generator
 ) -> FloatArray:
     """Random field of unit standard deviation that varies over about `length_m`."""
