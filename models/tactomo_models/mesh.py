@@ -53,7 +53,7 @@ def mesh_sheet(
         if disc:
             mesh = _on_circle(mesh, description.width_m / 2)
     mesh = _snap(mesh, ends)
-    return SheetMesh(mesh, _electrode_facets(mesh, description))
+    return SheetMesh(mesh, electrode_facets(mesh, description))
 
 
 def _rectangle(description: SensorDescription, spacing_m: float | None) -> skfem.MeshTri:
@@ -138,9 +138,10 @@ def _snap(mesh: skfem.MeshTri, ends: FloatArray) -> skfem.MeshTri:
     return skfem.MeshTri(points, mesh.t)
 
 
-def _electrode_facets(
+def electrode_facets(
     mesh: skfem.MeshTri, description: SensorDescription
 ) -> tuple[NDArray[np.intp], ...]:
+    """Boundary facets that each electrode covers, on a mesh with nodes at the electrodes' ends."""
     facets = mesh.boundary_facets()
     middle = mesh.p[:, mesh.facets[:, facets]].mean(axis=1)  # (2, facets)
     found = []
