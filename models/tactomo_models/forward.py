@@ -1,9 +1,10 @@
 """The forward model: voltages of a pressed sheet by the complete electrode model.
 
 The problem is solved once for the bare sheet, keeping the Green's function between the nodes that
-can be pressed. A contact then changes the conductivity in a few triangles only, and its voltages
-follow from a dense system on the nodes of those triangles (Woodbury identity): the cost goes by
-the pressed area, not by the size of the sheet.
+can be pressed. To all that lies outside, a pressed area is what it does on its rim: its inner
+nodes are condensed onto it (see `condensation`), and the currents that the rims then inject into
+the bare sheet follow from a dense system on their nodes (Woodbury identity). The cost goes by the
+pressed area, not by the size of the sheet.
 
 Everything is relative to a sheet of unit conductance: conductivities are ratios to the bare
 sheet's, transfer resistances are in units of the bare sheet's resistance per square.
@@ -26,11 +27,13 @@ from numpy.typing import NDArray
 from skfem.helpers import dot, grad
 from threadpoolctl import threadpool_limits
 
+from tactomo_models.condensation import Layers, condense, layers_of
 from tactomo_models.description import SensorDescription
 from tactomo_models.mesh import SheetMesh, mesh_sheet
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+_STRIP = 256  # nodes that are differentiated at once: what that works on stays in the cache
 _BLOCK = 256  # right-hand sides solved at once: bounds the memory of a build
 
 
@@ -48,6 +51,7 @@ class BareSheet:
             l and out of the last one.
         transfer: (L, L) electrode potentials for the same currents; the last row and column are 0.
         map_weights: (nodes_y * nodes_x, P) interpolation of pressable nodes onto the map.
+        conductivity: (N,) of an uneven sheet, relative to the description's; 1 if None.
     """
 
     points: FloatArray
@@ -58,6 +62,7 @@ class BareSheet:
     potentials: FloatArray
     transfer: FloatArray
     map_weights: sp.csr_matrix
+    conductivity: FloatArray | None = None
 
 
 def solve_bare_sheet(
@@ -83,7 +88,7 @@ def solve_bare_sheet(
     touched = np.isin(mesh.t, pressable).any(axis=0)
     support = np.unique(mesh.t[:, touched])
     with threadpool_limits(1):
-        green = _green(factor, support, len(fields))
+        green = _greens_function(factor, support, len(fields))
     return BareSheet(
         points=mesh.p,
         triangles=mesh.t.astype(np.intp),
@@ -93,6 +98,7 @@ def solve_bare_sheet(
         potentials=fields[support],
         transfer=_transfer(description, fields),
         map_weights=_map_weights(description, mesh)[:, pressable].tocsr(),
+        conductivity=conductivity,
     )
 
 
@@ -207,7 +213,7 @@ def _assemble(
     return (stiffness + sp.csr_matrix(terms, (size, size)))[:-1, :-1].tocsc()
 
 
-def _green(factor: spla.SuperLU, support: IntArray, size: int) -> FloatArray:
+def _greens_function(factor: spla.SuperLU, support: IntArray, size: int) -> FloatArray:
     green = np.empty((len(support), len(support)))
     for start in range(0, len(support), _BLOCK):
         block = support[start : start + _BLOCK]
@@ -238,17 +244,22 @@ def _inside_mesh(mesh: skfem.MeshTri, points: FloatArray) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Solution:
-    """Voltages of one pressed sheet, with what their derivatives need.
+    """Voltages of one pressed sheet, with what its potentials and derivatives follow from.
 
     Attributes:
         voltages: (M,) in scan order, relative (multiply by `ForwardModel.volts_per_unit`).
-        nodes: (n,) positions in `BareSheet.support` where potentials are known.
+        nodes: (n,) positions in `BareSheet.support` of the corners of all triangles that changed.
         potentials: (n, L - 1) potentials there.
+        rim: (r,) positions in `BareSheet.support` of those that other triangles touch, too.
+        injected: (r, L - 1) currents that, injected there into the bare sheet, make the pressed
+            sheet's potentials on the rims and everywhere outside.
     """
 
     voltages: FloatArray
     nodes: IntArray
     potentials: FloatArray
+    rim: IntArray
+    injected: FloatArray
 
 
 class ForwardModel:
@@ -257,126 +268,234 @@ class ForwardModel:
     def __init__(self, description: SensorDescription, bare: BareSheet) -> None:
         self.description = description
         self.bare = bare
-        electrodes = description.electrode_count
-        # Pairs recur in many voltages; fields are formed once for each of them.
-        self._pairs, index = np.unique(
-            np.sort(np.concatenate([description.pairs.drive, description.pairs.measure]), axis=1),
-            axis=0,
-            return_inverse=True,
-        )
-        self._pair_matrix = _pair_matrix(self._pairs, electrodes)[:, :-1]
-        both = np.concatenate([description.pairs.drive, description.pairs.measure])
-        sign = np.where(both[:, 0] < both[:, 1], 1.0, -1.0)
-        count = description.measurements
-        self._of_drive, self._of_measure = index[:count], index[count:]
-        self._pair_sign = sign[:count] * sign[count:]
         self.volts_per_unit = volts_per_unit(description)
         self.bare_voltages = scan_voltages(description, bare.transfer)
+        self._index_pairs()
         self._index_triangles()
+        self._index_nodes()
+
+    def _index_pairs(self) -> None:
+        """The different electrode pairs, and which two of them each voltage belongs to."""
+        pairs = self.description.pairs
+        both = np.concatenate([pairs.drive, pairs.measure])
+        different, pair = np.unique(np.sort(both, axis=1), axis=0, return_inverse=True)
+        matrix = np.zeros((len(different), self.description.electrode_count))
+        np.put_along_axis(matrix, different, [[1.0, -1.0]], axis=1)
+        self._pair_matrix = matrix[:, :-1]  # the last electrode's potential is 0
+        forwards = np.where(both[:, 0] < both[:, 1], 1.0, -1.0)
+        self._sign = np.prod(np.split(forwards, 2), axis=0)
+        # By reciprocity drive and measurement may change places: half of the products suffice.
+        self._products, self._product_of = np.unique(
+            np.sort(np.split(pair, 2), axis=0), axis=1, return_inverse=True
+        )
 
     def _index_triangles(self) -> None:
-        """Positions, gradients and areas of the triangles that touch a pressable node."""
+        """Corners, gradients and stiffness of the triangles that touch a pressable node."""
         bare = self.bare
         nodes = bare.points.shape[1]
-        in_support = np.full(nodes, -1)
-        in_support[bare.support] = np.arange(len(bare.support))
-        in_pressable = np.full(nodes, -1)
-        in_pressable[bare.pressable] = np.arange(len(bare.pressable))
-        touched = np.flatnonzero((in_pressable[bare.triangles] >= 0).any(axis=0))
+        touched = np.flatnonzero(np.isin(bare.triangles, bare.pressable).any(axis=0))
         corners = bare.triangles[:, touched]  # (3, t)
         p = bare.points[:, corners]  # (2, 3, t)
         edge = np.roll(p, -2, axis=1) - np.roll(p, -1, axis=1)  # opposite each corner
         twice = edge[0, 1] * edge[1, 2] - edge[1, 1] * edge[0, 2]
         gradient = np.stack([-edge[1], edge[0]]) / twice  # (2, 3, t) of each corner's hat function
-        self._corner_support = in_support[corners].T  # (t, 3)
-        self._corner_pressable = in_pressable[corners].T
+        self._corner_support = _positions(bare.support, nodes)[corners].T  # (t, 3)
+        self._corner_pressable = _positions(bare.pressable, nodes)[corners].T  # -1 elsewhere
         self._area = np.abs(twice) / 2
         self._gradient = np.ascontiguousarray(gradient.transpose(2, 0, 1))  # (t, 2, 3)
         self._stiffness = self._area[:, None, None] * np.einsum(
             "tdi,tdj->tij", self._gradient, self._gradient
         )
-        triangles = len(touched)
-        rows = self._corner_pressable.ravel()
-        columns = np.repeat(np.arange(triangles), 3)
-        on = rows >= 0
+        uneven = np.ones(nodes) if bare.conductivity is None else bare.conductivity
         # Conductivity of a triangle is the mean of its corners'.
-        self._mean = sp.csr_matrix(
-            (np.full(on.sum(), 1 / 3), (columns[on], rows[on])), (triangles, len(bare.pressable))
+        self._bare_conductivity = uneven[corners].mean(axis=0)
+
+    def _index_nodes(self) -> None:
+        """Triangles around each pressable node; neighbours of each support node."""
+        triangles, nodes = len(self._area), len(self.bare.support)
+        triangle, corner = np.nonzero(self._corner_pressable >= 0)
+        node = self._corner_pressable[triangle, corner]
+        self._triangles_of = _lists(node, triangle, len(self.bare.pressable), fill=triangles)
+        self._triangle_count = np.bincount(self._corner_support.ravel(), minlength=nodes)
+        law = _assembled(
+            self._bare_conductivity[:, None, None] * self._stiffness, self._corner_support, nodes
         )
-        self._mean_transposed = self._mean.T.tocsr()
+        row, column = law.nonzero()
+        self._neighbours = _lists(row, column, nodes, fill=nodes)
+        # Nodes where the bare sheet's currents balance among these triangles. Elsewhere an
+        # electrode, or a triangle that cannot be pressed, is part of the balance.
+        left = np.abs(law @ self.bare.potentials).max(axis=1)
+        self._closed = left < 1e-9 * (abs(law) @ np.abs(self.bare.potentials)).max(axis=1)
 
     def solve(self, change: FloatArray, also: NDArray[np.bool_] | None = None) -> Solution:
         """Solve for a pressed sheet.
 
         Args:
-            change: (P,) conductivity minus 1 at the pressable nodes.
-            also: (P,) nodes where derivatives will be asked for although nothing changed there.
+            change: (P,) conductivity minus the bare sheet's at the pressable nodes.
+            also: not needed any more: derivatives are to be had everywhere.
+
+        Raises:
+            numpy.linalg.LinAlgError: a conductivity is not above 0.
         """
-        triangles, nodes, local = self._changed(change, also)
-        u0 = self.bare.potentials[nodes]
-        if len(nodes) == 0:
-            return Solution(self.bare_voltages, nodes, u0)
-        delta = (self._mean[triangles] @ change)[:, None, None] * self._stiffness[triangles]
-        n = len(nodes)
-        rows = np.repeat(local, 3, axis=1).ravel()
-        columns = np.tile(local, (1, 3)).ravel()
-        update = sp.csr_matrix((delta.ravel(), (rows, columns)), (n, n))
-        system = update.T @ self.bare.green[np.ix_(nodes, nodes)]  # (G D)' = D' G
-        system[np.diag_indices(n)] += 1.0
-        potentials = np.linalg.solve(system.T, u0)
+        del also
+        triangles = self._around(np.flatnonzero(change))
+        if len(triangles) == 0:
+            nowhere = np.zeros(0, np.intp)
+            none = self.bare.potentials[nowhere]
+            return Solution(self.bare_voltages, nowhere, none, nowhere, none)
+        nodes, corners, layers = self._layers(triangles)
+        depth = layers.depth[layers.layer]
+        rim, near = depth == 0, depth <= 1
+        bare = self._bare_conductivity[triangles]
+        pressed = bare + np.append(change, 0.0)[self._corner_pressable[triangles]].mean(axis=1)
+        stiffness = self._stiffness[triangles]
+        condensed = condense(pressed[:, None, None] * stiffness, corners, layers)
+        law = _rim_law(bare[:, None, None] * stiffness, corners, rim, near)
+        # With S and S0 the areas' stiffness on their rims, pressed and bare, the potentials there
+        # are u = u0 + G i, and the currents i = -(S - S0) u. S0 needs no condensation: the bare
+        # sheet's u0 and G balance at inner nodes already, and the law itself does what S0 does.
+        u0, green = self.bare.potentials[nodes[near]], self._green(nodes[near], nodes[rim])
+        u0_rim, green_rim = u0[rim[near]], green[rim[near]]
+        system = condensed.times(green_rim) - law @ green
+        system[np.diag_indices(len(system))] += 1.0
+        injected = np.linalg.solve(system, law @ u0 - condensed.times(u0_rim))
         transfer = self.bare.transfer.copy()
-        transfer[:-1, :-1] -= u0.T @ (update @ potentials)
-        return Solution(scan_voltages(self.description, transfer), nodes, potentials)
+        transfer[:-1, :-1] += u0_rim.T @ injected
+        return Solution(
+            voltages=scan_voltages(self.description, transfer),
+            nodes=nodes,
+            potentials=condensed.inwards(u0_rim + green_rim @ injected),
+            rim=nodes[rim],
+            injected=injected,
+        )
 
-    def _changed(
-        self, change: FloatArray, also: NDArray[np.bool_] | None
-    ) -> tuple[IntArray, IntArray, IntArray]:
-        """Triangles that change, the support nodes they need, and their corners among those."""
-        moved = change != 0
-        if also is not None:
-            moved = moved | also
-        triangles = np.flatnonzero(self._mean @ moved.astype(float))
-        nodes, local = np.unique(self._corner_support[triangles], return_inverse=True)
-        return triangles, nodes, local.reshape(-1, 3)
+    def _layers(self, triangles: IntArray) -> tuple[IntArray, IntArray, Layers]:
+        """Support nodes of these triangles, layer by layer, and the corners (t, 3) among them."""
+        count = len(self.bare.support)
+        nodes, corners = _renumbered(self._corner_support[triangles], count)
+        here = np.bincount(corners.ravel())
+        rim = ~self._closed[nodes] | (here < self._triangle_count[nodes])
+        layers = layers_of(_positions(nodes, count + 1)[self._neighbours[nodes]], rim)
+        return nodes[layers.order], _positions(layers.order, len(nodes))[corners], layers
 
-    def jacobian(self, solution: Solution, where: IntArray) -> FloatArray:
-        """Derivative of the voltages with respect to the conductivity of pressable nodes.
+    def _green(self, rows: IntArray, columns: IntArray) -> FloatArray:
+        """Block of the bare sheet's Green's function; `take` is twice as fast as `np.ix_`."""
+        green = self.bare.green
+        return np.asarray(green.ravel().take(rows[:, None] * len(green) + columns))
+
+    def _around(self, nodes: IntArray) -> IntArray:
+        """Indexed triangles with any of these pressable nodes as a corner."""
+        found = np.zeros(len(self._area) + 1, bool)
+        found[self._triangles_of[nodes]] = True
+        return np.flatnonzero(found[:-1])
+
+    def potentials(self, solution: Solution, nodes: IntArray) -> FloatArray:
+        """Potentials (n, L - 1) of a pressed sheet at n positions in `BareSheet.support`."""
+        position = _positions(solution.nodes, len(self.bare.support))[nodes]
+        outside = position < 0
+        potentials = np.empty((len(nodes), self.bare.potentials.shape[1]))
+        potentials[~outside] = solution.potentials[position[~outside]]
+        others = nodes[outside]
+        moved = self._green(others, solution.rim) @ solution.injected
+        potentials[outside] = self.bare.potentials[others] + moved
+        return potentials
+
+    def jacobian(
+        self, solution: Solution, where: IntArray, onto: FloatArray | None = None
+    ) -> FloatArray:
+        """Derivative of the voltages with respect to conductivity.
 
         Args:
             solution: where to differentiate.
-            where: (n,) pressable nodes; the solution must know the potentials around them.
+            where: (n,) pressable nodes.
+            onto: (n, K) derivative of these nodes' conductivities by K parameters: sooner done
+                here than with the (M, n) derivative by nodes.
 
         Returns:
-            (M, n), relative volts per relative conductivity (the paper's equation 2).
+            (M, K), or (M, n) by the nodes' relative conductivity (the paper's equation 2).
         """
-        by_node = self._mean_transposed[where]  # (n, t)
-        triangles = np.flatnonzero(by_node.getnnz(axis=0))
-        position = np.full(len(self.bare.support), -1)
-        position[solution.nodes] = np.arange(len(solution.nodes))
-        corners = position[self._corner_support[triangles]]
-        fields = solution.potentials @ self._pair_matrix.T  # (n, pairs)
-        gradient = self._gradient[triangles] @ fields[corners]  # (t, 2, pairs)
-        product = gradient.transpose(0, 2, 1) @ gradient  # (t, pairs, pairs)
-        product *= -self._area[triangles, None, None]
-        pairs = len(self._pairs)
-        summed = by_node[:, triangles] @ product.reshape(len(triangles), pairs * pairs)
-        chosen = summed.reshape(len(where), pairs, pairs)[:, self._of_measure, self._of_drive]
-        return np.asarray(chosen * self._pair_sign).T
+        fields = np.zeros((len(self.bare.support), len(self._pair_matrix)))
+        nodes, _ = _renumbered(self._corner_support[self._around(where)], len(fields))
+        fields[nodes] = self.potentials(solution, nodes) @ self._pair_matrix.T
+        count = len(where) if onto is None else onto.shape[1]
+        summed = np.zeros((count, self._products.shape[1]))
+        for start in range(0, len(where), _STRIP):
+            strip = slice(start, start + _STRIP)
+            by_node = self._by_node(fields, where[strip])
+            if onto is None:
+                summed[strip] = by_node
+            else:
+                summed += onto[strip].T @ by_node
+        return np.asarray((summed[:, self._product_of] * self._sign).T)
+
+    def _by_node(self, fields: FloatArray, where: IntArray) -> FloatArray:
+        """Derivative by nodes (n, products), for the fields (S, pairs) of each pair's current."""
+        triangles = self._around(where)
+        gradient = self._gradient[triangles] @ fields[self._corner_support[triangles]]
+        x, y = gradient.transpose(1, 0, 2)  # (t, pairs) each
+        one, other = self._products
+        product = x.take(one, axis=1) * x.take(other, axis=1)
+        product += y.take(one, axis=1) * y.take(other, axis=1)
+        position = _positions(where, len(self.bare.pressable) + 1)  # the last: not pressable
+        corner = position[self._corner_pressable[triangles]]
+        triangle, which = np.nonzero(corner >= 0)
+        third = -self._area[triangles[triangle]] / 3
+        share = sp.csr_matrix(
+            (third, (corner[triangle, which], triangle)), (len(where), len(triangles))
+        )
+        return np.asarray(share @ product)
 
     def bare_jacobian(self) -> FloatArray:
         """Jacobian of the unpressed sheet, (M, P)."""
-        nodes = np.arange(len(self.bare.support))
-        solution = Solution(self.bare_voltages, nodes, self.bare.potentials)
-        return self.jacobian(solution, np.arange(len(self.bare.pressable)))
+        unpressed = self.solve(np.zeros(len(self.bare.pressable)))
+        return self.jacobian(unpressed, np.arange(len(self.bare.pressable)))
 
 
-def _pair_matrix(pairs: IntArray, electrodes: int) -> FloatArray:
-    """(n, electrodes): +1 at the first electrode of each pair, -1 at the second."""
-    matrix = np.zeros((len(pairs), electrodes))
-    rows = np.arange(len(pairs))
-    matrix[rows, pairs[:, 0]] = 1.0
-    matrix[rows, pairs[:, 1]] = -1.0
-    return matrix
+def _rim_law(
+    stiffness: FloatArray,
+    corners: IntArray,
+    rim: NDArray[np.bool_],
+    near: NDArray[np.bool_],
+) -> sp.csr_matrix:
+    """Rows of the rims' nodes, by them and their neighbours inside, of triangles assembled."""
+    triangle, corner = np.nonzero(rim[corners])
+    rows = (rim.cumsum() - 1)[corners[triangle, corner]]
+    columns = (near.cumsum() - 1)[corners[triangle]]
+    values = stiffness[triangle, corner]
+    return sp.csr_matrix(
+        (values.ravel(), (np.repeat(rows, 3), columns.ravel())), (rim.sum(), near.sum())
+    )
+
+
+def _assembled(stiffness: FloatArray, corners: IntArray, nodes: int) -> sp.csr_matrix:
+    """Sum the (t, 3, 3) of triangles into one matrix on all nodes."""
+    rows, columns = np.repeat(corners, 3, axis=1), np.tile(corners, (1, 3))
+    return sp.csr_matrix((stiffness.ravel(), (rows.ravel(), columns.ravel())), (nodes, nodes))
+
+
+def _positions(members: IntArray, count: int) -> IntArray:
+    """Where each number below `count` stands among `members`; -1 for those that do not."""
+    position = np.full(count, -1)
+    position[members] = np.arange(len(members))
+    return position
+
+
+def _renumbered(numbers: IntArray, count: int) -> tuple[IntArray, IntArray]:
+    """The different ones of numbers below `count`, ascending, and each one's place there."""
+    there = np.zeros(count, bool)
+    there[numbers] = True
+    different = np.flatnonzero(there)
+    return different, _positions(different, count)[numbers]
+
+
+def _lists(owner: IntArray, member: IntArray, owners: int, fill: int) -> IntArray:
+    """Members of each owner as (owners, most), filled up with `fill`."""
+    order = np.argsort(owner, kind="stable")
+    count = np.bincount(owner, minlength=owners)
+    slot = np.arange(len(owner)) - np.repeat(count.cumsum() - count, count)
+    lists = np.full((owners, count.max(initial=0)), fill)
+    lists[owner[order], slot] = member[order]
+    return lists
 
 
 def build_forward_model(
