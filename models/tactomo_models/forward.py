@@ -317,11 +317,12 @@ class ForwardModel:
         node = self._corner_pressable[triangle, corner]
         self._triangles_of = _lists(node, triangle, len(self.bare.pressable), fill=triangles)
         self._triangle_count = np.bincount(self._corner_support.ravel(), minlength=nodes)
+        ones = np.ones_like(self._stiffness)  # neighbours may have a stiffness of 0 between them
+        row, column = _assembled(ones, self._corner_support, nodes).nonzero()
+        self._neighbours = _lists(row, column, nodes, fill=nodes)
         law = _assembled(
             self._bare_conductivity[:, None, None] * self._stiffness, self._corner_support, nodes
         )
-        row, column = law.nonzero()
-        self._neighbours = _lists(row, column, nodes, fill=nodes)
         # Nodes where the bare sheet's currents balance among these triangles. Elsewhere an
         # electrode, or a triangle that cannot be pressed, is part of the balance.
         left = np.abs(law @ self.bare.potentials).max(axis=1)
