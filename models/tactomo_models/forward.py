@@ -149,7 +149,7 @@ def _factorise(
 
     The last electrode is what the currents leave by: its potential is 0 and no unknown.
     """
-    system = _assemble(description, sheet, conductivity, impedance)
+    system = assemble_sheet(description, sheet, conductivity, impedance)
     unknown = description.electrode_count - 1
     injected = np.zeros((system.shape[0], unknown))
     injected[-unknown:] = np.eye(unknown)
@@ -170,13 +170,24 @@ def _conduction(u: Any, v: Any, w: Any) -> Any:
     return w["conductivity"] * dot(grad(u), grad(v))
 
 
-def _assemble(
+def assemble_sheet(
     description: SensorDescription,
     sheet: SheetMesh,
     conductivity: FloatArray,
-    impedance: FloatArray | None,
+    impedance: FloatArray | None = None,
 ) -> sp.csc_matrix:
-    """Symmetric positive definite system of node potentials and all but the last electrode's."""
+    """Assemble the complete electrode model.
+
+    Args:
+        description: the sensor.
+        sheet: its mesh of N nodes and T triangles.
+        conductivity: (T,) of each triangle, relative to the description's.
+        impedance: (L,) contact impedances, relative to the description's; 1 if None.
+
+    Returns:
+        (N + L - 1, N + L - 1), symmetric positive definite, of the potentials of the nodes and of
+        all electrodes but the last.
+    """
     mesh = sheet.mesh
     nodes, electrodes = mesh.p.shape[1], description.electrode_count
     basis = skfem.Basis(mesh, skfem.ElementTriP1())

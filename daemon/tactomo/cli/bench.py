@@ -114,7 +114,7 @@ def bench(
     from rich.console import Console
 
     progress = Console(stderr=True)
-    results = Results(_machine(), description, "a twin" if replay is None else replay.name)
+    results = Results(machine(), description, "a twin" if replay is None else replay.name)
     with progress.status("starting") as shown:
         if live and replay is not None:
             _measure_replay(results, replay, shown.update)
@@ -386,7 +386,7 @@ def _stage_table(phases: list[Phase]) -> Table:
     return table
 
 
-def _machine() -> str:
+def machine() -> str:
     """Return the processor, its cores that we may use, and the versions that matter."""
     import numpy as np
 

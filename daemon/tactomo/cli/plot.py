@@ -45,7 +45,7 @@ def plot(
     the recording is reconstructed first, by the same code as live. Needs matplotlib:
     `pip install 'tactomo[plot]'`.
     """
-    _need_matplotlib()
+    need_matplotlib()
     from rich.console import Console
     from tactomo_models import load_description
 
@@ -81,7 +81,12 @@ class Point:
     pressure_kpa: float | None
 
 
-def _need_matplotlib() -> None:
+def need_matplotlib() -> None:
+    """Make sure that pictures can be drawn, without a display.
+
+    Raises:
+        TactomoError: matplotlib is not installed.
+    """
     try:
         import matplotlib
     except ImportError as error:
