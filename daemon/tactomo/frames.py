@@ -34,13 +34,13 @@ def scan_header(last: ChannelScan) -> dict[str, Any]:
     }
 
 
-def frame_header(last: ChannelScan, frame: Reconstruction, flags: set[str]) -> dict[str, Any]:
+def frame_header(last: ChannelScan, frame: Reconstruction) -> dict[str, Any]:
     """Return the same with what the reconstruction says about itself."""
     return {
         **scan_header(last),
         "tier": str(frame.tier),
         "tier_reason": frame.reason,
-        "flags": sorted(flags),
+        "flags": sorted(frame.flags.names()),
         "misfit": _finite(frame.misfit),
     }
 

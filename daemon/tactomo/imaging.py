@@ -16,6 +16,7 @@ import structlog
 from numpy.typing import NDArray
 from tactomo_client.messages import CONTACTS, MAP, SCAN
 from tactomo_models import (
+    Modality,
     ModelError,
     Reconstruction,
     Reconstructor,
@@ -37,6 +38,11 @@ from tactomo.timing import Durations, Rate
 
 NO_DATA_S: Final = 3.0
 """How long a tare on command waits for usable dual scans before it gives up."""
+
+MODALITIES: Final[tuple[tuple[Modality, Channel], ...]] = (
+    ("magnitude", Channel.MAGNITUDE),
+    ("structure", Channel.STRUCTURE),
+)
 
 Volts = dict[Channel, NDArray[np.float64]]
 
@@ -143,7 +149,7 @@ class Imaging:
         self._follow_recording(dual)
         volts = {scan.channel: scan.volts for scan in dual.scans}
         self._publish_scan(dual, volts)
-        frame = self._reconstruct(volts)
+        frame = self._reconstruct(volts, _saturated(dual))
         if frame is not None:
             self._publish_frame(dual, frame)
         if self._marked is not None and dual.recording == self._marked.number:
@@ -178,11 +184,11 @@ class Imaging:
                 entry = reference_entry(self.reference, time.monotonic_ns(), time.time_ns())
                 active.add(entry)
 
-    def _reconstruct(self, volts: Volts) -> Reconstruction | None:
+    def _reconstruct(self, volts: Volts, saturated: list[Modality]) -> Reconstruction | None:
         started_s = time.perf_counter()
         try:
             frame = self._reconstructor.reconstruct(
-                volts.get(Channel.MAGNITUDE), volts.get(Channel.STRUCTURE)
+                volts.get(Channel.MAGNITUDE), volts.get(Channel.STRUCTURE), saturated=saturated
             )
         except Exception as error:  # a robot is better off with the next frame than with none
             self._reconstructor.reset()
@@ -208,10 +214,7 @@ class Imaging:
 
     def _publish_frame(self, dual: DualScan, frame: Reconstruction) -> None:
         started_s = time.perf_counter()
-        flags = set(frame.flags.names())
-        if any(scan.flags & ScanFlag.SATURATED for scan in dual.scans):
-            flags.add("invalid_voltage")
-        header = frame_header(dual.last, frame, flags)
+        header = frame_header(dual.last, frame)
         self._publisher.header = header
         self._publisher.publish(CONTACTS, contacts_fields(dual.counter, frame), header)
         active = self._recorder.active
@@ -257,3 +260,9 @@ class Imaging:
         if stage not in self.stages:  # a new dictionary, for those who iterate over the old one
             self.stages = {**self.stages, stage: Durations()}
         self.stages[stage].add(seconds)
+
+
+def _saturated(dual: DualScan) -> list[Modality]:
+    """Return the channels whose device says that its converter clipped."""
+    clipped = {scan.channel for scan in dual.scans if scan.flags & ScanFlag.SATURATED}
+    return [name for name, channel in MODALITIES if channel in clipped]

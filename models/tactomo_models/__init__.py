@@ -25,7 +25,8 @@ from tactomo_models.description import (
     shipped_descriptions,
 )
 from tactomo_models.errors import ArtifactError, DataError, DescriptionError, ModelError
-from tactomo_models.reconstruct import METHODS, Flag, Reconstruction, Reconstructor, Tier
+from tactomo_models.plausibility import Flag
+from tactomo_models.reconstruct import METHODS, Reconstruction, Reconstructor, Tier
 from tactomo_models.reference import Reference
 from tactomo_models.scene import Press
 from tactomo_models.simulator import SkinSimulator

@@ -57,8 +57,15 @@ class Artifact:
 
 def nominal_noise(bare_voltages: FloatArray) -> FloatArray:
     """Relative noise (M,) of a converter with the same noise in volts on every measurement."""
-    absolute = np.sqrt(np.mean(bare_voltages**2)) * 10 ** (-NOMINAL_SNR_DB / 20)
-    return np.asarray(np.hypot(absolute / np.abs(bare_voltages), MODEL_ERROR))
+    return np.asarray(np.hypot(nominal_noise_v(bare_voltages) / np.abs(bare_voltages), MODEL_ERROR))
+
+
+def nominal_noise_v(voltages: FloatArray) -> FloatArray:
+    """Noise (M,) in volts of that converter; voltages that are no numbers count for nothing."""
+    finite = voltages[np.isfinite(voltages)]
+    largest = float(np.abs(finite).max(initial=0.0)) or 1.0
+    rms = largest * np.sqrt(np.mean((finite / largest) ** 2)) if len(finite) else 0.0
+    return np.full(voltages.shape, rms * 10 ** (-NOMINAL_SNR_DB / 20))
 
 
 def build_artifact(description: SensorDescription, progress: Progress | None = None) -> Artifact:

@@ -30,3 +30,15 @@ def scan_pairs(electrodes: int, drive_offset: int = 1, measure_offset: int = 1) 
     measure = np.stack([m, (m + measure_offset) % electrodes], axis=1)
     apart = ~(drive[:, :, None] == measure[:, None, :]).any(axis=(1, 2))
     return Pairs(drive[apart], measure[apart])
+
+
+def reciprocal_pairs(pairs: Pairs) -> NDArray[np.intp]:
+    """Positions (n, 2) in a scan of voltages that are the same but for noise: V(k, m) = V(m, k)."""
+    order = {
+        (*drive, *measure): index
+        for index, (drive, measure) in enumerate(
+            zip(pairs.drive.tolist(), pairs.measure.tolist(), strict=True)
+        )
+    }
+    found = [(i, order[k[2:] + k[:2]]) for k, i in order.items() if k[2:] + k[:2] in order]
+    return np.array([(i, j) for i, j in found if i < j], dtype=np.intp).reshape(-1, 2)

@@ -12,10 +12,10 @@ counted in modelled work, so that a recording reconstructs exactly as the live s
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from enum import IntFlag, StrEnum, auto
+from enum import StrEnum, auto
 from functools import cache
 from typing import Final
 
@@ -28,7 +28,7 @@ from tactomo_models.artifact import (
     Artifact,
     central_target,
     load_or_build_artifact,
-    nominal_noise,
+    nominal_noise_v,
 )
 from tactomo_models.contacts import (
     AreaFinder,
@@ -46,6 +46,13 @@ from tactomo_models.errors import DataError
 from tactomo_models.following import ShapeFollower
 from tactomo_models.forward import ForwardModel
 from tactomo_models.levelset import LevelSet, Shape
+from tactomo_models.plausibility import (
+    Flag,
+    ScanCheck,
+    Wiring,
+    asymmetry_of,
+    examine_reference,
+)
 from tactomo_models.reference import Reference, noise_of_reciprocity
 from tactomo_models.tikhonov import EVEN, noise_figure_weight, noser_spread, tikhonov_matrix
 
@@ -54,11 +61,12 @@ Image = NDArray[np.float32]
 
 DEFAULT_BUDGET_S = 0.05
 CHANGE_ERROR = 0.02  # least model error as a share of each voltage change: mesh, outline
-MOST_MISMATCH = 0.5  # of the reference with the model, beyond which it is not this sensor's
 FALSE_ALARM = 1e-6  # chance that an unpressed frame of pure noise is taken for a pressed one
 UNUSABLE = 1e3  # relative error of a voltage whose reference is zero or no number
 MOST_INVALID = 0.25  # share of voltages that may be invalid before the channel is given up
 BAD_MISFIT = 2.0  # the data are not explained: what is shown may be wrong
+SWAPPED = 2.0  # times the structure channel's signal that the magnitude channel's never reaches
+MUCH_MORE = 5.0  # ratio of the channels' contrasts (logarithms) for that
 WRONG_WAY = 5.0  # standard uncertainties by which a conductivity may change against its sign
 
 
@@ -74,22 +82,6 @@ class Tier(StrEnum):
 
 METHODS: Final = tuple(tier for tier in Tier if tier is not Tier.QUIET)  # that may be asked for
 LINEAR: Final = (Tier.TIKHONOV, Tier.NOSER)
-
-
-class Flag(IntFlag):
-    """What stands in the way of trusting a frame."""
-
-    STRUCTURE_MISSING = 1
-    MAGNITUDE_MISSING = 2
-    INVALID_VOLTAGE = 4
-    NO_REFERENCE = 8
-    MISFIT_HIGH = 16
-    NOT_CONVERGED = 32
-    REFERENCE_MISMATCH = 64  # tared under load, other electrodes' order, or another sensor
-
-    def names(self) -> list[str]:
-        """Names of the flags that are set, in lower case, as the stream carries them."""
-        return [flag.name.lower() for flag in self if flag.name]
 
 
 @dataclass(frozen=True)
@@ -131,6 +123,10 @@ class _Channel:
         per_volt: (M,) relative change that a volt makes; 0 where the reference is invalid.
         variance: (M,) of a relative change, by noise of scan and reference and by model error.
         mismatch: typical relative error of the model's prediction of the reference.
+        flags: what is wrong with the reference.
+        electrodes: those that the reference shows to be faulty.
+        check: what scans are held against.
+        total: (M,) weights of the changes whose sum is the change of the whole sheet.
         matrices: (P, M) reconstruction matrix of each linear method for that noise, in single
             precision: the rounding is far below the noise, and the product is bound by memory.
     """
@@ -140,6 +136,10 @@ class _Channel:
     per_volt: FloatArray
     variance: FloatArray
     mismatch: float
+    flags: Flag
+    electrodes: tuple[int, ...]
+    check: ScanCheck
+    total: FloatArray
     matrices: dict[Tier, Image]
 
 
@@ -150,11 +150,13 @@ class _Data:
     change: FloatArray
     weight: FloatArray
     quiet: bool
+    signal: float  # rms of the changes over their noise
 
     @property
     def misfit(self) -> float:
         """Misfit of a model in which nothing is pressed."""
-        return float(np.sqrt(np.mean((self.weight * self.change) ** 2)))
+        count = max(int(np.count_nonzero(self.weight)), 1)
+        return float(np.sqrt(((self.weight * self.change) ** 2).sum() / count))
 
 
 class Reconstructor:
@@ -182,6 +184,7 @@ class Reconstructor:
         self.budget_s = budget_s
         self._artifact = artifact or load_or_build_artifact(description)
         self._forward = ForwardModel(description, self._artifact.bare)
+        self._wiring = Wiring(description)
         self._areas = AreaFinder(self._forward)
         self._jacobian_by_node = np.ascontiguousarray(self._artifact.jacobian.T)
         self._follower = None
@@ -194,6 +197,8 @@ class Reconstructor:
         self._fitted_areas: Areas | None = None
         self._areas_shape: FloatArray | None = None
         self._stage_s: dict[str, float] = {}
+        self._left_out: list[str] = []
+        self._structure_answers_more = _structure_answers_more(description)
 
     def set_reference(self, reference: Reference) -> None:
         """Measure changes against this unpressed scan from now on; forgets the warm start.
@@ -218,24 +223,32 @@ class Reconstructor:
                 f"the {name} reference has shape {volts.shape}; sensor "
                 f"{self.description.name!r} has {self.description.measurements} voltages a scan"
             )
+        predicted = self._forward.bare_voltages
         if noise is None:
             noise = noise_of_reciprocity(self.description, volts)
         if noise is None:
-            relative = nominal_noise(self._forward.bare_voltages)
-        else:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                relative = np.hypot(noise / np.abs(volts) * np.sqrt(1 + 1 / scans), MODEL_ERROR)
-        usable = np.isfinite(volts) & np.isfinite(relative)
-        relative = np.where(usable, relative, UNUSABLE)
-        valid = usable & (volts != 0)
+            noise = nominal_noise_v(volts)
+        verdict = examine_reference(self._wiring, volts, predicted, noise / np.sqrt(scans))
+        valid = verdict.usable
         reference = np.where(valid, volts, 0.0)
+        per_volt = np.divide(1, np.abs(reference), out=np.zeros_like(reference), where=valid)
+        noise = np.where(valid, noise, 0.0)
+        relative = np.hypot(noise * per_volt * np.sqrt(1 + 1 / scans), MODEL_ERROR)
+        relative = np.where(valid, relative, UNUSABLE)
+        matrices = {method: self._matrix(method, relative) for method in LINEAR}
         return _Channel(
             reference=reference,
             valid=valid,
-            per_volt=np.divide(1, np.abs(reference), out=np.zeros_like(reference), where=valid),
+            per_volt=per_volt,
             variance=relative**2,
-            mismatch=_mismatch(volts, self._forward.bare_voltages),
-            matrices={method: self._matrix(method, relative) for method in LINEAR},
+            mismatch=_mismatch(reference[valid], predicted[valid]),
+            flags=verdict.flags,
+            electrodes=verdict.electrodes,
+            check=ScanCheck(
+                self._wiring, reference, noise, valid, asymmetry_of(self._wiring, reference)
+            ),
+            total=self._sign(name) * matrices[Tier.TIKHONOV].sum(axis=0, dtype=np.float64),
+            matrices=matrices,
         )
 
     def _matrix(self, method: Tier, noise: FloatArray) -> Image:
@@ -258,28 +271,53 @@ class Reconstructor:
         self._areas_shape = None
 
     def reconstruct(
-        self, magnitude: FloatArray | None, structure: FloatArray | None
+        self,
+        magnitude: FloatArray | None,
+        structure: FloatArray | None,
+        *,
+        saturated: Collection[Modality] = (),
     ) -> Reconstruction:
         """Reconstruct one frame.
 
         Args:
             magnitude: (M,) volts; None if that scan is missing.
             structure: (M,) volts; None if that scan is missing.
+            saturated: channels whose device says that its converter clipped this scan.
 
         Raises:
             DataError: a scan has another number of voltages than the sensor.
         """
         self._stage_s = {}
+        self._left_out = []
         flags = Flag(0)
         data: dict[Modality, _Data] = {}
         with self._timed("data"):
             for name, scan in (("magnitude", magnitude), ("structure", structure)):
                 if name in self.description.modalities:
-                    flags |= self._take(name, scan, data)
+                    flags |= self._take(name, scan, data, saturated=name in saturated)
+            if self._swapped(data):
+                flags |= Flag.CHANNELS_SWAPPED
         made = self._by_tier(data, flags)
-        return replace(made, stage_s=self._stage_s)
+        reason = "; ".join([made.reason, *self._left_out])
+        return replace(made, reason=reason, stage_s=self._stage_s)
 
-    def _take(self, name: Modality, scan: FloatArray | None, data: dict[Modality, _Data]) -> Flag:
+    def _swapped(self, data: dict[Modality, _Data]) -> bool:
+        """Tell whether the magnitude channel answers more than the structure channel.
+
+        The structure channel's contrast is far the larger, so that no pressing does that.
+        """
+        if len(data) < 2 or data["magnitude"].quiet or not self._structure_answers_more:
+            return False
+        return data["magnitude"].signal > SWAPPED * data["structure"].signal
+
+    def _take(
+        self,
+        name: Modality,
+        scan: FloatArray | None,
+        data: dict[Modality, _Data],
+        *,
+        saturated: bool,
+    ) -> Flag:
         """Put a channel's relative changes into `data`, or say by a flag why it has none."""
         missing = Flag.MAGNITUDE_MISSING if name == "magnitude" else Flag.STRUCTURE_MISSING
         if scan is None:
@@ -292,20 +330,24 @@ class Reconstructor:
         channel = self._channels.get(name)
         if channel is None:
             return missing | Flag.NO_REFERENCE
-        valid = np.isfinite(scan) & channel.valid
+        verdict = channel.check.examine(scan, saturated=saturated)
+        valid, flags = verdict.usable, channel.flags | verdict.flags
+        if electrodes := sorted({*channel.electrodes, *verdict.electrodes}):
+            self._left_out.append(_named(name, electrodes))
         count = int(np.count_nonzero(valid))
-        flags = Flag(0) if count == len(scan) else Flag.INVALID_VOLTAGE
-        if channel.mismatch > MOST_MISMATCH:
-            flags |= Flag.REFERENCE_MISMATCH
         if count < (1 - MOST_INVALID) * len(scan) or not scan[valid].any():
             return flags | missing | Flag.INVALID_VOLTAGE
         change = np.where(valid, scan - channel.reference, 0.0) * channel.per_volt
         square = change * change
+        variance = channel.variance * verdict.noise**2
         # A model that is wrong about the reference is as wrong about the changes.
         share = max(CHANGE_ERROR, channel.mismatch)
-        weight = valid / np.sqrt(channel.variance + share**2 * square)
-        quiet = float((square / channel.variance).sum()) < _noise_limit(count)
-        data[name] = _Data(change, weight, quiet)
+        weight = valid / np.sqrt(variance + share**2 * square)
+        statistic = float((square / variance).sum())
+        quiet = statistic < _noise_limit(count)
+        if not quiet and _fell(channel.total * change, channel.total**2 * variance):
+            flags |= Flag.REFERENCE_MISMATCH
+        data[name] = _Data(change, weight, quiet, (statistic / count) ** 0.5)
         return flags
 
     def _by_tier(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
@@ -495,13 +537,35 @@ def _noise_limit(count: int) -> float:
     return float(chi2.isf(FALSE_ALARM, count))
 
 
+def _structure_answers_more(description: SensorDescription) -> bool:
+    """Tell whether the structure channel's contrast is far above the magnitude channel's."""
+    if description.magnitude is None or description.structure is None:
+        return False
+    largest = 1 + description.magnitude.response.relative_change[-1]
+    contrast = abs(float(np.log(description.structure.saturated_ratio)))
+    return contrast > MUCH_MORE * abs(float(np.log(largest)))
+
+
+def _fell(total: FloatArray, variance: FloatArray) -> bool:
+    """Tell whether the sheet as a whole changed against the sign that pressing has.
+
+    Then less presses now than did at the tare.
+    """
+    return float(total.sum()) < -WRONG_WAY * float(np.sqrt(variance.sum()))
+
+
+def _named(name: Modality, electrodes: list[int]) -> str:
+    """Say in words which electrodes are left out; they are counted from 0."""
+    word = "electrode" if len(electrodes) == 1 else "electrodes"
+    return f"{name} {word} {', '.join(map(str, electrodes))} left out"
+
+
 def _mismatch(reference: FloatArray, predicted: FloatArray) -> float:
     """Typical relative error of a model that may be off by a common factor; 1 where none fits."""
     ratio = reference / predicted
-    ratio = ratio[np.isfinite(ratio)]
-    middle = float(np.median(ratio)) if len(ratio) else 0.0
-    if middle == 0:
+    if len(ratio) == 0:
         return 1.0
+    middle = float(np.median(ratio))
     # 0.6745 standard deviations hold half of a normal distribution.
     return float(np.median(np.abs(ratio / middle - 1))) / 0.6745
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from tactomo_models.description import SensorDescription
 from tactomo_models.errors import DataError
+from tactomo_models.pattern import reciprocal_pairs
 
 FloatArray = NDArray[np.float64]
 
@@ -73,21 +74,9 @@ def noise_of_reciprocity(description: SensorDescription, scans: FloatArray) -> F
     V(k, m) = V(m, k) but for noise. Electrodes and an uneven sheet do not disturb it; the median
     keeps a few broken electrodes from doing so. None where the pattern has no reciprocal pairs.
     """
-    pairs = description.pairs
-    order = {
-        (*drive, *measure): index
-        for index, (drive, measure) in enumerate(
-            zip(pairs.drive.tolist(), pairs.measure.tolist(), strict=True)
-        )
-    }
-    twins = [
-        (i, order[key[2:] + key[:2]]) for key, i in order.items() if key[2:] + key[:2] in order
-    ]
-    twins = [(i, j) for i, j in twins if i < j]
-    if not twins:
-        return None
-    i, j = np.array(twins).T
-    differences = np.abs(scans[..., i] - scans[..., j])
+    i, j = reciprocal_pairs(description.pairs).T
+    with np.errstate(over="ignore", invalid="ignore"):
+        differences = np.abs(scans[..., i] - scans[..., j])
     differences = differences[np.isfinite(differences)]
     if differences.size == 0:
         return None

@@ -11,7 +11,7 @@ import os
 import pty
 import time
 import tty
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from tactomo.log import configure_logging
 from tactomo.recording import open_recording
 from tactomo_client import request
 from tactomo_client.messages import KINDS, Message, decode_message, topic
-from tactomo_models import Contact, Flag, Reconstruction, Reference, Tier
+from tactomo_models import Contact, Flag, Modality, Reconstruction, Reference, Tier
 from tactomo_protocol import (
     Channel,
     Command,
@@ -232,10 +232,14 @@ class Memory:
         self._before = np.zeros((51, 51), np.float32)
 
     def reconstruct(
-        self, magnitude: NDArray[np.float64] | None, structure: NDArray[np.float64] | None
+        self,
+        magnitude: NDArray[np.float64] | None,
+        structure: NDArray[np.float64] | None,
+        *,
+        saturated: Collection[Modality] = (),
     ) -> Reconstruction:
         time.sleep(self.seconds)
-        flags = Flag(0)
+        flags = Flag.SATURATED if saturated else Flag(0)
         if magnitude is None:
             flags |= Flag.MAGNITUDE_MISSING
         if structure is None:

@@ -148,7 +148,7 @@ def test_a_reconstruction_that_fails_costs_its_frame_alone(
     memory = b.daemon._imaging._reconstructor
     reconstruct = memory.reconstruct
 
-    def fail_once(*volts: Any) -> Any:
+    def fail_once(*_: Any, **__: Any) -> Any:
         memory.reconstruct = reconstruct
         raise ZeroDivisionError("a mistake")
 

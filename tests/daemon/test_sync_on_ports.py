@@ -113,7 +113,7 @@ def test_a_saturated_scan_is_used_and_flagged(bench: Start) -> None:
     b = bench()
     b.tare()
     frame = b.step(flags=ScanFlag.SATURATED)
-    assert frame["flags"] == ["invalid_voltage"]
+    assert frame["flags"] == ["saturated"]
     assert frame["map"] is not None
 
 

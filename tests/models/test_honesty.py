@@ -30,7 +30,7 @@ Scans = dict[str, FloatArray]
 
 PRESS = Press(0.03, -0.02, 180.0)
 OTHER = Press(-0.03, 0.03, 170.0)
-UNTRUSTED = Flag.MISFIT_HIGH | Flag.NOT_CONVERGED | Flag.REFERENCE_MISMATCH | Flag.INVALID_VOLTAGE
+UNTRUSTED = ~(Flag.MAGNITUDE_MISSING | Flag.STRUCTURE_MISSING)
 
 
 @pytest.fixture

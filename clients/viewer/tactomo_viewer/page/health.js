@@ -8,10 +8,14 @@ const FLAGS = {
   magnitude_missing: ["Magnitude channel missing", "No scans of the magnitude channel: where it is touched is known, how hard is not."],
   structure_missing: ["Structure channel missing", "No scans of the structure channel: shapes come from the magnitude channel alone."],
   no_reference: ["No reference", "Not tared yet: press Tare while nothing touches the skin."],
-  reference_mismatch: ["Reference doubtful", "The reference does not look like this sensor unloaded: tare while nothing touches it. Is it the right sensor, its electrodes in order?"],
+  reference_mismatch: ["Reference doubtful", "The reference does not look like this sensor unloaded, or something was on the skin then: tare while nothing touches it. Is it the right sensor, its electrodes in order?"],
   misfit_high: ["Misfit high", "The model does not explain the data. Has the reference aged? Tare. Is a wire loose?"],
   not_converged: ["Not converged", "The reconstruction ran out of its time; this map is the best so far."],
-  invalid_voltage: ["Invalid voltage", "Some voltages were not numbers and were left out, or the converter was saturated."],
+  invalid_voltage: ["Invalid voltage", "Some voltages were not numbers, or cannot be right, and were left out. Is a wire loose?"],
+  saturated: ["Converter saturated", "The converter clipped; those voltages were left out. Lower the gain or the current."],
+  electrode_fault: ["Electrode fault", "An electrode reads nonsense and was left out; the reason beside the tier names it. Check its lead and contact, then tare."],
+  noise_high: ["Noise high", "Voltages that should be equal differ widely. Look for interference, a loose ground or a broken device."],
+  channels_swapped: ["Channels swapped?", "The magnitude channel answers more than the structure channel: exchange their plugs, then tare. Or is the structure channel dead?"],
 };
 
 /** A flag's name and meaning for people. */

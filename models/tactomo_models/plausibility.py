@@ -1,0 +1,301 @@
+"""What a scan can show of its own faults: broken leads, clipping, interference, wrong wiring.
+
+Nothing here knows what presses. Any sheet of any conductivity obeys three rules, whatever lies on
+it, and a scan that breaks one of them has a fault beyond its noise:
+
+- reciprocity: V(k, m) = V(m, k).
+- order: where the drive pair and the measuring pair do not cross, the voltage has the sign that it
+  has on the bare sheet. Potential falls steadily along the rim from one driven electrode to the
+  other: at a highest point in between no current could leave the sheet.
+- size: no voltage exceeds the bare sheet's by orders of magnitude, and a pair of electrodes under
+  which the sheet conducts does not fall silent in every measurement.
+
+Faults that most of an electrode's voltages share are that electrode's.
+
+Source of the second rule: Curtis, Ingerman & Morrow, "Circular planar graphs and resistor
+networks", Linear Algebra Appl. 283 (1998). What is read here of wrong leads follows Asfaw & Adler,
+"Automatic detection of detached and erroneous electrodes in electrical impedance tomography",
+Physiol. Meas. 26 (2005).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntFlag
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactomo_models.description import SensorDescription
+from tactomo_models.pattern import reciprocal_pairs
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+TINY = float(np.finfo(float).tiny)
+QUIETEST = 1e-6  # share of the largest voltage that any converter's noise exceeds
+LARGEST = 1e3  # times the largest voltage expected: more is no voltage of this sheet
+FARTHEST_SCALE = 1e30  # a reference in any sensible unit is within this of the model
+SMALLEST = 1e-6  # of the voltage expected: less in a reference is none to measure changes against
+SAME_CLIPPED = 3  # voltages of exactly the same, largest size: chance makes a pair at most
+ALIKE = 1.01  # ratio within which voltages may come out the same by symmetry
+QUARTILE = 0.3186  # standard deviations that hold a quarter of a normal distribution
+OUTLIER = 8.0  # standard deviations that noise does not reach
+LEAST_ASYMMETRY = 0.005  # share by which reciprocal voltages may differ on a good device
+COMMON_ASYMMETRY = 0.05  # likewise on any device that serves, before a tare has seen its own
+MOST_ASYMMETRY = 0.2  # share, rms, beyond which nothing can be located
+RISEN_NOISE = 2.0  # times what the tare saw: below, it is chance
+HIGH_NOISE = 10.0  # times what the tare saw: interference
+SILENT = 0.003  # share of its voltage that a pair under the strongest contact keeps at least
+SILENCE_SEEN = 0.01  # share that noise must stay below for silence to be told from pressing
+BLAMED_SHARE = 0.35  # of an electrode's voltages that must be wrong for it to be the cause
+BLAMED_LEAST = 5  # of its voltages, likewise
+UNEVEN = 0.05  # standard deviation of a good reference about the model
+MOST_DEVIATION = 3.0  # times that: a reference of this sheet, unloaded, deviates less
+
+
+class Flag(IntFlag):
+    """What stands in the way of trusting a frame."""
+
+    STRUCTURE_MISSING = 1
+    MAGNITUDE_MISSING = 2
+    INVALID_VOLTAGE = 4
+    NO_REFERENCE = 8
+    MISFIT_HIGH = 16
+    NOT_CONVERGED = 32
+    REFERENCE_MISMATCH = 64  # tared under load, other electrodes' order, or another sensor
+    ELECTRODE_FAULT = 128  # a broken lead; what was read by it is left out
+    NOISE_HIGH = 256  # reciprocity broken throughout: interference, or a device that is broken
+    CHANNELS_SWAPPED = 512  # the magnitude channel answers more than the structure channel
+    SATURATED = 1024  # the converter clipped; what it clipped is left out
+
+    def names(self) -> list[str]:
+        """Names of the flags that are set, in lower case, as the stream carries them."""
+        return [flag.name.lower() for flag in self if flag.name]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is wrong with a scan.
+
+    Attributes:
+        usable: (M,) voltages that may be believed.
+        flags: what is wrong.
+        electrodes: those whose voltages were left out.
+        noise: how many times noisier than expected; 1 where that may be chance.
+    """
+
+    usable: BoolArray
+    flags: Flag
+    electrodes: tuple[int, ...] = ()
+    noise: float = 1.0
+
+
+class Wiring:
+    """Which voltages belong together: reciprocal ones, and those of a pair or an electrode."""
+
+    def __init__(self, description: SensorDescription) -> None:
+        pairs, electrodes = description.pairs, description.electrode_count
+        self.reciprocal = reciprocal_pairs(pairs)
+        ends = np.hstack([pairs.drive, pairs.measure])
+        self.electrodes = (ends == np.arange(electrodes)[:, None, None]).any(axis=2)
+        self.ordered = ~_cross(pairs.drive, pairs.measure)
+        driven = np.unique(np.concatenate([pairs.drive, pairs.measure]), axis=0)
+        self.pairs = np.array(
+            [(pairs.drive == p).all(axis=1) | (pairs.measure == p).all(axis=1) for p in driven]
+        )
+
+
+def _cross(drive: NDArray[np.intp], measure: NDArray[np.intp]) -> BoolArray:
+    """Tell whether the chords of two pairs cross: one electrode lies between the others."""
+    low, high = drive.min(axis=1), drive.max(axis=1)
+    between = (low[:, None] < measure) & (measure < high[:, None])
+    return np.asarray(between[:, 0] != between[:, 1])
+
+
+class ScanCheck:
+    """Holds scans of one channel against the voltages that are expected.
+
+    Args:
+        wiring: of the sensor.
+        expected: (M,) volts of the unpressed sheet.
+        noise: (M,) standard deviation of a scan, volts.
+        usable: (M,) voltages for which there is an expectation.
+        asymmetry: (pairs,) share by which reciprocal voltages may differ.
+    """
+
+    def __init__(
+        self,
+        wiring: Wiring,
+        expected: FloatArray,
+        noise: FloatArray,
+        usable: BoolArray,
+        asymmetry: FloatArray | float,
+    ) -> None:
+        self._wiring = wiring
+        self._size = np.where(usable, np.abs(expected), 0.0)
+        noise = np.maximum(noise, QUIETEST * self._size.max(initial=0.0))
+        self._sign = np.sign(expected)
+        self._usable = usable
+        self._limit = LARGEST * float(self._size.max(initial=0.0))
+        self._first, self._second = wiring.reciprocal.T
+        variance = noise**2
+        self._pair_variance = variance[self._first] + variance[self._second] + TINY
+        self._asymmetry = np.broadcast_to(asymmetry, self._pair_variance.shape)
+        # Against this much the wrong way, a voltage's sign is wrong; elsewhere no sign is known.
+        self._wrong_way = np.where(wiring.ordered & usable, -OUTLIER * noise, -np.inf)
+        self._pairs = (wiring.pairs & wiring.ordered & usable).astype(float)
+        expected_sum = self._pairs @ self._size
+        doubt = 3 * np.sqrt(self._pairs @ np.where(usable, variance, 0.0))
+        told = doubt < (SILENCE_SEEN - SILENT) * expected_sum
+        self._silence = np.where(told, SILENT * expected_sum + doubt, -np.inf)
+
+    def examine(self, scan: FloatArray, *, saturated: bool = False) -> Verdict:
+        """Say what is wrong with a scan (M,); `saturated` if its device says that it clipped."""
+        size = np.abs(scan)
+        usable = self._usable & (size <= self._limit)
+        flags = Flag(0)
+        wrong = usable ^ self._usable
+        if not usable.all():
+            flags |= Flag.INVALID_VOLTAGE
+            size = np.where(usable, size, 0.0)
+            scan = np.where(usable, scan, 0.0)
+        clipped = self._clipped(size, saturated=saturated)
+        if clipped is not None:
+            flags |= Flag.SATURATED
+            usable &= ~clipped
+            wrong |= clipped
+        noise, unequal = self._reciprocity(scan, size, usable)
+        if noise > HIGH_NOISE:
+            flags |= Flag.NOISE_HIGH
+        along = scan * self._sign
+        odd = unequal | (along < self._wrong_way * noise)
+        silent = self._pairs @ along < self._silence
+        if silent.any():
+            odd |= self._wiring.pairs[silent].any(axis=0)
+        odd &= usable
+        wrong |= odd
+        if not wrong.any():
+            return Verdict(usable, flags, (), noise)
+        electrodes = self._blamed(wrong)
+        if electrodes:
+            flags |= Flag.ELECTRODE_FAULT
+            left_out = self._wiring.electrodes[list(electrodes)].any(axis=0)
+            usable &= ~left_out
+            odd &= ~left_out
+        if odd.any():
+            flags |= Flag.INVALID_VOLTAGE
+        return Verdict(usable & ~odd, flags, electrodes, noise)
+
+    def _clipped(self, size: FloatArray, *, saturated: bool) -> BoolArray | None:
+        """Voltages at the converter's limit: many of the same size that should not be alike."""
+        top = size == size.max()
+        if not saturated and np.count_nonzero(top) < SAME_CLIPPED:
+            return None
+        expected = self._size[top]
+        if not saturated and expected.max() <= ALIKE * expected.min():
+            return None
+        return np.asarray(top)
+
+    def _reciprocity(
+        self, scan: FloatArray, size: FloatArray, usable: BoolArray
+    ) -> tuple[float, BoolArray]:
+        """How many times noisier than expected, and the voltages that differ from their twins."""
+        unequal = np.zeros(len(scan), dtype=bool)
+        i, j = self._first, self._second
+        allowed = self._asymmetry * (size[i] + size[j])
+        error = np.abs(scan[i] - scan[j])
+        error /= np.sqrt(self._pair_variance + allowed * allowed)
+        both = usable[i] & usable[j]
+        compared = error if both.all() else error[both]
+        if len(compared) < 4:
+            return 1.0, unequal
+        # A quartile, not a median: some dead electrodes must not pass for noise.
+        quarter = len(compared) // 4
+        typical = float(np.partition(compared, quarter)[quarter]) / QUARTILE
+        noise = typical if typical > RISEN_NOISE else 1.0
+        bad = np.flatnonzero((error > OUTLIER * noise) & both)
+        unequal[i[bad]] = True
+        unequal[j[bad]] = True
+        return noise, unequal
+
+    def _blamed(self, wrong: BoolArray) -> tuple[int, ...]:
+        """Electrodes that share most of the wrong voltages and have most of theirs wrong."""
+        touches = self._wiring.electrodes & self._usable
+        enough = np.maximum(BLAMED_LEAST, BLAMED_SHARE * touches.sum(axis=1))
+        blamed: list[int] = []
+        while True:
+            counts = (touches & wrong).sum(axis=1)
+            worst = int(counts.argmax())
+            if counts[worst] < enough[worst]:
+                return tuple(sorted(blamed))
+            blamed.append(worst)
+            wrong = wrong & ~touches[worst]
+
+
+def examine_reference(
+    wiring: Wiring, volts: FloatArray, predicted: FloatArray, noise: FloatArray
+) -> Verdict:
+    """Say what is wrong with a reference (M,): hold it against the model of the unloaded sheet.
+
+    The model may be off by a common factor: the sheet's resistance, the current and the gain are
+    not known well, and whatever unit the voltages have divides out.
+
+    Args:
+        wiring: of the sensor.
+        volts: (M,) the reference.
+        predicted: (M,) by the model.
+        noise: (M,) standard deviation of the reference, volts.
+    """
+    finite = np.isfinite(volts) & np.isfinite(noise)
+    scale = float(np.median(volts[finite] / predicted[finite])) if finite.any() else 0.0
+    if not 1 / FARTHEST_SCALE < abs(scale) < FARTHEST_SCALE:
+        return Verdict(np.zeros_like(finite), Flag.INVALID_VOLTAGE)
+    volts, noise = np.where(finite, volts, 0.0) / scale, np.where(finite, noise, 0.0) / abs(scale)
+    size = np.abs(volts / predicted)
+    usable = finite & (size > SMALLEST) & (size < LARGEST)
+    volts = np.where(usable, volts, 0.0)
+    verdict = ScanCheck(wiring, predicted, noise, usable, COMMON_ASYMMETRY).examine(volts)
+    flags = verdict.flags if usable.all() else verdict.flags | Flag.INVALID_VOLTAGE
+    if _rewired(wiring, volts * np.sign(predicted), noise) or _deviates(
+        volts, predicted, noise, verdict.usable
+    ):
+        flags |= Flag.REFERENCE_MISMATCH
+    if _asymmetry(wiring, volts) > MOST_ASYMMETRY:
+        flags |= Flag.NOISE_HIGH
+    return Verdict(verdict.usable, flags, verdict.electrodes, verdict.noise)
+
+
+def _rewired(wiring: Wiring, along: FloatArray, noise: FloatArray) -> bool:
+    """Tell whether reciprocal voltages agree on a wrong sign: leads that changed places."""
+    against = wiring.ordered & (along < -OUTLIER * noise)
+    i, j = wiring.reciprocal.T
+    agree = np.abs(along[i] - along[j]) < 0.5 * np.abs(along[i] + along[j])
+    return int(np.count_nonzero(against[i] & against[j] & agree)) >= BLAMED_LEAST
+
+
+def _deviates(
+    volts: FloatArray, predicted: FloatArray, noise: FloatArray, usable: BoolArray
+) -> bool:
+    """Tell whether a reference is farther from the model than an uneven sheet would be."""
+    error = (volts - predicted) / np.hypot(noise, UNEVEN * np.abs(predicted))
+    return not usable.any() or float(np.sqrt(np.mean(error[usable] ** 2))) > MOST_DEVIATION
+
+
+def _asymmetry(wiring: Wiring, volts: FloatArray) -> float:
+    """Typical difference of reciprocal voltages as a share of the voltages' root mean square."""
+    if len(wiring.reciprocal) == 0:
+        return 0.0
+    i, j = wiring.reciprocal.T
+    spread = float(np.median(np.abs(volts[i] - volts[j]))) / 0.6745
+    return spread / max(float(np.sqrt(2 * np.mean(volts**2))), TINY)
+
+
+def asymmetry_of(wiring: Wiring, reference: FloatArray) -> FloatArray:
+    """Share (pairs,) by which a device's reciprocal voltages differ, as far as one tare tells."""
+    i, j = wiring.reciprocal.T
+    together = np.abs(reference[i]) + np.abs(reference[j])
+    own = np.divide(
+        np.abs(reference[i] - reference[j]), together, out=np.zeros(len(i)), where=together > 0
+    )
+    return np.asarray(np.maximum(own, LEAST_ASYMMETRY))
