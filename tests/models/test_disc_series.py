@@ -17,8 +17,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import spherical_jn
-from tactomo_models import SensorDescription, load_description
-from tactomo_models.forward import ForwardModel, solve_bare_sheet
+from tactomo_models import Press, SensorDescription, load_description
+from tactomo_models.evaluation.simulation import UnevenSkin, fine_mesh, with_contrast
+from tactomo_models.forward import ForwardModel, solve_bare_sheet, volts_per_unit
 from tactomo_models.mesh import mesh_sheet
 from variants import variant
 
@@ -122,3 +123,19 @@ def test_an_inclusion_matches_the_series(
     row = (INCLUSION_M, INCLUSION_M + spacing_m)
     found = minimize_scalar(error, bounds=row, method="bounded", options={"xatol": 1e-5})
     assert found.fun / np.linalg.norm(voltages / bare - 1) < 2e-3
+
+
+@pytest.mark.parametrize(("contrast", "limit"), [(2.0, 0.002), (30.0, 0.006), (100.0, 0.01)])
+def test_scenes_to_evaluate_on_are_simulated_right(
+    tank: SensorDescription, contrast: float, limit: float
+) -> None:
+    """No free radius here: voltage changes of a sharp circle, as large as it was asked for."""
+    assert tank.structure
+    conductive = variant(tank, structure={"conductivity_ratio": 100.0})
+    sensor = with_contrast(conductive, contrast)
+    seed = np.random.SeedSequence(0)
+    skin = UnevenSkin(sensor, fine_mesh(sensor), seed, unevenness=0.0, impedance_spread=0.0)
+    press = Press(0.0, 0.0, pressure_kpa=1.0, radius_m=INCLUSION_M)
+    change = skin.voltages([press])["structure"] - skin.voltages([])["structure"]
+    series = series_voltages(tank, contrast, INCLUSION_M) - series_voltages(tank)
+    assert relative_error(change / volts_per_unit(sensor), series) < limit

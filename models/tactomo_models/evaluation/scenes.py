@@ -46,7 +46,7 @@ SeedSet = Literal["tuning", "reporting"]
 SnrOf = Literal["voltage", "change"]
 SceneShape = Literal["ellipse", "rectangle", "ring", "mixed"]
 
-SIMULATION = 2  # raise it when `simulation` changes: what it stored before is not read
+SIMULATION = 3  # raise it when `simulation` changes: what it stored before is not read
 CONTACTS = (1, 2, 3, 4, 5, 6)
 GAP_M = 0.009  # least distance of two outlines
 HALF_AXIS_M = (0.007, 0.020)  # of every indenter, both axes

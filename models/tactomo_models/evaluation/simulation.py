@@ -33,9 +33,9 @@ Volts = dict[Modality, FloatArray]
 SPACING_SHARE = 0.58  # of the map's nodes' distance: 1.74 mm on the paper's sensor
 REFINEMENTS = 3  # at the electrodes' ends, one more than what inverts
 SHARP_M = 1e-9  # width of an outline: a point lies inside or outside
-OUTLINE_REFINEMENTS = 3  # to 0.2 mm: voltage changes are right to 1 %; without, to 6 %
-UNEVENNESS = 0.05  # standard deviation of a sheet's smooth conductivity error
-IMPEDANCE_SPREAD = 0.2  # standard deviation of the logarithm of the contact impedances
+OUTLINE_REFINEMENTS = 3  # to 0.2 mm: voltage changes are right to 1 %; without, to 10 %
+UNEVENNESS = 0.05
+IMPEDANCE_SPREAD = 0.2
 CELL_SAMPLES = 5  # per side of a map cell, where the truth's coverage is averaged
 
 
@@ -52,15 +52,26 @@ class UnevenSkin:
         description: the sensor; its responses are the true ones.
         mesh: see `fine_mesh`; of a sensor of the same geometry.
         seed: of the unevenness.
+        unevenness: standard deviation of each sheet's smooth conductivity error.
+        impedance_spread: standard deviation of the logarithm of the contact impedances.
     """
 
     def __init__(
-        self, description: SensorDescription, mesh: SheetMesh, seed: np.random.SeedSequence
+        self,
+        description: SensorDescription,
+        mesh: SheetMesh,
+        seed: np.random.SeedSequence,
+        *,
+        unevenness: float = UNEVENNESS,
+        impedance_spread: float = IMPEDANCE_SPREAD,
     ) -> None:
         self.description = description
         self._mesh = mesh
-        channels = zip(description.modalities, seed.spawn(len(description.modalities)), strict=True)
-        self._sheets = {name: _UnevenSheet(description, own) for name, own in channels}
+        rng = np.random.default_rng(seed)
+        self._sheets = {
+            name: _UnevenSheet(description, rng, unevenness, impedance_spread)
+            for name in description.modalities
+        }
         self._rest = {name: sheet.voltages(mesh) for name, sheet in self._sheets.items()}
 
     def voltages(self, presses: Sequence[Press]) -> Volts:
@@ -80,17 +91,24 @@ class UnevenSkin:
 
 
 class _UnevenSheet:
-    def __init__(self, description: SensorDescription, seed: np.random.SeedSequence) -> None:
+    def __init__(
+        self,
+        description: SensorDescription,
+        rng: np.random.Generator,
+        unevenness: float,
+        impedance_spread: float,
+    ) -> None:
         self._description = description
-        impedance, self._conductivity = seed.spawn(2)
-        spread = np.random.default_rng(impedance).standard_normal(description.electrode_count)
-        self._impedance = np.exp(IMPEDANCE_SPREAD * spread)
+        self._unevenness = unevenness
+        self._seed = int(rng.integers(2**63))  # the same field on whatever mesh
+        spread = impedance_spread * rng.standard_normal(description.electrode_count)
+        self._impedance = np.exp(spread)
 
     def voltages(self, mesh: SheetMesh, ratio: FloatArray | float = 1.0) -> FloatArray:
         """Volts (M,) where the conductivity of each triangle is so many times its own at rest."""
         x, y = _centroids(mesh)
-        rng = np.random.default_rng(self._conductivity)
-        own = 1 + UNEVENNESS * smooth_noise(x, y, self._description.width_m / 4, rng)
+        rng = np.random.default_rng(self._seed)
+        own = 1 + self._unevenness * smooth_noise(x, y, self._description.width_m / 4, rng)
         transfer = transfer_resistances(self._description, mesh, own * ratio, self._impedance)
         return scan_voltages(self._description, transfer) * volts_per_unit(self._description)
 
