@@ -19,12 +19,12 @@ from typer.testing import CliRunner
 Run = Callable[..., Any]
 
 
-@pytest.mark.parametrize("command", [*ORDER, "models build", "models list"])
+@pytest.mark.parametrize("command", [*ORDER, "models build", "models list", "evaluate scenes"])
 def test_every_command_explains_itself(command: str) -> None:
     result = CliRunner().invoke(app, [*command.split(), "--help"], prog_name="tactomo")
     assert result.exit_code == 0
     assert f"Usage: tactomo {command}" in result.output
-    if command not in ("models", "models list"):
+    if command not in ("models", "models list", "evaluate"):
         assert "Examples" in result.output
 
 

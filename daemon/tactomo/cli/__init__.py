@@ -8,7 +8,18 @@ from __future__ import annotations
 
 import sys
 
-from tactomo.cli import bench, bench_solves, demo, files, models, plot, service, steer, watch
+from tactomo.cli import (
+    bench,
+    bench_solves,
+    demo,
+    evaluate,
+    files,
+    models,
+    plot,
+    service,
+    steer,
+    watch,
+)
 from tactomo.cli.app import app
 from tactomo.cli.failure import explain
 from tactomo.cli.lifeline import hold_lifeline
@@ -16,7 +27,7 @@ from tactomo.cli.lifeline import hold_lifeline
 __all__ = ["app", "main"]
 
 # Importing a module registers its commands.
-COMMANDS = (bench, bench_solves, demo, files, models, plot, service, steer, watch)
+COMMANDS = (bench, bench_solves, demo, evaluate, files, models, plot, service, steer, watch)
 
 
 def main() -> None:

@@ -24,7 +24,7 @@ ORDER = (
     *("demo", "daemon", "twin", "viewer"),
     *("status", "watch", "tare", "record", "tier", "poke"),
     *("info", "import", "replay", "reconstruct", "plot"),
-    *("models", "bench", "bench-solves"),
+    *("models", "bench", "bench-solves", "evaluate"),
 )
 
 

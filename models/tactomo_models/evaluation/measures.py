@@ -306,7 +306,7 @@ GROUPINGS: dict[str, Callable[[SceneScore], str]] = {
     "SNR (dB)": lambda one: f"{one.snr_db:g}",
     "shape": lambda one: one.shape,
     "contrast": _contrast_band,
-    "magnitude": lambda one: "opposite sign" if one.opposite else "as described",
+    "sign": lambda one: "opposite" if one.opposite else "as shipped",
 }
 
 

@@ -1,0 +1,216 @@
+"""`tactomo evaluate`: how right the reconstruction is, where the truth is known."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+
+import typer
+
+from tactomo.cli.app import BUILD, DEFAULT_DESCRIPTION, JsonOutput, Method, app, examples
+from tactomo.cli.files import DescriptionOption
+from tactomo.cli.plot import need_matplotlib
+
+if TYPE_CHECKING:
+    from rich.table import Table
+    from tactomo_models.evaluation.measures import Summary
+    from tactomo_models.evaluation.still import Outcome
+
+Item = TypeVar("Item")
+
+evaluate_app = typer.Typer(
+    help="Measure how right the reconstruction is, where the truth is known.",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+)
+app.add_typer(evaluate_app, name="evaluate", rich_help_panel=BUILD)
+
+Seeds = Annotated[
+    Literal["tuning", "reporting"],
+    typer.Option(help="Tune on the one set of scenes, publish figures of the other."),
+]
+SnrOf = Annotated[
+    Literal["change", "voltage"],
+    typer.Option(
+        help="What noise is measured by: the rms of a channel's voltage changes, or of its "
+        "voltages at rest, of which changes are a few percent or less."
+    ),
+]
+Picture = Annotated[
+    Path | None,
+    typer.Option(help="Draw truth and outcome: .png, .svg or .pdf. Needs matplotlib."),
+]
+
+
+@evaluate_app.command(
+    epilog=examples(
+        "tactomo evaluate scenes",
+        "tactomo evaluate scenes --count 50 --contacts 1-4 --snr 60,40,20,10",
+        "tactomo evaluate scenes --method tikhonov --picture tikhonov.png",
+        "tactomo evaluate scenes --seeds reporting --snr-of voltage --json > report.json",
+    ),
+)
+def scenes(
+    seeds: Seeds = "tuning",
+    count: Annotated[int, typer.Option(min=1, help="Scenes of each number of contacts.")] = 10,
+    contacts: Annotated[str, typer.Option(help="How many contacts: 3, or 1-4.")] = "1-6",
+    snr: Annotated[str, typer.Option(help="Signal-to-noise ratios in dB, with commas.")] = "40",
+    snr_of: SnrOf = "change",
+    method: Annotated[Method, typer.Option(help="How to reconstruct.")] = "auto",
+    sensor: DescriptionOption = DEFAULT_DESCRIPTION,
+    picture: Picture = None,
+    as_json: JsonOutput = False,
+) -> None:
+    """Reconstruct simulated still scenes, each from a cold start, and compare with the truth.
+
+    Every scene has sheets of its own, uneven by 5 %, uneven electrodes, a contrast of 10 to 100
+    that the reconstruction is not told, and noise of equal size in volts on every voltage. They
+    are simulated on another, finer mesh than the one that reconstructs. The first run simulates
+    (half a second a scene) and keeps the voltages in the cache.
+    """
+    from tactomo_models import load_description
+    from tactomo_models.evaluation import scenes as draw_scenes
+    from tactomo_models.evaluation.still import reconstruct_scenes
+
+    if picture is not None:
+        need_matplotlib()
+    numbers, ratios = _range(contacts), _decibels(snr)
+    description = load_description(sensor)
+    drawn = chain.from_iterable(
+        draw_scenes(description, seeds, count, contacts=numbers, snr_db=ratio, snr_of=snr_of)
+        for ratio in ratios
+    )
+    total = count * len(numbers) * len(ratios)
+    outcomes = list(_shown(reconstruct_scenes(drawn, method), total, f"{seeds} scenes"))
+    settings = {
+        "simulated": True,
+        "sensor": description.name,
+        "seeds": seeds,
+        "scenes_each": count,
+        "snr_of": snr_of,
+        "method": method,
+    }
+    if as_json:
+        typer.echo(json.dumps({**settings, **_as_json(outcomes)}, indent=2))
+    else:
+        _print_scenes(settings, outcomes)
+    if picture is not None:
+        from tactomo.cli.evaluate_pictures import draw_outcomes
+
+        draw_outcomes(outcomes, picture)
+        typer.echo(f"wrote {picture}", err=True)
+
+
+def _range(text: str) -> range:
+    """The numbers from "3" or "1-4"."""
+    first, _, last = text.partition("-")
+    try:
+        numbers = range(int(first), int(last or first) + 1)
+    except ValueError:
+        numbers = range(0)
+    if not numbers or numbers[0] < 1:
+        raise typer.BadParameter(f"{text!r}: give a number such as 3, or a range such as 1-4")
+    return numbers
+
+
+def _decibels(text: str) -> list[float]:
+    """The numbers from "60,40,20"."""
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise typer.BadParameter(f"{text!r}: give numbers, such as 60,40,20,10") from error
+
+
+def _shown(items: Iterable[Item], total: int, what: str) -> Iterator[Item]:
+    """Pass items on, with a progress bar in the terminal."""
+    from rich.console import Console
+    from rich.progress import track
+
+    yield from track(
+        items, description=what, total=total, console=Console(stderr=True), transient=True
+    )
+
+
+def _as_json(outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    from tactomo_models.evaluation.measures import summaries, summarise
+
+    scores = [outcome.score for outcome in outcomes]
+    return {
+        "all": asdict(summarise(scores)),
+        "by": {
+            name: {value: asdict(summary) for value, summary in rows.items()}
+            for name, rows in summaries(scores).items()
+        },
+        "scenes": [one.as_json() for one in scores],
+    }
+
+
+def _print_scenes(settings: dict[str, Any], outcomes: Sequence[Outcome]) -> None:
+    from rich.console import Console
+    from tactomo_models.evaluation.measures import summaries, summarise
+
+    scores = [outcome.score for outcome in outcomes]
+    console = Console()
+    console.print(
+        f"simulated scenes of {settings['sensor']}, {settings['seeds']} seeds, method "
+        f"[bold]{settings['method']}[/], cold start; SNR of the {settings['snr_of']}"
+    )
+    groups = {"all": summarise(scores)}
+    for name, rows in summaries(scores).items():
+        if len(rows) > 1:
+            groups |= {f"{name} {value}": summary for value, summary in rows.items()}
+    console.print(_table("maps", groups, MAPS))
+    console.print(_table("contacts", groups, CONTACTS))
+    console.print(
+        "[dim]worst: ICC that 95 % exceed; shape: ICC of the pressed shape; wrong: ICC below 0.8 "
+        "or another count, and no flag that says so. count: right; missed: of the true contacts; "
+        "false: a scene; mm: centre error, median; Δσ: error of the magnitude, mean, share of the "
+        "range; spread: largest minus smallest at one pressure; in σ: within one reported "
+        "standard uncertainty, 68 % where that is right.[/]"
+    )
+
+
+# The tables of a summary: headings and what stands under them.
+MAPS: dict[str, Callable[[Summary], str]] = {
+    "scenes": lambda s: str(s.scenes),
+    "ICC": lambda s: f"{s.icc:.3f}",
+    "worst": lambda s: f"{s.icc_worst:.2f}",
+    "shape": lambda s: f"{s.icc_structure:.3f}",
+    "RIE": lambda s: f"{s.rie:.2f}",
+    "flagged": lambda s: f"{s.distrusted:.0%}",
+    "wrong": lambda s: f"{s.confidently_wrong:.0%}",
+    "ms": lambda s: f"{s.seconds * 1e3:.0f}",
+    "p99": lambda s: f"{s.seconds_99 * 1e3:.0f}",
+}
+CONTACTS: dict[str, Callable[[Summary], str]] = {
+    "count": lambda s: f"{s.count_right:.0%}",
+    "missed": lambda s: f"{s.missed:.0%}",
+    "false": lambda s: f"{s.false:.2f}",
+    "mm": lambda s: f"{s.centre_mm:.2f}",
+    "p95": lambda s: f"{s.centre_mm_95:.1f}",
+    "area": lambda s: f"{s.area_error:.0%}",
+    "Δσ": lambda s: f"{s.magnitude_error:.1%}",
+    "spread": lambda s: f"{s.magnitude_spread:.0%}",
+    "kPa": lambda s: f"{s.pressure_error_kpa:.1f}",
+    "in σ": lambda s: f"{s.within_sigma:.0%}",
+}
+
+
+def _table(
+    title: str, groups: dict[str, Summary], columns: dict[str, Callable[[Summary], str]]
+) -> Table:
+    from rich import box
+    from rich.table import Table
+
+    table = Table(title=title, box=box.SIMPLE_HEAD, padding=0, title_justify="left")
+    table.add_column("", no_wrap=True)
+    for name in columns:
+        table.add_column(name, justify="right", no_wrap=True, min_width=5)
+    for name, summary in groups.items():
+        table.add_row(name, *(show(summary) for show in columns.values()))
+    return table
