@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tactomo.cli.app import BUILD, DEFAULT_DESCRIPTION, Description, JsonOutput, app, examples
-from tactomo.errors import TactomoError
+from tactomo.cli.plot import need_matplotlib, save_figure
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -106,7 +106,6 @@ def bench_solves(
     from threadpoolctl import threadpool_limits
 
     from tactomo.cli.bench import machine
-    from tactomo.cli.plot import need_matplotlib
 
     if picture is not None:
         need_matplotlib()
@@ -296,12 +295,7 @@ def _draw(curves: Curves, output: Path) -> None:
         axes.grid(visible=True, which="both", alpha=0.2)
     panels[0].set_ylabel("ms")
     panels[0].legend(fontsize=7)
-    try:
-        figure.savefig(output, dpi=150)
-    except (OSError, ValueError) as error:
-        raise TactomoError(
-            f"cannot write {output}: {error}", "give a .png, .svg or .pdf that you may write"
-        ) from error
+    save_figure(figure, output)
 
 
 def _draw_series(axes: Any, rows: list[Row], along: str) -> None:

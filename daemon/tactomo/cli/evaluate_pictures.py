@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tactomo.errors import TactomoError
+from tactomo.cli.plot import save_figure
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from tactomo_models.evaluation.still import Outcome
 
 ROWS = 4  # scenes of each kind
@@ -33,21 +32,7 @@ def draw_outcomes(outcomes: Sequence[Outcome], output: Path) -> None:
         grid = half.subplots(len(chosen), 4, squeeze=False)
         for axes, outcome in zip(grid, chosen, strict=True):
             _draw_outcome(axes, outcome)
-    write(figure, output)
-
-
-def write(figure: Figure, output: Path) -> None:
-    """Write a picture.
-
-    Raises:
-        TactomoError: it cannot be written.
-    """
-    try:
-        figure.savefig(output, dpi=110)
-    except (OSError, ValueError) as error:
-        raise TactomoError(
-            f"cannot write {output}: {error}", "give a .png, .svg or .pdf that you may write"
-        ) from error
+    save_figure(figure, output)
 
 
 def _draw_outcome(axes: Any, outcome: Outcome) -> None:

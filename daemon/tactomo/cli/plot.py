@@ -14,6 +14,7 @@ from tactomo.cli.app import FILES, RecordingFile, app, examples
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from tactomo_models import SensorDescription
 
     from tactomo.recording import Recording
@@ -96,6 +97,20 @@ def need_matplotlib() -> None:
     matplotlib.use("Agg")
 
 
+def save_figure(figure: Figure, output: Path) -> None:
+    """Write a picture.
+
+    Raises:
+        TactomoError: it cannot be written.
+    """
+    try:
+        figure.savefig(output, dpi=150)
+    except (OSError, ValueError) as error:
+        raise TactomoError(
+            f"cannot write {output}: {error}", "give a .png, .svg or .pdf that you may write"
+        ) from error
+
+
 def _read_contacts(path: Path) -> list[Point]:
     """Return the contacts in a complete recording; none where it was made without them."""
     from mcap.reader import make_reader
@@ -152,12 +167,7 @@ def _draw(points: list[Point], description: SensorDescription, title: str, outpu
     left, right = halves
     _draw_sheet(left, points, description)
     _draw_traces(right, points)
-    try:
-        figure.savefig(output, dpi=150)
-    except (OSError, ValueError) as error:
-        raise TactomoError(
-            f"cannot write {output}: {error}", "give a .png, .svg or .pdf that you may write"
-        ) from error
+    save_figure(figure, output)
 
 
 def _draw_sheet(figure: Any, points: list[Point], description: SensorDescription) -> None:

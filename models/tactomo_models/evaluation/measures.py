@@ -21,7 +21,8 @@ from tactomo_models.contacts import Contact
 from tactomo_models.description import SensorDescription
 from tactomo_models.evaluation.scenes import PRESSURE_KPA, EvaluationScene
 from tactomo_models.evaluation.simulation import TrueContact
-from tactomo_models.reconstruct import Flag, Reconstruction
+from tactomo_models.plausibility import Flag
+from tactomo_models.reconstruct import Reconstruction
 
 FloatArray = NDArray[np.float64]
 
