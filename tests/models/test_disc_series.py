@@ -2,7 +2,8 @@
 
 Current through the rim of a disc is a sum of harmonics, and so is the potential it makes there;
 each harmonic of the one makes the same harmonic of the other, by a factor that is known in closed
-form for a homogeneous disc and for one with a concentric inclusion. What remains of the complete
+form for a homogeneous disc and for one with a concentric inclusion, be its edge sharp or a power
+of the radius. What remains of the complete
 electrode model is an equation on the electrodes alone, solved here with Legendre polynomials:
 no mesh, no triangles, nothing in common with the code under test.
 
@@ -25,6 +26,7 @@ from variants import variant
 
 FloatArray = NDArray[np.float64]
 INCLUSION_M = 0.04
+CORE_M = 0.015  # of an inclusion with a soft edge
 SPACINGS_M = (0.01, 0.005, 0.0025)
 
 
@@ -38,10 +40,14 @@ def series_voltages(
     tank: SensorDescription,
     ratio: float = 1.0,
     inclusion_m: float = 0.0,
+    core_m: float | None = None,
     modes: int = 20_000,
     order: int = 8,
 ) -> FloatArray:
     """Voltages (M,) of a disc with a concentric inclusion of a conductivity ratio to the rest.
+
+    The ratio holds up to core_m; from there to inclusion_m it goes to 1 as a power of the radius.
+    Its edge is sharp where core_m is not given.
 
     Current density on electrode l is sum_p c_lp P_p(s), s from -1 to 1 along it. Where it flows,
     potential and contact impedance give U_l = u + zeta j; tested with the same polynomials, and
@@ -51,8 +57,9 @@ def series_voltages(
     half = tank.electrodes.length_m / 2 / radius  # angle
     zeta = tank.electrodes.contact_impedance_ohm_m * tank.sheet_conductance_s
     angle = np.arctan2(*tank.electrode_centres_m.T[::-1])
-    n, p = np.arange(1, modes + 1), np.arange(order)
-    mirror = (ratio - 1) / (ratio + 1) * (inclusion_m / radius) ** (2.0 * n)
+    n, p = np.arange(1.0, modes + 1), np.arange(order)
+    seen = ratio if core_m is None else graded_conductivity(ratio, core_m / inclusion_m, n)
+    mirror = (seen - 1) / (seen + 1) * (inclusion_m / radius) ** (2.0 * n)
     gain = (1 - mirror) / (1 + mirror) / n  # of harmonic n, from current to potential
     # Fourier coefficients of a Legendre polynomial are spherical Bessel functions.
     legendre = (half / np.pi) * (-1j) ** p * spherical_jn(p, n[:, None] * half)
@@ -72,6 +79,20 @@ def series_voltages(
         - transfer[measure[1], drive[0]]
         + transfer[measure[1], drive[1]]
     )
+
+
+def graded_conductivity(ratio: float, core: float, n: FloatArray) -> FloatArray:
+    """Conductivity of the homogeneous inclusion that harmonics n cannot tell from a graded one.
+
+    Where conductivity is r^k from r = core to 1, harmonic n is a sum of r^s with s (s + k) = n^2;
+    inside the core it is r^n, and at the core's edge it and its slope are continuous.
+    """
+    k = np.log(ratio) / np.log(core)
+    root = np.sqrt(k**2 / 4 + n**2)
+    rising, falling = root - k / 2, -root - k / 2
+    share = (n - falling) / (2 * root)  # of the rising power at the core's edge
+    fallen = (1 - share) * core ** (2 * root)
+    return np.asarray((rising * share + falling * fallen) / (n * (share + fallen)))
 
 
 def model(tank: SensorDescription, spacing_m: float) -> ForwardModel:
@@ -139,3 +160,21 @@ def test_scenes_to_evaluate_on_are_simulated_right(
     change = skin.voltages([press])["structure"] - skin.voltages([])["structure"]
     series = series_voltages(tank, contrast, INCLUSION_M) - series_voltages(tank)
     assert relative_error(change / volts_per_unit(sensor), series) < limit
+
+
+@pytest.mark.parametrize("ratio", [100.0, 1.25, 0.01])
+def test_a_soft_inclusion_converges_to_the_series(
+    tank: SensorDescription, models: list[ForwardModel], ratio: float
+) -> None:
+    """Halved spacings, conductivity linear in each triangle: what it changes is of second order."""
+    bare = series_voltages(tank)
+    truth = series_voltages(tank, ratio, INCLUSION_M, CORE_M) / bare - 1
+    errors = []
+    for forward in models:
+        radius = np.hypot(*forward.bare.points[:, forward.bare.pressable])
+        depth = np.log(INCLUSION_M / radius.clip(CORE_M, INCLUSION_M))
+        power = np.log(ratio) / np.log(INCLUSION_M / CORE_M)
+        change = forward.solve(np.expm1(power * depth)).voltages / forward.bare_voltages - 1
+        errors.append(relative_error(change, truth))
+    assert errors[-1] < 8e-3
+    assert np.log2(errors[-2] / errors[-1]) == pytest.approx(2, abs=0.2)
