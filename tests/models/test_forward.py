@@ -139,6 +139,15 @@ def test_a_pressed_sheet_equals_a_solve_of_the_whole_system(
     assert np.abs(pressed / model.bare_voltages - 1).max() > 0.01
 
 
+def test_an_uneven_sheet_leaves_no_more_to_be_solved(
+    model: ForwardModel, uneven: ForwardModel
+) -> None:
+    change = bump(model, 2.0)
+    solution = uneven.solve(change)
+    np.testing.assert_array_equal(solution.rim, model.solve(change).rim)
+    assert len(solution.rim) < 0.5 * len(solution.nodes)
+
+
 spots = st.lists(
     st.tuples(
         st.floats(-0.03, 0.03),
