@@ -16,6 +16,7 @@ from scipy.optimize import linear_sum_assignment
 
 from tactomo_models.description import SensorDescription
 from tactomo_models.forward import ForwardModel
+from tactomo_models.shape_fit import Shape
 
 FloatArray = NDArray[np.float64]
 
@@ -38,6 +39,8 @@ class Contact:
             NaN if unknown.
         magnitude_sigma: standard uncertainty of the magnitude.
         pressure_kpa: NaN if unknown, or below the magnitude channel's onset.
+        x_sigma_m, y_sigma_m: standard uncertainties of the centroid; NaN if unknown.
+        area_sigma_m2: that of the area; NaN if unknown.
     """
 
     id: int
@@ -47,6 +50,9 @@ class Contact:
     magnitude: float = float("nan")
     magnitude_sigma: float = float("nan")
     pressure_kpa: float = float("nan")
+    x_sigma_m: float = float("nan")
+    y_sigma_m: float = float("nan")
+    area_sigma_m2: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -58,12 +64,14 @@ class Areas:
         on_nodes: (K, P) the same at the pressable nodes.
         centres_m: (K, 2) centroids.
         areas_m2: (K,).
+        sigmas: (K, 3) standard uncertainties of x, y and area; NaN where unknown.
     """
 
     on_map: FloatArray
     on_nodes: FloatArray
     centres_m: FloatArray
     areas_m2: FloatArray
+    sigmas: FloatArray
 
     def __len__(self) -> int:
         return len(self.areas_m2)
@@ -74,11 +82,13 @@ class AreaFinder:
 
     def __init__(self, forward: ForwardModel) -> None:
         description = forward.description
+        self._nodes = forward.bare.points[:, forward.bare.pressable]
+        self._node_m2 = forward.node_areas_m2
         self._x, self._y = np.meshgrid(description.map_x_m, description.map_y_m)
         self._cell_m2 = (description.map_x_m[1] - description.map_x_m[0]) * (
             description.map_y_m[1] - description.map_y_m[0]
         )
-        x, y = forward.bare.points[:, forward.bare.pressable]
+        x, y = self._nodes
         column = np.abs(x[:, None] - description.map_x_m).argmin(axis=1)
         row = np.abs(y[:, None] - description.map_y_m).argmin(axis=1)
         self._nearest = (row, column)  # map node next to each pressable node
@@ -93,7 +103,8 @@ class AreaFinder:
         label, count = ndimage.label(pressed > 0.5, structure=np.ones((3, 3)))
         if count == 0:
             none = np.zeros((0, *pressed.shape))
-            return Areas(none, np.zeros((0, len(pressed_nodes))), np.zeros((0, 2)), np.zeros(0))
+            on_nodes = np.zeros((0, len(pressed_nodes)))
+            return Areas(none, on_nodes, np.zeros((0, 2)), np.zeros(0), np.zeros((0, 3)))
         nearest = ndimage.distance_transform_edt(
             label == 0, return_distances=False, return_indices=True
         )
@@ -108,7 +119,26 @@ class AreaFinder:
             [(on_map * axis).sum(axis=(1, 2)) / weight for axis in (self._x, self._y)], axis=1
         )
         on_nodes = mine[keep][:, *self._nearest] * pressed_nodes
-        return Areas(on_map, on_nodes, centres, areas)
+        return Areas(on_map, on_nodes, centres, areas, np.full((len(areas), 3), np.nan))
+
+    def with_sigmas(self, areas: Areas, shape: Shape, covariance: FloatArray) -> Areas:
+        """Say how far the places and sizes of a shape's areas may be trusted.
+
+        Args:
+            areas: those of the shape.
+            shape: what they were found in.
+            covariance: (n, n) of its parameters.
+        """
+        edge = np.flatnonzero(shape.family.render(shape.parameters)[1])
+        slope = shape.family.slope(shape.parameters, edge) * self._node_m2[edge, None]
+        sigmas = np.full((len(areas), 3), np.nan)
+        for k, inside in enumerate(areas.on_nodes[:, edge] > 0):
+            by_area = slope[inside].sum(axis=0)
+            off = self._nodes[:, edge[inside]] - areas.centres_m[k, :, None]
+            by_centre = off @ slope[inside] / areas.areas_m2[k]
+            gradient = np.vstack([by_centre, by_area])
+            sigmas[k] = np.sqrt(np.einsum("ij,jk,ik->i", gradient, covariance, gradient))
+        return replace(areas, sigmas=sigmas)
 
 
 @dataclass(frozen=True)
@@ -148,6 +178,7 @@ def fit_magnitudes(
     areas: Areas,
     data: FloatArray,
     weight: FloatArray,
+    spread: FloatArray,
     start: Magnitudes | None = None,
     *,
     same_areas: bool = False,
@@ -160,6 +191,7 @@ def fit_magnitudes(
         areas: the K areas, at least one.
         data: (M,) relative voltage changes of the magnitude channel.
         weight: (M,) their inverse standard deviations.
+        spread: (M,) factor on variances, see `ShapeFit.covariance`.
         start: an earlier fit of as many areas.
         same_areas: the earlier fit was of these very areas: where its tangent still holds there
             is nothing to solve.
@@ -170,14 +202,16 @@ def fit_magnitudes(
         tangent = start.tangent
     else:
         tangent, solves = _touch(forward, areas, change), solves - 1
-    fitted = _step(tangent, data, weight)
+    fitted = _step(tangent, data, weight, spread)
     while solves > 0 and np.abs(fitted.change - tangent.change).max() > TANGENT_REACH:
         tangent, solves = _touch(forward, areas, fitted.change), solves - 1
-        fitted = _step(tangent, data, weight)
-    return fitted
+        fitted = _step(tangent, data, weight, spread)
+    # Where an area is taken too large, its change comes out too small.
+    by_area = fitted.change * np.nan_to_num(areas.sigmas[:, 2] / areas.areas_m2)
+    return replace(fitted, sigma=np.hypot(fitted.sigma, by_area))
 
 
-def _step(tangent: Tangent, data: FloatArray, weight: FloatArray) -> Magnitudes:
+def _step(tangent: Tangent, data: FloatArray, weight: FloatArray, spread: FloatArray) -> Magnitudes:
     """One step of Gauss-Newton."""
     J = tangent.jacobian * weight[:, None]
     residual = weight * (tangent.voltages - data)
@@ -185,7 +219,8 @@ def _step(tangent: Tangent, data: FloatArray, weight: FloatArray) -> Magnitudes:
     change = np.clip(tangent.change - covariance @ (J.T @ residual), *CHANGE_LIMITS)
     misfit = float(np.sqrt(np.mean((residual + J @ (change - tangent.change)) ** 2)))
     # A model that does not explain the data to their noise knows its unknowns less well, too.
-    sigma = np.sqrt(np.diag(covariance)) * max(1.0, misfit)
+    variance = np.diag(covariance @ (J.T @ (spread[:, None] * J)) @ covariance)
+    sigma = np.sqrt(variance) * max(1.0, misfit)
     return Magnitudes(change, sigma, misfit, tangent)
 
 
@@ -204,7 +239,9 @@ def bare_tangent(jacobian_by_node: FloatArray, areas: Areas) -> Tangent:
     return Tangent(np.zeros(len(areas)), np.zeros(voltages), columns)
 
 
-def linear_magnitudes(tangent: Tangent, data: FloatArray, weight: FloatArray) -> Magnitudes:
+def linear_magnitudes(
+    tangent: Tangent, data: FloatArray, weight: FloatArray, spread: FloatArray
+) -> Magnitudes:
     """Fit each area's conductivity change in one step, for areas that a linear image shows.
 
     Its outline is a guess, and a magnitude goes by the area: that is most of the uncertainty.
@@ -213,18 +250,18 @@ def linear_magnitudes(tangent: Tangent, data: FloatArray, weight: FloatArray) ->
         tangent: at the bare sheet, of K areas.
         data: (M,) relative voltage changes of the magnitude channel.
         weight: (M,) their inverse standard deviations.
+        spread: (M,) factor on variances, see `ShapeFit.covariance`.
     """
-    fitted = _step(tangent, data, weight)
+    fitted = _step(tangent, data, weight, spread)
     sigma = np.hypot(fitted.sigma, LINEAR_ERROR * np.abs(fitted.change))
     return replace(fitted, sigma=sigma)
 
 
 def _touch(forward: ForwardModel, areas: Areas, change: FloatArray) -> Tangent:
-    inside = np.asarray(areas.on_nodes.any(axis=0))
-    where = np.flatnonzero(inside)
-    solution = forward.solve(change @ areas.on_nodes, also=inside)
+    where = np.flatnonzero(areas.on_nodes.any(axis=0))
+    solution = forward.solve(change @ areas.on_nodes)
     bare = forward.bare_voltages
-    jacobian = forward.jacobian(solution, where) @ areas.on_nodes[:, where].T
+    jacobian = forward.jacobian(solution, where, areas.on_nodes[:, where].T)
     return Tangent(
         change, (solution.voltages - bare) / np.abs(bare), jacobian / np.abs(bare)[:, None]
     )

@@ -1,140 +1,349 @@
-"""Following a shape through time: the warm start, and what to do when it leads nowhere.
+"""Following what presses: from nothing or the last frame to the simplest shape that explains it.
 
-Each frame starts from the last one's shape. A level set moves outlines but cannot make a contact
-where there is none, so when the scene has changed too much, or a minimum does not explain the
-data, other starts are tried: the shape with what its residual shows added ("grown"), and the
-linear image alone ("cold"). A challenger is refined beside the shape in force, over as many frames
-as the budget needs, and takes its place only once it explains the data better.
+The simplest description comes first, and a dearer one only where the data ask for it: circles, one
+added at a time where the residual shows that it is missing; ellipses; ellipses with modulated
+edges; and, where no few outlines explain the data, a level set. Each such move makes a rival of
+the shape in force, which is refined beside it and takes its place once it explains the data better
+by more than its further parameters would by chance. Contacts that the data do not need are taken
+away again.
+
+Work is spent by the frame's budget; what one frame does not finish, the next one goes on with.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactomo_models.levelset import RESTING, LevelSet, Shape
+from tactomo_models.forward import ForwardModel
+from tactomo_models.levelset import LevelSet
+from tactomo_models.outlines import (
+    E1,
+    E2,
+    MOST_PARAMETERS,
+    SIZE,
+    UNIT_M,
+    Outlines,
+    X,
+    Y,
+    outlines_on,
+)
+from tactomo_models.search import Candidate, ContactSearch
+from tactomo_models.shape_fit import Budget, Shape, ShapeFit
 
 FloatArray = NDArray[np.float64]
-Imager = Callable[[FloatArray], FloatArray]
 
-GOOD_MISFIT = 1.0  # explained to the noise: no further step
-SUSPECT_MISFIT = 1.5  # a minimum this bad may be the wrong one: others are tried
-CUT_HEIGHTS = (0.8, 0.65, 0.5)  # of the linear image's peak, where an outline may start
+GOOD_MISFIT = 1.0  # explained to the noise (discrepancy principle): no further step
+SUSPECT_MISFIT = 1.5  # a minimum this bad may be the wrong one
 SLACK = 1.1  # a settled shape is left alone while its misfit stays within this
+STEPS = 4  # of a refinement, before what it leads to is judged
+TRIALS = 4  # of so many steps that a rival may take
+MOST_CONTACTS = 8
+# Gains and losses are in squared misfit, and count by how well the data are explained otherwise.
+SURE_GAIN = 30.0  # of a contact: the best of 500 places gains some 15 by noise alone
+WORTH = 2.5  # of one more parameter of a form
+FREE_WORTH = 100.0  # of a level set
+NEEDLESS = 15.0  # a contact whose absence costs less is not there
+NEAR_M = 0.012  # what is missing this near an outline is more likely a part of its form
+SMALLEST_M = 0.003  # radius below which it is an error of the model, not a contact
+SMALL_M = 0.006  # contacts of a smaller radius are asked whether they are needed
+
+
+class Freedom(Enum):
+    """How a scene may be described."""
+
+    AS_NEEDED = "as needed"
+    OUTLINES = "outlines"
+    LEVEL_SET = "level set"
+
+
+@dataclass(frozen=True)
+class _Rival:
+    """A shape that is refined beside the one in force.
+
+    Attributes:
+        shape: as refined so far.
+        gain: by how much its cost must be below that of the shape in force, to take its place.
+        trials: refinements that it may still have.
+    """
+
+    shape: Shape
+    gain: float
+    trials: int = TRIALS
 
 
 class ShapeFollower:
     """Keeps the shape of what presses from frame to frame.
 
     Args:
-        level_set: the fit.
-        imager: linear image (P,), not negative, of relative voltage changes (M,).
+        forward: the model of the sheet.
+        ratio: conductivity of the saturated phase over the bare sheet's.
     """
 
-    def __init__(self, level_set: LevelSet, imager: Imager) -> None:
-        self._level_set = level_set
-        self._imager = imager
+    def __init__(self, forward: ForwardModel, ratio: float) -> None:
+        self.fit = ShapeFit(forward, ratio)
+        self._freedom = Freedom.AS_NEEDED
+        self._outlines = outlines_on(forward, conductive=ratio > 1)
+        self._level_set = LevelSet(forward)
+        self._search = ContactSearch(forward, ratio)
         self.forget()
 
     def forget(self) -> None:
         """Drop the warm start."""
         self._shape: Shape | None = None
         self._settled_misfit = 0.0
-        self._challenger: Shape | None = None
-        self._challenges = 0
+        self._start_over()
 
-    def follow(self, change: FloatArray, weight: FloatArray, budget_s: float) -> tuple[Shape, str]:
+    def _start_over(self) -> None:
+        self._rival: _Rival | None = None
+        self._moves_tried = 0
+
+    def follow(
+        self,
+        change: FloatArray,
+        weight: FloatArray,
+        spread: FloatArray,
+        budget_s: float,
+        freedom: Freedom = Freedom.AS_NEEDED,
+    ) -> tuple[Shape, str]:
         """Find the shape that explains a frame.
 
         Args:
             change: (M,) relative voltage changes.
             weight: (M,) their inverse standard deviations.
+            spread: (M,) factor on variances, see `ShapeFit.covariance`.
             budget_s: compute time, by a model of the work.
+            freedom: how the shape may be described.
 
         Returns:
             The shape, and in words what it came from.
         """
+        self._data = change, weight
+        # Errors that go together look like something that is there: gains count for less.
+        self._doubt = float(np.sqrt(np.mean(spread)))
+        if freedom != self._freedom:
+            self.forget()
+            self._freedom = freedom
+        shape, how = self._start()
+        if not shape.converged:
+            shape = self._improve(shape, Budget(budget_s))
+            self._settled_misfit = shape.misfit
+        self._shape = shape
+        return shape, f"{how}, {self._in_words(shape)}"
+
+    def _start(self) -> tuple[Shape, str]:
+        """The last frame's shape where it still holds; else the best of what may be left of it."""
         before = self._shape
         if before is None:
-            shape, how = self._cold(change, weight), "cold start"
-        else:
-            shape, how = self._level_set.compare(before, change, weight), "warm start"
-            if before.converged and shape.misfit <= SLACK * max(self._settled_misfit, GOOD_MISFIT):
-                shape = replace(shape, converged=True)
-            elif _lost(before, shape):
-                shape, how = self._best_start(shape, change, weight)
-                self._challenger, self._challenges = None, 0
-        if not shape.converged:
-            shape = self._level_set.refine(shape, change, weight, budget_s, GOOD_MISFIT)
-            self._settled_misfit = shape.misfit
-        elif shape.misfit > SUSPECT_MISFIT:
-            shape, how = self._challenge(shape, how, change, weight, budget_s)
-        self._shape = shape
-        return shape, how
+            return self._nothing(), "cold start"
+        shape = self.fit.compare(before, *self._data)
+        if before.converged and shape.misfit <= SLACK * max(self._settled_misfit, GOOD_MISFIT):
+            return replace(shape, converged=True), "still"
+        shape = replace(shape, converged=False)
+        if shape.misfit > max(SUSPECT_MISFIT, 2 * before.misfit):
+            self._start_over()
+            nothing = self._nothing()
+            best = min([shape, *self._each_left_out(shape), nothing], key=lambda s: s.cost)
+            return best, "cold start" if best is nothing else "warm start"
+        if self._rival is not None:
+            rival = self.fit.compare(self._rival.shape, *self._data)
+            self._rival = replace(self._rival, shape=replace(rival, converged=False))
+        return shape, "warm start"
 
-    def _cold(self, change: FloatArray, weight: FloatArray) -> Shape:
-        """Cut the linear image at the height that explains the data best.
+    def _improve(self, shape: Shape, budget: Budget) -> Shape:
+        """Refine, and try one rival after another, until none is left or the budget ends."""
+        settled = len(shape.parameters) == 0  # no parameters: nothing to refine
+        moved = False  # whether the last frame's contacts were allowed to have moved
+        while not budget.over:
+            if self._rival is not None:
+                shape, settled = self._judge(shape, settled, budget)
+                moved = True
+            elif moved and not settled and (rival := self._missing(shape)):
+                self._rival = rival
+            elif not settled:
+                shape = self.fit.refine(shape, *self._data, budget, _good(shape), STEPS)
+                settled, moved = shape.converged, True
+            elif not self._challenge(shape):
+                return replace(shape, converged=True)
+        return replace(shape, converged=False)
 
-        The image of a contact is as wide as the sensor is blind there, so no single height will
-        do. Small shapes come first: they are the cheaper ones to solve.
-        """
-        image = self._imager(change)
-        likeness = image / max(float(image.max()), 1e-12)
-        best = None
-        for height in CUT_HEIGHTS:
-            cut = 0.5 + 0.5 * (likeness - height) / (1 - height)
-            shape = self._level_set.start(cut, change, weight)
-            if shape is None or (best is not None and shape.cost > best.cost):
-                break
-            best = shape
-        return best or self._level_set.nothing(change, weight)
+    def _judge(self, shape: Shape, settled: bool, budget: Budget) -> tuple[Shape, bool]:
+        """Refine the rival: it takes the shape's place, is given up, or goes on."""
+        assert self._rival is not None
+        rival = replace(self._rival, trials=self._rival.trials - 1)
+        if len(rival.shape.parameters):
+            good = _good(rival.shape)
+            refined = self.fit.refine(rival.shape, *self._data, budget, good, STEPS)
+            rival = replace(rival, shape=refined)
+        if rival.shape.cost < shape.cost - rival.gain:
+            self._start_over()
+            return rival.shape, rival.shape.converged or len(rival.shape.parameters) == 0
+        given_up = rival.shape.converged or rival.trials == 0
+        self._rival = None if given_up else rival
+        self._moves_tried += given_up
+        return shape, settled
 
-    def _grown(self, shape: Shape, change: FloatArray, weight: FloatArray) -> Shape:
-        """Add to a shape what the linear image of its residual shows."""
-        left = np.divide(-shape.residual, weight, out=np.zeros_like(change), where=weight > 0)
-        image = self._imager(left)
-        known = np.clip((self._level_set.function(shape) + 1) / 2, (1 + RESTING) / 2, 1)
-        likeness = np.maximum(known, image / max(float(image.max()), 1e-12))
-        return self._level_set.start(likeness, change, weight) or shape
+    def _challenge(self, shape: Shape) -> bool:
+        """Set the next rival against a shape that is at its minimum; False when all were tried."""
+        moves = self._moves(shape)
+        while self._rival is None and self._moves_tried < len(moves):
+            self._rival = moves[self._moves_tried](shape)
+            if self._rival is None:
+                self._moves_tried += 1
+        return self._rival is not None
 
-    def _best_start(
-        self, shape: Shape, change: FloatArray, weight: FloatArray
-    ) -> tuple[Shape, str]:
-        starts = [
-            (shape, "warm start"),
-            (self._grown(shape, change, weight), "grown"),
-            (self._cold(change, weight), "cold start"),
+    def _moves(self, shape: Shape) -> list[Callable[[Shape], _Rival | None]]:
+        if not isinstance(shape.family, Outlines):
+            return []
+        if self._freedom == Freedom.LEVEL_SET:
+            return [self._grown, self._freed]
+        form = [self._of_higher_order, self._split, self._grown_anywhere]
+        if shape.misfit <= GOOD_MISFIT:
+            form = [self._of_higher_order] if shape.family.order == 0 else []
+        free = [self._freed] if self._freedom == Freedom.AS_NEEDED else []
+        return [self._grown, *form, *free, *self._without_needless(shape)]
+
+    def _missing(self, shape: Shape) -> _Rival | None:
+        """A further contact where that much is left that it need not wait for the others."""
+        return self._grown(shape) if shape.misfit > SUSPECT_MISFIT else None
+
+    def _grown(self, shape: Shape) -> _Rival | None:
+        """A further contact, away from those that are known."""
+        return self._with_candidate(shape, lambda gap_m: gap_m > NEAR_M)
+
+    def _grown_anywhere(self, shape: Shape) -> _Rival | None:
+        return self._with_candidate(shape, lambda gap_m: True)
+
+    def _with_candidate(self, shape: Shape, may_be: Callable[[float], bool]) -> _Rival | None:
+        if not isinstance(shape.family, Outlines) or shape.family.count == MOST_CONTACTS:
+            return None
+        found = self._search.best(shape, self._data[1])
+        each = shape.family.split(shape.parameters)
+        # Circles leave much unexplained that a better form will explain: no contact is made of it.
+        sure = SURE_GAIN * self._scale(shape) * (2 if shape.family.order < 2 and len(each) else 1)
+        if found.gain < sure or found.radius_m < SMALLEST_M or not may_be(_gap_m(each, found)):
+            return None
+        further = np.zeros((1, MOST_PARAMETERS))
+        further[0, [X, Y, SIZE]] = (
+            found.x_m / UNIT_M,
+            found.y_m / UNIT_M,
+            np.log(max(found.radius_m, SMALL_M)),
+        )
+        rival = self._evaluate(np.vstack([each, further]), shape.family.order, shape.log_ratio)
+        return _Rival(rival, SURE_GAIN * self._scale(shape)) if rival else None
+
+    def _of_higher_order(self, shape: Shape) -> _Rival | None:
+        assert isinstance(shape.family, Outlines)
+        if shape.family.order == 4 or shape.family.count == 0:
+            return None
+        order = {0: 1, 1: 2, 2: 4}[shape.family.order]
+        rival = self._evaluate(shape.family.split(shape.parameters), order, shape.log_ratio)
+        if rival is None:
+            return None
+        further = len(rival.parameters) - len(shape.parameters)
+        return _Rival(rival, WORTH * further * self._scale(shape))
+
+    def _split(self, shape: Shape) -> _Rival | None:
+        """Two contacts for one, of the contact that stands it best."""
+        assert isinstance(shape.family, Outlines)
+        if shape.family.count == MOST_CONTACTS:
+            return None
+        each = shape.family.split(shape.parameters)
+        halved = [
+            self._evaluate(_halved(each, k), shape.family.order, shape.log_ratio)
+            for k in range(len(each))
         ]
-        return min(starts, key=lambda start: start[0].cost)
+        best = min((h for h in halved if h), key=lambda half: half.cost, default=None)
+        return _Rival(best, SURE_GAIN * self._scale(shape)) if best else None
 
-    def _challenge(
-        self, shape: Shape, how: str, change: FloatArray, weight: FloatArray, budget_s: float
-    ) -> tuple[Shape, str]:
-        """Refine another start beside a suspect minimum; the better of the two wins."""
-        if self._challenger is None:
-            if self._challenges == 2:
-                return shape, how  # both were tried: this is what the model can explain
-            if self._challenges == 0:
-                self._challenger = self._grown(shape, change, weight)
-            else:
-                self._challenger = self._cold(change, weight)
-            self._challenges += 1
-            return shape, how  # a start costs solves enough for one frame
-        rival = self._level_set.compare(self._challenger, change, weight)
-        rival = self._level_set.refine(rival, change, weight, budget_s, GOOD_MISFIT)
-        self._challenger = None if rival.converged else rival
-        if rival.cost < 0.98 * shape.cost:
-            self._challenger, self._challenges = None, 0
-            self._settled_misfit = rival.misfit
-            return rival, "restarted"
-        return shape, how
+    def _freed(self, shape: Shape) -> _Rival | None:
+        """The same as a level set."""
+        always = self._freedom == Freedom.LEVEL_SET
+        if len(shape.parameters) == 0 or (shape.misfit < SUSPECT_MISFIT and not always):
+            return None
+        parameters = self._level_set.parameters_of(shape.pressed)
+        rival = self.fit.evaluate(self._level_set, parameters, shape.log_ratio, *self._data)
+        return (
+            _Rival(rival, -np.inf if always else FREE_WORTH * self._scale(shape)) if rival else None
+        )
+
+    def _without_needless(self, shape: Shape) -> list[Callable[[Shape], _Rival | None]]:
+        """A move for each contact that is small or lies against another."""
+        assert isinstance(shape.family, Outlines)
+        each = shape.family.split(shape.parameters)
+        if len(each) < 2:
+            return []
+        apart = np.hypot(*(each[:, None, [X, Y]] - each[None, :, [X, Y]]).T) * UNIT_M
+        radius = np.exp(each[:, SIZE])
+        gap = apart - radius[:, None] - radius[None] + np.diag(np.full(len(each), np.inf))
+        asked = np.flatnonzero((radius < SMALL_M) | (gap.min(axis=1) < 0))
+
+        def without(k: int) -> Callable[[Shape], _Rival | None]:
+            def move(shape: Shape) -> _Rival | None:
+                rival = self._left_out(shape, k)
+                return _Rival(rival, -NEEDLESS * self._scale(shape)) if rival else None
+
+            return move
+
+        return [without(k) for k in asked[np.argsort(radius[asked])]]
+
+    def _each_left_out(self, shape: Shape) -> list[Shape]:
+        if not isinstance(shape.family, Outlines) or shape.family.count < 2:
+            return []
+        left = [self._left_out(shape, k) for k in range(shape.family.count)]
+        return [rest for rest in left if rest is not None]
+
+    def _left_out(self, shape: Shape, k: int) -> Shape | None:
+        assert isinstance(shape.family, Outlines)
+        each = np.delete(shape.family.split(shape.parameters), k, axis=0)
+        return self._evaluate(each, shape.family.order, shape.log_ratio)
+
+    def _nothing(self) -> Shape:
+        nothing = self._evaluate(np.zeros((0, MOST_PARAMETERS)), 0, self.fit.likely)
+        assert nothing is not None
+        return nothing
+
+    def _evaluate(self, each: FloatArray, order: int, log_ratio: float) -> Shape | None:
+        family = self._outlines.of(order, len(each))
+        return self.fit.evaluate(family, family.join(each), log_ratio, *self._data)
+
+    def _scale(self, shape: Shape) -> float:
+        """What one unit of squared misfit means, by what a shape leaves unexplained."""
+        return max(self._doubt, shape.misfit**2 / 2)
+
+    def _in_words(self, shape: Shape) -> str:
+        if not isinstance(shape.family, Outlines):
+            return "level set"
+        name = {0: "circle", 1: "circle", 2: "ellipse", 4: "rounded outline"}[shape.family.order]
+        return f"{shape.family.count} {name}{'s' * (shape.family.count != 1)}"
 
 
-def _lost(before: Shape, now: Shape) -> bool:
-    """Tell whether the last frame's shape, held against new data, is no longer a start."""
-    jumped = now.misfit > max(SUSPECT_MISFIT, 2 * before.misfit)
-    vanished = not np.any(now.pressed > 0.5)
-    return jumped or vanished
+def _good(shape: Shape) -> float:
+    """Misfit at which to stop: few parameters are better known at the minimum, many overfit."""
+    return 0.0 if isinstance(shape.family, Outlines) else GOOD_MISFIT
+
+
+def _halved(each: FloatArray, k: int) -> FloatArray:
+    """Contact k as two of half its length, side by side along its longer axis."""
+    size, e1, e2 = each[k, [SIZE, E1, E2]]
+    elongation = np.hypot(e1, e2)
+    angle = np.arctan2(e2, e1) / 2
+    # An ellipse of half axes a > b becomes two circles or ellipses of a / 2 and b.
+    away = np.exp(size + elongation) / 2 / UNIT_M * np.array([np.cos(angle), np.sin(angle)])
+    half = each[k].copy()
+    half[SIZE] -= np.log(2) / 2
+    half[E1:] = 0.0
+    one, other = half.copy(), half
+    one[[X, Y]] += away
+    other[[X, Y]] -= away
+    return np.vstack([np.delete(each, k, axis=0), one, other])
+
+
+def _gap_m(each: FloatArray, candidate: Candidate) -> float:
+    """Distance of a candidate's centre from the nearest outline, about."""
+    apart = np.hypot(each[:, X] * UNIT_M - candidate.x_m, each[:, Y] * UNIT_M - candidate.y_m)
+    return float(np.min(apart - np.exp(each[:, SIZE]), initial=np.inf))

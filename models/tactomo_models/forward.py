@@ -254,6 +254,19 @@ def _inside_mesh(mesh: skfem.MeshTri, points: FloatArray) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True)
+class Probes:
+    """Where the field is looked at: C spots, each an average over its neighbourhood.
+
+    Attributes:
+        bare: (2 C, L - 1) field of the bare sheet there, x components first.
+        green: (2 C, S) field there for a unit current into each support node.
+    """
+
+    bare: FloatArray
+    green: FloatArray
+
+
+@dataclass(frozen=True)
 class Solution:
     """Voltages of one pressed sheet, with what its potentials and derivatives follow from.
 
@@ -339,17 +352,15 @@ class ForwardModel:
         left = np.abs(law @ self.bare.potentials).max(axis=1)
         self._closed = left < 1e-9 * (abs(law) @ np.abs(self.bare.potentials)).max(axis=1)
 
-    def solve(self, change: FloatArray, also: NDArray[np.bool_] | None = None) -> Solution:
+    def solve(self, change: FloatArray) -> Solution:
         """Solve for a pressed sheet.
 
         Args:
             change: (P,) conductivity minus the bare sheet's at the pressable nodes.
-            also: not needed any more: derivatives are to be had everywhere.
 
         Raises:
             numpy.linalg.LinAlgError: a conductivity is not above 0.
         """
-        del also
         triangles = self._around(np.flatnonzero(change))
         if len(triangles) == 0:
             nowhere = np.zeros(0, np.intp)
@@ -456,6 +467,43 @@ class ForwardModel:
             (third, (corner[triangle, which], triangle)), (len(where), len(triangles))
         )
         return np.asarray(share @ product)
+
+    @property
+    def node_areas_m2(self) -> FloatArray:
+        """(P,) share of the sheet's area that belongs to each pressable node."""
+        return np.asarray(np.append(self._area, 0.0)[self._triangles_of].sum(axis=1) / 3)
+
+    def probes(self, x_m: FloatArray, y_m: FloatArray, radius_m: float) -> Probes:
+        """Prepare to look at the field around C points, each weighted by a cone of that radius."""
+        corners = self.bare.points[:, self.bare.support[self._corner_support]]  # (2, t, 3)
+        middle_x, middle_y = corners.mean(axis=2)
+        distance = np.hypot(x_m[:, None] - middle_x, y_m[:, None] - middle_y)
+        weight = np.clip(1 - distance / radius_m, 0, None) * self._area
+        weight /= weight.sum(axis=1, keepdims=True)
+        triangles, nodes = len(self._area), len(self.bare.support)
+        rows = np.repeat(np.arange(triangles), 3)
+        by_axis = [
+            sp.csr_matrix(
+                (self._gradient[:, axis].ravel(), (rows, self._corner_support.ravel())),
+                (triangles, nodes),
+            )
+            for axis in (0, 1)
+        ]
+        mean = sp.vstack([sp.csr_matrix(weight) @ gradient for gradient in by_axis]).tocsr()
+        return Probes(mean @ self.bare.potentials, mean @ self.bare.green)
+
+    def spot_sensitivity(self, probes: Probes, solution: Solution) -> FloatArray:
+        """Derivative (M, C) of the voltages by the conductivity of one square metre at each spot.
+
+        Unlike `jacobian` it looks anywhere, at the price of resolution: it is for finding where a
+        contact is missing in a solution, not for fitting it.
+        """
+        moved = probes.green[:, solution.rim] @ solution.injected
+        field = (probes.bare + moved) @ self._pair_matrix.T
+        x, y = np.split(field, 2)  # (C, pairs) each
+        one, other = self._products
+        product = x[:, one] * x[:, other] + y[:, one] * y[:, other]
+        return np.asarray(-(product[:, self._product_of] * self._sign).T)
 
     def bare_jacobian(self) -> FloatArray:
         """Jacobian of the unpressed sheet, (M, P)."""

@@ -43,9 +43,9 @@ from tactomo_models.contacts import (
 )
 from tactomo_models.description import Modality, SensorDescription
 from tactomo_models.errors import DataError
-from tactomo_models.following import ShapeFollower
+from tactomo_models.following import Freedom, ShapeFollower
 from tactomo_models.forward import ForwardModel
-from tactomo_models.levelset import LevelSet, Shape
+from tactomo_models.outlines import Outlines
 from tactomo_models.plausibility import (
     Flag,
     ScanCheck,
@@ -54,19 +54,27 @@ from tactomo_models.plausibility import (
     examine_reference,
 )
 from tactomo_models.reference import Reference, noise_of_reciprocity
+from tactomo_models.shape_fit import Shape
 from tactomo_models.tikhonov import EVEN, noise_figure_weight, noser_spread, tikhonov_matrix
 
 FloatArray = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 DEFAULT_BUDGET_S = 0.05
-CHANGE_ERROR = 0.02  # least model error as a share of each voltage change: mesh, outline
+CHANGE_ERROR = 0.01  # least model error, as a share of a change and of a typical one
+MISMATCH_SHARE = 1 / 3  # of the reference's mismatch that is left in the changes
+# An uneven sheet has few degrees of freedom: errors of the model go together, about as many
+# voltages at a time, and average out so much less than noise does.
+CORRELATED = 10.0
+MEDIAN_SQUARE = 0.455  # of a normal distribution of unit variance
 FALSE_ALARM = 1e-6  # chance that an unpressed frame of pure noise is taken for a pressed one
+TRACE = 1e-9  # relative noise of data that have none
 UNUSABLE = 1e3  # relative error of a voltage whose reference is zero or no number
 MOST_INVALID = 0.25  # share of voltages that may be invalid before the channel is given up
 BAD_MISFIT = 2.0  # the data are not explained: what is shown may be wrong
 SWAPPED = 2.0  # times the structure channel's signal that the magnitude channel's never reaches
 MUCH_MORE = 5.0  # ratio of the channels' contrasts (logarithms) for that
+LINEAR_PART = 0.5  # of the misfit of nothing, that areas cut out of a linear image may leave
 WRONG_WAY = 5.0  # standard uncertainties by which a conductivity may change against its sign
 
 
@@ -77,11 +85,13 @@ class Tier(StrEnum):
     QUIET = auto()  # nothing pressed: a test and no solve
     TIKHONOV = auto()  # one linear step, every node alike
     NOSER = auto()  # one linear step, nodes weighted by how well they are seen
-    LEVELSET = auto()  # level set on the structure channel, magnitudes fitted to its areas
+    FIT = auto()  # a few outlines on the structure channel, magnitudes fitted to their areas
+    LEVELSET = auto()  # a level set there instead: shapes of any form
 
 
 METHODS: Final = tuple(tier for tier in Tier if tier is not Tier.QUIET)  # that may be asked for
 LINEAR: Final = (Tier.TIKHONOV, Tier.NOSER)
+FREEDOM: Final = {Tier.FIT: Freedom.OUTLINES, Tier.LEVELSET: Freedom.LEVEL_SET}  # else as needed
 
 
 @dataclass(frozen=True)
@@ -121,7 +131,8 @@ class _Channel:
         reference: (M,) volts; 0 where it is invalid.
         valid: (M,) where there is a reference to measure changes against.
         per_volt: (M,) relative change that a volt makes; 0 where the reference is invalid.
-        variance: (M,) of a relative change, by noise of scan and reference and by model error.
+        noise: (M,) variance of a relative change, by noise of scan and reference.
+        variance: (M,) that of a change where nothing presses, drift included.
         mismatch: typical relative error of the model's prediction of the reference.
         flags: what is wrong with the reference.
         electrodes: those that the reference shows to be faulty.
@@ -134,6 +145,7 @@ class _Channel:
     reference: FloatArray
     valid: NDArray[np.bool_]
     per_volt: FloatArray
+    noise: FloatArray
     variance: FloatArray
     mismatch: float
     flags: Flag
@@ -145,10 +157,18 @@ class _Channel:
 
 @dataclass(frozen=True)
 class _Data:
-    """Relative voltage changes of one scan, with the weight of each; 0 where it is invalid."""
+    """Relative voltage changes of one scan.
+
+    Attributes:
+        change: (M,) 0 where it is invalid.
+        weight: (M,) inverse standard deviations, of noise and of model error; 0 where invalid.
+        spread: (M,) factor on variances because model errors go together.
+        quiet: whether nothing presses.
+    """
 
     change: FloatArray
     weight: FloatArray
+    spread: FloatArray
     quiet: bool
     signal: float  # rms of the changes over their noise
 
@@ -189,8 +209,8 @@ class Reconstructor:
         self._jacobian_by_node = np.ascontiguousarray(self._artifact.jacobian.T)
         self._follower = None
         if description.structure is not None:
-            level_set = LevelSet(self._forward, description.structure.saturated_ratio)
-            self._follower = ShapeFollower(level_set, self._structure_image)
+            ratio = description.structure.saturated_ratio
+            self._follower = ShapeFollower(self._forward, ratio)
         self._channels: dict[Modality, _Channel] = {}
         self._tracker = Tracker()
         self._magnitudes: Magnitudes | None = None
@@ -240,6 +260,7 @@ class Reconstructor:
             reference=reference,
             valid=valid,
             per_volt=per_volt,
+            noise=np.maximum(relative**2 - MODEL_ERROR**2, TRACE**2),
             variance=relative**2,
             mismatch=_mismatch(reference[valid], predicted[valid]),
             flags=verdict.flags,
@@ -339,15 +360,20 @@ class Reconstructor:
             return flags | missing | Flag.INVALID_VOLTAGE
         change = np.where(valid, scan - channel.reference, 0.0) * channel.per_volt
         square = change * change
-        variance = channel.variance * verdict.noise**2
-        # A model that is wrong about the reference is as wrong about the changes.
-        share = max(CHANGE_ERROR, channel.mismatch)
-        weight = valid / np.sqrt(variance + share**2 * square)
+        grown = verdict.noise**2
+        variance = channel.variance * grown
+        # A model that is wrong about the reference is wrong about the changes, too, if less: most
+        # of its error divides out. Small changes share in the error of the large ones beside them.
+        share = max(CHANGE_ERROR, MISMATCH_SHARE * channel.mismatch)
+        typical = float(np.median(square[valid])) / MEDIAN_SQUARE
+        noise, error = channel.noise * grown, share**2 * (square + typical)
+        weight = valid / np.sqrt(noise + error)
+        spread = 1 + (CORRELATED - 1) * error / (noise + error)
         statistic = float((square / variance).sum())
         quiet = statistic < _noise_limit(count)
         if not quiet and _fell(channel.total * change, channel.total**2 * variance):
             flags |= Flag.REFERENCE_MISMATCH
-        data[name] = _Data(change, weight, quiet, (statistic / count) ** 0.5)
+        data[name] = _Data(change, weight, spread, quiet, (statistic / count) ** 0.5)
         return flags
 
     def _by_tier(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
@@ -364,7 +390,7 @@ class Reconstructor:
         if "structure" not in data:
             why = "the structure channel is missing" if self._follower else "no structure channel"
             return self._linear(data, flags, Tier.TIKHONOV, why)
-        return self._by_level_set(data, flags)
+        return self._by_shape(data, flags)
 
     def _quiet(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
         blank = np.zeros((self.description.map.nodes_y, self.description.map.nodes_x), np.float32)
@@ -397,7 +423,9 @@ class Reconstructor:
             areas = self._areas.find(self._on_map(inside), inside)
             fitted = self._linear_magnitudes(areas, data)
             contacts = self._contacts(areas, fitted)
-        if self._magnitude_unexplained(data, fitted):
+        # Its outlines are a guess, so all that can be asked is that they explain most.
+        left = LINEAR_PART * data["magnitude"].misfit if "magnitude" in data else 0.0
+        if self._magnitude_unexplained(data, fitted, max(BAD_MISFIT, left)):
             flags |= Flag.MISFIT_HIGH
         linear = images.get("magnitude")
         return Reconstruction(
@@ -417,15 +445,13 @@ class Reconstructor:
         image = self._channels[name].matrices[method] @ signed.astype(np.float32)
         return np.maximum(image, 0.0, out=image)
 
-    def _structure_image(self, change: FloatArray) -> FloatArray:
-        return self._linear_image("structure", change, Tier.TIKHONOV).astype(np.float64)
-
     def _linear_magnitudes(self, areas: Areas, data: dict[Modality, _Data]) -> Magnitudes | None:
         """Magnitudes of a linear method: no forward solve, the bare sheet's Jacobian says all."""
         if "magnitude" not in data or not len(areas):
             return None
         tangent = bare_tangent(self._jacobian_by_node, areas)
-        return linear_magnitudes(tangent, data["magnitude"].change, data["magnitude"].weight)
+        taken = data["magnitude"]
+        return linear_magnitudes(tangent, taken.change, taken.weight, taken.spread)
 
     def _sign(self, name: Modality) -> float:
         if name == "magnitude":
@@ -438,17 +464,21 @@ class Reconstructor:
         shape = (self.description.map.nodes_y, self.description.map.nodes_x)
         return np.asarray(self._artifact.bare.map_weights @ nodes).reshape(shape)
 
-    def _by_level_set(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
+    def _by_shape(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
+        """Shapes on the structure channel, and a magnitude for each of their areas."""
         assert self._follower is not None
-        with self._timed("levelset"):
+        with self._timed("shape"):
             structure, budget_s = data["structure"], self.budget_s or DEFAULT_BUDGET_S
-            shape, how = self._follower.follow(structure.change, structure.weight, budget_s)
+            freedom = FREEDOM.get(self.tier, Freedom.AS_NEEDED)
+            shape, how = self._follower.follow(
+                structure.change, structure.weight, structure.spread, budget_s, freedom
+            )
         with self._timed("contacts"):
             pressed = self._on_map(shape.pressed)
-            areas = self._areas_of(shape, pressed)
+            areas = self._areas_of(shape, pressed, structure)
             fitted = self._fit_magnitudes(areas, data, 3 if shape.converged else 1)
             contacts = self._contacts(areas, fitted)
-        if shape.misfit > BAD_MISFIT or self._magnitude_unexplained(data, fitted):
+        if shape.misfit > BAD_MISFIT or self._magnitude_unexplained(data, fitted, BAD_MISFIT):
             flags |= Flag.MISFIT_HIGH
         if not shape.converged:
             flags |= Flag.NOT_CONVERGED
@@ -461,14 +491,14 @@ class Reconstructor:
             pressure_kpa=pressure,
             structure=pressed.astype(np.float32),
             contacts=contacts,
-            tier=Tier.LEVELSET,
+            tier=Tier.FIT if isinstance(shape.family, Outlines) else Tier.LEVELSET,
             reason=how,
             misfit=shape.misfit,
             flags=flags,
         )
 
     def _magnitude_unexplained(
-        self, data: dict[Modality, _Data], fitted: Magnitudes | None
+        self, data: dict[Modality, _Data], fitted: Magnitudes | None, bad_misfit: float
     ) -> bool:
         """Tell whether the contacts shown leave the magnitude channel's changes unexplained.
 
@@ -478,16 +508,21 @@ class Reconstructor:
         if "magnitude" not in data:
             return False
         if fitted is None:
-            return data["magnitude"].misfit > BAD_MISFIT
+            return data["magnitude"].misfit > bad_misfit
         wrong_way = self._sign("magnitude") * fitted.change < -WRONG_WAY * fitted.sigma
-        return fitted.misfit > BAD_MISFIT or bool(wrong_way.any())
+        return fitted.misfit > bad_misfit or bool(wrong_way.any())
 
-    def _areas_of(self, shape: Shape, pressed: FloatArray) -> Areas:
+    def _areas_of(self, shape: Shape, pressed: FloatArray, structure: _Data) -> Areas:
         """Areas of a shape; those of the frame before while the shape has not moved."""
-        if self._areas_shape is not shape.pressed or self._fitted_areas is None:
-            self._areas_shape = shape.pressed
-            return self._areas.find(pressed, shape.pressed)
-        return self._fitted_areas
+        assert self._follower is not None
+        if self._areas_shape is shape.pressed and self._fitted_areas is not None:
+            return self._fitted_areas
+        self._areas_shape = shape.pressed
+        areas = self._areas.find(pressed, shape.pressed)
+        if len(areas) == 0:
+            return areas
+        covariance = self._follower.fit.covariance(shape, structure.weight, structure.spread)
+        return self._areas.with_sigmas(areas, shape, covariance)
 
     def _fit_magnitudes(
         self, areas: Areas, data: dict[Modality, _Data], solves: int
@@ -497,9 +532,16 @@ class Reconstructor:
         if "magnitude" in data and len(areas):
             same = self._fitted_areas is areas
             start = last if last and len(last.change) == len(areas) else None
-            change, weight = data["magnitude"].change, data["magnitude"].weight
+            taken = data["magnitude"]
             self._magnitudes = fit_magnitudes(
-                self._forward, areas, change, weight, start, same_areas=same, solves=solves
+                self._forward,
+                areas,
+                taken.change,
+                taken.weight,
+                taken.spread,
+                start,
+                same_areas=same,
+                solves=solves,
             )
         self._fitted_areas = areas
         return self._magnitudes
@@ -520,6 +562,9 @@ class Reconstructor:
                 magnitude=float(size[k]),
                 magnitude_sigma=float(sigma[k]),
                 pressure_kpa=float(pressure[k]),
+                x_sigma_m=float(areas.sigmas[k, 0]),
+                y_sigma_m=float(areas.sigmas[k, 1]),
+                area_sigma_m2=float(areas.sigmas[k, 2]),
             )
             for k in range(len(areas))
         )
