@@ -48,6 +48,7 @@ SURE_GAIN = 30.0  # of a contact: the best of 500 places gains some 15 by noise 
 WORTH = 2.5  # of one more parameter of a form
 FREE_WORTH = 100.0  # of a level set
 NEEDLESS = 15.0  # a contact whose absence costs less is not there
+NOISE = 3.0  # what a parameter gains by following a new frame's noise, at most
 NEAR_M = 0.012  # what is missing this near an outline is more likely a part of its form
 SMALLEST_M = 0.003  # radius below which it is an error of the model, not a contact
 SMALL_M = 0.006  # contacts of a smaller radius are asked whether they are needed
@@ -101,6 +102,8 @@ class ShapeFollower:
     def _start_over(self) -> None:
         self._rival: _Rival | None = None
         self._moves_tried = 0
+        self._moved = False  # whether known contacts were let move, before any is added
+        self._settled = False  # whether the shape in force is at its minimum
 
     def follow(
         self,
@@ -149,6 +152,8 @@ class ShapeFollower:
             nothing = self._nothing()
             best = min([shape, *self._each_left_out(shape), nothing], key=lambda s: s.cost)
             return best, "cold start" if best is nothing else "warm start"
+        if before.converged:  # all was done, but for other data
+            self._moved = self._settled = False
         if self._rival is not None:
             rival = self.fit.compare(self._rival.shape, *self._data)
             self._rival = replace(self._rival, shape=replace(rival, converged=False))
@@ -156,36 +161,42 @@ class ShapeFollower:
 
     def _improve(self, shape: Shape, budget: Budget) -> Shape:
         """Refine, and try one rival after another, until none is left or the budget ends."""
-        settled = len(shape.parameters) == 0  # no parameters: nothing to refine
-        moved = False  # whether the last frame's contacts were allowed to have moved
         while not budget.over:
             if self._rival is not None:
-                shape, settled = self._judge(shape, settled, budget)
-                moved = True
-            elif moved and not settled and (rival := self._missing(shape)):
+                shape = self._judge(self._rival, shape, budget)
+            elif self._moved and not self._settled and (rival := self._missing(shape)):
                 self._rival = rival
-            elif not settled:
-                shape = self.fit.refine(shape, *self._data, budget, _good(shape), STEPS)
-                settled, moved = shape.converged, True
+            elif not self._settled:
+                before, shape = shape, self._refined(shape, budget)
+                # A budget of a step or so a frame lets it follow each frame's noise, no more.
+                follows = before.cost - shape.cost < NOISE * len(shape.parameters)
+                self._settled = shape.converged or (budget.over and follows)
+                self._moved = True
             elif not self._challenge(shape):
                 return replace(shape, converged=True)
         return replace(shape, converged=False)
 
-    def _judge(self, shape: Shape, settled: bool, budget: Budget) -> tuple[Shape, bool]:
-        """Refine the rival: it takes the shape's place, is given up, or goes on."""
-        assert self._rival is not None
-        rival = replace(self._rival, trials=self._rival.trials - 1)
-        if len(rival.shape.parameters):
-            good = _good(rival.shape)
-            refined = self.fit.refine(rival.shape, *self._data, budget, good, STEPS)
-            rival = replace(rival, shape=refined)
-        if rival.shape.cost < shape.cost - rival.gain:
+    def _refined(self, shape: Shape, budget: Budget) -> Shape:
+        if len(shape.parameters) == 0:
+            return replace(shape, converged=True)
+        # Few parameters are better known at the minimum; many would begin to explain the noise.
+        good = 0.0 if isinstance(shape.family, Outlines) else GOOD_MISFIT
+        return self.fit.refine(shape, *self._data, budget, good, STEPS)
+
+    def _judge(self, rival: _Rival, shape: Shape, budget: Budget) -> Shape:
+        """Refine a rival: it takes the shape's place, is given up, or goes on."""
+        refined = self._refined(rival.shape, budget)
+        if refined.cost < shape.cost - rival.gain:
             self._start_over()
-            return rival.shape, rival.shape.converged or len(rival.shape.parameters) == 0
-        given_up = rival.shape.converged or rival.trials == 0
-        self._rival = None if given_up else rival
-        self._moves_tried += given_up
-        return shape, settled
+            self._settled, self._moved = refined.converged, True
+            return refined
+        trials = rival.trials - (not budget.over)  # one that was cut short does not count
+        if refined.converged or trials == 0:
+            self._rival = None
+            self._moves_tried += 1
+        else:
+            self._rival = replace(rival, shape=refined, trials=trials)
+        return shape
 
     def _challenge(self, shape: Shape) -> bool:
         """Set the next rival against a shape that is at its minimum; False when all were tried."""
@@ -320,11 +331,6 @@ class ShapeFollower:
             return "level set"
         name = {0: "circle", 1: "circle", 2: "ellipse", 4: "rounded outline"}[shape.family.order]
         return f"{shape.family.count} {name}{'s' * (shape.family.count != 1)}"
-
-
-def _good(shape: Shape) -> float:
-    """Misfit at which to stop: few parameters are better known at the minimum, many overfit."""
-    return 0.0 if isinstance(shape.family, Outlines) else GOOD_MISFIT
 
 
 def _halved(each: FloatArray, k: int) -> FloatArray:
