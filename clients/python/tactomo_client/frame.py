@@ -61,7 +61,7 @@ class Frame:
     device_us: int | None
     """The device's own clock, microseconds."""
     tier: str | None
-    """How much model the frame was given: quiet, tikhonov, levelset, ..."""
+    """How much model the frame was given: quiet, tikhonov, fit, levelset, ..."""
     tier_reason: str | None
     flags: frozenset[str]
     """What to be wary of, such as ``misfit_high``; empty when all is well. See STREAM.md."""
