@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ def test_scenes_in_numbers(tactomo: Run, tmp_path: Path) -> None:
 def test_scenes_in_words(tactomo: Run) -> None:
     result = tactomo(*FEW, "--seeds", "tuning", "--snr-of", "voltage")
     assert result.returncode == 0
-    assert "simulated scenes of paper_square, tuning seeds" in result.stdout
+    assert "Simulated, not measured: paper_square, tuning seeds" in result.stdout
     assert "SNR of the voltage" in result.stdout
     for heading in ("RIE", "contacts 2", "spread", "within one reported standard uncertainty"):
         assert heading in result.stdout
@@ -52,3 +53,21 @@ def test_a_sensor_of_one_channel_cannot_be_evaluated_so(tactomo: Run) -> None:
     result = tactomo("evaluate", "scenes", "--sensor", "tank_disc")
     assert result.returncode == 1
     assert "one channel" in result.stderr
+
+
+@pytest.mark.slow
+def test_moving_scenes(tactomo: Run, tmp_path: Path) -> None:
+    """On a coarse map, so that a sequence is simulated in seconds."""
+    shipped = resources.files("tactomo_models.sensors").joinpath("paper_square.toml")
+    sensor, picture = tmp_path / "coarse.toml", tmp_path / "moving.png"
+    sensor.write_text(shipped.read_text("utf-8") + "[map]\nnodes_x = 21\nnodes_y = 21\n")
+    moving = ("evaluate", "moving", "--count", 1, "--sensor", sensor)
+    words = tactomo(*moving, "--budget-ms", 20, "--picture", picture)
+    assert words.returncode == 0
+    assert "Simulated, not measured" in words.stdout
+    for phase in ("slide", "jump", "merge", "split", "lost scans", "tare", "all"):
+        assert f" {phase} " in words.stdout
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    numbers = json.loads(tactomo(*moving, "--method", "noser", "--json").stdout)
+    assert numbers["simulated"] is True
+    assert numbers["phases"]["all"]["frames"] == len(numbers["sequences"][0])

@@ -19,7 +19,9 @@ from typer.testing import CliRunner
 Run = Callable[..., Any]
 
 
-@pytest.mark.parametrize("command", [*ORDER, "models build", "models list", "evaluate scenes"])
+@pytest.mark.parametrize(
+    "command", [*ORDER, "models build", "models list", "evaluate scenes", "evaluate moving"]
+)
 def test_every_command_explains_itself(command: str) -> None:
     result = CliRunner().invoke(app, [*command.split(), "--help"], prog_name="tactomo")
     assert result.exit_code == 0

@@ -16,11 +16,14 @@ from tactomo.cli.files import DescriptionOption
 from tactomo.cli.plot import need_matplotlib
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
     from tactomo_models.evaluation.measures import Summary
+    from tactomo_models.evaluation.moving import PhaseSummary
     from tactomo_models.evaluation.still import Outcome
 
 Item = TypeVar("Item")
+Row = TypeVar("Row")
 
 evaluate_app = typer.Typer(
     help="Measure how right the reconstruction is, where the truth is known.",
@@ -87,22 +90,78 @@ def scenes(
     )
     total = count * len(numbers) * len(ratios)
     outcomes = list(_shown(reconstruct_scenes(drawn, method), total, f"{seeds} scenes"))
-    settings = {
-        "simulated": True,
-        "sensor": description.name,
-        "seeds": seeds,
-        "scenes_each": count,
-        "snr_of": snr_of,
-        "method": method,
-    }
+    settings = _settings(description.name, seeds, snr_of, method)
     if as_json:
-        typer.echo(json.dumps({**settings, **_as_json(outcomes)}, indent=2))
+        typer.echo(json.dumps({**settings, "scenes_each": count, **_as_json(outcomes)}, indent=2))
     else:
         _print_scenes(settings, outcomes)
     if picture is not None:
         from tactomo.cli.evaluate_pictures import draw_outcomes
 
         draw_outcomes(outcomes, picture)
+        typer.echo(f"wrote {picture}", err=True)
+
+
+@evaluate_app.command(
+    epilog=examples(
+        "tactomo evaluate moving",
+        "tactomo evaluate moving --count 10 --snr 20 --budget-ms 100 --picture moving.png",
+        "tactomo evaluate moving --seeds reporting --json > moving.json",
+    ),
+)
+def moving(
+    seeds: Seeds = "tuning",
+    count: Annotated[int, typer.Option(min=1, help="Sequences.")] = 3,
+    snr: Annotated[float, typer.Option(help="Signal-to-noise ratio in dB.")] = 40.0,
+    snr_of: SnrOf = "change",
+    method: Annotated[Method, typer.Option(help="How to reconstruct.")] = "auto",
+    budget_ms: Annotated[
+        float | None, typer.Option(min=1.0, help="Compute time a frame may take. [the daemon's]")
+    ] = None,
+    sensor: DescriptionOption = DEFAULT_DESCRIPTION,
+    picture: Picture = None,
+    as_json: JsonOutput = False,
+) -> None:
+    """Follow simulated contacts that slide, land, lift, jump, merge and split, frame by frame.
+
+    With lost scans and a tare on the way, at 20 frames a second, under the budget that the daemon
+    has. Each sequence has sheets of its own, as in `tactomo evaluate scenes`. The first run
+    simulates (a minute a sequence) and keeps the voltages in the cache.
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+    from tactomo_models import load_description
+    from tactomo_models.evaluation.moving import draw_sequence, play, summarise_phases
+
+    if picture is not None:
+        need_matplotlib()
+    description = load_description(sensor)
+    played = []
+    with Progress(console=Console(stderr=True), transient=True) as shown:
+        for number in range(count):
+            task = shown.add_task(f"simulating sequence {number + 1} of {count}", total=None)
+            sequence = draw_sequence(description, seeds, number, snr_db=snr, snr_of=snr_of)
+            name = f"reconstructing sequence {number + 1} of {count}"
+            shown.update(task, description=name, total=len(sequence.steps))
+            scores = []
+            for score in play(sequence, method, None if budget_ms is None else budget_ms / 1e3):
+                scores.append(score)
+                shown.advance(task)
+            played.append(scores)
+            shown.remove_task(task)
+    phases = summarise_phases(played)
+    settings = _settings(description.name, seeds, snr_of, method)
+    if as_json:
+        settings |= {"snr_db": snr, "budget_ms": budget_ms}
+        rows = {name: asdict(summary) for name, summary in phases.items()}
+        frames = [[asdict(score) for score in scores] for scores in played]
+        typer.echo(json.dumps({**settings, "phases": rows, "sequences": frames}, indent=2))
+    else:
+        _print_moving(settings, f"{count} sequences, {snr:g} dB", phases)
+    if picture is not None:
+        from tactomo.cli.evaluate_pictures import draw_traces
+
+        draw_traces(played, picture)
         typer.echo(f"wrote {picture}", err=True)
 
 
@@ -150,21 +209,35 @@ def _as_json(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     }
 
 
+def _settings(sensor: str, seeds: str, snr_of: str, method: str) -> dict[str, Any]:
+    return {
+        "simulated": True,
+        "sensor": sensor,
+        "seeds": seeds,
+        "snr_of": snr_of,
+        "method": method,
+    }
+
+
+def _print_settings(console: Console, settings: dict[str, Any]) -> None:
+    console.print(
+        f"Simulated, not measured: {settings['sensor']}, {settings['seeds']} seeds, method "
+        f"[bold]{settings['method']}[/], SNR of the {settings['snr_of']}."
+    )
+
+
 def _print_scenes(settings: dict[str, Any], outcomes: Sequence[Outcome]) -> None:
     from rich.console import Console
     from tactomo_models.evaluation.measures import summaries, summarise
 
     scores = [outcome.score for outcome in outcomes]
     console = Console()
-    console.print(
-        f"simulated scenes of {settings['sensor']}, {settings['seeds']} seeds, method "
-        f"[bold]{settings['method']}[/], cold start; SNR of the {settings['snr_of']}"
-    )
+    _print_settings(console, settings)
     groups = {"all": summarise(scores)}
     for name, rows in summaries(scores).items():
         if len(rows) > 1:
             groups |= {f"{name} {value}": summary for value, summary in rows.items()}
-    console.print(_table("maps", groups, MAPS))
+    console.print(_table("maps, cold start", groups, MAPS))
     console.print(_table("contacts", groups, CONTACTS))
     console.print(
         "[dim]worst: ICC that 95 % exceed; shape: ICC of the pressed shape; wrong: ICC below 0.8 "
@@ -201,16 +274,43 @@ CONTACTS: dict[str, Callable[[Summary], str]] = {
 }
 
 
-def _table(
-    title: str, groups: dict[str, Summary], columns: dict[str, Callable[[Summary], str]]
-) -> Table:
+def _print_moving(settings: dict[str, Any], title: str, phases: dict[str, PhaseSummary]) -> None:
+    from rich.console import Console
+
+    console = Console()
+    _print_settings(console, settings)
+    console.print(_table(title, phases, PHASES))
+    console.print(
+        "[dim]worst: ICC that 95 % exceed; shape: ICC of the pressed shape; lost: longest run of "
+        "frames in which that is below 0.8, median and most; ids: identities lost; wrong: frames "
+        "with an ICC below 0.8 or another count, and no flag that says so.[/]"
+    )
+
+
+PHASES: dict[str, Callable[[PhaseSummary], str]] = {
+    "frames": lambda s: str(s.frames),
+    "ICC": lambda s: f"{s.icc:.3f}",
+    "worst": lambda s: f"{s.icc_worst:.2f}",
+    "shape": lambda s: f"{s.icc_structure:.3f}",
+    "count": lambda s: f"{s.count_right:.0%}",
+    "lost": lambda s: f"{s.recovery:.0f}",
+    "most": lambda s: f"{s.recovery_most:.0f}",
+    "ids": lambda s: str(s.switches),
+    "flag": lambda s: f"{s.distrusted:.0%}",
+    "wrong": lambda s: f"{s.confidently_wrong:.0%}",
+    "ms": lambda s: f"{s.seconds * 1e3:.0f}",
+    "p99": lambda s: f"{s.seconds_99 * 1e3:.0f}",
+}
+
+
+def _table(title: str, groups: dict[str, Row], columns: dict[str, Callable[[Row], str]]) -> Table:
     from rich import box
     from rich.table import Table
 
     table = Table(title=title, box=box.SIMPLE_HEAD, padding=0, title_justify="left")
     table.add_column("", no_wrap=True)
     for name in columns:
-        table.add_column(name, justify="right", no_wrap=True, min_width=5)
+        table.add_column(name, justify="right", no_wrap=True, min_width=3)
     for name, summary in groups.items():
-        table.add_row(name, *(show(summary) for show in columns.values()))
+        table.add_row(name, *(show(summary).replace("nan", "-") for show in columns.values()))
     return table

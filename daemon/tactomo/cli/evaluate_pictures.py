@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from tactomo.cli.plot import save_figure
 
 if TYPE_CHECKING:
+    from tactomo_models.evaluation.moving import FrameScore
     from tactomo_models.evaluation.still import Outcome
 
 ROWS = 4  # scenes of each kind
@@ -57,3 +58,42 @@ def _draw_outcome(axes: Any, outcome: Outcome) -> None:
     for contact in frame.contacts:
         axes[1].plot(contact.x_m * 1e3, contact.y_m * 1e3, "r+", markersize=6)
     axes[3].set_xlabel(", ".join(score.flags), fontsize=6, color="tab:red")
+
+
+def draw_traces(played: Sequence[Sequence[FrameScore]], output: Path) -> None:
+    """Draw how each moving scene was followed: ICC, contacts and time over its frames.
+
+    Raises:
+        TactomoError: the picture cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(15, 4.5 * len(played)), layout="constrained")
+    for part, scores in zip(figure.subfigures(len(played), 1, squeeze=False), played, strict=True):
+        _draw_trace(part[0], scores)
+    save_figure(figure, output)
+
+
+def _draw_trace(figure: Any, scores: Sequence[FrameScore]) -> None:
+    rows = figure.subplots(3, 1, sharex=True, height_ratios=(2, 1, 1))
+    frames = range(len(scores))
+    rows[0].plot(frames, [score.icc for score in scores], label="map")
+    rows[0].plot(frames, [score.icc_structure for score in scores], "--", label="shape")
+    rows[0].set(ylim=(0, 1), ylabel="ICC")
+    rows[1].step(frames, [score.contacts for score in scores], "k:", where="mid", label="true")
+    rows[1].step(frames, [score.found for score in scores], where="mid", label="found")
+    rows[1].set_ylabel("contacts")
+    rows[2].plot(frames, [score.seconds * 1e3 for score in scores])
+    rows[2].set(ylabel="ms", xlabel="frame")
+    for frame, score in enumerate(scores):
+        colour = "tab:red" if score.confidently_wrong else "0.8" if score.distrusted else None
+        if colour:
+            rows[0].axvspan(frame - 0.5, frame + 0.5, color=colour, linewidth=0, alpha=0.5)
+        if frame == 0 or score.phase != scores[frame - 1].phase:
+            rows[0].text(frame, 1.02, score.phase, fontsize=8, rotation=15)
+            for axes in rows:
+                axes.axvline(frame - 0.5, color="0.6", linewidth=0.5)
+    rows[0].plot([], [], color="0.8", linewidth=6, label="flagged")
+    rows[0].plot([], [], color="tab:red", linewidth=6, alpha=0.5, label="wrong, not flagged")
+    for axes in rows[:2]:
+        axes.legend(fontsize=7, loc="lower left", ncols=4)

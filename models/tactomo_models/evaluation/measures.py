@@ -251,33 +251,35 @@ def summarise(scores: Sequence[SceneScore]) -> Summary:
     icc = [one.icc for one in scores]
     return Summary(
         scenes=len(scores),
-        icc=_mean(icc),
-        icc_worst=_percentile(icc, 5),
-        rie=_mean(one.rie for one in scores),
-        icc_structure=_mean(one.icc_structure for one in scores),
-        count_right=_mean(one.count_right for one in scores),
-        missed=_mean(contact.missed for contact in contacts),
-        false=_mean(one.found - one.matched for one in scores),
-        centre_mm=_percentile(centre, 50),
-        centre_mm_95=_percentile(centre, 95),
-        area_error=_percentile([abs(contact.area_error) for contact in matched], 50),
-        magnitude_error=_mean(np.abs(error)),
+        icc=mean(icc),
+        icc_worst=percentile(icc, 5),
+        rie=mean(one.rie for one in scores),
+        icc_structure=mean(one.icc_structure for one in scores),
+        count_right=mean(one.count_right for one in scores),
+        missed=mean(contact.missed for contact in contacts),
+        false=mean(one.found - one.matched for one in scores),
+        centre_mm=percentile(centre, 50),
+        centre_mm_95=percentile(centre, 95),
+        area_error=percentile([abs(contact.area_error) for contact in matched], 50),
+        magnitude_error=mean(np.abs(error)),
         magnitude_spread=_largest_spread(matched),
-        pressure_error_kpa=_mean(abs(contact.pressure_error_kpa) for contact in matched),
-        within_sigma=_mean(np.where(np.isfinite(error), np.abs(error) <= sigma, np.nan)),
-        distrusted=_mean(one.distrusted for one in scores),
-        confidently_wrong=_mean(one.confidently_wrong for one in scores),
-        seconds=_percentile(seconds, 50),
-        seconds_99=_percentile(seconds, 99),
+        pressure_error_kpa=mean(abs(contact.pressure_error_kpa) for contact in matched),
+        within_sigma=mean(np.where(np.isfinite(error), np.abs(error) <= sigma, np.nan)),
+        distrusted=mean(one.distrusted for one in scores),
+        confidently_wrong=mean(one.confidently_wrong for one in scores),
+        seconds=percentile(seconds, 50),
+        seconds_99=percentile(seconds, 99),
     )
 
 
-def _mean(values: Iterable[Any]) -> float:
+def mean(values: Iterable[Any]) -> float:
+    """Mean of the numbers among some values; NaN where there are none."""
     known = _known(values)
     return float(known.mean()) if len(known) else float("nan")
 
 
-def _percentile(values: Iterable[Any], percent: float) -> float:
+def percentile(values: Iterable[Any], percent: float) -> float:
+    """Percentile of the numbers among some values; NaN where there are none."""
     known = _known(values)
     return float(np.percentile(known, percent)) if len(known) else float("nan")
 

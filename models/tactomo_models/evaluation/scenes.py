@@ -12,9 +12,7 @@ scene is in both, whatever its number.
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -24,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from tactomo_models.archive import read_arrays
 from tactomo_models.artifact import cache_folder
 from tactomo_models.description import Modality, SensorDescription
 from tactomo_models.errors import DataError
+from tactomo_models.evaluation.cache import cached
 from tactomo_models.evaluation.simulation import (
     Truth,
     UnevenSkin,
@@ -46,7 +44,7 @@ SeedSet = Literal["tuning", "reporting"]
 SnrOf = Literal["voltage", "change"]
 SceneShape = Literal["ellipse", "rectangle", "ring", "mixed"]
 
-SIMULATION = 3  # raise it when `simulation` changes: what it stored before is not read
+SIMULATION = 4  # raise it when `simulation` changes: what it stored before is not read
 CONTACTS = (1, 2, 3, 4, 5, 6)
 GAP_M = 0.009  # least distance of two outlines
 HALF_AXIS_M = (0.007, 0.020)  # of every indenter, both axes
@@ -82,7 +80,7 @@ class Layout:
 
     def seed(self, purpose: str) -> np.random.SeedSequence:
         """Seed of one of the scene's random draws."""
-        return _seed(self.seed_set, len(self.presses), self.number, purpose)
+        return seed_of(self.seed_set, purpose, len(self.presses), self.number)
 
     def __str__(self) -> str:
         return f"{self.seed_set} {len(self.presses)}/{self.number}"
@@ -141,11 +139,7 @@ def scenes(
     Raises:
         DataError: the sensor has a single channel, or no room for that many contacts.
     """
-    if len(description.modalities) < 2:
-        raise DataError(
-            f"sensor {description.name!r} has one channel; scenes need a magnitude and a "
-            "structure channel: choose another description"
-        )
+    require_both_channels(description)
     folder = cache or cache_folder() / "scenes"
     simulation = _Simulation(description, folder)
     for contact_count in contacts:
@@ -154,9 +148,23 @@ def scenes(
             yield measure(simulation.voltages(layout), layout, description, snr_db, snr_of)
 
 
-def _seed(seed_set: SeedSet, contacts: int, number: int, purpose: str) -> np.random.SeedSequence:
+def require_both_channels(description: SensorDescription) -> None:
+    """Refuse a sensor that has a single channel.
+
+    Raises:
+        DataError: it has.
+    """
+    if len(description.modalities) < 2:
+        raise DataError(
+            f"sensor {description.name!r} has one channel; scenes need a magnitude and a "
+            "structure channel: choose another description"
+        )
+
+
+def seed_of(seed_set: SeedSet, purpose: str, *numbers: int) -> np.random.SeedSequence:
+    """Seed of one random draw; no number in one set leads to what another set or purpose has."""
     name = hashlib.sha256(f"{seed_set} {purpose}".encode()).digest()
-    return np.random.SeedSequence([int.from_bytes(name), contacts, number])
+    return np.random.SeedSequence([int.from_bytes(name), *numbers])
 
 
 def draw_layout(
@@ -170,7 +178,7 @@ def draw_layout(
     Raises:
         DataError: there is no room for so many.
     """
-    rng = np.random.default_rng(_seed(seed_set, contacts, number, "layout"))
+    rng = np.random.default_rng(seed_of(seed_set, "layout", contacts, number))
     shape = SCENE_SHAPES[rng.integers(4 if contacts > 1 else 3)]
     contrast = float(np.exp(rng.uniform(*np.log(CONTRAST))))
     opposite = bool(rng.integers(2))
@@ -257,31 +265,24 @@ class _Simulation:
 
     def voltages(self, layout: Layout) -> SimulatedVolts:
         """Noise-free voltages of a scene."""
-        what = f"{SIMULATION} {layout!r}"
-        key = hashlib.sha256((what + self._description.model_dump_json()).encode()).hexdigest()
-        path = self._folder / f"{key[:32]}.npz"
-        # A cache that cannot be read or written costs time and nothing else.
-        with suppress(OSError, DataError, KeyError):
-            stored = read_arrays(path)
-            return SimulatedVolts(
-                *({name: stored[f"{state}_{name}"] for name in MODALITIES} for state in STATES)
-            )
-        made = self._simulate(layout)
-        with suppress(OSError):
-            _store(made, path)
-        return made
+        what = f"{SIMULATION} {layout!r} {self._description.model_dump_json()}"
+        volts = cached(self._folder, what, lambda: self._simulate(layout))
+        return SimulatedVolts(
+            *({name: volts[f"{name}_{state}"] for name in MODALITIES} for state in STATES)
+        )
 
-    def _simulate(self, layout: Layout) -> SimulatedVolts:
+    def _simulate(self, layout: Layout) -> dict[str, FloatArray]:
         sensor = with_contrast(self._description, layout.contrast)
         if layout.opposite:
             sensor = with_opposite_magnitude(sensor)
         skin = UnevenSkin(sensor, self._mesh, layout.seed("sheet"))
-        return SimulatedVolts(skin.voltages([]), skin.voltages(layout.presses))
+        scans = zip(STATES, (skin.voltages([]), skin.voltages(layout.presses)), strict=True)
+        return {f"{name}_{state}": scan[name] for state, scan in scans for name in MODALITIES}
 
 
 @dataclass(frozen=True)
 class SimulatedVolts:
-    """Noise-free voltages (M,) of each channel, volts: at rest and pressed."""
+    """Noise-free voltages of each channel, volts: (M,) at rest and (M,) or (T, M) pressed."""
 
     rest: Volts
     pressed: Volts
@@ -289,17 +290,6 @@ class SimulatedVolts:
 
 MODALITIES: tuple[Modality, ...] = ("magnitude", "structure")
 STATES = ("rest", "pressed")
-
-
-def _store(volts: SimulatedVolts, path: Path) -> None:
-    arrays = {
-        f"{state}_{name}": scan for state in STATES for name, scan in getattr(volts, state).items()
-    }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    with part.open("wb") as file:
-        np.savez(file, **arrays)
-    part.replace(path)
 
 
 def noise_std(volts: SimulatedVolts, name: Modality, snr_db: float, snr_of: SnrOf) -> float:

@@ -159,7 +159,8 @@ class Truth:
     Attributes:
         map: (nodes_y, nodes_x) |relative conductivity change| of the magnitude channel, averaged
             over the cell around each node.
-        pressed: (nodes_y, nodes_x) share of each cell that is pressed.
+        pressed: (nodes_y, nodes_x) share of each cell that is pressed; below saturation, of the
+            structure channel's change, in logarithm.
         contacts: one for each indenter.
     """
 
@@ -180,7 +181,7 @@ def truth_of(description: SensorDescription, presses: Sequence[Press]) -> Truth:
     magnitude = coverage * np.abs(response.change(pressure))
     return Truth(
         map=_over_cells(magnitude),
-        pressed=_over_cells(coverage),
+        pressed=_over_cells(coverage * _saturation(description, pressure)),
         contacts=tuple(
             TrueContact(
                 x_m=press.x_m,
@@ -193,6 +194,14 @@ def truth_of(description: SensorDescription, presses: Sequence[Press]) -> Truth:
             for press in presses
         ),
     )
+
+
+def _saturation(description: SensorDescription, pressure_kpa: FloatArray) -> FloatArray:
+    """Share of the structure channel's full change, in logarithm, at a pressure; same shape."""
+    if description.structure is None or description.structure.response is None:
+        return np.asarray((pressure_kpa > 0).astype(np.float64))
+    ratio = description.structure.response.ratio(pressure_kpa)
+    return np.asarray(np.log(ratio) / np.log(description.structure.saturated_ratio))
 
 
 def _cell_samples(nodes_m: FloatArray) -> tuple[FloatArray, float]:

@@ -1,0 +1,40 @@
+"""Simulated voltages kept on disk: simulating takes longer than reconstructing."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tactomo_models.archive import read_arrays
+from tactomo_models.errors import DataError
+
+Arrays = dict[str, Any]
+
+
+def cached(folder: Path, what: str, make: Callable[[], Arrays]) -> Arrays:
+    """Arrays from an earlier call, or made anew and kept.
+
+    A file that cannot be read or written costs time and nothing else.
+
+    Args:
+        folder: where files are kept.
+        what: all that the arrays depend on.
+        make: makes them.
+    """
+    path = folder / f"{hashlib.sha256(what.encode()).hexdigest()[:32]}.npz"
+    with suppress(OSError, DataError):
+        return read_arrays(path)
+    arrays = make()
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with part.open("wb") as file:
+            np.savez(file, **arrays)
+        part.replace(path)
+    return arrays
