@@ -16,7 +16,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from enum import StrEnum, auto
-from functools import cache
+from functools import cache, cached_property
 from typing import Final
 
 import numpy as np
@@ -46,6 +46,7 @@ from tactomo_models.errors import DataError
 from tactomo_models.following import Freedom, ShapeFollower
 from tactomo_models.forward import ForwardModel
 from tactomo_models.outlines import Outlines
+from tactomo_models.paper_level_set import PaperLevelSet
 from tactomo_models.plausibility import (
     Flag,
     ScanCheck,
@@ -85,6 +86,7 @@ class Tier(StrEnum):
     QUIET = auto()  # nothing pressed: a test and no solve
     TIKHONOV = auto()  # one linear step, every node alike
     NOSER = auto()  # one linear step, nodes weighted by how well they are seen
+    PLS_PAPER = "pls-paper"  # the paper's level set, linear in the bare sheet's Jacobian, cold
     FIT = auto()  # a few outlines on the structure channel, magnitudes fitted to their areas
     LEVELSET = auto()  # a level set there instead: shapes of any form
 
@@ -466,13 +468,9 @@ class Reconstructor:
 
     def _by_shape(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
         """Shapes on the structure channel, and a magnitude for each of their areas."""
-        assert self._follower is not None
         with self._timed("shape"):
             structure, budget_s = data["structure"], self.budget_s or DEFAULT_BUDGET_S
-            freedom = FREEDOM.get(self.tier, Freedom.AS_NEEDED)
-            shape, how = self._follower.follow(
-                structure.change, structure.weight, structure.spread, budget_s, freedom
-            )
+            shape, how = self._shape_of(structure, budget_s)
         with self._timed("contacts"):
             pressed = self._on_map(shape.pressed)
             areas = self._areas_of(shape, pressed, structure)
@@ -491,11 +489,33 @@ class Reconstructor:
             pressure_kpa=pressure,
             structure=pressed.astype(np.float32),
             contacts=contacts,
-            tier=Tier.FIT if isinstance(shape.family, Outlines) else Tier.LEVELSET,
+            tier=self._tier_of(shape),
             reason=how,
             misfit=shape.misfit,
             flags=flags,
         )
+
+    def _shape_of(self, structure: _Data, budget_s: float) -> tuple[Shape, str]:
+        assert self._follower is not None
+        change, weight, spread = structure.change, structure.weight, structure.spread
+        if self.tier is Tier.PLS_PAPER:
+            self._forget_shape()  # it starts cold, always
+            image = self._linear_image("structure", change, Tier.TIKHONOV)
+            return self._paper.fit(change, weight, image), "as requested"
+        freedom = FREEDOM.get(self.tier, Freedom.AS_NEEDED)
+        return self._follower.follow(change, weight, spread, budget_s, freedom)
+
+    def _tier_of(self, shape: Shape) -> Tier:
+        if self.tier is Tier.PLS_PAPER:
+            return Tier.PLS_PAPER
+        return Tier.FIT if isinstance(shape.family, Outlines) else Tier.LEVELSET
+
+    @cached_property
+    def _paper(self) -> PaperLevelSet:
+        """Made when it is first asked for."""
+        assert self.description.structure is not None
+        ratio = self.description.structure.saturated_ratio
+        return PaperLevelSet(self._forward, self._jacobian_by_node, ratio)
 
     def _magnitude_unexplained(
         self, data: dict[Modality, _Data], fitted: Magnitudes | None, bad_misfit: float

@@ -147,13 +147,14 @@ class ShapeFit:
         log_ratio: float,
         data: FloatArray,
         weight: FloatArray,
+        most_pressed: int = MOST_PRESSED,
     ) -> Shape | None:
         """Solve the forward model for given parameters and compare it with the data.
 
         None where so much would be pressed that no deadline could be kept.
         """
         pressed, moving = family.render(parameters)
-        if np.count_nonzero(moving) > MOST_PRESSED:
+        if np.count_nonzero(moving) > most_pressed:
             return None
         change = conductivity(pressed, log_ratio)[0] - 1
         solution = self.forward.solve(change)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, get_args
 
 import pytest
@@ -78,6 +80,11 @@ def test_the_default_addresses_are_the_clients() -> None:
 
 def test_the_methods_are_the_models() -> None:
     assert get_args(Method) == METHODS
+    root = Path(__file__).parents[2]
+    page = (root / "clients/viewer/tactomo_viewer/page/index.html").read_text("utf-8")
+    assert tuple(re.findall(r"<option>(.*?)</option>", page)) == METHODS
+    example = (root / "deploy/daemon.example.toml").read_text("utf-8")
+    assert all(f'"{method}"' in example for method in METHODS)
     for command in ("reconstruct", "daemon", "tier"):
         shown = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200"})
         assert all(method in shown.output for method in METHODS)

@@ -29,6 +29,27 @@ def test_a_press_is_found_in_a_file(tactomo: Run, tmp_path: Path) -> None:
         assert abs(maps["contact_y_mm"][0] - 30.0) < 3.0
 
 
+def test_every_method_can_be_asked_for(tactomo: Run, tmp_path: Path) -> None:
+    skin = SkinSimulator(load_description("paper_square"))
+    empty = skin.voltages([])
+    pressed = skin.voltages([Press(x_m=0.03, y_m=-0.02, pressure_kpa=180.0)])
+    references = {f"{name}_reference": volts for name, volts in empty.items()}
+    scans = {str(name): volts[None] for name, volts in pressed.items()}
+    np.savez(tmp_path / "in.npz", **scans, **references)  # type: ignore[arg-type]
+    maps = {}
+    for method in METHODS:
+        result = tactomo("reconstruct", "in.npz", f"{method}.npz", "--method", method)
+        assert result.returncode == 0, result.stderr
+        with np.load(tmp_path / f"{method}.npz") as out:
+            maps[method] = out["structure"][0]
+            nearest = np.hypot(out["contact_x_mm"] - 30, out["contact_y_mm"] + 20).min()
+            assert nearest < 5, method
+            assert out["seconds"][0] > 0
+    for method in set(METHODS) - {"auto"}:
+        others = (maps[other] for other in METHODS if other not in ("auto", method))
+        assert all((maps[method] != other).any() for other in others), "each has its own image"
+
+
 def test_an_unknown_method_is_refused(tactomo: Run, tmp_path: Path) -> None:
     np.savez(tmp_path / "in.npz", magnitude=np.ones((1, 208)), magnitude_reference=np.ones(208))
     result = tactomo("reconstruct", "in.npz", "out.npz", "--method", "guess")

@@ -531,11 +531,11 @@ def test_recording_starts_and_stops(page: Page) -> None:
 
 
 def test_the_tier_can_be_chosen(page: Page) -> None:
-    page.daemon.answers["set_tier"] = {"tier": "quiet"}
+    page.daemon.answers["set_tier"] = {"tier": "tikhonov"}
     page.open()
-    page["tier-choice"].find_element(By.XPATH, "./option[text()='quiet']").click()
+    page["tier-choice"].find_element(By.XPATH, "./option[text()='tikhonov']").click()
     wait_for(lambda: page.daemon.requests)
-    assert page.daemon.requests == [("set_tier", {"tier": "quiet"})]
+    assert page.daemon.requests == [("set_tier", {"tier": "tikhonov"})]
 
 
 # When things stop
