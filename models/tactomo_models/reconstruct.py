@@ -415,13 +415,13 @@ class Reconstructor:
         self._forget_shape()
         with self._timed(method):
             images = {name: self._linear_image(name, d.change, method) for name, d in data.items()}
+            maps = {name: self._on_map(image) for name, image in images.items()}
         with self._timed("contacts"):
             shown = images.get("structure", images.get("magnitude"))
             assert shown is not None
             peak = max(float(shown.max()), 1e-12)
-            pressed = shown / peak
             # The rest of the image is blur: a contact there would be as large as the sheet.
-            inside = np.where(pressed > 0.5, 1.0, 0.0)
+            inside = np.where(shown > 0.5 * peak, 1.0, 0.0)
             areas = self._areas.find(self._on_map(inside), inside)
             fitted = self._linear_magnitudes(areas, data)
             contacts = self._contacts(areas, fitted)
@@ -429,11 +429,12 @@ class Reconstructor:
         left = LINEAR_PART * data["magnitude"].misfit if "magnitude" in data else 0.0
         if self._magnitude_unexplained(data, fitted, max(BAD_MISFIT, left)):
             flags |= Flag.MISFIT_HIGH
-        linear = images.get("magnitude")
         return Reconstruction(
-            map=None if linear is None else self._on_map(linear).astype(np.float32),
+            map=maps["magnitude"].astype(np.float32) if "magnitude" in data else None,
             pressure_kpa=None,  # a linear image spreads and pales: no pressure follows from it
-            structure=self._on_map(pressed).astype(np.float32) if "structure" in data else None,
+            structure=(maps["structure"] / peak).astype(np.float32)
+            if "structure" in data
+            else None,
             contacts=contacts,
             tier=method,
             reason=reason,
