@@ -33,7 +33,7 @@ from tactomo_models.mesh import SheetMesh, mesh_sheet
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
-_STRIP = 256  # nodes that are differentiated at once: what that works on stays in the cache
+_STRIP = 128  # triangles that are differentiated at once: what that takes stays in the cache
 _BLOCK = 256  # right-hand sides solved at once: bounds the memory of a build
 
 
@@ -437,36 +437,38 @@ class ForwardModel:
         Returns:
             (M, K), or (M, n) by the nodes' relative conductivity (the paper's equation 2).
         """
-        fields = np.zeros((len(self.bare.support), len(self._pair_matrix)))
-        nodes, _ = _renumbered(self._corner_support[self._around(where)], len(fields))
-        fields[nodes] = self.potentials(solution, nodes) @ self._pair_matrix.T
-        count = len(where) if onto is None else onto.shape[1]
-        summed = np.zeros((count, self._products.shape[1]))
-        for start in range(0, len(where), _STRIP):
-            strip = slice(start, start + _STRIP)
-            by_node = self._by_node(fields, where[strip])
-            if onto is None:
-                summed[strip] = by_node
-            else:
-                summed += onto[strip].T @ by_node
+        triangles = self._around(where)
+        nodes, corners = _renumbered(self._corner_support[triangles], len(self.bare.support))
+        fields = self.potentials(solution, nodes) @ self._pair_matrix.T  # (nodes, pairs)
+        gradient = self._gradient[triangles] @ fields[corners]  # (t, 2, pairs)
+        share = self._shares(where, triangles)
+        if onto is None:
+            summed = share @ self._field_products(gradient)
+        else:
+            weight = share.T @ onto  # (t, K)
+            summed = np.zeros((weight.shape[1], self._products.shape[1]))
+            for start in range(0, len(triangles), _STRIP):
+                strip = slice(start, start + _STRIP)
+                summed += weight[strip].T @ self._field_products(gradient[strip])
         return np.asarray((summed[:, self._product_of] * self._sign).T)
 
-    def _by_node(self, fields: FloatArray, where: IntArray) -> FloatArray:
-        """Derivative by nodes (n, products), for the fields (S, pairs) of each pair's current."""
-        triangles = self._around(where)
-        gradient = self._gradient[triangles] @ fields[self._corner_support[triangles]]
-        x, y = gradient.transpose(1, 0, 2)  # (t, pairs) each
-        one, other = self._products
-        product = x.take(one, axis=1) * x.take(other, axis=1)
-        product += y.take(one, axis=1) * y.take(other, axis=1)
+    def _shares(self, where: IntArray, triangles: IntArray) -> sp.csr_matrix:
+        """Minus the area (n, t) of each triangle that belongs to each pressable node."""
         position = _positions(where, len(self.bare.pressable) + 1)  # the last: not pressable
         corner = position[self._corner_pressable[triangles]]
         triangle, which = np.nonzero(corner >= 0)
         third = -self._area[triangles[triangle]] / 3
-        share = sp.csr_matrix(
+        return sp.csr_matrix(
             (third, (corner[triangle, which], triangle)), (len(where), len(triangles))
         )
-        return np.asarray(share @ product)
+
+    def _field_products(self, gradient: FloatArray) -> FloatArray:
+        """Products (t, q) of the fields (t, 2, pairs) of two pairs each."""
+        x, y = gradient.transpose(1, 0, 2)
+        one, other = self._products
+        product = x.take(one, axis=1) * x.take(other, axis=1)
+        product += y.take(one, axis=1) * y.take(other, axis=1)
+        return np.asarray(product)
 
     @property
     def node_areas_m2(self) -> FloatArray:
