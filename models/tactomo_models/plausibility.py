@@ -42,12 +42,12 @@ ALIKE = 1.01  # ratio within which voltages may come out the same by symmetry
 QUARTILE = 0.3186  # standard deviations that hold a quarter of a normal distribution
 OUTLIER = 8.0  # standard deviations that noise does not reach
 LEAST_ASYMMETRY = 0.005  # share by which reciprocal voltages may differ on a good device
-COMMON_ASYMMETRY = 0.05  # likewise on any device that serves, before a tare has seen its own
+COMMON_ASYMMETRY = 0.02  # likewise on any device that serves, before a tare has seen its own
 MOST_ASYMMETRY = 0.2  # share, rms, beyond which nothing can be located
 RISEN_NOISE = 2.0  # times what the tare saw: below, it is chance
 HIGH_NOISE = 10.0  # times what the tare saw: interference
-SILENT = 0.003  # share of its voltage that a pair under the strongest contact keeps at least
-SILENCE_SEEN = 0.01  # share that noise must stay below for silence to be told from pressing
+SILENT = 0.3  # over the channel's contrast: a share of its voltage that a pair always exceeds
+SILENCE_SEEN = 1.2  # likewise: noise must stay below it for silence to be told from pressing
 BLAMED_SHARE = 0.35  # of an electrode's voltages that must be wrong for it to be the cause
 BLAMED_LEAST = 5  # of its voltages, likewise
 UNEVEN = 0.05  # standard deviation of a good reference about the model
@@ -122,6 +122,7 @@ class ScanCheck:
         noise: (M,) standard deviation of a scan, volts.
         usable: (M,) voltages for which there is an expectation.
         asymmetry: (pairs,) share by which reciprocal voltages may differ.
+        contrast: factor by which pressing changes conductivity at most, up or down.
     """
 
     def __init__(
@@ -131,6 +132,7 @@ class ScanCheck:
         noise: FloatArray,
         usable: BoolArray,
         asymmetry: FloatArray | float,
+        contrast: float,
     ) -> None:
         self._wiring = wiring
         self._size = np.where(usable, np.abs(expected), 0.0)
@@ -146,18 +148,27 @@ class ScanCheck:
         self._wrong_way = np.where(wiring.ordered & usable, -OUTLIER * noise, -np.inf)
         self._pairs = (wiring.pairs & wiring.ordered & usable).astype(float)
         expected_sum = self._pairs @ self._size
-        doubt = 3 * np.sqrt(self._pairs @ np.where(usable, variance, 0.0))
-        told = doubt < (SILENCE_SEEN - SILENT) * expected_sum
-        self._silence = np.where(told, SILENT * expected_sum + doubt, -np.inf)
+        doubt = 2.5 * np.sqrt(self._pairs @ np.where(usable, variance, 0.0))
+        told = doubt < (SILENCE_SEEN - SILENT) / contrast * expected_sum
+        self._silence = np.where(told, SILENT / contrast * expected_sum + doubt, -np.inf)
 
-    def examine(self, scan: FloatArray, *, saturated: bool = False) -> Verdict:
-        """Say what is wrong with a scan (M,); `saturated` if its device says that it clipped."""
+    def examine(
+        self, scan: FloatArray, *, saturated: bool = False, suspect: BoolArray | None = None
+    ) -> Verdict:
+        """Say what is wrong with a scan.
+
+        Args:
+            scan: (M,) volts.
+            saturated: its device says that it clipped.
+            suspect: (M,) voltages that speak against their electrodes, but no more than that.
+        """
         size = np.abs(scan)
         usable = self._usable & (size <= self._limit)
         flags = Flag(0)
         wrong = usable ^ self._usable
-        if not usable.all():
+        if wrong.any():
             flags |= Flag.INVALID_VOLTAGE
+        if not usable.all():
             size = np.where(usable, size, 0.0)
             scan = np.where(usable, scan, 0.0)
         clipped = self._clipped(size, saturated=saturated)
@@ -170,11 +181,15 @@ class ScanCheck:
             flags |= Flag.NOISE_HIGH
         along = scan * self._sign
         odd = unequal | (along < self._wrong_way * noise)
+        if odd.any():
+            along = np.where(odd, self._size, along)
         silent = self._pairs @ along < self._silence
         if silent.any():
             odd |= self._wiring.pairs[silent].any(axis=0)
         odd &= usable
         wrong |= odd
+        if suspect is not None:
+            wrong |= suspect
         if not wrong.any():
             return Verdict(usable, flags, (), noise)
         electrodes = self._blamed(wrong)
@@ -234,7 +249,11 @@ class ScanCheck:
 
 
 def examine_reference(
-    wiring: Wiring, volts: FloatArray, predicted: FloatArray, noise: FloatArray
+    wiring: Wiring,
+    volts: FloatArray,
+    predicted: FloatArray,
+    noise: FloatArray,
+    contrast: float,
 ) -> Verdict:
     """Say what is wrong with a reference (M,): hold it against the model of the unloaded sheet.
 
@@ -246,6 +265,7 @@ def examine_reference(
         volts: (M,) the reference.
         predicted: (M,) by the model.
         noise: (M,) standard deviation of the reference, volts.
+        contrast: factor by which pressing changes conductivity at most, up or down.
     """
     finite = np.isfinite(volts) & np.isfinite(noise)
     scale = float(np.median(volts[finite] / predicted[finite])) if finite.any() else 0.0
@@ -255,7 +275,10 @@ def examine_reference(
     size = np.abs(volts / predicted)
     usable = finite & (size > SMALLEST) & (size < LARGEST)
     volts = np.where(usable, volts, 0.0)
-    verdict = ScanCheck(wiring, predicted, noise, usable, COMMON_ASYMMETRY).examine(volts)
+    check = ScanCheck(wiring, predicted, noise, usable, COMMON_ASYMMETRY, contrast)
+    # A lead that picks up interference at rest: by itself noisy, and maybe right on average.
+    noisy = usable & (noise > OUTLIER * np.median(noise[usable]))
+    verdict = check.examine(volts, suspect=noisy)
     flags = verdict.flags if usable.all() else verdict.flags | Flag.INVALID_VOLTAGE
     if _rewired(wiring, volts * np.sign(predicted), noise) or _deviates(
         volts, predicted, noise, verdict.usable

@@ -220,7 +220,10 @@ class Reconstructor:
         self._areas_shape: FloatArray | None = None
         self._stage_s: dict[str, float] = {}
         self._left_out: list[str] = []
-        self._structure_answers_more = _structure_answers_more(description)
+        self._structure_answers_more = len(description.modalities) == 2 and bool(
+            np.log(_contrast(description, "structure"))
+            > MUCH_MORE * np.log(_contrast(description, "magnitude"))
+        )
 
     def set_reference(self, reference: Reference) -> None:
         """Measure changes against this unpressed scan from now on; forgets the warm start.
@@ -250,7 +253,10 @@ class Reconstructor:
             noise = noise_of_reciprocity(self.description, volts)
         if noise is None:
             noise = nominal_noise_v(volts)
-        verdict = examine_reference(self._wiring, volts, predicted, noise / np.sqrt(scans))
+        contrast = _contrast(self.description, name)
+        verdict = examine_reference(
+            self._wiring, volts, predicted, noise / np.sqrt(scans), contrast
+        )
         valid = verdict.usable
         reference = np.where(valid, volts, 0.0)
         per_volt = np.divide(1, np.abs(reference), out=np.zeros_like(reference), where=valid)
@@ -268,7 +274,12 @@ class Reconstructor:
             flags=verdict.flags,
             electrodes=verdict.electrodes,
             check=ScanCheck(
-                self._wiring, reference, noise, valid, asymmetry_of(self._wiring, reference)
+                self._wiring,
+                reference,
+                noise,
+                valid,
+                asymmetry_of(self._wiring, reference),
+                contrast,
             ),
             total=self._sign(name) * matrices[Tier.TIKHONOV].sum(axis=0, dtype=np.float64),
             matrices=matrices,
@@ -373,7 +384,7 @@ class Reconstructor:
         spread = 1 + (CORRELATED - 1) * error / (noise + error)
         statistic = float((square / variance).sum())
         quiet = statistic < _noise_limit(count)
-        if not quiet and _fell(channel.total * change, channel.total**2 * variance):
+        if not (quiet or electrodes) and _fell(channel.total * change, channel.total**2 * variance):
             flags |= Flag.REFERENCE_MISMATCH
         data[name] = _Data(change, weight, spread, quiet, (statistic / count) ** 0.5)
         return flags
@@ -603,13 +614,15 @@ def _noise_limit(count: int) -> float:
     return float(chi2.isf(FALSE_ALARM, count))
 
 
-def _structure_answers_more(description: SensorDescription) -> bool:
-    """Tell whether the structure channel's contrast is far above the magnitude channel's."""
-    if description.magnitude is None or description.structure is None:
-        return False
-    largest = 1 + description.magnitude.response.relative_change[-1]
-    contrast = abs(float(np.log(description.structure.saturated_ratio)))
-    return contrast > MUCH_MORE * abs(float(np.log(largest)))
+def _contrast(description: SensorDescription, name: Modality) -> float:
+    """Factor, above 1, by which pressing changes a channel's conductivity at most, up or down."""
+    if name == "magnitude":
+        assert description.magnitude is not None
+        ratio = 1 + description.magnitude.response.relative_change[-1]
+    else:
+        assert description.structure is not None
+        ratio = description.structure.saturated_ratio
+    return max(ratio, 1 / ratio)
 
 
 def _fell(total: FloatArray, variance: FloatArray) -> bool:

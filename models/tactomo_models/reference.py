@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from tactomo_models.description import SensorDescription
 from tactomo_models.errors import DataError
@@ -59,13 +60,15 @@ def noise_of_scans(scans: FloatArray) -> FloatArray | None:
     """Standard deviation (M,) of one scan, from n scans (n, M) at rest; None from a single one.
 
     A converter's noise is much the same on every measurement while a few scans know each one
-    poorly, so the mean of all counts as much as `TRUSTED_SCANS` scans of the measurement's own.
+    poorly, so what is common counts as much as `TRUSTED_SCANS` scans of the measurement's own.
+    The common variance is a median: a lead that picks up interference is not the others' noise.
     """
     if len(scans) < 2:
         return None
-    own = scans.var(axis=0, ddof=1)
+    own, freedom = scans.var(axis=0, ddof=1), len(scans) - 1
+    common = float(np.median(own)) * freedom / chi2.median(freedom)
     share = len(scans) / (len(scans) + TRUSTED_SCANS)
-    return np.asarray(np.sqrt(share * own + (1 - share) * own.mean()))
+    return np.asarray(np.sqrt(share * own + (1 - share) * common))
 
 
 def noise_of_reciprocity(description: SensorDescription, scans: FloatArray) -> FloatArray | None:
