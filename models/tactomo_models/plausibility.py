@@ -37,12 +37,14 @@ QUIETEST = 1e-6  # share of the largest voltage that any converter's noise excee
 LARGEST = 1e3  # times the largest voltage expected: more is no voltage of this sheet
 FARTHEST_SCALE = 1e30  # a reference in any sensible unit is within this of the model
 SMALLEST = 1e-6  # of the voltage expected: less in a reference is none to measure changes against
-SAME_CLIPPED = 3  # voltages of exactly the same, largest size: chance makes a pair at most
-ALIKE = 1.01  # ratio within which voltages may come out the same by symmetry
+ROUNDING = 1e-12  # share by which the mean of equal values may miss them
+SAME_CLIPPED = 4  # voltages of exactly the same, largest size: beside noise, no chance
+ALIKE = 1.01  # ratio within which they may come out the same by symmetry without noise
 QUARTILE = 0.3186  # standard deviations that hold a quarter of a normal distribution
 OUTLIER = 8.0  # standard deviations that noise does not reach
-LEAST_ASYMMETRY = 0.005  # share by which reciprocal voltages may differ on a good device
-COMMON_ASYMMETRY = 0.02  # likewise on any device that serves, before a tare has seen its own
+COMMON_ASYMMETRY = 0.02  # share by which reciprocal voltages differ on a device that serves
+LEAST_ASYMMETRY = 0.001  # likewise beyond what the tare saw, on a good device
+PASSING_ASYMMETRY = 0.35  # share of what the tare saw that may come and go with what is pressed
 MOST_ASYMMETRY = 0.2  # share, rms, beyond which nothing can be located
 RISEN_NOISE = 2.0  # times what the tare saw: below, it is chance
 HIGH_NOISE = 10.0  # times what the tare saw: interference
@@ -121,8 +123,8 @@ class ScanCheck:
         expected: (M,) volts of the unpressed sheet.
         noise: (M,) standard deviation of a scan, volts.
         usable: (M,) voltages for which there is an expectation.
-        asymmetry: (pairs,) share by which reciprocal voltages may differ.
         contrast: factor by which pressing changes conductivity at most, up or down.
+        asymmetry: (pairs,) what a tare has seen of `asymmetry_of` the device; unknown if None.
     """
 
     def __init__(
@@ -131,19 +133,28 @@ class ScanCheck:
         expected: FloatArray,
         noise: FloatArray,
         usable: BoolArray,
-        asymmetry: FloatArray | float,
         contrast: float,
+        asymmetry: FloatArray | None = None,
     ) -> None:
         self._wiring = wiring
         self._size = np.where(usable, np.abs(expected), 0.0)
-        noise = np.maximum(noise, QUIETEST * self._size.max(initial=0.0))
+        quietest = QUIETEST * float(self._size.max(initial=0.0))
+        self._noiseless = float(noise.max(initial=0.0)) < quietest
+        noise = np.maximum(noise, quietest)
         self._sign = np.sign(expected)
         self._usable = usable
         self._limit = LARGEST * float(self._size.max(initial=0.0))
         self._first, self._second = wiring.reciprocal.T
         variance = noise**2
         self._pair_variance = variance[self._first] + variance[self._second] + TINY
-        self._asymmetry = np.broadcast_to(asymmetry, self._pair_variance.shape)
+        if asymmetry is None:
+            self._asymmetry = np.zeros_like(self._pair_variance)
+            self._tolerance = np.full_like(self._pair_variance, COMMON_ASYMMETRY)
+        else:
+            self._asymmetry = asymmetry
+            own = np.abs(asymmetry)
+            typical = float(np.median(own)) if len(own) else 0.0
+            self._tolerance = LEAST_ASYMMETRY + PASSING_ASYMMETRY * np.maximum(own, typical)
         # Against this much the wrong way, a voltage's sign is wrong; elsewhere no sign is known.
         self._wrong_way = np.where(wiring.ordered & usable, -OUTLIER * noise, -np.inf)
         self._pairs = (wiring.pairs & wiring.ordered & usable).astype(float)
@@ -176,7 +187,7 @@ class ScanCheck:
             flags |= Flag.SATURATED
             usable &= ~clipped
             wrong |= clipped
-        noise, unequal = self._reciprocity(scan, size, usable)
+        noise, unequal = self._reciprocity(scan, usable)
         if noise > HIGH_NOISE:
             flags |= Flag.NOISE_HIGH
         along = scan * self._sign
@@ -204,22 +215,22 @@ class ScanCheck:
 
     def _clipped(self, size: FloatArray, *, saturated: bool) -> BoolArray | None:
         """Voltages at the converter's limit: many of the same size that should not be alike."""
-        top = size == size.max()
+        top = size >= size.max() * (1 - ROUNDING)
         if not saturated and np.count_nonzero(top) < SAME_CLIPPED:
             return None
         expected = self._size[top]
-        if not saturated and expected.max() <= ALIKE * expected.min():
+        if not saturated and self._noiseless and expected.max() <= ALIKE * expected.min():
             return None
         return np.asarray(top)
 
-    def _reciprocity(
-        self, scan: FloatArray, size: FloatArray, usable: BoolArray
-    ) -> tuple[float, BoolArray]:
+    def _reciprocity(self, scan: FloatArray, usable: BoolArray) -> tuple[float, BoolArray]:
         """How many times noisier than expected, and the voltages that differ from their twins."""
         unequal = np.zeros(len(scan), dtype=bool)
         i, j = self._first, self._second
-        allowed = self._asymmetry * (size[i] + size[j])
-        error = np.abs(scan[i] - scan[j])
+        one, other = scan[i], scan[j]
+        total = one + other
+        allowed = self._tolerance * total
+        error = np.abs(one - other - self._asymmetry * total)
         error /= np.sqrt(self._pair_variance + allowed * allowed)
         both = usable[i] & usable[j]
         compared = error if both.all() else error[both]
@@ -236,7 +247,7 @@ class ScanCheck:
 
     def _blamed(self, wrong: BoolArray) -> tuple[int, ...]:
         """Electrodes that share most of the wrong voltages and have most of theirs wrong."""
-        touches = self._wiring.electrodes & self._usable
+        touches = self._wiring.electrodes
         enough = np.maximum(BLAMED_LEAST, BLAMED_SHARE * touches.sum(axis=1))
         blamed: list[int] = []
         while True:
@@ -267,18 +278,24 @@ def examine_reference(
         noise: (M,) standard deviation of the reference, volts.
         contrast: factor by which pressing changes conductivity at most, up or down.
     """
-    finite = np.isfinite(volts) & np.isfinite(noise)
-    scale = float(np.median(volts[finite] / predicted[finite])) if finite.any() else 0.0
-    if not 1 / FARTHEST_SCALE < abs(scale) < FARTHEST_SCALE:
-        return Verdict(np.zeros_like(finite), Flag.INVALID_VOLTAGE)
-    volts, noise = np.where(finite, volts, 0.0) / scale, np.where(finite, noise, 0.0) / abs(scale)
-    size = np.abs(volts / predicted)
+    finite = np.isfinite(volts) & np.isfinite(noise) & (noise >= 0)
+    nothing = Verdict(np.zeros_like(finite), Flag.INVALID_VOLTAGE)
+    with np.errstate(over="ignore"):
+        ratio = np.where(finite, volts, 0.0) / predicted
+        scale = float(np.median(ratio[finite])) if finite.any() else 0.0
+        if not 1 / FARTHEST_SCALE < abs(scale) < FARTHEST_SCALE:
+            return nothing
+        size = np.abs(ratio / scale)
+        noise = np.where(finite, noise, 0.0) / abs(scale)
     usable = finite & (size > SMALLEST) & (size < LARGEST)
-    volts = np.where(usable, volts, 0.0)
-    check = ScanCheck(wiring, predicted, noise, usable, COMMON_ASYMMETRY, contrast)
+    usable &= noise < LARGEST * np.abs(predicted).max()
+    if not usable.any():
+        return nothing
+    volts, noise = np.where(usable, volts, 0.0) / scale, np.where(usable, noise, 0.0)
+    check = ScanCheck(wiring, predicted, noise, usable, contrast)
     # A lead that picks up interference at rest: by itself noisy, and maybe right on average.
     noisy = usable & (noise > OUTLIER * np.median(noise[usable]))
-    verdict = check.examine(volts, suspect=noisy)
+    verdict = check.examine(volts, suspect=noisy | ~usable)
     flags = verdict.flags if usable.all() else verdict.flags | Flag.INVALID_VOLTAGE
     if _rewired(wiring, volts * np.sign(predicted), noise) or _deviates(
         volts, predicted, noise, verdict.usable
@@ -315,10 +332,8 @@ def _asymmetry(wiring: Wiring, volts: FloatArray) -> float:
 
 
 def asymmetry_of(wiring: Wiring, reference: FloatArray) -> FloatArray:
-    """Share (pairs,) by which a device's reciprocal voltages differ, as far as one tare tells."""
+    """Difference of a device's reciprocal voltages over their sum, (pairs,): unequal gains."""
     i, j = wiring.reciprocal.T
-    together = np.abs(reference[i]) + np.abs(reference[j])
-    own = np.divide(
-        np.abs(reference[i] - reference[j]), together, out=np.zeros(len(i)), where=together > 0
-    )
-    return np.asarray(np.maximum(own, LEAST_ASYMMETRY))
+    difference, total = reference[i] - reference[j], reference[i] + reference[j]
+    share = np.divide(difference, total, out=np.zeros_like(total), where=total != 0)
+    return np.asarray(np.clip(share, -1, 1))

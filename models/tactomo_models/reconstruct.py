@@ -71,7 +71,7 @@ MEDIAN_SQUARE = 0.455  # of a normal distribution of unit variance
 FALSE_ALARM = 1e-6  # chance that an unpressed frame of pure noise is taken for a pressed one
 TRACE = 1e-9  # relative noise of data that have none
 UNUSABLE = 1e3  # relative error of a voltage whose reference is zero or no number
-MOST_INVALID = 0.25  # share of voltages that may be invalid before the channel is given up
+MOST_INVALID = 0.5  # share of voltages that may be invalid before the channel is given up
 BAD_MISFIT = 2.0  # the data are not explained: what is shown may be wrong
 SWAPPED = 2.0  # times the structure channel's signal that the magnitude channel's never reaches
 MUCH_MORE = 5.0  # ratio of the channels' contrasts (logarithms) for that
@@ -278,8 +278,8 @@ class Reconstructor:
                 reference,
                 noise,
                 valid,
-                asymmetry_of(self._wiring, reference),
                 contrast,
+                asymmetry_of(self._wiring, reference),
             ),
             total=self._sign(name) * matrices[Tier.TIKHONOV].sum(axis=0, dtype=np.float64),
             matrices=matrices,

@@ -80,8 +80,8 @@ def noise_of_reciprocity(description: SensorDescription, scans: FloatArray) -> F
     i, j = reciprocal_pairs(description.pairs).T
     with np.errstate(over="ignore", invalid="ignore"):
         differences = np.abs(scans[..., i] - scans[..., j])
-    differences = differences[np.isfinite(differences)]
-    if differences.size == 0:
-        return None
-    spread = np.median(differences) / 0.6745 / np.sqrt(2)
+        differences = differences[np.isfinite(differences)]
+        if differences.size == 0:
+            return None
+        spread = np.median(differences) / 0.6745 / np.sqrt(2)
     return np.full(description.measurements, float(spread))
