@@ -153,10 +153,15 @@ class MagnitudeChannel(_Section):
 
 
 class StructureChannel(_Section):
-    """The saturating channel: pressed or not. Give a response, or the saturated ratio alone."""
+    """The saturating channel: pressed or not. Give a response, or the saturated ratio alone.
+
+    With `either_way`, as in a tank that holds metal and plastic, objects of both kinds may be in
+    one scene: of this ratio, or of one over it.
+    """
 
     response: StructureResponse | None = None
     conductivity_ratio: Annotated[float, Field(gt=0, le=1e6)] | None = None
+    either_way: bool = False
 
     @model_validator(mode="after")
     def _one_of_the_two(self) -> Self:
@@ -164,6 +169,11 @@ class StructureChannel(_Section):
             raise ValueError("response or conductivity_ratio: give one of the two")
         if self.saturated_ratio == 1:
             raise ValueError("conductivity_ratio = 1: must differ from 1")
+        if self.either_way and self.saturated_ratio < 1:
+            raise ValueError(
+                f"conductivity_ratio = {self.saturated_ratio:g}: must be above 1 with either_way, "
+                "objects of one over it are the other kind"
+            )
         return self
 
     @property

@@ -45,6 +45,7 @@ from tactomo_models.description import Modality, SensorDescription
 from tactomo_models.errors import DataError
 from tactomo_models.following import Freedom, ShapeFollower
 from tactomo_models.forward import ForwardModel
+from tactomo_models.objects import ObjectFollower
 from tactomo_models.outlines import Outlines
 from tactomo_models.paper_level_set import PaperLevelSet
 from tactomo_models.plausibility import (
@@ -105,7 +106,8 @@ class Reconstruction:
             where it cannot be computed.
         pressure_kpa: (nodes_y, nodes_x); None where it cannot be computed. Nodes pressed below
             the magnitude channel's onset are 0: see `structure`.
-        structure: (nodes_y, nodes_x) 0 bare to 1 pressed; None where it cannot be computed.
+        structure: (nodes_y, nodes_x) 0 bare to 1 pressed; None where it cannot be computed. For
+            a sensor whose objects conduct `either_way`, -1 where one conducts worse.
         contacts: pressed areas.
         tier: what made this frame.
         reason: why that tier.
@@ -209,10 +211,13 @@ class Reconstructor:
         self._wiring = Wiring(description)
         self._areas = AreaFinder(self._forward)
         self._jacobian_by_node = np.ascontiguousarray(self._artifact.jacobian.T)
-        self._follower = None
+        self._follower: ShapeFollower | ObjectFollower | None = None
         if description.structure is not None:
             ratio = description.structure.saturated_ratio
-            self._follower = ShapeFollower(self._forward, ratio)
+            if description.structure.either_way:
+                self._follower = ObjectFollower(self._forward, ratio, self._object_image)
+            else:
+                self._follower = ShapeFollower(self._forward, ratio)
         self._channels: dict[Modality, _Channel] = {}
         self._tracker = Tracker()
         self._magnitudes: Magnitudes | None = None
@@ -430,9 +435,9 @@ class Reconstructor:
         with self._timed("contacts"):
             shown = images.get("structure", images.get("magnitude"))
             assert shown is not None
-            peak = max(float(shown.max()), 1e-12)
+            peak = max(float(np.abs(shown).max()), 1e-12)
             # The rest of the image is blur: a contact there would be as large as the sheet.
-            inside = np.where(shown > 0.5 * peak, 1.0, 0.0)
+            inside = np.where(np.abs(shown) > 0.5 * peak, 1.0, 0.0)
             areas = self._areas.find(self._on_map(inside), inside)
             fitted = self._linear_magnitudes(areas, data)
             contacts = self._contacts(areas, fitted)
@@ -457,7 +462,14 @@ class Reconstructor:
         """Linear image (P,) of the change in the channel's own direction; the rest cut off."""
         signed = self._sign(name) * change
         image = self._channels[name].matrices[method] @ signed.astype(np.float32)
-        return np.maximum(image, 0.0, out=image)
+        return image if self._either_way(name) else np.maximum(image, 0.0, out=image)
+
+    def _object_image(self, change: FloatArray) -> FloatArray:
+        return self._linear_image("structure", change, Tier.NOSER).astype(np.float64)
+
+    def _either_way(self, name: Modality) -> bool:
+        structure = self.description.structure
+        return name == "structure" and structure is not None and structure.either_way
 
     def _linear_magnitudes(self, areas: Areas, data: dict[Modality, _Data]) -> Magnitudes | None:
         """Magnitudes of a linear method: no forward solve, the bare sheet's Jacobian says all."""
@@ -512,8 +524,10 @@ class Reconstructor:
         change, weight, spread = structure.change, structure.weight, structure.spread
         if self.tier is Tier.PLS_PAPER:
             self._forget_shape()  # it starts cold, always
-            image = self._linear_image("structure", change, Tier.TIKHONOV)
+            image = np.maximum(self._linear_image("structure", change, Tier.TIKHONOV), 0.0)
             return self._paper.fit(change, weight, image), "as requested"
+        if isinstance(self._follower, ObjectFollower):
+            return self._follower.follow(change, weight, budget_s)
         freedom = FREEDOM.get(self.tier, Freedom.AS_NEEDED)
         return self._follower.follow(change, weight, spread, budget_s, freedom)
 
@@ -550,7 +564,7 @@ class Reconstructor:
         if self._areas_shape is shape.pressed and self._fitted_areas is not None:
             return self._fitted_areas
         self._areas_shape = shape.pressed
-        areas = self._areas.find(pressed, shape.pressed)
+        areas = self._areas.find(np.abs(pressed), np.abs(shape.pressed))
         if len(areas) == 0:
             return areas
         covariance = self._follower.fit.covariance(shape, structure.weight, structure.spread)

@@ -277,15 +277,16 @@ def conductivity(
 
     Across an edge the phase that conducts worse decides: resistivities mix in proportion where
     contacts conduct better than the sheet, conductivities where they conduct worse. The outline
-    then stands where the voltages put it, whatever the ratio.
+    then stands where the voltages put it, whatever the ratio. Where h is negative (`objects`) the
+    ratio is turned over.
     """
-    ratio = np.exp(log_ratio)
-    if log_ratio > 0:
-        sigma = 1 / (1 - pressed + pressed / ratio)
-        square = sigma**2
-        return sigma, square * (1 - 1 / ratio), square * pressed / ratio
-    sigma = 1 - pressed + pressed * ratio
-    return sigma, np.full_like(pressed, ratio - 1), pressed * ratio
+    share, worse = np.abs(pressed), np.where(pressed < 0, log_ratio > 0, log_ratio < 0)
+    least = np.exp(-abs(log_ratio))
+    mixed = 1 - share + share * least
+    sigma = np.where(worse, mixed, 1 / mixed)
+    by_mixed = np.where(worse, 1.0, -(sigma**2))
+    by_h = by_mixed * (least - 1) * np.where(pressed < 0, -1.0, 1.0)
+    return sigma, by_h, by_mixed * share * least * -np.sign(log_ratio)
 
 
 def heaviside(t: FloatArray) -> FloatArray:

@@ -22,7 +22,12 @@ Run = Callable[..., Any]
 
 
 @pytest.mark.parametrize(
-    "command", [*ORDER, "models build", "models list", "evaluate scenes", "evaluate moving"]
+    "command",
+    [
+        *ORDER,
+        *("models build", "models list"),
+        *("evaluate scenes", "evaluate moving", "evaluate tanks", "evaluate skin"),
+    ],
 )
 def test_every_command_explains_itself(command: str) -> None:
     result = CliRunner().invoke(app, [*command.split(), "--help"], prog_name="tactomo")

@@ -96,6 +96,10 @@ def test_no_change_tells_no_pressure(paper: SensorDescription) -> None:
         (("0.0, 0.0, 0.25]", "0.0, 0.3, 0.25]"), ["relative_change", "only rise or only fall"]),
         (("0.0, 0.0, 0.25]", "0.0, 0.25]"), ["as many entries"]),
         (("conductivity_ratio = 100.0", "conductivity_ratio = 1.0"), ["differ from 1"]),
+        (
+            ("conductivity_ratio = 100.0", "conductivity_ratio = 0.01\neither_way = true"),
+            ["structure.conductivity_ratio = 0.01", "above 1 with either_way"],
+        ),
         (("schema = 1", "schema = 2"), ["schema", "2", "1"]),
         (('name = "small"', 'name = "Über Skin"'), ["name", "Über Skin"]),
         (("schema = 1", "schema = = 1"), ["not valid TOML"]),
@@ -124,7 +128,9 @@ def test_an_unreadable_file_is_named(tmp_path: Path, content: bytes | None) -> N
 
 def test_a_folder_and_an_unknown_name_are_named(tmp_path: Path) -> None:
     for source in (tmp_path, "paper_sqare"):
-        with pytest.raises(DescriptionError, match=f"{source}.*paper_square, tank_disc"):
+        with pytest.raises(
+            DescriptionError, match=f"{source}.*paper_square, skin_round, tank_disc"
+        ):
             load_description(source)
 
 

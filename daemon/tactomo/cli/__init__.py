@@ -13,6 +13,7 @@ from tactomo.cli import (
     bench_solves,
     demo,
     evaluate,
+    evaluate_measured,
     files,
     models,
     plot,
@@ -27,7 +28,19 @@ from tactomo.cli.lifeline import hold_lifeline
 __all__ = ["app", "main"]
 
 # Importing a module registers its commands.
-COMMANDS = (bench, bench_solves, demo, evaluate, files, models, plot, service, steer, watch)
+COMMANDS = (
+    bench,
+    bench_solves,
+    demo,
+    evaluate,
+    evaluate_measured,
+    files,
+    models,
+    plot,
+    service,
+    steer,
+    watch,
+)
 
 
 def main() -> None:

@@ -237,7 +237,9 @@ def reconstruct(
     `structure_reference` (M,); structure may be missing. OUT gets `map` (T, ny, nx), the relative
     conductivity change; `structure` (T, ny, nx) from 0 to 1; `misfit`, `flags` and `seconds` (T,);
     and the contacts as flat arrays `contact_frame`, `contact_x_mm`, `contact_y_mm`,
-    `contact_area_mm2`, `contact_magnitude`, `contact_sigma`.
+    `contact_area_mm2`, `contact_magnitude`, `contact_sigma`. Where the sensor's objects conduct
+    `either_way`, such as metal and plastic in a tank, `structure` is -1 in those that conduct
+    worse.
     """
     from rich.progress import Progress
     from tactomo_models import load_description

@@ -69,7 +69,7 @@ class UnevenSkin:
         self._mesh = mesh
         rng = np.random.default_rng(seed)
         self._sheets = {
-            name: _UnevenSheet(description, rng, unevenness, impedance_spread)
+            name: UnevenSheet(description, rng, unevenness, impedance_spread)
             for name in description.modalities
         }
         self._rest = {name: sheet.voltages(mesh) for name, sheet in self._sheets.items()}
@@ -78,8 +78,8 @@ class UnevenSkin:
         """Noise-free voltages (M,) of each channel, volts."""
         if not presses:
             return self._rest
-        mesh = _fitted(self._mesh, presses, self.description)
-        x, y = _centroids(mesh)
+        mesh = fitted_mesh(self._mesh, presses, self.description)
+        x, y = centroids(mesh)
         pressure, coverage = strongest(presses, x, y, edge_m=SHARP_M)
         volts: Volts = {}
         for name, sheet in self._sheets.items():
@@ -90,7 +90,9 @@ class UnevenSkin:
         return volts
 
 
-class _UnevenSheet:
+class UnevenSheet:
+    """One sheet, uneven in its own way; the arguments are those of `UnevenSkin`."""
+
     def __init__(
         self,
         description: SensorDescription,
@@ -106,19 +108,19 @@ class _UnevenSheet:
 
     def voltages(self, mesh: SheetMesh, ratio: FloatArray | float = 1.0) -> FloatArray:
         """Volts (M,) where the conductivity of each triangle is so many times its own at rest."""
-        x, y = _centroids(mesh)
+        x, y = centroids(mesh)
         rng = np.random.default_rng(self._seed)
         own = 1 + self._unevenness * smooth_noise(x, y, self._description.width_m / 4, rng)
         transfer = transfer_resistances(self._description, mesh, own * ratio, self._impedance)
         return scan_voltages(self._description, transfer) * volts_per_unit(self._description)
 
 
-def _centroids(sheet: SheetMesh) -> FloatArray:
+def centroids(sheet: SheetMesh) -> FloatArray:
     """Centroids (2, T) of the triangles."""
     return np.asarray(sheet.mesh.p[:, sheet.mesh.t].mean(axis=1))
 
 
-def _fitted(
+def fitted_mesh(
     sheet: SheetMesh, presses: Sequence[Press], description: SensorDescription
 ) -> SheetMesh:
     """Halve the triangles that an outline cuts, `OUTLINE_REFINEMENTS` times."""
