@@ -25,51 +25,6 @@ IntArray = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
-class Layers:
-    """Nodes of pressed areas, area by area, and in each by layers from the rim inwards.
-
-    Attributes:
-        order: (n,) which node comes next.
-        layer: (n,) layer of each node in that order.
-        start: (l + 1,) where each layer starts in that order; the last is n.
-        depth: (l,) of each layer: 0 for a rim, 1 for its neighbours, and so on.
-    """
-
-    order: IntArray
-    layer: IntArray
-    start: IntArray
-    depth: IntArray
-
-
-def layers_of(neighbours: IntArray, rim: NDArray[np.bool_]) -> Layers:
-    """Sort the nodes of pressed areas into layers.
-
-    Args:
-        neighbours: (n, most) of each node, filled up with -1.
-        rim: (n,) nodes that are not to be eliminated, one at least in each area.
-    """
-    depth = np.where(rim, 0, -1)
-    front = np.flatnonzero(rim)
-    while len(front):
-        reached = neighbours[front]
-        reached = reached[reached >= 0]
-        reached = reached[depth[reached] < 0]
-        depth[reached] = level = depth[front[0]] + 1
-        front = np.flatnonzero(depth == level)
-    there = neighbours >= 0
-    graph = sp.csr_matrix(
-        (np.ones(there.sum()), neighbours[there], np.append(0, there.sum(axis=1).cumsum())),
-        (len(rim), len(rim)),
-    )
-    _, area = connected_components(graph, connection="strong")
-    order = np.lexsort((depth, area))
-    depth = depth[order]
-    starts = np.append(True, (np.diff(depth) != 0) | (np.diff(area[order]) != 0))
-    start = np.flatnonzero(starts)
-    return Layers(order, starts.cumsum() - 1, np.append(start, len(order)), depth[start])
-
-
-@dataclass(frozen=True)
 class Condensed:
     """Pressed areas as seen from their rims.
 
@@ -101,51 +56,99 @@ class Condensed:
         return np.split(potentials, np.cumsum([len(rim) for rim in self.rims[:-1]]))
 
 
-def condense(stiffness: FloatArray, corners: IntArray, layers: Layers) -> Condensed:
-    """Eliminate the inner nodes of pressed areas.
+class Condensation:
+    """How pressed areas are condensed: all that does not depend on their conductivity.
 
     Args:
-        stiffness: (t, 3, 3) of each triangle.
-        corners: (t, 3) its corners, by their place in the layers' order.
-        layers: of the nodes.
+        neighbours: (n, most) of each node, filled up with -1.
+        rim: (n,) nodes that are not to be eliminated, one at least in each area.
+        corners: (t, 3) nodes of each triangle.
 
-    Raises:
-        numpy.linalg.LinAlgError: a conductivity is not above 0.
+    Attributes:
+        order: (n,) nodes area by area and, in each, by layers from the rim inwards.
+        depth: (n,) of the nodes in that order: 0 on a rim, 1 for its neighbours, and so on.
+        corners: (t, 3) of the triangles, by their places in that order.
     """
-    own, coupling = _blocks(stiffness, corners, layers)
-    rims: list[FloatArray] = []
-    inner: list[list[tuple[FloatArray, FloatArray]]] = [[]]
-    for layer in reversed(range(len(own))):
-        if layers.depth[layer] == 0:
-            rims.insert(0, own[layer])
-            inner.insert(0, [])
-            continue
-        lower, failed = dpotrf(own[layer].T, lower=1, overwrite_a=1)
-        if failed:
-            raise np.linalg.LinAlgError("a conductivity of zero or less has no solution")
-        coupled = dtrsm(1.0, lower, coupling[layer].T, lower=1, overwrite_b=1)
-        own[layer - 1] -= coupled.T @ coupled
-        inner[0].insert(0, (lower, coupled))
-    return Condensed(rims, inner[1:])
+
+    def __init__(self, neighbours: IntArray, rim: NDArray[np.bool_], corners: IntArray) -> None:
+        area, depth = _areas(neighbours), _depths(neighbours, rim)
+        self.order = np.lexsort((depth, area))
+        place = np.empty_like(self.order)
+        place[self.order] = np.arange(len(place))
+        self.corners = place[corners]
+        self.depth = depth[self.order]
+        first = np.append(True, (np.diff(self.depth) != 0) | (np.diff(area[self.order]) != 0))
+        self._is_rim = self.depth[first] == 0
+        self._lay_out(np.append(np.flatnonzero(first), len(rim)), first.cumsum() - 1)
+
+    def _lay_out(self, start: IntArray, layer: IntArray) -> None:
+        """Where each entry of the triangles' stiffness goes.
+
+        Each layer has a block of its own, and right above it one (outer, own) that couples it
+        with the next layer outwards.
+        """
+        self._size = np.diff(start)
+        self._outer = np.where(self._is_rim, 0, np.append(0, self._size[:-1]))
+        rows = np.repeat(self.corners, 3, axis=1).ravel()
+        columns = np.tile(self.corners, (1, 3)).ravel()
+        self._once = np.flatnonzero(layer[rows] <= layer[columns])
+        rows, columns = rows[self._once], columns[self._once]
+        of = layer[columns]
+        self._offset = np.append(0, ((self._outer + self._size) * self._size).cumsum())
+        row = rows - (start[of] - self._outer[of])
+        self._place = self._offset[of] + row * self._size[of] + columns - start[of]
+
+    def condense(self, stiffness: FloatArray) -> Condensed:
+        """Eliminate the inner nodes.
+
+        Args:
+            stiffness: (t, 3, 3) of each triangle.
+
+        Raises:
+            numpy.linalg.LinAlgError: a conductivity is not above 0.
+        """
+        entries = stiffness.ravel()[self._once]
+        flat = np.asarray(np.bincount(self._place, entries, self._offset[-1]), np.float64)
+        rims: list[FloatArray] = []
+        inner: list[list[tuple[FloatArray, FloatArray]]] = [[]]
+        given = np.zeros(())  # by the next layer inwards
+        for layer in reversed(range(len(self._size))):
+            block = flat[self._offset[layer] : self._offset[layer + 1]]
+            block = block.reshape(-1, self._size[layer])
+            coupling, own = np.split(block, self._outer[layer : layer + 1])
+            own -= given
+            if self._is_rim[layer]:
+                rims.insert(0, own)
+                inner.insert(0, [])
+                given = np.zeros(())
+                continue
+            lower, failed = dpotrf(own.T, lower=1, overwrite_a=1)
+            if failed:
+                raise np.linalg.LinAlgError("a conductivity of zero or less has no solution")
+            coupled = dtrsm(1.0, lower, coupling.T, lower=1, overwrite_b=1)
+            inner[0].insert(0, (lower, coupled))
+            given = coupled.T @ coupled
+        return Condensed(rims, inner[1:])
 
 
-def _blocks(
-    stiffness: FloatArray, corners: IntArray, layers: Layers
-) -> tuple[list[FloatArray], list[FloatArray]]:
-    """Assemble each layer's own block, and (outer, own) what couples it with the next outwards."""
-    size = np.diff(layers.start)
-    outer = np.where(layers.depth > 0, np.append(0, size[:-1]), 0)
-    rows, columns = np.repeat(corners, 3, axis=1).ravel(), np.tile(corners, (1, 3)).ravel()
-    row_layer, column_layer = layers.layer[rows], layers.layer[columns]
-    once = row_layer <= column_layer
-    rows, columns, row_layer, of = (a[once] for a in (rows, columns, row_layer, column_layer))
-    # A layer's coupling block lies right above its own, so that they share the columns.
-    first = layers.start[of] - outer[of]
-    offset = np.append(0, ((outer + size) * size).cumsum())
-    place = offset[of] + (rows - first) * size[of] + columns - layers.start[of]
-    flat = np.asarray(np.bincount(place, stiffness.ravel()[once], offset[-1]), np.float64)
-    both = [flat[a:b].reshape(-1, m) for a, b, m in zip(offset, offset[1:], size, strict=False)]
-    return (
-        [block[m:] for block, m in zip(both, outer, strict=True)],
-        [block[:m] for block, m in zip(both, outer, strict=True)],
+def _depths(neighbours: IntArray, rim: NDArray[np.bool_]) -> IntArray:
+    """Steps from each node to the nearest rim."""
+    depth = np.where(rim, 0, -1)
+    front = np.flatnonzero(rim)
+    while len(front):
+        reached = neighbours[front]
+        reached = reached[reached >= 0]
+        reached = reached[depth[reached] < 0]
+        depth[reached] = level = depth[front[0]] + 1
+        front = np.flatnonzero(depth == level)
+    return depth
+
+
+def _areas(neighbours: IntArray) -> IntArray:
+    """Number of the connected area that each node belongs to."""
+    there = neighbours >= 0
+    first = np.append(0, there.sum(axis=1).cumsum())
+    graph = sp.csr_matrix(
+        (np.ones(first[-1]), neighbours[there], first), (len(neighbours), len(neighbours))
     )
+    return np.asarray(connected_components(graph, connection="strong")[1])

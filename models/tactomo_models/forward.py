@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from skfem.helpers import dot, grad
 from threadpoolctl import threadpool_limits
 
-from tactomo_models.condensation import Layers, condense, layers_of
+from tactomo_models.condensation import Condensation
 from tactomo_models.description import SensorDescription
 from tactomo_models.mesh import SheetMesh, mesh_sheet
 
@@ -286,6 +286,34 @@ class Solution:
     injected: FloatArray
 
 
+@dataclass(frozen=True)
+class _PressedAreas:
+    """What a solve needs to know of the areas that are pressed, however strongly they are.
+
+    With S and S0 the areas' stiffness on their rims, pressed and bare, the potentials there are
+    u = u0 + G i, and the currents injected there i = -(S - S0) u.
+
+    Attributes:
+        triangles: (t,) indexed triangles that change.
+        condensation: of their corners onto the rims.
+        nodes: (n,) positions of the corners in `BareSheet.support`, in the condensation's order.
+        rim: (r,) positions of those on rims.
+        potentials: (r, L - 1) u0.
+        green: (r, r) G.
+        bare_currents: (r, L - 1) S0 u0.
+        bare_response: (r, r) S0 G.
+    """
+
+    triangles: IntArray
+    condensation: Condensation
+    nodes: IntArray
+    rim: IntArray
+    potentials: FloatArray
+    green: FloatArray
+    bare_currents: FloatArray
+    bare_response: FloatArray
+
+
 class ForwardModel:
     """Voltages and their derivatives for relative conductivities on the pressable nodes."""
 
@@ -350,6 +378,7 @@ class ForwardModel:
         # Nodes where the bare sheet's currents balance among these triangles. Elsewhere an
         # electrode, or a triangle that cannot be pressed, is part of the balance.
         left = np.abs(law @ self.bare.potentials).max(axis=1)
+        self._last_areas: _PressedAreas | None = None
         self._closed = left < 1e-9 * (abs(law) @ np.abs(self.bare.potentials)).max(axis=1)
 
     def solve(self, change: FloatArray) -> Solution:
@@ -366,40 +395,60 @@ class ForwardModel:
             nowhere = np.zeros(0, np.intp)
             none = self.bare.potentials[nowhere]
             return Solution(self.bare_voltages, nowhere, none, nowhere, none)
-        nodes, corners, layers = self._layers(triangles)
-        depth = layers.depth[layers.layer]
-        rim, near = depth == 0, depth <= 1
-        bare = self._bare_conductivity[triangles]
-        pressed = bare + np.append(change, 0.0)[self._corner_pressable[triangles]].mean(axis=1)
-        stiffness = self._stiffness[triangles]
-        condensed = condense(pressed[:, None, None] * stiffness, corners, layers)
-        law = _rim_law(bare[:, None, None] * stiffness, corners, rim, near)
-        # With S and S0 the areas' stiffness on their rims, pressed and bare, the potentials there
-        # are u = u0 + G i, and the currents i = -(S - S0) u. S0 needs no condensation: the bare
-        # sheet's u0 and G balance at inner nodes already, and the law itself does what S0 does.
-        u0, green = self.bare.potentials[nodes[near]], self._green(nodes[near], nodes[rim])
-        u0_rim, green_rim = u0[rim[near]], green[rim[near]]
-        system = condensed.times(green_rim) - law @ green
+        areas = self._areas(triangles)
+        extra = np.append(change, 0.0)[self._corner_pressable[triangles]].mean(axis=1)
+        conductivity = self._bare_conductivity[triangles] + extra
+        condensed = areas.condensation.condense(
+            conductivity[:, None, None] * self._stiffness[triangles]
+        )
+        system = condensed.times(areas.green) - areas.bare_response
         system[np.diag_indices(len(system))] += 1.0
-        injected = np.linalg.solve(system, law @ u0 - condensed.times(u0_rim))
+        currents = areas.bare_currents - condensed.times(areas.potentials)
+        injected = np.asarray(np.linalg.solve(system, currents), np.float64)
         transfer = self.bare.transfer.copy()
-        transfer[:-1, :-1] += u0_rim.T @ injected
+        transfer[:-1, :-1] += areas.potentials.T @ injected
         return Solution(
             voltages=scan_voltages(self.description, transfer),
-            nodes=nodes,
-            potentials=condensed.inwards(u0_rim + green_rim @ injected),
-            rim=nodes[rim],
+            nodes=areas.nodes,
+            potentials=condensed.inwards(areas.potentials + areas.green @ injected),
+            rim=areas.rim,
             injected=injected,
         )
 
-    def _layers(self, triangles: IntArray) -> tuple[IntArray, IntArray, Layers]:
-        """Support nodes of these triangles, layer by layer, and the corners (t, 3) among them."""
+    def _areas(self, triangles: IntArray) -> _PressedAreas:
+        """What was found out for the last solve, where the same triangles change again."""
+        last = self._last_areas
+        if last is None or not np.array_equal(last.triangles, triangles):
+            self._last_areas = last = self._explored(triangles)
+        return last
+
+    def _explored(self, triangles: IntArray) -> _PressedAreas:
         count = len(self.bare.support)
         nodes, corners = _renumbered(self._corner_support[triangles], count)
         here = np.bincount(corners.ravel())
         rim = ~self._closed[nodes] | (here < self._triangle_count[nodes])
-        layers = layers_of(_positions(nodes, count + 1)[self._neighbours[nodes]], rim)
-        return nodes[layers.order], _positions(layers.order, len(nodes))[corners], layers
+        neighbours = _positions(nodes, count + 1)[self._neighbours[nodes]]
+        condensation = Condensation(neighbours, rim, corners)
+        nodes, depth = nodes[condensation.order], condensation.depth
+        near, on_rim = nodes[depth <= 1], depth[depth <= 1] == 0
+        # S0 needs no condensation: the bare sheet's u0 and G balance at inner nodes already, so
+        # that the law itself, at rims and by their neighbours, does what S0 does.
+        law = _rim_law(
+            self._bare_conductivity[triangles, None, None] * self._stiffness[triangles],
+            condensation.corners,
+            depth,
+        )
+        potentials, green = self.bare.potentials[near], self._green(near, near[on_rim])
+        return _PressedAreas(
+            triangles=triangles,
+            condensation=condensation,
+            nodes=nodes,
+            rim=near[on_rim],
+            potentials=potentials[on_rim],
+            green=green[on_rim],
+            bare_currents=law @ potentials,
+            bare_response=law @ green,
+        )
 
     def _green(self, rows: IntArray, columns: IntArray) -> FloatArray:
         """Block of the bare sheet's Green's function; `take` is twice as fast as `np.ix_`."""
@@ -513,13 +562,9 @@ class ForwardModel:
         return self.jacobian(unpressed, np.arange(len(self.bare.pressable)))
 
 
-def _rim_law(
-    stiffness: FloatArray,
-    corners: IntArray,
-    rim: NDArray[np.bool_],
-    near: NDArray[np.bool_],
-) -> sp.csr_matrix:
+def _rim_law(stiffness: FloatArray, corners: IntArray, depth: IntArray) -> sp.csr_matrix:
     """Rows of the rims' nodes, by them and their neighbours inside, of triangles assembled."""
+    rim, near = depth == 0, depth <= 1
     triangle, corner = np.nonzero(rim[corners])
     rows = (rim.cumsum() - 1)[corners[triangle, corner]]
     columns = (near.cumsum() - 1)[corners[triangle]]

@@ -44,8 +44,7 @@ def test_curves_in_numbers_and_as_a_picture(tactomo: Run, tmp_path: Path) -> Non
     rows = json.loads(result.stdout)["rows"]
     assert {row["series"] for row in rows} == {"area", "mesh", "sheet"}
     for row in rows:
-        times = (row[name] for name in ("solve_ms", "jacobian_ms", "sparse_ms", "assembly_ms"))
-        assert all(ms > 0 for ms in times)
+        assert all(ms > 0 for name, ms in row.items() if name.endswith("_ms"))
     sheets = [row for row in rows if row["series"] == "sheet"]
     assert sheets[-1]["sheet_nodes"] > 3 * sheets[0]["sheet_nodes"]
     assert len({row["rim_nodes"] for row in sheets}) == 1
