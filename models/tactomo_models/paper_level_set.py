@@ -36,7 +36,7 @@ FloatArray = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 ALPHA: Final = 1.0  # with data of unit root mean square
-CUT: Final = 0.35  # of the Tikhonov image's peak, where the outline starts
+CUT: Final = 0.25  # of the Tikhonov image's peak, where the outline starts
 MOST_TRIALS: Final = 100  # steps tried, taken or not
 SETTLED: Final = 1e-4  # share of the cost below which a gain is the last
 
@@ -113,4 +113,6 @@ class PaperLevelSet:
         self, mu: FloatArray, data: FloatArray, scale: FloatArray
     ) -> tuple[FloatArray, float]:
         residual = scale * (self.predict(mu) - data)
-        return residual, float(residual @ residual + ALPHA * (mu @ mu))
+        cost = float(residual @ residual + ALPHA * (mu @ mu))
+        # Where nothing is pressed there is no slope, and no way back.
+        return residual, cost if self.family.render(mu)[0].max() > 0.5 else np.inf

@@ -3,7 +3,7 @@
 Two measurements. *Live*: a twin and a daemon as processes of their own, and this process as the
 subscriber; latency is from the moment at which the daemon has read the last byte of a dual scan to
 the arrival of its contacts here, by the clock that both processes share. *Methods*: the time that
-one reconstruction takes, one thread: cold, with no frame before it, and warm, in a still scene.
+one reconstruction takes by every method, beside what it is compared with (`bench_methods`).
 """
 
 from __future__ import annotations
@@ -22,27 +22,16 @@ import typer
 from tactomo.cli.app import BUILD, DEFAULT_DESCRIPTION, Description, JsonOutput, app, examples
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
     from rich.table import Table
-    from tactomo_models import Reconstructor, SensorDescription
+    from tactomo_models import SensorDescription
 
+    from tactomo.cli.bench_methods import MethodTime
     from tactomo.cli.children import Family
 
 SENSOR = "bench"
 SETTLE_S = 1.5
 STATUS_S = 13.0  # at 20 dual scans a second: as far back as the stage times in a status go
 START_S = 60.0
-REFERENCE_SCANS = 20
-SETTLE_SCANS, TIMED_SCANS = 10, 20
-MODALITIES = ("magnitude", "structure")
-METHODS = (
-    *(("auto", contacts) for contacts in (0, 1, 2, 4)),
-    *(("tikhonov", contacts) for contacts in (1, 4)),
-    *(("levelset", contacts) for contacts in (1, 4)),
-)
-# Places in shares of half the sheet's size, all of them within a disc, too.
-PLACES = ((0.0, 0.1), (-0.45, -0.4), (0.5, -0.35), (0.1, 0.55))
 
 
 @dataclass(frozen=True)
@@ -56,18 +45,6 @@ class Phase:
     latency_p99_ms: float
     stage_ms: dict[str, dict[str, float]]
     tiers: dict[str, int]
-
-
-@dataclass(frozen=True)
-class MethodTime:
-    """How long one method takes for one frame of one scene."""
-
-    method: str
-    contacts: int
-    cold_p50_ms: float
-    cold_p99_ms: float
-    warm_p50_ms: float
-    warm_p99_ms: float
 
 
 @dataclass
@@ -109,7 +86,9 @@ def bench(
     """Measure latency, rate and time per frame on this machine.
 
     Starts a twin and a daemon of its own on free addresses, so a running demo is not disturbed
-    (but shares the processor). Takes about two minutes.
+    (but shares the processor). The methods are set beside a bare matrix-vector product, the
+    paper's own level set and pyEIT's Gauss-Newton (`pip install 'tactomo[compare]'`), ratios first.
+    Takes about two minutes.
     """
     from rich.console import Console
 
@@ -121,7 +100,9 @@ def bench(
         elif live:
             _measure_twin(results, ports, rate, seconds, shown.update)
         if methods:
-            results.methods = list(_measure_methods(description, shown.update))
+            from tactomo.cli.bench_methods import measure_methods
+
+            results.methods = measure_methods(description, shown.update)
     if as_json:
         typer.echo(json.dumps(asdict(results), indent=2))
     else:
@@ -135,9 +116,11 @@ def _measure_twin(
     from tactomo_client import request
     from tactomo_models import load_description
 
+    from tactomo.cli.bench_methods import PLACES
+
     with _sockets() as at, _family() as family:
         size = load_description(results.description)
-        spots = [_spot(size, place) for place in PLACES]
+        spots = [_spot(size, place) for place in PLACES[:3]]
         options = ("--description", results.description)
         family.start("models build", "models", "build", *options).wait_done()
         skin = family.start(
@@ -247,89 +230,13 @@ class _Stream:
                 return
 
 
-def _measure_methods(name: str, tell: Callable[[str], None]) -> Iterator[MethodTime]:
-    """Time every tier on simulated scans of one to four contacts, in this process."""
-    import numpy as np
-    from tactomo_models import (
-        Reconstructor,
-        Reference,
-        Tier,
-        load_description,
-        load_or_build_artifact,
-    )
-    from threadpoolctl import threadpool_limits
-
-    from tactomo.twin import make_skin
-
-    tell("methods: building the models")
-    description = load_description(name)
-    artifact = load_or_build_artifact(description)
-    skin = make_skin(description)
-    noise = np.random.default_rng(0)
-    with threadpool_limits(1):
-        reconstructor = Reconstructor(description, artifact)
-        empty = _noisy(skin.voltages([]), noise, REFERENCE_SCANS)
-        reference = Reference.from_scans(empty.get("magnitude"), empty.get("structure"))
-        for method, contacts in METHODS:
-            tell(f"methods: {method}, {contacts} contact(s)")
-            presses = [_press(description, place) for place in PLACES[:contacts]]
-            scans = _noisy(skin.voltages(presses), noise, SETTLE_SCANS + TIMED_SCANS)
-            reconstructor.tier = Tier(method)
-            reconstructor.set_reference(reference)
-            yield _time_method(method, contacts, reconstructor, scans)
-
-
-def _time_method(
-    method: str, contacts: int, reconstructor: Reconstructor, scans: dict[str, NDArray[np.float64]]
-) -> MethodTime:
-    import numpy as np
-
-    def time_ms(number: int) -> float:
-        begin_s = time.perf_counter()
-        reconstructor.reconstruct(
-            *(scans[name][number] if name in scans else None for name in MODALITIES)
-        )
-        return (time.perf_counter() - begin_s) * 1e3
-
-    def cold_ms(number: int) -> float:
-        reconstructor.reset()
-        return time_ms(number)
-
-    cold = [cold_ms(number) for number in range(SETTLE_SCANS, SETTLE_SCANS + TIMED_SCANS)]
-    warm = [time_ms(number) for number in range(SETTLE_SCANS + TIMED_SCANS)][SETTLE_SCANS:]
-    percentiles = [np.percentile(times, (50, 99)).tolist() for times in (cold, warm)]
-    return MethodTime(method, contacts, *percentiles[0], *percentiles[1])
-
-
-def _noisy(
-    volts: dict[Any, NDArray[np.float64]], noise: np.random.Generator, count: int
-) -> dict[str, NDArray[np.float64]]:
-    """Return `count` copies of each channel's voltages, (count, M), with the twin's noise."""
-    from tactomo.twin.device import NOISE_SHARE
-
-    scans = {}
-    for name, clean in volts.items():
-        size = NOISE_SHARE * abs(clean).max()
-        scans[str(name)] = clean + size * noise.standard_normal((count, len(clean)))
-    return scans
-
-
 def _spot(description: SensorDescription, place: tuple[float, float]) -> tuple[float, float]:
     """Return the millimetres of a place that is given in shares of half the sheet's size."""
     return place[0] * description.width_m * 500.0, place[1] * description.height_m * 500.0
 
 
-def _press(description: SensorDescription, place: tuple[float, float]) -> Any:
-    from tactomo_models import Press
-
-    x_mm, y_mm = _spot(description, place)
-    radius_m = 0.1 * description.width_m
-    return Press(x_m=x_mm * 1e-3, y_m=y_mm * 1e-3, pressure_kpa=180.0, radius_m=radius_m)
-
-
 def _print(results: Results) -> None:
     from rich.console import Console
-    from rich.table import Table
 
     console = Console()
     console.print(f"[bold]{results.machine}[/], sensor {results.description}")
@@ -342,13 +249,9 @@ def _print(results: Results) -> None:
                 f"dual scans dropped by the daemon: {results.dropped_scans}"
             )
     if results.methods:
-        table = Table(title="one reconstruction, one thread")
-        for name in ("method", "contacts", "cold p50", "cold p99", "warm p50", "warm p99 (ms)"):
-            table.add_column(name, justify="right")
-        for row in results.methods:
-            times = (row.cold_p50_ms, row.cold_p99_ms, row.warm_p50_ms, row.warm_p99_ms)
-            table.add_row(row.method, str(row.contacts), *(f"{ms:.1f}" for ms in times))
-        console.print(table)
+        from tactomo.cli.bench_methods import table_of
+
+        console.print(table_of(results.methods))
 
 
 def _live_table(results: Results) -> Table:
