@@ -88,7 +88,7 @@ class ShapeFollower:
     def __init__(self, forward: ForwardModel, ratio: float) -> None:
         self.fit = ShapeFit(forward, ratio)
         self._freedom = Freedom.AS_NEEDED
-        self._outlines = outlines_on(forward, conductive=ratio > 1)
+        self._outlines = outlines_on(forward)
         self._level_set = LevelSet(forward)
         self._search = ContactSearch(forward, ratio)
         self.forget()

@@ -277,6 +277,8 @@ class Solution:
         rim: (r,) positions in `BareSheet.support` of those that other triangles touch, too.
         injected: (r, L - 1) currents that, injected there into the bare sheet, make the pressed
             sheet's potentials on the rims and everywhere outside.
+        mixed: (P,) changes at the pressable nodes whose resistivities were mixed; None where
+            conductivities were.
     """
 
     voltages: FloatArray
@@ -284,6 +286,7 @@ class Solution:
     potentials: FloatArray
     rim: IntArray
     injected: FloatArray
+    mixed: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -381,11 +384,15 @@ class ForwardModel:
         self._last_areas: _PressedAreas | None = None
         self._closed = left < 1e-9 * (abs(law) @ np.abs(self.bare.potentials)).max(axis=1)
 
-    def solve(self, change: FloatArray) -> Solution:
+    def solve(self, change: FloatArray, *, mix_resistivities: bool = False) -> Solution:
         """Solve for a pressed sheet.
 
         Args:
             change: (P,) conductivity minus the bare sheet's at the pressable nodes.
+            mix_resistivities: a triangle's resistivity, not its conductivity, is the mean of its
+                corners'. Across the edge of what conducts far better than the sheet, current
+                meets the two in series: there this keeps an edge where its nodes put it, whatever
+                the contrast (to 0.3 mm of 3 mm triangles; otherwise it is off by up to 0.9 mm).
 
         Raises:
             numpy.linalg.LinAlgError: a conductivity is not above 0.
@@ -396,8 +403,11 @@ class ForwardModel:
             none = self.bare.potentials[nowhere]
             return Solution(self.bare_voltages, nowhere, none, nowhere, none)
         areas = self._areas(triangles)
-        extra = np.append(change, 0.0)[self._corner_pressable[triangles]].mean(axis=1)
-        conductivity = self._bare_conductivity[triangles] + extra
+        at_corners = self._at_corners(triangles, change)
+        if mix_resistivities:
+            conductivity = 1 / (1 / at_corners).mean(axis=1)
+        else:
+            conductivity = at_corners.mean(axis=1)
         condensed = areas.condensation.condense(
             conductivity[:, None, None] * self._stiffness[triangles]
         )
@@ -413,7 +423,13 @@ class ForwardModel:
             potentials=condensed.inwards(areas.potentials + areas.green @ injected),
             rim=areas.rim,
             injected=injected,
+            mixed=change if mix_resistivities else None,
         )
+
+    def _at_corners(self, triangles: IntArray, change: FloatArray) -> FloatArray:
+        """Conductivity (t, 3) of triangles as their corners have it."""
+        bare = self._bare_conductivity[triangles, None]
+        return np.asarray(bare + np.append(change, 0.0)[self._corner_pressable[triangles]])
 
     def _areas(self, triangles: IntArray) -> _PressedAreas:
         """What was found out for the last solve, where the same triangles change again."""
@@ -490,7 +506,7 @@ class ForwardModel:
         nodes, corners = _renumbered(self._corner_support[triangles], len(self.bare.support))
         fields = self.potentials(solution, nodes) @ self._pair_matrix.T  # (nodes, pairs)
         gradient = self._gradient[triangles] @ fields[corners]  # (t, 2, pairs)
-        share = self._shares(where, triangles)
+        share = self._shares(where, triangles, solution.mixed)
         if onto is None:
             summed = share @ self._field_products(gradient)
         else:
@@ -501,14 +517,20 @@ class ForwardModel:
                 summed += weight[strip].T @ self._field_products(gradient[strip])
         return np.asarray((summed[:, self._product_of] * self._sign).T)
 
-    def _shares(self, where: IntArray, triangles: IntArray) -> sp.csr_matrix:
-        """Minus the area (n, t) of each triangle that belongs to each pressable node."""
+    def _shares(
+        self, where: IntArray, triangles: IntArray, mixed: FloatArray | None
+    ) -> sp.csr_matrix:
+        """Minus the area (n, t) of each triangle whose conductivity goes with each node's."""
         position = _positions(where, len(self.bare.pressable) + 1)  # the last: not pressable
         corner = position[self._corner_pressable[triangles]]
         triangle, which = np.nonzero(corner >= 0)
-        third = -self._area[triangles[triangle]] / 3
+        area = -self._area[triangles[triangle]] / 3
+        if mixed is not None:  # d sigma / d sigma_i = (sigma / sigma_i)^2 / 3
+            at_corners = self._at_corners(triangles, mixed)
+            mean = 1 / (1 / at_corners).mean(axis=1)
+            area *= (mean[triangle] / at_corners[triangle, which]) ** 2
         return sp.csr_matrix(
-            (third, (corner[triangle, which], triangle)), (len(where), len(triangles))
+            (area, (corner[triangle, which], triangle)), (len(where), len(triangles))
         )
 
     def _field_products(self, gradient: FloatArray) -> FloatArray:

@@ -58,6 +58,10 @@ class LevelSet:
         f = self._function(parameters, slice(None))
         return heaviside(f / HALF_WIDTH), f > -HALF_WIDTH
 
+    def coverage(self, parameters: FloatArray) -> FloatArray:
+        """(P,) share pressed."""
+        return self.render(parameters)[0]
+
     def slope(self, parameters: FloatArray, nodes: NDArray[np.intp]) -> FloatArray:
         """Derivative (n, K) of h at n nodes by the coefficients."""
         f = self._function(parameters, nodes)

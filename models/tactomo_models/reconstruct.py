@@ -183,6 +183,15 @@ class _Data:
         return float(np.sqrt(((self.weight * self.change) ** 2).sum() / count))
 
 
+@dataclass(frozen=True)
+class _Shown:
+    """What was made of a shape: it serves again while the shape stays as it is."""
+
+    pressed: FloatArray
+    on_map: FloatArray
+    areas: Areas
+
+
 class Reconstructor:
     """Turns dual scans into maps and contacts; keeps the warm start between them.
 
@@ -222,7 +231,7 @@ class Reconstructor:
         self._tracker = Tracker()
         self._magnitudes: Magnitudes | None = None
         self._fitted_areas: Areas | None = None
-        self._areas_shape: FloatArray | None = None
+        self._shown: _Shown | None = None
         self._stage_s: dict[str, float] = {}
         self._left_out: list[str] = []
         self._structure_answers_more = len(description.modalities) == 2 and bool(
@@ -307,7 +316,7 @@ class Reconstructor:
             self._follower.forget()
         self._magnitudes = None
         self._fitted_areas = None
-        self._areas_shape = None
+        self._shown = None
 
     def reconstruct(
         self,
@@ -496,8 +505,7 @@ class Reconstructor:
             structure, budget_s = data["structure"], self.budget_s or DEFAULT_BUDGET_S
             shape, how = self._shape_of(structure, budget_s)
         with self._timed("contacts"):
-            pressed = self._on_map(shape.pressed)
-            areas = self._areas_of(shape, pressed, structure)
+            areas, pressed = self._areas_of(shape, structure)
             fitted = self._fit_magnitudes(areas, data, 3 if shape.converged else 1)
             contacts = self._contacts(areas, fitted)
         if shape.misfit > BAD_MISFIT or self._magnitude_unexplained(data, fitted, BAD_MISFIT):
@@ -558,17 +566,19 @@ class Reconstructor:
         wrong_way = self._sign("magnitude") * fitted.change < -WRONG_WAY * fitted.sigma
         return fitted.misfit > bad_misfit or bool(wrong_way.any())
 
-    def _areas_of(self, shape: Shape, pressed: FloatArray, structure: _Data) -> Areas:
-        """Areas of a shape; those of the frame before while the shape has not moved."""
+    def _areas_of(self, shape: Shape, structure: _Data) -> tuple[Areas, FloatArray]:
+        """Areas of a shape and its map; those of the frame before while it has not moved."""
         assert self._follower is not None
-        if self._areas_shape is shape.pressed and self._fitted_areas is not None:
-            return self._fitted_areas
-        self._areas_shape = shape.pressed
-        areas = self._areas.find(np.abs(pressed), np.abs(shape.pressed))
-        if len(areas) == 0:
-            return areas
-        covariance = self._follower.fit.covariance(shape, structure.weight, structure.spread)
-        return self._areas.with_sigmas(areas, shape, covariance)
+        if self._shown is not None and self._shown.pressed is shape.pressed:
+            return self._shown.areas, self._shown.on_map
+        coverage = shape.coverage
+        on_map = self._on_map(coverage)
+        areas = self._areas.find(np.abs(on_map), np.abs(coverage))
+        if len(areas):
+            covariance = self._follower.fit.covariance(shape, structure.weight, structure.spread)
+            areas = self._areas.with_sigmas(areas, shape, covariance)
+        self._shown = _Shown(shape.pressed, on_map, areas)
+        return areas, on_map
 
     def _fit_magnitudes(
         self, areas: Areas, data: dict[Modality, _Data], solves: int

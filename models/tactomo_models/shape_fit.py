@@ -49,7 +49,10 @@ class Family(Protocol):
         """Bring parameters (n,) back to where they mean something."""
 
     def render(self, parameters: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """(P,) h, and where it is not 0 or may become so."""
+        """(P,) h as the mesh needs it, and where it is not 0 or may become so."""
+
+    def coverage(self, parameters: FloatArray) -> FloatArray:
+        """(P,) share pressed, for people to look at."""
 
     def slope(self, parameters: FloatArray, nodes: NDArray[np.intp]) -> FloatArray:
         """Derivative (k, n) of h at k nodes by the parameters."""
@@ -63,7 +66,7 @@ class Shape:
         family: what its parameters mean.
         parameters: (n,) of the family.
         log_ratio: logarithm of the pressed over the bare conductivity.
-        pressed: (P,) h at the pressable nodes, 0 to 1.
+        pressed: (P,) h at the pressable nodes, 0 to 1, as the mesh needs it.
         solution: forward solution for it.
         residual: (M,) noise-weighted misfit of the data.
         cost: what is minimised, the prior included.
@@ -82,6 +85,11 @@ class Shape:
     damping: float = 1.0
     jacobian: FloatArray | None = None
     converged: bool = False
+
+    @property
+    def coverage(self) -> FloatArray:
+        """(P,) share pressed, without what the mesh needs drawn differently."""
+        return self.family.coverage(self.parameters)
 
     @property
     def misfit(self) -> float:
@@ -157,7 +165,7 @@ class ShapeFit:
         if np.count_nonzero(moving) > most_pressed:
             return None
         change = conductivity(pressed, log_ratio)[0] - 1
-        solution = self.forward.solve(change)
+        solution = self.forward.solve(change, mix_resistivities=log_ratio > 0)
         return self._judged(family, parameters, log_ratio, pressed, solution, data, weight)
 
     def _judged(

@@ -58,7 +58,7 @@ def start_at(
     if order is None:
         free = LevelSet(fit.forward)
         return free, free.parameters_of(likeness(fit.forward, x_m, y_m, radius_m))
-    family = outlines_on(fit.forward, conductive=fit.likely > 0).of(order, 1)
+    family = outlines_on(fit.forward).of(order, 1)
     form = [x_m / UNIT_M, y_m / UNIT_M, np.log(radius_m), 0.2, -0.1, 0.03, -0.02, 0.04, 0.05]
     return family, np.array(form[: PARAMETERS[order]])
 
@@ -115,7 +115,7 @@ def test_the_jacobian_of_a_shape_passes_a_taylor_test(fit: ShapeFit, order: int 
 @pytest.mark.parametrize("order", [0, 2, 4])
 def test_two_outlines_that_overlap_pass_a_taylor_test(forward: ForwardModel, order: int) -> None:
     rng = np.random.default_rng(4)
-    family = outlines_on(forward, conductive=True).of(order, 2)
+    family = outlines_on(forward).of(order, 2)
     each = np.zeros((2, 9))
     each[:, :3] = [[-0.4, 0.1, np.log(0.009)], [0.5, -0.2, np.log(0.007)]]
     parameters = family.join(each)
@@ -212,7 +212,7 @@ def test_the_search_finds_the_contact_that_is_missing(forward: ForwardModel, rat
     """Beside one that is known, and about as large as it is."""
     fit = ShapeFit(forward, ratio)
     known = shape_at(fit, 0, x_m=-0.012, y_m=-0.008, radius_m=0.006)
-    family = outlines_on(forward, conductive=ratio > 1).of(0, 2)
+    family = outlines_on(forward).of(0, 2)
     both = np.append(known.parameters, [0.012 / UNIT_M, 0.006 / UNIT_M, np.log(0.004)])
     truth = fit.evaluate(family, both, fit.likely, known.residual, known.residual)
     assert truth is not None
