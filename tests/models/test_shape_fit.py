@@ -157,7 +157,7 @@ def test_the_fit_explains_what_its_own_model_made(fit: ShapeFit, order: int | No
     truth = shape_at(fit, order)
     data = data_of(truth, fit)
     weight = np.full(len(data), 1 / 0.003)
-    start = shape_at(fit, order, data, weight, x_m=0.0, y_m=0.003, radius_m=0.009)
+    start = shape_at(fit, order, data, weight, x_m=0.002, y_m=0.002, radius_m=0.009)
     found = fit.refine(start, data, weight, Budget(5.0), good_enough=1.0)
     assert start.misfit > 10
     assert found.misfit <= 1
