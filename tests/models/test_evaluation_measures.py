@@ -50,6 +50,13 @@ def test_too_far_is_no_match_and_spoils_no_other() -> None:
     assert match([far, near], [TRUE]) == [(1, 0)]
 
 
+def test_a_false_contact_far_away_does_not_push_the_others() -> None:
+    """Least total distance alone would give the near one to the wrong contact."""
+    true = [TRUE, replace(TRUE, x_m=TRUE.x_m + 0.011)]
+    near, false = (replace(FOUND, x_m=TRUE.x_m + x) for x in (0.010, 0.100))
+    assert match([near, false], true) == [(0, 1)]
+
+
 def test_a_contact_is_scored_in_the_units_it_says(paper: SensorDescription) -> None:
     assert full_range(paper) == 0.25
     off = replace(

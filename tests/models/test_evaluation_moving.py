@@ -155,6 +155,12 @@ def test_identities_that_are_lost(paper: SensorDescription, simulator: SkinSimul
     assert [score.switches for score in play(lifted)] == [0, 0, 0]  # a new one, and told so
 
 
+def test_a_tare_forgets_who_was_who(paper: SensorDescription, simulator: SkinSimulator) -> None:
+    held = Step("hold", {"A": press("A")})
+    scores = play(sequence(paper, simulator, held, held, replace(held, tare=True)))
+    assert [score.switches for score in scores] == [0, 0, 1]
+
+
 def frame(phase: str, icc: float, found: int = 1, distrusted: bool = False) -> FrameScore:
     return FrameScore(phase, icc, icc, 1, found, True, 0, distrusted, 0.01)
 

@@ -120,6 +120,13 @@ def test_the_truth_has_the_area_the_place_and_the_magnitude(
     np.testing.assert_allclose(truth.map, contact.magnitude * truth.pressed)
 
 
+def test_a_light_press_is_pressed_in_part_and_has_no_magnitude(paper: SensorDescription) -> None:
+    light, firm = (truth_of(paper, [Press(0, 0, kpa, 0.012)]) for kpa in (5.0, 150.0))
+    np.testing.assert_allclose(light.pressed, firm.pressed * np.log(2) / np.log(100))
+    assert not light.map.any()
+    assert firm.map.max() == pytest.approx(0.03 + 0.22 / 6)
+
+
 def test_variants_of_a_sensor(paper: SensorDescription, small: SensorDescription) -> None:
     assert paper.magnitude
     assert small.structure
