@@ -17,9 +17,9 @@ def test_scenes_do_not_know_of_each_other(
     monkeypatch.setattr(
         "tactomo_models.evaluation.still.load_or_build_artifact", lambda _: artifact
     )
-    drawn = list(scenes(paper, "tuning", 2, contacts=(1, 2), cache=tmp_path))
+    drawn = list(scenes(paper, "tuning", 2, contacts=(1, 2), cache=tmp_path))[:3]
     assert len({scene.layout.opposite for scene in drawn}) == 2  # or the test would show less
-    for outcome in reconstruct_scenes([*drawn, *reversed(drawn)], "tikhonov"):
+    for outcome in reconstruct_scenes(drawn, "tikhonov"):
         alone = Reconstructor(outcome.scene.description, artifact, tier=outcome.frame.tier)
         alone.set_reference(outcome.scene.reference)
         frame = alone.reconstruct(outcome.scene.magnitude, outcome.scene.structure)
