@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from tactomo.cli import app
-from tactomo_models import METHODS, Press, SkinSimulator, load_description
+from tactomo_models import METHODS, Flag, Press, SkinSimulator, load_description
 from typer.testing import CliRunner
 
 Run = Callable[..., Any]
@@ -60,3 +60,42 @@ def test_an_unknown_method_is_refused(tactomo: Run, tmp_path: Path) -> None:
     result = tactomo("reconstruct", "in.npz", "out.npz", "--method", "guess")
     assert result.returncode == 2
     assert all(method in result.stderr for method in METHODS)
+
+
+def test_bad_scans_are_flagged_in_the_file(tactomo: Run, tmp_path: Path) -> None:
+    description = load_description("paper_square")
+    skin = SkinSimulator(description, unevenness=0.03, seed=3)
+    press = Press(x_m=-0.03, y_m=0.03, pressure_kpa=180.0)
+    rng = np.random.default_rng(8)
+
+    def noisy(volts: Any) -> Any:
+        return volts + 1e-4 * np.abs(volts).max() * rng.standard_normal(volts.shape)
+
+    pressed = {
+        name: noisy(np.tile(volts, (6, 1))) for name, volts in skin.voltages([press]).items()
+    }
+    structure = pressed["structure"]
+    structure[1, 7] = np.nan
+    touched = (np.hstack([description.pairs.drive, description.pairs.measure]) == 5).any(axis=1)
+    structure[2, touched] = 0.0
+    structure[3] = np.clip(structure[3], -0.5 * np.abs(structure[3]).max(), None)
+    structure[4] = 0.0
+    structure[5] = 0.3 * rng.standard_normal(208)
+    empty = {f"{name}_reference": noisy(volts) for name, volts in skin.voltages([]).items()}
+    np.savez(tmp_path / "in.npz", **pressed, **empty)
+    assert tactomo("reconstruct", "in.npz", "out.npz").returncode == 0
+    with np.load(tmp_path / "out.npz") as maps:
+        flags = [Flag(int(value)) for value in maps["flags"]]
+    assert flags[0] == Flag(0)
+    assert Flag.INVALID_VOLTAGE in flags[1]
+    assert Flag.ELECTRODE_FAULT in flags[2]
+    assert Flag.SATURATED in flags[3]
+    assert Flag.STRUCTURE_MISSING | Flag.INVALID_VOLTAGE in flags[4]
+    assert flags[5] & (Flag.NOISE_HIGH | Flag.STRUCTURE_MISSING)
+
+
+def test_help_lists_every_flag(tactomo: Run) -> None:
+    said = " ".join(tactomo("reconstruct", "--help").stdout.replace("│", " ").split())
+    for flag in Flag:
+        assert flag.name
+        assert f"{flag.value} {flag.name.lower().replace('_', ' ')}" in said

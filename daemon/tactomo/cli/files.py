@@ -240,6 +240,10 @@ def reconstruct(
     `contact_area_mm2`, `contact_magnitude`, `contact_sigma`. Where the sensor's objects conduct
     `either_way`, such as metal and plastic in a tank, `structure` is -1 in those that conduct
     worse.
+
+    `flags` adds up what stands in the way of trusting a frame: 1 structure missing, 2 magnitude
+    missing, 4 invalid voltage, 8 no reference, 16 misfit high, 32 not converged, 64 reference
+    mismatch, 128 electrode fault, 256 noise high, 512 channels swapped, 1024 saturated.
     """
     from rich.progress import Progress
     from tactomo_models import load_description
