@@ -141,7 +141,8 @@ class _Channel:
         flags: what is wrong with the reference.
         electrodes: those that the reference shows to be faulty.
         check: what scans are held against.
-        total: (M,) weights of the changes whose sum is the change of the whole sheet.
+        total: (M,) weights of the changes whose sum is the change of the whole sheet in the
+            direction of pressing; 0 where objects change it either way.
         matrices: (P, M) reconstruction matrix of each linear method for that noise, in single
             precision: the rounding is far below the noise, and the product is bound by memory.
     """
@@ -278,6 +279,7 @@ class Reconstructor:
         relative = np.hypot(noise * per_volt * np.sqrt(1 + 1 / scans), MODEL_ERROR)
         relative = np.where(valid, relative, UNUSABLE)
         matrices = {method: self._matrix(method, relative) for method in LINEAR}
+        direction = 0.0 if self._either_way(name) else self._sign(name)
         return _Channel(
             reference=reference,
             valid=valid,
@@ -295,7 +297,7 @@ class Reconstructor:
                 contrast,
                 asymmetry_of(self._wiring, reference),
             ),
-            total=self._sign(name) * matrices[Tier.TIKHONOV].sum(axis=0, dtype=np.float64),
+            total=direction * matrices[Tier.TIKHONOV].sum(axis=0, dtype=np.float64),
             matrices=matrices,
         )
 
