@@ -93,6 +93,8 @@ def test_the_methods_are_the_models() -> None:
     for command in ("reconstruct", "daemon", "tier"):
         shown = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200"})
         assert all(method in shown.output for method in METHODS)
+        if command == "reconstruct":
+            assert "noise figure" in " ".join(shown.output.split()), "the rule is stated"
 
 
 def test_every_key_of_the_configuration_has_a_flag_with_its_default() -> None:

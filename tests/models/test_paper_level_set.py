@@ -87,6 +87,7 @@ def test_every_frame_starts_anew(paper_method: Reconstructor, skin: Skin) -> Non
     again = paper_method.reconstruct(**scan)
     assert first.structure is not None
     np.testing.assert_array_equal(first.structure, again.structure)
+    assert [c.magnitude for c in first.contacts] == [c.magnitude for c in again.contacts]
 
 
 def test_a_sheet_pressed_nearly_everywhere_ends_and_is_flagged(

@@ -244,6 +244,12 @@ def reconstruct(
     `flags` adds up what stands in the way of trusting a frame: 1 structure missing, 2 magnitude
     missing, 4 invalid voltage, 8 no reference, 16 misfit high, 32 not converged, 64 reference
     mismatch, 128 electrode fault, 256 noise high, 512 channels swapped, 1024 saturated.
+
+    Methods: *tikhonov* and *noser* are one linear step, regularised so that the image is as noisy,
+    relative to its signal, as the scans are (noise figure 1); *pls-paper* is the level set of the
+    paper that tactomo is compared with, linear and cold; *fit* models a few outlines, *levelset*
+    shapes of any form, both nonlinear and down to the scans' noise; *auto* takes what a frame
+    needs.
     """
     from rich.progress import Progress
     from tactomo_models import load_description
