@@ -129,7 +129,7 @@ class AreaFinder:
             shape: what they were found in.
             covariance: (n, n) of its parameters.
         """
-        edge = np.flatnonzero(shape.family.render(shape.parameters)[1])
+        edge = shape.moving
         slope = shape.family.slope(shape.parameters, edge) * self._node_m2[edge, None]
         sigmas = np.full((len(areas), 3), np.nan)
         for k, inside in enumerate(areas.on_nodes[:, edge] > 0):

@@ -97,6 +97,7 @@ class ShapeFollower:
         """Drop the warm start."""
         self._shape: Shape | None = None
         self._settled_misfit = 0.0
+        self._tried_misfit = 0.0  # at which all moves were tried on contacts like these
         self._start_over()
 
     def _start_over(self) -> None:
@@ -151,6 +152,8 @@ class ShapeFollower:
             self._start_over()
             nothing = self._nothing()
             best = min([shape, *self._each_left_out(shape), nothing], key=lambda s: s.cost)
+            if best is not shape:  # else they moved: once they have been followed, all is as it was
+                self._tried_misfit = 0.0
             return best, "cold start" if best is nothing else "warm start"
         if before.converged:  # all was done, but for other data
             self._moved = self._settled = False
@@ -172,7 +175,8 @@ class ShapeFollower:
                 follows = before.cost - shape.cost < NOISE * len(shape.parameters)
                 self._settled = shape.converged or (budget.over and follows)
                 self._moved = True
-            elif not self._challenge(shape):
+            elif shape.misfit <= SLACK * self._tried_misfit or not self._challenge(shape):
+                self._tried_misfit = max(self._tried_misfit, shape.misfit)
                 return replace(shape, converged=True)
         return replace(shape, converged=False)
 
@@ -188,6 +192,7 @@ class ShapeFollower:
         refined = self._refined(rival.shape, budget)
         if refined.cost < shape.cost - rival.gain:
             self._start_over()
+            self._tried_misfit = 0.0
             self._settled, self._moved = refined.converged, True
             return refined
         trials = rival.trials - (not budget.over)  # one that was cut short does not count

@@ -103,9 +103,24 @@ class Outlines:
 
     def render(self, parameters: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
         """(P,) h of all contacts together, and where it is not 0."""
-        drawn = _Drawing(self, self.split(parameters), slice(None))
-        pressed = 1 - np.prod(1 - heaviside(drawn.t), axis=0)
-        return pressed, (drawn.t > -1).any(axis=0)
+        each = self.split(parameters)
+        near = self._near(each)
+        drawn = _Drawing(self, each, near)
+        pressed, moving = np.zeros(len(self.x_m)), np.zeros(len(self.x_m), bool)
+        pressed[near] = 1 - np.prod(1 - heaviside(drawn.t), axis=0)
+        moving[near] = (drawn.t > -1).any(axis=0)
+        return pressed, moving
+
+    def _near(self, each: FloatArray) -> NDArray[np.intp]:
+        """Nodes that any contact can reach: what is farther away need not be drawn."""
+        longest = np.exp(
+            each[:, SIZE]
+            + np.hypot(each[:, E1], each[:, E2])
+            + np.abs(each[:, HARMONIC:]).sum(axis=1)
+        )
+        reach = longest + 2 * (self.half_width_m + self.offset_m)
+        apart = np.hypot(self.x_m - UNIT_M * each[:, X, None], self.y_m - UNIT_M * each[:, Y, None])
+        return np.flatnonzero((apart < reach[:, None]).any(axis=0))
 
     def coverage(self, parameters: FloatArray) -> FloatArray:
         """(P,) share pressed, by the outlines themselves and not as the mesh needs them drawn."""

@@ -67,6 +67,7 @@ class Shape:
         parameters: (n,) of the family.
         log_ratio: logarithm of the pressed over the bare conductivity.
         pressed: (P,) h at the pressable nodes, 0 to 1, as the mesh needs it.
+        moving: (n,) nodes where h is not 0 or may become so.
         solution: forward solution for it.
         residual: (M,) noise-weighted misfit of the data.
         cost: what is minimised, the prior included.
@@ -79,6 +80,7 @@ class Shape:
     parameters: FloatArray
     log_ratio: float
     pressed: FloatArray
+    moving: NDArray[np.intp]
     solution: Solution
     residual: FloatArray
     cost: float
@@ -141,6 +143,7 @@ class ShapeFit:
             shape.parameters,
             shape.log_ratio,
             shape.pressed,
+            shape.moving,
             shape.solution,
             data,
             weight,
@@ -161,12 +164,13 @@ class ShapeFit:
 
         None where so much would be pressed that no deadline could be kept.
         """
-        pressed, moving = family.render(parameters)
-        if np.count_nonzero(moving) > most_pressed:
+        pressed, may_move = family.render(parameters)
+        moving = np.flatnonzero(may_move)
+        if len(moving) > most_pressed:
             return None
         change = conductivity(pressed, log_ratio)[0] - 1
         solution = self.forward.solve(change, mix_resistivities=log_ratio > 0)
-        return self._judged(family, parameters, log_ratio, pressed, solution, data, weight)
+        return self._judged(family, parameters, log_ratio, pressed, moving, solution, data, weight)
 
     def _judged(
         self,
@@ -174,6 +178,7 @@ class ShapeFit:
         parameters: FloatArray,
         log_ratio: float,
         pressed: FloatArray,
+        moving: NDArray[np.intp],
         solution: Solution,
         data: FloatArray,
         weight: FloatArray,
@@ -183,11 +188,13 @@ class ShapeFit:
         off = (log_ratio - self.likely) / (family.ratio_freedom * self._ratio_sigma)
         away = family.prior_precision @ (parameters - family.prior_mean) ** 2
         cost = residual @ residual + away + off**2
-        return Shape(family, parameters, log_ratio, pressed, solution, residual, float(cost))
+        return Shape(
+            family, parameters, log_ratio, pressed, moving, solution, residual, float(cost)
+        )
 
     def jacobian(self, shape: Shape, weight: FloatArray) -> FloatArray:
         """Derivative of the weighted residual by the parameters and the log ratio: (M, n + 1)."""
-        moved = np.flatnonzero(shape.family.render(shape.parameters)[1])
+        moved = shape.moving
         _, by_pressed, by_log_ratio = conductivity(shape.pressed[moved], shape.log_ratio)
         slope = by_pressed[:, None] * shape.family.slope(shape.parameters, moved)
         onto = np.hstack([slope, by_log_ratio[:, None]])
