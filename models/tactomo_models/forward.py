@@ -393,6 +393,7 @@ class ForwardModel:
                 corners'. Across the edge of what conducts far better than the sheet, current
                 meets the two in series: there this keeps an edge where its nodes put it, whatever
                 the contrast (to 0.3 mm of 3 mm triangles; otherwise it is off by up to 0.9 mm).
+                Triangles with a corner that conducts worse than the sheet mix conductivities.
 
         Raises:
             numpy.linalg.LinAlgError: a conductivity is not above 0.
@@ -404,10 +405,10 @@ class ForwardModel:
             return Solution(self.bare_voltages, nowhere, none, nowhere, none)
         areas = self._areas(triangles)
         at_corners = self._at_corners(triangles, change)
+        conductivity = at_corners.mean(axis=1)
         if mix_resistivities:
-            conductivity = 1 / (1 / at_corners).mean(axis=1)
-        else:
-            conductivity = at_corners.mean(axis=1)
+            better = self._better(triangles, at_corners)
+            conductivity[better] = 1 / (1 / at_corners[better]).mean(axis=1)
         condensed = areas.condensation.condense(
             conductivity[:, None, None] * self._stiffness[triangles]
         )
@@ -430,6 +431,10 @@ class ForwardModel:
         """Conductivity (t, 3) of triangles as their corners have it."""
         bare = self._bare_conductivity[triangles, None]
         return np.asarray(bare + np.append(change, 0.0)[self._corner_pressable[triangles]])
+
+    def _better(self, triangles: IntArray, at_corners: FloatArray) -> NDArray[np.bool_]:
+        """Tell which triangles (t,) conduct nowhere worse than the bare sheet."""
+        return np.asarray((at_corners >= self._bare_conductivity[triangles, None]).all(axis=1))
 
     def _areas(self, triangles: IntArray) -> _PressedAreas:
         """What was found out for the last solve, where the same triangles change again."""
@@ -528,7 +533,8 @@ class ForwardModel:
         if mixed is not None:  # d sigma / d sigma_i = (sigma / sigma_i)^2 / 3
             at_corners = self._at_corners(triangles, mixed)
             mean = 1 / (1 / at_corners).mean(axis=1)
-            area *= (mean[triangle] / at_corners[triangle, which]) ** 2
+            share = (mean[triangle] / at_corners[triangle, which]) ** 2
+            area *= np.where(self._better(triangles, at_corners)[triangle], share, 1.0)
         return sp.csr_matrix(
             (area, (corner[triangle, which], triangle)), (len(where), len(triangles))
         )

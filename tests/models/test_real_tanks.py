@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,27 @@ def test_measured_tanks(tanks: Tanks) -> None:
         for sign in (-1, 1):
             if (truth == sign).any():
                 assert sign * np.nanmean(outcome.image[truth == sign]) > 0.4, outcome.name
+
+
+def test_objects_stand_at_the_electrodes_that_their_names_tell() -> None:
+    """Another tank, of unknown size: metal and plastic beside electrodes 1, 5, 9, 13."""
+    tank = load_description("tank_uef2017")
+    imager = TankImager(tank)
+    x, y = np.meshgrid(tank.map_x_m, tank.map_y_m)
+    with np.load(measured("tank_labelled.npz")) as scans:
+        arrays = [scans[key] for key in ("name", "target", "reference")]
+    seen = 0
+    for name, target, reference in zip(*arrays, strict=True):
+        change = np.abs(target.real) - np.abs(reference.real)
+        image = imager.reconstruct(change, "noser").structure
+        assert image is not None
+        for electrode, kind in re.findall(r"electrode(\d\d)_(metal|plastic)", name):
+            angle = np.radians(-90 + (int(electrode) - 1) * 22.5)
+            near = np.hypot(x - 0.1 * np.cos(angle), y - 0.1 * np.sin(angle)) < 0.03
+            strongest = image[near][np.abs(image[near]).argmax()]
+            assert (strongest > 0.3) if kind == "metal" else (strongest < -0.3), name
+            seen += 1
+    assert seen >= 16
 
 
 @pytest.mark.slow
