@@ -140,6 +140,9 @@ def _contact(contact: Contact) -> dict[str, Any]:
         "magnitude": _finite(contact.magnitude),
         "magnitude_sigma": _finite(contact.magnitude_sigma),
         "pressure_kpa": _finite(contact.pressure_kpa),
+        "x_sigma_mm": _finite(contact.x_sigma_m * 1e3),
+        "y_sigma_mm": _finite(contact.y_sigma_m * 1e3),
+        "area_sigma_mm2": _finite(contact.area_sigma_m2 * 1e6),
     }
 
 

@@ -168,4 +168,7 @@ def frame_arrays(
         "contact_area_mm2": column([c.area_m2 * 1e6 for _, c in contacts]),
         "contact_magnitude": column([c.magnitude for _, c in contacts]),
         "contact_sigma": column([c.magnitude_sigma for _, c in contacts]),
+        "contact_x_sigma_mm": column([c.x_sigma_m * 1e3 for _, c in contacts]),
+        "contact_y_sigma_mm": column([c.y_sigma_m * 1e3 for _, c in contacts]),
+        "contact_area_sigma_mm2": column([c.area_sigma_m2 * 1e6 for _, c in contacts]),
     }

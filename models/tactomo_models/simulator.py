@@ -71,7 +71,9 @@ class SkinSimulator:
         pressure, coverage = strongest(scene, self._x, self._y, self._spacing_m)
         ratio = conductivity_ratio(self.description, modality, pressure, coverage)
         change = self._background * (ratio - 1)
-        return self._forward.solve(change).voltages * self._forward.volts_per_unit
+        # Across the edge of a good conductor resistivities mix; see `ForwardModel.solve`.
+        solved = self._forward.solve(change, mix_resistivities=bool(np.all(ratio >= 1)))
+        return solved.voltages * self._forward.volts_per_unit
 
 
 def conductivity_ratio(
@@ -82,7 +84,8 @@ def conductivity_ratio(
 ) -> FloatArray:
     """Conductivity over the bare sheet's at each point, same shape.
 
-    A point that an indenter covers in part takes that share of the change's logarithm.
+    A point that an indenter covers in part has that share of the worse conductor's say:
+    resistivities mix where it conducts better under pressure, conductivities where worse.
     """
     if modality == "magnitude":
         assert description.magnitude is not None
@@ -92,7 +95,8 @@ def conductivity_ratio(
         response = description.structure.response
         saturated = np.where(pressure_kpa > 0, description.structure.saturated_ratio, 1.0)
         full = response.ratio(pressure_kpa) if response else saturated
-    return np.asarray(full**coverage)
+    mixed = 1 - coverage + coverage * np.minimum(full, 1 / full)
+    return np.asarray(np.where(full > 1, 1 / mixed, mixed))
 
 
 def smooth_noise(

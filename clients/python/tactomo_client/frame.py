@@ -36,6 +36,12 @@ class Contact:
     magnitude_sigma: float | None
     """Standard uncertainty of `magnitude`."""
     pressure_kpa: float | None
+    x_sigma_mm: float | None = None
+    """Standard uncertainty of `x_mm`; None where the method gives none."""
+    y_sigma_mm: float | None = None
+    """Standard uncertainty of `y_mm`."""
+    area_sigma_mm2: float | None = None
+    """Standard uncertainty of `area_mm2`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,6 +158,9 @@ def _contact(value: object) -> Contact:
         magnitude=_number_or_none(value, "magnitude"),
         magnitude_sigma=_number_or_none(value, "magnitude_sigma"),
         pressure_kpa=_number_or_none(value, "pressure_kpa"),
+        x_sigma_mm=_number_or_none(value, "x_sigma_mm"),
+        y_sigma_mm=_number_or_none(value, "y_sigma_mm"),
+        area_sigma_mm2=_number_or_none(value, "area_sigma_mm2"),
     )
 
 
