@@ -158,8 +158,8 @@ def localise(
 
     methods: dict[str, Estimator] = {
         "mean position (no measurement)": mean,
-        "Tikhonov image, all voltages": image(noser=False, halves=False),
         "Tikhonov image": image(noser=False, halves=True),
+        "NOSER image, all voltages": image(noser=True, halves=False),
         "NOSER image": image(noser=True, halves=True),
         "ridge regression (no physics)": ridge,
     }
