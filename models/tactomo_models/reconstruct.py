@@ -77,6 +77,7 @@ BAD_MISFIT = 2.0  # the data are not explained: what is shown may be wrong
 SWAPPED = 2.0  # times the structure channel's signal that the magnitude channel's never reaches
 MUCH_MORE = 5.0  # ratio of the channels' contrasts (logarithms) for that
 LINEAR_PART = 0.5  # of the misfit of nothing, that areas cut out of a linear image may leave
+MOST_HELD = 10  # frames without a structure scan that the last shape stands in for: half a second
 WRONG_WAY = 5.0  # standard uncertainties by which a conductivity may change against its sign
 
 
@@ -191,6 +192,7 @@ class _Shown:
     pressed: FloatArray
     on_map: FloatArray
     areas: Areas
+    tier: Tier
 
 
 class Reconstructor:
@@ -233,6 +235,7 @@ class Reconstructor:
         self._magnitudes: Magnitudes | None = None
         self._fitted_areas: Areas | None = None
         self._shown: _Shown | None = None
+        self._frames_held = 0  # since the last structure scan
         self._stage_s: dict[str, float] = {}
         self._left_out: list[str] = []
         self._structure_answers_more = len(description.modalities) == 2 and bool(
@@ -416,6 +419,8 @@ class Reconstructor:
             return self._quiet(data, flags)
         if self.tier in LINEAR:
             return self._linear(data, flags, self.tier, "as requested")
+        if "structure" not in data and (held := self._held(data, flags)):
+            return held
         if "structure" not in data:
             why = "the structure channel is missing" if self._follower else "no structure channel"
             return self._linear(data, flags, Tier.TIKHONOV, why)
@@ -503,6 +508,7 @@ class Reconstructor:
 
     def _by_shape(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
         """Shapes on the structure channel, and a magnitude for each of their areas."""
+        self._frames_held = 0
         with self._timed("shape"):
             structure, budget_s = data["structure"], self.budget_s or DEFAULT_BUDGET_S
             shape, how = self._shape_of(structure, budget_s)
@@ -526,6 +532,29 @@ class Reconstructor:
             tier=self._tier_of(shape),
             reason=how,
             misfit=shape.misfit,
+            flags=flags,
+        )
+
+    def _held(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction | None:
+        """Bridge a lost structure scan with the last shape, as long as it explains the other."""
+        self._frames_held += 1
+        if self._shown is None or self._frames_held > MOST_HELD:
+            return None
+        with self._timed("contacts"):
+            areas, pressed = self._shown.areas, self._shown.on_map
+            fitted = self._fit_magnitudes(areas, data, 1)
+            if self._magnitude_unexplained(data, fitted, BAD_MISFIT):
+                return None
+            contacts = self._contacts(areas, fitted)
+        assert fitted is not None
+        return Reconstruction(
+            map=_fused(areas, np.array([c.magnitude for c in contacts]), pressed.shape),
+            pressure_kpa=_fused(areas, np.array([c.pressure_kpa for c in contacts]), pressed.shape),
+            structure=None,
+            contacts=contacts,
+            tier=self._shown.tier,
+            reason="the last shape: the structure scan is missing",
+            misfit=fitted.misfit,
             flags=flags,
         )
 
@@ -579,7 +608,7 @@ class Reconstructor:
         if len(areas):
             covariance = self._follower.fit.covariance(shape, structure.weight, structure.spread)
             areas = self._areas.with_sigmas(areas, shape, covariance)
-        self._shown = _Shown(shape.pressed, on_map, areas)
+        self._shown = _Shown(shape.pressed, on_map, areas, self._tier_of(shape))
         return areas, on_map
 
     def _fit_magnitudes(

@@ -160,6 +160,32 @@ def test_without_structure_the_linear_image_goes_on_flagged(
     assert error_mm(nearest(frame, press), press) < 12
 
 
+def test_a_lost_structure_scan_is_bridged_by_the_last_shape(
+    reconstructor: Reconstructor, skin: Skin
+) -> None:
+    """Pressures stay right and identities stay; a shape that no longer fits is not held."""
+    (before,) = settle(reconstructor, skin, press_mm(-30, 20, 190)).contacts
+    weaker = press_mm(-30, 20, 160)
+    frame = reconstructor.reconstruct(skin.scan(weaker)["magnitude"], None)
+    (contact,) = frame.contacts
+    assert frame.tier is Tier.FIT
+    assert frame.flags == Flag.STRUCTURE_MISSING
+    assert frame.structure is None
+    assert contact.id == before.id
+    assert contact.pressure_kpa == pytest.approx(160, abs=8)
+    elsewhere = skin.scan(press_mm(40, -40, 190))["magnitude"]
+    assert reconstructor.reconstruct(elsewhere, None).tier is Tier.TIKHONOV
+
+
+def test_the_last_shape_is_not_held_for_ever(reconstructor: Reconstructor, skin: Skin) -> None:
+    settle(reconstructor, skin, CENTRE)
+    tiers = [
+        reconstructor.reconstruct(skin.scan(CENTRE)["magnitude"], None).tier for _ in range(30)
+    ]
+    assert tiers[0] is Tier.FIT
+    assert tiers[-1] is Tier.TIKHONOV
+
+
 def test_without_magnitude_the_outline_goes_on_flagged(
     reconstructor: Reconstructor, skin: Skin
 ) -> None:
