@@ -22,6 +22,8 @@ FloatArray = NDArray[np.float64]
 
 SMALLEST_AREA_M2 = 20e-6  # below this, a spot is a trace of the fit, not a contact
 FARTHEST_STEP_M = 0.025  # a contact that moved more than this between frames is a new one
+SURE_HOLE = 3.0  # standard uncertainties between a rim's change and that of what is inside it
+MOST_IN_HOLE = 0.6  # of the rim's change: with more than that inside it is no ring
 TANGENT_REACH = 0.02  # change of conductivity over which the voltages are as good as linear
 LINEAR_ERROR = 0.6  # of a magnitude in a linear image's outline, share of itself: two in three fit
 CHANGE_LIMITS = (-0.9, 20.0)  # relative conductivity changes that a fit may propose
@@ -120,6 +122,19 @@ class AreaFinder:
         )
         on_nodes = mine[keep][:, *self._nearest] * pressed_nodes
         return Areas(on_map, on_nodes, centres, areas, np.full((len(areas), 3), np.nan))
+
+    def inner_parts(self, areas: Areas, coverage: FloatArray, on_map: FloatArray) -> Areas:
+        """What of each area lies within shapes that are drawn smaller.
+
+        Args:
+            areas: K areas.
+            coverage: (P,) share pressed by the smaller shapes.
+            on_map: (nodes_y, nodes_x) the same.
+        """
+        inside = np.minimum(areas.on_nodes, (areas.on_nodes > 0) * coverage)
+        parts = np.minimum(areas.on_map, (areas.on_map > 0) * on_map)
+        size = parts.sum(axis=(1, 2)) * self._cell_m2
+        return replace(areas, on_map=parts, on_nodes=inside, areas_m2=size)
 
     def with_sigmas(self, areas: Areas, shape: Shape, covariance: FloatArray) -> Areas:
         """Say how far the places and sizes of a shape's areas may be trusted.
@@ -264,6 +279,55 @@ def _touch(forward: ForwardModel, areas: Areas, change: FloatArray) -> Tangent:
     jacobian = forward.jacobian(solution, where, areas.on_nodes[:, where].T)
     return Tangent(
         change, (solution.voltages - bare) / np.abs(bare), jacobian / np.abs(bare)[:, None]
+    )
+
+
+def without_holes(
+    forward: ForwardModel,
+    areas: Areas,
+    inner: Areas,
+    data: FloatArray,
+    weight: FloatArray,
+    spread: FloatArray,
+) -> Areas:
+    """Take out of each area the inner part on which nothing presses, where that is certain.
+
+    The saturated channel sees a ring as a disc: what is inside a good conductor is hidden. The
+    magnitude channel, whose contrast is mild, looks inside.
+
+    Args:
+        forward: the model of the sheet.
+        areas: K areas.
+        inner: the inner parts of the same areas.
+        data: (M,) relative voltage changes of the magnitude channel.
+        weight: (M,) their inverse standard deviations.
+        spread: (M,) factor on variances, see `ShapeFit.covariance`.
+
+    Returns:
+        The same areas if none is hollow.
+    """
+    count = len(areas)
+    rims = areas.on_nodes - inner.on_nodes
+    parts = np.vstack([rims, inner.on_nodes])
+    apart = Areas(parts, parts, parts[:, :2], np.ones(2 * count), np.full((2 * count, 3), np.nan))
+    fitted = fit_magnitudes(forward, apart, data, weight, spread)
+    J = fitted.tangent.jacobian * weight[:, None]
+    inverse = np.linalg.inv(J.T @ J + 1e-9 * np.eye(2 * count))
+    covariance = inverse @ (J.T @ (spread[:, None] * J)) @ inverse
+    difference = np.hstack([np.eye(count), -np.eye(count)])
+    rim, hole = np.split(fitted.change, 2)
+    sigma = np.sqrt(np.einsum("ki,ij,kj->k", difference, covariance, difference))
+    # The rim changes, the inner part hardly, and the difference is no accident.
+    hollow = (np.sign(rim) * (rim - hole) > SURE_HOLE * sigma) & (hole / rim < MOST_IN_HOLE)
+    if not hollow.any():
+        return areas
+    share = hollow[:, None]
+    return Areas(
+        on_map=areas.on_map - share[:, :, None] * inner.on_map,
+        on_nodes=areas.on_nodes - share * inner.on_nodes,
+        centres_m=areas.centres_m,
+        areas_m2=areas.areas_m2 - hollow * inner.areas_m2,
+        sigmas=areas.sigmas,
     )
 
 

@@ -126,6 +126,12 @@ class Outlines:
         """(P,) share pressed, by the outlines themselves and not as the mesh needs them drawn."""
         return replace(self, offset_m=0.0).render(parameters)[0]
 
+    def inner_coverage(self, parameters: FloatArray) -> FloatArray:
+        """(P,) share within outlines of half the size: where a ring has its hole."""
+        each = self.split(parameters)
+        each[:, SIZE] -= np.log(2)
+        return self.coverage(self.join(each))
+
     def slope(self, parameters: FloatArray, nodes: NDArray[np.intp]) -> FloatArray:
         """Derivative (n, parameters) of h at n nodes."""
         drawn = _Drawing(self, self.split(parameters), nodes)

@@ -40,6 +40,7 @@ from tactomo_models.contacts import (
     fit_magnitudes,
     linear_magnitudes,
     pressure_of,
+    without_holes,
 )
 from tactomo_models.description import Modality, SensorDescription
 from tactomo_models.errors import DataError
@@ -76,6 +77,7 @@ MOST_INVALID = 0.5  # share of voltages that may be invalid before the channel i
 BAD_MISFIT = 2.0  # the data are not explained: what is shown may be wrong
 SWAPPED = 2.0  # times the structure channel's signal that the magnitude channel's never reaches
 MUCH_MORE = 5.0  # ratio of the channels' contrasts (logarithms) for that
+HOLLOW_MISFIT = 1.1  # of the magnitude channel: enough to ask whether a contact is a ring
 LINEAR_PART = 0.5  # of the misfit of nothing, that areas cut out of a linear image may leave
 MOST_HELD = 10  # frames without a structure scan that the last shape stands in for: half a second
 WRONG_WAY = 5.0  # standard uncertainties by which a conductivity may change against its sign
@@ -193,6 +195,7 @@ class _Shown:
     on_map: FloatArray
     areas: Areas
     tier: Tier
+    holes_sought: bool = False
 
 
 class Reconstructor:
@@ -515,6 +518,9 @@ class Reconstructor:
         with self._timed("contacts"):
             areas, pressed = self._areas_of(shape, structure)
             fitted = self._fit_magnitudes(areas, data, 3 if shape.converged else 1)
+            if fitted is not None and self._may_be_hollow(shape, fitted):
+                areas, pressed = self._hollowed(shape, data["magnitude"])
+                fitted = self._fit_magnitudes(areas, data, 3)
             contacts = self._contacts(areas, fitted)
         if shape.misfit > BAD_MISFIT or self._magnitude_unexplained(data, fitted, BAD_MISFIT):
             flags |= Flag.MISFIT_HIGH
@@ -609,6 +615,26 @@ class Reconstructor:
             covariance = self._follower.fit.covariance(shape, structure.weight, structure.spread)
             areas = self._areas.with_sigmas(areas, shape, covariance)
         self._shown = _Shown(shape.pressed, on_map, areas, self._tier_of(shape))
+        return areas, on_map
+
+    def _may_be_hollow(self, shape: Shape, fitted: Magnitudes) -> bool:
+        """Tell whether to look for rings: once for a shape, where something is unexplained."""
+        assert self._shown is not None
+        unasked = not self._shown.holes_sought and isinstance(shape.family, Outlines)
+        return unasked and shape.converged and fitted.misfit > HOLLOW_MISFIT
+
+    def _hollowed(self, shape: Shape, magnitude: _Data) -> tuple[Areas, FloatArray]:
+        """The shape's areas and map with the holes of rings taken out."""
+        assert self._shown is not None
+        assert isinstance(shape.family, Outlines)
+        solid, coverage = self._shown.areas, shape.family.inner_coverage(shape.parameters)
+        inner = self._areas.inner_parts(solid, coverage, self._on_map(coverage))
+        change, weight, spread = magnitude.change, magnitude.weight, magnitude.spread
+        areas = without_holes(self._forward, solid, inner, change, weight, spread)
+        on_map = self._shown.on_map
+        if areas is not solid:
+            on_map = on_map - (solid.on_map - areas.on_map).sum(axis=0)
+        self._shown = replace(self._shown, areas=areas, on_map=on_map, holes_sought=True)
         return areas, on_map
 
     def _fit_magnitudes(

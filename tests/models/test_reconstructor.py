@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -299,3 +300,18 @@ def test_an_insulating_object_in_a_disc_is_found() -> None:
     (contact,) = frame.contacts
     assert error_mm(contact, cup) < 3
     assert frame.map is None, "a single channel that saturates has no magnitude"
+
+
+@pytest.mark.parametrize("shape", ["ring", "ellipse"])
+def test_a_ring_is_told_from_a_disc_by_the_magnitude_channel(
+    reconstructor: Reconstructor, skin: Skin, shape: Literal["ring", "ellipse"]
+) -> None:
+    """What is inside a saturated contact is hidden from the structure channel alone."""
+    press = Press(0.035, -0.03, 190, 0.02, shape=shape)
+    frame = settle(reconstructor, skin, press)
+    (contact,) = frame.contacts
+    assert contact.pressure_kpa == pytest.approx(190, abs=10)
+    full = math.pi * press.radius_m**2
+    assert contact.area_m2 == pytest.approx(0.75 * full if shape == "ring" else full, rel=0.1)
+    assert frame.map is not None
+    assert (frame.map[15, 37] < 0.05 * contact.magnitude) == (shape == "ring")
