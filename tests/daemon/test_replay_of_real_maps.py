@@ -36,7 +36,8 @@ def test_the_replay_of_a_pressed_skin_gives_the_same_maps(
     for step in range(4):
         press(Press(-0.03 + 0.004 * step, 0.02, 180.0))
     pressed = press(Press(-0.014, 0.02, 180.0), Press(0.04, -0.03, 190.0))
-    press(Press(-0.014, 0.02, 180.0), channels=(Channel.MAGNITUDE,))
+    press(Press(-0.014, 0.02, 180.0), channels=(Channel.MAGNITUDE,))  # the last shape is held
+    press(Press(0.0, -0.05, 190.0), channels=(Channel.MAGNITUDE,))  # it explains this no more
     press()
     press(Press(0.04, -0.03, 190.0))
     b.ask("record_stop")
