@@ -7,12 +7,14 @@ the shape in force, which is refined beside it and takes its place once it expla
 by more than its further parameters would by chance. Contacts that the data do not need are taken
 away again.
 
+A shape that a warm start led to and that does not explain the data is challenged by a cold one.
 Work is spent by the frame's budget; what one frame does not finish, the next one goes on with.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -98,6 +100,8 @@ class ShapeFollower:
         self._shape: Shape | None = None
         self._settled_misfit = 0.0
         self._tried_misfit = 0.0  # at which all moves were tried on contacts like these
+        self._from_nothing = True  # or from the shape of frames before
+        self._understudy: ShapeFollower | None = None
         self._start_over()
 
     def _start_over(self) -> None:
@@ -137,7 +141,29 @@ class ShapeFollower:
             shape = self._improve(shape, Budget(budget_s))
             self._settled_misfit = shape.misfit
         self._shape = shape
+        if shape.converged and shape.misfit > SUSPECT_MISFIT and not self._from_nothing:
+            shape, how = self._challenged_from_nothing(shape, how, spread, budget_s)
+        else:
+            self._understudy = None
         return shape, f"{how}, {self._in_words(shape)}"
+
+    def _challenged_from_nothing(
+        self, shape: Shape, how: str, spread: FloatArray, budget_s: float
+    ) -> tuple[Shape, str]:
+        """Let a cold start run beside a suspect shape from a warm one; the better goes on."""
+        if self._understudy is None:
+            self._understudy = copy(self)
+            self._understudy.forget()
+            return shape, how  # its first frame is the next one
+        other, _ = self._understudy.follow(*self._data, spread, budget_s, self._freedom)
+        if not other.converged:
+            return shape, how
+        self._from_nothing, self._understudy = True, None
+        if other.cost > shape.cost - SURE_GAIN * self._scale(shape):
+            return shape, how
+        self._start_over()
+        self._shape, self._settled_misfit, self._tried_misfit = other, other.misfit, other.misfit
+        return other, "restarted"
 
     def _start(self) -> tuple[Shape, str]:
         """The last frame's shape where it still holds; else the best of what may be left of it."""
@@ -152,6 +178,7 @@ class ShapeFollower:
             self._start_over()
             nothing = self._nothing()
             best = min([shape, *self._each_left_out(shape), nothing], key=lambda s: s.cost)
+            self._from_nothing = best is nothing
             if best is not shape:  # else they moved: once they have been followed, all is as it was
                 self._tried_misfit = 0.0
             return best, "cold start" if best is nothing else "warm start"

@@ -94,6 +94,19 @@ def test_several_presses_stay_separate(reconstructor: Reconstructor, skin: Skin)
         assert contact.pressure_kpa == pytest.approx(press.pressure_kpa, abs=20)
 
 
+def test_a_suspect_shape_is_challenged_by_a_cold_start(
+    reconstructor: Reconstructor, skin: Skin
+) -> None:
+    """A level set has no derivative where nothing presses: alone it never finds what lands."""
+    reconstructor.tier = Tier.LEVELSET
+    held, lands = press_mm(-30, 25), press_mm(35, -30)
+    assert len(settle(reconstructor, skin, held).contacts) == 1
+    frames = [reconstructor.reconstruct(**skin.scan(held, lands)) for _ in range(12)]
+    assert frames[-1].flags == Flag(0)
+    assert len(frames[-1].contacts) == 2
+    assert any(frame.reason.startswith("restarted") for frame in frames)
+
+
 def test_nothing_pressed_takes_a_test_and_no_solve(
     reconstructor: Reconstructor, skin: Skin, solves: list[int]
 ) -> None:
