@@ -243,6 +243,12 @@ class SensorDescription(_Section):
         """Number of electrodes of one sheet."""
         return self.electrodes.count or 4 * (self.electrodes.per_side or 0)
 
+    def __eq__(self, other: object) -> bool:
+        """Descriptions are equal by what they say, whatever has been worked out from them."""
+        if not isinstance(other, SensorDescription):
+            return NotImplemented
+        return self is other or self.model_dump() == other.model_dump()
+
     @cached_property
     def pairs(self) -> Pairs:
         """Drive and measuring pairs of every voltage, in the order of a scan."""

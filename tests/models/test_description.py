@@ -216,3 +216,14 @@ def test_the_hash_follows_the_physics_alone(
 
     changed = hash_of(small_text.replace(*change))
     assert (changed != hash_of(small_text)) == rebuild
+
+
+def test_descriptions_are_equal_by_what_they_say() -> None:
+    """They serve as keys, also once arrays have been worked out from them."""
+    one, other = load_description("paper_square"), load_description("paper_square")
+    assert one is not other
+    assert all(len(d.map_x_m) and len(d.electrode_ends_m) and d.sha256 for d in (one, other))
+    assert one == other
+    assert {one: "kept"}[other] == "kept"
+    assert one != load_description("tank_disc")
+    assert one != "paper_square"
