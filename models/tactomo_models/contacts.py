@@ -24,6 +24,7 @@ SMALLEST_AREA_M2 = 20e-6  # below this, a spot is a trace of the fit, not a cont
 FARTHEST_STEP_M = 0.025  # a contact that moved more than this between frames is a new one
 SURE_HOLE = 3.0  # standard uncertainties between a rim's change and that of what is inside it
 MOST_IN_HOLE = 0.6  # of the rim's change: with more than that inside it is no ring
+MOST_MISSED = 5  # frames that a contact may be gone and still be the same when it comes back
 TANGENT_REACH = 0.02  # change of conductivity over which the voltages are as good as linear
 LINEAR_ERROR = 0.6  # of a magnitude in a linear image's outline, share of itself: two in three fit
 CHANGE_LIMITS = (-0.9, 20.0)  # relative conductivity changes that a fit may propose
@@ -332,33 +333,54 @@ def without_holes(
 
 
 class Tracker:
-    """Gives contacts an identity over time: the assignment that moves them least."""
+    """Gives contacts an identity over time: the assignment that moves them least.
+
+    Rules that a controller can rely on:
+
+    - A contact keeps its identity while it moves less than 25 mm from one frame to the next.
+    - It keeps it through a gap: what comes back within 5 frames and 25 mm is the same contact, not
+      a new one. So a frame that misses a contact costs nothing.
+    - Where two contacts merge, the one whose centre is nearer to that of both together lives on;
+      if they part again within 5 frames, each has its own identity back.
+    - An identity that is gone for longer is never used again.
+    """
 
     def __init__(self) -> None:
         self._centres = np.zeros((0, 2))
         self._ids: list[int] = []
+        self._missed: list[int] = []  # frames since each was last seen
         self._next = 1
 
     def update(self, centres_m: FloatArray) -> list[int]:
-        """Identities of the contacts at `centres_m` (K, 2), kept where one moved only a little."""
+        """Identities of the contacts at `centres_m` (K, 2) in the next frame."""
         ids = [0] * len(centres_m)
         distance = np.linalg.norm(self._centres[:, None] - centres_m[None], axis=2)
         # Too far costs alike: such a pair is made only where nothing better is left, and dropped.
-        for old, new in zip(
-            *linear_sum_assignment(np.minimum(distance, FARTHEST_STEP_M)), strict=True
-        ):
+        # What has been missed comes second to what was there.
+        cost = np.minimum(distance, FARTHEST_STEP_M)
+        cost += np.where(np.array(self._missed, int) > 0, FARTHEST_STEP_M, 0.0)[:, None]
+        found = set()
+        for old, new in zip(*linear_sum_assignment(cost), strict=True):
             if distance[old, new] < FARTHEST_STEP_M:
                 ids[new] = self._ids[old]
+                found.add(old)
         for index, known in enumerate(ids):
             if not known:
                 ids[index] = self._next
                 self._next += 1
-        self._centres, self._ids = centres_m, ids
+        kept = [
+            old
+            for old in range(len(self._ids))
+            if old not in found and self._missed[old] < MOST_MISSED
+        ]
+        self._missed = [0] * len(ids) + [self._missed[old] + 1 for old in kept]
+        self._centres = np.vstack([centres_m, self._centres[kept]])
+        self._ids = ids + [self._ids[old] for old in kept]
         return ids
 
     def clear(self) -> None:
         """Forget all contacts; identities are not used again."""
-        self._centres, self._ids = np.zeros((0, 2)), []
+        self._centres, self._ids, self._missed = np.zeros((0, 2)), [], []
 
 
 def pressure_of(

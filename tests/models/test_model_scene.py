@@ -88,3 +88,31 @@ def test_identities_follow_contacts_and_not_their_order(
     first = tracker.update(at)
     again = tracker.update(at[order] + (dx, dy))
     assert again == [first[index] for index in order]
+
+
+@pytest.mark.parametrize(("gap", "same"), [(1, True), (5, True), (6, False)])
+def test_a_contact_outlives_a_short_gap(gap: int, same: bool) -> None:
+    tracker = Tracker()
+    here, beside = np.array([[0.02, 0.03]]), np.array([[0.02, 0.03], [-0.04, 0.0]])
+    known, other = tracker.update(beside)
+    for _ in range(gap):
+        assert tracker.update(beside[1:]) == [other]
+    back = tracker.update(np.vstack([here + 0.002, beside[1:]]))
+    assert (back[0] == known) is same
+    assert back[1] == other
+
+
+def test_contacts_that_merge_and_part_again_have_their_identities_back() -> None:
+    tracker = Tracker()
+    apart = np.array([[-0.012, 0.0], [0.010, 0.0]])
+    both = tracker.update(apart)
+    assert tracker.update(np.array([[0.0, 0.0]])) == [both[1]]  # the nearer one lives on
+    assert tracker.update(apart) == both
+
+
+def test_what_was_missed_does_not_take_the_identity_of_what_moved() -> None:
+    tracker = Tracker()
+    left, right = tracker.update(np.array([[-0.02, 0.0], [0.0, 0.0]]))
+    assert tracker.update(np.array([[-0.002, 0.0]])) == [right]
+    assert tracker.update(np.array([[-0.018, 0.0]])) == [right]  # it moved to where the other was
+    assert left != right
