@@ -90,6 +90,7 @@ class ShapeFollower:
     def __init__(self, forward: ForwardModel, ratio: float) -> None:
         self.fit = ShapeFit(forward, ratio)
         self._freedom = Freedom.AS_NEEDED
+        self._budget = Budget(0.0)
         self._outlines = outlines_on(forward)
         self._level_set = LevelSet(forward)
         self._search = ContactSearch(forward, ratio)
@@ -136,9 +137,10 @@ class ShapeFollower:
         if freedom != self._freedom:
             self.forget()
             self._freedom = freedom
+        self._budget = Budget(budget_s)
         shape, how = self._start()
         if not shape.converged:
-            shape = self._improve(shape, Budget(budget_s))
+            shape = self._improve(shape, self._budget)
             self._settled_misfit = shape.misfit
         self._shape = shape
         if shape.converged and shape.misfit > SUSPECT_MISFIT and not self._from_nothing:
@@ -191,7 +193,7 @@ class ShapeFollower:
 
     def _improve(self, shape: Shape, budget: Budget) -> Shape:
         """Refine, and try one rival after another, until none is left or the budget ends."""
-        while not budget.over:
+        while True:
             if self._rival is not None:
                 shape = self._judge(self._rival, shape, budget)
             elif self._moved and not self._settled and (rival := self._missing(shape)):
@@ -205,7 +207,8 @@ class ShapeFollower:
             elif shape.misfit <= SLACK * self._tried_misfit or not self._challenge(shape):
                 self._tried_misfit = max(self._tried_misfit, shape.misfit)
                 return replace(shape, converged=True)
-        return replace(shape, converged=False)
+            if budget.over:  # one thing at least is done in every frame
+                return replace(shape, converged=False)
 
     def _refined(self, shape: Shape, budget: Budget) -> Shape:
         if len(shape.parameters) == 0:
@@ -265,6 +268,7 @@ class ShapeFollower:
         if not isinstance(shape.family, Outlines) or shape.family.count == MOST_CONTACTS:
             return None
         found = self._search.best(shape, self._data[1])
+        self._budget.spend(shape)  # about what a search takes, too
         each = shape.family.split(shape.parameters)
         # Circles leave much unexplained that a better form will explain: no contact is made of it.
         sure = SURE_GAIN * self._scale(shape) * (2 if shape.family.order < 2 and len(each) else 1)
@@ -352,7 +356,10 @@ class ShapeFollower:
 
     def _evaluate(self, each: FloatArray, order: int, log_ratio: float) -> Shape | None:
         family = self._outlines.of(order, len(each))
-        return self.fit.evaluate(family, family.join(each), log_ratio, *self._data)
+        shape = self.fit.evaluate(family, family.join(each), log_ratio, *self._data)
+        if shape is not None:
+            self._budget.spend(shape)
+        return shape
 
     def _scale(self, shape: Shape) -> float:
         """What one unit of squared misfit means, by what a shape leaves unexplained."""
