@@ -41,7 +41,8 @@ FloatArray = NDArray[np.float64]
 
 GOOD_MISFIT = 1.0  # explained to the noise (discrepancy principle): no further step
 SUSPECT_MISFIT = 1.5  # a minimum this bad may be the wrong one
-SLACK = 1.1  # a settled shape is left alone while its misfit stays within this
+STILL = 1.5  # mean square of a still scene's differences over their noise: 1, give or take 0.1
+SLACK = 1.1  # contacts that are explained as well as before are not questioned again
 STEPS = 4  # of a refinement, before what it leads to is judged
 TRIALS = 4  # of so many steps that a rival may take
 MOST_CONTACTS = 8
@@ -99,7 +100,7 @@ class ShapeFollower:
     def forget(self) -> None:
         """Drop the warm start."""
         self._shape: Shape | None = None
-        self._settled_misfit = 0.0
+        self._settled_data = np.zeros(0)  # of the frame that the shape is of
         self._tried_misfit = 0.0  # at which all moves were tried on contacts like these
         self._from_nothing = True  # or from the shape of frames before
         self._understudy: ShapeFollower | None = None
@@ -116,6 +117,7 @@ class ShapeFollower:
         change: FloatArray,
         weight: FloatArray,
         spread: FloatArray,
+        noise: FloatArray,
         budget_s: float,
         freedom: Freedom = Freedom.AS_NEEDED,
     ) -> tuple[Shape, str]:
@@ -125,13 +127,14 @@ class ShapeFollower:
             change: (M,) relative voltage changes.
             weight: (M,) their inverse standard deviations.
             spread: (M,) factor on variances, see `ShapeFit.covariance`.
+            noise: (M,) variances of what differs between two frames of a still scene, of each.
             budget_s: compute time, by a model of the work.
             freedom: how the shape may be described.
 
         Returns:
             The shape, and in words what it came from.
         """
-        self._data = change, weight
+        self._data, self._noise = (change, weight), noise
         # Errors that go together look like something that is there: gains count for less.
         self._doubt = float(np.sqrt(np.mean(spread)))
         if freedom != self._freedom:
@@ -141,30 +144,30 @@ class ShapeFollower:
         shape, how = self._start()
         if not shape.converged:
             shape = self._improve(shape, self._budget)
-            self._settled_misfit = shape.misfit
+            self._settled_data = change
         self._shape = shape
         if shape.converged and shape.misfit > SUSPECT_MISFIT and not self._from_nothing:
-            shape, how = self._challenged_from_nothing(shape, how, spread, budget_s)
+            shape, how = self._challenged_from_nothing(shape, how, spread, noise, budget_s)
         else:
             self._understudy = None
         return shape, f"{how}, {self._in_words(shape)}"
 
     def _challenged_from_nothing(
-        self, shape: Shape, how: str, spread: FloatArray, budget_s: float
+        self, shape: Shape, how: str, spread: FloatArray, noise: FloatArray, budget_s: float
     ) -> tuple[Shape, str]:
         """Let a cold start run beside a suspect shape from a warm one; the better goes on."""
         if self._understudy is None:
             self._understudy = copy(self)
             self._understudy.forget()
             return shape, how  # its first frame is the next one
-        other, _ = self._understudy.follow(*self._data, spread, budget_s, self._freedom)
+        other, _ = self._understudy.follow(*self._data, spread, noise, budget_s, self._freedom)
         if not other.converged:
             return shape, how
         self._from_nothing, self._understudy = True, None
         if other.cost > shape.cost - SURE_GAIN * self._scale(shape):
             return shape, how
         self._start_over()
-        self._shape, self._settled_misfit, self._tried_misfit = other, other.misfit, other.misfit
+        self._shape, self._settled_data, self._tried_misfit = other, self._data[0], other.misfit
         return other, "restarted"
 
     def _start(self) -> tuple[Shape, str]:
@@ -173,11 +176,16 @@ class ShapeFollower:
         if before is None:
             return self._nothing(), "cold start"
         shape = self.fit.compare(before, *self._data)
-        if before.converged and shape.misfit <= SLACK * max(self._settled_misfit, GOOD_MISFIT):
+        still = self._is_still()
+        if before.converged and still:
             return replace(shape, converged=True), "still"
         shape = replace(shape, converged=False)
-        if shape.misfit > max(SUSPECT_MISFIT, 2 * before.misfit):
+        # What did not explain its own frame has no claim on the next one.
+        suspect = before.misfit > SUSPECT_MISFIT and not still
+        if suspect or shape.misfit > max(SUSPECT_MISFIT, 2 * before.misfit):
             self._start_over()
+            if suspect:
+                self._tried_misfit = 0.0
             nothing = self._nothing()
             best = min([shape, *self._each_left_out(shape), nothing], key=lambda s: s.cost)
             self._from_nothing = best is nothing
@@ -190,6 +198,12 @@ class ShapeFollower:
             rival = self.fit.compare(self._rival.shape, *self._data)
             self._rival = replace(self._rival, shape=replace(rival, converged=False))
         return shape, "warm start"
+
+    def _is_still(self) -> bool:
+        """Tell whether this frame differs by noise alone from the one that the shape is of."""
+        valid = self._data[1] > 0
+        difference = (self._data[0] - self._settled_data)[valid]
+        return float(np.mean(difference**2 / (2 * self._noise[valid]))) < STILL
 
     def _improve(self, shape: Shape, budget: Budget) -> Shape:
         """Refine, and try one rival after another, until none is left or the budget ends."""

@@ -69,6 +69,7 @@ MISMATCH_SHARE = 1 / 3  # of the reference's mismatch that is left in the change
 # An uneven sheet has few degrees of freedom: errors of the model go together, about as many
 # voltages at a time, and average out so much less than noise does.
 CORRELATED = 10.0
+STILL_SHARE = 0.01  # of the model error's variance, that a still scene may change by
 MEDIAN_SQUARE = 0.455  # of a normal distribution of unit variance
 FALSE_ALARM = 1e-6  # chance that an unpressed frame of pure noise is taken for a pressed one
 TRACE = 1e-9  # relative noise of data that have none
@@ -171,12 +172,14 @@ class _Data:
         change: (M,) 0 where it is invalid.
         weight: (M,) inverse standard deviations, of noise and of model error; 0 where invalid.
         spread: (M,) factor on variances because model errors go together.
+        between: (M,) variances of each of two frames' changes, where the scene is still.
         quiet: whether nothing presses.
     """
 
     change: FloatArray
     weight: FloatArray
     spread: FloatArray
+    between: FloatArray
     quiet: bool
     signal: float  # rms of the changes over their noise
 
@@ -408,7 +411,9 @@ class Reconstructor:
         quiet = statistic < _noise_limit(count)
         if not (quiet or electrodes) and _fell(channel.total * change, channel.total**2 * variance):
             flags |= Flag.REFERENCE_MISMATCH
-        data[name] = _Data(change, weight, spread, quiet, (statistic / count) ** 0.5)
+        # What is far below the model's error is not worth a solve either.
+        between = noise + STILL_SHARE * error
+        data[name] = _Data(change, weight, spread, between, quiet, (statistic / count) ** 0.5)
         return flags
 
     def _by_tier(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
@@ -432,6 +437,9 @@ class Reconstructor:
     def _quiet(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
         blank = np.zeros((self.description.map.nodes_y, self.description.map.nodes_x), np.float32)
         magnitude = blank if "magnitude" in data else None
+        misfit = max(d.misfit for d in data.values())
+        if misfit > BAD_MISFIT and Flag.NOISE_HIGH in flags:
+            flags |= Flag.MISFIT_HIGH
         return Reconstruction(
             map=magnitude,
             pressure_kpa=magnitude,
@@ -439,7 +447,7 @@ class Reconstructor:
             contacts=(),
             tier=Tier.QUIET,
             reason="no change above the noise",
-            misfit=max(d.misfit for d in data.values()),
+            misfit=misfit,
             flags=flags,
         )
 
@@ -567,6 +575,7 @@ class Reconstructor:
     def _shape_of(self, structure: _Data, budget_s: float) -> tuple[Shape, str]:
         assert self._follower is not None
         change, weight, spread = structure.change, structure.weight, structure.spread
+        between = structure.between
         if self.tier is Tier.PLS_PAPER:
             self._forget_shape()  # it starts cold, always
             image = np.maximum(self._linear_image("structure", change, Tier.TIKHONOV), 0.0)
@@ -574,7 +583,7 @@ class Reconstructor:
         if isinstance(self._follower, ObjectFollower):
             return self._follower.follow(change, weight, budget_s)
         freedom = FREEDOM.get(self.tier, Freedom.AS_NEEDED)
-        return self._follower.follow(change, weight, spread, budget_s, freedom)
+        return self._follower.follow(change, weight, spread, between, budget_s, freedom)
 
     def _tier_of(self, shape: Shape) -> Tier:
         if self.tier is Tier.PLS_PAPER:

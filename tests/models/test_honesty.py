@@ -245,3 +245,30 @@ def test_the_linear_map_is_linear(
     assert twice is not None
     assert once.max() > 0.02
     np.testing.assert_allclose(twice, 2 * once, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("tier", [Tier.AUTO, Tier.FIT, Tier.LEVELSET])
+@pytest.mark.parametrize("bad", ["reversed", "louder", "noisier"])
+def test_one_bad_frame_is_forgotten(
+    reconstructor: Reconstructor, skin: Skin, tier: Tier, bad: str
+) -> None:
+    """What explained a bad frame, badly or well, has no claim on the good ones after it."""
+    spoil = {
+        "reversed": lambda volts: volts[::-1].copy(),
+        "louder": lambda volts: 1.02 * volts,
+        "noisier": lambda volts: volts * (1 + 0.02 * np.cos(7 * np.arange(len(volts)))),
+    }[bad]
+    reconstructor.tier = tier
+    before = frames(reconstructor, skin, PRESS, OTHER, count=12)[-1]
+    scan = skin.scan(PRESS, OTHER)
+    assert reconstructor.reconstruct(**{name: spoil(volts) for name, volts in scan.items()}).flags
+    after = frames(reconstructor, skin, PRESS, OTHER, count=15)[-1]
+    assert after.flags == before.flags == Flag(0)
+    assert len(after.contacts) == len(before.contacts) == 2
+    for one, other in zip(
+        sorted(before.contacts, key=lambda c: c.x_m),
+        sorted(after.contacts, key=lambda c: c.x_m),
+        strict=True,
+    ):
+        assert np.hypot(one.x_m - other.x_m, one.y_m - other.y_m) < 1.5e-3
+        assert other.magnitude == pytest.approx(one.magnitude, rel=0.15)
