@@ -49,12 +49,12 @@ def reconstruct_file(
     if method not in METHODS:
         raise DataError(f"unknown method {method!r}; choose one of: {', '.join(METHODS)}")
     scans, reference = read_scans(source, description)
-    reconstructor = Reconstructor(description, tier=Tier(method), budget_s=BUDGET_S)
-    reconstructor.set_reference(reference)
     total = max(len(channel) for channel in scans.values())
     frames: list[Reconstruction] = []
     seconds = np.zeros(total)
     with threadpool_limits(1):  # as the daemon runs, so that `seconds` are what a robot would see
+        reconstructor = Reconstructor(description, tier=Tier(method), budget_s=BUDGET_S)
+        reconstructor.set_reference(reference)
         for index in range(total):
             magnitude, structure = (_scan(scans, n, index) for n in ("magnitude", "structure"))
             start = time.perf_counter()
@@ -67,7 +67,9 @@ def reconstruct_file(
         with target.open("wb") as file:
             np.savez_compressed(file, **arrays)
     except OSError as error:
-        raise DataError(f"cannot write {target}: {error.strerror}") from error
+        raise DataError(
+            f"cannot write {target}: {error.strerror}; name a file in a folder that you may write"
+        ) from error
     return total
 
 
@@ -102,6 +104,8 @@ def read_scans(
             if key not in arrays:
                 raise DataError(f"{source} has {name} but no {key}: add the unpressed scan")
             references[name] = _checked(source, key, arrays[key], (description.measurements,))
+            if not np.any(np.nan_to_num(references[name])):
+                raise DataError(f"{source}: {key} holds no voltage; take the unpressed scan again")
     if not scans:
         raise DataError(
             f"{source} holds none of the channels of {description.name!r} "

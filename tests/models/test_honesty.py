@@ -253,7 +253,7 @@ def test_one_bad_frame_is_forgotten(
     reconstructor: Reconstructor, skin: Skin, tier: Tier, bad: str
 ) -> None:
     """What explained a bad frame, badly or well, has no claim on the good ones after it."""
-    spoil = {
+    spoil: Callable[[FloatArray], FloatArray] = {
         "reversed": lambda volts: volts[::-1].copy(),
         "louder": lambda volts: 1.02 * volts,
         "noisier": lambda volts: volts * (1 + 0.02 * np.cos(7 * np.arange(len(volts)))),

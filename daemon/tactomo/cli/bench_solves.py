@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tactomo.cli.app import BUILD, DEFAULT_DESCRIPTION, Description, JsonOutput, app, examples
-from tactomo.cli.plot import need_matplotlib, save_figure
+from tactomo.cli.plot import prepare_picture, save_figure
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -110,7 +110,7 @@ def bench_solves(
     from tactomo.cli.bench import machine
 
     if picture is not None:
-        need_matplotlib()
+        prepare_picture(picture)
     sensor = load_description(description)
     curves = Curves(machine(), description)
     with Console(stderr=True).status("starting") as shown, threadpool_limits(1):

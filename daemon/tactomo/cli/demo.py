@@ -182,6 +182,8 @@ def _print_box(addresses: Mapping[str, Any]) -> None:
     at_control = _flag("--control", addresses["control"], DEFAULT_CONTROL)
     at_stream = _flag("--stream", addresses["stream"], DEFAULT_STREAM)
     named = _flag("--sensor", name, DEFAULT_NAME)
+    at = addresses["stream"]
+    called = f'"{name}"' if at == DEFAULT_STREAM else f'"{name}", address="{at}"'
     lines = [f"open      [bold link={addresses['viewer']}]{addresses['viewer']}[/]"]
     if "twin" in addresses:
         at_twin = _flag("--control", addresses["twin"], DEFAULT_TWIN_CONTROL)
@@ -194,7 +196,7 @@ def _print_box(addresses: Mapping[str, Any]) -> None:
         f"health    tactomo status{at_control}",
         f"tare      tactomo tare{at_control}",
         f"record    tactomo record press.mcap --seconds 10{at_control}",
-        f'Python    for frame in tactomo_client.subscribe("{name}"): print(frame.contacts)',
+        f"Python    for frame in tactomo_client.subscribe({called}): print(frame.contacts)",
         "",
         "Ctrl-C stops everything",
     ]

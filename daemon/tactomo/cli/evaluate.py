@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict
 from itertools import chain
@@ -13,7 +14,7 @@ import typer
 
 from tactomo.cli.app import BUILD, DEFAULT_DESCRIPTION, JsonOutput, Method, app, examples
 from tactomo.cli.files import DescriptionOption
-from tactomo.cli.plot import need_matplotlib
+from tactomo.cli.plot import prepare_picture
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -81,7 +82,7 @@ def scenes(
     from tactomo_models.evaluation.still import reconstruct_scenes
 
     if picture is not None:
-        need_matplotlib()
+        prepare_picture(picture)
     numbers, ratios = _range(contacts), _decibels(snr)
     description = load_description(sensor)
     drawn = chain.from_iterable(
@@ -134,7 +135,7 @@ def moving(
     from tactomo_models.evaluation.moving import draw_sequence, play, summarise_phases
 
     if picture is not None:
-        need_matplotlib()
+        prepare_picture(picture)
     description = load_description(sensor)
     played = []
     with Progress(console=Console(stderr=True), transient=True) as shown:
@@ -173,16 +174,21 @@ def _range(text: str) -> range:
     except ValueError:
         numbers = range(0)
     if not numbers or numbers[0] < 1:
-        raise typer.BadParameter(f"{text!r}: give a number such as 3, or a range such as 1-4")
+        raise typer.BadParameter(
+            f"--contacts {text!r}: give a number such as 3, or a range such as 1-4"
+        )
     return numbers
 
 
 def _decibels(text: str) -> list[float]:
     """The numbers from "60,40,20"."""
     try:
-        return [float(part) for part in text.split(",")]
-    except ValueError as error:
-        raise typer.BadParameter(f"{text!r}: give numbers, such as 60,40,20,10") from error
+        ratios = [float(part) for part in text.split(",")]
+    except ValueError:
+        ratios = []
+    if not ratios or any(math.isnan(ratio) for ratio in ratios):
+        raise typer.BadParameter(f"--snr {text!r}: give numbers, such as 60,40,20,10")
+    return ratios
 
 
 def _shown(items: Iterable[Item], total: int, what: str) -> Iterator[Item]:

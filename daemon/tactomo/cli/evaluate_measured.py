@@ -13,7 +13,8 @@ import typer
 from tactomo.cli.app import JsonOutput, Method, examples
 from tactomo.cli.evaluate import Picture, Seeds, evaluate_app
 from tactomo.cli.files import DescriptionOption
-from tactomo.cli.plot import need_matplotlib, save_figure
+from tactomo.cli.plot import prepare_picture, save_figure
+from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -71,8 +72,13 @@ def tanks(
     )
 
     if picture is not None:
-        need_matplotlib()
+        prepare_picture(picture)
     description = load_description(sensor)
+    if description.modalities != ("structure",):
+        raise TactomoError(
+            f"{description.name!r} is no tank: it has a magnitude channel",
+            "give a description of one channel, such as tank_uef2017",
+        )
     methods = [method] if method else ["tikhonov", "noser", "levelset"]
     with _progress("reading") as (say, count):
         if scans is None:

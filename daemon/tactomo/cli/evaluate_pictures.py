@@ -42,10 +42,10 @@ def _draw_outcome(axes: Any, outcome: Outcome) -> None:
     sensor = outcome.scene.description
     x, y = sensor.map_x_m * 1e3, sensor.map_y_m * 1e3
     images = (
-        (truth.map, top, f"{score.scene}, {score.snr_db:g} dB"),
-        (frame.map, top, f"|Δσ|/σ₀  ICC {score.icc:.2f}"),
-        (truth.pressed, 1.0, f"{score.shape}, contrast {score.contrast:.0f}"),
-        (frame.structure, 1.0, f"shape  ICC {score.icc_structure:.2f}"),
+        (truth.map, top, f"truth |Δσ|/σ₀: {score.scene}, {score.snr_db:g} dB"),
+        (frame.map, top, f"found, + centres: ICC {score.icc:.2f}"),
+        (truth.pressed, 1.0, f"true shape: {score.shape}, contrast {score.contrast:.0f}"),
+        (frame.structure, 1.0, f"found: ICC {score.icc_structure:.2f}"),
     )
     for panel, (image, highest, title) in zip(axes, images, strict=True):
         panel.set_title(title, fontsize=8)

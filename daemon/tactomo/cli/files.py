@@ -237,9 +237,13 @@ def reconstruct(
     `structure_reference` (M,); structure may be missing. OUT gets `map` (T, ny, nx), the relative
     conductivity change; `structure` (T, ny, nx) from 0 to 1; `misfit`, `flags` and `seconds` (T,);
     and the contacts as flat arrays `contact_frame`, `contact_x_mm`, `contact_y_mm`,
-    `contact_area_mm2`, `contact_magnitude`, `contact_sigma`. Where the sensor's objects conduct
-    `either_way`, such as metal and plastic in a tank, `structure` is -1 in those that conduct
-    worse.
+    `contact_area_mm2`, `contact_magnitude`, `contact_sigma` (of the magnitude), and the standard
+    uncertainties `contact_x_sigma_mm`, `contact_y_sigma_mm`, `contact_area_sigma_mm2`. Where the
+    sensor's objects conduct `either_way`, such as metal and plastic in a tank, `structure` is -1 in
+    those that conduct worse.
+
+    Frames follow one another, as in a stream: each one starts from what the last one found. Give
+    scenes that have nothing to do with each other in files of their own.
 
     `flags` adds up what stands in the way of trusting a frame: 1 structure missing, 2 magnitude
     missing, 4 invalid voltage, 8 no reference, 16 misfit high, 32 not converged, 64 reference

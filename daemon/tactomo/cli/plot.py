@@ -46,7 +46,7 @@ def plot(
     the recording is reconstructed first, by the same code as live. Needs matplotlib:
     `pip install 'tactomo[plot]'`.
     """
-    need_matplotlib()
+    prepare_picture(output)
     from rich.console import Console
     from tactomo_models import load_description
 
@@ -82,12 +82,17 @@ class Point:
     pressure_kpa: float | None
 
 
-def need_matplotlib() -> None:
-    """Make sure that pictures can be drawn, without a display.
+def prepare_picture(output: Path) -> None:
+    """Make sure before the work that a picture of it can be drawn, without a display.
 
     Raises:
-        TactomoError: matplotlib is not installed.
+        TactomoError: matplotlib is not installed, or the picture could not be written.
     """
+    next_step = "give a .png, .svg or .pdf in a folder that you may write"
+    if not output.parent.is_dir():
+        raise TactomoError(f"cannot write {output}: there is no folder {output.parent}", next_step)
+    if output.suffix.lower() not in (".png", ".svg", ".pdf"):
+        raise TactomoError(f"cannot write {output}: not a kind of picture", next_step)
     try:
         import matplotlib
     except ImportError as error:
