@@ -7,36 +7,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from small_sensor import SMALL
 from tactomo.cli import app
 from tactomo.cli.bench_methods import HOW_TO_GET_PYEIT, PRODUCT, PYEIT_GN, PYEIT_STEP
 from tactomo_models import METHODS
 from typer.testing import CliRunner
-
-SMALL = """
-schema = 1
-name = "small"
-[sheet]
-shape = "rectangle"
-width_m = 0.06
-height_m = 0.06
-conductivity_s_m = 1.0
-thickness_m = 1e-4
-[electrodes]
-per_side = 2
-length_m = 0.006
-pitch_m = 0.02
-contact_impedance_ohm_m = 10.0
-[pattern]
-current_a = 1e-4
-[map]
-nodes_x = 21
-nodes_y = 21
-[magnitude.response]
-pressure_kpa = [0.0, 100.0, 200.0]
-relative_change = [0.0, 0.0, 0.25]
-[structure]
-conductivity_ratio = 100.0
-"""
 
 
 @pytest.mark.slow

@@ -8,36 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from small_sensor import SMALL
 
 Run = Callable[..., Any]
-
-SMALL = """
-schema = 1
-name = "small"
-[sheet]
-shape = "rectangle"
-width_m = 0.06
-height_m = 0.06
-conductivity_s_m = 1.0
-thickness_m = 1e-4
-[electrodes]
-per_side = 2
-length_m = 0.006
-pitch_m = 0.02
-contact_impedance_ohm_m = 10.0
-[pattern]
-current_a = 1e-4
-[map]
-nodes_x = 21
-nodes_y = 21
-[structure]
-conductivity_ratio = 100.0
-"""
 
 
 @pytest.mark.slow
 def test_curves_in_numbers_and_as_a_picture(tactomo: Run, tmp_path: Path) -> None:
-    (tmp_path / "small.toml").write_text(SMALL)
+    square = SMALL.replace("height_m = 0.05", "height_m = 0.06")
+    (tmp_path / "small.toml").write_text(square)
     picture = tmp_path / "solves.png"
     result = tactomo("bench-solves", "-d", "small.toml", "--json", "--picture", picture)
     assert result.returncode == 0
