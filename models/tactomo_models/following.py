@@ -7,7 +7,7 @@ the shape in force, which is refined beside it and takes its place once it expla
 by more than its further parameters would by chance. Contacts that the data do not need are taken
 away again.
 
-A shape that a warm start led to and that does not explain the data is challenged by a cold one.
+After a change that the known contacts do not account for, a cold start runs beside the warm one.
 Work is spent by the frame's budget; what one frame does not finish, the next one goes on with.
 """
 
@@ -43,6 +43,7 @@ GOOD_MISFIT = 1.0  # explained to the noise (discrepancy principle): no further 
 SUSPECT_MISFIT = 1.5  # a minimum this bad may be the wrong one
 STILL = 1.5  # mean square of a still scene's differences over their noise: 1, give or take 0.1
 SLACK = 1.1  # contacts that are explained as well as before are not questioned again
+MOST_LEFT = 0.25  # of the cost of nothing, that contacts which moved leave to a new frame
 STEPS = 4  # of a refinement, before what it leads to is judged
 TRIALS = 4  # of so many steps that a rival may take
 MOST_CONTACTS = 8
@@ -146,25 +147,34 @@ class ShapeFollower:
             shape = self._improve(shape, self._budget)
             self._settled_data = change
         self._shape = shape
-        if shape.converged and shape.misfit > SUSPECT_MISFIT and not self._from_nothing:
-            shape, how = self._challenged_from_nothing(shape, how, spread, noise, budget_s)
-        else:
+        while self._doubtful(shape):
+            shape, how = self._challenged_from_nothing(shape, how, spread, noise)
+            if self._budget.over:
+                break
+        if not self._doubtful(shape):
             self._understudy = None
         return shape, f"{how}, {self._in_words(shape)}"
 
+    def _doubtful(self, shape: Shape) -> bool:
+        """Tell whether a cold start might do better: where the warm one had little to go on."""
+        return shape.converged and not self._from_nothing
+
     def _challenged_from_nothing(
-        self, shape: Shape, how: str, spread: FloatArray, noise: FloatArray, budget_s: float
+        self, shape: Shape, how: str, spread: FloatArray, noise: FloatArray
     ) -> tuple[Shape, str]:
-        """Let a cold start run beside a suspect shape from a warm one; the better goes on."""
+        """Let a cold start run beside a doubtful shape; the better or the simpler goes on."""
         if self._understudy is None:
             self._understudy = copy(self)
             self._understudy.forget()
-            return shape, how  # its first frame is the next one
-        other, _ = self._understudy.follow(*self._data, spread, noise, budget_s, self._freedom)
+        left_s = self._budget.left_s
+        other, _ = self._understudy.follow(*self._data, spread, noise, left_s, self._freedom)
+        self._budget.left_s = self._understudy._budget.left_s
         if not other.converged:
             return shape, how
         self._from_nothing, self._understudy = True, None
-        if other.cost > shape.cost - SURE_GAIN * self._scale(shape):
+        simpler = len(other.parameters) < len(shape.parameters)
+        as_good = other.misfit <= SLACK * max(shape.misfit, GOOD_MISFIT)
+        if other.cost > shape.cost - SURE_GAIN * self._scale(shape) and not (simpler and as_good):
             return shape, how
         self._start_over()
         self._shape, self._settled_data, self._tried_misfit = other, self._data[0], other.misfit
@@ -188,7 +198,8 @@ class ShapeFollower:
                 self._tried_misfit = 0.0
             nothing = self._nothing()
             best = min([shape, *self._each_left_out(shape), nothing], key=lambda s: s.cost)
-            self._from_nothing = best is nothing
+            # What was only moved explains most at once; what was found elsewhere may mislead.
+            self._from_nothing = best is nothing or best.cost < MOST_LEFT * nothing.cost
             if best is not shape:  # else they moved: once they have been followed, all is as it was
                 self._tried_misfit = 0.0
             return best, "cold start" if best is nothing else "warm start"

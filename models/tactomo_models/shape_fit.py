@@ -104,20 +104,23 @@ class Budget:
 
     A model and not a clock: the steps taken, and so the maps, must not depend on how busy the
     machine was.
+
+    Attributes:
+        left_s: seconds left.
     """
 
     def __init__(self, seconds: float) -> None:
-        self._left_s = seconds
+        self.left_s = seconds
 
     @property
     def over(self) -> bool:
         """Whether nothing more should be begun."""
-        return self._left_s <= 0
+        return self.left_s <= 0
 
     def spend(self, shape: Shape) -> None:
         """Take off what a solve or a Jacobian of this size costs."""
         nodes = len(shape.solution.nodes)
-        self._left_s -= 0.0007 + 2.5e-6 * nodes + 2e-12 * nodes**3  # see tactomo bench-solves
+        self.left_s -= 0.0007 + 2.5e-6 * nodes + 2e-12 * nodes**3  # see tactomo bench-solves
 
 
 class ShapeFit:
