@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tactomo_models import Artifact, Press, SensorDescription, SkinSimulator
+from tactomo_models.contacts import MOST_MISSED
 from tactomo_models.evaluation.moving import (
     INDENTERS,
     FrameScore,
@@ -139,20 +140,21 @@ def test_contacts_that_touch_are_one_and_near_ones_are_not_counted(
 
 
 def test_identities_that_are_lost(paper: SensorDescription, simulator: SkinSimulator) -> None:
-    """A scan of nothing between two of a contact: the daemon gives it a new identity."""
-    held = Step("hold", {"A": press("A")})
-    scene = sequence(paper, simulator, held, held, held)
+    """Scans of nothing for longer than a contact is remembered: it gets a new identity."""
+    held, gap = Step("hold", {"A": press("A")}), MOST_MISSED + 1
+    scene = sequence(paper, simulator, held, *[held] * gap, held)
     blink = scene.volts.pressed["structure"].copy(), scene.volts.pressed["magnitude"].copy()
     for scans, name in zip(blink, ("structure", "magnitude"), strict=True):
-        scans[1] = scene.volts.rest[name]  # type: ignore[index]
+        scans[1:-1] = scene.volts.rest[name]  # type: ignore[index]
     blinking = replace(
         scene,
         volts=replace(scene.volts, pressed={"structure": blink[0], "magnitude": blink[1]}),
     )
-    assert [score.switches for score in play(scene)] == [0, 0, 0]
-    assert [score.switches for score in play(blinking)] == [0, 0, 1]
-    lifted = replace(blinking, steps=(held, Step("hold", {}), held))
-    assert [score.switches for score in play(lifted)] == [0, 0, 0]  # a new one, and told so
+    none = [0] * (gap + 1)
+    assert [score.switches for score in play(scene)] == [*none, 0]
+    assert [score.switches for score in play(blinking)] == [*none, 1]
+    lifted = replace(blinking, steps=(held, *[Step("hold", {})] * gap, held))
+    assert [score.switches for score in play(lifted)] == [*none, 0]  # a new one, and told so
 
 
 def test_a_tare_forgets_who_was_who(paper: SensorDescription, simulator: SkinSimulator) -> None:
