@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from tactomo.cli.children import Family
 
 SENSOR = "bench"
+PAGE_WIDTH = 150
 SETTLE_S = 1.5
 STATUS_S = 13.0  # at 20 dual scans a second: as far back as the stage times in a status go
 START_S = 60.0
@@ -239,6 +240,8 @@ def _print(results: Results) -> None:
     from rich.console import Console
 
     console = Console()
+    if not console.is_terminal:  # a file has no width of its own, and the table needs one
+        console = Console(width=PAGE_WIDTH)
     console.print(f"[bold]{results.machine}[/], sensor {results.description}")
     if results.live:
         console.print(_live_table(results))
