@@ -11,19 +11,22 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 Shape = Literal["ellipse", "rectangle", "ring"]
+Profile = Literal["flat", "dome"]
 
 
 @dataclass(frozen=True)
 class Press:
-    """One indenter: a flat punch of a shape and size that presses with an even pressure.
+    """One indenter of a shape and size, and the pressure under it.
 
     Attributes:
         x_m, y_m: its centre.
-        pressure_kpa: pressure under it.
+        pressure_kpa: pressure under it; the largest, of a dome.
         radius_m: half its width along its own x axis.
         radius_y_m: half its width along its own y axis; `radius_m` if None.
         angle_rad: turned by this, counter-clockwise.
         shape: an ellipse, a rectangle, or a ring (an ellipse with its inner half left out).
+        profile: "flat", a punch that presses evenly, or "dome", a ball whose pressure falls to
+            nothing at the rim (Hertz) of the ellipse or of the ellipse around a rectangle.
     """
 
     x_m: float
@@ -33,6 +36,20 @@ class Press:
     radius_y_m: float | None = None
     angle_rad: float = 0.0
     shape: Shape = "ellipse"
+    profile: Profile = "flat"
+
+    def pressure_at(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray | float:
+        """Pressure in kPa at points that the indenter covers, same shape."""
+        if self.profile == "flat":
+            return self.pressure_kpa
+        u, v = self._own_axes(x_m, y_m)
+        rho = np.hypot(u / self.radius_m, v / (self.radius_y_m or self.radius_m))
+        return np.asarray(self.pressure_kpa * np.sqrt(np.maximum(1 - rho**2, 0.0)))
+
+    def _own_axes(self, x_m: FloatArray, y_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        cos, sin = np.cos(self.angle_rad), np.sin(self.angle_rad)
+        dx, dy = x_m - self.x_m, y_m - self.y_m
+        return cos * dx + sin * dy, -sin * dx + cos * dy
 
     def coverage(self, x_m: FloatArray, y_m: FloatArray, edge_m: float) -> FloatArray:
         """Share of the neighbourhood of each point that the indenter covers, 0 to 1, same shape.
@@ -43,9 +60,7 @@ class Press:
             edge_m: width over which the share falls from 1 to 0 across the outline: the distance
                 of the points, so that area is kept whatever the grid.
         """
-        cos, sin = np.cos(self.angle_rad), np.sin(self.angle_rad)
-        dx, dy = x_m - self.x_m, y_m - self.y_m
-        u, v = cos * dx + sin * dy, -sin * dx + cos * dy
+        u, v = self._own_axes(x_m, y_m)
         a, b = self.radius_m, self.radius_y_m or self.radius_m
         if self.shape == "rectangle":
             outside = np.maximum(np.abs(u) - a, np.abs(v) - b)
@@ -72,7 +87,8 @@ def strongest(
     pressure, coverage = np.zeros_like(x_m), np.zeros_like(x_m)
     for press in presses:
         covered = press.coverage(x_m, y_m, edge_m)
-        wins = covered * press.pressure_kpa > coverage * pressure
-        pressure = np.where(wins, press.pressure_kpa, pressure)
+        own = press.pressure_at(x_m, y_m)
+        wins = covered * own > coverage * pressure
+        pressure = np.where(wins, own, pressure)
         coverage = np.where(wins, covered, coverage)
     return pressure, coverage

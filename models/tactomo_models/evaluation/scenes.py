@@ -161,7 +161,7 @@ def require_both_channels(description: SensorDescription) -> None:
         )
 
 
-def seed_of(seed_set: SeedSet, purpose: str, *numbers: int) -> np.random.SeedSequence:
+def seed_of(seed_set: str, purpose: str, *numbers: int) -> np.random.SeedSequence:
     """Seed of one random draw; no number in one set leads to what another set or purpose has."""
     name = hashlib.sha256(f"{seed_set} {purpose}".encode()).digest()
     return np.random.SeedSequence([int.from_bytes(name), *numbers])

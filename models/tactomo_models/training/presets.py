@@ -1,0 +1,202 @@
+"""What training scenes are like: the paper's, and ones as hard as a real skin.
+
+A preset draws a scene from a seed and its number. No seed of a training scene is one of the
+evaluation's: the set's name is part of both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactomo_models.description import SensorDescription
+from tactomo_models.errors import DataError
+from tactomo_models.evaluation.scenes import CONTRAST, gap_m, outline_of, seed_of
+from tactomo_models.scene import Press, Profile, Shape
+
+FloatArray = NDArray[np.float64]
+PresetName = Literal["paper", "robust"]
+PRESET_NAMES: Final[tuple[PresetName, ...]] = ("paper", "robust")
+
+PAPER_CONTACTS = 4
+PAPER_CHANGE = (0.05, 0.25)  # 0.95 to 0.75 S/m in a sheet of 1 S/m
+PAPER_CONTRAST = 100.0
+PAPER_HALF_AXIS_M = (0.007, 0.020)  # the paper leaves sizes open
+
+ROBUST_CONTACTS = (0.03, 0.22, 0.22, 0.22, 0.20, 0.07, 0.04)  # shares of scenes with 0 to 6
+ROBUST_HALF_AXIS_M = (0.005, 0.023)
+MOST_ASPECT = 2.2
+RING_HALF_AXIS_M = 0.010  # least of a ring
+# Shares of contacts by pressure: measurable, too light to be measured, beyond the range.
+ROBUST_PRESSURE_KPA = ((0.70, 140.0, 210.0), (0.15, 20.0, 140.0), (0.15, 200.0, 300.0))
+DOMES = 0.15  # share of contacts whose pressure falls towards their rim
+ROBUST_GAP_M = 0.004
+MOST_UNEVEN = 0.08  # standard deviation of a sheet's smooth conductivity error
+IMPEDANCE_SPREAD = 0.3  # standard deviation of the logarithm of contact impedances
+SAME_SKIN = 4  # scenes in a row that have the same sheets, which saves a third of the time
+WEAK_ELECTRODES = 0.03  # share of scenes with one whose contact impedance is
+WEAK_FACTOR = (5.0, 50.0)  # so many times the others'
+DISPLACED_M = 0.0007  # standard deviation of the electrodes' places along the rim
+
+
+@dataclass(frozen=True)
+class SheetErrors:
+    """How one sheet differs from its description.
+
+    Attributes:
+        seed: of the field of conductivity errors.
+        unevenness: standard deviation of that smooth field.
+        impedance: (L,) contact impedances, relative to the description's.
+        displaced_m: (L,) by how much each electrode sits off along the rim, counter-clockwise.
+    """
+
+    seed: int
+    unevenness: float
+    impedance: FloatArray
+    displaced_m: FloatArray
+
+
+@dataclass(frozen=True)
+class TrainingScene:
+    """A scene to simulate.
+
+    Attributes:
+        presses: what presses.
+        contrast: of the structure channel when saturated.
+        opposite: whether the magnitude channel changes against the description's sign.
+        sheets: errors of the magnitude and of the structure sheet; None where there are none.
+    """
+
+    presses: tuple[Press, ...]
+    contrast: float
+    opposite: bool
+    sheets: tuple[SheetErrors, SheetErrors] | None
+
+
+def draw_scene(
+    preset: PresetName, description: SensorDescription, seed: int, number: int
+) -> TrainingScene:
+    """Draw one scene of a preset.
+
+    Args:
+        preset: "paper" or "robust".
+        description: the sensor; needs both channels.
+        seed: of the whole set.
+        number: of the scene in it.
+
+    Raises:
+        DataError: there is no room for so many contacts.
+    """
+    if preset == "paper":
+        return _paper(description, seed, number)
+    return _robust(description, seed, number)
+
+
+def _paper(description: SensorDescription, seed: int, number: int) -> TrainingScene:
+    """One to four ellipses that do not overlap, on an even sheet (paper, section III-C-2)."""
+    assert description.magnitude is not None
+    rng = np.random.default_rng(seed_of("training", "paper", seed, number))
+    response = description.magnitude.response
+    least, most = PAPER_HALF_AXIS_M
+
+    def one() -> Press:
+        long = rng.uniform(least, most)
+        return Press(
+            *_anywhere(description, rng),
+            pressure_kpa=float(response.pressure(np.array(rng.uniform(*PAPER_CHANGE)))),
+            radius_m=long,
+            radius_y_m=rng.uniform(max(least, long / 2), long),
+            angle_rad=rng.uniform(0, np.pi),
+        )
+
+    presses = _placed(description, rng, 1 + number % PAPER_CONTACTS, 0.0, one)
+    return TrainingScene(presses, PAPER_CONTRAST, opposite=True, sheets=None)
+
+
+def _robust(description: SensorDescription, seed: int, number: int) -> TrainingScene:
+    """None to six contacts of any form and pressure, on sheets as uneven as real ones."""
+    rng = np.random.default_rng(seed_of("training", "robust", seed, number))
+    skin = np.random.default_rng(seed_of("training", "robust skin", seed, number // SAME_SKIN))
+    opposite = bool(skin.integers(2))
+    sheets = (_sheet_errors(description, skin), _sheet_errors(description, skin))
+    count = int(rng.choice(len(ROBUST_CONTACTS), p=ROBUST_CONTACTS))
+    presses = _placed(description, rng, count, ROBUST_GAP_M, lambda: _any_press(description, rng))
+    contrast = float(np.exp(rng.uniform(*np.log(CONTRAST))))
+    return TrainingScene(presses, contrast, opposite, sheets)
+
+
+def _any_press(description: SensorDescription, rng: np.random.Generator) -> Press:
+    shapes: tuple[Shape, ...] = ("ellipse", "rectangle", "ring")
+    shape = shapes[rng.choice(3, p=(0.4, 0.35, 0.25))]
+    least, most = ROBUST_HALF_AXIS_M
+    least = RING_HALF_AXIS_M if shape == "ring" else least
+    long = rng.uniform(least, most)
+    shares = [share for share, _, _ in ROBUST_PRESSURE_KPA]
+    _, low, high = ROBUST_PRESSURE_KPA[rng.choice(len(shares), p=shares)]
+    profile: Profile = "dome" if shape == "ellipse" and rng.random() < DOMES / 0.4 else "flat"
+    return Press(
+        *_anywhere(description, rng),
+        pressure_kpa=rng.uniform(low, high) * (1.3 if profile == "dome" else 1.0),
+        radius_m=long,
+        radius_y_m=rng.uniform(max(least, long / MOST_ASPECT), long),
+        angle_rad=rng.uniform(0, np.pi),
+        shape=shape,
+        profile=profile,
+    )
+
+
+def _anywhere(description: SensorDescription, rng: np.random.Generator) -> tuple[float, float]:
+    x, y = rng.uniform(-0.5, 0.5, 2)
+    return x * description.width_m, y * description.height_m
+
+
+def _placed(
+    description: SensorDescription,
+    rng: np.random.Generator,
+    count: int,
+    least_gap_m: float,
+    draw: Callable[[], Press],
+) -> tuple[Press, ...]:
+    """Draw contacts inside the sensing area that lie apart; anew from the first if one has no room.
+
+    Those that have no room for long are drawn smaller.
+    """
+    frame_m = description.sheet.frame_width_m
+    for trial in range(300):
+        shrink = min(1.0, 60 / (trial + 1))
+        placed: list[Press] = []
+        for _ in range(40 * count):
+            if len(placed) == count:
+                break
+            press = draw()
+            press = replace(
+                press,
+                radius_m=press.radius_m * shrink,
+                radius_y_m=(press.radius_y_m or press.radius_m) * shrink,
+            )
+            x, y = outline_of(press)
+            inside = description.on_sheet(x, y, frame_m).all()
+            if inside and all(gap_m(press, other) > least_gap_m for other in placed):
+                placed.append(press)
+        if len(placed) == count:
+            return tuple(placed)
+    raise DataError(
+        f"no room for {count} contacts on {description.name!r}: its sensing area is too small"
+    )
+
+
+def _sheet_errors(description: SensorDescription, rng: np.random.Generator) -> SheetErrors:
+    electrodes = description.electrode_count
+    impedance = np.exp(IMPEDANCE_SPREAD * rng.standard_normal(electrodes))
+    if rng.random() < WEAK_ELECTRODES:
+        impedance[rng.integers(electrodes)] *= np.exp(rng.uniform(*np.log(WEAK_FACTOR)))
+    return SheetErrors(
+        seed=int(rng.integers(2**63)),
+        unevenness=rng.uniform(0, MOST_UNEVEN),
+        impedance=impedance,
+        displaced_m=DISPLACED_M * rng.standard_normal(electrodes),
+    )
