@@ -141,7 +141,7 @@ def scenes(
     """
     require_both_channels(description)
     folder = cache or cache_folder() / "scenes"
-    simulation = _Simulation(description, folder)
+    simulation = Simulation(description, folder)
     for contact_count in contacts:
         for number in range(count):
             layout = draw_layout(description, seed_set, contact_count, number)
@@ -252,12 +252,20 @@ def _covers(press: Press, points: FloatArray) -> bool:
     return bool((filled.coverage(points[0], points[1], edge_m=1e-6) > 0.5).any())
 
 
-class _Simulation:
-    """Simulates scenes, or reads what an earlier run simulated."""
+class Simulation:
+    """Simulates scenes, or reads what an earlier run simulated.
 
-    def __init__(self, description: SensorDescription, folder: Path) -> None:
+    Args:
+        description: the sensor; needs both channels.
+        folder: of simulated voltages.
+        even: whether sheets and electrodes are as even as the model's, instead of each scene's
+            own.
+    """
+
+    def __init__(self, description: SensorDescription, folder: Path, *, even: bool = False) -> None:
         self._description = description
         self._folder = folder
+        self._even = even
 
     @cached_property
     def _mesh(self) -> SheetMesh:
@@ -266,6 +274,7 @@ class _Simulation:
     def voltages(self, layout: Layout) -> SimulatedVolts:
         """Noise-free voltages of a scene."""
         what = f"{SIMULATION} {layout!r} {self._description.model_dump_json()}"
+        what += " even" if self._even else ""
         volts = cached(self._folder, what, lambda: self._simulate(layout))
         return SimulatedVolts(
             *({name: volts[f"{name}_{state}"] for name in MODALITIES} for state in STATES)
@@ -275,7 +284,8 @@ class _Simulation:
         sensor = with_contrast(self._description, layout.contrast)
         if layout.opposite:
             sensor = with_opposite_magnitude(sensor)
-        skin = UnevenSkin(sensor, self._mesh, layout.seed("sheet"))
+        errors = {"unevenness": 0.0, "impedance_spread": 0.0} if self._even else {}
+        skin = UnevenSkin(sensor, self._mesh, layout.seed("sheet"), **errors)
         scans = zip(STATES, (skin.voltages([]), skin.voltages(layout.presses)), strict=True)
         return {f"{name}_{state}": scan[name] for state, scan in scans for name in MODALITIES}
 

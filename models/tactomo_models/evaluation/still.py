@@ -18,34 +18,35 @@ from tactomo_models.reconstruct import Reconstruction, Reconstructor, Tier
 
 @dataclass(frozen=True)
 class Outcome:
-    """A scene, what was made of it, and how right that is."""
+    """A scene, what a method made of it, and how right that is."""
 
+    method: str
     scene: EvaluationScene
     frame: Reconstruction
     score: SceneScore
 
 
-def reconstruct_scenes(
-    scenes: Iterable[EvaluationScene], method: str = Tier.AUTO
-) -> Iterator[Outcome]:
-    """Reconstruct each scene by itself, on one thread.
+def reconstruct_scenes(scenes: Iterable[EvaluationScene], *methods: str) -> Iterator[Outcome]:
+    """Reconstruct each scene by itself, by one method after the other, on one thread.
 
     Args:
         scenes: of one sensor, whatever its sign.
-        method: a reconstruction method, as `tactomo reconstruct` has them.
+        *methods: of reconstruction, as `tactomo reconstruct` has them.
     """
     reconstructors: dict[SensorDescription, Reconstructor] = {}
     for scene in scenes:
         sensor = scene.description
         if sensor not in reconstructors:
             artifact = load_or_build_artifact(sensor)
-            reconstructors[sensor] = Reconstructor(
-                sensor, artifact, tier=Tier(method), budget_s=BUDGET_S
-            )
+            reconstructors[sensor] = Reconstructor(sensor, artifact, budget_s=BUDGET_S)
         reconstructor = reconstructors[sensor]
         with threadpool_limits(1):
-            reconstructor.set_reference(scene.reference)
-            begin_s = time.perf_counter()
-            frame = reconstructor.reconstruct(scene.magnitude, scene.structure)
-            seconds = time.perf_counter() - begin_s
-        yield Outcome(scene, frame, score(scene, frame, seconds))
+            reconstructor.set_reference(scene.reference)  # costs more than many a method
+        for method in methods:
+            reconstructor.tier = Tier(method)
+            reconstructor.reset()
+            with threadpool_limits(1):
+                begin_s = time.perf_counter()
+                frame = reconstructor.reconstruct(scene.magnitude, scene.structure)
+                seconds = time.perf_counter() - begin_s
+            yield Outcome(method, scene, frame, score(scene, frame, seconds))

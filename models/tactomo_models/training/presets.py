@@ -97,9 +97,21 @@ def draw_scene(
 
 
 def _paper(description: SensorDescription, seed: int, number: int) -> TrainingScene:
-    """One to four ellipses that do not overlap, on an even sheet (paper, section III-C-2)."""
-    assert description.magnitude is not None
+    """One to four ellipses on an even sheet, noise-free."""
     rng = np.random.default_rng(seed_of("training", "paper", seed, number))
+    presses = paper_presses(description, rng, 1 + number % PAPER_CONTACTS)
+    return TrainingScene(presses, PAPER_CONTRAST, opposite=True, sheets=None)
+
+
+def paper_presses(
+    description: SensorDescription, rng: np.random.Generator, count: int
+) -> tuple[Press, ...]:
+    """Draw ellipses that do not overlap, as the paper trains and tests on (section III-C-2).
+
+    Raises:
+        DataError: there is no room for so many.
+    """
+    assert description.magnitude is not None
     response = description.magnitude.response
     least, most = PAPER_HALF_AXIS_M
 
@@ -113,8 +125,7 @@ def _paper(description: SensorDescription, seed: int, number: int) -> TrainingSc
             angle_rad=rng.uniform(0, np.pi),
         )
 
-    presses = _placed(description, rng, 1 + number % PAPER_CONTACTS, 0.0, one)
-    return TrainingScene(presses, PAPER_CONTRAST, opposite=True, sheets=None)
+    return _placed(description, rng, count, 0.0, one)
 
 
 def _robust(description: SensorDescription, seed: int, number: int) -> TrainingScene:
