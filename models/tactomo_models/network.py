@@ -1,0 +1,310 @@
+"""Trained networks at run time: ONNX Runtime on one thread, no PyTorch.
+
+A network's file carries what it was made for: the sensor's hash, the basis of its prefilter, its
+scale. One that does not belong to the sensor at hand is refused with the reason.
+"""
+
+from __future__ import annotations
+
+import io
+from base64 import b64decode
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+import onnxruntime as ort
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from tactomo_models.artifact import cache_folder
+from tactomo_models.description import Modality, SensorDescription
+from tactomo_models.errors import ArtifactError
+from tactomo_models.prefilter import BANDS, Prefilter, prefilter
+
+FloatArray = NDArray[np.float64]
+Image = NDArray[np.float32]
+NetworkKind = Literal["network", "cnn-single", "cnn-multimodal"]
+NETWORK_KINDS: Final[tuple[NetworkKind, ...]] = ("network", "cnn-single", "cnn-multimodal")
+
+FORMAT = 1
+NEWEST_OPSET = 21  # that the oldest ONNX Runtime we support runs
+FILTER_SIGMA = 1.0  # nodes, of the Gaussian filter at the paper's networks' output
+OUTPUTS: Final[dict[NetworkKind, tuple[str, ...]]] = {
+    "network": ("map", "structure", "confidence"),
+    "cnn-single": ("map",),
+    "cnn-multimodal": ("map",),
+}
+
+
+@dataclass(frozen=True)
+class NetworkImage:
+    """What a network makes of a frame.
+
+    Attributes:
+        map: (nodes_y, nodes_x) |relative conductivity change| of the magnitude channel.
+        structure: (nodes_y, nodes_x) 0 bare to 1 pressed; None from the paper's.
+        confidence: expected correlation of the map with the truth, 0 to 1; NaN from the paper's.
+    """
+
+    map: Image
+    structure: Image | None
+    confidence: float
+
+
+class Network:
+    """A network in a file, bound to its buffers: a run allocates nothing but what it returns.
+
+    Args:
+        path: the .onnx file.
+        description: the sensor.
+        kind: what the network is to be.
+
+    Raises:
+        ArtifactError: it is missing, damaged, of another kind, sensor or format.
+    """
+
+    def __init__(self, path: Path, description: SensorDescription, kind: NetworkKind) -> None:
+        self.path = path
+        self._session = _open(path)
+        self._meta = _checked(self._session, path, description, kind)
+        self._nodes = (description.map.nodes_y, description.map.nodes_x)
+        shapes = {"map": self._nodes, "structure": self._nodes, "confidence": ()}
+        inputs = self._input_shapes(description, kind)
+        _check_shapes(path, "input", self._session.get_inputs(), inputs)
+        outputs = {name: shapes[name] for name in OUTPUTS[kind]}
+        _check_shapes(path, "output", self._session.get_outputs(), outputs)
+        self._inputs = {name: np.zeros((1, *shape), np.float32) for name, shape in inputs.items()}
+        self._outputs = {name: np.zeros((1, *shape), np.float32) for name, shape in outputs.items()}
+        self._binding = self._session.io_binding()
+        for name, array in self._inputs.items():
+            self._binding.bind_input(name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
+        for name, array in self._outputs.items():
+            self._binding.bind_output(name, "cpu", 0, np.float32, array.shape, array.ctypes.data)
+
+    def _input_shapes(
+        self, description: SensorDescription, kind: NetworkKind
+    ) -> dict[str, tuple[int, ...]]:
+        if kind == "network":
+            components = description.measurements // 2 + BANDS
+            return {"data": (len(self.modalities) * components,)}
+        return dict.fromkeys(self.modalities, self._nodes)
+
+    @cached_property
+    def modalities(self) -> tuple[Modality, ...]:
+        """Channels that the network is given."""
+        names: tuple[Modality, ...] = ("magnitude", "structure")
+        return tuple(name for name in names if name in self._meta["modalities"].split())
+
+    def run(self, inputs: Mapping[str, Any]) -> dict[str, NDArray[np.float32]]:
+        """Run on inputs of the network's own shapes, without the first axis.
+
+        Returns:
+            Its outputs, likewise; they are overwritten by the next run.
+        """
+        for name, array in self._inputs.items():
+            array[0] = inputs[name]
+        self._session.run_with_iobinding(self._binding)
+        return {name: array[0] for name, array in self._outputs.items()}
+
+
+class FusionNetwork:
+    """Our network and its prefilters, for one sensor and the noise that a tare has seen.
+
+    Args:
+        network: of the kind "network".
+    """
+
+    def __init__(self, network: Network) -> None:
+        self._network = network
+        bases = np.load(io.BytesIO(b64decode(network._meta["bases"])), allow_pickle=False)
+        self._bases = {name: bases[name].astype(np.float64) for name in network.modalities}
+        self._filters: dict[Modality, Prefilter] = {}
+        silent = {name: np.zeros(len(basis)) for name, basis in self._bases.items()}
+        self._mute = {name: prefilter(self._bases[name], silent[name]) for name in silent}
+
+    def set_noise(self, weights: Mapping[Modality, FloatArray]) -> None:
+        """Filter for data of this noise from now on.
+
+        Args:
+            weights: (M,) inverse variance of each relative change of each channel that has a
+                reference; 0 where there is none.
+        """
+        self._filters = {
+            name: prefilter(basis, weights[name])
+            for name, basis in self._bases.items()
+            if name in weights
+        }
+
+    def image(self, changes: Mapping[Modality, FloatArray]) -> NetworkImage:
+        """Reconstruct a frame.
+
+        Args:
+            changes: (M,) relative voltage changes, in the direction of pressing, of each channel
+                that has a scan.
+        """
+        parts: list[FloatArray] = []
+        for name in self._network.modalities:
+            if name in changes and name in self._filters:
+                used = self._filters[name]
+                parts += [used.matrix @ changes[name], used.known]
+            else:
+                used = self._mute[name]
+                parts += [np.zeros(len(used.matrix)), used.known]
+        made = self._network.run({"data": np.concatenate(parts)})
+        return NetworkImage(made["map"].copy(), made["structure"].copy(), float(made["confidence"]))
+
+
+class PaperNetwork:
+    """One of the paper's networks, with its pre-processing (section III-C, Fig. 3).
+
+    Args:
+        network: of the kind "cnn-single" or "cnn-multimodal".
+    """
+
+    def __init__(self, network: Network) -> None:
+        self._network = network
+        self._input_scale = float(network._meta["input_scale"])
+        self._scale = float(network._meta["scale"])
+
+    @property
+    def modalities(self) -> tuple[Modality, ...]:
+        """Channels whose images it is given."""
+        return self._network.modalities
+
+    def image(self, images: Mapping[Modality, FloatArray | Image]) -> NetworkImage:
+        """Reconstruct a frame.
+
+        Args:
+            images: (nodes_y, nodes_x) preliminary images: Tikhonov's of the magnitude channel,
+                in the direction of pressing, and the paper's level set's of the structure channel.
+        """
+        made = self._network.run(preprocessed(images, self._input_scale))
+        filtered = gaussian_filter(made["map"], FILTER_SIGMA)
+        return NetworkImage((filtered * self._scale).astype(np.float32), None, float("nan"))
+
+
+def preprocessed(
+    images: Mapping[Modality, FloatArray | Image], input_scale: float
+) -> dict[str, FloatArray | Image]:
+    """Negative truncation; global 0-1 normalisation of magnitudes, of each instance of structure.
+
+    Args:
+        images: preliminary images (..., nodes_y, nodes_x).
+        input_scale: largest value of all magnitude images trained on.
+    """
+    ready: dict[str, FloatArray | Image] = {}
+    for name, image in images.items():
+        positive = np.maximum(image, 0.0)
+        if name == "magnitude":
+            ready[name] = positive / input_scale
+        else:
+            largest = positive.max(axis=(-2, -1), keepdims=True)
+            ready[name] = positive / np.where(largest > 0, largest, 1.0)
+    return ready
+
+
+def find_network(description: SensorDescription, kind: NetworkKind) -> Path | None:
+    """File of a sensor's network: the user's own, or the one that ships; None if there is none."""
+    own = own_path(description, kind)
+    if own.exists():
+        return own
+    shipped = Path(str(files("tactomo_models"))) / "networks" / f"{description.name}-{kind}.onnx"
+    return shipped if shipped.exists() and _belongs(shipped, description) else None
+
+
+def own_path(description: SensorDescription, kind: NetworkKind) -> Path:
+    """Where a network that a user has trained is looked for."""
+    return cache_folder() / f"{description.name}-{description.sha256[:12]}-{kind}.onnx"
+
+
+def load_network(
+    description: SensorDescription, kind: NetworkKind, path: Path | None = None
+) -> Network:
+    """Load a sensor's network.
+
+    Args:
+        description: the sensor.
+        kind: which network.
+        path: its file; the user's own or the shipped one if None.
+
+    Raises:
+        ArtifactError: there is none, or it cannot be used.
+    """
+    found = path or find_network(description, kind)
+    if found is None:
+        raise ArtifactError(
+            f"there is no {kind} for sensor {description.name!r} ({description.sha256[:12]}); "
+            "train one: tactomo models simulate, then tactomo models train"
+        )
+    return Network(found, description, kind)
+
+
+def _belongs(path: Path, description: SensorDescription) -> bool:
+    try:
+        meta = _open(path).get_modelmeta().custom_metadata_map
+    except ArtifactError:
+        return False
+    return bool(meta.get("sha256") == description.sha256)
+
+
+def _open(path: Path) -> ort.InferenceSession:
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
+    options.log_severity_level = 3
+    try:
+        model = path.read_bytes()
+        return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    except FileNotFoundError as error:
+        raise ArtifactError(f"there is no network at {path}; name another file") from error
+    except OSError as error:
+        raise ArtifactError(f"cannot read {path}: {error.strerror}") from error
+    except Exception as error:  # ONNX Runtime's own classes derive from nothing narrower
+        reason = str(error).splitlines()[0][:200]
+        raise ArtifactError(
+            f"{path} is no network that ONNX Runtime {ort.__version__} can run: {reason}; export "
+            f"it anew, with opset {NEWEST_OPSET} or older"
+        ) from error
+
+
+def _checked(
+    session: ort.InferenceSession, path: Path, description: SensorDescription, kind: NetworkKind
+) -> dict[str, str]:
+    """The file's notes on itself, which must be of this sensor and kind."""
+    meta: dict[str, str] = session.get_modelmeta().custom_metadata_map
+    again = "train one with `tactomo models train`"
+    if not {"format", "kind", "sensor", "sha256", "modalities", "scale"} <= meta.keys():
+        raise ArtifactError(f"{path} is an ONNX file, but no network of tactomo; {again}")
+    if meta["format"] != str(FORMAT):
+        raise ArtifactError(
+            f"{path} has format {meta['format']}, this version reads {FORMAT}; {again}"
+        )
+    if meta["kind"] != kind:
+        raise ArtifactError(f"{path} is a {meta['kind']}, not a {kind}; name another file")
+    if meta["sha256"] != description.sha256:
+        raise ArtifactError(
+            f"{path} was trained for sensor {meta['sensor']!r} ({meta['sha256'][:12]}), not for "
+            f"{description.name!r} ({description.sha256[:12]}); {again}"
+        )
+    return meta
+
+
+def _check_shapes(
+    path: Path, what: str, there: list[Any], expected: Mapping[str, tuple[int, ...]]
+) -> None:
+    shapes = {node.name: tuple(node.shape) for node in there}
+    wanted = {name: (1, *shape) for name, shape in expected.items()}
+    if shapes != wanted:
+        raise ArtifactError(
+            f"{path} has {what}s {shapes}, this sensor needs {wanted}; export it anew"
+        )
+    types = {node.type for node in there}
+    if types != {"tensor(float)"}:
+        raise ArtifactError(
+            f"{path} has {what}s of type {', '.join(sorted(types))}, not tensor(float); export it "
+            "anew"
+        )

@@ -1,0 +1,333 @@
+"""Training a network: by a recipe, epoch after epoch, from its checkpoint if there is one."""
+
+from __future__ import annotations
+
+import copy
+import os
+import pickle
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from tactomo_models.errors import ModelError
+from tactomo_models.training.batches import Batch, SceneBatches
+
+AVERAGED = 0.998  # of the averaged weights that each step keeps
+LEAST_CHANGE = 0.4  # squared sum of a map below which scenes count less: 25 nodes of half a range
+SHAPE_SHARE = 0.5  # of the loss that the pressed shape has, to one of the map's
+LEAST_PRESSED = 20.0  # nodes pressed, likewise
+TRUST_SHARE = 0.05
+REPORT_DB = (40.0, 20.0, 10.0)
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """What one epoch came to.
+
+    Attributes:
+        loss: mean over its batches.
+        held_out: correlation of the maps of scenes that are not trained on, by noise in dB and
+            number of contacts.
+    """
+
+    loss: float
+    held_out: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How long and how fast.
+
+    Attributes:
+        epochs: passes over the scenes.
+        batch: scenes in a step.
+        rate: highest learning rate; it rises over a twentieth of the steps and falls by a cosine.
+        seed: of the order, the noise and the turns.
+        half: compute products in bfloat16, twice as fast where the processor has it.
+    """
+
+    epochs: int
+    batch: int = 128
+    rate: float = 2e-3
+    weight_decay: float = 1e-2
+    seed: int = 0
+    half: bool = True
+    device: str = "cpu"
+
+
+class Lesson(Protocol):
+    """What is trained: makes batches, and says how wrong the network's answer is."""
+
+    @property
+    def scenes(self) -> int:
+        """How many scenes there are to train on."""
+
+    def loss(
+        self, network: nn.Module, chosen: Tensor, random: torch.Generator, device: str
+    ) -> Tensor:
+        """Loss of some scenes, by their positions among those to train on."""
+
+    def examine(self, network: nn.Module, device: str) -> dict[str, float]:
+        """Measures on scenes that are not trained on."""
+
+
+class FusionLesson:
+    """Our network's: maps and shapes from noisy, filtered voltages.
+
+    Args:
+        batches: the scenes.
+    """
+
+    def __init__(self, batches: SceneBatches) -> None:
+        self.batches = batches
+
+    @property
+    def scenes(self) -> int:
+        """How many scenes there are to train on."""
+        return len(self.batches.trained)
+
+    def loss(
+        self, network: nn.Module, chosen: Tensor, random: torch.Generator, device: str
+    ) -> Tensor:
+        """RIE squared of the map, cross entropy of the shape, and of the confidence."""
+        turn = int(torch.randint(8, (1,), generator=random))
+        batch = self.batches.draw(chosen, random, turn=turn % self.batches.turns)
+        size, shape, trust = network.raw(batch.inputs.to(device))
+        size, shape = size.float(), shape.float()
+        true, pressed = batch.map.to(device) / network.scale, batch.pressed.to(device)
+        weight = 1 / ((true**2).sum((1, 2)) + LEAST_CHANGE)
+        of_map = (((size - true) ** 2).sum((1, 2)) * weight).mean()
+        entropy = nn.functional.binary_cross_entropy_with_logits(shape, pressed, reduction="none")
+        of_shape = (entropy.sum((1, 2)) / (pressed.sum((1, 2)) + LEAST_PRESSED)).mean()
+        right = correlations(size.detach(), true).clamp(0, 1)
+        told = nn.functional.binary_cross_entropy_with_logits(
+            trust.float(), right, reduction="none"
+        )
+        of_trust = (told * (true.amax((1, 2)) > 0)).mean()
+        return torch.as_tensor(of_map + SHAPE_SHARE * of_shape + TRUST_SHARE * of_trust)
+
+    def examine(self, network: nn.Module, device: str) -> dict[str, float]:
+        """Correlation with the truth, by noise and number of contacts."""
+        found: dict[str, float] = {}
+        for snr_db in REPORT_DB:
+            random = torch.Generator().manual_seed(1)
+            icc, contacts = [], []
+            for chosen in torch.tensor(self.batches.held_out).split(256):
+                batch = self.batches.draw(chosen, random, snr_db=snr_db)
+                size, _, _ = network(batch.inputs.to(device))
+                icc.append(correlations(size.cpu().float(), batch.map))
+                contacts.append(torch.where(batch.map.amax((1, 2)) > 0, batch.contacts, 0))
+            found |= by_contacts(f"{snr_db:g} dB", torch.cat(icc), torch.cat(contacts))
+        return found
+
+
+def correlations(images: Tensor, truths: Tensor) -> Tensor:
+    """Pearson correlation (n,) of images (n, rows, columns) with the true ones."""
+    a, b = (x.flatten(1) - x.flatten(1).mean(1, keepdim=True) for x in (images, truths))
+    return torch.as_tensor((a * b).sum(1) / (a.norm(dim=1) * b.norm(dim=1) + 1e-9))
+
+
+def by_contacts(what: str, icc: Tensor, contacts: Tensor, most: int = 4) -> dict[str, float]:
+    """Mean of the correlations of scenes with one, two... contacts."""
+    return {
+        f"{what}, {count}": float(icc[contacts == count].mean()) for count in range(1, most + 1)
+    }
+
+
+@dataclass
+class Training:
+    """A network in training, as its checkpoint keeps it.
+
+    Attributes:
+        network: as trained.
+        averaged: its weights averaged over the last steps: what is exported.
+        optimiser, random: their states go on, too.
+        history: one for each epoch that is done.
+    """
+
+    network: nn.Module
+    averaged: nn.Module
+    optimiser: torch.optim.Optimizer
+    random: torch.Generator
+    history: list[Epoch] = field(default_factory=list)
+
+
+def begin(network: nn.Module, settings: Settings) -> Training:
+    """A training before its first step."""
+    network = network.to(settings.device)
+    network = network.to(memory_format=torch.channels_last)
+    optimiser = torch.optim.AdamW(
+        network.parameters(), lr=settings.rate, weight_decay=settings.weight_decay
+    )
+    random = torch.Generator().manual_seed(settings.seed)
+    return Training(network, copy.deepcopy(network), optimiser, random)
+
+
+def train(
+    training: Training,
+    lesson: Lesson,
+    settings: Settings,
+    checkpoint: Path | None = None,
+    tell: Callable[[int, int, float], None] = lambda step, steps, loss: None,
+) -> Iterator[Epoch]:
+    """Train until all epochs are done, with a checkpoint after each.
+
+    Args:
+        training: from `begin` or `load_checkpoint`.
+        lesson: what is trained.
+        settings: how long and how fast.
+        checkpoint: file of the checkpoints; none if None.
+        tell: called after each step with its number, how many the epoch has, and the loss.
+
+    Yields:
+        Each epoch's outcome.
+
+    Raises:
+        ModelError: a checkpoint cannot be written, or the loss is no number.
+    """
+    steps = max(1, lesson.scenes // settings.batch)
+    for epoch in range(len(training.history), settings.epochs):
+        order = torch.randperm(lesson.scenes, generator=training.random)
+        training.network.train()
+        total = 0.0
+        for step, chosen in enumerate(order[: steps * settings.batch].split(settings.batch)):
+            done = (epoch * steps + step) / (settings.epochs * steps)
+            loss = _step(training, lesson, chosen, settings, _rate(settings.rate, done))
+            total += loss
+            tell(step + 1, steps, loss)
+        if not np.isfinite(total):
+            raise ModelError(
+                f"the loss is no number any more in epoch {epoch + 1}: train with a lower rate"
+            )
+        training.averaged.eval()
+        with torch.inference_mode():
+            outcome = Epoch(total / steps, lesson.examine(training.averaged, settings.device))
+        training.history.append(outcome)
+        if checkpoint is not None:
+            save_checkpoint(training, settings, checkpoint)
+        yield outcome
+
+
+def _step(
+    training: Training, lesson: Lesson, chosen: Tensor, settings: Settings, rate: float
+) -> float:
+    for group in training.optimiser.param_groups:
+        group["lr"] = rate
+    training.optimiser.zero_grad(set_to_none=True)
+    with torch.autocast(settings.device, dtype=torch.bfloat16, enabled=settings.half):
+        loss = lesson.loss(training.network, chosen, training.random, settings.device)
+    loss.backward()
+    nn.utils.clip_grad_norm_(training.network.parameters(), 1.0)
+    training.optimiser.step()
+    # The average starts with what there is, not with the untrained weights.
+    done = training.optimiser.state[training.optimiser.param_groups[0]["params"][0]]["step"]
+    kept = min(AVERAGED, float(done) / (float(done) + 10))
+    new = training.network.state_dict()
+    for name, value in training.averaged.state_dict().items():
+        if value.dtype.is_floating_point:
+            value.lerp_(new[name], 1 - kept)
+        else:
+            value.copy_(new[name])
+    return float(loss.detach())
+
+
+def _rate(highest: float, done: float) -> float:
+    """Learning rate after a share of all steps."""
+    rise = 0.05
+    if done < rise:
+        return highest * (done / rise + 0.02)
+    return highest * (0.01 + 0.99 * 0.5 * (1 + float(np.cos(np.pi * (done - rise) / (1 - rise)))))
+
+
+def save_checkpoint(training: Training, settings: Settings, path: Path) -> None:
+    """Keep a training; a half-written file never takes the place of a whole one.
+
+    Raises:
+        ModelError: the file cannot be written.
+    """
+    state = {
+        "settings": asdict(settings),
+        "network": training.network.state_dict(),
+        "averaged": training.averaged.state_dict(),
+        "optimiser": training.optimiser.state_dict(),
+        "random": training.random.get_state(),
+        "history": [asdict(epoch) for epoch in training.history],
+    }
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        torch.save(state, part)
+        part.replace(path)
+    except (OSError, RuntimeError) as error:  # torch reports a full disk as a RuntimeError
+        part.unlink(missing_ok=True)
+        raise ModelError(
+            f"cannot write {path}: {error}; free some space or name another file, then go on "
+            "from the last checkpoint"
+        ) from error
+
+
+def load_checkpoint(training: Training, settings: Settings, path: Path) -> None:
+    """Go on from a checkpoint.
+
+    Raises:
+        ModelError: it is damaged, or of other settings or another network.
+    """
+    try:
+        state: dict[str, Any] = torch.load(path, weights_only=True)
+        before = Settings(**state["settings"])
+        history = [Epoch(**epoch) for epoch in state["history"]]
+        states = [state[name] for name in ("network", "averaged", "optimiser", "random")]
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError, KeyError, TypeError) as error:
+        raise ModelError(
+            f"{path} is no checkpoint, or a damaged one ({_first_line(error)}): delete it to begin "
+            "anew"
+        ) from error
+    for name, old, new in (
+        (name, getattr(before, name), getattr(settings, name))
+        for name in ("epochs", "batch", "rate", "weight_decay", "seed")
+    ):
+        if old != new:
+            raise ModelError(
+                f"{path} was begun with {name} {old}, not {new}: name another file, or go on as "
+                "it was begun"
+            )
+    try:
+        training.network.load_state_dict(states[0])
+        training.averaged.load_state_dict(states[1])
+        training.optimiser.load_state_dict(states[2])
+    except (RuntimeError, ValueError) as error:
+        raise ModelError(
+            f"{path} is of another network ({_first_line(error)}): name another file"
+        ) from error
+    training.random.set_state(states[3])
+    training.history = history
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+
+
+def linear_images(batches: SceneBatches, scale: float, scenes: int = 8000) -> np.ndarray[Any, Any]:
+    """Best linear estimates of map and pressed shape from filtered data, by ridge regression.
+
+    Returns:
+        (2, rows, columns, K), for `FusionNetwork.start_linear`.
+    """
+    random = torch.Generator().manual_seed(2)
+    some = torch.tensor(batches.trained)[:: max(1, len(batches.trained) // scenes)]
+    drawn = [batches.draw(chosen, random) for chosen in some.split(512)]
+    inputs = torch.cat([batch.inputs for batch in drawn]).double()
+    goals = torch.cat([_goals(batch, scale) for batch in drawn]).double()
+    ridge = 1e-3 * len(inputs) * torch.eye(inputs.shape[1], dtype=torch.float64)
+    weights = torch.linalg.solve(inputs.T @ inputs + ridge, inputs.T @ goals)
+    rows, columns = batches.nodes
+    return np.asarray(weights.T.reshape(2, rows, columns, -1))
+
+
+def _goals(batch: Batch, scale: float) -> Tensor:
+    return torch.cat([batch.map.flatten(1) / scale, batch.pressed.flatten(1)], dim=1)
