@@ -19,6 +19,7 @@ from tactomo_models.forward import ForwardModel
 from tactomo_models.shape_fit import Shape
 
 FloatArray = NDArray[np.float64]
+Image = NDArray[np.float32]
 
 SMALLEST_AREA_M2 = 20e-6  # below this, a spot is a trace of the fit, not a contact
 FARTHEST_STEP_M = 0.025  # a contact that moved more than this between frames is a new one
@@ -96,7 +97,11 @@ class AreaFinder:
         row = np.abs(y[:, None] - description.map_y_m).argmin(axis=1)
         self._nearest = (row, column)  # map node next to each pressable node
 
-    def find(self, pressed: FloatArray, pressed_nodes: FloatArray) -> Areas:
+    def on_nodes(self, image: FloatArray | Image) -> FloatArray:
+        """What an image (nodes_y, nodes_x) shows at the pressable nodes, (P,)."""
+        return np.asarray(image[self._nearest], np.float64)
+
+    def find(self, pressed: FloatArray | Image, pressed_nodes: FloatArray) -> Areas:
         """Find connected areas above one half; what lies around each goes to the nearest.
 
         Args:

@@ -112,7 +112,7 @@ class Network:
 
 
 class FusionNetwork:
-    """Our network and its prefilters, for one sensor and the noise that a tare has seen.
+    """Our network and its prefilters, for one sensor.
 
     Args:
         network: of the kind "network".
@@ -122,40 +122,38 @@ class FusionNetwork:
         self._network = network
         bases = np.load(io.BytesIO(b64decode(network._meta["bases"])), allow_pickle=False)
         self._bases = {name: bases[name].astype(np.float64) for name in network.modalities}
-        self._filters: dict[Modality, Prefilter] = {}
-        silent = {name: np.zeros(len(basis)) for name, basis in self._bases.items()}
-        self._mute = {name: prefilter(self._bases[name], silent[name]) for name in silent}
-
-    def set_noise(self, weights: Mapping[Modality, FloatArray]) -> None:
-        """Filter for data of this noise from now on.
-
-        Args:
-            weights: (M,) inverse variance of each relative change of each channel that has a
-                reference; 0 where there is none.
-        """
-        self._filters = {
-            name: prefilter(basis, weights[name])
-            for name, basis in self._bases.items()
-            if name in weights
+        self._filters: dict[Modality, tuple[bytes, Prefilter]] = {}
+        self._mute = {
+            name: prefilter(basis, np.zeros(len(basis))) for name, basis in self._bases.items()
         }
 
-    def image(self, changes: Mapping[Modality, FloatArray]) -> NetworkImage:
+    def image(
+        self, changes: Mapping[Modality, FloatArray], certainty: Mapping[Modality, FloatArray]
+    ) -> NetworkImage:
         """Reconstruct a frame.
 
         Args:
             changes: (M,) relative voltage changes, in the direction of pressing, of each channel
                 that has a scan.
+            certainty: (M,) inverse variance of each by noise; 0 where there is no voltage.
         """
         parts: list[FloatArray] = []
         for name in self._network.modalities:
-            if name in changes and name in self._filters:
-                used = self._filters[name]
+            if name in changes:
+                used = self._filter(name, certainty[name])
                 parts += [used.matrix @ changes[name], used.known]
             else:
                 used = self._mute[name]
                 parts += [np.zeros(len(used.matrix)), used.known]
         made = self._network.run({"data": np.concatenate(parts)})
         return NetworkImage(made["map"].copy(), made["structure"].copy(), float(made["confidence"]))
+
+    def _filter(self, name: Modality, certainty: FloatArray) -> Prefilter:
+        """Made anew when the noise changes: at a tare, or when a lead breaks."""
+        key = certainty.tobytes()
+        if name not in self._filters or self._filters[name][0] != key:
+            self._filters[name] = (key, prefilter(self._bases[name], certainty))
+        return self._filters[name][1]
 
 
 class PaperNetwork:

@@ -70,6 +70,7 @@ class Flag(IntFlag):
     NOISE_HIGH = 256  # reciprocity broken throughout: interference, or a device that is broken
     CHANNELS_SWAPPED = 512  # the magnitude channel answers more than the structure channel
     SATURATED = 1024  # the converter clipped; what it clipped is left out
+    LOW_CONFIDENCE = 2048  # the network expects its own map to be wrong
 
     def names(self) -> list[str]:
         """Names of the flags that are set, in lower case, as the stream carries them."""

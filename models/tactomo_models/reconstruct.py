@@ -46,6 +46,13 @@ from tactomo_models.description import Modality, SensorDescription
 from tactomo_models.errors import DataError
 from tactomo_models.following import Freedom, ShapeFollower
 from tactomo_models.forward import ForwardModel
+from tactomo_models.network import (
+    FusionNetwork,
+    NetworkImage,
+    NetworkKind,
+    PaperNetwork,
+    load_network,
+)
 from tactomo_models.objects import ObjectFollower
 from tactomo_models.outlines import Outlines
 from tactomo_models.paper_level_set import PaperLevelSet
@@ -81,6 +88,7 @@ MUCH_MORE = 5.0  # ratio of the channels' contrasts (logarithms) for that
 HOLLOW_MISFIT = 1.1  # of the magnitude channel: enough to ask whether a contact is a ring
 LINEAR_PART = 0.5  # of the misfit of nothing, that areas cut out of a linear image may leave
 MOST_HELD = 10  # frames without a structure scan that the last shape stands in for: half a second
+LOW_CONFIDENCE = 0.7  # expected correlation below which a map is better not trusted
 WRONG_WAY = 5.0  # standard uncertainties by which a conductivity may change against its sign
 
 
@@ -94,10 +102,15 @@ class Tier(StrEnum):
     PLS_PAPER = "pls-paper"  # the paper's level set, linear in the bare sheet's Jacobian, cold
     FIT = auto()  # a few outlines on the structure channel, magnitudes fitted to their areas
     LEVELSET = auto()  # a level set there instead: shapes of any form
+    NETWORK = auto()  # our fusion network alone
+    HYBRID = auto()  # the network proposes, outlines are refined and judged by the physics
+    CNN_SINGLE = "cnn-single"  # the paper's network, of the magnitude channel's Tikhonov image
+    CNN_MULTIMODAL = "cnn-multimodal"  # ... and of the structure channel's pls-paper image
 
 
 METHODS: Final = tuple(tier for tier in Tier if tier is not Tier.QUIET)  # that may be asked for
 LINEAR: Final = (Tier.TIKHONOV, Tier.NOSER)
+PAPER_NETWORKS: Final = (Tier.CNN_SINGLE, Tier.CNN_MULTIMODAL)
 FREEDOM: Final = {Tier.FIT: Freedom.OUTLINES, Tier.LEVELSET: Freedom.LEVEL_SET}  # else as needed
 
 
@@ -118,6 +131,8 @@ class Reconstruction:
         misfit: root mean square of the noise-weighted residual; about 1 where all is explained.
         flags: what stands in the way of trusting it.
         stage_s: seconds spent in each stage.
+        confidence: expected correlation of the map with the truth, 0 to 1, as a network judges
+            it; NaN where none did.
     """
 
     map: Image | None
@@ -129,6 +144,7 @@ class Reconstruction:
     misfit: float
     flags: Flag = field(default_factory=lambda: Flag(0))
     stage_s: dict[str, float] = field(default_factory=dict)
+    confidence: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -182,6 +198,7 @@ class _Data:
     between: FloatArray
     quiet: bool
     signal: float  # rms of the changes over their noise
+    certainty: FloatArray  # (M,) inverse variances of the changes by noise; 0 where invalid
 
     @property
     def misfit(self) -> float:
@@ -413,7 +430,8 @@ class Reconstructor:
             flags |= Flag.REFERENCE_MISMATCH
         # What is far below the model's error is not worth a solve either.
         between = noise + STILL_SHARE * error
-        data[name] = _Data(change, weight, spread, between, quiet, (statistic / count) ** 0.5)
+        signal = (statistic / count) ** 0.5
+        data[name] = _Data(change, weight, spread, between, quiet, signal, valid / variance)
         return flags
 
     def _by_tier(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
@@ -427,6 +445,10 @@ class Reconstructor:
             return self._quiet(data, flags)
         if self.tier in LINEAR:
             return self._linear(data, flags, self.tier, "as requested")
+        if self.tier is Tier.NETWORK:
+            return self._by_network(data, flags, "as requested")
+        if self.tier in PAPER_NETWORKS:
+            return self._by_paper_network(data, flags)
         if "structure" not in data and (held := self._held(data, flags)):
             return held
         if "structure" not in data:
@@ -517,6 +539,103 @@ class Reconstructor:
         shape = (self.description.map.nodes_y, self.description.map.nodes_x)
         return np.asarray(self._artifact.bare.map_weights @ nodes).reshape(shape)
 
+    def _by_network(self, data: dict[Modality, _Data], flags: Flag, reason: str) -> Reconstruction:
+        """Our network's images; its shapes' areas carry what its map shows in them."""
+        self._forget_shape()
+        with self._timed("network"):
+            image = self._network_image(data)
+        return self._imaged(image, data, flags, Tier.NETWORK, reason)
+
+    def _network_image(self, data: dict[Modality, _Data]) -> NetworkImage:
+        return self._fusion.image(
+            {name: self._sign(name) * d.change for name, d in data.items()},
+            {name: d.certainty for name, d in data.items()},
+        )
+
+    @cached_property
+    def _fusion(self) -> FusionNetwork:
+        """Loaded when it is first asked for."""
+        return FusionNetwork(load_network(self.description, "network"))
+
+    def _by_paper_network(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
+        """The paper's network; areas are where its map exceeds half of its peak."""
+        self._forget_shape()
+        with self._timed("images"):
+            images = self._preliminary_images(data, self._paper_network.modalities)
+        with self._timed("network"):
+            image = self._paper_network.image(images)
+        return self._imaged(image, data, flags, self.tier, "as requested")
+
+    @cached_property
+    def _paper_network(self) -> PaperNetwork:
+        kind: NetworkKind = "cnn-single" if self.tier is Tier.CNN_SINGLE else "cnn-multimodal"
+        return PaperNetwork(load_network(self.description, kind))
+
+    def _preliminary_images(
+        self, data: dict[Modality, _Data], modalities: Collection[Modality]
+    ) -> dict[Modality, FloatArray]:
+        """What the paper's networks are given: see `network.preprocessed`; 0 without a scan."""
+        blank = np.zeros((self.description.map.nodes_y, self.description.map.nodes_x))
+        images = dict.fromkeys(modalities, blank)
+        if "magnitude" in data and "magnitude" in modalities:
+            # The artifact's matrix, whose regularisation is fixed, as the paper's is: what a
+            # network was trained on must not depend on the noise.
+            signed = self._sign("magnitude") * data["magnitude"].change
+            images["magnitude"] = self._on_map(self._artifact.tikhonov @ signed)
+        if "structure" in data and "structure" in modalities:
+            images["structure"] = self._on_map(self._paper_shape(data["structure"]).coverage)
+        return images
+
+    def preliminary_images(
+        self, magnitude: FloatArray, structure: FloatArray
+    ) -> dict[Modality, FloatArray]:
+        """Images (nodes_y, nodes_x) that the paper's networks are given for a frame.
+
+        Args:
+            magnitude: (M,) volts.
+            structure: (M,) volts.
+        """
+        data: dict[Modality, _Data] = {}
+        self._take("magnitude", magnitude, data, saturated=False)
+        self._take("structure", structure, data, saturated=False)
+        return self._preliminary_images(data, self.description.modalities)
+
+    def _imaged(
+        self,
+        image: NetworkImage,
+        data: dict[Modality, _Data],
+        flags: Flag,
+        tier: Tier,
+        reason: str,
+    ) -> Reconstruction:
+        """A frame whose images a network made."""
+        with self._timed("contacts"):
+            pressed = image.structure
+            if pressed is None:  # the paper's show magnitudes alone
+                pressed = image.map / max(float(image.map.max()), 1e-12)
+            areas = self._areas.find(pressed, self._areas.on_nodes(pressed))
+            peak = np.maximum(areas.on_map.sum(axis=(1, 2)), 1e-12)
+            size = (image.map * (areas.on_map > 0)).sum(axis=(1, 2)) / peak
+            contacts = self._contacts_of(areas, size, np.full(len(areas), np.nan))
+        if "magnitude" not in data:
+            contacts = tuple(
+                replace(c, magnitude=float("nan"), pressure_kpa=float("nan")) for c in contacts
+            )
+        if image.confidence < LOW_CONFIDENCE:
+            flags |= Flag.LOW_CONFIDENCE
+        pressure = np.array([c.pressure_kpa for c in contacts])
+        return Reconstruction(
+            map=image.map if "magnitude" in data else None,
+            pressure_kpa=_fused(areas, pressure, image.map.shape) if "magnitude" in data else None,
+            structure=image.structure if "structure" in data else None,
+            contacts=contacts,
+            tier=tier,
+            reason=reason,
+            misfit=float("nan"),
+            flags=flags,
+            confidence=image.confidence,
+        )
+
     def _by_shape(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
         """Shapes on the structure channel, and a magnitude for each of their areas."""
         self._frames_held = 0
@@ -578,12 +697,15 @@ class Reconstructor:
         between = structure.between
         if self.tier is Tier.PLS_PAPER:
             self._forget_shape()  # it starts cold, always
-            image = np.maximum(self._linear_image("structure", change, Tier.TIKHONOV), 0.0)
-            return self._paper.fit(change, weight, image), "as requested"
+            return self._paper_shape(structure), "as requested"
         if isinstance(self._follower, ObjectFollower):
             return self._follower.follow(change, weight, budget_s)
         freedom = FREEDOM.get(self.tier, Freedom.AS_NEEDED)
         return self._follower.follow(change, weight, spread, between, budget_s, freedom)
+
+    def _paper_shape(self, structure: _Data) -> Shape:
+        image = np.maximum(self._linear_image("structure", structure.change, Tier.TIKHONOV), 0.0)
+        return self._paper.fit(structure.change, structure.weight, image)
 
     def _tier_of(self, shape: Shape) -> Tier:
         if self.tier is Tier.PLS_PAPER:
@@ -669,11 +791,16 @@ class Reconstructor:
         return self._magnitudes
 
     def _contacts(self, areas: Areas, fitted: Magnitudes | None) -> tuple[Contact, ...]:
-        ids = self._tracker.update(areas.centres_m)
         unknown = np.full(len(areas), np.nan)
         size, sigma = unknown, unknown
         if fitted is not None:
             size, sigma = np.maximum(self._sign("magnitude") * fitted.change, 0.0), fitted.sigma
+        return self._contacts_of(areas, size, sigma)
+
+    def _contacts_of(
+        self, areas: Areas, size: FloatArray, sigma: FloatArray
+    ) -> tuple[Contact, ...]:
+        ids = self._tracker.update(areas.centres_m)
         pressure = pressure_of(self.description, size, sigma)
         return tuple(
             Contact(

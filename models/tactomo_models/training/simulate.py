@@ -406,3 +406,13 @@ def read_scenes(folder: Path) -> dict[str, Any]:
                 f"{path} is damaged ({error}): delete it and simulate again"
             ) from error
     return {key: np.concatenate([shard[key] for shard in shards]) for key in shards[0]}
+
+
+def shard_paths(folder: Path) -> list[Path]:
+    """The files of a folder's scenes, in the order of their numbers.
+
+    Raises:
+        ModelError: the folder holds no scenes.
+    """
+    scenes = read_manifest(folder).scenes
+    return [_shard_path(folder, first) for first in range(0, scenes, SHARD)]

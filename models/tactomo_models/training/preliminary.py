@@ -1,0 +1,102 @@
+"""The images that the paper's networks are given, made once for a folder of scenes.
+
+Tikhonov's image of the magnitude channel and the paper's level set of the structure channel, of
+noise-free data, as the paper trains on (section III-C-2). They are kept beside the scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tactomo_models.archive import read_arrays, write_arrays
+from tactomo_models.description import Modality, SensorDescription
+from tactomo_models.errors import ModelError
+from tactomo_models.evaluation.simulation import with_opposite_magnitude
+from tactomo_models.reconstruct import Reconstructor, Tier
+from tactomo_models.reference import Reference
+from tactomo_models.training.simulate import read_manifest, shard_paths
+
+
+def make_images(description: SensorDescription, folder: Path, *, jobs: int = -1) -> Iterator[int]:
+    """Make what is missing of a folder's images.
+
+    Args:
+        description: the sensor.
+        folder: of simulated scenes.
+        jobs: processes; -1 for one on every core.
+
+    Yields:
+        How many scenes more have theirs: those of earlier runs first.
+
+    Raises:
+        ModelError: a file is missing, damaged, or cannot be written.
+    """
+    from joblib import Parallel, delayed
+
+    shards = shard_paths(folder)
+    missing = [path for path in shards if not _images_path(path).exists()]
+    scenes = read_manifest(folder).scenes
+    yield round(scenes * (1 - len(missing) / len(shards)))
+    as_json = description.model_dump_json(by_alias=True)
+    work = (delayed(_image_shard)(as_json, str(path)) for path in missing)
+    yield from Parallel(n_jobs=jobs, return_as="generator_unordered")(work)
+
+
+def read_images(folder: Path) -> dict[str, Any]:
+    """`magnitude` and `structure`, (scenes, nodes_y, nodes_x) each.
+
+    Raises:
+        ModelError: some are missing or damaged.
+    """
+    shards = [read_arrays(_images_path(path)) for path in shard_paths(folder)]
+    return {key: np.concatenate([shard[key] for shard in shards]) for key in shards[0]}
+
+
+def _images_path(shard: Path) -> Path:
+    return shard.with_name(shard.name.replace("scenes", "images"))
+
+
+def _image_shard(description: str, path: str) -> int:
+    """Make the images of one shard; says of how many scenes."""
+    scenes = read_arrays(Path(path))
+    reconstructors = _reconstructors(description)
+    made: dict[Modality, list[Any]] = {"magnitude": [], "structure": []}
+    last: dict[bool, bytes] = {}  # what each measures changes against: the paper's sheet is one
+    for number in range(len(scenes["contacts"])):
+        rest = {name: scenes[f"{name}_rest"][number].astype(np.float64) for name in made}
+        volts = {
+            name: rest[name] + np.abs(rest[name]) * scenes[f"{name}_change"][number]
+            for name in made
+        }
+        opposite = bool(scenes["opposite"][number])
+        reconstructor, at_rest = reconstructors[opposite], rest["magnitude"].tobytes()
+        if last.get(opposite) != at_rest:
+            reconstructor.set_reference(Reference(rest["magnitude"], rest["structure"]))
+            last[opposite] = at_rest
+        images = reconstructor.preliminary_images(volts["magnitude"], volts["structure"])
+        for name, image in images.items():
+            made[name].append(image.astype(np.float16))
+    target = _images_path(Path(path))
+    try:
+        write_arrays(target, {name: np.stack(images) for name, images in made.items()})
+    except OSError as error:
+        raise ModelError(
+            f"cannot write {target}: {error.strerror}; free some space, then run the same command "
+            "again: it goes on where it stopped"
+        ) from error
+    return len(made["magnitude"])
+
+
+@lru_cache(maxsize=2)
+def _reconstructors(description: str) -> dict[bool, Reconstructor]:
+    """One for each sign of the magnitude channel, in each process."""
+    sensor = SensorDescription.model_validate_json(description)
+    return {
+        False: Reconstructor(sensor, tier=Tier.CNN_MULTIMODAL),
+        True: Reconstructor(with_opposite_magnitude(sensor), tier=Tier.CNN_MULTIMODAL),
+    }
