@@ -186,7 +186,7 @@ class PaperNetwork:
 
 
 def preprocessed(
-    images: Mapping[Modality, FloatArray | Image], input_scale: float
+    images: Mapping[Any, FloatArray | Image], input_scale: float
 ) -> dict[str, FloatArray | Image]:
     """Negative truncation; global 0-1 normalisation of magnitudes, of each instance of structure.
 

@@ -91,7 +91,7 @@ def notes_of(
     description: SensorDescription,
     modalities: tuple[Modality, ...],
     scale: float,
-    bases: Mapping[str, NDArray[np.float64]] | None = None,
+    bases: Mapping[Modality, NDArray[np.float64]] | None = None,
     **further: str,
 ) -> dict[str, str]:
     """What a network's file says of itself.
