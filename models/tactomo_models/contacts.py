@@ -97,6 +97,11 @@ class AreaFinder:
         row = np.abs(y[:, None] - description.map_y_m).argmin(axis=1)
         self._nearest = (row, column)  # map node next to each pressable node
 
+    @property
+    def map_places(self) -> tuple[FloatArray, FloatArray]:
+        """X and y (nodes_y, nodes_x) of the map's nodes, metres."""
+        return self._x, self._y
+
     def on_nodes(self, image: FloatArray | Image) -> FloatArray:
         """What an image (nodes_y, nodes_x) shows at the pressable nodes, (P,)."""
         return np.asarray(image[self._nearest], np.float64)

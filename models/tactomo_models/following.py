@@ -56,6 +56,9 @@ NOISE = 3.0  # what a parameter gains by following a new frame's noise, at most
 NEAR_M = 0.012  # what is missing this near an outline is more likely a part of its form
 SMALLEST_M = 0.003  # radius below which it is an error of the model, not a contact
 SMALL_M = 0.006  # contacts of a smaller radius are asked whether they are needed
+PROPOSED_ORDER = 2  # ellipses
+
+Propose = Callable[[], FloatArray]  # (K, MOST_PARAMETERS), see `outlines.ellipses_of`
 
 
 class Freedom(Enum):
@@ -95,6 +98,7 @@ class ShapeFollower:
         self._budget = Budget(0.0)
         self._outlines = outlines_on(forward)
         self._level_set = LevelSet(forward)
+        self._propose: Propose | None = None
         self._search = ContactSearch(forward, ratio)
         self.forget()
 
@@ -121,6 +125,7 @@ class ShapeFollower:
         noise: FloatArray,
         budget_s: float,
         freedom: Freedom = Freedom.AS_NEEDED,
+        propose: Propose | None = None,
     ) -> tuple[Shape, str]:
         """Find the shape that explains a frame.
 
@@ -131,11 +136,13 @@ class ShapeFollower:
             noise: (M,) variances of what differs between two frames of a still scene, of each.
             budget_s: compute time, by a model of the work.
             freedom: how the shape may be described.
+            propose: asked for contacts to start from where there is no shape to go on with; they
+                are judged by the data as any other.
 
         Returns:
             The shape, and in words what it came from.
         """
-        self._data, self._noise = (change, weight), noise
+        self._data, self._noise, self._propose = (change, weight), noise, propose
         # Errors that go together look like something that is there: gains count for less.
         self._doubt = float(np.sqrt(np.mean(spread)))
         if freedom != self._freedom:
@@ -167,7 +174,9 @@ class ShapeFollower:
             self._understudy = copy(self)
             self._understudy.forget()
         left_s = self._budget.left_s
-        other, _ = self._understudy.follow(*self._data, spread, noise, left_s, self._freedom)
+        other, _ = self._understudy.follow(
+            *self._data, spread, noise, left_s, self._freedom, self._propose
+        )
         self._budget.left_s = self._understudy._budget.left_s
         if not other.converged:
             return shape, how
@@ -184,7 +193,7 @@ class ShapeFollower:
         """The last frame's shape where it still holds; else the best of what may be left of it."""
         before = self._shape
         if before is None:
-            return self._nothing(), "cold start"
+            return self._from_scratch()
         shape = self.fit.compare(before, *self._data)
         still = self._is_still()
         if before.converged and still:
@@ -196,19 +205,29 @@ class ShapeFollower:
             self._start_over()
             if suspect:
                 self._tried_misfit = 0.0
-            nothing = self._nothing()
-            best = min([shape, *self._each_left_out(shape), nothing], key=lambda s: s.cost)
+            scratch, how = self._from_scratch()
+            best = min([shape, *self._each_left_out(shape), scratch], key=lambda s: s.cost)
             # What was only moved explains most at once; what was found elsewhere may mislead.
-            self._from_nothing = best is nothing or best.cost < MOST_LEFT * nothing.cost
+            nothing_cost = self._nothing().cost
+            self._from_nothing = best is scratch or best.cost < MOST_LEFT * nothing_cost
             if best is not shape:  # else they moved: once they have been followed, all is as it was
                 self._tried_misfit = 0.0
-            return best, "cold start" if best is nothing else "warm start"
+            return best, how if best is scratch else "warm start"
         if before.converged:  # all was done, but for other data
             self._moved = self._settled = False
         if self._rival is not None:
             rival = self.fit.compare(self._rival.shape, *self._data)
             self._rival = replace(self._rival, shape=replace(rival, converged=False))
         return shape, "warm start"
+
+    def _from_scratch(self) -> tuple[Shape, str]:
+        """What is proposed, where that explains something; else nothing at all."""
+        nothing = self._nothing()
+        if self._propose is not None and len(each := self._propose()[:MOST_CONTACTS]):
+            proposed = self._evaluate(each, PROPOSED_ORDER, self.fit.likely)
+            if proposed is not None and proposed.cost < nothing.cost:
+                return proposed, "proposed"
+        return nothing, "cold start"
 
     def _is_still(self) -> bool:
         """Tell whether this frame differs by noise alone from the one that the shape is of."""

@@ -228,3 +228,28 @@ def outlines_on(forward: ForwardModel) -> Outlines:
     description = forward.description
     spacing = description.width_m / (description.map.nodes_x - 1)
     return Outlines(x, y, spacing, OFFSET * spacing)
+
+
+def ellipses_of(images: FloatArray, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
+    """Parameters (K, MOST_PARAMETERS) of ellipses of the same centre, area and second moments.
+
+    Args:
+        images: (K, rows, columns) share pressed by each contact, nowhere all 0.
+        x_m: (rows, columns) places, evenly spaced.
+        y_m: (rows, columns) places.
+    """
+    cell_m2 = float((x_m[0, 1] - x_m[0, 0]) * (y_m[1, 0] - y_m[0, 0]))
+    each = np.zeros((len(images), MOST_PARAMETERS))
+    for contact, image in zip(each, images, strict=True):
+        share = image / image.sum()
+        x, y = float((share * x_m).sum()), float((share * y_m).sum())
+        dx, dy = x_m - x, y_m - y
+        # A cell is no point: it has moments of its own.
+        xx, yy = ((share * d**2).sum() + cell_m2 / 12 for d in (dx, dy))
+        xy = (share * dx * dy).sum()
+        apart = np.hypot(xx - yy, 2 * xy) / 2
+        long, short = (xx + yy) / 2 + apart, max((xx + yy) / 2 - apart, cell_m2 / 12)
+        elongation, angle = np.log(long / short) / 4, np.arctan2(2 * xy, xx - yy)
+        contact[[X, Y, SIZE]] = (x / UNIT_M, y / UNIT_M, np.log(image.sum() * cell_m2 / np.pi) / 2)
+        contact[[E1, E2]] = elongation * np.cos(angle), elongation * np.sin(angle)
+    return each

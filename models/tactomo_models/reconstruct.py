@@ -51,10 +51,11 @@ from tactomo_models.network import (
     NetworkImage,
     NetworkKind,
     PaperNetwork,
+    find_network,
     load_network,
 )
 from tactomo_models.objects import ObjectFollower
-from tactomo_models.outlines import Outlines
+from tactomo_models.outlines import Outlines, ellipses_of
 from tactomo_models.paper_level_set import PaperLevelSet
 from tactomo_models.plausibility import (
     Flag,
@@ -641,7 +642,7 @@ class Reconstructor:
         self._frames_held = 0
         with self._timed("shape"):
             structure, budget_s = data["structure"], self.budget_s or DEFAULT_BUDGET_S
-            shape, how = self._shape_of(structure, budget_s)
+            shape, how = self._shape_of(data, budget_s)
         with self._timed("contacts"):
             areas, pressed = self._areas_of(shape, structure)
             fitted = self._fit_magnitudes(areas, data, 3 if shape.converged else 1)
@@ -691,8 +692,9 @@ class Reconstructor:
             flags=flags,
         )
 
-    def _shape_of(self, structure: _Data, budget_s: float) -> tuple[Shape, str]:
+    def _shape_of(self, data: dict[Modality, _Data], budget_s: float) -> tuple[Shape, str]:
         assert self._follower is not None
+        structure = data["structure"]
         change, weight, spread = structure.change, structure.weight, structure.spread
         between = structure.between
         if self.tier is Tier.PLS_PAPER:
@@ -701,7 +703,25 @@ class Reconstructor:
         if isinstance(self._follower, ObjectFollower):
             return self._follower.follow(change, weight, budget_s)
         freedom = FREEDOM.get(self.tier, Freedom.AS_NEEDED)
-        return self._follower.follow(change, weight, spread, between, budget_s, freedom)
+        propose = (lambda: self._proposed(data)) if self._proposes else None
+        return self._follower.follow(change, weight, spread, between, budget_s, freedom, propose)
+
+    def _proposed(self, data: dict[Modality, _Data]) -> FloatArray:
+        """Ellipses that the network's shape suggests, to be refined and judged by the physics."""
+        with self._timed("network"):
+            pressed = self._network_image(data).structure
+        assert pressed is not None
+        areas = self._areas.find(pressed, self._areas.on_nodes(pressed))
+        return ellipses_of(areas.on_map, *self._areas.map_places)
+
+    @cached_property
+    def _has_network(self) -> bool:
+        both = len(self.description.modalities) == 2
+        return both and find_network(self.description, "network") is not None
+
+    @property
+    def _proposes(self) -> bool:
+        return self.tier is Tier.HYBRID or (self.tier is Tier.AUTO and self._has_network)
 
     def _paper_shape(self, structure: _Data) -> Shape:
         image = np.maximum(self._linear_image("structure", structure.change, Tier.TIKHONOV), 0.0)
