@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +35,20 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def write_arrays(path: Path, arrays: dict[str, Any]) -> None:
-    """Write an .npz file; a half-written one is never left under that name.
+    """Write an .npz file as a whole, see `write_whole`.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    write_whole(path, lambda file: np.savez_compressed(file, **arrays))
+
+
+def write_whole(path: Path, write: Callable[[IO[bytes]], object]) -> None:
+    """Write a file and make its folder; a half-written one is never left under that name.
+
+    Args:
+        path: the file.
+        write: writes its content.
 
     Raises:
         OSError: the file cannot be written.
@@ -42,8 +57,9 @@ def write_arrays(path: Path, arrays: dict[str, Any]) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with part.open("wb") as file:
-            np.savez_compressed(file, **arrays)
+            write(file)
         part.replace(path)
     except OSError:
-        part.unlink(missing_ok=True)
+        with suppress(OSError):
+            part.unlink()
         raise

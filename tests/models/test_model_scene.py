@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tactomo_models import Press
 from tactomo_models.contacts import FARTHEST_STEP_M, Tracker
+from tactomo_models.scene import strongest
 
 STEP_M = 0.001
 AXIS_M = np.arange(-0.06, 0.06, STEP_M)
@@ -37,6 +38,27 @@ def test_an_indenter_covers_its_area_wherever_it_stands(
 def test_a_ring_is_open_in_the_middle() -> None:
     press = Press(0.0, 0.0, 100.0, 0.02, shape="ring")
     assert press.coverage(np.array([0.0, 0.015]), np.zeros(2), STEP_M).tolist() == [0.0, 1.0]
+
+
+def test_a_dome_presses_most_in_the_middle_and_not_at_its_rim() -> None:
+    """As a ball does (Hertz): the mean pressure is two thirds of the largest."""
+    dome = Press(0.01, -0.005, 150.0, 0.02, 0.012, 0.7, profile="dome")
+    pressure, coverage = strongest([dome], X, Y, STEP_M)
+    assert pressure.max() == pytest.approx(150.0, rel=1e-3)
+    assert (pressure * coverage).sum() / coverage.sum() == pytest.approx(100.0, rel=0.02)
+    along, across = (
+        dome.pressure_at(np.array(0.01 + r * np.cos(t)), np.array(-0.005 + r * np.sin(t)))
+        for r, t in ((0.016, 0.7), (0.0096, 0.7 + np.pi / 2))
+    )
+    assert along == pytest.approx(150.0 * 0.6)  # at 0.8 of both half axes
+    assert across == pytest.approx(along)
+
+
+def test_the_strongest_of_two_indenters_is_felt_point_by_point() -> None:
+    """A dome above a punch: the punch is felt where the dome has fallen below it."""
+    dome, punch = Press(0, 0, 200.0, 0.02, profile="dome"), Press(0, 0, 120.0, 0.02)
+    pressure, _ = strongest([dome, punch], np.array([0.0, 0.015, 0.017]), np.zeros(3), STEP_M)
+    np.testing.assert_allclose(pressure, [200.0, 200.0 * np.sqrt(1 - 0.5625), 120.0])
 
 
 places = st.lists(st.tuples(st.floats(-0.07, 0.07), st.floats(-0.07, 0.07)), max_size=6)

@@ -2,6 +2,9 @@
 
 A preset draws a scene from a seed and its number. No seed of a training scene is one of the
 evaluation's: the set's name is part of both.
+
+Lengths and pressures are those of a sheet of 150 mm whose response table ends at 300 kPa, the
+paper's; on another sensor they scale with its shorter side and with its own table.
 """
 
 from __future__ import annotations
@@ -21,6 +24,10 @@ from tactomo_models.scene import Press, Profile, Shape
 FloatArray = NDArray[np.float64]
 PresetName = Literal["paper", "robust"]
 PRESET_NAMES: Final[tuple[PresetName, ...]] = ("paper", "robust")
+SCENES: Final[dict[PresetName, int]] = {"paper": 12_000, "robust": 24_000}  # of a whole set
+
+SIDE_M = 0.150  # of the sheet that the lengths below are for
+END_KPA = 300.0  # of the response table that the pressures below are for
 
 PAPER_CONTACTS = 4
 PAPER_CHANGE = (0.05, 0.25)  # 0.95 to 0.75 S/m in a sheet of 1 S/m
@@ -31,9 +38,11 @@ ROBUST_CONTACTS = (0.03, 0.22, 0.22, 0.22, 0.20, 0.07, 0.04)  # shares of scenes
 ROBUST_HALF_AXIS_M = (0.005, 0.023)
 MOST_ASPECT = 2.2
 RING_HALF_AXIS_M = 0.010  # least of a ring
+ROBUST_SHAPES: Final[dict[Shape, float]] = {"ellipse": 0.40, "rectangle": 0.35, "ring": 0.25}
 # Shares of contacts by pressure: measurable, too light to be measured, beyond the range.
 ROBUST_PRESSURE_KPA = ((0.70, 140.0, 210.0), (0.15, 20.0, 140.0), (0.15, 200.0, 300.0))
-DOMES = 0.15  # share of contacts whose pressure falls towards their rim
+DOMES = 0.15  # share of contacts, all ellipses, whose pressure falls towards their rim
+DOME_PEAK = 1.3  # of a dome's pressure, over that of a punch
 ROBUST_GAP_M = 0.004
 MOST_UNEVEN = 0.08  # standard deviation of a sheet's smooth conductivity error
 IMPEDANCE_SPREAD = 0.3  # standard deviation of the logarithm of contact impedances
@@ -98,9 +107,12 @@ def draw_scene(
 
 def _paper(description: SensorDescription, seed: int, number: int) -> TrainingScene:
     """One to four ellipses on an even sheet, noise-free."""
+    assert description.magnitude is not None
     rng = np.random.default_rng(seed_of("training", "paper", seed, number))
     presses = paper_presses(description, rng, 1 + number % PAPER_CONTACTS)
-    return TrainingScene(presses, PAPER_CONTRAST, opposite=True, sheets=None)
+    # The paper's conductivity falls, whatever the sensor's does.
+    opposite = description.magnitude.response.sign > 0
+    return TrainingScene(presses, PAPER_CONTRAST, opposite, sheets=None)
 
 
 def paper_presses(
@@ -113,7 +125,7 @@ def paper_presses(
     """
     assert description.magnitude is not None
     response = description.magnitude.response
-    least, most = PAPER_HALF_AXIS_M
+    least, most = (scale_of(description) * half_axis for half_axis in PAPER_HALF_AXIS_M)
 
     def one() -> Press:
         long = rng.uniform(least, most)
@@ -135,29 +147,43 @@ def _robust(description: SensorDescription, seed: int, number: int) -> TrainingS
     opposite = bool(skin.integers(2))
     sheets = (_sheet_errors(description, skin), _sheet_errors(description, skin))
     count = int(rng.choice(len(ROBUST_CONTACTS), p=ROBUST_CONTACTS))
-    presses = _placed(description, rng, count, ROBUST_GAP_M, lambda: _any_press(description, rng))
+    gap = scale_of(description) * ROBUST_GAP_M
+    presses = _placed(description, rng, count, gap, lambda: _any_press(description, rng))
     contrast = float(np.exp(rng.uniform(*np.log(CONTRAST))))
     return TrainingScene(presses, contrast, opposite, sheets)
 
 
 def _any_press(description: SensorDescription, rng: np.random.Generator) -> Press:
-    shapes: tuple[Shape, ...] = ("ellipse", "rectangle", "ring")
-    shape = shapes[rng.choice(3, p=(0.4, 0.35, 0.25))]
+    shape = tuple(ROBUST_SHAPES)[rng.choice(len(ROBUST_SHAPES), p=tuple(ROBUST_SHAPES.values()))]
     least, most = ROBUST_HALF_AXIS_M
     least = RING_HALF_AXIS_M if shape == "ring" else least
+    scale = scale_of(description)
+    least, most = scale * least, scale * most
     long = rng.uniform(least, most)
     shares = [share for share, _, _ in ROBUST_PRESSURE_KPA]
-    _, low, high = ROBUST_PRESSURE_KPA[rng.choice(len(shares), p=shares)]
-    profile: Profile = "dome" if shape == "ellipse" and rng.random() < DOMES / 0.4 else "flat"
+    _, *pressures = ROBUST_PRESSURE_KPA[rng.choice(len(shares), p=shares)]
+    low, high = (_pressure_scale(description) * pressure for pressure in pressures)
+    domed = shape == "ellipse" and rng.random() < DOMES / ROBUST_SHAPES["ellipse"]
+    profile: Profile = "dome" if domed else "flat"
     return Press(
         *_anywhere(description, rng),
-        pressure_kpa=rng.uniform(low, high) * (1.3 if profile == "dome" else 1.0),
+        pressure_kpa=rng.uniform(low, high) * (DOME_PEAK if domed else 1.0),
         radius_m=long,
         radius_y_m=rng.uniform(max(least, long / MOST_ASPECT), long),
         angle_rad=rng.uniform(0, np.pi),
         shape=shape,
         profile=profile,
     )
+
+
+def scale_of(description: SensorDescription) -> float:
+    """How large a sensor is, in sheets of 150 mm."""
+    return min(description.width_m, description.height_m) / SIDE_M
+
+
+def _pressure_scale(description: SensorDescription) -> float:
+    assert description.magnitude is not None
+    return description.magnitude.response.pressure_kpa[-1] / END_KPA
 
 
 def _anywhere(description: SensorDescription, rng: np.random.Generator) -> tuple[float, float]:
@@ -209,5 +235,5 @@ def _sheet_errors(description: SensorDescription, rng: np.random.Generator) -> S
         seed=int(rng.integers(2**63)),
         unevenness=rng.uniform(0, MOST_UNEVEN),
         impedance=impedance,
-        displaced_m=DISPLACED_M * rng.standard_normal(electrodes),
+        displaced_m=scale_of(description) * DISPLACED_M * rng.standard_normal(electrodes),
     )

@@ -1,19 +1,23 @@
 """Simulating training scenes: thousands of them, on as many cores or machines as there are.
 
 Scenes are kept in shards, files of a few hundred that are drawn from their own seeds, so that an
-interrupted run goes on where it stopped and shards may be made anywhere, in any order. Voltages
-are noise-free: noise is added in training, anew in every epoch.
+interrupted run goes on where it stopped and shards may be made anywhere, in any order. One process
+writes them, each as a whole. Voltages are noise-free: noise is added in training, anew in every
+epoch.
 
 The mesh is another one than the one that inverts, and coarser than the one that evaluates; within
 each triangle the conductivity is the mean over nine parts (of resistivities, where contacts
-conduct better). Changes are right to 1.5 % of the structure channel's, 0.5 % of the magnitude's.
+conduct better). Changes differ from the evaluation's by 2 % in the structure channel and 1 % in the
+magnitude channel (root mean square; twice that where contacts are small).
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Iterator
-from contextlib import nullcontext
+from collections.abc import Iterator, Mapping
+from concurrent.futures import BrokenExecutor
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -22,8 +26,10 @@ from typing import Any
 import numpy as np
 import skfem
 from numpy.typing import NDArray
+from scipy.spatial.distance import pdist
+from threadpoolctl import threadpool_limits
 
-from tactomo_models.archive import read_arrays
+from tactomo_models.archive import read_arrays, write_arrays, write_whole
 from tactomo_models.description import Modality, SensorDescription
 from tactomo_models.errors import DataError, ModelError
 from tactomo_models.evaluation.simulation import (
@@ -49,9 +55,12 @@ SPACING_SHARE = 5 / 6  # of the map's nodes' distance: 2.5 mm on the paper's sen
 REFINEMENTS = 2
 PARTS = 3  # that each side of a triangle is divided into, where its conductivity is averaged
 SHARP_M = 1e-9  # width of an outline: a point lies inside or outside
-ELECTRODE_REACH_M = 0.008  # of the stretch around an electrode that sits off its place
-FORMAT = 1
+ELECTRODE_REACH_M = 0.008  # of the stretch around an electrode that sits off its place, at most
+REACH_SHARE = 0.30  # of the electrodes' distance: neighbours do not pull at each other
+SCENES = "scenes"  # begins the names of the files that hold them
+FORMAT = 1  # raise it when what is drawn or simulated changes
 MANIFEST = "manifest.json"
+CLUSTER_S = 10  # that a cluster may take to answer
 
 
 @dataclass(frozen=True)
@@ -63,6 +72,7 @@ class Manifest:
         preset, seed: what scenes were drawn by.
         sensor, sha256: description, and the hash of its physics.
         scenes: how many there are to be.
+        responses: hash of what its channels show of a pressure; "" where that was not kept.
     """
 
     format: int
@@ -71,6 +81,7 @@ class Manifest:
     sensor: str
     sha256: str
     scenes: int
+    responses: str = ""
 
 
 @dataclass(frozen=True)
@@ -147,15 +158,19 @@ class SceneSimulator:
         errors: SheetErrors | None,
     ) -> tuple[FloatArray, FloatArray]:
         """Volts at rest and relative changes of one channel."""
-        seed = errors.seed if errors else None
-        if name not in self._sheets or self._sheets[name][0] != seed:
-            self._sheets[name] = (seed, self._sheet(errors))
-        sheet = self._sheets[name][1]
+        sheet = self._sheet_of(name, errors)
         if not scene.presses:
             return sheet.rest, np.zeros_like(sheet.rest)
         ratio = _ratio_of(sensor, name, scene, sheet.mesh)
         pressed = self._solve(sheet.mesh, sheet.conductivity * ratio, sheet.impedance)
         return sheet.rest, (pressed - sheet.rest) / np.abs(sheet.rest)
+
+    def _sheet_of(self, name: Modality, errors: SheetErrors | None) -> _Sheet:
+        """The last scene's sheet, if this one has the same."""
+        seed = errors.seed if errors else None
+        if name not in self._sheets or self._sheets[name][0] != seed:
+            self._sheets[name] = (seed, self._sheet(errors))
+        return self._sheets[name][1]
 
     def _sheet(self, errors: SheetErrors | None) -> _Sheet:
         """A sheet with its errors, solved at rest."""
@@ -210,61 +225,37 @@ def displaced(
         description: the sensor.
         displaced_m: (L,) by how much along the rim, counter-clockwise.
     """
-    ends = description.electrode_ends_m
+    ends, centres = description.electrode_ends_m, description.electrode_centres_m
     along = ends[:, 1] - ends[:, 0]
     step = displaced_m[:, None] * along / np.linalg.norm(along, axis=1, keepdims=True)
-    off = sheet.mesh.p.T[:, None, :] - description.electrode_centres_m
-    reach = np.exp(-0.5 * (off**2).sum(axis=2) / ELECTRODE_REACH_M**2)
+    off = sheet.mesh.p.T[:, None, :] - centres
+    reach_m = min(ELECTRODE_REACH_M, REACH_SHARE * float(pdist(centres).min()))
+    pull = np.exp(-0.5 * (off**2).sum(axis=2) / reach_m**2)
     return SheetMesh(
-        skfem.MeshTri(sheet.mesh.p + (reach @ step).T, sheet.mesh.t), sheet.electrode_facets
+        skfem.MeshTri(sheet.mesh.p + (pull @ step).T, sheet.mesh.t), sheet.electrode_facets
     )
 
 
 def simulate_shard(
-    description: SensorDescription,
-    preset: PresetName,
-    seed: int,
-    folder: str,
-    first: int,
-    last: int,
-) -> int:
-    """Simulate scenes `first` to before `last` into their file.
+    description: SensorDescription, preset: PresetName, seed: int, first: int, last: int
+) -> tuple[int, dict[str, Any]]:
+    """Simulate scenes `first` to before `last`, on one thread.
 
     Returns:
-        How many scenes it holds.
-
-    Raises:
-        ModelError: the file cannot be written.
+        `first`, and what the shard holds.
     """
-    simulator = _simulator(description.model_dump_json(by_alias=True))
-    made = [
-        simulator.simulate(draw_scene(preset, description, seed, number))
-        for number in range(first, last)
-    ]
-    arrays: dict[str, Any] = {key: np.stack([one[key] for one in made]) for key in made[0]}
-    path = _shard_path(Path(folder), first)
-    part = path.with_name(f".{path.name}.part")
-    try:
-        with part.open("wb") as file:
-            np.savez_compressed(file, **arrays)
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise ModelError(
-            f"cannot write {path}: {error.strerror}; free some space, then run the same command "
-            "again: it goes on where it stopped"
-        ) from error
-    return last - first
+    simulator = SceneSimulator(description)
+    with threadpool_limits(1):
+        made = [
+            simulator.simulate(draw_scene(preset, description, seed, number))
+            for number in range(first, last)
+        ]
+    return first, {key: np.stack([one[key] for one in made]) for key in made[0]}
 
 
-@lru_cache(maxsize=2)
-def _simulator(description: str) -> SceneSimulator:
-    """One for each process."""
-    return SceneSimulator(SensorDescription.model_validate_json(description))
-
-
-def _shard_path(folder: Path, first: int) -> Path:
-    return folder / f"scenes-{first:07d}.npz"
+def shard_path(folder: Path, first: int, what: str = SCENES) -> Path:
+    """File of the shard that begins with a scene's number."""
+    return folder / f"{what}-{first:07d}.npz"
 
 
 def simulate(
@@ -286,72 +277,150 @@ def simulate(
         scenes: how many; a set can be enlarged later.
         seed: of the set.
         jobs: processes; -1 for one on every core.
-        dask: address of a Dask scheduler whose workers do the work instead, and see the folder.
+        dask: address of a Dask scheduler whose workers do the work instead; they need this
+            version of tactomo, and not the folder.
 
     Yields:
         How many scenes more are there: those of earlier runs first.
 
     Raises:
-        ModelError: the folder holds another set, or a file cannot be written.
+        ModelError: the folder holds another set, a file cannot be written, or workers fail.
         DataError: the sensor has one channel, or no room for the contacts.
+        ModuleNotFoundError: joblib or Dask is not installed; both come with tactomo[train].
     """
-    from joblib import Parallel, delayed, parallel_config
+    from joblib import delayed
 
     SceneSimulator(description)  # refuses a sensor it cannot serve before anything is written
-    write_manifest(
-        folder, Manifest(FORMAT, preset, seed, description.name, description.sha256, scenes)
-    )
-    shards = [(first, min(first + SHARD, scenes)) for first in range(0, scenes, SHARD)]
-    missing = [shard for shard in shards if not _is_whole(folder, *shard)]
-    yield sum(last - first for first, last in shards) - sum(b - a for a, b in missing)
+    write_manifest(folder, _manifest(description, preset, seed, scenes))
+    missing = {
+        first: size
+        for first, size in shards_of(scenes)
+        if not is_whole(shard_path(folder, first), size)
+    }
+    yield scenes - sum(missing.values())
     work = (
-        delayed(simulate_shard)(description, preset, seed, str(folder), first, last)
-        for first, last in missing
+        delayed(simulate_shard)(description, preset, seed, first, first + size)
+        for first, size in missing.items()
     )
-    where = parallel_config("dask") if dask else parallel_config(n_jobs=jobs)
-    with _on_cluster(dask) if dask else nullcontext(), where:
-        yield from Parallel(return_as="generator_unordered")(work)
+    with (
+        _on_cluster(dask) if dask else on_cores(jobs) as parallel,
+        closing(parallel(work)) as made,
+    ):
+        for first, arrays in made:
+            with _writing(shard_path(folder, first)) as path:
+                write_arrays(path, arrays)
+            yield missing[first]
 
 
-def _on_cluster(address: str) -> Any:
-    from distributed import Client
+def shards_of(scenes: int) -> Iterator[tuple[int, int]]:
+    """Number of the first scene of each shard, and how many scenes it has at least."""
+    for first in range(0, scenes, SHARD):
+        yield first, min(SHARD, scenes - first)
+
+
+@contextmanager
+def on_cores(jobs: int) -> Iterator[Any]:
+    """A joblib.Parallel on this machine, whose results come as they are ready."""
+    from joblib import Parallel
 
     try:
-        return Client(address, timeout="10s")
-    except OSError as error:
+        yield Parallel(n_jobs=jobs, return_as="generator_unordered")
+    except BrokenExecutor as error:
         raise ModelError(
-            f"no Dask scheduler answers at {address}: start one with `dask scheduler`, or leave "
-            "--dask out to use this machine's cores"
+            "a process that simulates was killed, as happens when memory runs out; run the same "
+            "command again with fewer jobs: it goes on where it stopped"
         ) from error
 
 
+@contextmanager
+def _on_cluster(address: str) -> Iterator[Any]:
+    """A joblib.Parallel on a Dask cluster, whose results come as they are ready."""
+    from distributed import Client
+    from joblib import Parallel, parallel_config
+
+    try:
+        client = Client(address, timeout=CLUSTER_S)
+    except (OSError, ValueError) as error:
+        raise ModelError(
+            f"no Dask scheduler answers at {address}: start one with `dask scheduler` and give "
+            "the address that it prints, or leave Dask out to use this machine's cores"
+        ) from error
+    with client:
+        _check_workers(client, address)
+        with parallel_config("dask", client=client):
+            parallel = Parallel(return_as="generator_unordered")
+        yield parallel
+
+
+def _check_workers(client: Any, address: str) -> None:
+    """Refuse a cluster on which joblib would wait for ever, or that draws other scenes.
+
+    Raises:
+        ModelError: it has no workers, or tactomo is missing on one or another version.
+    """
+    try:
+        client.wait_for_workers(1, timeout=CLUSTER_S)
+        formats = set(client.run(_format).values())
+    except TimeoutError as error:
+        raise ModelError(
+            f"the Dask scheduler at {address} has no workers: start some with "
+            f"`dask worker {address}`, where tactomo is installed"
+        ) from error
+    except Exception as error:  # whatever a worker raises that cannot import this module
+        formats = {str(error)}
+    if formats != {FORMAT}:
+        raise ModelError(
+            f"not every Dask worker of {address} can simulate these scenes "
+            f"({', '.join(map(str, formats))}): install this version of tactomo on each"
+        )
+
+
+def _format() -> int:
+    return FORMAT
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[Path]:
+    try:
+        yield path
+    except OSError as error:
+        raise ModelError(
+            f"cannot write {path}: {error.strerror}; free some space or choose another folder, "
+            "then run the same command again: it goes on where it stopped"
+        ) from error
+
+
+def _manifest(
+    description: SensorDescription, preset: PresetName, seed: int, scenes: int
+) -> Manifest:
+    channels = description.model_dump_json(include={"magnitude", "structure"})
+    responses = hashlib.sha256(channels.encode()).hexdigest()
+    return Manifest(FORMAT, preset, seed, description.name, description.sha256, scenes, responses)
+
+
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Say in a folder what its shards are; the number of scenes may grow.
+    """Say in a folder what its shards are; the number of scenes may change.
 
     Raises:
         ModelError: it holds something else, or cannot be written.
     """
     path = folder / MANIFEST
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if path.exists():
-            there = read_manifest(folder)
-            for name, old, new in _differences(there, manifest):
-                raise ModelError(
-                    f"{folder} holds scenes of {name} {old}, not {new}: choose another folder, or "
-                    "delete this one"
-                )
-        path.write_text(json.dumps(asdict(manifest), indent=2) + "\n")
-    except OSError as error:
-        raise ModelError(
-            f"cannot write to {folder}: {error.strerror}; choose another folder"
-        ) from error
+    if path.exists():
+        for name, old, new in _differences(read_manifest(folder), manifest):
+            raise ModelError(
+                f"{folder} holds scenes made with another {name}, {old}, not {new}: choose another "
+                "folder, or delete this one"
+            )
+    content = json.dumps(asdict(manifest), indent=2) + "\n"
+    with _writing(path):
+        write_whole(path, lambda file: file.write(content.encode()))
 
 
-def _differences(old: Manifest, new: Manifest) -> Iterator[tuple[str, Any, Any]]:
-    for name in ("format", "preset", "seed", "sensor", "sha256"):
-        if getattr(old, name) != getattr(new, name):
-            yield name, getattr(old, name), getattr(new, name)
+def _differences(old: Manifest, new: Manifest) -> Iterator[tuple[str, str, str]]:
+    for name in ("format", "preset", "seed", "sensor", "sha256", "responses"):
+        before, now = str(getattr(old, name)), str(getattr(new, name))
+        if before != now and before:
+            yield name, before[:16], now[:16]
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -373,14 +442,6 @@ def read_manifest(folder: Path) -> Manifest:
         ) from error
 
 
-def _is_whole(folder: Path, first: int, last: int) -> bool:
-    """Tell whether a shard is there with all its scenes; a damaged one is made anew."""
-    try:
-        return len(read_arrays(_shard_path(folder, first))["contacts"]) == last - first
-    except (OSError, KeyError, ValueError, DataError):
-        return False
-
-
 def read_scenes(folder: Path) -> dict[str, Any]:
     """Read all scenes of a folder, in the order of their numbers.
 
@@ -390,22 +451,50 @@ def read_scenes(folder: Path) -> dict[str, Any]:
     Raises:
         ModelError: the folder holds none, is not complete, or a file is damaged.
     """
-    manifest = read_manifest(folder)
-    shards = []
-    for first in range(0, manifest.scenes, SHARD):
-        path = _shard_path(folder, first)
-        try:
-            shards.append(read_arrays(path))
-        except FileNotFoundError as error:
-            raise ModelError(
-                f"{folder} is not complete: {path.name} is missing; run tactomo models simulate "
-                "again, it goes on where it stopped"
-            ) from error
-        except (OSError, ValueError, DataError) as error:
-            raise ModelError(
-                f"{path} is damaged ({error}): delete it and simulate again"
-            ) from error
+    return read_shards(folder, SCENES)
+
+
+def read_shards(folder: Path, what: str) -> dict[str, Any]:
+    """Read what a folder holds of all its scenes: `SCENES`, or what was made of them.
+
+    Raises:
+        ModelError: it holds none, is not complete, or a file is damaged.
+    """
+    shards = [
+        read_shard(shard_path(folder, first, what), size)
+        for first, size in shards_of(read_manifest(folder).scenes)
+    ]
     return {key: np.concatenate([shard[key] for shard in shards]) for key in shards[0]}
+
+
+def read_shard(path: Path, size: int) -> dict[str, Any]:
+    """Read the first scenes of a shard, which has more if the set was larger once."""
+    try:
+        arrays = read_arrays(path)
+    except FileNotFoundError:
+        arrays = {}
+    except (OSError, DataError) as error:
+        raise ModelError(
+            f"{error}; run `tactomo models simulate` again, it makes damaged files anew"
+        ) from error
+    if _length(arrays) < size:
+        raise ModelError(
+            f"{path.parent} is not complete, {path.name} is missing or short: run `tactomo models "
+            "simulate` again, it goes on where it stopped"
+        )
+    return {key: array[:size] for key, array in arrays.items()}
+
+
+def is_whole(path: Path, size: int) -> bool:
+    """Tell whether a shard is there, undamaged, with at least so many scenes."""
+    try:
+        return _length(read_arrays(path)) >= size
+    except (OSError, DataError):
+        return False
+
+
+def _length(arrays: Mapping[str, NDArray[Any]]) -> int:
+    return min((len(array) for array in arrays.values()), default=0)
 
 
 def shard_paths(folder: Path) -> list[Path]:
@@ -414,5 +503,4 @@ def shard_paths(folder: Path) -> list[Path]:
     Raises:
         ModelError: the folder holds no scenes.
     """
-    scenes = read_manifest(folder).scenes
-    return [_shard_path(folder, first) for first in range(0, scenes, SHARD)]
+    return [shard_path(folder, first) for first, _ in shards_of(read_manifest(folder).scenes)]
