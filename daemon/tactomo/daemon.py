@@ -34,6 +34,7 @@ import zmq
 from platformdirs import user_data_path
 from tactomo_client.messages import EVENT, SCHEMA, STATUS
 from tactomo_models import (
+    ArtifactError,
     Reconstructor,
     Reference,
     SensorDescription,
@@ -41,12 +42,13 @@ from tactomo_models import (
     load_description,
     load_or_build_artifact,
 )
+from tactomo_models.reconstruct import check_tier
 from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
 
 from tactomo.config import DaemonConfig
 from tactomo.control import Control, Nothing, RecordStart, SetBudget, SetTier
-from tactomo.errors import ConfigError
+from tactomo.errors import CommandError, ConfigError
 from tactomo.events import Severity
 from tactomo.imaging import Imaging
 from tactomo.pipeline import Pipeline, Replay
@@ -86,6 +88,7 @@ class Daemon:
         self._undo = contextlib.ExitStack()
         self._stop_asked = threading.Event()
         description = load_description(config.description)
+        self._description = description
         replay = read_replay(config.ports, description)
         channels = tuple(c for c in Channel if c.name.lower() in description.modalities)
         self._recorder = Recorder(_origin(config, description), self._on_event)
@@ -239,7 +242,12 @@ class Daemon:
         return {"path": str(path), "bytes": length}
 
     def _set_tier(self, arguments: SetTier) -> Mapping[str, Any]:
-        self._pipeline.set_tier(Tier(arguments.tier))
+        tier = Tier(arguments.tier)
+        try:
+            check_tier(self._description, tier)
+        except ArtifactError as error:
+            raise CommandError(str(error), "ask for another tier", "no_network") from error
+        self._pipeline.set_tier(tier)
         return {"tier": arguments.tier}
 
     def _set_budget(self, arguments: SetBudget) -> Mapping[str, Any]:

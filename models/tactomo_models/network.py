@@ -27,14 +27,14 @@ from tactomo_models.prefilter import BANDS, Prefilter, prefilter
 
 FloatArray = NDArray[np.float64]
 Image = NDArray[np.float32]
-NetworkKind = Literal["network", "cnn-single", "cnn-multimodal"]
-NETWORK_KINDS: Final[tuple[NetworkKind, ...]] = ("network", "cnn-single", "cnn-multimodal")
+NetworkKind = Literal["network", "refiner", "cnn-single", "cnn-multimodal"]
 
 FORMAT = 1
 NEWEST_OPSET = 21  # that the oldest ONNX Runtime we support runs
 FILTER_SIGMA = 1.0  # nodes, of the Gaussian filter at the paper's networks' output
 OUTPUTS: Final[dict[NetworkKind, tuple[str, ...]]] = {
     "network": ("map", "structure", "confidence"),
+    "refiner": ("map", "structure", "confidence"),
     "cnn-single": ("map",),
     "cnn-multimodal": ("map",),
 }
@@ -88,9 +88,10 @@ class Network:
     def _input_shapes(
         self, description: SensorDescription, kind: NetworkKind
     ) -> dict[str, tuple[int, ...]]:
-        if kind == "network":
+        if kind in ("network", "refiner"):
             components = description.measurements // 2 + BANDS
-            return {"data": (len(self.modalities) * components,)}
+            data: dict[str, tuple[int, ...]] = {"data": (len(self.modalities) * components,)}
+            return data if kind == "network" else {**data, "seen": (2, *self._nodes)}
         return dict.fromkeys(self.modalities, self._nodes)
 
     @cached_property
@@ -115,7 +116,7 @@ class FusionNetwork:
     """Our network and its prefilters, for one sensor.
 
     Args:
-        network: of the kind "network".
+        network: of the kind "network", or "refiner", which is given another method's images, too.
     """
 
     def __init__(self, network: Network) -> None:
@@ -128,7 +129,10 @@ class FusionNetwork:
         }
 
     def image(
-        self, changes: Mapping[Modality, FloatArray], certainty: Mapping[Modality, FloatArray]
+        self,
+        changes: Mapping[Modality, FloatArray],
+        certainty: Mapping[Modality, FloatArray],
+        seen: FloatArray | Image | None = None,
     ) -> NetworkImage:
         """Reconstruct a frame.
 
@@ -136,7 +140,19 @@ class FusionNetwork:
             changes: (M,) relative voltage changes, in the direction of pressing, of each channel
                 that has a scan.
             certainty: (M,) inverse variance of each by noise; 0 where there is no voltage.
+            seen: (2, nodes_y, nodes_x) map and structure that another method has found, for a
+                network that refines them.
         """
+        inputs: dict[str, Any] = {"data": self.filtered(changes, certainty)}
+        if seen is not None:
+            inputs["seen"] = seen
+        made = self._network.run(inputs)
+        return NetworkImage(made["map"].copy(), made["structure"].copy(), float(made["confidence"]))
+
+    def filtered(
+        self, changes: Mapping[Modality, FloatArray], certainty: Mapping[Modality, FloatArray]
+    ) -> FloatArray:
+        """What the network is given of a frame's voltages, (K,); the arguments are `image`'s."""
         parts: list[FloatArray] = []
         for name in self._network.modalities:
             if name in changes:
@@ -145,8 +161,7 @@ class FusionNetwork:
             else:
                 used = self._mute[name]
                 parts += [np.zeros(len(used.matrix)), used.known]
-        made = self._network.run({"data": np.concatenate(parts)})
-        return NetworkImage(made["map"].copy(), made["structure"].copy(), float(made["confidence"]))
+        return np.concatenate(parts)
 
     def _filter(self, name: Modality, certainty: FloatArray) -> Prefilter:
         """Made anew when the noise changes: at a tare, or when a lead breaks."""

@@ -12,7 +12,7 @@ counted in modelled work, so that a recording reconstructs exactly as the live s
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from enum import StrEnum, auto
@@ -112,6 +112,12 @@ class Tier(StrEnum):
 METHODS: Final = tuple(tier for tier in Tier if tier is not Tier.QUIET)  # that may be asked for
 LINEAR: Final = (Tier.TIKHONOV, Tier.NOSER)
 PAPER_NETWORKS: Final = (Tier.CNN_SINGLE, Tier.CNN_MULTIMODAL)
+NETWORK_OF: Final[dict[Tier, NetworkKind]] = {  # what each of these cannot do without
+    Tier.NETWORK: "network",
+    Tier.HYBRID: "network",
+    Tier.CNN_SINGLE: "cnn-single",
+    Tier.CNN_MULTIMODAL: "cnn-multimodal",
+}
 FREEDOM: Final = {Tier.FIT: Freedom.OUTLINES, Tier.LEVELSET: Freedom.LEVEL_SET}  # else as needed
 
 
@@ -148,6 +154,18 @@ class Reconstruction:
     confidence: float = float("nan")
 
 
+class _MadeWhenAsked(dict[Tier, Image]):
+    """Reconstruction matrices by method."""
+
+    def __init__(self, make: Callable[[Tier], Image]) -> None:
+        super().__init__()
+        self._make = make
+
+    def __missing__(self, method: Tier) -> Image:
+        self[method] = self._make(method)
+        return self[method]
+
+
 @dataclass(frozen=True)
 class _Channel:
     """What is known of one channel since the last tare.
@@ -166,6 +184,7 @@ class _Channel:
             direction of pressing; 0 where objects change it either way.
         matrices: (P, M) reconstruction matrix of each linear method for that noise, in single
             precision: the rounding is far below the noise, and the product is bound by memory.
+            They take a tenth of a second, so that each is made when it is first needed.
     """
 
     reference: FloatArray
@@ -178,7 +197,7 @@ class _Channel:
     electrodes: tuple[int, ...]
     check: ScanCheck
     total: FloatArray
-    matrices: dict[Tier, Image]
+    matrices: _MadeWhenAsked
 
 
 @dataclass(frozen=True)
@@ -228,6 +247,9 @@ class Reconstructor:
         tier: the most that is done; `Tier.AUTO` does what the scene needs.
         budget_s: compute time a frame may take, on a machine of the 2.5 GHz class.
 
+    Raises:
+        ArtifactError: the artifact or the tier's network cannot be used.
+
     Not thread-safe: one thread owns it.
     """
 
@@ -242,6 +264,7 @@ class Reconstructor:
         self.description = description
         self.tier = tier
         self.budget_s = budget_s
+        check_tier(description, tier)
         self._artifact = artifact or load_or_build_artifact(description)
         self._forward = ForwardModel(description, self._artifact.bare)
         self._wiring = Wiring(description)
@@ -262,6 +285,7 @@ class Reconstructor:
         self._frames_held = 0  # since the last structure scan
         self._stage_s: dict[str, float] = {}
         self._left_out: list[str] = []
+        self._paper_networks: dict[Tier, PaperNetwork] = {}
         self._structure_answers_more = len(description.modalities) == 2 and bool(
             np.log(_contrast(description, "structure"))
             > MUCH_MORE * np.log(_contrast(description, "magnitude"))
@@ -305,7 +329,9 @@ class Reconstructor:
         noise = np.where(valid, noise, 0.0)
         relative = np.hypot(noise * per_volt * np.sqrt(1 + 1 / scans), MODEL_ERROR)
         relative = np.where(valid, relative, UNUSABLE)
-        matrices = {method: self._matrix(method, relative) for method in LINEAR}
+        matrices = _MadeWhenAsked(lambda method: self._matrix(method, relative))
+        if self.tier in LINEAR:
+            matrices[self.tier]
         direction = 0.0 if self._either_way(name) else self._sign(name)
         return _Channel(
             reference=reference,
@@ -324,7 +350,7 @@ class Reconstructor:
                 contrast,
                 asymmetry_of(self._wiring, reference),
             ),
-            total=direction * matrices[Tier.TIKHONOV].sum(axis=0, dtype=np.float64),
+            total=direction * self._artifact.tikhonov.sum(axis=0),
             matrices=matrices,
         )
 
@@ -548,10 +574,24 @@ class Reconstructor:
         return self._imaged(image, data, flags, Tier.NETWORK, reason)
 
     def _network_image(self, data: dict[Modality, _Data]) -> NetworkImage:
-        return self._fusion.image(
-            {name: self._sign(name) * d.change for name, d in data.items()},
-            {name: d.certainty for name, d in data.items()},
-        )
+        return self._fusion.image(*self._network_data(data))
+
+    def _network_data(
+        self, data: dict[Modality, _Data]
+    ) -> tuple[dict[Modality, FloatArray], dict[Modality, FloatArray]]:
+        """Changes in the direction of pressing, and their inverse variances by noise."""
+        changes = {name: self._sign(name) * d.change for name, d in data.items()}
+        return changes, {name: d.certainty for name, d in data.items()}
+
+    def network_inputs(self, magnitude: FloatArray, structure: FloatArray) -> FloatArray:
+        """What our network is given of a frame, (K,); the arguments are `reconstruct`'s."""
+        return self._fusion.filtered(*self._network_data(self._taken(magnitude, structure)))
+
+    def _taken(self, magnitude: FloatArray, structure: FloatArray) -> dict[Modality, _Data]:
+        data: dict[Modality, _Data] = {}
+        self._take("magnitude", magnitude, data, saturated=False)
+        self._take("structure", structure, data, saturated=False)
+        return data
 
     @cached_property
     def _fusion(self) -> FusionNetwork:
@@ -567,10 +607,12 @@ class Reconstructor:
             image = self._paper_network.image(images)
         return self._imaged(image, data, flags, self.tier, "as requested")
 
-    @cached_property
+    @property
     def _paper_network(self) -> PaperNetwork:
-        kind: NetworkKind = "cnn-single" if self.tier is Tier.CNN_SINGLE else "cnn-multimodal"
-        return PaperNetwork(load_network(self.description, kind))
+        if self.tier not in self._paper_networks:
+            kind = NETWORK_OF[self.tier]
+            self._paper_networks[self.tier] = PaperNetwork(load_network(self.description, kind))
+        return self._paper_networks[self.tier]
 
     def _preliminary_images(
         self, data: dict[Modality, _Data], modalities: Collection[Modality]
@@ -596,9 +638,7 @@ class Reconstructor:
             magnitude: (M,) volts.
             structure: (M,) volts.
         """
-        data: dict[Modality, _Data] = {}
-        self._take("magnitude", magnitude, data, saturated=False)
-        self._take("structure", structure, data, saturated=False)
+        data = self._taken(magnitude, structure)
         return self._preliminary_images(data, self.description.modalities)
 
     def _imaged(
@@ -843,6 +883,16 @@ class Reconstructor:
         start = time.perf_counter()
         yield
         self._stage_s[stage] = self._stage_s.get(stage, 0.0) + time.perf_counter() - start
+
+
+def check_tier(description: SensorDescription, tier: Tier) -> None:
+    """Make sure that a sensor can be reconstructed that way.
+
+    Raises:
+        ArtifactError: the network that it takes is missing or cannot be used.
+    """
+    if tier in NETWORK_OF:
+        load_network(description, NETWORK_OF[tier])
 
 
 @cache

@@ -52,7 +52,18 @@ app = typer.Typer(
 )
 
 # The models' METHODS, which are not imported for a command line that only shows its help.
-Method: TypeAlias = Literal["auto", "tikhonov", "noser", "pls-paper", "fit", "levelset", "network", "hybrid", "cnn-single", "cnn-multimodal"]
+Method: TypeAlias = Literal[
+    "auto",
+    "tikhonov",
+    "noser",
+    "pls-paper",
+    "fit",
+    "levelset",
+    "network",
+    "hybrid",
+    "cnn-single",
+    "cnn-multimodal",
+]
 SensorName: TypeAlias = Annotated[
     str, typer.Option("--sensor", "-s", help="The sensor's name in the stream.")
 ]

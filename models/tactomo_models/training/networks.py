@@ -28,10 +28,15 @@ class FusionNetwork(nn.Module):
         nodes: (rows, columns) of the map.
         width: channels at half of the map's resolution; twice that at a quarter.
         scale: relative conductivity change that counts as 1 inside.
+        images: how many images it is given beside the voltages: the map over the scale and the
+            pressed shape that another method has found.
     """
 
-    def __init__(self, inputs: int, nodes: tuple[int, int], width: int, scale: float) -> None:
+    def __init__(
+        self, inputs: int, nodes: tuple[int, int], width: int, scale: float, images: int = 0
+    ) -> None:
         super().__init__()
+        self.images = images
         self.inputs, self.nodes, self.width, self.scale = inputs, nodes, width, scale
         self.half = ((nodes[0] + 1) // 2, (nodes[1] + 1) // 2)
         self.quarter = ((self.half[0] + 1) // 2, (self.half[1] + 1) // 2)
@@ -44,7 +49,7 @@ class FusionNetwork(nn.Module):
             nn.GELU(),
             nn.Linear(16 * width, width * self.quarter[0] * self.quarter[1]),
         )
-        self.fine = nn.Sequential(_Conv(width // 3, width), _Residual(width))
+        self.fine = nn.Sequential(_Conv(width // 3 + 4 * images, width), _Residual(width))
         self.down = _Conv(width, wide, stride=2)
         self.coarse = nn.Sequential(_Conv(wide + width, wide), _Residual(wide), _Residual(wide))
         self.up = nn.Sequential(nn.Conv2d(wide, 4 * width, 1), nn.PixelShuffle(2))
@@ -53,32 +58,50 @@ class FusionNetwork(nn.Module):
             nn.Conv2d(width, 4 * (width // 2), 3, padding=1),
             nn.PixelShuffle(2),
             nn.ReLU(),
-            nn.Conv2d(width // 2, 3, 3, padding=1),
         )
+        self.last = nn.Conv2d(width // 2 + images, 3, 3, padding=1)
         with torch.no_grad():  # begin with nothing pressed, as most of a map is
-            self.draw[-1].bias.copy_(torch.tensor([-3.0, -3.0, 0.0]))
+            assert self.last.bias is not None
+            self.last.bias.copy_(torch.tensor([-3.0, -3.0, 0.0]))
         self.trust = nn.Sequential(nn.Linear(2 * wide + inputs, 64), nn.GELU(), nn.Linear(64, 1))
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, x: Tensor, seen: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """From filtered data (n, K) to map and pressed shape (n, rows, columns), confidence (n,).
 
-        The map is |relative conductivity change|, the shape 0 to 1, the confidence the expected
-        correlation of the map with the truth.
+        Images (n, images, rows, columns) of another method go in beside the data. The map is
+        |relative conductivity change|, the shape 0 to 1, the confidence the expected correlation
+        of the map with the truth.
         """
-        size, shape, trust = self.raw(x)
+        size, shape, trust = self.raw(x, seen)
         return size * self.scale, torch.sigmoid(shape), torch.sigmoid(trust)
 
-    def raw(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def raw(self, x: Tensor, seen: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """The map over the scale, and the logarithmic odds of shape and confidence."""
-        fine = self.fine(self.image(x).view(-1, self.width // 3, *self.half))
+        image = self.image(x).view(-1, self.width // 3, *self.half)
+        if seen is not None:
+            rows, columns = (
+                2 * half - nodes for half, nodes in zip(self.half, self.nodes, strict=True)
+            )
+            seen = fn.pad(seen, (0, columns, 0, rows))  # to whole squares of four nodes
+            image = torch.cat([image, fn.pixel_unshuffle(seen, 2)], dim=1)
+        fine = self.fine(image)
         whole = self.whole(x).view(-1, self.width, *self.quarter)
         coarse = self.coarse(torch.cat([self.down(fine), whole], dim=1))
         up = self.up(coarse)[..., : self.half[0], : self.half[1]]
         drawn = self.draw(self.join(torch.cat([up, fine], dim=1)))
+        drawn = self.last(drawn if seen is None else torch.cat([drawn, seen], dim=1))
         shape, edge, size = drawn[..., : self.nodes[0], : self.nodes[1]].unbind(1)
         pooled = torch.cat([coarse.mean((2, 3)), coarse.amax((2, 3)), x], dim=1).detach()
         trust = self.trust(pooled).squeeze(1)
         return torch.sigmoid(edge) * fn.softplus(size), shape, trust
+
+    def start_from(self, other: FusionNetwork) -> None:
+        """Begin as a network that is given no images: they count for nothing at first."""
+        with torch.no_grad():
+            for name, weight in self.state_dict().items():
+                known = other.state_dict()[name]
+                weight.zero_()
+                weight[tuple(slice(0, size) for size in known.shape)] = known
 
     def start_linear(self, images: FloatArray) -> None:
         """Let the first image channels begin as the best linear estimates (2, rows, columns, K)."""

@@ -97,6 +97,6 @@ def _reconstructors(description: str) -> dict[bool, Reconstructor]:
     """One for each sign of the magnitude channel, in each process."""
     sensor = SensorDescription.model_validate_json(description)
     return {
-        False: Reconstructor(sensor, tier=Tier.CNN_MULTIMODAL),
-        True: Reconstructor(with_opposite_magnitude(sensor), tier=Tier.CNN_MULTIMODAL),
+        False: Reconstructor(sensor, tier=Tier.PLS_PAPER),
+        True: Reconstructor(with_opposite_magnitude(sensor), tier=Tier.PLS_PAPER),
     }
