@@ -3,8 +3,12 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+TRAIN_READY := $(VENV)/.ready-train
 
-.PHONY: help run test test-slow lint format bench lock clean
+LOCKED := pyproject.toml --universal --python-version 3.11 --generate-hashes \
+  --no-emit-package tactomo-client --no-emit-package tactomo
+
+.PHONY: help run test test-slow test-train lint format bench lock clean
 
 help:            ## list these targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -16,7 +20,10 @@ test: $(READY)   ## the default test suite
 	$(BIN)/pytest $(ARGS)
 
 test-slow: $(READY)  ## the tests too long for every run
-	$(BIN)/pytest -m slow $(ARGS)
+	$(BIN)/pytest -m 'slow and not train' $(ARGS)
+
+test-train: $(TRAIN_READY)  ## the tests of training; installs PyTorch
+	$(BIN)/pytest -m train $(ARGS)
 
 lint: $(READY)   ## ruff and mypy --strict
 	$(BIN)/ruff check .
@@ -30,10 +37,10 @@ format: $(READY) ## let ruff rewrite what it can
 bench: $(READY)  ## latency and time per frame on this machine
 	$(BIN)/tactomo bench $(ARGS)
 
-lock:            ## refresh requirements.lock (needs uv on the PATH)
-	uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 \
-	  --generate-hashes --no-emit-package tactomo-client --no-emit-package tactomo \
-	  -o requirements.lock
+lock:            ## refresh the lock files (needs uv on the PATH)
+	uv pip compile $(LOCKED) --extra dev -o requirements.lock
+	uv pip compile $(LOCKED) --extra train -c requirements.lock -c requirements-torch.txt \
+	  --no-emit-package torch -o requirements-train.lock
 
 clean:           ## remove the environment and caches
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis
@@ -44,4 +51,10 @@ $(READY): requirements.lock pyproject.toml clients/python/pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --require-hashes -r requirements.lock
 	$(BIN)/python -m pip install --quiet --no-build-isolation --no-deps -e clients/python -e .
+	touch $@
+
+# On top of that: torch last, when all it needs has come with its hash.
+$(TRAIN_READY): $(READY) requirements-train.lock requirements-torch.txt
+	$(BIN)/python -m pip install --quiet --require-hashes -r requirements-train.lock
+	$(BIN)/python -m pip install --quiet -r requirements-torch.txt
 	touch $@
