@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.ndimage import gaussian_filter
 from torch import Tensor, nn
 
+from tactomo_models.description import SensorDescription
 from tactomo_models.network import FILTER_SIGMA, preprocessed
-from tactomo_models.training.batches import Batch, SceneBatches
+from tactomo_models.prefilter import BANDS
+from tactomo_models.symmetry import Symmetry, symmetries
+from tactomo_models.training.batches import HELD_OUT, Batch, SceneBatches
 from tactomo_models.training.preliminary import read_images
+from tactomo_models.training.sights import read_sights
 from tactomo_models.training.simulate import read_scenes
 
 LEAST_CHANGE = 0.4  # squared sum of a map below which scenes count less: 25 nodes of half a range
@@ -44,19 +51,8 @@ class FusionLesson:
         """RIE squared of the map, cross entropy of the shape, and of the confidence."""
         turn = int(torch.randint(8, (1,), generator=random))
         batch = self.batches.draw(chosen, random, turn=turn % self.batches.turns)
-        size, shape, trust = network.raw(batch.inputs.to(device))
-        size, shape = size.float(), shape.float()
-        true, pressed = batch.map.to(device) / network.scale, batch.pressed.to(device)
-        weight = 1 / ((true**2).sum((1, 2)) + LEAST_CHANGE)
-        of_map = (((size - true) ** 2).sum((1, 2)) * weight).mean()
-        entropy = nn.functional.binary_cross_entropy_with_logits(shape, pressed, reduction="none")
-        of_shape = (entropy.sum((1, 2)) / (pressed.sum((1, 2)) + LEAST_PRESSED)).mean()
-        right = correlations(size.detach(), true).clamp(0, 1)
-        told = nn.functional.binary_cross_entropy_with_logits(
-            trust.float(), right, reduction="none"
-        )
-        of_trust = (told * (true.amax((1, 2)) > 0)).mean()
-        return torch.as_tensor(of_map + SHAPE_SHARE * of_shape + TRUST_SHARE * of_trust)
+        made = network.raw(batch.inputs.to(device))
+        return image_loss(made, batch.map.to(device) / network.scale, batch.pressed.to(device))
 
     def examine(self, network: nn.Module, device: str) -> dict[str, float]:
         """Correlation with the truth, by noise and number of contacts."""
@@ -71,6 +67,102 @@ class FusionLesson:
                 contacts.append(torch.where(batch.map.amax((1, 2)) > 0, batch.contacts, 0))
             found |= by_contacts(f"{snr_db:g} dB", torch.cat(icc), torch.cat(contacts))
         return found
+
+
+def image_loss(made: tuple[Tensor, Tensor, Tensor], true: Tensor, pressed: Tensor) -> Tensor:
+    """RIE squared of the map, cross entropy of the shape, and of the confidence.
+
+    Args:
+        made: `FusionNetwork.raw` of n scenes.
+        true: (n, rows, columns) maps over the network's scale.
+        pressed: (n, rows, columns) shapes.
+    """
+    size, shape, trust = (part.float() for part in made)
+    weight = 1 / ((true**2).sum((1, 2)) + LEAST_CHANGE)
+    of_map = (((size - true) ** 2).sum((1, 2)) * weight).mean()
+    entropy = nn.functional.binary_cross_entropy_with_logits(shape, pressed, reduction="none")
+    of_shape = (entropy.sum((1, 2)) / (pressed.sum((1, 2)) + LEAST_PRESSED)).mean()
+    right = correlations(size.detach(), true).clamp(0, 1)
+    told = nn.functional.binary_cross_entropy_with_logits(trust, right, reduction="none")
+    of_trust = (told * (true.amax((1, 2)) > 0)).mean()
+    return torch.as_tensor(of_map + SHAPE_SHARE * of_shape + TRUST_SHARE * of_trust)
+
+
+class RefinerLesson:
+    """The refining network's: better images from those that the physics has found.
+
+    Args:
+        folder: of simulated scenes whose sights are made, see `training.sights`.
+        description: the sensor.
+        bases: (M, K) signal basis of each channel, as of the network that proposed.
+        scale: relative conductivity change that counts as 1.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        description: SensorDescription,
+        bases: Sequence[NDArray[np.float64]],
+        scale: float,
+    ) -> None:
+        sights = read_sights(folder)
+        seen = np.stack([sights["map"] / np.float16(scale), sights["structure"]], axis=1)
+        self._inputs = torch.as_tensor(sights["inputs"])
+        self._seen = torch.as_tensor(seen)
+        self._map, self._pressed = (torch.as_tensor(sights[k]) for k in ("true_map", "pressed"))
+        self._contacts = torch.as_tensor(sights["contacts"].astype(np.int64))
+        self._snr_db = torch.as_tensor(sights["snr_db"])
+        self._turns = [
+            (torch.as_tensor(turn.nodes), _turned_inputs(turn, bases))
+            for turn in symmetries(description)
+        ]
+        self._scale = scale
+        self.scenes = round(len(self._inputs) * (1 - HELD_OUT))
+        self.nodes = (description.map.nodes_y, description.map.nodes_x)
+
+    @property
+    def inputs(self) -> int:
+        """Numbers that the network is given beside the images."""
+        return int(self._inputs.shape[1])
+
+    def loss(
+        self, network: nn.Module, chosen: Tensor, random: torch.Generator, device: str
+    ) -> Tensor:
+        """See `image_loss`."""
+        turn = int(torch.randint(len(self._turns), (1,), generator=random))
+        nodes, matrix = self._turns[turn]
+        seen, true, pressed = (
+            images[chosen].float().flatten(-2)[..., nodes].unflatten(-1, self.nodes)
+            for images in (self._seen, self._map, self._pressed)
+        )
+        made = network.raw((self._inputs[chosen] @ matrix.T).to(device), seen.to(device))
+        return image_loss(made, true.to(device) / self._scale, pressed.to(device))
+
+    def examine(self, network: nn.Module, device: str) -> dict[str, float]:
+        """Correlation with the truth, by noise, of what goes in and of what comes out."""
+        held_out = torch.arange(self.scenes, len(self._inputs))
+        before, after = [], []
+        for chosen in held_out.split(256):
+            seen = self._seen[chosen].float()
+            size, _, _ = network(self._inputs[chosen].to(device), seen.to(device))
+            truth = self._map[chosen].float()
+            before.append(correlations(seen[:, 0], truth))
+            after.append(correlations(size.cpu().float(), truth))
+        found, noise = {}, self._snr_db[held_out]
+        for low, high in ((30, 60), (15, 30), (8, 15)):
+            band = (noise >= low) & (noise < high)
+            found[f"{low}-{high} dB, seen"] = float(torch.cat(before)[band].mean())
+            found[f"{low}-{high} dB, refined"] = float(torch.cat(after)[band].mean())
+        return found
+
+
+def _turned_inputs(turn: Symmetry, bases: Sequence[NDArray[np.float64]]) -> Tensor:
+    """Matrix (K, K) that takes filtered data to those of the turned scene."""
+    blocks = []
+    for basis in bases:
+        turned = basis[turn.scan] * turn.sign[:, None]
+        blocks += [np.linalg.pinv(basis) @ turned, np.eye(BANDS)]
+    return torch.as_tensor(block_diag(*blocks)).float()
 
 
 def correlations(images: Tensor, truths: Tensor) -> Tensor:
