@@ -29,6 +29,8 @@ from tactomo_models.evaluation.scenes import (
     gap_m,
     outline_of,
 )
+from tactomo_models.evaluation.still import Variant
+from tactomo_models.evaluation.trade_off import measure_moving
 
 PLACES_MM = {"A": (-38, -38), "B": (35, 10)}
 
@@ -198,3 +200,30 @@ def test_a_sequence_is_drawn_once_and_kept(small: SensorDescription, tmp_path: P
     assert first.noise["structure"] == pytest.approx(0.01 * np.sqrt(np.mean(change[loaded] ** 2)))
     quiet = np.abs(change).max(axis=1) == 0
     np.testing.assert_array_equal(quiet, ~np.array(loaded))
+
+
+def test_speed_and_accuracy_are_of_all_frames(
+    paper: SensorDescription,
+    simulator: SkinSimulator,
+    artifact: Artifact,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(
+        "tactomo_models.evaluation.moving.load_or_build_artifact", lambda _: artifact
+    )
+    scene = sequence(paper, simulator, Step("rest", {}), *[Step("still", {"A": press("A")})] * 2)
+    done: list[None] = []
+    points = list(
+        measure_moving(
+            [scene],
+            [Variant("noser"), Variant("fit", 0.05)],
+            lambda: done.append(None),
+        )
+    )
+    assert [(p.scene, p.snr_db, str(p.variant), p.frames) for p in points] == [
+        ("moving", 40.0, "noser", 3),
+        ("moving", 40.0, "fit, 50 ms", 3),
+    ]
+    assert len(done) == 6
+    assert points[0].icc < points[1].icc < 1
+    assert 0 < points[0].p50_s <= points[0].p99_s

@@ -1,9 +1,10 @@
 """`tactomo bench`: how fast all this is on the machine at hand.
 
-Two measurements. *Live*: a twin and a daemon as processes of their own, and this process as the
+Three measurements. *Live*: a twin and a daemon as processes of their own, and this process as the
 subscriber; latency is from the moment at which the daemon has read the last byte of a dual scan to
 the arrival of its contacts here, by the clock that both processes share. *Methods*: the time that
 one reconstruction takes by every method, beside what it is compared with (`bench_methods`).
+*Chart*: that time against how right the reconstruction is (`bench_chart`), instead of the others.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import typer
 from tactomo.cli.app import BUILD, DEFAULT_DESCRIPTION, Description, JsonOutput, app, examples
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
     from tactomo_models import SensorDescription
 
@@ -33,6 +35,7 @@ PAGE_WIDTH = 150
 SETTLE_S = 1.5
 STATUS_S = 13.0  # at 20 dual scans a second: as far back as the stage times in a status go
 START_S = 60.0
+LIVE, CHART = "Live and methods", "Speed against accuracy"
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,7 @@ class Results:
     late_scans: int | None = None
     dropped_scans: int | None = None
     methods: list[MethodTime] = field(default_factory=list)
+    chart: list[dict[str, Any]] = field(default_factory=list)
 
 
 @app.command(
@@ -68,20 +72,43 @@ class Results:
         "tactomo bench --seconds 20 --ports 1",
         "tactomo bench --replay grasp.mcap",
         "tactomo bench --no-live --json > times.json",
+        "tactomo bench --chart speed_accuracy.png --count 25",
     ),
 )
 def bench(
     description: Description = DEFAULT_DESCRIPTION,
     seconds: Annotated[
-        float, typer.Option(min=1.0, help="Time of each of the four live scenes.")
+        float,
+        typer.Option(min=1.0, rich_help_panel=LIVE, help="Time of each of the four live scenes."),
     ] = STATUS_S,
-    ports: Annotated[int, typer.Option(min=1, max=2, help="Lines of the twin.")] = 2,
-    rate: Annotated[float, typer.Option(help="Dual scans a second of the twin.")] = 20.0,
+    ports: Annotated[
+        int, typer.Option(min=1, max=2, rich_help_panel=LIVE, help="Lines of the twin.")
+    ] = 2,
+    rate: Annotated[
+        float, typer.Option(rich_help_panel=LIVE, help="Dual scans a second of the twin.")
+    ] = 20.0,
     replay: Annotated[
-        Path | None, typer.Option(help="Measure on this recording instead of a twin.")
+        Path | None,
+        typer.Option(rich_help_panel=LIVE, help="Measure on this recording instead of a twin."),
     ] = None,
-    live: Annotated[bool, typer.Option(help="Measure latency from port to subscriber.")] = True,
-    methods: Annotated[bool, typer.Option(help="Measure the time of each method.")] = True,
+    live: Annotated[
+        bool, typer.Option(rich_help_panel=LIVE, help="Measure latency from port to subscriber.")
+    ] = True,
+    methods: Annotated[
+        bool, typer.Option(rich_help_panel=LIVE, help="Measure the time of each method.")
+    ] = True,
+    chart: Annotated[
+        Path | None,
+        typer.Option(
+            rich_help_panel=CHART,
+            help="Instead of all else, draw every method's accuracy over its time: .png, .svg or "
+            ".pdf, and a .csv beside it. Needs matplotlib.",
+        ),
+    ] = None,
+    count: Annotated[
+        int,
+        typer.Option(min=1, rich_help_panel=CHART, help="Still scenes each of 1 to 4 contacts."),
+    ] = 10,
     as_json: JsonOutput = False,
 ) -> None:
     """Measure latency, rate and time per frame on this machine.
@@ -90,12 +117,18 @@ def bench(
     (but shares the processor). The methods are set beside a bare matrix-vector product, the
     paper's own level set and pyEIT's Gauss-Newton (`pip install 'tactomo[compare]'`), ratios first.
     Takes about two minutes.
+
+    With `--chart`, every method reconstructs simulated scenes of the reporting seeds: still ones
+    at 40, 20 and 10 dB, each from a cold start, and moving ones under a daemon's budgets. Takes
+    about ten minutes, the first time some more to simulate them.
     """
+    results = Results(machine(), description, "a twin" if replay is None else replay.name)
+    if chart is not None:
+        _chart(results, chart, count, as_json)
+        return
     from rich.console import Console
 
-    progress = Console(stderr=True)
-    results = Results(machine(), description, "a twin" if replay is None else replay.name)
-    with progress.status("starting") as shown:
+    with Console(stderr=True).status("starting") as shown:
         if live and replay is not None:
             _measure_replay(results, replay, shown.update)
         elif live:
@@ -108,6 +141,31 @@ def bench(
         typer.echo(json.dumps(asdict(results), indent=2))
     else:
         _print(results)
+
+
+def _chart(results: Results, picture: Path, count: int, as_json: bool) -> None:
+    """Measure, draw and tell speed against accuracy."""
+    from tactomo.cli import bench_chart
+    from tactomo.cli.bench_chart_picture import draw_chart
+    from tactomo.cli.plot import save_figure
+
+    bench_chart.prepare_chart(picture)
+    points = bench_chart.measure_chart(results.description, count)
+    results.chart = bench_chart.rows_of(points)
+    bench_chart.write_table(results.chart, results.machine, bench_chart.table_path(picture))
+    sequences = bench_chart.sequences(count)
+    title = (
+        f"Simulated, not measured on hardware: sensor {results.description}, reporting seeds; "
+        f"{count} still scenes each of 1 to 4 contacts, {sequences} moving "
+        f"scene{'s' * (sequences > 1)}\none thread of {results.machine}; figures at points: "
+        "budget of modelled work; pale: something else is both faster and better"
+    )
+    save_figure(draw_chart(points, title), picture)
+    if as_json:
+        typer.echo(json.dumps(asdict(results), indent=2))
+    else:
+        _console(results).print(bench_chart.table_of(points))
+    typer.echo(f"wrote {picture} and {bench_chart.table_path(picture)}", err=True)
 
 
 def _measure_twin(
@@ -237,12 +295,7 @@ def _spot(description: SensorDescription, place: tuple[float, float]) -> tuple[f
 
 
 def _print(results: Results) -> None:
-    from rich.console import Console
-
-    console = Console()
-    if not console.is_terminal:  # a file has no width of its own, and the table needs one
-        console = Console(width=PAGE_WIDTH)
-    console.print(f"[bold]{results.machine}[/], sensor {results.description}")
+    console = _console(results)
     if results.live:
         console.print(_live_table(results))
         console.print(_stage_table(results.live))
@@ -255,6 +308,17 @@ def _print(results: Results) -> None:
         from tactomo.cli.bench_methods import table_of
 
         console.print(table_of(results.methods))
+
+
+def _console(results: Results) -> Console:
+    """Return where to print, and say there on what everything was measured."""
+    from rich.console import Console
+
+    console = Console()
+    if not console.is_terminal:  # a file has no width of its own, and the table needs one
+        console = Console(width=PAGE_WIDTH)
+    console.print(f"[bold]{results.machine}[/], sensor {results.description}")
+    return console
 
 
 def _live_table(results: Results) -> Table:

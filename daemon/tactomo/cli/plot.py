@@ -100,6 +100,24 @@ def prepare_picture(output: Path) -> None:
             "drawing needs matplotlib, which is not installed", "pip install 'tactomo[plot]'"
         ) from error
     matplotlib.use("Agg")
+    prepare_file(output)
+
+
+def prepare_file(output: Path) -> None:
+    """Make sure before the work that a file can be written; what it holds stays as it is.
+
+    Raises:
+        TactomoError: it cannot be.
+    """
+    is_new = not output.exists()
+    try:
+        output.open("ab").close()
+        if is_new:
+            output.unlink()
+    except OSError as error:
+        raise TactomoError(
+            f"cannot write {output}: {error.strerror}", "name a file that you may write"
+        ) from error
 
 
 def save_figure(figure: Figure, output: Path) -> None:

@@ -1,0 +1,173 @@
+"""The chart of `tactomo bench`: every method's speed against its accuracy, on simulated scenes.
+
+Still scenes at three signal-to-noise ratios and moving ones, all with reporting seeds. The points
+go into a table of comma-separated values beside the picture (`bench_chart_picture`).
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import typer
+from rich.console import Console
+from rich.progress import Progress
+from tactomo_models import METHODS, load_description
+from tactomo_models.evaluation import scenes as draw_scenes
+from tactomo_models.evaluation.moving import draw_sequence
+from tactomo_models.evaluation.trade_off import (
+    STILL_BUDGETS_S,
+    Point,
+    left_out,
+    measure_moving,
+    measure_still,
+    panels,
+    pareto_front,
+    variants,
+)
+
+from tactomo.cli.plot import prepare_file, prepare_picture
+from tactomo.errors import TactomoError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+STILL_SNR_DB: Final = (40.0, 20.0, 10.0)
+MOVING_SNR_DB: Final = 40.0
+CONTACTS: Final = (1, 2, 3, 4)
+SCENES_A_SEQUENCE: Final = 5  # a sequence has 146 frames
+SEEDS: Final = "reporting"
+
+
+def prepare_chart(picture: Path) -> None:
+    """Make sure before the work that the chart and its table can be written.
+
+    Raises:
+        TactomoError: they cannot be.
+    """
+    prepare_picture(picture)
+    prepare_file(table_path(picture))
+
+
+def table_path(picture: Path) -> Path:
+    """Return where the points are written: beside the picture."""
+    return picture.with_suffix(".csv")
+
+
+def sequences(count: int) -> int:
+    """Return how many moving scenes go with `count` still ones of each number of contacts."""
+    return -(-count // SCENES_A_SEQUENCE)
+
+
+def measure_chart(name: str, count: int) -> list[Point]:
+    """Measure every method that is to be had, with a progress bar in the terminal.
+
+    Args:
+        name: of the sensor, or its description's path.
+        count: still scenes of each number of contacts.
+
+    Raises:
+        ModelError: there are no scenes for such a sensor.
+    """
+    sensor = load_description(name)
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        still = [
+            list(
+                progress.track(
+                    draw_scenes(sensor, SEEDS, count, contacts=CONTACTS, snr_db=snr_db),
+                    total=count * len(CONTACTS),
+                    description=f"simulating still scenes, {snr_db:g} dB",
+                )
+            )
+            for snr_db in STILL_SNR_DB
+        ]
+        numbers = progress.track(range(sequences(count)), description="simulating moving scenes")
+        moving = [draw_sequence(sensor, SEEDS, n, snr_db=MOVING_SNR_DB) for n in numbers]
+        missing = left_out(still[0][0], METHODS)
+        for method, reason in missing.items():
+            typer.echo(f"left out: {method}: {reason}", err=True)
+        methods = [method for method in METHODS if method not in missing]
+
+        points: list[Point] = []
+        of_still, of_moving = variants(methods, STILL_BUDGETS_S), variants(methods)
+        for scenes in still:
+            what = f"measuring on still scenes, {scenes[0].snr_db:g} dB"
+            task = progress.add_task(what, total=len(scenes) * len(of_still))
+            points += measure_still(scenes, of_still, partial(progress.advance, task))
+        for variant in of_moving:
+            frames = sum(len(sequence.steps) for sequence in moving)
+            task = progress.add_task(f"measuring on moving scenes: {variant}", total=frames)
+            points += measure_moving(moving, [variant], partial(progress.advance, task))
+    return points
+
+
+def rows_of(points: Sequence[Point]) -> list[dict[str, Any]]:
+    """Return the points as flat rows, for JSON and tables; in each panel the fastest first."""
+    rows = []
+    for panel in panels(points):
+        front = pareto_front(panel)
+        for point in sorted(panel, key=lambda p: p.p50_s):
+            row = asdict(point)
+            variant, p50_s, p99_s = row.pop("variant"), row.pop("p50_s"), row.pop("p99_s")
+            budget_s = variant["budget_s"]
+            rows.append(
+                {
+                    "scene": row.pop("scene"),
+                    "snr_db": row.pop("snr_db"),
+                    "method": str(variant["method"]),
+                    "budget_ms": None if budget_s is None else budget_s * 1e3,
+                    "p50_ms": p50_s * 1e3,
+                    "p99_ms": p99_s * 1e3,
+                    **row,
+                    "on_front": point in front,
+                }
+            )
+    return rows
+
+
+def write_table(rows: Sequence[dict[str, Any]], machine: str, path: Path) -> None:
+    """Write the chart's rows as comma-separated values, each with the machine it was measured on.
+
+    Raises:
+        TactomoError: the file cannot be written.
+    """
+    try:
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, [*rows[0], "simulated", "seeds", "threads", "machine"])
+            writer.writeheader()
+            for row in rows:
+                shown = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()}
+                how = {"simulated": True, "seeds": SEEDS, "threads": 1, "machine": machine}
+                writer.writerow({**shown, **how})
+    except OSError as error:
+        raise TactomoError(
+            f"cannot write {path}: {error.strerror}",
+            "name a picture in a folder that you may write",
+        ) from error
+
+
+def table_of(points: Sequence[Point]) -> Table:
+    """Lay out the Pareto fronts: that than which nothing is both faster and more right."""
+    from rich.table import Table
+
+    table = Table(title="Pareto fronts (simulated, one thread): the best for its time")
+    for name in ("scenes", "method", "p50 ms", "p99 ms", "ICC", "worst", "count", "wrong"):
+        table.add_column(name, justify="left" if name in ("scenes", "method") else "right")
+    for panel in panels(points):
+        for point in pareto_front(panel):
+            table.add_row(
+                f"{point.scene}, {point.snr_db:g} dB",
+                str(point.variant),
+                f"{point.p50_s * 1e3:.1f}",
+                f"{point.p99_s * 1e3:.1f}",
+                f"{point.icc:.3f}",
+                f"{point.icc_worst:.2f}",
+                f"{point.count_right:.0%}",
+                f"{point.confidently_wrong:.0%}",
+            )
+        table.add_section()
+    return table
