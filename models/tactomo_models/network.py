@@ -200,6 +200,51 @@ class PaperNetwork:
         return NetworkImage((filtered * self._scale).astype(np.float32), None, float("nan"))
 
 
+class SensorNetworks:
+    """The networks of one sensor, each loaded when it is first asked for.
+
+    Args:
+        description: the sensor.
+    """
+
+    def __init__(self, description: SensorDescription) -> None:
+        self._description = description
+        self._paper: dict[NetworkKind, PaperNetwork] = {}
+
+    @cached_property
+    def fusion(self) -> FusionNetwork:
+        """Ours alone.
+
+        Raises:
+            ArtifactError: there is none, or it cannot be used; as for the others.
+        """
+        return FusionNetwork(load_network(self._description, "network"))
+
+    @cached_property
+    def refiner(self) -> FusionNetwork:
+        """The one that redraws what the physics has found."""
+        return FusionNetwork(load_network(self._description, "refiner"))
+
+    def paper(self, kind: NetworkKind) -> PaperNetwork:
+        """One of the paper's."""
+        if kind not in self._paper:
+            self._paper[kind] = PaperNetwork(load_network(self._description, kind))
+        return self._paper[kind]
+
+    @cached_property
+    def missing(self) -> str:
+        """Why the physics has to do without networks; empty where it need not."""
+        if len(self._description.modalities) < 2:
+            return "a single channel"
+        if not all(find_network(self._description, kind) for kind in ("network", "refiner")):
+            return "none trained for this sensor"
+        try:
+            _ = self.fusion, self.refiner
+        except ArtifactError as error:
+            return str(error)
+        return ""
+
+
 def preprocessed(
     images: Mapping[Any, FloatArray | Image], input_scale: float
 ) -> dict[str, FloatArray | Image]:

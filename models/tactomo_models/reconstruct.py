@@ -47,11 +47,9 @@ from tactomo_models.errors import DataError
 from tactomo_models.following import Freedom, ShapeFollower
 from tactomo_models.forward import ForwardModel
 from tactomo_models.network import (
-    FusionNetwork,
     NetworkImage,
     NetworkKind,
-    PaperNetwork,
-    find_network,
+    SensorNetworks,
     load_network,
 )
 from tactomo_models.objects import ObjectFollower
@@ -285,7 +283,8 @@ class Reconstructor:
         self._frames_held = 0  # since the last structure scan
         self._stage_s: dict[str, float] = {}
         self._left_out: list[str] = []
-        self._paper_networks: dict[Tier, PaperNetwork] = {}
+        self._networks = SensorNetworks(description)
+        _ = self._proposes  # loads what it takes now, and not when something presses
         self._structure_answers_more = len(description.modalities) == 2 and bool(
             np.log(_contrast(description, "structure"))
             > MUCH_MORE * np.log(_contrast(description, "magnitude"))
@@ -574,7 +573,7 @@ class Reconstructor:
         return self._imaged(image, data, flags, Tier.NETWORK, reason)
 
     def _network_image(self, data: dict[Modality, _Data]) -> NetworkImage:
-        return self._fusion.image(*self._network_data(data))
+        return self._networks.fusion.image(*self._network_data(data))
 
     def _network_data(
         self, data: dict[Modality, _Data]
@@ -585,7 +584,9 @@ class Reconstructor:
 
     def network_inputs(self, magnitude: FloatArray, structure: FloatArray) -> FloatArray:
         """What our network is given of a frame, (K,); the arguments are `reconstruct`'s."""
-        return self._fusion.filtered(*self._network_data(self._taken(magnitude, structure)))
+        return self._networks.fusion.filtered(
+            *self._network_data(self._taken(magnitude, structure))
+        )
 
     def _taken(self, magnitude: FloatArray, structure: FloatArray) -> dict[Modality, _Data]:
         data: dict[Modality, _Data] = {}
@@ -593,26 +594,15 @@ class Reconstructor:
         self._take("structure", structure, data, saturated=False)
         return data
 
-    @cached_property
-    def _fusion(self) -> FusionNetwork:
-        """Loaded when it is first asked for."""
-        return FusionNetwork(load_network(self.description, "network"))
-
     def _by_paper_network(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
         """The paper's network; areas are where its map exceeds half of its peak."""
         self._forget_shape()
+        network = self._networks.paper(NETWORK_OF[self.tier])
         with self._timed("images"):
-            images = self._preliminary_images(data, self._paper_network.modalities)
+            images = self._preliminary_images(data, network.modalities)
         with self._timed("network"):
-            image = self._paper_network.image(images)
+            image = network.image(images)
         return self._imaged(image, data, flags, self.tier, "as requested")
-
-    @property
-    def _paper_network(self) -> PaperNetwork:
-        if self.tier not in self._paper_networks:
-            kind = NETWORK_OF[self.tier]
-            self._paper_networks[self.tier] = PaperNetwork(load_network(self.description, kind))
-        return self._paper_networks[self.tier]
 
     def _preliminary_images(
         self, data: dict[Modality, _Data], modalities: Collection[Modality]
@@ -754,14 +744,10 @@ class Reconstructor:
         areas = self._areas.find(pressed, self._areas.on_nodes(pressed))
         return ellipses_of(areas.on_map, *self._areas.map_places)
 
-    @cached_property
-    def _has_network(self) -> bool:
-        both = len(self.description.modalities) == 2
-        return both and find_network(self.description, "network") is not None
-
     @property
     def _proposes(self) -> bool:
-        return self.tier is Tier.HYBRID or (self.tier is Tier.AUTO and self._has_network)
+        """Whether networks help the physics."""
+        return self.tier is Tier.HYBRID or (self.tier is Tier.AUTO and not self._networks.missing)
 
     def _paper_shape(self, structure: _Data) -> Shape:
         image = np.maximum(self._linear_image("structure", structure.change, Tier.TIKHONOV), 0.0)
