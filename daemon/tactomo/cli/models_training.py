@@ -1,13 +1,15 @@
-"""`tactomo models simulate`: the scenes that networks are trained on."""
+"""`tactomo models simulate` and `train`: scenes to learn from, and the networks that do."""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict, replace
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -20,6 +22,8 @@ from tactomo.errors import TactomoError
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress, Task
+    from tactomo_models.training.recipes import Prepared
+    from tactomo_models.training.train import Epoch, Settings, Training
 
 EXTRA = frozenset({"dask", "distributed", "joblib", "onnx", "onnxscript", "torch"})
 INTERRUPTED = 130
@@ -106,6 +110,163 @@ def simulate(
         typer.echo(f"wrote {picture}", err=True)
 
 
+@models_app.command(
+    epilog=examples(
+        "tactomo models train scenes/robust",
+        "tactomo models train scenes/robust --epochs 5 --output trial.onnx --picture trial.png",
+        "tactomo models train scenes/paper --recipe paper-multimodal --device cuda",
+    ),
+)
+def train(
+    folder: Annotated[Path, typer.Argument(help="Scenes, from `tactomo models simulate`.")],
+    recipe: Annotated[
+        Literal["ours", "ours-small", "ours-single", "paper-single", "paper-multimodal"],
+        typer.Option(help="Which network, see above."),
+    ] = "ours",
+    epochs: Annotated[
+        int | None, typer.Option(min=1, help="Passes over the scenes. [the recipe's]")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of weights, order, noise and turns.")] = 0,
+    device: Annotated[Literal["cpu", "cuda"], typer.Option(help="What computes.")] = "cpu",
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Processes and threads. [one for each core]")
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="The network. [the cache, where tactomo looks]"),
+    ] = None,
+    checkpoint: Annotated[
+        Path | None, typer.Option(help="What to go on from. [FOLDER/RECIPE.pt]")
+    ] = None,
+    sensor: DescriptionOption = DEFAULT_DESCRIPTION,
+    picture: Annotated[
+        Path | None,
+        typer.Option(help="Draw loss and correlation by epoch, after each: .png, .svg or .pdf."),
+    ] = None,
+    as_json: JsonOutput = False,
+) -> None:
+    """Train a network on simulated scenes and export it to ONNX.
+
+    A checkpoint is kept after each epoch: Ctrl-C stops, and the same command goes on, to the same
+    network as without the stop. Some of the scenes are held out; what is shown of them is the
+    correlation (ICC) of the found map with the truth, by noise and number of contacts.
+
+    *ours* takes both channels' voltages, *ours-small* is half as wide, *ours-single* has the
+    magnitude channel alone; all want scenes of the preset robust. *paper-single* and
+    *paper-multimodal* are the paper's, on scenes of the preset paper, whose Tikhonov and level set
+    images are made first and kept. All take one to two hours on two cores.
+
+    A network that is written to the cache is used from then on for this sensor, instead of the one
+    that ships; delete it to go back. Needs `pip install 'tactomo[train]'`.
+    """
+    if picture is not None:
+        prepare_picture(picture)
+    with _training_extra():
+        import torch
+        from tactomo_models import load_description
+        from tactomo_models.network import own_path
+        from tactomo_models.training.recipes import RECIPES, export_trained
+
+        if device == "cuda" and not torch.cuda.is_available():
+            raise TactomoError("PyTorch finds no GPU here", "leave out --device, or use cpu")
+        if jobs is not None:
+            torch.set_num_threads(jobs)
+        description, chosen = load_description(sensor), RECIPES[recipe]
+        settings = replace(chosen.settings, seed=seed, device=device)
+        settings = replace(settings, epochs=epochs or settings.epochs)
+        prepared = _prepare(recipe, folder, sensor, seed, jobs)
+        kept = checkpoint or folder / f"{recipe}.pt"
+        training = _train(prepared, settings, kept, recipe, picture)
+        written = output or own_path(description, chosen.kind)
+        export_trained(prepared, training, written)
+    if as_json:
+        told = {"recipe": recipe, "folder": str(folder), "simulated": True, "output": str(written)}
+        history = [_as_json(epoch) for epoch in training.history]
+        typer.echo(json.dumps({**told, **asdict(settings), "history": history}, indent=2))
+    else:
+        typer.echo(f"wrote {written}: {written.stat().st_size / 1e6:.1f} MB")
+
+
+def _prepare(recipe: str, folder: Path, sensor: str, seed: int, jobs: int | None) -> Prepared:
+    """Read the scenes; those of the paper's networks get their images first."""
+    from rich.console import Console
+    from tactomo_models import load_description
+    from tactomo_models.training.preliminary import make_images
+    from tactomo_models.training.recipes import RECIPES, check_scenes, prepare
+    from tactomo_models.training.simulate import read_manifest
+
+    description, chosen = load_description(sensor), RECIPES[recipe]
+    check_scenes(chosen, folder, description)
+    if chosen.kind != "network":
+        steps = make_images(description, folder, jobs=jobs or -1)
+        _follow(steps, read_manifest(folder).scenes, "images of the scenes", folder)
+    with Console(stderr=True).status(f"reading {folder}"):
+        return prepare(chosen, folder, description, seed)
+
+
+def _train(
+    prepared: Prepared, settings: Settings, checkpoint: Path, recipe: str, picture: Path | None
+) -> Training:
+    """Train to the end, telling what each epoch came to."""
+    from rich.console import Console
+    from tactomo_models.training.train import begin, load_checkpoint, train
+
+    console = Console(stderr=True)
+    training = begin(prepared.network, settings)
+    if checkpoint.exists():
+        load_checkpoint(training, settings, checkpoint)
+        console.print(f"going on after epoch {len(training.history)}, from {checkpoint}")
+    with _training_progress(console) as shown:
+        task = shown.add_task("", loss=math.nan)
+
+        def tell(step: int, steps: int, loss: float) -> None:
+            epoch = len(training.history)
+            name = f"{recipe}, epoch {epoch + 1} of {settings.epochs}"
+            shown.update(task, description=name, total=settings.epochs * steps, loss=loss)
+            shown.update(task, completed=epoch * steps + step)
+
+        try:
+            for epoch in train(training, prepared.lesson, settings, checkpoint, tell):
+                line = _in_words(epoch, len(training.history))
+                shown.console.print(line, highlight=False, soft_wrap=True)
+                if picture is not None:
+                    _draw(training, recipe, picture)
+        except KeyboardInterrupt:
+            shown.stop()
+            typer.echo(
+                f"stopped: {checkpoint} has {len(training.history)} of {settings.epochs} epochs; "
+                "run the same command again, it goes on there",
+                err=True,
+            )
+            raise typer.Exit(INTERRUPTED) from None
+    if picture is not None:
+        _draw(training, recipe, picture)
+    return training
+
+
+def _draw(training: Training, recipe: str, picture: Path) -> None:
+    from tactomo.cli.models_training_pictures import draw_curves
+
+    draw_curves(training.history, f"{recipe}, on simulated scenes", picture)
+
+
+def _in_words(epoch: Epoch, number: int) -> str:
+    """One line: the loss, and the held-out correlations of each level of noise."""
+    from tactomo.cli.models_training_pictures import by_noise
+
+    parts = [
+        f"{noise} " + " ".join("–" if math.isnan(icc) else f"{icc:.3f}" for _, icc in values)
+        for noise, values in by_noise(epoch.held_out).items()
+    ]
+    contacts = "1 to 4 contacts, held out"
+    return f"epoch {number}: loss {epoch.loss:.4f}; ICC with {contacts}: {', '.join(parts)}"
+
+
+def _as_json(epoch: Epoch) -> dict[str, Any]:
+    held_out = {name: None if math.isnan(v) else v for name, v in epoch.held_out.items()}
+    return {"loss": epoch.loss, "held_out": held_out}
+
+
 def _follow(steps: Iterator[int], total: int, what: str, folder: Path) -> tuple[int, int]:
     """Show the progress of a simulation.
 
@@ -130,6 +291,20 @@ def _follow(steps: Iterator[int], total: int, what: str, folder: Path) -> tuple[
             )
             raise typer.Exit(INTERRUPTED) from None
     return before, done - before
+
+
+def _training_progress(console: Console) -> Progress:
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("loss {task.fields[loss]:.4f}"),
+        TimeRemainingColumn(),
+        console=console,
+        transient=True,
+        speed_estimate_period=600,
+    )
 
 
 def _progress(console: Console) -> Progress:

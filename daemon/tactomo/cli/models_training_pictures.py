@@ -1,7 +1,8 @@
-"""Pictures of `tactomo models simulate`: what networks are trained on."""
+"""Pictures of `tactomo models simulate` and `train`: scenes to learn from, and how that went."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ from tactomo.cli.plot import save_figure
 
 if TYPE_CHECKING:
     from tactomo_models import SensorDescription
+    from tactomo_models.training.train import Epoch
 
 ROWS, COLUMNS = 3, 4  # of scenes, each a pair of images
 
@@ -71,3 +73,42 @@ def draw_scenes(
 def _falls(description: SensorDescription, opposite: bool) -> bool:
     assert description.magnitude is not None
     return bool((description.magnitude.response.sign < 0) != opposite)
+
+
+def draw_curves(history: Sequence[Epoch], title: str, output: Path) -> None:
+    """Draw the loss, and the correlation with the truth on held-out scenes, epoch by epoch.
+
+    Raises:
+        TactomoError: the picture cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    epochs = range(1, len(history) + 1)
+    noises = [*by_noise(history[-1].held_out)] if history else []
+    figure = Figure(figsize=(4 * (1 + len(noises)), 3.6), layout="constrained")
+    figure.suptitle(title)
+    axes: Any = figure.subplots(1, 1 + len(noises), squeeze=False)[0]
+    axes[0].plot(epochs, [epoch.loss for epoch in history], ".-")
+    axes[0].set(xlabel="epoch", ylabel="loss", yscale="log", title="training scenes")
+    for panel, noise in zip(axes[1:], noises, strict=True):
+        curves: dict[str, list[float]] = {}
+        for epoch in history:
+            for contacts, icc in by_noise(epoch.held_out)[noise]:
+                curves.setdefault(contacts, []).append(icc)
+        for contacts, values in curves.items():
+            panel.plot(epochs, values, ".-", label=f"{contacts} contact(s): {values[-1]:.3f}")
+        panel.set(xlabel="epoch", ylabel="ICC of the map", title=f"held-out scenes, {noise}")
+        panel.legend(fontsize=8, loc="lower right")
+        panel.grid(alpha=0.3)
+    for panel in axes:
+        panel.xaxis.get_major_locator().set_params(integer=True)
+    save_figure(figure, output)
+
+
+def by_noise(held_out: Mapping[str, float]) -> dict[str, list[tuple[str, float]]]:
+    """Measures named "40 dB, 2" as pairs of the number of contacts and the value, by noise."""
+    found: dict[str, list[tuple[str, float]]] = {}
+    for name, value in held_out.items():
+        noise, _, contacts = name.rpartition(", ")
+        found.setdefault(noise, []).append((contacts, value))
+    return found

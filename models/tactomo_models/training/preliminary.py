@@ -7,19 +7,30 @@ noise-free data, as the paper trains on (section III-C-2). They are kept beside 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tactomo_models.archive import read_arrays, write_arrays
+from tactomo_models.archive import write_arrays
 from tactomo_models.description import Modality, SensorDescription
 from tactomo_models.errors import ModelError
 from tactomo_models.evaluation.simulation import with_opposite_magnitude
 from tactomo_models.reconstruct import Reconstructor, Tier
 from tactomo_models.reference import Reference
-from tactomo_models.training.simulate import read_manifest, shard_paths
+from tactomo_models.training.simulate import (
+    is_whole,
+    on_cores,
+    read_manifest,
+    read_shard,
+    read_shards,
+    shard_path,
+    shards_of,
+)
+
+IMAGES = "images"  # begins the names of the files that hold them
 
 
 def make_images(description: SensorDescription, folder: Path, *, jobs: int = -1) -> Iterator[int]:
@@ -36,15 +47,22 @@ def make_images(description: SensorDescription, folder: Path, *, jobs: int = -1)
     Raises:
         ModelError: a file is missing, damaged, or cannot be written.
     """
-    from joblib import Parallel, delayed
+    from joblib import delayed
 
-    shards = shard_paths(folder)
-    missing = [path for path in shards if not _images_path(path).exists()]
     scenes = read_manifest(folder).scenes
-    yield round(scenes * (1 - len(missing) / len(shards)))
+    missing = {
+        first: size
+        for first, size in shards_of(scenes)
+        if not is_whole(shard_path(folder, first, IMAGES), size)
+    }
+    yield scenes - sum(missing.values())
     as_json = description.model_dump_json(by_alias=True)
-    work = (delayed(_image_shard)(as_json, str(path)) for path in missing)
-    yield from Parallel(n_jobs=jobs, return_as="generator_unordered")(work)
+    work = (
+        delayed(_image_shard)(as_json, str(folder), first, size) for first, size in missing.items()
+    )
+    with on_cores(jobs) as parallel, closing(parallel(work)) as made:
+        for first in made:
+            yield missing[first]
 
 
 def read_images(folder: Path) -> dict[str, Any]:
@@ -53,17 +71,12 @@ def read_images(folder: Path) -> dict[str, Any]:
     Raises:
         ModelError: some are missing or damaged.
     """
-    shards = [read_arrays(_images_path(path)) for path in shard_paths(folder)]
-    return {key: np.concatenate([shard[key] for shard in shards]) for key in shards[0]}
+    return read_shards(folder, IMAGES)
 
 
-def _images_path(shard: Path) -> Path:
-    return shard.with_name(shard.name.replace("scenes", "images"))
-
-
-def _image_shard(description: str, path: str) -> int:
-    """Make the images of one shard; says of how many scenes."""
-    scenes = read_arrays(Path(path))
+def _image_shard(description: str, folder: str, first: int, size: int) -> int:
+    """Make the images of the shard that begins with scene `first`; returns that."""
+    scenes = read_shard(shard_path(Path(folder), first), size)
     reconstructors = _reconstructors(description)
     made: dict[Modality, list[Any]] = {"magnitude": [], "structure": []}
     last: dict[bool, bytes] = {}  # what each measures changes against: the paper's sheet is one
@@ -81,7 +94,7 @@ def _image_shard(description: str, path: str) -> int:
         images = reconstructor.preliminary_images(volts["magnitude"], volts["structure"])
         for name, image in images.items():
             made[name].append(image.astype(np.float16))
-    target = _images_path(Path(path))
+    target = shard_path(Path(folder), first, IMAGES)
     try:
         write_arrays(target, {name: np.stack(images) for name, images in made.items()})
     except OSError as error:
@@ -89,7 +102,7 @@ def _image_shard(description: str, path: str) -> int:
             f"cannot write {target}: {error.strerror}; free some space, then run the same command "
             "again: it goes on where it stopped"
         ) from error
-    return len(made["magnitude"])
+    return first
 
 
 @lru_cache(maxsize=2)

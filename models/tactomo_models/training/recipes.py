@@ -71,6 +71,24 @@ class Prepared:
     scale: float
 
 
+def check_scenes(recipe: Recipe, folder: Path, description: SensorDescription) -> None:
+    """Refuse scenes that a recipe cannot use.
+
+    Raises:
+        ModelError: they are of another sensor or preset, or there are none.
+    """
+    manifest = read_manifest(folder)
+    for name, there, needed in (
+        ("preset", manifest.preset, recipe.preset),
+        ("sensor", manifest.sha256, description.sha256),
+    ):
+        if there != needed:
+            raise ModelError(
+                f"{folder} holds scenes of {name} {there[:12]}, this recipe needs {needed[:12]}: "
+                "name another folder, or simulate one"
+            )
+
+
 def prepare(
     recipe: Recipe, folder: Path, description: SensorDescription, seed: int = 0
 ) -> Prepared:
@@ -85,16 +103,7 @@ def prepare(
     Raises:
         ModelError: the scenes are of another sensor or preset, or something is missing.
     """
-    manifest = read_manifest(folder)
-    for name, there, needed in (
-        ("preset", manifest.preset, recipe.preset),
-        ("sensor", manifest.sha256, description.sha256),
-    ):
-        if there != needed:
-            raise ModelError(
-                f"{folder} holds scenes of {name} {there[:12]}, this recipe needs {needed[:12]}: "
-                "name another folder, or simulate one"
-            )
+    check_scenes(recipe, folder, description)
     torch.manual_seed(seed)
     scale = full_range(description)
     if recipe.kind == "network":

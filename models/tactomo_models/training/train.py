@@ -209,14 +209,15 @@ def load_checkpoint(training: Training, settings: Settings, path: Path) -> None:
         ModelError: it is damaged, or of other settings or another network.
     """
     try:
-        state: dict[str, Any] = torch.load(path, weights_only=True)
+        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
         before = Settings(**state["settings"])
         history = [Epoch(**epoch) for epoch in state["history"]]
         states = [state[name] for name in ("network", "averaged", "optimiser", "random")]
-    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError, KeyError, TypeError) as error:
+    except OSError as error:
+        raise ModelError(f"cannot read {path}: {error.strerror}; name another file") from error
+    except (RuntimeError, EOFError, pickle.UnpicklingError, KeyError, TypeError) as error:
         raise ModelError(
-            f"{path} is no checkpoint, or a damaged one ({_first_line(error)}): delete it to begin "
-            "anew"
+            f"{path} is no checkpoint, or a damaged one: delete it to begin anew"
         ) from error
     for name, old, new in (
         (name, getattr(before, name), getattr(settings, name))
@@ -232,12 +233,6 @@ def load_checkpoint(training: Training, settings: Settings, path: Path) -> None:
         training.averaged.load_state_dict(states[1])
         training.optimiser.load_state_dict(states[2])
     except (RuntimeError, ValueError) as error:
-        raise ModelError(
-            f"{path} is of another network ({_first_line(error)}): name another file"
-        ) from error
+        raise ModelError(f"{path} is of another network: name another file") from error
     training.random.set_state(states[3])
     training.history = history
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).splitlines()[0][:120] if str(error) else type(error).__name__
