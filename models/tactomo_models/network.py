@@ -122,10 +122,11 @@ class FusionNetwork:
     def __init__(self, network: Network) -> None:
         self._network = network
         bases = np.load(io.BytesIO(b64decode(network._meta["bases"])), allow_pickle=False)
-        self._bases = {name: bases[name].astype(np.float64) for name in network.modalities}
+        #: (M, K) of each channel's prefilter
+        self.bases = {name: bases[name].astype(np.float64) for name in network.modalities}
         self._filters: dict[Modality, tuple[bytes, Prefilter]] = {}
         self._mute = {
-            name: prefilter(basis, np.zeros(len(basis))) for name, basis in self._bases.items()
+            name: prefilter(basis, np.zeros(len(basis))) for name, basis in self.bases.items()
         }
 
     def image(
@@ -167,7 +168,7 @@ class FusionNetwork:
         """Made anew when the noise changes: at a tare, or when a lead breaks."""
         key = certainty.tobytes()
         if name not in self._filters or self._filters[name][0] != key:
-            self._filters[name] = (key, prefilter(self._bases[name], certainty))
+            self._filters[name] = (key, prefilter(self.bases[name], certainty))
         return self._filters[name][1]
 
 

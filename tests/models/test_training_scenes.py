@@ -83,7 +83,8 @@ def test_contacts_lie_apart_inside_the_sensing_area(
 ) -> None:
     for scene in robust_scenes:
         for press in scene.presses:
-            assert paper.on_sheet(*outline_of(press), paper.sheet.frame_width_m).all()
+            x, y = outline_of(press)
+            assert paper.on_sheet(x, y, paper.sheet.frame_width_m).all()
         assert all(gap_m(a, b) > 0.004 for a, b in combinations(scene.presses, 2))
 
 

@@ -114,17 +114,27 @@ def simulate(
     epilog=examples(
         "tactomo models train scenes/robust",
         "tactomo models train scenes/robust --epochs 5 --output trial.onnx --picture trial.png",
+        "tactomo models train scenes/robust --recipe refiner --start scenes/robust/ours.pt",
         "tactomo models train scenes/paper --recipe paper-multimodal --device cuda",
     ),
 )
 def train(
     folder: Annotated[Path, typer.Argument(help="Scenes, from `tactomo models simulate`.")],
     recipe: Annotated[
-        Literal["ours", "ours-small", "ours-single", "paper-single", "paper-multimodal"],
+        Literal["ours", "ours-small", "ours-single", "refiner", "paper-single", "paper-multimodal"],
         typer.Option(help="Which network, see above."),
     ] = "ours",
     epochs: Annotated[
         int | None, typer.Option(min=1, help="Passes over the scenes. [the recipe's]")
+    ] = None,
+    batch: Annotated[
+        int | None, typer.Option(min=1, help="Scenes in a step. [the recipe's]")
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option(min=1e-6, max=1.0, help="Learning rate. [the recipe's]")
+    ] = None,
+    start: Annotated[
+        Path | None, typer.Option(help="Begin with the weights of this checkpoint.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of weights, order, noise and turns.")] = 0,
     device: Annotated[Literal["cpu", "cuda"], typer.Option(help="What computes.")] = "cpu",
@@ -152,7 +162,9 @@ def train(
     correlation (ICC) of the found map with the truth, by noise and number of contacts.
 
     *ours* takes both channels' voltages, *ours-small* is half as wide, *ours-single* has the
-    magnitude channel alone; all want scenes of the preset robust. *paper-single* and
+    magnitude channel alone; *refiner* redraws what the physics has found with the help of *ours*,
+    which is trained first: give its checkpoint by --start. All want the preset robust.
+    *paper-single* and
     *paper-multimodal* are the paper's, on scenes of the preset paper, whose Tikhonov and level set
     images are made first and kept. All take one to two hours on two cores.
 
@@ -173,8 +185,13 @@ def train(
             torch.set_num_threads(jobs)
         description, chosen = load_description(sensor), RECIPES[recipe]
         settings = replace(chosen.settings, seed=seed, device=device)
-        settings = replace(settings, epochs=epochs or settings.epochs)
-        prepared = _prepare(recipe, folder, sensor, seed, jobs)
+        settings = replace(
+            settings,
+            epochs=epochs or settings.epochs,
+            batch=batch or settings.batch,
+            rate=rate or settings.rate,
+        )
+        prepared = _prepare(recipe, folder, sensor, seed, jobs, start)
         kept = checkpoint or folder / f"{recipe}.pt"
         training = _train(prepared, settings, kept, recipe, picture)
         written = output or own_path(description, chosen.kind)
@@ -187,21 +204,29 @@ def train(
         typer.echo(f"wrote {written}: {written.stat().st_size / 1e6:.1f} MB")
 
 
-def _prepare(recipe: str, folder: Path, sensor: str, seed: int, jobs: int | None) -> Prepared:
-    """Read the scenes; those of the paper's networks get their images first."""
+def _prepare(
+    recipe: str, folder: Path, sensor: str, seed: int, jobs: int | None, start: Path | None
+) -> Prepared:
+    """Read the scenes; some networks need to see first what other methods make of them."""
     from rich.console import Console
     from tactomo_models import load_description
     from tactomo_models.training.preliminary import make_images
     from tactomo_models.training.recipes import RECIPES, check_scenes, prepare
+    from tactomo_models.training.sights import SIGHTS, make_sights
     from tactomo_models.training.simulate import read_manifest
 
     description, chosen = load_description(sensor), RECIPES[recipe]
     check_scenes(chosen, folder, description)
-    if chosen.kind != "network":
+    scenes = read_manifest(folder).scenes
+    if chosen.kind == "refiner":
+        scenes = min(scenes, SIGHTS)
+        steps = make_sights(description, folder, scenes, jobs=jobs or -1)
+        _follow(steps, scenes, "scenes reconstructed by the physics", folder)
+    elif chosen.kind != "network":
         steps = make_images(description, folder, jobs=jobs or -1)
-        _follow(steps, read_manifest(folder).scenes, "images of the scenes", folder)
+        _follow(steps, scenes, "images of the scenes", folder)
     with Console(stderr=True).status(f"reading {folder}"):
-        return prepare(chosen, folder, description, seed)
+        return prepare(chosen, folder, description, seed, start)
 
 
 def _train(

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, cast
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 
 from tactomo_models.artifact import load_or_build_artifact
@@ -14,14 +17,14 @@ from tactomo_models.description import Modality, SensorDescription
 from tactomo_models.errors import ModelError
 from tactomo_models.evaluation.measures import full_range
 from tactomo_models.forward import ForwardModel
-from tactomo_models.network import OUTPUTS, NetworkKind
+from tactomo_models.network import OUTPUTS, NetworkKind, SensorNetworks
 from tactomo_models.training.batches import SceneBatches
 from tactomo_models.training.export import export, notes_of
-from tactomo_models.training.lessons import FusionLesson, PaperLesson, linear_images
+from tactomo_models.training.lessons import FusionLesson, PaperLesson, RefinerLesson, linear_images
 from tactomo_models.training.networks import FusionNetwork, PaperNetwork
 from tactomo_models.training.presets import PresetName
 from tactomo_models.training.simulate import read_manifest
-from tactomo_models.training.train import Lesson, Settings, Training
+from tactomo_models.training.train import Lesson, Settings, Training, load_weights
 
 BOTH: Final[tuple[Modality, ...]] = ("magnitude", "structure")
 
@@ -51,10 +54,13 @@ class Recipe:
 # smaller batches, at a rate that rises and falls, and narrower convolutions: an hour on a core.
 _SHORT = Settings(epochs=20, batch=32, rate=1e-3, weight_decay=0.0)
 
+_OURS = Settings(epochs=40, batch=64)
+
 RECIPES: Final[dict[str, Recipe]] = {
-    "ours": Recipe("network", "robust", BOTH, 24, Settings(epochs=26)),
-    "ours-small": Recipe("network", "robust", BOTH, 12, Settings(epochs=26)),
-    "ours-single": Recipe("network", "robust", ("magnitude",), 24, Settings(epochs=26)),
+    "ours": Recipe("network", "robust", BOTH, 24, _OURS),
+    "ours-small": Recipe("network", "robust", BOTH, 12, _OURS),
+    "ours-single": Recipe("network", "robust", ("magnitude",), 24, _OURS),
+    "refiner": Recipe("refiner", "robust", BOTH, 24, Settings(epochs=16, batch=64, rate=1e-3)),
     "paper-single": Recipe("cnn-single", "paper", ("magnitude",), 12, _SHORT, hidden=256),
     "paper-multimodal": Recipe("cnn-multimodal", "paper", BOTH, 12, _SHORT, hidden=256),
 }
@@ -69,6 +75,7 @@ class Prepared:
     network: nn.Module
     lesson: Lesson
     scale: float
+    bases: Mapping[Modality, NDArray[np.float64]] | None = None
 
 
 def check_scenes(recipe: Recipe, folder: Path, description: SensorDescription) -> None:
@@ -90,15 +97,22 @@ def check_scenes(recipe: Recipe, folder: Path, description: SensorDescription) -
 
 
 def prepare(
-    recipe: Recipe, folder: Path, description: SensorDescription, seed: int = 0
+    recipe: Recipe,
+    folder: Path,
+    description: SensorDescription,
+    seed: int = 0,
+    start: Path | None = None,
 ) -> Prepared:
     """Read the scenes and make the network.
 
     Args:
         recipe: what is to be made.
-        folder: of simulated scenes; with their images, for the paper's networks.
+        folder: of simulated scenes; with their images, for the paper's networks; with their
+            sights, for the refiner.
         description: the sensor.
         seed: of the network's first weights.
+        start: checkpoint whose averaged weights it begins with; a refiner may begin with those of
+            a network that is given no images.
 
     Raises:
         ModelError: the scenes are of another sensor or preset, or something is missing.
@@ -110,10 +124,26 @@ def prepare(
         forward = ForwardModel(description, load_or_build_artifact(description).bare)
         batches = SceneBatches(folder, description, recipe.modalities, forward)
         network = FusionNetwork(batches.inputs, batches.nodes, recipe.width, scale)
-        network.start_linear(linear_images(batches, scale))
-        return Prepared(recipe, description, network, FusionLesson(batches), scale)
+        if start is None:
+            network.start_linear(linear_images(batches, scale))
+        else:
+            load_weights(network, start)
+        bases = dict(zip(recipe.modalities, batches.bases, strict=True))
+        return Prepared(recipe, description, network, FusionLesson(batches), scale, bases)
+    if recipe.kind == "refiner":
+        proposing = SensorNetworks(description).fusion
+        redrawn = RefinerLesson(folder, description, list(proposing.bases.values()), scale)
+        nodes = redrawn.nodes
+        network = FusionNetwork(redrawn.inputs, nodes, recipe.width, scale, images=2)
+        if start is not None:
+            other = FusionNetwork(redrawn.inputs, nodes, recipe.width, scale)
+            load_weights(other, start)
+            network.start_from(other)
+        return Prepared(recipe, description, network, redrawn, scale, proposing.bases)
     lesson = PaperLesson(folder, multimodal=len(recipe.modalities) == 2, scale=scale)
     paper = PaperNetwork(len(recipe.modalities), lesson.nodes, recipe.width, recipe.hidden)
+    if start is not None:
+        load_weights(paper, start)
     return Prepared(recipe, description, paper, lesson, scale)
 
 
@@ -125,15 +155,22 @@ def export_trained(prepared: Prepared, training: Training, path: Path) -> None:
     """
     recipe, lesson = prepared.recipe, prepared.lesson
     further = {"trained": f"{len(training.history)} epochs, {lesson.scenes} scenes"}
-    bases = None
-    if isinstance(lesson, FusionLesson):
-        bases = dict(zip(recipe.modalities, lesson.batches.bases, strict=True))
-        example = {"data": torch.zeros(1, lesson.batches.inputs)}
+    example: dict[str, torch.Tensor] = {}
+    if isinstance(lesson, PaperLesson):
+        further["input_scale"] = repr(lesson.input_scale)
+        for name in recipe.modalities:
+            example[name] = torch.zeros(1, *lesson.nodes)
     else:
-        paper = cast(PaperLesson, lesson)
-        further["input_scale"] = repr(paper.input_scale)
-        example = {name: torch.zeros(1, *paper.nodes) for name in recipe.modalities}
+        network = cast(FusionNetwork, training.averaged)
+        example["data"] = torch.zeros(1, network.inputs)
+        if network.images:
+            example["seen"] = torch.zeros(1, network.images, *network.nodes)
     notes = notes_of(
-        recipe.kind, prepared.description, recipe.modalities, prepared.scale, bases, **further
+        recipe.kind,
+        prepared.description,
+        recipe.modalities,
+        prepared.scale,
+        prepared.bases,
+        **further,
     )
     export(training.averaged.to("cpu"), example, OUTPUTS[recipe.kind], notes, path)

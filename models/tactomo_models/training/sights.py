@@ -23,6 +23,7 @@ from tactomo_models.reconstruct import Reconstructor, Tier
 from tactomo_models.reference import Reference
 from tactomo_models.training.simulate import shard_paths
 
+SIGHTS = 10_000  # scenes of a set that are reconstructed, at most: a twentieth of a second each
 SNR_DB = (8.0, 60.0)  # of the changes, drawn evenly
 VOLTAGE_SNR_DB = (35.0, 70.0)  # of the voltages, for the rest of the scenes
 OF_VOLTAGE = 0.2  # share of scenes whose noise goes by the voltages
