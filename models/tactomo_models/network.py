@@ -121,6 +121,7 @@ class FusionNetwork:
 
     def __init__(self, network: Network) -> None:
         self._network = network
+        self._scale = np.float32(network._meta["scale"])
         bases = np.load(io.BytesIO(b64decode(network._meta["bases"])), allow_pickle=False)
         #: (M, K) of each channel's prefilter
         self.bases = {name: bases[name].astype(np.float64) for name in network.modalities}
@@ -133,7 +134,7 @@ class FusionNetwork:
         self,
         changes: Mapping[Modality, FloatArray],
         certainty: Mapping[Modality, FloatArray],
-        seen: FloatArray | Image | None = None,
+        seen: tuple[Image, Image] | None = None,
     ) -> NetworkImage:
         """Reconstruct a frame.
 
@@ -141,12 +142,12 @@ class FusionNetwork:
             changes: (M,) relative voltage changes, in the direction of pressing, of each channel
                 that has a scan.
             certainty: (M,) inverse variance of each by noise; 0 where there is no voltage.
-            seen: (2, nodes_y, nodes_x) map and structure that another method has found, for a
-                network that refines them.
+            seen: map and structure (nodes_y, nodes_x) that the physics has found, for a network
+                that redraws them.
         """
         inputs: dict[str, Any] = {"data": self.filtered(changes, certainty)}
         if seen is not None:
-            inputs["seen"] = seen
+            inputs["seen"] = np.stack([seen[0] / self._scale, seen[1]])
         made = self._network.run(inputs)
         return NetworkImage(made["map"].copy(), made["structure"].copy(), float(made["confidence"]))
 

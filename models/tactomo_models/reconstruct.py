@@ -244,6 +244,7 @@ class Reconstructor:
         artifact: what is precomputed for it; read or built if None.
         tier: the most that is done; `Tier.AUTO` does what the scene needs.
         budget_s: compute time a frame may take, on a machine of the 2.5 GHz class.
+        redraw: whether the refining network has the last word on what the physics has found.
 
     Raises:
         ArtifactError: the artifact or the tier's network cannot be used.
@@ -258,10 +259,12 @@ class Reconstructor:
         *,
         tier: Tier = Tier.AUTO,
         budget_s: float | None = None,
+        redraw: bool = True,
     ) -> None:
         self.description = description
         self.tier = tier
         self.budget_s = budget_s
+        self._redraw = redraw
         check_tier(description, tier)
         self._artifact = artifact or load_or_build_artifact(description)
         self._forward = ForwardModel(description, self._artifact.bare)
@@ -688,7 +691,7 @@ class Reconstructor:
         if "magnitude" in data:
             magnitude = _fused(areas, np.array([c.magnitude for c in contacts]), pressed.shape)
             pressure = _fused(areas, np.array([c.pressure_kpa for c in contacts]), pressed.shape)
-        return Reconstruction(
+        made = Reconstruction(
             map=magnitude,
             pressure_kpa=pressure,
             structure=pressed.astype(np.float32),
@@ -697,6 +700,22 @@ class Reconstructor:
             reason=how,
             misfit=shape.misfit,
             flags=flags,
+        )
+        return self._redrawn(made, data) if self._redraw and self._proposes else made
+
+    def _redrawn(self, made: Reconstruction, data: dict[Modality, _Data]) -> Reconstruction:
+        """The physics' images, redrawn by a network that has seen what it tends to get wrong."""
+        if made.map is None or made.structure is None or not made.contacts:
+            return made
+        with self._timed("network"):
+            seen = (made.map, made.structure)
+            image = self._networks.refiner.image(*self._network_data(data), seen)
+        return replace(
+            made,
+            map=image.map,
+            structure=image.structure,
+            tier=Tier.HYBRID,
+            confidence=image.confidence,
         )
 
     def _held(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction | None:

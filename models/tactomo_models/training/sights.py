@@ -152,6 +152,7 @@ def _reconstructors(description: str) -> dict[bool, Reconstructor]:
             with_opposite_magnitude(sensor) if opposite else sensor,
             tier=Tier.HYBRID,
             budget_s=BUDGET_S,
+            redraw=False,
         )
         for opposite in (False, True)
     }
