@@ -27,6 +27,7 @@ Run = Callable[..., Any]
         *ORDER,
         *("models build", "models list"),
         *("evaluate scenes", "evaluate moving", "evaluate tanks", "evaluate skin"),
+        "evaluate stability",
     ],
 )
 def test_every_command_explains_itself(command: str) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from faulty_skin import rewired, shorted, touches, with_lead
+from faulty_skin import rewired, shorted, touches
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from noisy_skin import Skin, rms
@@ -30,6 +30,7 @@ from tactomo_models import (
     SkinSimulator,
     build_artifact,
 )
+from tactomo_models.evaluation.faults import with_lead
 from tactomo_models.forward import ForwardModel, solve_bare_sheet
 from tactomo_models.mesh import mesh_sheet
 from variants import variant

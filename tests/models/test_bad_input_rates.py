@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from faulty_skin import rewired, shorted, touches, with_lead
+from faulty_skin import rewired, shorted, touches
 from noisy_skin import Skin, rms
 from numpy.typing import NDArray
 from tactomo_models import (
@@ -25,6 +25,7 @@ from tactomo_models import (
     SensorDescription,
     SkinSimulator,
 )
+from tactomo_models.evaluation.faults import with_lead
 
 FloatArray = NDArray[np.float64]
 Scans = dict[str, FloatArray]

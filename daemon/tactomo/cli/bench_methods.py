@@ -27,7 +27,6 @@ import numpy as np
 from numpy.typing import NDArray
 from tactomo_models import (
     METHODS,
-    Flag,
     Press,
     Reconstruction,
     Reconstructor,
@@ -39,6 +38,7 @@ from tactomo_models import (
     load_or_build_artifact,
 )
 from tactomo_models.batch import BUDGET_S
+from tactomo_models.evaluation.measures import DISTRUST
 from tactomo_models.mesh import mesh_sheet
 from tactomo_models.reconstruct import LINEAR
 from threadpoolctl import threadpool_limits
@@ -65,7 +65,6 @@ REFERENCE_SCANS: Final = 20
 SETTLE_FRAMES: Final = 10
 FRAMES: Final = 20
 FAST_FRAMES: Final = 200  # of what takes a millisecond or less
-UNTRUSTED: Final = Flag.MISFIT_HIGH | Flag.NOT_CONVERGED
 SLIDE_M: Final = 2.5e-3  # of a moving contact from frame to frame
 GAUSS_NEWTON_STEPS: Final = 3  # at most
 
@@ -317,7 +316,7 @@ def _frames_row(
     spent = {s: [1e3 * frame.stage_s.get(s, 0.0) for _, frame in timed] for s in stages}
     return replace(
         _row(method, contacts, state, [seconds for seconds, _ in timed]),
-        flagged=float(np.mean([bool(frame.flags & UNTRUSTED) for _, frame in timed])),
+        flagged=float(np.mean([bool(frame.flags & DISTRUST) for _, frame in timed])),
         stage_ms={str(s): float(np.median(times)) for s, times in spent.items()},
     )
 

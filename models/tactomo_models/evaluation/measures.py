@@ -28,7 +28,15 @@ FloatArray = NDArray[np.float64]
 
 MATCH_M = 0.012  # centres farther apart belong to different contacts
 WRONG_ICC = 0.8  # a map that correlates less shows something else than what presses
-DISTRUST = Flag.MISFIT_HIGH | Flag.NOT_CONVERGED  # flags that tell a user not to trust a frame
+# Flags that tell a user not to trust a frame. The others say that a part of the data is missing or
+# was left out, and that the frame stands on the rest.
+DISTRUST = (
+    Flag.MISFIT_HIGH
+    | Flag.NOT_CONVERGED
+    | Flag.REFERENCE_MISMATCH
+    | Flag.NOISE_HIGH
+    | Flag.CHANNELS_SWAPPED
+)
 FULL_RANGE_KPA = PRESSURE_KPA[1]
 BAND_KPA = 10.0  # pressures that count as one where errors at one pressure are compared
 

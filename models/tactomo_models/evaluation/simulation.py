@@ -8,7 +8,7 @@ and jumps at an outline, while what inverts has it linear between its nodes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +22,7 @@ from tactomo_models.description import (
     StructureChannel,
     StructureResponse,
 )
+from tactomo_models.evaluation.faults import exchanged
 from tactomo_models.forward import scan_voltages, transfer_resistances, volts_per_unit
 from tactomo_models.mesh import SheetMesh, electrode_facets, mesh_sheet
 from tactomo_models.scene import Press, Shape, strongest
@@ -29,6 +30,7 @@ from tactomo_models.simulator import conductivity_ratio, smooth_noise
 
 FloatArray = NDArray[np.float64]
 Volts = dict[Modality, FloatArray]
+Warp = Callable[[SheetMesh], SheetMesh]
 
 SPACING_SHARE = 0.58  # of the map's nodes' distance: 1.74 mm on the paper's sensor
 REFINEMENTS = 3  # at the electrodes' ends, one more than what inverts
@@ -45,6 +47,26 @@ def fine_mesh(description: SensorDescription) -> SheetMesh:
     return mesh_sheet(description, spacing_m, REFINEMENTS)
 
 
+@dataclass(frozen=True)
+class SheetState:
+    """What has become of a sheet; as it was made by default.
+
+    Attributes:
+        warming: relative change of its conductivity, everywhere alike.
+        drift: standard deviation of a smooth relative change of its conductivity.
+        impedance: (L,) factors on its contact impedances; 1 where empty.
+        leads: (L,) the electrode that each of the device's leads is on; its own where empty.
+    """
+
+    warming: float = 0.0
+    drift: float = 0.0
+    impedance: tuple[float, ...] = ()
+    leads: tuple[int, ...] = ()
+
+
+AS_MADE = SheetState()
+
+
 class UnevenSkin:
     """The sheets of one sensor, uneven in their own way, and what they show of presses.
 
@@ -54,6 +76,7 @@ class UnevenSkin:
         seed: of the unevenness.
         unevenness: standard deviation of each sheet's smooth conductivity error.
         impedance_spread: standard deviation of the logarithm of the contact impedances.
+        warp: moves the nodes of a mesh to where they are on this skin; they stay if None.
     """
 
     def __init__(
@@ -64,30 +87,47 @@ class UnevenSkin:
         *,
         unevenness: float = UNEVENNESS,
         impedance_spread: float = IMPEDANCE_SPREAD,
+        warp: Warp | None = None,
     ) -> None:
         self.description = description
         self._mesh = mesh
+        self._warp: Warp = warp or (lambda mesh: mesh)
         rng = np.random.default_rng(seed)
         self._sheets = {
             name: UnevenSheet(description, rng, unevenness, impedance_spread)
             for name in description.modalities
         }
-        self._rest = {name: sheet.voltages(mesh) for name, sheet in self._sheets.items()}
+        self._rest: dict[tuple[Modality, SheetState], FloatArray] = {}
 
-    def voltages(self, presses: Sequence[Press]) -> Volts:
-        """Noise-free voltages (M,) of each channel, volts."""
+    def voltages(
+        self, presses: Sequence[Press], states: Mapping[Modality, SheetState] | None = None
+    ) -> Volts:
+        """Noise-free voltages (M,) of each channel, volts.
+
+        Args:
+            presses: what presses.
+            states: of the sheets that are no longer as they were made.
+        """
+        states = states or {}
+        volts = {name: self._at_rest(name, states.get(name, AS_MADE)) for name in self._sheets}
         if not presses:
-            return self._rest
-        mesh = fitted_mesh(self._mesh, presses, self.description)
+            return volts
+        mesh = self._warp(fitted_mesh(self._mesh, presses, self.description, self._warp))
         x, y = centroids(mesh)
         pressure, coverage = strongest(presses, x, y, edge_m=SHARP_M)
-        volts: Volts = {}
         for name, sheet in self._sheets.items():
+            state = states.get(name, AS_MADE)
             ratio = conductivity_ratio(self.description, name, pressure, coverage)
-            pressed = sheet.voltages(mesh, ratio)
+            pressed = sheet.voltages(mesh, ratio, state)
             # Of one mesh, so that no change is a change of mesh.
-            volts[name] = self._rest[name] + pressed - sheet.voltages(mesh)
+            volts[name] = volts[name] + pressed - sheet.voltages(mesh, state=state)
         return volts
+
+    def _at_rest(self, name: Modality, state: SheetState) -> FloatArray:
+        if (name, state) not in self._rest:
+            mesh = self._warp(self._mesh)
+            self._rest[name, state] = self._sheets[name].voltages(mesh, state=state)
+        return self._rest[name, state]
 
 
 class UnevenSheet:
@@ -106,12 +146,21 @@ class UnevenSheet:
         spread = impedance_spread * rng.standard_normal(description.electrode_count)
         self._impedance = np.exp(spread)
 
-    def voltages(self, mesh: SheetMesh, ratio: FloatArray | float = 1.0) -> FloatArray:
+    def voltages(
+        self, mesh: SheetMesh, ratio: FloatArray | float = 1.0, state: SheetState = AS_MADE
+    ) -> FloatArray:
         """Volts (M,) where the conductivity of each triangle is so many times its own at rest."""
         x, y = centroids(mesh)
-        rng = np.random.default_rng(self._seed)
-        own = 1 + self._unevenness * smooth_noise(x, y, self._description.width_m / 4, rng)
-        transfer = transfer_resistances(self._description, mesh, own * ratio, self._impedance)
+        length_m = self._description.width_m / 4
+        field = smooth_noise(x, y, length_m, np.random.default_rng(self._seed))
+        conductivity = (1 + self._unevenness * field) * ratio * (1 + state.warming)
+        if state.drift:
+            drift = smooth_noise(x, y, length_m, np.random.default_rng([self._seed, 1]))
+            conductivity = conductivity * (1 + state.drift * drift)
+        impedance = self._impedance * np.array(state.impedance or 1.0)
+        transfer = transfer_resistances(self._description, mesh, conductivity, impedance)
+        if state.leads:
+            transfer = exchanged(transfer, state.leads)
         return scan_voltages(self._description, transfer) * volts_per_unit(self._description)
 
 
@@ -121,14 +170,26 @@ def centroids(sheet: SheetMesh) -> FloatArray:
 
 
 def fitted_mesh(
-    sheet: SheetMesh, presses: Sequence[Press], description: SensorDescription
+    sheet: SheetMesh,
+    presses: Sequence[Press],
+    description: SensorDescription,
+    warp: Warp = lambda mesh: mesh,
 ) -> SheetMesh:
-    """Halve the triangles that an outline cuts, `OUTLINE_REFINEMENTS` times."""
+    """Halve the triangles that an outline cuts, `OUTLINE_REFINEMENTS` times.
+
+    Args:
+        sheet: mesh with its nodes and electrodes in place.
+        presses: what presses.
+        description: the sensor.
+        warp: moves the nodes to where they are when an outline cuts them; what is returned is
+            still in place.
+    """
     mesh = sheet.mesh
     for _ in range(OUTLINE_REFINEMENTS):
+        x, y = warp(SheetMesh(mesh, ())).mesh.p
         cut = np.zeros(mesh.t.shape[1], bool)
         for press in presses:
-            corners = press.coverage(mesh.p[0], mesh.p[1], SHARP_M)[mesh.t]
+            corners = press.coverage(x, y, SHARP_M)[mesh.t]
             cut |= corners.max(axis=0) != corners.min(axis=0)
         mesh = mesh.refined(np.flatnonzero(cut))
     return SheetMesh(mesh, electrode_facets(mesh, description))

@@ -137,7 +137,7 @@ def paper_presses(
             angle_rad=rng.uniform(0, np.pi),
         )
 
-    return _placed(description, rng, count, 0.0, one)
+    return placed_apart(description, rng, count, 0.0, one)
 
 
 def _robust(description: SensorDescription, seed: int, number: int) -> TrainingScene:
@@ -148,7 +148,7 @@ def _robust(description: SensorDescription, seed: int, number: int) -> TrainingS
     sheets = (_sheet_errors(description, skin), _sheet_errors(description, skin))
     count = int(rng.choice(len(ROBUST_CONTACTS), p=ROBUST_CONTACTS))
     gap = scale_of(description) * ROBUST_GAP_M
-    presses = _placed(description, rng, count, gap, lambda: _any_press(description, rng))
+    presses = placed_apart(description, rng, count, gap, lambda: _any_press(description, rng))
     contrast = float(np.exp(rng.uniform(*np.log(CONTRAST))))
     return TrainingScene(presses, contrast, opposite, sheets)
 
@@ -191,7 +191,7 @@ def _anywhere(description: SensorDescription, rng: np.random.Generator) -> tuple
     return x * description.width_m, y * description.height_m
 
 
-def _placed(
+def placed_apart(
     description: SensorDescription,
     rng: np.random.Generator,
     count: int,

@@ -1,0 +1,229 @@
+"""`tactomo evaluate stability`: where methods fail, and whether they say so."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tactomo.cli.app import DEFAULT_DESCRIPTION, JsonOutput, examples
+from tactomo.cli.evaluate import Seeds, evaluate_app, shown
+from tactomo.cli.files import DescriptionOption
+from tactomo.cli.plot import prepare_picture
+from tactomo.errors import TactomoError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+    from tactomo_models.evaluation.stability import CaseScore, Trust
+
+IN_WORDS = "auto"  # the method whose doings are told in words, where it is among those asked for
+
+
+@evaluate_app.command(
+    epilog=examples(
+        "tactomo evaluate stability --count 2",
+        "tactomo evaluate stability --regime jump,drift --methods auto,tikhonov --picture pictures",
+        "tactomo evaluate stability --seeds reporting --jobs 2 --csv stability.csv",
+    ),
+)
+def stability(
+    seeds: Seeds = "tuning",
+    count: Annotated[int, typer.Option(min=1, help="Cases of each regime.")] = 6,
+    regime: Annotated[
+        str | None, typer.Option(help="Which regimes, with commas. [all of them]")
+    ] = None,
+    methods: Annotated[
+        str | None, typer.Option(help="Which methods, with commas. [all that are available]")
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes that share the work.")] = 1,
+    sensor: DescriptionOption = DEFAULT_DESCRIPTION,
+    picture: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Draw each regime's worst case of every method, and an overview. Needs "
+            "matplotlib.",
+        ),
+    ] = None,
+    table: Annotated[
+        Path | None, typer.Option("--csv", help="Write every case as a line of a table.")
+    ] = None,
+    as_json: JsonOutput = False,
+) -> None:
+    """Break what reconstruction relies on, one regime at a time, and see whether it is flagged.
+
+    Noise, small contacts, many contacts, bad leads, drift, a stretched sheet, jumps and more. Of
+    each regime some simulated cases, reconstructed by every method. A map is bad where its ICC is
+    below 0.7. Flags that tell not to trust a map: misfit_high, not_converged, reference_mismatch,
+    noise_high, channels_swapped; it counts, too, if there is no map. The first run simulates (a
+    second a case, some seconds where a case is several frames) and keeps the voltages in the cache.
+    """
+    from tactomo_models import METHODS, load_description
+    from tactomo_models.evaluation.regimes import REGIMES
+    from tactomo_models.evaluation.stability import available_methods, evaluate_regimes
+
+    regimes = _chosen("--regime", regime, REGIMES) or list(REGIMES)
+    asked = _chosen("--methods", methods, METHODS)
+    if picture is not None:
+        _make_folder(picture)
+        prepare_picture(picture / "overview.png")
+    description = load_description(sensor)
+    chosen = asked or available_methods(description)
+    cases = evaluate_regimes(description, regimes, chosen, seeds, count, jobs=jobs)
+    total = len(regimes) * count
+    outcomes = [one for case in shown(cases, total, f"{seeds} cases") for one in case]
+    scores = [outcome.score for outcome in outcomes]
+    settings = {
+        "simulated": True,
+        "sensor": description.name,
+        "seeds": seeds,
+        "cases_each": count,
+        "methods": list(chosen),
+    }
+    if table is not None:
+        _write_csv(scores, table)
+    if as_json:
+        typer.echo(json.dumps({**settings, **_as_json(scores)}, indent=2))
+    else:
+        _print(settings, scores)
+    if picture is not None:
+        from tactomo.cli.evaluate_stability_pictures import draw_overview, draw_worst
+
+        for name in regimes:
+            of_regime = [one for one in outcomes if one.score.regime == name]
+            draw_worst(of_regime, picture / f"{name}.png")
+        draw_overview(scores, picture / "overview.png")
+        typer.echo(f"wrote {len(regimes) + 1} pictures into {picture}", err=True)
+
+
+def _chosen(option: str, text: str | None, known: Iterable[str]) -> list[str]:
+    """The names from "a,b"; none where nothing was asked for."""
+    names = [name.strip() for name in text.split(",")] if text is not None else []
+    for name in names:
+        if name not in known:
+            choices = ", ".join(known)
+            raise typer.BadParameter(f"{option} {name!r}: give one or more of {choices}")
+    return list(dict.fromkeys(names))
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TactomoError(
+            f"cannot make the folder {folder}: {error.strerror}", "choose another one"
+        ) from error
+
+
+def _write_csv(scores: Sequence[CaseScore], path: Path) -> None:
+    rows = [{**one.as_json(), "flags": " ".join(one.flags)} for one in scores]
+    try:
+        with path.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+    except OSError as error:
+        raise TactomoError(
+            f"cannot write {path}: {error.strerror}", "give a file that you may write"
+        ) from error
+    typer.echo(f"wrote {path}", err=True)
+
+
+def _as_json(scores: Sequence[CaseScore]) -> dict[str, Any]:
+    from tactomo_models.evaluation.regimes import REGIMES
+    from tactomo_models.evaluation.stability import trust_by_regime
+
+    by_regime = {
+        regime: {
+            "what": REGIMES[regime].what if regime in REGIMES else "all of these regimes",
+            "methods": {method: asdict(counts) for method, counts in by_method.items()},
+        }
+        for regime, by_method in trust_by_regime(scores).items()
+    }
+    return {"regimes": by_regime, "cases": [one.as_json() for one in scores]}
+
+
+def _print(settings: dict[str, Any], scores: Sequence[CaseScore]) -> None:
+    from rich.console import Console
+    from tactomo_models.evaluation.stability import trust_by_regime
+
+    console = Console()
+    console.print(
+        f"Simulated, not measured: {settings['sensor']}, {settings['seeds']} seeds, "
+        f"{settings['cases_each']} case(s) of each regime."
+    )
+    rows = trust_by_regime(scores)
+    console.print(_counts(rows))
+    console.print(
+        "[dim]Each cell: mean ICC; bad maps (ICC < 0.7) without a flag that tells to distrust, of "
+        "all bad ones; good maps with one, of all good ones.[/]\n"
+    )
+    for method, counts in rows["all"].items():
+        console.print(f"[bold]{method}[/]: {_headline(counts)}")
+    methods = settings["methods"]
+    method = IN_WORDS if IN_WORDS in methods else methods[0]
+    console.print(_doings(method, [one for one in scores if one.method == method]))
+
+
+def _headline(counts: Trust) -> str:
+    good = counts.maps - counts.bad
+    return (
+        f"of {counts.bad} bad maps {counts.bad_unwarned}{_percent(counts.silent)} without a flag "
+        f"that tells to distrust, {counts.bad_unflagged} without any flag; of {good} good maps "
+        f"{counts.good_warned}{_percent(counts.alarms)} with one that does, "
+        f"{counts.good_flagged} with any flag."
+    )
+
+
+def _percent(share: float) -> str:
+    return "" if math.isnan(share) else f" ({share:.0%})"
+
+
+def _counts(rows: dict[str, dict[str, Trust]]) -> Table:
+    from rich import box
+    from rich.table import Table
+
+    made = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    made.add_column("", no_wrap=True)
+    for method in rows["all"]:
+        made.add_column(method, justify="right", no_wrap=True)
+    for regime, by_method in rows.items():
+        if regime == "all":
+            made.add_section()
+        made.add_row(regime, *(_cell(counts) for counts in by_method.values()))
+    return made
+
+
+def _cell(counts: Trust) -> str:
+    silent = f"{counts.bad_unwarned}/{counts.bad}"
+    if counts.bad_unwarned:
+        silent = f"[red]{silent}[/]"
+    return f"{counts.icc:.2f} {silent} {counts.good_warned}/{counts.maps - counts.bad}"
+
+
+def _doings(method: str, scores: Sequence[CaseScore]) -> Table:
+    """What one method did in each regime: tiers that made the maps, and flags."""
+    from rich import box
+    from rich.table import Table
+    from tactomo_models.evaluation.regimes import REGIMES
+
+    made = Table(title=f"what {method} did", box=box.SIMPLE_HEAD, title_justify="left")
+    for name in ("", "what goes wrong", "made by", "flags"):
+        made.add_column(name)
+    for regime in dict.fromkeys(one.regime for one in scores):
+        own = [one for one in scores if one.regime == regime]
+        tiers = Counter(one.tier for one in own)
+        flags = Counter(flag for one in own for flag in one.flags)
+        made.add_row(regime, REGIMES[regime].what, _tally(tiers), _tally(flags))
+    return made
+
+
+def _tally(counts: Counter[str]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in counts.most_common()) or "none"
