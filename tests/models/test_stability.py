@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from tactomo_models import Artifact, DataError, Reconstructor, SensorDescription, build_artifact
 from tactomo_models import tikhonov as linear
 from tactomo_models.evaluation.faults import exchanged
@@ -22,6 +23,7 @@ from tactomo_models.evaluation.simulation import (
 from tactomo_models.evaluation.stability import (
     Case,
     CaseScore,
+    Outcome,
     Trust,
     evaluate_regimes,
     make_case,
@@ -31,6 +33,8 @@ from tactomo_models.evaluation.stability import (
 )
 from tactomo_models.training.simulate import displaced
 from variants import variant
+
+FloatArray = NDArray[np.float64]
 
 CASES = range(8)
 
@@ -107,7 +111,7 @@ def test_a_case_is_measured_as_planned(small: SensorDescription, folder: Path) -
     assert 0.005 < change(rest.frames[0]["structure"], rest.reference.structure) < 0.2
 
 
-def change(volts: np.ndarray, others: np.ndarray) -> float:  # type: ignore[type-arg]
+def change(volts: FloatArray, others: FloatArray) -> float:
     return float(np.linalg.norm(volts - others) / np.linalg.norm(others))
 
 
@@ -182,6 +186,11 @@ def small_artifact(small: SensorDescription) -> Artifact:
     return build_artifact(small)
 
 
+def by(method: str, case: Case, artifact: Artifact) -> Outcome:
+    (outcome,) = reconstruct_case(case, method, artifact=artifact)
+    return outcome
+
+
 @pytest.mark.parametrize("method", ["tikhonov", "noser"])
 def test_regularisation_is_so_many_times_what_the_rule_chooses(
     small: SensorDescription,
@@ -193,14 +202,14 @@ def test_regularisation_is_so_many_times_what_the_rule_chooses(
     case = case_of(small, folder, "wrong-lambda")
     factor = case.plan.regularisation
     assert factor == 0.01
-    wrong = reconstruct_case(case, method, small_artifact).frame.map
+    wrong = by(method, case, small_artifact).frame.map
     plan = replace(case.plan, regularisation=1.0)
-    right = reconstruct_case(replace(case, plan=plan), method, small_artifact).frame.map
+    right = by(method, replace(case, plan=plan), small_artifact).frame.map
     monkeypatch.setattr(
         "tactomo_models.reconstruct.noise_figure_weight",
         lambda *given: factor * linear.noise_figure_weight(*given),
     )
-    expected = reconstruct_case(replace(case, plan=plan), method, small_artifact).frame.map
+    expected = by(method, replace(case, plan=plan), small_artifact).frame.map
     assert wrong is not None
     assert right is not None
     assert expected is not None
@@ -213,7 +222,7 @@ def test_a_case_is_judged_by_its_last_frame(
     small: SensorDescription, small_artifact: Artifact, folder: Path
 ) -> None:
     case = case_of(small, folder, "jump")
-    outcome = reconstruct_case(case, "tikhonov", small_artifact)
+    outcome = by("tikhonov", case, small_artifact)
     alone = Reconstructor(case.description, small_artifact, tier=outcome.frame.tier)
     alone.set_reference(case.reference)
     frame = alone.reconstruct(**case.frames[-1])
@@ -230,23 +239,25 @@ def test_what_is_right_where_the_magnitude_channel_shows_nothing(
     """The pressed shape counts; at rest, whether a contact is reported; a lack of a map warns."""
     light = case_of(small, folder, "light")
     assert not light.truth.map.any()
-    outcome = reconstruct_case(light, "tikhonov", small_artifact)
+    outcome = by("tikhonov", light, small_artifact)
     assert outcome.frame.structure is not None
     expected = np.corrcoef(outcome.frame.structure.ravel(), light.truth.pressed.ravel())[0, 1]
     assert outcome.score.icc == pytest.approx(expected)
     drifted = case_of(small, folder, "drift-at-rest")
-    ghosts = reconstruct_case(drifted, "tikhonov", small_artifact).score
+    ghosts = by("tikhonov", drifted, small_artifact).score
     assert (ghosts.icc == 0) is (ghosts.found > 0)
     still = replace(drifted, frames=({n: getattr(drifted.reference, n) for n in MODALITIES},))
-    assert reconstruct_case(still, "tikhonov", small_artifact).score.icc == 1
+    assert by("tikhonov", still, small_artifact).score.icc == 1
     nothing = replace(case_of(small, folder, "ordinary"), frames=({},))
-    absent = reconstruct_case(nothing, "tikhonov", small_artifact).score
+    absent = by("tikhonov", nothing, small_artifact).score
     assert absent.bad
     assert absent.warned
 
 
 def one(icc: float, warned: bool = False, flags: tuple[str, ...] = ()) -> CaseScore:
-    return CaseScore("a", "tuning 0", "auto", 1, 1, icc, warned, flags, "fit", "", 1.0)
+    return CaseScore(
+        "a", "tuning 0", "auto", 1, 1, icc, warned, flags, "fit", "", 1.0, float("nan")
+    )
 
 
 def test_warnings_are_counted() -> None:
@@ -256,7 +267,8 @@ def test_warnings_are_counted() -> None:
         *(one(0.7), one(0.9, flags=lead), one(0.8, warned=True), one(0.95)),
     ]
     counted = trust(scores)
-    assert counted == Trust(7, pytest.approx(4.34 / 7), 3, 2, 1, 1, 2)
+    assert counted.icc == pytest.approx(4.34 / 7)
+    assert counted == Trust(7, counted.icc, 3, 2, 1, 1, 2)
     assert counted.silent == pytest.approx(2 / 3)
     assert counted.alarms == pytest.approx(1 / 4)
     assert np.isnan(trust([one(0.9)]).silent)

@@ -59,11 +59,12 @@ def stability(
 ) -> None:
     """Break what reconstruction relies on, one regime at a time, and see whether it is flagged.
 
-    Noise, small contacts, many contacts, bad leads, drift, a stretched sheet, jumps and more. Of
-    each regime some simulated cases, reconstructed by every method. A map is bad where its ICC is
-    below 0.7. Flags that tell not to trust a map: misfit_high, not_converged, reference_mismatch,
-    noise_high, channels_swapped; it counts, too, if there is no map. The first run simulates (a
-    second a case, some seconds where a case is several frames) and keeps the voltages in the cache.
+    Noise, small contacts, many contacts, bad leads, drift, a stretched sheet, jumps and more: some
+    simulated cases of each regime, reconstructed by every method. A map is bad where its ICC is
+    below 0.7. What tells not to trust it: the flags misfit_high, not_converged, low_confidence,
+    reference_mismatch, noise_high and channels_swapped, or that there is no map. The first run
+    simulates (a second a case, some more where a case is several frames) and keeps the voltages
+    in the cache.
     """
     from tactomo_models import METHODS, load_description
     from tactomo_models.evaluation.regimes import REGIMES

@@ -36,6 +36,7 @@ DISTRUST = (
     | Flag.REFERENCE_MISMATCH
     | Flag.NOISE_HIGH
     | Flag.CHANNELS_SWAPPED
+    | Flag.LOW_CONFIDENCE
 )
 FULL_RANGE_KPA = PRESSURE_KPA[1]
 BAND_KPA = 10.0  # pressures that count as one where errors at one pressure are compared

@@ -27,6 +27,8 @@ from tactomo_models.description import Modality, SensorDescription
 from tactomo_models.errors import DataError
 from tactomo_models.evaluation.cache import cached
 from tactomo_models.evaluation.simulation import (
+    IMPEDANCE_SPREAD,
+    UNEVENNESS,
     Truth,
     UnevenSkin,
     Volts,
@@ -284,8 +286,14 @@ class Simulation:
         sensor = with_contrast(self._description, layout.contrast)
         if layout.opposite:
             sensor = with_opposite_magnitude(sensor)
-        errors = {"unevenness": 0.0, "impedance_spread": 0.0} if self._even else {}
-        skin = UnevenSkin(sensor, self._mesh, layout.seed("sheet"), **errors)
+        unevenness, spread = (0.0, 0.0) if self._even else (UNEVENNESS, IMPEDANCE_SPREAD)
+        skin = UnevenSkin(
+            sensor,
+            self._mesh,
+            layout.seed("sheet"),
+            unevenness=unevenness,
+            impedance_spread=spread,
+        )
         scans = zip(STATES, (skin.voltages([]), skin.voltages(layout.presses)), strict=True)
         return {f"{name}_{state}": scan[name] for state, scan in scans for name in MODALITIES}
 

@@ -14,7 +14,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,6 @@ from threadpoolctl import threadpool_limits
 from tactomo_models.artifact import Artifact, cache_folder, load_or_build_artifact
 from tactomo_models.batch import BUDGET_S
 from tactomo_models.description import Modality, SensorDescription
-from tactomo_models.errors import ModelError
 from tactomo_models.evaluation.cache import cached
 from tactomo_models.evaluation.faults import with_lead
 from tactomo_models.evaluation.measures import DISTRUST, correlation, mean
@@ -48,6 +47,7 @@ from tactomo_models.evaluation.simulation import (
     with_opposite_magnitude,
 )
 from tactomo_models.mesh import SheetMesh
+from tactomo_models.network import NetworkKind, find_network
 from tactomo_models.reconstruct import METHODS, Reconstruction, Reconstructor, Tier
 from tactomo_models.reference import Reference
 from tactomo_models.training.simulate import displaced
@@ -55,6 +55,12 @@ from tactomo_models.training.simulate import displaced
 FloatArray = NDArray[np.float64]
 
 BAD_ICC = 0.7
+NETWORKS: Final[dict[Tier, NetworkKind]] = {  # of the methods that need one
+    Tier.NETWORK: "network",
+    Tier.HYBRID: "network",
+    Tier.CNN_SINGLE: "cnn-single",
+    Tier.CNN_MULTIMODAL: "cnn-multimodal",
+}
 
 
 @dataclass(frozen=True)
@@ -195,14 +201,23 @@ def _measure(
 class _Misregularised(Reconstructor):
     """A reconstructor whose linear methods have so many times the right regularisation."""
 
-    factor = 1.0
+    def __init__(
+        self,
+        description: SensorDescription,
+        artifact: Artifact,
+        factor: float,
+        *,
+        budget_s: float | None,
+    ) -> None:
+        super().__init__(description, artifact, budget_s=budget_s)
+        self._factor = factor
 
     def _matrix(self, method: Tier, noise: FloatArray) -> NDArray[np.float32]:
         # R = S²J'(JS²J' + λN)⁻¹, so that JR = I - λN(JS²J' + λN)⁻¹, and with fλ for λ it is
         # R(I + (f - 1)(I - JR))⁻¹.
         right = super()._matrix(method, noise).astype(np.float64)
         one = np.eye(right.shape[1])
-        change = one + (self.factor - 1) * (one - self._artifact.jacobian @ right)
+        change = one + (self._factor - 1) * (one - self._artifact.jacobian @ right)
         return np.asarray(np.linalg.solve(change.T, right.T).T, dtype=np.float32)
 
 
@@ -217,7 +232,7 @@ class CaseScore:
             in it; where nothing presses at all, 1 if nothing was reported and else 0.
         warned: whether a flag of `DISTRUST`, or the lack of a map, told not to trust it.
         flags: names of all that were raised.
-        tier, reason, misfit: as reported.
+        tier, reason, misfit, confidence: as reported.
     """
 
     regime: str
@@ -231,6 +246,7 @@ class CaseScore:
     tier: str
     reason: str
     misfit: float
+    confidence: float
 
     @property
     def bad(self) -> bool:
@@ -251,40 +267,36 @@ class Outcome:
     score: CaseScore
 
 
-def reconstruct_case(case: Case, method: str, artifact: Artifact | None = None) -> Outcome:
-    """Reconstruct the frames of a case, on one thread, and judge the last one.
+def reconstruct_case(case: Case, *methods: str, artifact: Artifact | None = None) -> list[Outcome]:
+    """Reconstruct a case by one method after the other, on one thread; the last frame is judged.
 
     One frame alone is run to its end, as a file's are; several have the daemon's budget.
 
     Args:
         case: what to reconstruct.
-        method: one of `METHODS`.
+        *methods: of `METHODS`.
         artifact: of the sensor; read or built if None.
 
     Raises:
-        ModelError: the method's models are not there.
+        ModelError: a method's network is not there.
     """
-    reconstructor = _reconstructor(case.description, method, artifact, case.plan.regularisation)
-    reconstructor.budget_s = BUDGET_S if len(case.frames) == 1 else None
+    artifact = artifact or _artifact(case.description)
+    budget_s = BUDGET_S if len(case.frames) == 1 else None
+    if case.plan.regularisation == 1:
+        reconstructor = Reconstructor(case.description, artifact, budget_s=budget_s)
+    else:
+        factor = case.plan.regularisation
+        reconstructor = _Misregularised(case.description, artifact, factor, budget_s=budget_s)
+    outcomes = []
     with threadpool_limits(1):
-        reconstructor.set_reference(case.reference)
-        for scans in case.frames:
-            frame = reconstructor.reconstruct(scans.get("magnitude"), scans.get("structure"))
-    return Outcome(case, frame, _score(case, method, frame))
-
-
-def _reconstructor(
-    description: SensorDescription,
-    method: str,
-    artifact: Artifact | None = None,
-    regularisation: float = 1.0,
-) -> Reconstructor:
-    artifact = artifact or _artifact(description)
-    if regularisation == 1:
-        return Reconstructor(description, artifact, tier=Tier(method))
-    made = _Misregularised(description, artifact, tier=Tier(method))
-    made.factor = regularisation
-    return made
+        reconstructor.set_reference(case.reference)  # costs more than many a method
+        for method in methods:
+            reconstructor.tier = Tier(method)
+            reconstructor.reset()
+            for scans in case.frames:
+                frame = reconstructor.reconstruct(scans.get("magnitude"), scans.get("structure"))
+            outcomes.append(Outcome(case, frame, _score(case, method, frame)))
+    return outcomes
 
 
 @lru_cache(maxsize=2)  # one serves both signs
@@ -310,19 +322,17 @@ def _score(case: Case, method: str, frame: Reconstruction) -> CaseScore:
         tier=frame.tier,
         reason=frame.reason,
         misfit=frame.misfit,
+        confidence=frame.confidence,
     )
 
 
 def available_methods(description: SensorDescription) -> tuple[str, ...]:
-    """Of all methods, those whose models are there."""
-    available = []
-    for method in METHODS:
-        try:
-            _reconstructor(description, method)
-        except ModelError:
-            continue
-        available.append(str(method))
-    return tuple(available)
+    """Of all methods, those whose network is there, and those that need none."""
+    return tuple(
+        str(method)
+        for method in METHODS
+        if method not in NETWORKS or find_network(description, NETWORKS[method])
+    )
 
 
 def evaluate_regimes(
@@ -373,7 +383,7 @@ def _evaluate_case(
     which: tuple[str, int],
 ) -> list[Outcome]:
     case = make_case(description, which[0], seed_set, which[1], cache)
-    return [reconstruct_case(case, method) for method in methods]
+    return reconstruct_case(case, *methods)
 
 
 @dataclass(frozen=True)
