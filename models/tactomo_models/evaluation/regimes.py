@@ -5,7 +5,7 @@ what of that the reconstructor is not told. Its last frame is the one that is ju
 else is as in the evaluation's scenes: uneven sheets and electrodes, a contrast of 10 to 100, either
 sign of the magnitude channel, noise of 40 dB of the change.
 
-Lengths are the paper's sensor's; on another one they are scaled by its width.
+Lengths are the paper's sensor's; on another one they are scaled by its size.
 """
 
 from __future__ import annotations
@@ -31,11 +31,10 @@ from tactomo_models.evaluation.scenes import (
 )
 from tactomo_models.evaluation.simulation import AS_MADE, SheetState
 from tactomo_models.scene import Press, Profile
-from tactomo_models.training.presets import placed_apart
+from tactomo_models.training.presets import placed_apart, scale_of
 
 Range = tuple[float, float]
 
-PAPER_WIDTH_M = 0.150
 SETTLED_FRAMES = 6  # of a scene that stays, before something happens
 SLIDE_FRAMES = 4
 CONVERTER_DB = 60.0  # of the voltage, where there is no change for noise to be measured by
@@ -109,7 +108,7 @@ class Draw:
         self.description = description
         self.rng = rng
         self.number = number
-        self.mm = 1e-3 * description.width_m / PAPER_WIDTH_M
+        self.mm = 1e-3 * scale_of(description)
 
     def plan(self, *frames: Sequence[Press]) -> Plan:
         """A plan of these frames, on any sheet."""
