@@ -1,15 +1,18 @@
-"""Fixtures that several folders share: a real browser."""
+"""Fixtures that several folders share: a real browser, the command line as a user runs it."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+import signal
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from selenium import webdriver
 from selenium.common.exceptions import WebDriverException
 from selenium.webdriver.chrome.service import Service
+from tactomo.cli import main
 
 CHROMIUM_OPTIONS = (
     "--headless=new",
@@ -59,3 +62,36 @@ def browser(_chromium: webdriver.Chrome) -> Iterator[webdriver.Chrome]:
     _chromium.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
     _chromium.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": False})
     _chromium.get("about:blank")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a command."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+@pytest.fixture
+def tactomo(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Iterator[Callable[..., Outcome]]:
+    """Run `tactomo ARGUMENTS` in an empty folder, in this process, and say what became of it.
+
+    Whatever is not told to the user as an error comes out as an exception here.
+    """
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+
+    def run(*arguments: object) -> Outcome:
+        monkeypatch.setattr("sys.argv", ["tactomo", *map(str, arguments)])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as exit_:
+            main()
+        return Outcome(int(exit_.value.code or 0), *capsys.readouterr())
+
+    yield run
+    for number, handler in before.items():
+        signal.signal(number, handler)

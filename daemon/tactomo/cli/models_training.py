@@ -300,8 +300,8 @@ def _follow(steps: Iterator[int], total: int, what: str, folder: Path) -> tuple[
     """
     from rich.console import Console
 
+    before = done = next(steps)
     with _progress(Console(stderr=True)) as shown:
-        before = done = next(steps)
         task = shown.add_task(what, total=total, completed=before, before=before)
         try:
             for more in steps:
