@@ -21,6 +21,7 @@ NO_FRAME_YET: Final[dict[str, Any]] = {
     "tier_reason": None,
     "flags": [],
     "misfit": None,
+    "confidence": None,
 }
 
 
@@ -42,6 +43,7 @@ def frame_header(last: ChannelScan, frame: Reconstruction) -> dict[str, Any]:
         "tier_reason": frame.reason,
         "flags": sorted(frame.flags.names()),
         "misfit": _finite(frame.misfit),
+        "confidence": _finite(frame.confidence),
     }
 
 

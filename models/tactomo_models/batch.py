@@ -165,6 +165,7 @@ def frame_arrays(
         "map": np.array([absent if f.map is None else f.map for f in frames]),
         "structure": np.array([absent if f.structure is None else f.structure for f in frames]),
         "misfit": column([f.misfit for f in frames]),
+        "confidence": column([f.confidence for f in frames]),
         "flags": np.array([int(f.flags) for f in frames], dtype=np.uint32),
         "contact_frame": np.array([i for i, _ in contacts], dtype=np.int64),
         "contact_x_mm": column([c.x_m * 1e3 for _, c in contacts]),

@@ -67,12 +67,15 @@ class Frame:
     device_us: int | None
     """The device's own clock, microseconds."""
     tier: str | None
-    """How much model the frame was given: quiet, tikhonov, fit, levelset, ..."""
+    """How much model the frame was given: quiet, tikhonov, fit, hybrid, ..."""
     tier_reason: str | None
     flags: frozenset[str]
     """What to be wary of, such as ``misfit_high``; empty when all is well. See STREAM.md."""
     misfit: float | None
     """Rms of what the model left unexplained, in units of the noise: about 1 is good."""
+    confidence: float | None
+    """Correlation of the map with the truth that a network expects, 0 to 1; None where none was
+    asked."""
     contacts: tuple[Contact, ...]
     map: Image | None
     """|Δσ|/σ₀ of the magnitude channel, a ratio."""
@@ -106,7 +109,7 @@ def frame_from_message(message: Message, received_ns: int, stale_after_s: float)
     """
     fields = message.fields
     has_images = message.kind == MAP
-    misfit = fields["misfit"]
+    misfit, confidence = fields["misfit"], fields.get("confidence")
     contacts = fields.get("contacts")
     if not isinstance(contacts, list):
         raise MessageError("field 'contacts' is not a list")
@@ -122,6 +125,7 @@ def frame_from_message(message: Message, received_ns: int, stale_after_s: float)
         tier_reason=fields["tier_reason"],
         flags=frozenset(fields["flags"]),
         misfit=None if misfit is None else float(misfit),
+        confidence=None if confidence is None else float(confidence),
         contacts=tuple(_contact(contact) for contact in contacts),
         map=_image(fields, "map") if has_images else None,
         pressure_kpa=_image(fields, "pressure_kpa") if has_images else None,

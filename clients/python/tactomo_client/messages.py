@@ -56,6 +56,7 @@ _HEADER: Final[dict[str, tuple[tuple[type, ...], bool, bool]]] = {
     "tier_reason": ((str,), True, False),
     "flags": ((list, tuple), False, False),
     "misfit": ((float, int), True, False),
+    "confidence": ((float, int), True, True),
     "clock_id": ((str,), False, True),
 }
 

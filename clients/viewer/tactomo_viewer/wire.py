@@ -31,6 +31,7 @@ def frame_message(frame: Frame) -> bytes:
         "tier_reason": frame.tier_reason,
         "flags": sorted(frame.flags),
         "misfit": frame.misfit,
+        "confidence": frame.confidence,
         "contacts": [dataclasses.asdict(contact) for contact in frame.contacts],
         "x_mm": frame.x_mm,
         "y_mm": frame.y_mm,

@@ -235,8 +235,9 @@ def reconstruct(
 
     IN holds `magnitude` and `structure` (T, M) volts and `magnitude_reference`,
     `structure_reference` (M,); structure may be missing. OUT gets `map` (T, ny, nx), the relative
-    conductivity change; `structure` (T, ny, nx) from 0 to 1; `misfit`, `flags` and `seconds` (T,);
-    and the contacts as flat arrays `contact_frame`, `contact_x_mm`, `contact_y_mm`,
+    conductivity change; `structure` (T, ny, nx) from 0 to 1; `misfit`, `confidence` (the
+    correlation with the truth that the network expects, where one was asked), `flags` and
+    `seconds` (T,); and the contacts as flat arrays `contact_frame`, `contact_x_mm`, `contact_y_mm`,
     `contact_area_mm2`, `contact_magnitude`, `contact_sigma` (of the magnitude), and the standard
     uncertainties `contact_x_sigma_mm`, `contact_y_sigma_mm`, `contact_area_sigma_mm2`. Where the
     sensor's objects conduct `either_way`, such as metal and plastic in a tank, `structure` is -1 in
@@ -247,13 +248,16 @@ def reconstruct(
 
     `flags` adds up what stands in the way of trusting a frame: 1 structure missing, 2 magnitude
     missing, 4 invalid voltage, 8 no reference, 16 misfit high, 32 not converged, 64 reference
-    mismatch, 128 electrode fault, 256 noise high, 512 channels swapped, 1024 saturated.
+    mismatch, 128 electrode fault, 256 noise high, 512 channels swapped, 1024 saturated,
+    2048 low confidence.
 
     Methods: *tikhonov* and *noser* are one linear step, regularised so that the image is as noisy,
     relative to its signal, as the scans are (noise figure 1); *pls-paper* is the level set of the
     paper that tactomo is compared with, linear and cold; *fit* models a few outlines, *levelset*
-    shapes of any form, both nonlinear and down to the scans' noise; *auto* takes what a frame
-    needs.
+    shapes of any form, both nonlinear and down to the scans' noise; *network* is our fusion network
+    alone; in *hybrid* it proposes, outlines are fitted to the scans, and a second network redraws
+    what they show; *cnn-single* and *cnn-multimodal* are the paper's networks. *auto* takes what a
+    frame needs: *hybrid* where the sensor has its networks, else *fit* or *levelset*.
     """
     from rich.progress import Progress
     from tactomo_models import load_description
