@@ -31,13 +31,15 @@ class _Part:
     """What came out of one experiment.
 
     Attributes:
-        tables: to print.
+        title, table, caption: to print.
         facts: the same for programs, by figure.
         claims: what the paper says, and whether it holds here.
         pictures: draws each figure.
     """
 
-    tables: list[Table]
+    title: str
+    table: Table
+    caption: str
     facts: dict[int, Any]
     claims: list[Claim]
     pictures: dict[int, Callable[[Path], None]]
@@ -213,9 +215,11 @@ def _simulation_study(study: _Study, asked: set[int]) -> _Part:
 
         draw_simulation(points, path)
 
-    table = _table("Fig. 5: error and correlation of the map by number of contacts, simulated")
+    title = "Fig. 5: error and correlation of the map by number of contacts, simulated"
+    table = _table()
     for name in ("noise", "method", *(f"RIE {n}" for n in COUNTS), *(f"ICC {n}" for n in COUNTS)):
-        table.add_column(name, justify="left" if name in ("noise", "method") else "right")
+        left = name in ("noise", "method")
+        table.add_column(name, justify="left" if left else "right", no_wrap=True)
     summary = {(p.snr_db, p.method, p.contacts): p.summary for p in points}
     for snr_db in SNR_DB:
         for method in study.methods:
@@ -225,7 +229,12 @@ def _simulation_study(study: _Study, asked: set[int]) -> _Part:
             table.add_row(_decibels(snr_db) if first else "", method, *values)
         table.add_section()
     return _Part(
-        [table], {5: [asdict(point) for point in points]}, simulation_claims(points), {5: draw}
+        title,
+        table,
+        "",
+        {5: [asdict(point) for point in points]},
+        simulation_claims(points),
+        {5: draw},
     )
 
 
@@ -241,7 +250,8 @@ def _response_test(study: _Study, asked: set[int]) -> _Part:
 
         draw_response(points, path)
 
-    table = _table("Fig. 7: largest value of the Tikhonov image at (36, 36) mm, simulated")
+    title = "Fig. 7: largest value of the Tikhonov image at (36, 36) mm, simulated"
+    table = _table()
     for name in ("pressure, kPa", "magnitude channel", "structure channel"):
         table.add_column(name, justify="right")
     for kpa in RESPONSE_KPA:
@@ -249,7 +259,12 @@ def _response_test(study: _Study, asked: set[int]) -> _Part:
         values = [[point.peak[name] for point in at] for name in study.description.modalities]
         table.add_row(f"{kpa:g}", *(_mean_and_spread(of, "{:.4f}") for of in values))
     return _Part(
-        [table], {7: [asdict(point) for point in points]}, response_claims(points), {7: draw}
+        title,
+        table,
+        "",
+        {7: [asdict(point) for point in points]},
+        response_claims(points),
+        {7: draw},
     )
 
 
@@ -271,7 +286,8 @@ def _single_areas(study: _Study, asked: set[int]) -> _Part:
 
         draw_traces(frames, path)
 
-    table = _table("Figs. 8 and 9: magnitude error over cases 1 to 4, at its worst pressure")
+    title = "Figs. 8 and 9: magnitude error over cases 1 to 4, at its worst pressure"
+    table = _table()
     for name in ("method", "paper, hardware", "ours, simulated", "of range", "of contacts"):
         table.add_column(name, justify="left" if name == "method" else "right")
     for method in study.methods:
@@ -285,7 +301,7 @@ def _single_areas(study: _Study, asked: set[int]) -> _Part:
             _mean_and_spread([e.of_range for e in of], "{:.0%}"),
             _mean_and_spread([e.of_contacts for e in of], "{:.0%}"),
         )
-    table.caption = (
+    caption = (
         "ours: of the method's own largest estimate, the paper's 0-1 normalisation; of range: of "
         "the change at 200 kPa; of contacts: likewise, of the magnitudes that contacts have"
     )
@@ -302,7 +318,9 @@ def _single_areas(study: _Study, asked: set[int]) -> _Part:
     }
     pictures = {8: draw_8, 9: draw_9}
     return _Part(
-        [table],
+        title,
+        table,
+        caption,
         {9: facts},
         magnitude_claims(estimates, errors),
         {number: pictures[number] for number in sorted(asked)},
@@ -320,7 +338,8 @@ def _localisation(study: _Study, asked: set[int]) -> _Part:
 
         draw_places(places, study.description, path)
 
-    table = _table("Fig. 10: localisation error in 25 places, mm, mean ± standard deviation")
+    title = "Fig. 10: localisation error in 25 places, mm, mean ± standard deviation"
+    table = _table()
     for name in ("method", "paper, hardware", "ours, simulated", "contact", "one contact"):
         table.add_column(name, justify="left" if name == "method" else "right")
     for method in study.methods:
@@ -333,7 +352,7 @@ def _localisation(study: _Study, asked: set[int]) -> _Part:
             _mean_and_spread([place.contact_error_mm for place in of], "{:.1f}"),
             f"{sum(place.contacts == 1 for place in of) / len(of):.0%}",
         )
-    table.caption = (
+    caption = (
         "ours: of the image's mass, as the paper's; contact: of the contact that is reported; "
         "one contact: share of presses in which one is"
     )
@@ -347,7 +366,7 @@ def _localisation(study: _Study, asked: set[int]) -> _Part:
             for method, (middle, spread) in LOCALISATION_MM.items()
         },
     }
-    return _Part([table], {10: facts}, localisation_claims(places), {10: draw})
+    return _Part(title, table, caption, {10: facts}, localisation_claims(places), {10: draw})
 
 
 def _several_areas(study: _Study, asked: set[int]) -> _Part:
@@ -369,7 +388,8 @@ def _several_areas(study: _Study, asked: set[int]) -> _Part:
 
         return draw
 
-    table = _table("Figs. 11 and 12: two to four areas, simulated; the paper prints no numbers")
+    title = "Figs. 11 and 12: two to four areas, simulated; the paper prints no numbers"
+    table = _table()
     for name in ("case", "method", "ICC", "told apart", "in order", "alike", "counted"):
         table.add_column(name, justify="left" if name in ("case", "method") else "right")
     for case in chosen:
@@ -385,7 +405,7 @@ def _several_areas(study: _Study, asked: set[int]) -> _Part:
                 f"{mean(one.counted for one in of):.0%}",
             )
         table.add_section()
-    table.caption = (
+    caption = (
         "told apart: the image falls below half between any two areas; in order: pairs of which "
         "the harder pressed one reads higher; alike: of pairs under one pressure, the lower "
         "reading over the other; counted: right number of contacts; *: places and sizes are ours"
@@ -399,7 +419,9 @@ def _several_areas(study: _Study, asked: set[int]) -> _Part:
         for number in sorted(asked)
     }
     return _Part(
-        [table],
+        title,
+        table,
+        caption,
         facts,
         several_areas_claims(read),
         {number: draws(number) for number in sorted(asked)},
@@ -440,11 +462,11 @@ def _mean_and_spread(values: Iterable[float], form: str) -> str:
     return f"{middle} ± {form.format(np.std(known))}" if len(known) > 1 else middle
 
 
-def _table(title: str) -> Table:
+def _table() -> Table:
     from rich import box
     from rich.table import Table
 
-    return Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", caption_justify="left")
+    return Table(box=box.SIMPLE_HEAD, padding=0)
 
 
 def _print_settings(settings: dict[str, Any]) -> None:
@@ -453,7 +475,7 @@ def _print_settings(settings: dict[str, Any]) -> None:
     console = Console()
     console.print(
         f"Ours are simulated, not measured: {settings['sensor']}, {settings['seeds']} seeds; "
-        f"Figs. 7 to 12 on {settings['sheets']} uneven sheets, "
+        f"Figs. 7 to 12 on {settings['sheets']} uneven sheet(s), "
         f"{settings['snr_of_voltages_db']:g} dB of the voltages at rest, one scan a press."
     )
     for method, why in settings["left_out"].items():
@@ -464,9 +486,12 @@ def _print(part: _Part) -> None:
     from rich.console import Console
 
     console = Console()
-    for table in part.tables:
-        console.print(table)
-    told = _table("what the paper says of it, and whether that holds here")
+    console.print(f"\n[italic]{part.title}[/]")
+    console.print(part.table)
+    if part.caption:
+        console.print(f"[dim]{part.caption}[/]")
+    console.print("\n[italic]what the paper says of it, and whether that holds here[/]")
+    told = _table()
     for name in ("the paper", "seen on", "ours, simulated", "holds"):
         told.add_column(name)
     for claim in part.claims:

@@ -201,7 +201,7 @@ def draw_places(
     methods = _methods(places)
     columns = min(3, len(methods))
     rows = -(-len(methods) // columns)
-    figure = Figure(figsize=(4.0 * columns, 4.2 * rows + 0.4), layout="constrained")
+    figure = Figure(figsize=(4.0 * columns, 4.3 * rows + 1.2), layout="constrained")
     figure.suptitle("Fig. 10 repeated, simulated, one uneven sheet", fontsize=11)
     panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     half = description.width_m * 500, description.height_m * 500

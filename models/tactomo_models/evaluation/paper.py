@@ -100,12 +100,14 @@ def paper_scenes(
         DataError: the sensor has a single channel, or no room for that many contacts.
     """
     require_both_channels(description)
+    assert description.magnitude is not None
+    opposite = description.magnitude.response.sign > 0  # the paper's conductivity falls
     simulation = Simulation(description, cache or cache_folder() / "scenes", even=True)
     for contact_count in contacts:
         for number in range(count):
             rng = np.random.default_rng(seed_of(seed_set, "paper", contact_count, number))
             presses = paper_presses(description, rng, contact_count)
-            layout = Layout(seed_set, number, presses, "ellipse", PAPER_CONTRAST, opposite=True)
+            layout = Layout(seed_set, number, presses, "ellipse", PAPER_CONTRAST, opposite)
             volts = simulation.voltages(layout)
             yield measure(volts, layout, description, snr_db, "change")
 
