@@ -90,7 +90,7 @@ def scenes(
         for ratio in ratios
     )
     total = count * len(numbers) * len(ratios)
-    outcomes = list(tracked(reconstruct_scenes(drawn, method), total, f"{seeds} scenes"))
+    outcomes = list(shown(reconstruct_scenes(drawn, method), total, f"{seeds} scenes"))
     settings = _settings(description.name, seeds, snr_of, method)
     if as_json:
         typer.echo(json.dumps({**settings, "scenes_each": count, **_as_json(outcomes)}, indent=2))
@@ -191,7 +191,7 @@ def _decibels(text: str) -> list[float]:
     return ratios
 
 
-def tracked(items: Iterable[Item], total: int, what: str) -> Iterator[Item]:
+def shown(items: Iterable[Item], total: int, what: str) -> Iterator[Item]:
     """Pass items on, with a progress bar in the terminal."""
     from rich.console import Console
     from rich.progress import track

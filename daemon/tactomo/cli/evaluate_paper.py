@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tactomo.cli.app import DEFAULT_DESCRIPTION, JsonOutput, examples
-from tactomo.cli.evaluate import Seeds, evaluate_app, tracked
+from tactomo.cli.evaluate import Seeds, evaluate_app, shown
 from tactomo.cli.files import DescriptionOption
 from tactomo.cli.plot import prepare_picture
 from tactomo.errors import TactomoError
@@ -115,7 +115,7 @@ def paper(
     if picture is not None:
         _prepare_folder(picture)
     description = load_description(sensor)
-    numbers = tracked(range(sheets), sheets, "simulating sheets at rest")
+    numbers = shown(range(sheets), sheets, "simulating sheets at rest")
     rigs = [Rig(description, seeds, number, snr_db=snr) for number in numbers]
     usable, left_out = usable_methods(rigs[0], wanted)
     if not usable:
@@ -208,7 +208,7 @@ def _simulation_study(study: _Study, asked: set[int]) -> _Part:
         for snr_db in SNR_DB
     )
     total = study.count * len(COUNTS) * len(SNR_DB) * len(study.methods)
-    points = cells(tracked(reconstruct_scenes(drawn, *study.methods), total, "Fig. 5"))
+    points = cells(shown(reconstruct_scenes(drawn, *study.methods), total, "Fig. 5"))
 
     def draw(path: Path) -> None:
         from tactomo.cli.evaluate_paper_pictures import draw_simulation
@@ -243,7 +243,7 @@ def _response_test(study: _Study, asked: set[int]) -> _Part:
     from tactomo_models.evaluation.paper_claims import response_claims
 
     total = len(RESPONSE_KPA) * len(study.rigs)
-    points = list(tracked(measure_response(study.rigs), total, "Fig. 7"))
+    points = list(shown(measure_response(study.rigs), total, "Fig. 7"))
 
     def draw(path: Path) -> None:
         from tactomo.cli.evaluate_paper_pictures import draw_response
@@ -441,7 +441,7 @@ def _image(study: _Study, cases: Sequence[Case], what: str) -> list[Frame]:
     from tactomo_models.evaluation.paper import frames_of, image_cases
 
     total = frames_of(cases) * len(study.rigs) * len(study.methods)
-    return list(tracked(image_cases(study.rigs, cases, study.methods), total, what))
+    return list(shown(image_cases(study.rigs, cases, study.methods), total, what))
 
 
 # ------------------------------------------------------------------ how it is told
