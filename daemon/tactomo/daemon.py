@@ -42,6 +42,7 @@ from tactomo_models import (
     load_description,
     load_or_build_artifact,
 )
+from tactomo_models.calibration import Calibration, calibration_for
 from tactomo_models.reconstruct import check_tier
 from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
@@ -71,6 +72,8 @@ class Daemon:
         config: what it serves.
         reconstructor: what makes maps of voltages; by default the description's own, with an
             artifact that is built if need be.
+        calibration: what turns a budget of time into one of work; by default what was measured on
+            this machine, if that was.
 
     Raises:
         ModelError: the description or the artifact cannot be used.
@@ -82,7 +85,13 @@ class Daemon:
 
     """
 
-    def __init__(self, config: DaemonConfig, *, reconstructor: Reconstructor | None = None) -> None:
+    def __init__(
+        self,
+        config: DaemonConfig,
+        *,
+        reconstructor: Reconstructor | None = None,
+        calibration: Calibration | None = None,
+    ) -> None:
         self.config = config
         self.session = uuid.uuid4().hex
         self._undo = contextlib.ExitStack()
@@ -98,6 +107,7 @@ class Daemon:
         self._imaging = Imaging(
             description,
             reconstructor or _make_reconstructor(config, description),
+            calibration or _find_calibration(description),
             config.tare_scans,
             self._recorder,
             self._publisher,
@@ -318,6 +328,10 @@ def _make_reconstructor(config: DaemonConfig, description: SensorDescription) ->
     budget_s = None if config.budget_ms is None else config.budget_ms * 1e-3
     artifact = load_or_build_artifact(description)
     return Reconstructor(description, artifact, tier=Tier(config.tier), budget_s=budget_s)
+
+
+def _find_calibration(description: SensorDescription) -> Calibration:
+    return calibration_for(description, lambda why: log.warning("calibration_unused", detail=why))
 
 
 def _origin(config: DaemonConfig, description: SensorDescription) -> Origin:

@@ -24,6 +24,7 @@ from tactomo_models import (
     SensorDescription,
     Tier,
 )
+from tactomo_models.calibration import Calibration
 from tactomo_protocol import Channel, ScanFlag
 
 from tactomo.errors import CommandError
@@ -52,7 +53,13 @@ log = structlog.get_logger()
 class Imaging:
     """Reconstructs dual scans against a reference that it takes itself.
 
+    The tier and the time budget that are asked for become what the reconstructor is given by a
+    calibration, before they are recorded: marks hold what was given, so that a replay gives the
+    same on any machine.
+
     Attributes:
+        calibration: what turns a budget of time into one of work.
+        given: the tier that frames are given, and the milliseconds of modelled work.
         reference: what changes are measured against; None before the first tare.
         reference_realtime_ns: when it was taken.
         stages: how long each stage takes.
@@ -65,11 +72,14 @@ class Imaging:
         self,
         description: SensorDescription,
         reconstructor: Reconstructor,
+        calibration: Calibration,
         tare_scans: int,
         recorder: Recorder,
         publisher: Publisher,
         on_event: OnEvent,
     ) -> None:
+        self.calibration = calibration
+        self.given: tuple[Tier, float | None]
         self.reference: Reference | None = None
         self.reference_realtime_ns = 0
         self.stages: dict[str, Durations] = {}
@@ -86,6 +96,8 @@ class Imaging:
         self._tare_deadline_s = 0.0
         self._marked: ActiveRecording | None = None  # the recording that gets marks
         self._failure_limit = RateLimit()
+        budget_s = reconstructor.budget_s
+        self._ask(reconstructor.tier, None if budget_s is None else budget_s * 1e3)
 
     @property
     def is_taring(self) -> bool:
@@ -99,20 +111,30 @@ class Imaging:
     @property
     def tier(self) -> Tier:
         """The tier that is asked for."""
-        return self._reconstructor.tier
+        return self._asked[0]
 
     @tier.setter
     def tier(self, tier: Tier) -> None:
-        self._reconstructor.tier = tier
+        self._ask(tier, self.budget_ms)
 
     @property
     def budget_ms(self) -> float | None:
         """The time that a frame may take; None for the tier's own."""
-        budget_s = self._reconstructor.budget_s
-        return None if budget_s is None else budget_s * 1e3
+        return self._asked[1]
 
     @budget_ms.setter
     def budget_ms(self, budget_ms: float | None) -> None:
+        self._ask(self.tier, budget_ms)
+
+    def _ask(self, tier: Tier, budget_ms: float | None) -> None:
+        self._asked = (tier, budget_ms)
+        plan = self.calibration.plan(tier, None if budget_ms is None else budget_ms * 1e-3)
+        self._give(plan.tier, None if plan.budget_s is None else plan.budget_s * 1e3)
+
+    def _give(self, tier: Tier, budget_ms: float | None) -> None:
+        # Milliseconds are what is recorded: live and replay must come to the same seconds.
+        self.given = (tier, budget_ms)
+        self._reconstructor.tier = tier
         self._reconstructor.budget_s = None if budget_ms is None else budget_ms * 1e-3
 
     def use_reference(self, reference: Reference, realtime_ns: int) -> None:
@@ -154,16 +176,16 @@ class Imaging:
             self._publish_frame(dual, frame)
         if self._marked is not None and dual.recording == self._marked.number:
             keys = tuple(ScanKey(s.channel, s.counter, s.device_us) for s in dual.scans)
-            done = Mark(keys, str(self.tier), self.budget_ms)
+            tier, budget_ms = self.given
+            done = Mark(keys, str(tier), budget_ms)
             self._marked.add(mark_entry(done, time.monotonic_ns(), time.time_ns()))
         self._go_on_taring(volts, lost)
 
     def _obey(self, mark: Mark) -> None:
         """Put in force what was in force when this dual scan was recorded."""
-        if self.tier != mark.tier:
-            self.tier = Tier(mark.tier)
-        if self.budget_ms != mark.budget_ms:
-            self.budget_ms = mark.budget_ms
+        if self.given != (mark.tier, mark.budget_ms):
+            self._asked = (Tier(mark.tier), mark.budget_ms)
+            self._give(*self._asked)
         if mark.reference is not None:
             self.use_reference(mark.reference, time.time_ns())
 

@@ -9,7 +9,8 @@ port/N         raw         bytes of port N exactly as read; the first ones start
 port/N/hello   raw         one whole frame: the hello in force when the recording began
 reference      msgpack     the reference that holds from here on: volts and noise of each channel
 frame          msgpack     a dual scan that the daemon reconstructed: channel, counter and device
-                           time of each of its scans, the tier and the time budget in force
+                           time of each of its scans, the tier and the budget (ms of modelled
+                           work, not of time) that it was reconstructed with
 map, contacts  stream      messages exactly as published, if asked for
 =============  ==========  =======================================================================
 

@@ -65,6 +65,7 @@ class Status:
             "latency_ms": latency.percentiles_ms(),
             "tier_requested": str(imaging.tier),
             "budget_ms": imaging.budget_ms,
+            "calibration": self._calibration(),
             "recording": active and {"path": str(active.path), "bytes": active.bytes_written},
             "subscribers": subscribers,
         }
@@ -77,6 +78,11 @@ class Status:
         if time.monotonic_ns() - last_ns > STALE_S * 1e9:
             return "stale"
         return "taring" if self._imaging.is_taring else "running"
+
+    def _calibration(self) -> dict[str, Any]:
+        tier, modelled_ms = self._imaging.given
+        source = self._imaging.calibration.source
+        return {"source": source, "tier": str(tier), "modelled_ms": modelled_ms}
 
     def _rates(self) -> dict[str, float | None]:
         rates = self._pipeline.scan_rates

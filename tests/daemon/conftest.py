@@ -28,6 +28,7 @@ from tactomo.recording import open_recording
 from tactomo_client import request
 from tactomo_client.messages import KINDS, Message, decode_message, topic
 from tactomo_models import Contact, Flag, Modality, Reconstruction, Reference, Tier
+from tactomo_models.calibration import Calibration
 from tactomo_protocol import (
     Channel,
     Command,
@@ -325,12 +326,19 @@ def make_skin() -> Iterator[Callable[[Path, int], Any]]:
 def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Callable[..., Any]]:
     """Start a daemon: ``bench(ports=1, **config)``; everything is stopped later.
 
-    It has the reconstructor above, each frame of which takes `seconds`, or the `real` one.
+    It has the reconstructor above, each frame of which takes `seconds`, or the `real` one; and a
+    `calibration`, or this machine's.
     """
     daemons: list[Daemon] = []
     listeners: list[Listener] = []
 
-    def start(ports: int = 1, seconds: float = 0.0, real: bool = False, **config: Any) -> Bench:
+    def start(
+        ports: int = 1,
+        seconds: float = 0.0,
+        real: bool = False,
+        calibration: Calibration | None = None,
+        **config: Any,
+    ) -> Bench:
         folder = tmp_path / f"ports-{len(daemons)}"
         folder.mkdir()
         skin = make_skin(folder, ports)
@@ -344,7 +352,9 @@ def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Cal
             **config,
         }
         memory: Any = None if real else Memory(seconds)
-        daemon = Daemon(load_config(None, **settings), reconstructor=memory)
+        daemon = Daemon(
+            load_config(None, **settings), reconstructor=memory, calibration=calibration
+        )
         daemon.start()
         daemons.append(daemon)
         listener = Listener(daemon.stream_address, "left")
@@ -378,10 +388,19 @@ class Heard:
 
 @pytest.fixture
 def replay(tmp_path: Path) -> Callable[..., Any]:
-    """Replay a recording to its end: ``replay(path, speed=0, **config)`` returns what was said."""
+    """Replay a recording to its end: ``replay(path, speed=0, **config)`` returns what was said.
+
+    With a `calibration`, or this machine's.
+    """
     count = itertools.count()
 
-    def run(path: Path, speed: float = 0, real: bool = False, **config: Any) -> Heard:
+    def run(
+        path: Path,
+        speed: float = 0,
+        real: bool = False,
+        calibration: Calibration | None = None,
+        **config: Any,
+    ) -> Heard:
         out = tmp_path / f"replayed-{next(count)}.mcap"
         settings = {
             "name": "left",
@@ -395,7 +414,9 @@ def replay(tmp_path: Path) -> Callable[..., Any]:
             **config,
         }
         memory: Any = None if real else Memory()
-        daemon = Daemon(load_config(None, **settings), reconstructor=memory)
+        daemon = Daemon(
+            load_config(None, **settings), reconstructor=memory, calibration=calibration
+        )
         daemon.start()
         try:
             assert daemon.wait() == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import msgpack  # type: ignore[import-untyped]
@@ -14,6 +15,7 @@ from tactomo.daemon import Daemon
 from tactomo.errors import AddressError
 from tactomo_client import ControlError
 from tactomo_client.messages import array_from_wire, decode_reply, encode_request
+from tactomo_models import Tier
 
 Start = Callable[..., Any]
 
@@ -195,7 +197,7 @@ def test_an_address_in_use_is_refused_and_nothing_is_left_open(
     b = bench(**{purpose: other})
     taken = getattr(b.daemon, f"{purpose}_address")
     settings = {"stream": "tcp://127.0.0.1:0", "control": "tcp://127.0.0.1:0", purpose: taken}
-    memory: Any = object()
+    memory: Any = SimpleNamespace(tier=Tier.AUTO, budget_s=None)
     second = Daemon(load_config(ports=["/dev/null"], **settings), reconstructor=memory)
     before = threading.active_count()
     with pytest.raises(AddressError, match="in use") as caught:

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -20,6 +21,7 @@ from tactomo.daemon import Daemon
 from tactomo.errors import TactomoError
 from tactomo.recording import open_recording
 from tactomo_client import request
+from tactomo_models import Tier
 
 Start = Callable[..., Any]
 
@@ -111,7 +113,7 @@ def test_nothing_is_left_after_a_start_that_failed(bench: Start, tmp_path: Path)
     good, bad = os.ttyname(free[1]), str(tmp_path / "absent")
     threads = set(threading.enumerate())
     before = len(os.listdir("/proc/self/fd"))
-    memory: Any = object()
+    memory: Any = SimpleNamespace(tier=Tier.AUTO, budget_s=None)
     local = {"stream": "tcp://127.0.0.1:0", "control": "tcp://127.0.0.1:0"}
     for settings in (
         {"ports": [good, bad], **local},

@@ -15,6 +15,7 @@ from tactomo.recorder import write_recording
 from tactomo.recording import open_recording
 from tactomo_client.messages import array_from_wire
 from tactomo_models import Reference
+from tactomo_models.calibration import Calibration, Row
 from tactomo_protocol import Channel, Scan, ScanFlag, encode
 
 Start = Callable[..., Any]
@@ -132,11 +133,51 @@ def test_the_tier_that_was_in_force_is_again(bench: Start, replay: Replay, tmp_p
     b.daemon.stop()
     marks = open_recording(path).marks()
     assert [mark.tier for mark in marks] == ["auto"] * 3 + ["noser"]
-    assert marks[-1].budget_ms == 12
+    assert marks[-1].budget_ms is not None
     again = replay(path).path
     assert [(m.tier, m.budget_ms) for m in open_recording(again).marks()] == [
         (m.tier, m.budget_ms) for m in marks
     ]
+
+
+def test_what_a_time_bought_is_given_again_on_any_machine(
+    bench: Start, replay: Replay, tmp_path: Path
+) -> None:
+    path = tmp_path / "budget.mcap"
+    rows = (
+        Row(method="auto", budget_s=0.001, p50_s=0.003, p99_s=0.004, icc=0.9),
+        Row(method="noser", budget_s=None, p50_s=0.001, p99_s=0.002, icc=0.6),
+    )
+    here = Calibration(
+        tactomo="1",
+        machine="of the test",
+        taken="2026-01-31",
+        sensor="paper_square",
+        sha256="",
+        overhead_s=0.002,
+        speed=2.0,
+        rows=rows,
+    )
+    b = bench(record=path, calibration=here)
+    b.tare()
+    for budget_ms, tier, modelled_ms in (
+        (12, "auto", 5.0),
+        (3, "noser", 1.0),
+        (None, "auto", None),
+    ):
+        b.ask("set_budget", budget_ms=budget_ms)
+        given = {"source": here.source, "tier": tier, "modelled_ms": modelled_ms}
+        b.until(lambda given=given: b.ask("status")["calibration"] == pytest.approx(given))
+        status = b.ask("status")
+        assert (status["tier_requested"], status["budget_ms"]) == ("auto", budget_ms)
+        b.step(load=0.1)
+    b.daemon.stop()
+    marks = [(mark.tier, mark.budget_ms) for mark in open_recording(path).marks()]
+    assert [tier for tier, _ in marks] == ["auto"] * 4 + ["noser", "auto"]
+    assert [budget_ms for _, budget_ms in marks[3:]] == [pytest.approx(5), 1, None]
+    elsewhere = here.model_copy(update={"overhead_s": 0.0, "speed": 0.1, "rows": rows[1:]})
+    again = replay(path, calibration=elsewhere)
+    assert [(mark.tier, mark.budget_ms) for mark in open_recording(again.path).marks()] == marks
 
 
 def test_a_recording_knows_what_is_in_it(bench: Start, tmp_path: Path) -> None:

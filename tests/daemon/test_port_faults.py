@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ import pytest
 from tactomo.config import load_config
 from tactomo.daemon import Daemon
 from tactomo.errors import PortBusyError, PortError
+from tactomo_models import Tier
 from tactomo_protocol import Acknowledge, AckStatus, Channel, CommandCode, Scan, ScanFlag
 
 Start = Callable[..., Any]
@@ -22,7 +24,7 @@ Start = Callable[..., Any]
 
 def refusal(port: str | Path) -> PortError:
     """Return the error with which a daemon refuses to start on a port."""
-    memory: Any = object()
+    memory: Any = SimpleNamespace(tier=Tier.AUTO, budget_s=None)
     local = "tcp://127.0.0.1:0"
     config = load_config(None, ports=[str(port)], stream=local, control=local)
     daemon = Daemon(config, reconstructor=memory)

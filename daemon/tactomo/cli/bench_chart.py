@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any, Final
 import typer
 from rich.console import Console
 from rich.progress import Progress
-from tactomo_models import METHODS, load_description
+from tactomo_models import METHODS, SensorDescription, load_description
+from tactomo_models.evaluation import moving
 from tactomo_models.evaluation import scenes as draw_scenes
-from tactomo_models.evaluation.moving import draw_sequence
+from tactomo_models.evaluation.still import Variant
 from tactomo_models.evaluation.trade_off import (
     STILL_BUDGETS_S,
     Point,
@@ -74,6 +75,7 @@ def measure_chart(name: str, count: int) -> list[Point]:
         ModelError: there are no scenes for such a sensor.
     """
     sensor = load_description(name)
+    methods = to_be_had(sensor, METHODS)
     with Progress(console=Console(stderr=True), transient=True) as progress:
         still = [
             list(
@@ -86,22 +88,35 @@ def measure_chart(name: str, count: int) -> list[Point]:
             for snr_db in STILL_SNR_DB
         ]
         numbers = progress.track(range(sequences(count)), description="simulating moving scenes")
-        moving = [draw_sequence(sensor, SEEDS, n, snr_db=MOVING_SNR_DB) for n in numbers]
-        missing = left_out(still[0][0], METHODS)
-        for method, reason in missing.items():
-            typer.echo(f"left out: {method}: {reason}", err=True)
-        methods = [method for method in METHODS if method not in missing]
-
+        played = [moving.draw_sequence(sensor, SEEDS, n, snr_db=MOVING_SNR_DB) for n in numbers]
         points: list[Point] = []
-        of_still, of_moving = variants(methods, STILL_BUDGETS_S), variants(methods)
         for scenes in still:
+            asked = variants(methods, STILL_BUDGETS_S)
             what = f"measuring on still scenes, {scenes[0].snr_db:g} dB"
-            task = progress.add_task(what, total=len(scenes) * len(of_still))
-            points += measure_still(scenes, of_still, partial(progress.advance, task))
-        for variant in of_moving:
-            frames = sum(len(sequence.steps) for sequence in moving)
-            task = progress.add_task(f"measuring on moving scenes: {variant}", total=frames)
-            points += measure_moving(moving, [variant], partial(progress.advance, task))
+            task = progress.add_task(what, total=len(scenes) * len(asked))
+            points += measure_still(scenes, asked, partial(progress.advance, task))
+        points += follow(played, variants(methods), progress)
+    return points
+
+
+def to_be_had(sensor: SensorDescription, methods: Sequence[str]) -> list[str]:
+    """Return the methods that a sensor has; say on standard error why others are left out."""
+    missing = left_out(sensor, methods)
+    for method, reason in missing.items():
+        typer.echo(f"left out: {method}: {reason}", err=True)
+    return [method for method in methods if method not in missing]
+
+
+def follow(
+    sequences: Sequence[moving.Sequence], asked: Sequence[Variant], progress: Progress
+) -> list[Point]:
+    """Measure variants on moving scenes, a bar for each of them."""
+    points: list[Point] = []
+    for variant in asked:
+        frames = sum(len(sequence.steps) for sequence in sequences)
+        task = progress.add_task(f"measuring on moving scenes: {variant}", total=frames)
+        points += measure_moving(sequences, [variant], partial(progress.advance, task))
+        progress.remove_task(task)
     return points
 
 

@@ -63,6 +63,15 @@ def _draw_panel(axes: Any, panel: Sequence[Point]) -> None:
     if front:
         x, y = [p.p50_s * 1e3 for p in front], [p.icc for p in front]
         axes.step([*x, PAPER_MS], [*y, y[-1]], where="post", color=FRONT, linewidth=1.5, zorder=1)
+        axes.annotate(
+            "Pareto front ",
+            (PAPER_MS, y[-1]),
+            xytext=(-10, 3),
+            textcoords="offset points",
+            ha="right",
+            fontsize=7,
+            color=FRONT,
+        )
     for method in dict.fromkeys(point.variant.method for point in panel):
         _draw_method(axes, [p for p in panel if p.variant.method == method], front)
     kind = "Still scenes, cold start" if panel[0].scene == "still" else "Moving scenes, 20 frames/s"

@@ -198,6 +198,7 @@ def _status_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
             for stage, times in (status.get("stage_ms") or {}).items()
         ),
         ("tier", f"{status.get('tier') or '-'} (asked for: {status.get('tier_requested')})"),
+        ("budget", _budget(status.get("budget_ms"), status.get("calibration") or {})),
         ("flags", ", ".join(status.get("flags", [])) or "none"),
         ("misfit", _number(status.get("misfit"))),
         (
@@ -224,6 +225,15 @@ def _port_line(port: dict[str, Any]) -> str:
         f"{', '.join(device.get('channels', [])) or '-'}; {port.get('packets', 0)} packets, "
         + (f"[yellow]{corrupt} corrupt[/]" if corrupt else "none corrupt")
     )
+
+
+def _budget(budget_ms: float | None, calibration: dict[str, Any]) -> str:
+    """Say what time a frame may take, and what it is given for that."""
+    source = f"calibration: {calibration.get('source', '-')}"
+    if budget_ms is None:
+        return f"the tier's own; {source}"
+    given = f"{calibration.get('tier')}, {_number(calibration.get('modelled_ms'))} modelled ms"
+    return f"{budget_ms:g} ms: {given}; {source}"
 
 
 def _percentiles(times: dict[str, Any]) -> str:

@@ -15,12 +15,13 @@ from typing import Final, Literal
 import numpy as np
 
 from tactomo_models.batch import BUDGET_S
+from tactomo_models.description import SensorDescription
 from tactomo_models.errors import ModelError
 from tactomo_models.evaluation import moving
 from tactomo_models.evaluation.measures import SceneScore, Summary, summarise
 from tactomo_models.evaluation.scenes import EvaluationScene
 from tactomo_models.evaluation.still import Variant, reconstruct_scenes
-from tactomo_models.reconstruct import DEFAULT_BUDGET_S, METHODS, Tier
+from tactomo_models.reconstruct import DEFAULT_BUDGET_S, METHODS, Tier, check_tier
 
 SceneKind = Literal["still", "moving"]
 Done = Callable[[], None]
@@ -117,12 +118,12 @@ def measure_moving(
         yield _point("moving", sequences[0].snr_db, variant, summary.frames, summary)
 
 
-def left_out(scene: EvaluationScene, methods: Iterable[str]) -> dict[str, str]:
+def left_out(description: SensorDescription, methods: Iterable[str]) -> dict[str, str]:
     """Methods that are not to be had for a sensor, and why: a network that nobody trained."""
     reasons = {}
     for method in methods:
         try:
-            next(reconstruct_scenes([scene], method))
+            check_tier(description, Tier(method))
         except ModelError as error:
             reasons[method] = str(error)
     return reasons

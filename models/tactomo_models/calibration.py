@@ -1,0 +1,251 @@
+"""What a budget of time buys on the machine at hand: how much work, and which method.
+
+A reconstructor's budget counts modelled work, so that a recording reconstructs exactly as the live
+stream did (`shape_fit.Budget`). A calibration turns time into such a budget, once, before the
+reconstructor is given it and before it is recorded: a replay needs no calibration, and takes the
+same steps on any machine.
+
+It is measured by `tactomo bench --calibrate` and kept beside the sensor's artifact. Where there is
+none, one that comes with tactomo stands in.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import cache
+from importlib.metadata import version
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Final, Literal, NamedTuple
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from scipy.optimize import nnls
+
+from tactomo_models.artifact import default_path
+from tactomo_models.description import SensorDescription
+from tactomo_models.errors import ArtifactError, explain
+from tactomo_models.reconstruct import METHODS, Tier, check_tier
+
+SHIPPED: Final = "shipped_calibration.json"
+AGAIN: Final = "run: tactomo bench --calibrate"
+LEAST_BUDGET_S: Final = 0.001  # a frame does one thing at least, whatever it may take
+
+
+def _known(method: str) -> str:
+    if method not in METHODS:
+        raise ValueError(f"use one of: {', '.join(METHODS)}")
+    return method
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Row(_Table):
+    """How fast and how right a method is on moving scenes, frame after frame.
+
+    Attributes:
+        method: one of METHODS.
+        budget_s: modelled work that a frame might take; None where a method takes what it takes.
+        p50_s, p99_s: time of a frame.
+        icc: of the magnitude map, mean.
+    """
+
+    method: Annotated[str, AfterValidator(_known)]
+    budget_s: Annotated[float, Field(gt=0)] | None
+    p50_s: Annotated[float, Field(gt=0)]
+    p99_s: Annotated[float, Field(gt=0)]
+    icc: Annotated[float, Field(ge=-1, le=1)]
+
+
+class Plan(NamedTuple):
+    """What a reconstructor is given for the tier and the time that were asked for."""
+
+    tier: Tier
+    budget_s: float | None
+
+
+class Calibration(_Table):
+    """What was measured for one sensor on one machine.
+
+    Attributes:
+        format: of the file.
+        tactomo: the version that measured.
+        machine: its processor.
+        taken: the day, as YYYY-MM-DD.
+        sensor: name of the description.
+        sha256: that description's hash.
+        overhead_s: time of a frame, at its 99th percentile, that goes by no budget.
+        speed: seconds that a frame takes for each second of modelled work, there.
+        rows: the methods that `auto` may choose from.
+        shipped: whether it came with tactomo.
+    """
+
+    format: Literal[1] = 1
+    tactomo: str
+    machine: str
+    taken: str
+    sensor: str
+    sha256: str
+    overhead_s: Annotated[float, Field(ge=0)]
+    speed: Annotated[float, Field(gt=0)]
+    rows: tuple[Row, ...]
+    shipped: Annotated[bool, Field(exclude=True)] = False
+
+    @classmethod
+    def of_rows(
+        cls, description: SensorDescription, taken: str, rows: Sequence[Row]
+    ) -> Calibration:
+        """Make a calibration of what was measured just now on this machine.
+
+        Args:
+            description: the sensor.
+            taken: the day.
+            rows: some of them of `auto`, under different budgets.
+        """
+        overhead_s, speed = _law([row for row in rows if row.method == Tier.AUTO])
+        return cls(
+            tactomo=version("tactomo"),
+            machine=processor(),
+            taken=taken,
+            sensor=description.name,
+            sha256=description.sha256,
+            overhead_s=overhead_s,
+            speed=speed,
+            rows=tuple(rows),
+        )
+
+    def plan(self, tier: Tier, time_s: float | None) -> Plan:
+        """Return what to give a reconstructor, so that 99 frames of 100 keep to a time.
+
+        Args:
+            tier: that is asked for. `auto` becomes another method where that one is more right
+                within so little time.
+            time_s: that a frame may take; None leaves it to the tier.
+        """
+        if time_s is None:
+            return Plan(tier, None)
+        best = self.best_within(time_s) if tier is Tier.AUTO else None
+        budget_s = max(LEAST_BUDGET_S, (time_s - self.overhead_s) / self.speed)
+        return Plan(tier if best is None else Tier(best.method), budget_s)
+
+    def best_within(self, time_s: float) -> Row | None:
+        """Return the most accurate row that keeps to a time, or else the fastest one."""
+        fitting = [row for row in self.rows if row.p99_s <= time_s]
+        if fitting:
+            return max(fitting, key=lambda row: row.icc)
+        return min(self.rows, key=lambda row: row.p99_s, default=None)
+
+    @property
+    def source(self) -> str:
+        """In words, where it comes from."""
+        if self.shipped:
+            return f"shipped, of {self.machine}; {AGAIN}"
+        return f"measured here on {self.taken}"
+
+
+def _law(rows: Sequence[Row]) -> tuple[float, float]:
+    """Overhead and slope of the frames' time over their budget, by least relative squares."""
+    budget_s = np.array([row.budget_s or 0.0 for row in rows])
+    p99_s = np.array([row.p99_s for row in rows])
+    terms = np.stack([np.ones(len(rows)), budget_s], axis=1)
+    (overhead_s, speed), _ = nnls(terms / p99_s[:, None], np.ones(len(rows)))
+    return float(overhead_s), max(float(speed), 1e-3)
+
+
+def calibration_path(description: SensorDescription) -> Path:
+    """Where a sensor's calibration is kept: beside its artifact."""
+    return default_path(description).with_suffix(".calibration.json")
+
+
+def save_calibration(calibration: Calibration, path: Path) -> None:
+    """Write a calibration; a half-written one is never left under that name.
+
+    Raises:
+        ArtifactError: the file cannot be written.
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_text(calibration.model_dump_json(indent=1) + "\n", "utf-8")
+        part.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            part.unlink()
+        raise ArtifactError(f"cannot write {path}: {error.strerror}; free some space") from error
+
+
+def load_calibration(path: Path, description: SensorDescription) -> Calibration:
+    """Read a calibration and make sure that it holds here.
+
+    Raises:
+        ArtifactError: it is damaged, or of another machine, sensor or version of tactomo.
+        FileNotFoundError: there is none.
+    """
+    try:
+        found = Calibration.model_validate_json(path.read_bytes())
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise ArtifactError(f"cannot read {path}: {error.strerror}; {AGAIN}") from error
+    except ValidationError as error:
+        complaint = " ".join(explain(error.errors()[0]).split())[:200]
+        raise ArtifactError(f"{path} is damaged ({complaint}); {AGAIN}") from error
+    for what, of, here in (
+        ("on", found.machine, processor()),
+        ("for", found.sha256, description.sha256),
+        ("by tactomo", found.tactomo, version("tactomo")),
+    ):
+        if of != here:
+            raise ArtifactError(
+                f"{path} was measured {what} {of[:60]}, not {what} {here[:60]}; {AGAIN}"
+            )
+    return found
+
+
+def calibration_for(description: SensorDescription, warn: Callable[[str], None]) -> Calibration:
+    """The calibration in force: what was measured here, or else what comes with tactomo.
+
+    Args:
+        description: the sensor.
+        warn: told in one line why what was measured here is not used.
+    """
+    try:
+        found = load_calibration(calibration_path(description), description)
+    except FileNotFoundError:
+        found = _shipped()
+    except ArtifactError as error:
+        warn(f"{error}; until then: the calibration that comes with tactomo")
+        found = _shipped()
+    # Which method is best is another sensor's, and a network may be gone that was there.
+    of_this = found.sha256 == description.sha256
+    rows = [row for row in found.rows if of_this and _is_to_be_had(description, row.method)]
+    return found.model_copy(update={"rows": tuple(rows)})
+
+
+def _is_to_be_had(description: SensorDescription, method: str) -> bool:
+    try:
+        check_tier(description, Tier(method))
+    except ArtifactError:
+        return False
+    return True
+
+
+def _shipped() -> Calibration:
+    text = files("tactomo_models").joinpath(SHIPPED).read_text("utf-8")
+    return Calibration.model_validate_json(text).model_copy(update={"shipped": True})
+
+
+@cache
+def processor() -> str:
+    """Name of this machine's processor."""
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(": ")[2]
+    return platform.processor() or platform.machine()
