@@ -62,6 +62,16 @@ def test_the_picture_names_every_method_and_no_label_covers_another() -> None:
     assert figure.get_suptitle() == "a title"
 
 
+def test_no_two_methods_look_alike() -> None:
+    figure = draw_chart([point(method, 0.02, 0.9) for method in METHODS], "a title")
+    (axes,) = figure.axes
+    looks = {(bar[0].get_marker(), bar[0].get_color()) for bar in axes.containers}
+    assert len(looks) == len(METHODS)
+    assert (
+        len({marker for marker, _ in looks}) == len({colour for _, colour in looks}) == len(looks)
+    )
+
+
 def test_what_cannot_be_written_is_refused_before_the_work(
     tactomo: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

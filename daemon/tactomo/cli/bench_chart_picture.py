@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 # Okabe and Ito's colours, which those who see fewer colours tell apart, too.
 COLOURS: Final = (
     *("#D55E00", "#0072B2", "#56B4E9", "#000000", "#009E73"),
-    *("#CC79A7", "#E69F00", "#7A4FBF", "#8C6D31", "#999999"),
+    *("#CC79A7", "#E69F00", "#7A4FBF", "#8C6D31", "#808080", "#00A5B5", "#A50F3C"),
 )
-MARKERS: Final = "oDsXPv^<>*"
+MARKERS: Final = "oDsXPv^*<>hp"
 MARKER: Final = 7.0  # points of print, across
 PALE: Final = 0.35  # opacity of what something else is better than
 FRONT: Final = "0.45"
