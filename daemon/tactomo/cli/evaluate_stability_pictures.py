@@ -39,7 +39,7 @@ def draw_worst(outcomes: Sequence[Outcome], output: Path) -> None:
     shape = not any(one.case.truth.map.any() for one in outcomes)
     top = max(float(_images(one, shape=shape)[0].max()) for one in chosen) or 1.0
     width = PANEL_INCHES * len(chosen) + BAR_INCHES
-    figure = Figure(figsize=(width, 2 * PANEL_INCHES + NOTE_INCHES + 1.2), layout="constrained")
+    figure = Figure(figsize=(width, 2 * PANEL_INCHES + NOTE_INCHES + 1.0), layout="constrained")
     regime = outcomes[0].score.regime
     title = f"{regime}: {REGIMES[regime].what} Each method's worst case, simulated."
     figure.suptitle(textwrap.fill(title, int(13 * width)), fontsize=10)
@@ -48,6 +48,8 @@ def draw_worst(outcomes: Sequence[Outcome], output: Path) -> None:
     )
     for axes, one in zip(grid.T, chosen, strict=True):
         _draw_outcome(axes, one, _images(one, shape=shape), top)
+    for panel in grid[:2, 1:].ravel():
+        panel.tick_params(labelleft=False)
     grid[0, 0].set_ylabel("truth\ny (mm)", fontsize=9)
     grid[1, 0].set_ylabel("found, + contacts\ny (mm)", fontsize=9)
     label = "pressed: 0 bare to 1 saturated" if shape else "|Δσ|/σ₀ of the magnitude channel"
@@ -85,8 +87,8 @@ def _draw_outcome(
 
 def _verdict(score: CaseScore) -> str:
     if score.bad:
-        return f"ICC {score.icc:.2f}: bad, {'warned' if score.warned else 'NO WARNING'}"
-    return f"ICC {score.icc:.2f}: good{', but warned' if score.warned else ''}"
+        return f"ICC {score.icc:.2f}: bad,\n{'warned' if score.warned else 'no warning'}"
+    return f"ICC {score.icc:.2f}: good,\n{'but warned' if score.warned else 'no warning'}"
 
 
 def _colour(score: CaseScore) -> str:

@@ -416,8 +416,10 @@ _ALL = (
     ),
     Regime("displaced", "An electrode that sits 2 to 4 mm off its place.", _displaced_electrode),
     Regime("swapped", "Two leads of one sheet that were exchanged.", _swapped_electrodes),
-    Regime("drift", "1 to 4 % of common, 0.5 to 2 % of smooth change since the tare.", _drift),
-    Regime("drift-at-rest", "The same, and nothing presses.", _drift_at_rest),
+    Regime(
+        "drift", "Sheets 1 to 4 % better or worse conductors than at the tare, unevenly so.", _drift
+    ),
+    Regime("drift-at-rest", "Drift as above, and nothing presses.", _drift_at_rest),
     Regime("stretched", "A sheet 2 to 5 % longer along x than described.", _stretched),
     Regime("one-scan-apart", "A sliding contact, the structure scan one behind.", _behind),
     Regime("jump", "A contact that is elsewhere in the next frame.", _jump),
