@@ -173,6 +173,7 @@ def _label(axes: Any, panel: Sequence[Point]) -> None:
     """Name each method once, at its most accurate point, and the budgets of those that have one."""
     front = pareto_front(panel)
     taken = [_box(axes, point) for point in panel]
+    taken += [text.get_window_extent() for text in axes.texts]
     best = {m: _most_accurate(panel, m) for m in dict.fromkeys(p.variant.method for p in panel)}
     for method, point in best.items():
         if point is not None:
