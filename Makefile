@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 TRAIN_READY := $(VENV)/.ready-train
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
 LOCKED := pyproject.toml --universal --python-version 3.11 --generate-hashes \
   --no-emit-package tactomo-client --no-emit-package tactomo
@@ -53,8 +54,9 @@ $(READY): requirements.lock pyproject.toml clients/python/pyproject.toml
 	$(BIN)/python -m pip install --quiet --no-build-isolation --no-deps -e clients/python -e .
 	touch $@
 
-# On top of that: torch last, when all it needs has come with its hash.
+# On top of that: torch last, when all it needs has come with its hash. Where its own index cannot
+# be reached, pip says so and takes what the others have.
 $(TRAIN_READY): $(READY) requirements-train.lock requirements-torch.txt
 	$(BIN)/python -m pip install --quiet --require-hashes -r requirements-train.lock
-	$(BIN)/python -m pip install --quiet -r requirements-torch.txt
+	$(BIN)/python -m pip install --quiet --extra-index-url $(TORCH_INDEX) -r requirements-torch.txt
 	touch $@

@@ -59,7 +59,7 @@ def write_whole(path: Path, write: Callable[[IO[bytes]], object]) -> None:
         with part.open("wb") as file:
             write(file)
         part.replace(path)
-    except OSError:
+    except BaseException:  # Ctrl-C included
         with suppress(OSError):
             part.unlink()
         raise

@@ -11,7 +11,8 @@ from small_sensor import SMALL
 from tactomo_models import SensorDescription, load_description
 from threadpoolctl import threadpool_limits
 
-collect_ignore_glob = [] if find_spec("torch") and find_spec("joblib") else ["test_*.py"]
+EXTRA = ("distributed", "joblib", "onnx", "torch")
+collect_ignore_glob = [] if all(map(find_spec, EXTRA)) else ["test_*.py"]
 
 
 @pytest.fixture(scope="session")

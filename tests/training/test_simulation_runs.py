@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from distributed import LocalCluster
 from tactomo_models import DataError, ModelError, SensorDescription, load_description
+from tactomo_models.archive import write_arrays
 from tactomo_models.training import simulate as module
 from tactomo_models.training.simulate import read_scenes, simulate
 from variants import variant
@@ -259,14 +260,13 @@ class TestCommand:
     def test_ctrl_c_leaves_whole_shards_and_says_how_to_go_on(
         self, tactomo: Run, small_file: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     ) -> None:
-        written = []
-        write = module.write_arrays
+        written: list[Path] = []
 
         def write_one(path: Path, arrays: dict[str, Any]) -> None:
             if written:
                 raise KeyboardInterrupt
             written.append(path)
-            write(path, arrays)
+            write_arrays(path, arrays)
 
         monkeypatch.setattr(module, "write_arrays", write_one)
         command = ("models", "simulate", "scenes", "--scenes", SCENES, "--sensor", small_file)

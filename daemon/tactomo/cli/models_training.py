@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, replace
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import typer
 
@@ -28,6 +28,10 @@ if TYPE_CHECKING:
 EXTRA = frozenset({"dask", "distributed", "joblib", "onnx", "onnxscript", "torch"})
 INTERRUPTED = 130
 
+# The models' RECIPES, which are not imported for a command line that only shows its help.
+RecipeName: TypeAlias = Literal[
+    "ours", "ours-small", "ours-single", "refiner", "paper-single", "paper-multimodal"
+]
 Picture = Annotated[
     Path | None,
     typer.Option(help="Draw some of the scenes: .png, .svg or .pdf. Needs matplotlib."),
@@ -120,10 +124,7 @@ def simulate(
 )
 def train(
     folder: Annotated[Path, typer.Argument(help="Scenes, from `tactomo models simulate`.")],
-    recipe: Annotated[
-        Literal["ours", "ours-small", "ours-single", "refiner", "paper-single", "paper-multimodal"],
-        typer.Option(help="Which network, see above."),
-    ] = "ours",
+    recipe: Annotated[RecipeName, typer.Option(help="Which network, see above.")] = "ours",
     epochs: Annotated[
         int | None, typer.Option(min=1, help="Passes over the scenes. [the recipe's]")
     ] = None,
@@ -163,10 +164,10 @@ def train(
 
     *ours* takes both channels' voltages, *ours-small* is half as wide, *ours-single* has the
     magnitude channel alone; *refiner* redraws what the physics has found with the help of *ours*,
-    which is trained first: give its checkpoint by --start. All want the preset robust.
-    *paper-single* and
-    *paper-multimodal* are the paper's, on scenes of the preset paper, whose Tikhonov and level set
-    images are made first and kept. All take one to two hours on two cores.
+    which is trained first: give its checkpoint by --start. All these want the preset robust.
+    *paper-single* and *paper-multimodal* are the paper's, on scenes of the preset paper. What the
+    physics makes of the scenes, for the refiner and the paper's two, is computed first and kept
+    beside them. All take one to two hours on two cores.
 
     A network that is written to the cache is used from then on for this sensor, instead of the one
     that ships; delete it to go back. Needs `pip install 'tactomo[train]'`.
@@ -279,12 +280,13 @@ def _in_words(epoch: Epoch, number: int) -> str:
     """One line: the loss, and the held-out correlations of each level of noise."""
     from tactomo.cli.models_training_pictures import by_noise
 
+    rows = by_noise(epoch.held_out)
+    names = "/".join(name for name, _ in next(iter(rows.values()), []))
     parts = [
-        f"{noise} " + " ".join("–" if math.isnan(icc) else f"{icc:.3f}" for _, icc in values)
-        for noise, values in by_noise(epoch.held_out).items()
+        f"{noise} " + "/".join("–" if math.isnan(icc) else f"{icc:.3f}" for _, icc in row)
+        for noise, row in rows.items()
     ]
-    contacts = "1 to 4 contacts, held out"
-    return f"epoch {number}: loss {epoch.loss:.4f}; ICC with {contacts}: {', '.join(parts)}"
+    return f"epoch {number}: loss {epoch.loss:.4f}; held-out ICC ({names}): {', '.join(parts)}"
 
 
 def _as_json(epoch: Epoch) -> dict[str, Any]:

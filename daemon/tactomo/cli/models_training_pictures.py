@@ -96,7 +96,8 @@ def draw_curves(history: Sequence[Epoch], title: str, output: Path) -> None:
             for contacts, icc in by_noise(epoch.held_out)[noise]:
                 curves.setdefault(contacts, []).append(icc)
         for contacts, values in curves.items():
-            panel.plot(epochs, values, ".-", label=f"{contacts} contact(s): {values[-1]:.3f}")
+            name = f"{contacts} contact(s)" if contacts.isdigit() else contacts
+            panel.plot(epochs, values, ".-", label=f"{name}: {values[-1]:.3f}")
         panel.set(xlabel="epoch", ylabel="ICC of the map", title=f"held-out scenes, {noise}")
         panel.legend(fontsize=8, loc="lower right")
         panel.grid(alpha=0.3)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
 from base64 import b64encode
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor, nn
 
+from tactomo_models.archive import write_whole
 from tactomo_models.description import Modality, SensorDescription
 from tactomo_models.errors import ModelError
 from tactomo_models.network import FORMAT, NetworkKind
@@ -58,13 +58,9 @@ def export(
     for name, value in notes.items():
         model.metadata_props.add(key=name, value=value)
     onnx.checker.check_model(model)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(model.SerializeToString())
-        part.replace(path)
+        write_whole(path, lambda file: file.write(model.SerializeToString()))
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise ModelError(
             f"cannot write {path}: {error.strerror}; free some space or name another file"
         ) from error

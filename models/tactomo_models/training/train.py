@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import os
 import pickle
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
@@ -14,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from tactomo_models.archive import write_whole
 from tactomo_models.errors import ModelError
 
 AVERAGED = 0.998  # of the averaged weights that each step keeps
@@ -189,13 +189,9 @@ def save_checkpoint(training: Training, settings: Settings, path: Path) -> None:
         "random": training.random.get_state(),
         "history": [asdict(epoch) for epoch in training.history],
     }
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        torch.save(state, part)
-        part.replace(path)
+        write_whole(path, lambda file: torch.save(state, file))
     except (OSError, RuntimeError) as error:  # torch reports a full disk as a RuntimeError
-        part.unlink(missing_ok=True)
         raise ModelError(
             f"cannot write {path}: {error}; free some space or name another file, then go on "
             "from the last checkpoint"

@@ -1,0 +1,37 @@
+"""`tactomo models simulate` and `train` where the extra that they need is not installed."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+Run = Callable[..., Any]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "package"),
+    [
+        (("simulate", "scenes", "--sensor", "paper_square"), "joblib"),
+        (("simulate", "scenes", "--dask", "tcp://127.0.0.1:8786"), "distributed"),
+        (("train", "scenes"), "torch"),
+    ],
+)
+def test_a_missing_extra_is_told(
+    tactomo: Run,
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: tuple[str, ...],
+    package: str,
+) -> None:
+    joblib = ModuleType("joblib")  # which may be missing here, too
+    monkeypatch.setattr(joblib, "delayed", None, raising=False)
+    monkeypatch.setitem(sys.modules, "joblib", joblib)
+    monkeypatch.setitem(sys.modules, package, None)
+    result = tactomo("models", *arguments)
+    assert result.returncode == 1
+    assert f"training needs {package}, which is not installed" in result.stderr
+    assert "pip install 'tactomo[train]'" in result.stderr
+    assert "https://download.pytorch.org/whl/cpu" in result.stderr
