@@ -32,6 +32,7 @@ from tactomo_models.reconstruct import METHODS, Tier, check_tier
 
 SHIPPED: Final = "shipped_calibration.json"
 AGAIN: Final = "run: tactomo bench --calibrate"
+CLEARLY: Final = 0.02  # of ICC: by more than this another method must be better than auto's own
 LEAST_BUDGET_S: Final = 0.001  # a frame does one thing at least, whatever it may take
 
 
@@ -134,10 +135,14 @@ class Calibration(_Table):
         return Plan(tier if best is None else Tier(best.method), budget_s)
 
     def best_within(self, time_s: float) -> Row | None:
-        """Return the most accurate row that keeps to a time, or else the fastest one."""
+        """Return the most accurate row that keeps to a time, or else the fastest one.
+
+        What `auto` does by itself is judged by the physics and flagged where that finds fault, so
+        that another method has to be clearly more accurate.
+        """
         fitting = [row for row in self.rows if row.p99_s <= time_s]
         if fitting:
-            return max(fitting, key=lambda row: row.icc)
+            return max(fitting, key=lambda row: row.icc + CLEARLY * (row.method == Tier.AUTO))
         return min(self.rows, key=lambda row: row.p99_s, default=None)
 
     @property

@@ -23,7 +23,7 @@ from tactomo_models.calibration import (
 from tactomo_models.evaluation.moving import draw_sequence
 from tactomo_models.evaluation.trade_off import BUDGETED, BUDGETS_S, Point, variants
 
-from tactomo.cli.bench_chart import follow, to_be_had
+from tactomo.cli.bench_chart import follow, to_be_had, told_if_busy
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -46,7 +46,8 @@ def calibrate(name: str) -> Calibration:
     with Progress(console=Console(stderr=True), transient=True) as progress:
         ratios = progress.track(SNR_DB, description="simulating a moving scene")
         moving = [draw_sequence(sensor, SEEDS, 0, snr_db=snr_db) for snr_db in ratios]
-        points = follow(moving, variants(methods, (LEAST_S, *BUDGETS_S)), progress)
+        with told_if_busy():
+            points = follow(moving, variants(methods, (LEAST_S, *BUDGETS_S)), progress)
     today = datetime.now(UTC).date().isoformat()
     calibration = Calibration.of_rows(sensor, today, [_row(point) for point in points])
     save_calibration(calibration, calibration_path(sensor))

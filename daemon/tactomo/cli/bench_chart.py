@@ -7,7 +7,9 @@ go into a table of comma-separated values beside the picture (`bench_chart_pictu
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -42,6 +44,7 @@ MOVING_SNR_DB: Final = 40.0
 CONTACTS: Final = (1, 2, 3, 4)
 SCENES_A_SEQUENCE: Final = 5  # a sequence has 146 frames
 SEEDS: Final = "reporting"
+BUSY: Final = 0.8  # share of a core below which times are those of whatever else ran
 
 
 def prepare_chart(picture: Path) -> None:
@@ -90,13 +93,28 @@ def measure_chart(name: str, count: int) -> list[Point]:
         numbers = progress.track(range(sequences(count)), description="simulating moving scenes")
         played = [moving.draw_sequence(sensor, SEEDS, n, snr_db=MOVING_SNR_DB) for n in numbers]
         points: list[Point] = []
-        for scenes in still:
-            asked = variants(methods, STILL_BUDGETS_S)
-            what = f"measuring on still scenes, {scenes[0].snr_db:g} dB"
-            task = progress.add_task(what, total=len(scenes) * len(asked))
-            points += measure_still(scenes, asked, partial(progress.advance, task))
-        points += follow(played, variants(methods), progress)
+        with told_if_busy():
+            for scenes in still:
+                asked = variants(methods, STILL_BUDGETS_S)
+                what = f"measuring on still scenes, {scenes[0].snr_db:g} dB"
+                task = progress.add_task(what, total=len(scenes) * len(asked))
+                points += measure_still(scenes, asked, partial(progress.advance, task))
+            points += follow(played, variants(methods), progress)
     return points
+
+
+@contextmanager
+def told_if_busy() -> Iterator[None]:
+    """Say on standard error if this process had to wait for others while it measured times."""
+    wall_s, own_s = time.perf_counter(), time.process_time()
+    yield
+    share = (time.process_time() - own_s) / (time.perf_counter() - wall_s)
+    if share < BUSY:
+        typer.echo(
+            f"the machine was busy: this had {share:.0%} of a core, and its times are too long; "
+            "run it again when nothing else runs",
+            err=True,
+        )
 
 
 def to_be_had(sensor: SensorDescription, methods: Sequence[str]) -> list[str]:

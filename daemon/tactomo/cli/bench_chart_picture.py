@@ -29,7 +29,7 @@ PAPER_MS: Final = 6000.0  # the paper, section V: whole tomography, hardware; it
 FRAME_MS: Final = 50.0  # between two scans at 20 a second
 # Places of a label by its point, in points of print, near ones first.
 OFFSETS: Final = tuple(
-    sorted(product(range(-63, 64, 9), range(-45, 46, 9)), key=lambda at: np.hypot(*at))
+    sorted(product(range(-99, 100, 9), range(-63, 64, 9)), key=lambda at: np.hypot(*at))
 )
 NEAR: Final = 26.0  # farther away, a budget's label would be taken for another point's
 
@@ -178,12 +178,14 @@ def _label(axes: Any, panel: Sequence[Point]) -> None:
     for method, point in best.items():
         if point is not None:
             alpha = 1.0 if any(p.variant.method == method for p in front) else 0.7
-            _place(axes, point, str(method), taken, np.inf, fontsize=9, alpha=alpha)
+            _place(axes, panel, point, str(method), taken, np.inf, fontsize=9, alpha=alpha)
     methods = [point.variant.method for point in panel]
     for point in panel:
         if methods.count(point.variant.method) > 1:
             alpha = 1.0 if point in front else 0.6
-            _place(axes, point, point.variant.budget_name, taken, NEAR, fontsize=6, alpha=alpha)
+            _place(
+                axes, panel, point, point.variant.budget_name, taken, NEAR, fontsize=6, alpha=alpha
+            )
 
 
 def _most_accurate(panel: Sequence[Point], method: str) -> Point | None:
@@ -201,7 +203,13 @@ def _box(axes: Any, point: Point) -> Any:
 
 
 def _place(
-    axes: Any, point: Point, text: str, taken: list[Any], farthest: float, **style: Any
+    axes: Any,
+    panel: Sequence[Point],
+    point: Point,
+    text: str,
+    taken: list[Any],
+    farthest: float,
+    **style: Any,
 ) -> None:
     """Write text by a point, at the nearest place where it covers nothing; else not at all."""
     from matplotlib.patheffects import withStroke
@@ -218,14 +226,27 @@ def _place(
         **style,
     )
     inside, centred = axes.get_window_extent(), label.get_window_extent()
+    pixels = axes.figure.dpi / 72
+    strangers = [_box(axes, p) for p in panel if p.variant.method != point.variant.method]
+    free: list[tuple[float, tuple[int, int], Any]] = []
     for offset in OFFSETS:
-        if np.hypot(*offset) > farthest:
-            break
-        x, y = np.multiply(offset, axes.figure.dpi / 72)
-        box = centred.translated(x, y)
+        far = float(np.hypot(*offset))
+        box = centred.translated(*np.multiply(offset, pixels))
         fits = inside.x0 < box.x0 and box.x1 < inside.x1 and inside.y0 < box.y0 < inside.y1
-        if fits and not any(box.overlaps(other) for other in taken):
-            label.set_position(offset)
-            taken.append(box)
-            return
-    label.remove()
+        if far <= farthest and fits and not any(box.overlaps(other) for other in taken):
+            # By another method's point it would be taken for that one's name.
+            apart = min((_distance(box, other) for other in strangers), default=np.inf) / pixels
+            free.append((far + 2 * max(0.0, 1.5 * MARKER - apart), offset, box))
+    if not free:
+        label.remove()
+        return
+    _, offset, box = min(free, key=lambda place: place[0])
+    label.set_position(offset)
+    taken.append(box)
+
+
+def _distance(one: Any, other: Any) -> float:
+    """Return how far two boxes are apart."""
+    gap_x = max(one.x0 - other.x1, other.x0 - one.x1, 0.0)
+    gap_y = max(one.y0 - other.y1, other.y0 - one.y1, 0.0)
+    return float(np.hypot(gap_x, gap_y))
