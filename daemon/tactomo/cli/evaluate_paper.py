@@ -284,7 +284,7 @@ def _single_areas(study: _Study, asked: set[int]) -> _Part:
     def draw_9(path: Path) -> None:
         from tactomo.cli.evaluate_paper_pictures import draw_traces
 
-        draw_traces(frames, path)
+        draw_traces(frames, errors, path)
 
     title = "Figs. 8 and 9: magnitude error over cases 1 to 4, at its worst pressure"
     table = _table()

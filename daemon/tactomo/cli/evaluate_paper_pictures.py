@@ -12,7 +12,7 @@ from tactomo.cli.plot import save_figure
 
 if TYPE_CHECKING:
     from tactomo_models import SensorDescription
-    from tactomo_models.evaluation.paper import Cell, Frame, Localisation, Response
+    from tactomo_models.evaluation.paper import Cell, Frame, Localisation, MagnitudeError, Response
 
 # The paper's own colours for its three methods.
 COLOURS = {
@@ -51,6 +51,7 @@ def draw_simulation(points: Sequence[Cell], output: Path) -> None:
             of = [p for p in points if (p.method, p.snr_db) == (method, snr_db)]
             contacts = [point.contacts for point in of]
             style = {"marker": "o", "markersize": 4, "color": COLOURS.get(method), "label": method}
+            style["linestyle"] = "--" if method == "auto" else "-"  # it often is another one's
             rows[0, column].plot(contacts, [point.summary.rie for point in of], **style)
             rows[1, column].plot(contacts, [point.summary.icc for point in of], **style)
         rows[0, column].set_title("no noise" if np.isinf(snr_db) else f"SNR {snr_db:g} dB")
@@ -151,18 +152,31 @@ def _fill_images(
     bar.set_label("|Δσ| over the method's largest", fontsize=8)
 
 
-def draw_traces(frames: Sequence[Frame], output: Path) -> None:
-    """Fig. 9: the images of the first sensor row by row, a colour for each pressure."""
+def draw_traces(frames: Sequence[Frame], errors: Sequence[MagnitudeError], output: Path) -> None:
+    """Fig. 9: the images of the first sensor row by row, a colour for each pressure.
+
+    Args:
+        frames: of cases 1 to 4.
+        errors: magnitude errors of all sensors, to be told beside the paper's.
+        output: the picture.
+    """
     from matplotlib.figure import Figure
+    from tactomo_models.evaluation.paper_claims import MAGNITUDE_ERROR
 
     shown = _of_first_sheet(frames)
     figure = Figure(figsize=(13, 1.7 * len(_methods(shown)) + 1), layout="constrained")
     figure.suptitle("Fig. 9 repeated, simulated, one uneven sheet: images row by row", fontsize=11)
-    _fill_traces(figure, shown)
+    for method, row in zip(_methods(shown), _fill_traces(figure, shown), strict=True):
+        own = np.mean([error.error for error in errors if error.method == method])
+        told = f"magnitude error, simulated: {own:.0%}"
+        if method in MAGNITUDE_ERROR:
+            told += f"; paper, hardware: {MAGNITUDE_ERROR[method][0]:.0%}"
+        row[0].text(0.02, 0.97, told, transform=row[0].transAxes, fontsize=6.5, va="top")
     save_figure(figure, output)
 
 
-def _fill_traces(figure: Any, shown: Sequence[Frame]) -> None:
+def _fill_traces(figure: Any, shown: Sequence[Frame]) -> Any:
+    """Draw, and return the panels: a row for each method, a column for each case."""
     methods, cases = _methods(shown), list(dict.fromkeys(frame.case.number for frame in shown))
     panels = figure.subplots(len(methods), len(cases), sharex=True, sharey="row", squeeze=False)
     for row, method in enumerate(methods):
@@ -179,17 +193,18 @@ def _fill_traces(figure: Any, shown: Sequence[Frame]) -> None:
                 if row == 0:
                     axes.text(
                         middle,
-                        1.02,
+                        1.25,
                         _kpa(frame.pressures_kpa),
                         color=colour,
                         ha="center",
                         va="bottom",
                         fontsize=7,
                     )
-            axes.set(xticks=[], ylim=(0, 1.02))
+            axes.set(xticks=[], ylim=(0, 1.25))
         panels[row, 0].set_ylabel(f"{method}\n(0 to 1)", fontsize=8)
     for axes, case in zip(panels[-1], cases, strict=True):
         axes.set_xlabel(f"case {case}: map nodes, row by row", fontsize=8)
+    return panels
 
 
 def draw_places(
@@ -197,11 +212,12 @@ def draw_places(
 ) -> None:
     """Fig. 10: from where the first sensor was pressed to where each method's image has it."""
     from matplotlib.figure import Figure
+    from tactomo_models.evaluation.paper_claims import LOCALISATION_MM
 
     methods = _methods(places)
     columns = min(3, len(methods))
     rows = -(-len(methods) // columns)
-    figure = Figure(figsize=(4.0 * columns, 4.3 * rows + 1.2), layout="constrained")
+    figure = Figure(figsize=(4.0 * columns, 4.4 * rows + 0.9), layout="constrained")
     figure.suptitle("Fig. 10 repeated, simulated, one uneven sheet", fontsize=11)
     panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     half = description.width_m * 500, description.height_m * 500
@@ -219,17 +235,18 @@ def draw_places(
                     *(1e3 * np.array(spot)), **(marker | {"color": marker["color"] or colour})
                 )
         axes.set(xlim=(-half[0], half[0]), ylim=(-half[1], half[1]), aspect="equal")
-        axes.set_title(
-            f"{method}: {np.nanmean(errors):.1f} ± {np.nanstd(errors):.1f} mm", fontsize=10
-        )
+        title = f"{method}: {np.nanmean(errors):.1f} ± {np.nanstd(errors):.1f} mm"
+        if theirs := LOCALISATION_MM.get(method):
+            title += f"\npaper, hardware: {theirs[0]:.1f} ± {theirs[1]:.1f} mm"
+        axes.set_title(title, fontsize=10)
+        axes.tick_params(labelbottom=True)
+        axes.set_xlabel("x (mm)")
         axes.grid(visible=True, alpha=0.3)
     for axes in list(panels.flat)[len(methods) :]:
         axes.set_axis_off()
     for marker, label in MARKS:
         panels[0, 0].plot([], [], label=label, **(marker | {"color": marker["color"] or "gray"}))
     figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    for axes in panels[-1]:
-        axes.set_xlabel("x (mm)")
     for axes in panels[:, 0]:
         axes.set_ylabel("y (mm)")
     save_figure(figure, output)
