@@ -178,11 +178,10 @@ def test_the_response_rises_where_the_channel_answers(rig: Rig) -> None:
 
 
 def test_frames_come_from_a_cold_start(small: SensorDescription, rig: Rig) -> None:
-    frames = list(image_cases([rig], SHORT, ["fit", "tikhonov"]))
-    assert [one.method for one in frames] == ["fit", "tikhonov"] * 2
+    frames = list(image_cases([rig], SHORT, ["fit"]))
     alone = list(image_cases([rig], SHORT[1:], ["fit"]))
-    np.testing.assert_array_equal(alone[-1].image, frames[-2].image)
-    place = locate(frames[-2], small)
+    np.testing.assert_array_equal(alone[-1].image, frames[-1].image)
+    place = locate(frames[-1], small)
     assert place.contacts == 1
     assert place.contact_error_mm < 1
     assert place.mass_error_mm < 1
