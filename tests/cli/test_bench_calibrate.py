@@ -58,6 +58,7 @@ def test_a_sensor_without_scenes_cannot_be_calibrated(tactomo: Run) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_a_machine_is_measured(
     tactomo: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -89,6 +89,7 @@ def test_what_cannot_be_written_is_refused_before_the_work(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_the_whole_chart(tactomo: Run, tmp_path: Path) -> None:
     """On a coarse map, so that scenes are simulated in seconds."""
     shipped = resources.files("tactomo_models.sensors").joinpath("paper_square.toml")
