@@ -68,7 +68,9 @@ def stability(
     """
     from tactomo_models import METHODS, load_description
     from tactomo_models.evaluation.regimes import REGIMES
-    from tactomo_models.evaluation.stability import available_methods, evaluate_regimes
+    from tactomo_models.evaluation.stability import evaluate_regimes
+
+    from tactomo.cli.bench_chart import to_be_had
 
     regimes = _chosen("--regime", regime, REGIMES) or list(REGIMES)
     asked = _chosen("--methods", methods, METHODS)
@@ -76,7 +78,7 @@ def stability(
         _make_folder(picture)
         prepare_picture(picture / "overview.png")
     description = load_description(sensor)
-    chosen = asked or available_methods(description)
+    chosen = asked or to_be_had(description, METHODS)
     cases = evaluate_regimes(description, regimes, chosen, seeds, count, jobs=jobs)
     total = len(regimes) * count
     outcomes = [one for case in shown(cases, total, f"{seeds} cases") for one in case]
@@ -86,7 +88,7 @@ def stability(
         "sensor": description.name,
         "seeds": seeds,
         "cases_each": count,
-        "methods": list(chosen),
+        "methods": chosen,
     }
     if table is not None:
         _write_csv(scores, table)

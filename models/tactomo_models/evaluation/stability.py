@@ -14,7 +14,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,20 +47,13 @@ from tactomo_models.evaluation.simulation import (
     with_opposite_magnitude,
 )
 from tactomo_models.mesh import SheetMesh
-from tactomo_models.network import NetworkKind, find_network
-from tactomo_models.reconstruct import METHODS, Reconstruction, Reconstructor, Tier
+from tactomo_models.reconstruct import Reconstruction, Reconstructor, Tier
 from tactomo_models.reference import Reference
 from tactomo_models.training.simulate import displaced
 
 FloatArray = NDArray[np.float64]
 
 BAD_ICC = 0.7
-NETWORKS: Final[dict[Tier, NetworkKind]] = {  # of the methods that need one
-    Tier.NETWORK: "network",
-    Tier.HYBRID: "network",
-    Tier.CNN_SINGLE: "cnn-single",
-    Tier.CNN_MULTIMODAL: "cnn-multimodal",
-}
 
 
 @dataclass(frozen=True)
@@ -323,15 +316,6 @@ def _score(case: Case, method: str, frame: Reconstruction) -> CaseScore:
         reason=frame.reason,
         misfit=frame.misfit,
         confidence=frame.confidence,
-    )
-
-
-def available_methods(description: SensorDescription) -> tuple[str, ...]:
-    """Of all methods, those whose network is there, and those that need none."""
-    return tuple(
-        str(method)
-        for method in METHODS
-        if method not in NETWORKS or find_network(description, NETWORKS[method])
     )
 
 
