@@ -175,15 +175,12 @@ def train(
     if picture is not None:
         prepare_picture(picture)
     with _training_extra():
-        import torch
         from tactomo_models import load_description
         from tactomo_models.network import own_path
         from tactomo_models.training.recipes import RECIPES, export_trained
+        from tactomo_models.training.train import use
 
-        if device == "cuda" and not torch.cuda.is_available():
-            raise TactomoError("PyTorch finds no GPU here", "leave out --device, or use cpu")
-        if jobs is not None:
-            torch.set_num_threads(jobs)
+        use(device, jobs)
         description, chosen = load_description(sensor), RECIPES[recipe]
         settings = replace(chosen.settings, seed=seed, device=device)
         settings = replace(

@@ -88,6 +88,18 @@ class Training:
     history: list[Epoch] = field(default_factory=list)
 
 
+def use(device: str, threads: int | None = None) -> None:
+    """Prepare this process for a device, and for so many threads; PyTorch's choice if None.
+
+    Raises:
+        ModelError: there is no such device.
+    """
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ModelError("PyTorch finds no GPU here; leave out --device, or use cpu")
+    if threads is not None:
+        torch.set_num_threads(threads)
+
+
 def begin(network: nn.Module, settings: Settings) -> Training:
     """A training before its first step."""
     network = network.to(settings.device)
