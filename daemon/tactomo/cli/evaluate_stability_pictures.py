@@ -100,7 +100,11 @@ def _colour(score: CaseScore) -> str:
 
 def _note(score: CaseScore) -> str:
     flags = f"flags: {', '.join(score.flags) or 'none'}"
-    parts = (flags, f"{score.tier}: {score.reason}", f"misfit {score.misfit:.1f}")
+    parts = [flags, f"{score.tier}: {score.reason}"]
+    if np.isfinite(score.misfit):
+        parts.append(f"misfit {score.misfit:.1f}")
+    if np.isfinite(score.confidence):
+        parts.append(f"confidence {score.confidence:.2f}")
     return "\n".join(textwrap.fill(part, 27) for part in parts)
 
 
