@@ -22,15 +22,16 @@ from tactomo_models.description import SensorDescription
 from tactomo_models.errors import ArtifactError, DataError
 from tactomo_models.forward import BareSheet, ForwardModel, solve_bare_sheet
 from tactomo_models.mesh import mesh_sheet
-from tactomo_models.tikhonov import noise_figure_weight, tikhonov_matrix
+from tactomo_models.tikhonov import even_spread, prior_weight, tikhonov_matrix
 
 FloatArray = NDArray[np.float64]
 Progress = Callable[[str], None]
 
-FORMAT = 1
+FORMAT = 2
 NOMINAL_SNR_DB = 60.0  # of the voltages' root mean square; until a tare has seen the real noise
 MODEL_ERROR = 0.003  # relative error of any voltage that no noise accounts for
 INVERSE_REFINEMENTS = 2
+TYPICAL_CHANGE = 0.3  # of conductivity, by which presses change the magnitude channel
 TARGET_SHARE = 0.1  # radius of the noise figure's target over the smaller half side
 
 
@@ -44,7 +45,7 @@ class Artifact:
         bare: the solved bare sheet.
         jacobian: (M, P) derivative of relative voltage changes by relative conductivity.
         tikhonov: (P, M) reconstruction matrix for the nominal noise.
-        regularisation: its lambda, chosen for a noise figure of 1.
+        regularisation: its lambda, for changes of a typical size.
     """
 
     sensor: str
@@ -85,13 +86,14 @@ def build_artifact(description: SensorDescription, progress: Progress | None = N
     jacobian = forward.bare_jacobian() / np.abs(forward.bare_voltages)[:, None]
     say("choosing the regularisation")
     noise = nominal_noise(forward.bare_voltages)
-    weight = noise_figure_weight(jacobian, noise, central_target(description, bare))
+    spread = even_spread(forward.node_areas_m2)
+    weight = prior_weight(TYPICAL_CHANGE, spread)
     return Artifact(
         sensor=description.name,
         sha256=description.sha256,
         bare=bare,
         jacobian=jacobian,
-        tikhonov=tikhonov_matrix(jacobian, noise, weight),
+        tikhonov=tikhonov_matrix(jacobian, noise, weight, spread),
         regularisation=weight,
     )
 
@@ -211,12 +213,15 @@ def load_or_build_artifact(
         progress: called with a short text at the start of each step of a build.
 
     Raises:
-        ArtifactError: the file is there but damaged or built for another sensor, or it cannot
-            be written to a path that was given.
+        ArtifactError: the file that was named is damaged or built for another sensor, or cannot
+            be written. In the cache it is built anew.
     """
     target = path or default_path(description)
-    if target.exists():
+    try:
         return load_artifact(target, description)
+    except ArtifactError:
+        if path is not None and path.exists():
+            raise  # what was asked for by name is not replaced; what is in the cache is
     artifact = build_artifact(description, progress)
     try:
         save_artifact(artifact, target)

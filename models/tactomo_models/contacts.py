@@ -237,6 +237,42 @@ def fit_magnitudes(
     return replace(fitted, sigma=np.hypot(fitted.sigma, by_area))
 
 
+class MagnitudeFollower:
+    """Fits magnitudes frame after frame, each time from where the last one ended.
+
+    Args:
+        forward: the model of the sheet.
+    """
+
+    def __init__(self, forward: ForwardModel) -> None:
+        self._forward = forward
+        self.forget()
+
+    def forget(self) -> None:
+        """Drop the warm start."""
+        self._areas: Areas | None = None
+        self._last: Magnitudes | None = None
+
+    def fit(
+        self,
+        areas: Areas,
+        data: FloatArray,
+        weight: FloatArray,
+        spread: FloatArray,
+        *,
+        solves: int,
+    ) -> Magnitudes | None:
+        """Fit; see `fit_magnitudes`. None where there is no area."""
+        last, same = self._last, self._areas is areas
+        self._areas, self._last = areas, None
+        if len(areas):
+            start = last if last and len(last.change) == len(areas) else None
+            self._last = fit_magnitudes(
+                self._forward, areas, data, weight, spread, start, same_areas=same, solves=solves
+            )
+        return self._last
+
+
 def _step(tangent: Tangent, data: FloatArray, weight: FloatArray, spread: FloatArray) -> Magnitudes:
     """One step of Gauss-Newton."""
     J = tangent.jacobian * weight[:, None]

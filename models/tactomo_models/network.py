@@ -31,6 +31,7 @@ NetworkKind = Literal["network", "refiner", "cnn-single", "cnn-multimodal"]
 
 FORMAT = 1
 NEWEST_OPSET = 21  # that the oldest ONNX Runtime we support runs
+MAGNITUDE_ERROR = 0.1  # share of the range that two in three of our network's magnitudes err by
 FILTER_SIGMA = 1.0  # nodes, of the Gaussian filter at the paper's networks' output
 OUTPUTS: Final[dict[NetworkKind, tuple[str, ...]]] = {
     "network": ("map", "structure", "confidence"),
@@ -48,11 +49,13 @@ class NetworkImage:
         map: (nodes_y, nodes_x) |relative conductivity change| of the magnitude channel.
         structure: (nodes_y, nodes_x) 0 bare to 1 pressed; None from the paper's.
         confidence: expected correlation of the map with the truth, 0 to 1; NaN from the paper's.
+        magnitude_sigma: standard uncertainty of a contact's magnitude; NaN from the paper's.
     """
 
     map: Image
     structure: Image | None
     confidence: float
+    magnitude_sigma: float = float("nan")
 
 
 class Network:
@@ -122,6 +125,7 @@ class FusionNetwork:
     def __init__(self, network: Network) -> None:
         self._network = network
         self._scale = np.float32(network._meta["scale"])
+        self._sigma = MAGNITUDE_ERROR * float(self._scale)
         bases = np.load(io.BytesIO(b64decode(network._meta["bases"])), allow_pickle=False)
         #: (M, K) of each channel's prefilter
         self.bases = {name: bases[name].astype(np.float64) for name in network.modalities}
@@ -149,7 +153,9 @@ class FusionNetwork:
         if seen is not None:
             inputs["seen"] = np.stack([seen[0] / self._scale, seen[1]])
         made = self._network.run(inputs)
-        return NetworkImage(made["map"].copy(), made["structure"].copy(), float(made["confidence"]))
+        return NetworkImage(
+            made["map"].copy(), made["structure"].copy(), float(made["confidence"]), self._sigma
+        )
 
     def filtered(
         self, changes: Mapping[Modality, FloatArray], certainty: Mapping[Modality, FloatArray]

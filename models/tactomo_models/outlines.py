@@ -6,7 +6,8 @@ round contact does not need 81 kernels; what no order explains is left to the le
 
     u = B (x - x0),  B = exp(-s) expm(-E),  E = [[e1, e2], [e2, -e1]]     the unit circle of u
     log q = log |u| - sum_k (a_k cos k psi + b_k sin k psi),  psi = angle of u,  k = 3, 4
-    phi = -log q |u|^2 / |B u|          distance inside the outline, to first order of it
+    phi = -log q |u|^2 / |B u|          distance inside the outline, to first order of it;
+                                        held at its maximum where q < 1 / e
     h = H((phi + offset) / w)           H of compact support, 2 w wide
 """
 
@@ -34,6 +35,7 @@ FIRM_RATIO = 0.02  # share of the log ratio's uncertainty that circles of order 
 MOST_ELONGATED = 0.9  # half the logarithm of the ratio of an ellipse's axes
 MOST_BULGE = 0.25
 PRIOR_SIGMA = np.array([5.0, 5.0, 0.6, 0.3, 0.3, 0.05, 0.05, 0.07, 0.07])
+NOWHERE = 1e-6  # distance from a contact's centre, over its size, that has no direction
 OFFSET = 0.1  # see `outlines_on`
 
 
@@ -155,10 +157,10 @@ class _Drawing:
         self.r = np.stack([dx, dy], axis=1)  # (K, 2, n)
         self.B, self.dB = _axes(each)
         self.u = self.B @ self.r
+        self.u[:, 0] += NOWHERE * (np.abs(self.u).max(axis=1) < NOWHERE)  # any direction will do
         self.v = self.B @ self.u
-        # At its very centre a contact has no direction; h is 1 all around there.
-        self.square = np.maximum((self.u**2).sum(axis=1), 1e-12)
-        self.length = np.maximum(np.sqrt((self.v**2).sum(axis=1)), 1e-9)
+        self.square = (self.u**2).sum(axis=1)
+        self.length = np.sqrt((self.v**2).sum(axis=1))
         self.scale = self.square / self.length
         self.log_q = 0.5 * np.log(self.square)
         self.turn: FloatArray | None = None
@@ -169,7 +171,11 @@ class _Drawing:
             self.waves = np.stack([cos, sin], axis=2).reshape(len(each), 4, -1)
             self.turn = (WAVES[:, None] * (b * cos - a * sin)).sum(axis=1)
             self.log_q -= (a * cos + b * sin).sum(axis=1)
-        self.t = (outlines.offset_m - self.log_q * self.scale) / outlines.half_width_m
+        # The first order holds near the outline, and would fall to 0 again at the centre.
+        inner = np.exp(np.maximum(-1 - self.log_q, 0.0))
+        self.depth = np.where(self.log_q > -1, -self.log_q, inner)
+        self.depth_slope = -inner
+        self.t = (outlines.offset_m + self.depth * self.scale) / outlines.half_width_m
 
     def slope(self) -> FloatArray:
         """Derivative (K, parameters, n) of t; each parameter moves u by du and B by dB."""
@@ -192,9 +198,10 @@ class _Drawing:
         by_scale = self.scale[:, None] * (
             2 * radial / self.square[:, None] - along / (self.length**2)[:, None]
         )
-        by_phi = -by_log_q * self.scale[:, None] - self.log_q[:, None] * by_scale
+        by_depth = self.depth_slope * self.scale
+        by_phi = by_log_q * by_depth[:, None] + self.depth[:, None] * by_scale
         if self.turn is not None:
-            by_phi = np.concatenate([by_phi, self.waves * self.scale[:, None]], axis=1)
+            by_phi = np.concatenate([by_phi, -self.waves * by_depth[:, None]], axis=1)
         return np.asarray(by_phi / self.outlines.half_width_m)
 
 

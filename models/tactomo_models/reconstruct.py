@@ -25,6 +25,7 @@ from scipy.stats import chi2
 
 from tactomo_models.artifact import (
     MODEL_ERROR,
+    TYPICAL_CHANGE,
     Artifact,
     central_target,
     load_or_build_artifact,
@@ -34,10 +35,10 @@ from tactomo_models.contacts import (
     AreaFinder,
     Areas,
     Contact,
+    MagnitudeFollower,
     Magnitudes,
     Tracker,
     bare_tangent,
-    fit_magnitudes,
     linear_magnitudes,
     pressure_of,
     without_holes,
@@ -62,9 +63,17 @@ from tactomo_models.plausibility import (
     asymmetry_of,
     examine_reference,
 )
+from tactomo_models.redrawing import Drawing, MagnitudeData, Redrawer, SecondOpinion
 from tactomo_models.reference import Reference, noise_of_reciprocity
 from tactomo_models.shape_fit import Shape
-from tactomo_models.tikhonov import EVEN, noise_figure_weight, noser_spread, tikhonov_matrix
+from tactomo_models.tikhonov import (
+    EVEN,
+    even_spread,
+    noise_figure_weight,
+    noser_spread,
+    prior_weight,
+    tikhonov_matrix,
+)
 
 FloatArray = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -87,7 +96,10 @@ MUCH_MORE = 5.0  # ratio of the channels' contrasts (logarithms) for that
 HOLLOW_MISFIT = 1.1  # of the magnitude channel: enough to ask whether a contact is a ring
 LINEAR_PART = 0.5  # of the misfit of nothing, that areas cut out of a linear image may leave
 MOST_HELD = 10  # frames without a structure scan that the last shape stands in for: half a second
-LOW_CONFIDENCE = 0.7  # expected correlation below which a map is better not trusted
+LOW_CONFIDENCE = 0.8  # expected correlation below which a map is better not trusted
+SURE_CONFIDENCE = 0.9  # ... from which one is, although the physics cannot explain the data
+UNSURE_MISFIT = 1.5  # of both channels together
+UNSURE_MAGNITUDE = 0.5  # uncertainty of all magnitudes together, share of themselves
 WRONG_WAY = 5.0  # standard uncertainties by which a conductivity may change against its sign
 
 
@@ -110,11 +122,11 @@ class Tier(StrEnum):
 METHODS: Final = tuple(tier for tier in Tier if tier is not Tier.QUIET)  # that may be asked for
 LINEAR: Final = (Tier.TIKHONOV, Tier.NOSER)
 PAPER_NETWORKS: Final = (Tier.CNN_SINGLE, Tier.CNN_MULTIMODAL)
-NETWORK_OF: Final[dict[Tier, NetworkKind]] = {  # what each of these cannot do without
-    Tier.NETWORK: "network",
-    Tier.HYBRID: "network",
-    Tier.CNN_SINGLE: "cnn-single",
-    Tier.CNN_MULTIMODAL: "cnn-multimodal",
+NETWORKS_OF: Final[dict[Tier, tuple[NetworkKind, ...]]] = {  # what they cannot do without
+    Tier.NETWORK: ("network",),
+    Tier.HYBRID: ("network", "refiner"),
+    Tier.CNN_SINGLE: ("cnn-single",),
+    Tier.CNN_MULTIMODAL: ("cnn-multimodal",),
 }
 FREEDOM: Final = {Tier.FIT: Freedom.OUTLINES, Tier.LEVELSET: Freedom.LEVEL_SET}  # else as needed
 
@@ -265,7 +277,8 @@ class Reconstructor:
         self.tier = tier
         self.budget_s = budget_s
         self._redraw = redraw
-        check_tier(description, tier)
+        if redraw:
+            check_tier(description, tier)
         self._artifact = artifact or load_or_build_artifact(description)
         self._forward = ForwardModel(description, self._artifact.bare)
         self._wiring = Wiring(description)
@@ -280,8 +293,7 @@ class Reconstructor:
                 self._follower = ShapeFollower(self._forward, ratio)
         self._channels: dict[Modality, _Channel] = {}
         self._tracker = Tracker()
-        self._magnitudes: Magnitudes | None = None
-        self._fitted_areas: Areas | None = None
+        self._magnitudes = MagnitudeFollower(self._forward)
         self._shown: _Shown | None = None
         self._frames_held = 0  # since the last structure scan
         self._stage_s: dict[str, float] = {}
@@ -331,7 +343,7 @@ class Reconstructor:
         noise = np.where(valid, noise, 0.0)
         relative = np.hypot(noise * per_volt * np.sqrt(1 + 1 / scans), MODEL_ERROR)
         relative = np.where(valid, relative, UNUSABLE)
-        matrices = _MadeWhenAsked(lambda method: self._matrix(method, relative))
+        matrices = _MadeWhenAsked(lambda method: self._matrix(name, method, relative))
         if self.tier in LINEAR:
             matrices[self.tier]
         direction = 0.0 if self._either_way(name) else self._sign(name)
@@ -356,8 +368,14 @@ class Reconstructor:
             matrices=matrices,
         )
 
-    def _matrix(self, method: Tier, noise: FloatArray) -> Image:
+    def _matrix(self, name: Modality, method: Tier, noise: FloatArray) -> Image:
         jacobian = self._artifact.jacobian
+        if name == "magnitude":
+            even = even_spread(self._forward.node_areas_m2)
+            spread = noser_spread(jacobian, noise) if method is Tier.NOSER else even
+            weight = prior_weight(TYPICAL_CHANGE, spread)
+            return tikhonov_matrix(jacobian, noise, weight, spread).astype(np.float32)
+        # The structure channel changes far beyond what is linear: how much says no prior.
         target = central_target(self.description, self._artifact.bare)
         spread = noser_spread(jacobian, noise) if method is Tier.NOSER else EVEN
         weight = noise_figure_weight(jacobian, noise, target, spread)
@@ -371,8 +389,9 @@ class Reconstructor:
     def _forget_shape(self) -> None:
         if self._follower:
             self._follower.forget()
-        self._magnitudes = None
-        self._fitted_areas = None
+        self._magnitudes.forget()
+        if "_redrawer" in self.__dict__:
+            self._redrawer.forget()
         self._shown = None
 
     def reconstruct(
@@ -482,6 +501,8 @@ class Reconstructor:
             return held
         if "structure" not in data:
             why = "the structure channel is missing" if self._follower else "no structure channel"
+            if self._proposes:  # the network fills in what is missing as best it can
+                return self._by_network(data, flags, why)
             return self._linear(data, flags, Tier.TIKHONOV, why)
         return self._by_shape(data, flags)
 
@@ -489,7 +510,7 @@ class Reconstructor:
         blank = np.zeros((self.description.map.nodes_y, self.description.map.nodes_x), np.float32)
         magnitude = blank if "magnitude" in data else None
         misfit = max(d.misfit for d in data.values())
-        if misfit > BAD_MISFIT and Flag.NOISE_HIGH in flags:
+        if misfit > BAD_MISFIT and flags & (Flag.NOISE_HIGH | Flag.STRUCTURE_MISSING):
             flags |= Flag.MISFIT_HIGH
         return Reconstruction(
             map=magnitude,
@@ -600,7 +621,7 @@ class Reconstructor:
     def _by_paper_network(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
         """The paper's network; areas are where its map exceeds half of its peak."""
         self._forget_shape()
-        network = self._networks.paper(NETWORK_OF[self.tier])
+        network = self._networks.paper(NETWORKS_OF[self.tier][0])
         with self._timed("images"):
             images = self._preliminary_images(data, network.modalities)
         with self._timed("network"):
@@ -644,17 +665,15 @@ class Reconstructor:
     ) -> Reconstruction:
         """A frame whose images a network made."""
         with self._timed("contacts"):
-            pressed = image.structure
+            pressed = image.structure if "structure" in data else None
             if pressed is None:  # the paper's show magnitudes alone
                 pressed = image.map / max(float(image.map.max()), 1e-12)
             areas = self._areas.find(pressed, self._areas.on_nodes(pressed))
             peak = np.maximum(areas.on_map.sum(axis=(1, 2)), 1e-12)
             size = (image.map * (areas.on_map > 0)).sum(axis=(1, 2)) / peak
-            contacts = self._contacts_of(areas, size, np.full(len(areas), np.nan))
-        if "magnitude" not in data:
-            contacts = tuple(
-                replace(c, magnitude=float("nan"), pressure_kpa=float("nan")) for c in contacts
-            )
+            known = 1.0 if "magnitude" in data else np.nan
+            sigma = np.full(len(areas), image.magnitude_sigma)
+            contacts = self._contacts_of(areas, known * size, known * sigma)
         if image.confidence < LOW_CONFIDENCE:
             flags |= Flag.LOW_CONFIDENCE
         pressure = np.array([c.pressure_kpa for c in contacts])
@@ -674,49 +693,100 @@ class Reconstructor:
         """Shapes on the structure channel, and a magnitude for each of their areas."""
         self._frames_held = 0
         with self._timed("shape"):
-            structure, budget_s = data["structure"], self.budget_s or DEFAULT_BUDGET_S
-            shape, how = self._shape_of(data, budget_s)
+            shape, how = self._shape_of(data, self.budget_s or DEFAULT_BUDGET_S)
+        solves = 3 if shape.converged else 1
         with self._timed("contacts"):
-            areas, pressed = self._areas_of(shape, structure)
-            fitted = self._fit_magnitudes(areas, data, 3 if shape.converged else 1)
-            if fitted is not None and self._may_be_hollow(shape, fitted):
-                areas, pressed = self._hollowed(shape, data["magnitude"])
-                fitted = self._fit_magnitudes(areas, data, 3)
-            contacts = self._contacts(areas, fitted)
-        if shape.misfit > BAD_MISFIT or self._magnitude_unexplained(data, fitted, BAD_MISFIT):
-            flags |= Flag.MISFIT_HIGH
+            own = self._drawing_of(shape, data, solves)
+        second = self._second_opinion(own, data, solves)
+        shown = second.drawing if second is not None and second.share > 0.5 else own
         if not shape.converged:
             flags |= Flag.NOT_CONVERGED
-        magnitude, pressure = None, None
+        if self._unexplained(shape, shown, data, second is not None):
+            flags |= Flag.MISFIT_HIGH
+            if second is not None:
+                return self._network_instead(shape, data, flags)
+        with self._timed("contacts"):
+            contacts = self._contacts(shown.areas, shown.fitted)
+        if second is not None:
+            vague = not data["magnitude"].quiet and _unsure(shown)
+            if vague or second.confidence < LOW_CONFIDENCE:
+                flags |= Flag.LOW_CONFIDENCE
+        magnitude, pressure, structure = None, None, own.pressed
         if "magnitude" in data:
-            magnitude = _fused(areas, np.array([c.magnitude for c in contacts]), pressed.shape)
-            pressure = _fused(areas, np.array([c.pressure_kpa for c in contacts]), pressed.shape)
-        made = Reconstruction(
-            map=magnitude,
+            magnitude = own.map(self._sign("magnitude"))
+            kpa = np.array([c.pressure_kpa for c in contacts])
+            pressure = _fused(shown.areas, kpa, own.pressed.shape)
+        if second is not None and magnitude is not None:
+            other, share = second.drawing, second.share
+            magnitude += share * (other.map(self._sign("magnitude")) - magnitude)
+            structure = structure + share * (other.pressed - structure)
+        return Reconstruction(
+            map=None if magnitude is None else magnitude.astype(np.float32),
             pressure_kpa=pressure,
-            structure=pressed.astype(np.float32),
+            structure=structure.astype(np.float32),
             contacts=contacts,
-            tier=self._tier_of(shape),
+            tier=self._tier_of(shape) if second is None else Tier.HYBRID,
             reason=how,
             misfit=shape.misfit,
             flags=flags,
+            confidence=float("nan") if second is None else second.confidence,
         )
-        return self._redrawn(made, data) if self._redraw and self._proposes else made
 
-    def _redrawn(self, made: Reconstruction, data: dict[Modality, _Data]) -> Reconstruction:
-        """The physics' images, redrawn by a network that has seen what it tends to get wrong."""
-        if made.map is None or made.structure is None or not made.contacts:
-            return made
+    def _unexplained(
+        self, shape: Shape, shown: Drawing, data: dict[Modality, _Data], strict: bool
+    ) -> bool:
+        """Tell whether the data say that something else presses.
+
+        With a network to turn to, it is asked sooner.
+        """
+        if shape.misfit > BAD_MISFIT:
+            return True
+        if self._magnitude_unexplained(data, shown.fitted, BAD_MISFIT):
+            return True
+        other = shown.fitted.misfit if shown.fitted else 0.0
+        return strict and bool(np.hypot(shape.misfit, other) > np.sqrt(2) * UNSURE_MISFIT)
+
+    def _network_instead(
+        self, shape: Shape, data: dict[Modality, _Data], flags: Flag
+    ) -> Reconstruction:
+        """Our network's frame where no shape with even pressures explains the data.
+
+        It has learnt soft rims and contacts between two scans, too; where it is sure, so are we.
+        """
         with self._timed("network"):
-            seen = (made.map, made.structure)
-            image = self._networks.refiner.image(*self._network_data(data), seen)
-        return replace(
-            made,
-            map=image.map,
-            structure=image.structure,
-            tier=Tier.HYBRID,
-            confidence=image.confidence,
-        )
+            image = self._network_image(data)
+        if image.confidence >= SURE_CONFIDENCE:
+            flags &= ~Flag.MISFIT_HIGH
+        made = self._imaged(image, data, flags, Tier.NETWORK, "no even presses explain the data")
+        return replace(made, misfit=shape.misfit)
+
+    def _drawing_of(self, shape: Shape, data: dict[Modality, _Data], solves: int) -> Drawing:
+        """The physics' account of a shape."""
+        areas, pressed = self._areas_of(shape, data["structure"])
+        fitted = self._fit_magnitudes(areas, data, solves)
+        if fitted is not None and self._may_be_hollow(shape, fitted):
+            areas, pressed = self._hollowed(shape, data["magnitude"])
+            fitted = self._fit_magnitudes(areas, data, 3)
+        return Drawing(areas, pressed, fitted)
+
+    def _second_opinion(
+        self, own: Drawing, data: dict[Modality, _Data], solves: int
+    ) -> SecondOpinion | None:
+        if not (self._redraw and self._proposes) or own.fitted is None:
+            return None
+        with self._timed("network"):
+            taken = data["magnitude"]
+            return self._redrawer.redraw(
+                own,
+                self._sign("magnitude"),
+                *self._network_data(data),
+                MagnitudeData(taken.change, taken.weight, taken.spread, taken.between),
+                solves,
+            )
+
+    @cached_property
+    def _redrawer(self) -> Redrawer:
+        return Redrawer(self._forward, self._areas, self._networks.refiner)
 
     def _held(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction | None:
         """Bridge a lost structure scan with the last shape, as long as it explains the other."""
@@ -836,24 +906,11 @@ class Reconstructor:
     def _fit_magnitudes(
         self, areas: Areas, data: dict[Modality, _Data], solves: int
     ) -> Magnitudes | None:
-        """Fit each area's magnitude, starting from the frame before where the areas are as many."""
-        last, self._magnitudes = self._magnitudes, None
-        if "magnitude" in data and len(areas):
-            same = self._fitted_areas is areas
-            start = last if last and len(last.change) == len(areas) else None
-            taken = data["magnitude"]
-            self._magnitudes = fit_magnitudes(
-                self._forward,
-                areas,
-                taken.change,
-                taken.weight,
-                taken.spread,
-                start,
-                same_areas=same,
-                solves=solves,
-            )
-        self._fitted_areas = areas
-        return self._magnitudes
+        if "magnitude" not in data:
+            self._magnitudes.forget()
+            return None
+        taken = data["magnitude"]
+        return self._magnitudes.fit(areas, taken.change, taken.weight, taken.spread, solves=solves)
 
     def _contacts(self, areas: Areas, fitted: Magnitudes | None) -> tuple[Contact, ...]:
         unknown = np.full(len(areas), np.nan)
@@ -896,8 +953,16 @@ def check_tier(description: SensorDescription, tier: Tier) -> None:
     Raises:
         ArtifactError: the network that it takes is missing or cannot be used.
     """
-    if tier in NETWORK_OF:
-        load_network(description, NETWORK_OF[tier])
+    for kind in NETWORKS_OF.get(tier, ()):
+        load_network(description, kind)
+
+
+def _unsure(drawing: Drawing) -> bool:
+    """Tell whether the magnitudes are hardly known."""
+    assert drawing.fitted is not None
+    weights, fitted = drawing.areas.areas_m2, drawing.fitted
+    known, unknown = weights @ fitted.change**2, weights @ fitted.sigma**2
+    return bool(unknown > UNSURE_MAGNITUDE**2 * known)
 
 
 @cache

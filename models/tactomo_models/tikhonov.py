@@ -32,6 +32,17 @@ NOSER_POWER: Final = 0.5
 EVEN: Final = np.ones(1)  # s of Tikhonov
 
 
+def even_spread(areas_m2: FloatArray) -> FloatArray:
+    """Expected size of each node's change (P,), up to a factor, of an image that is white noise.
+
+    A node that stands for a smaller area varies more: without that the image follows the mesh.
+
+    Args:
+        areas_m2: (P,) that each node stands for.
+    """
+    return np.asarray(np.sqrt(areas_m2.mean() / areas_m2))
+
+
 def noser_spread(J: FloatArray, noise: FloatArray) -> FloatArray:
     """Expected size of each node's change (P,), up to a factor, by the NOSER prior.
 
@@ -60,6 +71,16 @@ def tikhonov_matrix(
     scaled = J * spread**2
     data_space = scaled @ J.T + np.diag(weight * noise**2)
     return np.asarray(np.linalg.solve(data_space, scaled).T)
+
+
+def prior_weight(size: float, spread: FloatArray) -> float:
+    """Regularisation parameter by Bayes: noise and changes are both what they are expected to be.
+
+    Args:
+        size: expected size of a node's change, root mean square over the nodes.
+        spread: (P,) of `tikhonov_matrix`.
+    """
+    return float(np.mean(spread**2)) / size**2
 
 
 def noise_figure_weight(

@@ -20,9 +20,9 @@ from tactomo_models import (
     load_or_build_artifact,
     save_artifact,
 )
-from tactomo_models.artifact import central_target, nominal_noise
+from tactomo_models.artifact import TYPICAL_CHANGE, nominal_noise
 from tactomo_models.forward import ForwardModel
-from tactomo_models.tikhonov import tikhonov_matrix
+from tactomo_models.tikhonov import even_spread, tikhonov_matrix
 
 
 @pytest.fixture(scope="module")
@@ -154,21 +154,23 @@ def test_a_cache_that_cannot_be_written_does_not_stop_anybody(
 
 
 def test_tikhonov_is_equation_4_on_whitened_data(built: Artifact, small: SensorDescription) -> None:
+    """L is the identity on functions: at nodes, the areas that they stand for."""
     J, weight = built.jacobian, built.regularisation
-    noise = nominal_noise(ForwardModel(small, built.bare).bare_voltages)
+    forward = ForwardModel(small, built.bare)
+    noise = nominal_noise(forward.bare_voltages)
     whitened = J / noise[:, None]
-    by_nodes = np.linalg.solve(
-        whitened.T @ whitened + weight * np.eye(J.shape[1]), whitened.T / noise
-    )
+    areas = forward.node_areas_m2 / forward.node_areas_m2.mean()
+    by_nodes = np.linalg.solve(whitened.T @ whitened + weight * np.diag(areas), whitened.T / noise)
     np.testing.assert_allclose(
         built.tikhonov, by_nodes, rtol=1e-5, atol=1e-9 * np.abs(by_nodes).max()
     )
-    np.testing.assert_array_equal(built.tikhonov, tikhonov_matrix(J, noise, weight))
+    spread = even_spread(forward.node_areas_m2)
+    np.testing.assert_array_equal(built.tikhonov, tikhonov_matrix(J, noise, weight, spread))
 
 
-def test_the_noise_figure_is_1(artifact: Artifact, paper: SensorDescription) -> None:
-    noise = nominal_noise(ForwardModel(paper, artifact.bare).bare_voltages)
-    signal = (artifact.jacobian / noise[:, None]) @ central_target(paper, artifact.bare)
-    matrix = artifact.tikhonov * noise  # takes whitened data
-    image_snr = np.mean(np.abs(matrix @ signal)) / np.sqrt(np.mean((matrix**2).sum(axis=1)))
-    assert np.mean(np.abs(signal)) / image_snr == pytest.approx(1, rel=0.01)
+def test_lambda_is_that_of_changes_of_a_typical_size(
+    built: Artifact, small: SensorDescription
+) -> None:
+    """Bayes: with L of unit mean square, one over the expected change squared."""
+    spread = even_spread(ForwardModel(small, built.bare).node_areas_m2)
+    assert built.regularisation == pytest.approx(np.mean(spread**2) / TYPICAL_CHANGE**2)

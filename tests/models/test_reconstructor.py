@@ -69,7 +69,7 @@ def test_one_press_is_found_with_its_pressure(
 ) -> None:
     press = press_mm(*place)
     frame = settle(reconstructor, skin, press)
-    assert frame.tier is Tier.FIT
+    assert frame.tier is Tier.HYBRID
     assert frame.flags == Flag(0)
     assert frame.misfit < 1.5
     (contact,) = frame.contacts
@@ -168,7 +168,7 @@ def test_without_structure_the_linear_image_goes_on_flagged(
     frame = reconstructor.reconstruct(skin.scan(press)["magnitude"], None)
     assert frame.flags == Flag.STRUCTURE_MISSING
     assert frame.flags.names() == ["structure_missing"]
-    assert frame.tier is Tier.TIKHONOV
+    assert frame.tier is Tier.NETWORK
     assert frame.structure is None
     assert frame.map is not None
     assert error_mm(nearest(frame, press), press) < 12
@@ -188,7 +188,7 @@ def test_a_lost_structure_scan_is_bridged_by_the_last_shape(
     assert contact.id == before.id
     assert contact.pressure_kpa == pytest.approx(160, abs=8)
     elsewhere = skin.scan(press_mm(40, -40, 190))["magnitude"]
-    assert reconstructor.reconstruct(elsewhere, None).tier is Tier.TIKHONOV
+    assert reconstructor.reconstruct(elsewhere, None).tier is Tier.NETWORK
 
 
 def test_the_last_shape_is_not_held_for_ever(reconstructor: Reconstructor, skin: Skin) -> None:
@@ -197,7 +197,7 @@ def test_the_last_shape_is_not_held_for_ever(reconstructor: Reconstructor, skin:
         reconstructor.reconstruct(skin.scan(CENTRE)["magnitude"], None).tier for _ in range(30)
     ]
     assert tiers[0] is Tier.FIT
-    assert tiers[-1] is Tier.TIKHONOV
+    assert tiers[-1] is Tier.NETWORK
 
 
 def test_without_magnitude_the_outline_goes_on_flagged(

@@ -205,10 +205,10 @@ class _Misregularised(Reconstructor):
         super().__init__(description, artifact, budget_s=budget_s)
         self._factor = factor
 
-    def _matrix(self, method: Tier, noise: FloatArray) -> NDArray[np.float32]:
+    def _matrix(self, name: Modality, method: Tier, noise: FloatArray) -> NDArray[np.float32]:
         # R = S²J'(JS²J' + λN)⁻¹, so that JR = I - λN(JS²J' + λN)⁻¹, and with fλ for λ it is
         # R(I + (f - 1)(I - JR))⁻¹.
-        right = super()._matrix(method, noise).astype(np.float64)
+        right = super()._matrix(name, method, noise).astype(np.float64)
         one = np.eye(right.shape[1])
         change = one + (self._factor - 1) * (one - self._artifact.jacobian @ right)
         return np.asarray(np.linalg.solve(change.T, right.T).T, dtype=np.float32)

@@ -16,6 +16,8 @@ from torch.nn import functional as fn
 
 FloatArray = NDArray[np.float64]
 
+LEAST_ODDS = 1e-3  # of a shape that is certain: its cross entropy must stay finite
+
 
 class FusionNetwork(nn.Module):
     """Ours: from both channels' filtered voltages to the map, the pressed shape and a confidence.
@@ -59,10 +61,10 @@ class FusionNetwork(nn.Module):
             nn.PixelShuffle(2),
             nn.ReLU(),
         )
-        self.last = nn.Conv2d(width // 2 + images, 3, 3, padding=1)
+        self.last = nn.Conv2d(width // 2 + images, 4 if images else 3, 3, padding=1)
         with torch.no_grad():  # begin with nothing pressed, as most of a map is
             assert self.last.bias is not None
-            self.last.bias.copy_(torch.tensor([-3.0, -3.0, 0.0]))
+            self.last.bias[:3] = torch.tensor([-3.0, -3.0, 0.0])
         self.trust = nn.Sequential(nn.Linear(2 * wide + inputs, 64), nn.GELU(), nn.Linear(64, 1))
 
     def forward(self, x: Tensor, seen: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
@@ -90,10 +92,17 @@ class FusionNetwork(nn.Module):
         up = self.up(coarse)[..., : self.half[0], : self.half[1]]
         drawn = self.draw(self.join(torch.cat([up, fine], dim=1)))
         drawn = self.last(drawn if seen is None else torch.cat([drawn, seen], dim=1))
-        shape, edge, size = drawn[..., : self.nodes[0], : self.nodes[1]].unbind(1)
+        shape, edge, size, *doubt = drawn[..., : self.nodes[0], : self.nodes[1]].unbind(1)
+        size = torch.sigmoid(edge) * fn.softplus(size)
+        if seen is not None:  # what is not doubted stays as it was seen
+            share = torch.sigmoid(doubt[0].float())
+            seen_size, seen_shape = seen[:, :2, : self.nodes[0], : self.nodes[1]].unbind(1)
+            size = torch.lerp(seen_size, size.float(), share)
+            drawn_shape = torch.lerp(seen_shape, torch.sigmoid(shape.float()), share)
+            shape = torch.logit(drawn_shape, eps=LEAST_ODDS)
         pooled = torch.cat([coarse.mean((2, 3)), coarse.amax((2, 3)), x], dim=1).detach()
         trust = self.trust(pooled).squeeze(1)
-        return torch.sigmoid(edge) * fn.softplus(size), shape, trust
+        return size, shape, trust
 
     def start_from(self, other: FusionNetwork) -> None:
         """Begin as a network that is given no images: they count for nothing at first."""
@@ -175,7 +184,8 @@ class PaperNetwork(nn.Module):
             for extract, image in zip(self.extractors, images, strict=True)
         ]
         joined = self.connected(torch.cat(features, dim=1))
-        return torch.as_tensor(joined.view(-1, *self.nodes))
+        made: Tensor = joined.view(-1, *self.nodes)
+        return made
 
 
 def _halved(nodes: int, times: int) -> int:
