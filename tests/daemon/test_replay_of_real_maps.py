@@ -44,7 +44,7 @@ def test_the_replay_of_a_pressed_skin_gives_the_same_maps(
     live = [frame for frame in b.listener.of("map") if frame["scan_counter"] >= first]
 
     assert len(pressed["contacts"]) == 2
-    assert {"quiet", "fit", "tikhonov"} == {frame["tier"] for frame in live}
+    assert {"quiet", "hybrid", "fit", "network"} == {frame["tier"] for frame in live}
     again = replay(path, real=True).of("map")
     assert len(again) == len(live) == open_recording(path).summary.frames
     for one, other in zip(live, again, strict=True):

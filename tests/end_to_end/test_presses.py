@@ -85,9 +85,9 @@ def test_a_lost_channel_is_flagged_and_the_other_goes_on(any_demo: Demo) -> None
     with subscribe(SENSOR, address=any_demo.stream, timeout_s=PATIENCE_S) as frames:
         missing = (frame for frame in frames if "structure_missing" in frame.flags)
         bridged = next(missing)
-        linear = next(frame for frame in missing if frame.tier == "tikhonov")
+        alone = next(frame for frame in missing if frame.tier == "network")
     assert bridged.tier == "fit", "the last shape stands in for a moment"
-    for frame in (bridged, linear):
+    for frame in (bridged, alone):
         assert frame.map is not None, "the magnitude channel's image goes on"
         assert frame.structure is None
     settled_frame(any_demo, [(10.0, -10.0)])  # and both again once it is back

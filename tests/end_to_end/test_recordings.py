@@ -61,7 +61,7 @@ class Listener(threading.Thread):
 def test_a_replay_gives_the_maps_of_the_live_run(demo: Demo, tmp_path: Path) -> None:
     live, again = tmp_path / "live.mcap", tmp_path / "again.mcap"
     demo.press(15.0, 20.0, id="a")  # begun under load: the reference must come along
-    wait_for(lambda: request("status", demo.control)["tier"] == "fit", "a contact")
+    wait_for(lambda: request("status", demo.control)["tier"] == "hybrid", "a contact")
     listener = Listener(demo)
     listener.start()
     request("record_start", demo.control, path=str(live))
