@@ -4,7 +4,6 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 TRAIN_READY := $(VENV)/.ready-train
-TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 
 LOCKED := pyproject.toml --universal --python-version 3.11 --generate-hashes \
   --no-emit-package tactomo-client --no-emit-package tactomo
@@ -58,5 +57,5 @@ $(READY): requirements.lock pyproject.toml clients/python/pyproject.toml
 # be reached, pip says so and takes what the others have.
 $(TRAIN_READY): $(READY) requirements-train.lock requirements-torch.txt
 	$(BIN)/python -m pip install --quiet --require-hashes -r requirements-train.lock
-	$(BIN)/python -m pip install --quiet --extra-index-url $(TORCH_INDEX) -r requirements-torch.txt
+	$(BIN)/python -m pip install --quiet -r requirements-torch.txt
 	touch $@

@@ -34,4 +34,4 @@ def test_a_missing_extra_is_told(
     assert result.returncode == 1
     assert f"training needs {package}, which is not installed" in result.stderr
     assert "pip install 'tactomo[train]'" in result.stderr
-    assert "https://download.pytorch.org/whl/cpu" in result.stderr
+    assert "https://pytorch.org/get-started" in result.stderr

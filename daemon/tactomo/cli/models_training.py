@@ -365,6 +365,6 @@ def _training_extra() -> Iterator[None]:
             raise
         raise TactomoError(
             f"training needs {error.name}, which is not installed",
-            "pip install 'tactomo[train]'; without a GPU, a smaller PyTorch first: "
-            "pip install torch --index-url https://download.pytorch.org/whl/cpu",
+            "pip install 'tactomo[train]'; without a GPU, install the smaller PyTorch for CPUs "
+            "first: see https://pytorch.org/get-started",
         ) from error
