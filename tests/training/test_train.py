@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,13 @@ import pytest
 import torch
 from small_sensor import SMALL
 from tactomo.cli.models_training import RecipeName
-from tactomo_models import ModelError, SensorDescription, load_description
+from tactomo_models import (
+    ModelError,
+    Reconstructor,
+    SensorDescription,
+    Tier,
+    load_description,
+)
 from tactomo_models.network import FusionNetwork, Network, PaperNetwork, load_network, preprocessed
 from tactomo_models.symmetry import symmetries
 from tactomo_models.training.batches import Batch, SceneBatches
@@ -261,6 +268,29 @@ class TestCommand:
         result = tactomo(*command, "--checkpoint", "ours.pt", "--sensor", square_file)
         assert result.returncode == 0, result.stderr
         assert load_network(load_description(square_file), "network").path.is_relative_to(tmp_path)
+
+    def test_a_refiner_learns_from_what_the_physics_makes(
+        self,
+        tactomo: Run,
+        robust: Path,
+        square_file: Path,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        """And with both networks a new sensor has the hybrid."""
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+        folder = tmp_path / "scenes"
+        shutil.copytree(robust, folder)
+        command = ("models", "train", folder, "--epochs", 1, "--jobs", 1, "--sensor", square_file)
+        refiner = (*command, "--recipe", "refiner", "--start", folder / "ours.pt")
+        early = tactomo(*refiner)
+        assert early.returncode == 1
+        assert "there is no network for sensor 'small'" in early.stderr
+        assert tactomo(*command).returncode == 0
+        result = tactomo(*refiner)
+        assert result.returncode == 0, result.stderr
+        description = load_description(square_file)
+        assert Reconstructor(description, tier=Tier.HYBRID).tier is Tier.HYBRID
 
     def test_wrong_scenes_are_told(
         self, tactomo: Run, robust: Path, paper: Path, square_file: Path, tmp_path: Path
