@@ -1,9 +1,10 @@
 """From two scans to a map and contacts: the tiers, and the warm start between frames.
 
 A scene is modelled no further than it needs. Nothing pressed: a chi-square test, and no solve.
-Something pressed: the Tikhonov image starts a level set on the structure channel, whose areas
-take one magnitude each from the other channel. The estimate of one frame starts the next, so that
-a still scene costs a comparison and no solve.
+Something pressed: a network proposes contacts where the sensor has one, outlines or a level set are
+fitted to the structure channel, their areas take one magnitude each from the other channel, and a
+second network redraws them for the data to choose. Each frame starts from the last one's estimate,
+so that a still scene costs a comparison and no solve.
 
 The outcome depends on the sequence of frames alone, never on the clock: the compute budget is
 counted in modelled work, so that a recording reconstructs exactly as the live stream did.
