@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from rich.table import Table
     from tactomo_models.evaluation.stability import CaseScore, Trust
 
+NAME_WIDTH, CELL_WIDTH = 17, 16  # characters of the first and of the other columns
 IN_WORDS = "auto"  # the method whose doings are told in words, where it is among those asked for
 
 
@@ -163,14 +164,16 @@ def _print(settings: dict[str, Any], scores: Sequence[CaseScore]) -> None:
         f"{settings['cases_each']} case(s) of each regime."
     )
     rows = trust_by_regime(scores)
-    console.print(_counts(rows))
+    fit = max(1, (console.width - NAME_WIDTH) // CELL_WIDTH)
+    methods = list(rows["all"])
+    for first in range(0, len(methods), fit):  # as many tables as the terminal is too narrow for
+        console.print(_counts(rows, methods[first : first + fit]))
     console.print(
         "[dim]Each cell: mean ICC; bad maps (ICC < 0.7) without a flag that tells to distrust, of "
         "all bad ones; good maps with one, of all good ones.[/]\n"
     )
     for method, counts in rows["all"].items():
         console.print(f"[bold]{method}[/]: {_headline(counts)}")
-    methods = settings["methods"]
     method = IN_WORDS if IN_WORDS in methods else methods[0]
     console.print(_doings(method, [one for one in scores if one.method == method]))
 
@@ -189,18 +192,18 @@ def _percent(share: float) -> str:
     return "" if math.isnan(share) else f" ({share:.0%})"
 
 
-def _counts(rows: dict[str, dict[str, Trust]]) -> Table:
+def _counts(rows: dict[str, dict[str, Trust]], methods: Sequence[str]) -> Table:
     from rich import box
     from rich.table import Table
 
     made = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     made.add_column("", no_wrap=True)
-    for method in rows["all"]:
+    for method in methods:
         made.add_column(method, justify="right", no_wrap=True)
     for regime, by_method in rows.items():
         if regime == "all":
             made.add_section()
-        made.add_row(regime, *(_cell(counts) for counts in by_method.values()))
+        made.add_row(regime, *(_cell(by_method[method]) for method in methods))
     return made
 
 
