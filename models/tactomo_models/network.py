@@ -31,6 +31,7 @@ NetworkKind = Literal["network", "refiner", "cnn-single", "cnn-multimodal"]
 
 FORMAT = 1
 NEWEST_OPSET = 21  # that the oldest ONNX Runtime we support runs
+FAINT = 0.05  # share pressed below which nothing is: a solve goes by the area that is not 0
 MAGNITUDE_ERROR = 0.1  # share of the range that two in three of our network's magnitudes err by
 FILTER_SIGMA = 1.0  # nodes, of the Gaussian filter at the paper's networks' output
 OUTPUTS: Final[dict[NetworkKind, tuple[str, ...]]] = {
@@ -153,9 +154,9 @@ class FusionNetwork:
         if seen is not None:
             inputs["seen"] = np.stack([seen[0] / self._scale, seen[1]])
         made = self._network.run(inputs)
-        return NetworkImage(
-            made["map"].copy(), made["structure"].copy(), float(made["confidence"]), self._sigma
-        )
+        structure = made["structure"].copy()
+        structure[structure < FAINT] = 0.0
+        return NetworkImage(made["map"].copy(), structure, float(made["confidence"]), self._sigma)
 
     def filtered(
         self, changes: Mapping[Modality, FloatArray], certainty: Mapping[Modality, FloatArray]
