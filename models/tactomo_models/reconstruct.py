@@ -99,6 +99,7 @@ LINEAR_PART = 0.5  # of the misfit of nothing, that areas cut out of a linear im
 MOST_HELD = 10  # frames without a structure scan that the last shape stands in for: half a second
 LOW_CONFIDENCE = 0.8  # expected correlation below which a map is better not trusted
 SURE_CONFIDENCE = 0.9  # ... from which one is, although the physics cannot explain the data
+SURE_SHARE = 0.85  # of the second opinion, from which contacts are its own: outlines know theirs
 UNSURE_MISFIT = 1.5  # of both channels together
 UNSURE_MAGNITUDE = 0.5  # uncertainty of all magnitudes together, share of themselves
 WRONG_WAY = 5.0  # standard uncertainties by which a conductivity may change against its sign
@@ -275,7 +276,7 @@ class Reconstructor:
         redraw: bool = True,
     ) -> None:
         self.description = description
-        self.tier = tier
+        self._tier = tier
         self.budget_s = budget_s
         self._redraw = redraw
         if redraw:
@@ -300,11 +301,11 @@ class Reconstructor:
         self._stage_s: dict[str, float] = {}
         self._left_out: list[str] = []
         self._networks = SensorNetworks(description)
-        _ = self._proposes  # loads what it takes now, and not when something presses
         self._structure_answers_more = len(description.modalities) == 2 and bool(
             np.log(_contrast(description, "structure"))
             > MUCH_MORE * np.log(_contrast(description, "magnitude"))
         )
+        self._make_ready()
 
     def set_reference(self, reference: Reference) -> None:
         """Measure changes against this unpressed scan from now on; forgets the warm start.
@@ -319,7 +320,25 @@ class Reconstructor:
             for name in self.description.modalities
             if (scan := volts[name]) is not None
         }
+        self._make_ready()
         self.reset()
+
+    @property
+    def tier(self) -> Tier:
+        """The most that is done; `Tier.AUTO` does what the scene needs."""
+        return self._tier
+
+    @tier.setter
+    def tier(self, tier: Tier) -> None:
+        self._tier = tier
+        self._make_ready()
+
+    def _make_ready(self) -> None:
+        """Make what the tier takes now, and not when something presses."""
+        _ = self._proposes
+        if self.tier in LINEAR:
+            for channel in self._channels.values():
+                _ = channel.matrices[self.tier]
 
     def _prepare(
         self, name: Modality, volts: FloatArray, noise: FloatArray | None, scans: int
@@ -345,8 +364,6 @@ class Reconstructor:
         relative = np.hypot(noise * per_volt * np.sqrt(1 + 1 / scans), MODEL_ERROR)
         relative = np.where(valid, relative, UNUSABLE)
         matrices = _MadeWhenAsked(lambda method: self._matrix(name, method, relative))
-        if self.tier in LINEAR:
-            matrices[self.tier]
         direction = 0.0 if self._either_way(name) else self._sign(name)
         return _Channel(
             reference=reference,
@@ -699,7 +716,7 @@ class Reconstructor:
         with self._timed("contacts"):
             own = self._drawing_of(shape, data, solves)
         second = self._second_opinion(own, data, solves)
-        shown = second.drawing if second is not None and second.share > 0.5 else own
+        shown = second.drawing if second is not None and second.share > SURE_SHARE else own
         if not shape.converged:
             flags |= Flag.NOT_CONVERGED
         if self._unexplained(shape, shown, data, second is not None):
