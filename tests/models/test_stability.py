@@ -206,8 +206,8 @@ def test_regularisation_is_so_many_times_what_the_rule_chooses(
     plan = replace(case.plan, regularisation=1.0)
     right = by(method, replace(case, plan=plan), small_artifact).frame.map
     monkeypatch.setattr(
-        "tactomo_models.reconstruct.noise_figure_weight",
-        lambda *given: factor * linear.noise_figure_weight(*given),
+        "tactomo_models.reconstruct.prior_weight",
+        lambda *given: factor * linear.prior_weight(*given),
     )
     expected = by(method, replace(case, plan=plan), small_artifact).frame.map
     assert wrong is not None

@@ -72,7 +72,7 @@ def test_still_scenes_are_measured_under_each_budget(
         "tactomo_models.evaluation.still.load_or_build_artifact", lambda _: artifact
     )
     drawn = list(scenes(paper, "tuning", 1, contacts=(3,), snr_db=20, cache=tmp_path))
-    asked = [Variant("tikhonov"), Variant("auto", 0.001), Variant("auto", 0.2)]
+    asked = [Variant("tikhonov"), Variant("fit", 0.001), Variant("fit", 0.2)]
     done: list[None] = []
     linear, hasty, patient = measure_still(drawn, asked, lambda: done.append(None))
     assert [linear.variant, hasty.variant, patient.variant] == asked
