@@ -30,6 +30,7 @@ Image = NDArray[np.float32]
 NetworkKind = Literal["network", "refiner", "cnn-single", "cnn-multimodal"]
 
 FORMAT = 1
+NONE_TRAINED = "none is trained for this sensor"
 NEWEST_OPSET = 21  # that the oldest ONNX Runtime we support runs
 FAINT = 0.05  # share pressed below which nothing is: a solve goes by the area that is not 0
 MAGNITUDE_ERROR = 0.1  # share of the range that two in three of our network's magnitudes err by
@@ -244,9 +245,9 @@ class SensorNetworks:
     def missing(self) -> str:
         """Why the physics has to do without networks; empty where it need not."""
         if len(self._description.modalities) < 2:
-            return "a single channel"
+            return f"{NONE_TRAINED}: it has a single channel"
         if not all(find_network(self._description, kind) for kind in ("network", "refiner")):
-            return "none trained for this sensor"
+            return NONE_TRAINED
         try:
             _ = self.fusion, self.refiner
         except ArtifactError as error:
@@ -302,6 +303,11 @@ def load_network(
         ArtifactError: there is none, or it cannot be used.
     """
     found = path or find_network(description, kind)
+    if found is None and len(description.modalities) < 2:
+        raise ArtifactError(
+            f"there is no {kind} for sensor {description.name!r}, and there can be none: networks "
+            "need both channels; choose fit, levelset or another method"
+        )
     if found is None:
         raise ArtifactError(
             f"there is no {kind} for sensor {description.name!r} ({description.sha256[:12]}); "

@@ -49,6 +49,7 @@ from tactomo_models.errors import DataError
 from tactomo_models.following import Freedom, ShapeFollower
 from tactomo_models.forward import ForwardModel
 from tactomo_models.network import (
+    NONE_TRAINED,
     NetworkImage,
     NetworkKind,
     SensorNetworks,
@@ -333,6 +334,13 @@ class Reconstructor:
         self._tier = tier
         self._make_ready()
 
+    @property
+    def _unusable_network(self) -> str:
+        """Why `auto` has to do without a network that is there; empty where it need not."""
+        if self.tier is not Tier.AUTO or NONE_TRAINED in self._networks.missing:
+            return ""
+        return f"no network: {self._networks.missing}" if self._networks.missing else ""
+
     def _make_ready(self) -> None:
         """Make what the tier takes now, and not when something presses."""
         _ = self._proposes
@@ -430,7 +438,7 @@ class Reconstructor:
             DataError: a scan has another number of voltages than the sensor.
         """
         self._stage_s = {}
-        self._left_out = []
+        self._left_out = [self._unusable_network] if self._unusable_network else []
         flags = Flag(0)
         data: dict[Modality, _Data] = {}
         with self._timed("data"):
@@ -514,6 +522,10 @@ class Reconstructor:
         if self.tier is Tier.NETWORK:
             return self._by_network(data, flags, "as requested")
         if self.tier in PAPER_NETWORKS:
+            needed = self._networks.paper(NETWORKS_OF[self.tier][0]).modalities
+            if not data.keys() >= set(needed):
+                why = "a channel that the network needs is missing"
+                return self._linear(data, flags, Tier.TIKHONOV, why)
             return self._by_paper_network(data, flags)
         if "structure" not in data and (held := self._held(data, flags)):
             return held

@@ -105,6 +105,7 @@ def test_auto_does_without_a_network_that_is_damaged(
     reconstructor.set_reference(skin.reference())
     frame = reconstructor.reconstruct(**skin.scan(ONE))
     assert frame.tier == Tier.FIT
+    assert "no network: " in frame.reason
     assert len(frame.contacts) == 1
 
 
@@ -196,3 +197,16 @@ def test_the_reference_may_change_between_frames(
         reconstructor.set_reference(skin.reference())
         shown.append(reconstructor.reconstruct(**skin.scan(ONE)))
     assert all(len(frame.contacts) == 1 for frame in shown)
+
+
+def test_the_papers_network_is_not_asked_about_half_of_a_frame(
+    paper: SensorDescription, artifact: Artifact, simulator: SkinSimulator
+) -> None:
+    """Without a channel it would show nothing pressed."""
+    skin = Skin(simulator)
+    reconstructor = Reconstructor(paper, artifact, tier=Tier.CNN_MULTIMODAL)
+    reconstructor.set_reference(skin.reference())
+    frame = reconstructor.reconstruct(skin.scan(ONE)["magnitude"], None)
+    assert frame.tier is Tier.TIKHONOV
+    assert "missing" in frame.reason
+    assert len(frame.contacts) == 1

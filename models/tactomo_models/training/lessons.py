@@ -17,7 +17,7 @@ from tactomo_models.description import SensorDescription
 from tactomo_models.network import FILTER_SIGMA, preprocessed
 from tactomo_models.prefilter import BANDS
 from tactomo_models.symmetry import Symmetry, symmetries
-from tactomo_models.training.batches import HELD_OUT, Batch, SceneBatches
+from tactomo_models.training.batches import Batch, SceneBatches, trained_of
 from tactomo_models.training.preliminary import read_images
 from tactomo_models.training.sights import read_sights
 from tactomo_models.training.simulate import read_scenes
@@ -117,7 +117,7 @@ class RefinerLesson:
             for turn in symmetries(description)
         ]
         self._scale = scale
-        self.scenes = round(len(self._inputs) * (1 - HELD_OUT))
+        self.scenes = trained_of(len(self._inputs))
         self.nodes = (description.map.nodes_y, description.map.nodes_x)
 
     @property
