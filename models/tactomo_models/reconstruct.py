@@ -741,19 +741,18 @@ class Reconstructor:
             vague = not data["magnitude"].quiet and _unsure(shown)
             if vague or second.confidence < LOW_CONFIDENCE:
                 flags |= Flag.LOW_CONFIDENCE
-        magnitude, pressure, structure = None, None, own.pressed
+        magnitude, pressure = None, None
         if "magnitude" in data:
             magnitude = own.map(self._sign("magnitude"))
             kpa = np.array([c.pressure_kpa for c in contacts])
             pressure = _fused(shown.areas, kpa, own.pressed.shape)
         if second is not None and magnitude is not None:
-            other, share = second.drawing, second.share
-            magnitude += share * (other.map(self._sign("magnitude")) - magnitude)
-            structure = structure + share * (other.pressed - structure)
+            other = second.drawing.map(self._sign("magnitude"))
+            magnitude += second.share * (other - magnitude)
         return Reconstruction(
             map=None if magnitude is None else magnitude.astype(np.float32),
             pressure_kpa=pressure,
-            structure=structure.astype(np.float32),
+            structure=shown.pressed.astype(np.float32),
             contacts=contacts,
             tier=self._tier_of(shape) if second is None else Tier.HYBRID,
             reason=how,
