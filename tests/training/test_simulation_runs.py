@@ -7,6 +7,7 @@ import os
 import resource
 import signal
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -207,22 +208,26 @@ def test_a_folder_that_cannot_be_written_is_told(small: SensorDescription, tmp_p
         list(simulate(small, "robust", tmp_path / "file" / "scenes", SCENES, jobs=1))
 
 
-@pytest.fixture
-def _full_disk() -> Iterator[None]:
-    """No file may be longer than the manifest."""
+@contextmanager
+def full_disk() -> Iterator[None]:
+    """No file may be longer than the manifest, of whoever writes in here."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    signal.signal(signal.SIGXFSZ, handler)
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
 
 
-@pytest.mark.usefixtures("_full_disk")
 def test_a_full_disk_is_told_and_leaves_no_half_shard(
     small: SensorDescription, tmp_path: Path
 ) -> None:
-    with pytest.raises(ModelError, match=r"cannot write .*npz: File too large; free some space"):
+    with (
+        pytest.raises(ModelError, match=r"cannot write .*npz: File too large; free some space"),
+        full_disk(),
+    ):
         list(simulate(small, "robust", tmp_path, SCENES, jobs=1))
     assert [file.name for file in tmp_path.iterdir()] == ["manifest.json"]
 
