@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +16,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from platformdirs import user_cache_path
 
-from tactomo_models.archive import read_arrays
+from tactomo_models.archive import read_arrays, write_whole
 from tactomo_models.description import SensorDescription
 from tactomo_models.errors import ArtifactError, DataError
 from tactomo_models.forward import BareSheet, ForwardModel, solve_bare_sheet
@@ -138,15 +137,9 @@ def save_artifact(artifact: Artifact, path: Path) -> None:
     }
     for name in _BARE_ARRAYS:
         arrays[name] = getattr(artifact.bare, name)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("wb") as file:
-            np.savez(file, **arrays)
-        part.replace(path)
+        write_whole(path, lambda file: np.savez(file, **arrays))
     except OSError as error:
-        with suppress(OSError):
-            part.unlink()
         raise ArtifactError(
             f"cannot write {path}: {error.strerror}; free some space or name another path"
         ) from error

@@ -11,10 +11,8 @@ none, one that comes with tactomo stands in.
 
 from __future__ import annotations
 
-import os
 import platform
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
 from importlib.resources import files
@@ -25,6 +23,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from scipy.optimize import nnls
 
+from tactomo_models.archive import write_whole
 from tactomo_models.artifact import default_path
 from tactomo_models.description import SensorDescription
 from tactomo_models.errors import ArtifactError, explain
@@ -173,14 +172,10 @@ def save_calibration(calibration: Calibration, path: Path) -> None:
     Raises:
         ArtifactError: the file cannot be written.
     """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    content = (calibration.model_dump_json(indent=1) + "\n").encode()
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(calibration.model_dump_json(indent=1) + "\n", "utf-8")
-        part.replace(path)
+        write_whole(path, lambda file: file.write(content))
     except OSError as error:
-        with suppress(OSError):
-            part.unlink()
         raise ArtifactError(f"cannot write {path}: {error.strerror}; free some space") from error
 
 

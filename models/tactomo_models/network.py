@@ -278,10 +278,8 @@ def preprocessed(
 def find_network(description: SensorDescription, kind: NetworkKind) -> Path | None:
     """File of a sensor's network: the user's own, or the one that ships; None if there is none."""
     own = own_path(description, kind)
-    if own.exists():
-        return own
-    shipped = Path(str(files("tactomo_models"))) / "networks" / f"{description.name}-{kind}.onnx"
-    return shipped if shipped.exists() and _belongs(shipped, description) else None
+    shipped = Path(str(files("tactomo_models"))) / "networks" / own.name
+    return next((path for path in (own, shipped) if path.exists()), None)
 
 
 def own_path(description: SensorDescription, kind: NetworkKind) -> Path:
@@ -314,14 +312,6 @@ def load_network(
             "train one: tactomo models simulate, then tactomo models train"
         )
     return Network(found, description, kind)
-
-
-def _belongs(path: Path, description: SensorDescription) -> bool:
-    try:
-        meta = _open(path).get_modelmeta().custom_metadata_map
-    except ArtifactError:
-        return False
-    return bool(meta.get("sha256") == description.sha256)
 
 
 def _open(path: Path) -> ort.InferenceSession:

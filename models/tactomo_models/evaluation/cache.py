@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from tactomo_models.archive import read_arrays
+from tactomo_models.archive import read_arrays, write_whole
 from tactomo_models.errors import DataError
 
 Arrays = dict[str, Any]
@@ -31,10 +30,6 @@ def cached(folder: Path, what: str, make: Callable[[], Arrays]) -> Arrays:
     with suppress(OSError, DataError):
         return read_arrays(path)
     arrays = make()
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     with suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("wb") as file:
-            np.savez(file, **arrays)
-        part.replace(path)
+        write_whole(path, lambda file: np.savez(file, **arrays))
     return arrays
