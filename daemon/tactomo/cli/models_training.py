@@ -210,14 +210,14 @@ def _prepare(
     from tactomo_models import load_description
     from tactomo_models.training.preliminary import make_images
     from tactomo_models.training.recipes import RECIPES, check_scenes, prepare
-    from tactomo_models.training.sights import SIGHTS, make_sights
+    from tactomo_models.training.sights import MOST_SIGHTS, make_sights
     from tactomo_models.training.simulate import read_manifest
 
     description, chosen = load_description(sensor), RECIPES[recipe]
     check_scenes(chosen, folder, description)
     scenes = read_manifest(folder).scenes
     if chosen.kind == "refiner":
-        scenes = min(scenes, SIGHTS)
+        scenes = min(scenes, MOST_SIGHTS)
         steps = make_sights(description, folder, scenes, jobs=jobs or -1)
         _follow(steps, scenes, "scenes reconstructed by the physics", folder)
     elif chosen.kind != "network":

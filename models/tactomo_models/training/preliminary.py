@@ -16,7 +16,6 @@ import numpy as np
 
 from tactomo_models.archive import write_arrays
 from tactomo_models.description import Modality, SensorDescription
-from tactomo_models.errors import ModelError
 from tactomo_models.evaluation.simulation import with_opposite_magnitude
 from tactomo_models.reconstruct import Reconstructor, Tier
 from tactomo_models.reference import Reference
@@ -28,6 +27,7 @@ from tactomo_models.training.simulate import (
     read_shards,
     shard_path,
     shards_of,
+    writing,
 )
 
 IMAGES = "images"  # begins the names of the files that hold them
@@ -94,14 +94,8 @@ def _image_shard(description: str, folder: str, first: int, size: int) -> int:
         images = reconstructor.preliminary_images(volts["magnitude"], volts["structure"])
         for name, image in images.items():
             made[name].append(image.astype(np.float16))
-    target = shard_path(Path(folder), first, IMAGES)
-    try:
+    with writing(shard_path(Path(folder), first, IMAGES)) as target:
         write_arrays(target, {name: np.stack(images) for name, images in made.items()})
-    except OSError as error:
-        raise ModelError(
-            f"cannot write {target}: {error.strerror}; free some space, then run the same command "
-            "again: it goes on where it stopped"
-        ) from error
     return first
 
 

@@ -7,6 +7,7 @@ outcome is kept beside the scenes, with the filtered data that it was made of.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -21,9 +22,17 @@ from tactomo_models.evaluation.scenes import REFERENCE_SCANS, seed_of
 from tactomo_models.evaluation.simulation import with_opposite_magnitude
 from tactomo_models.reconstruct import Reconstructor, Tier
 from tactomo_models.reference import Reference
-from tactomo_models.training.simulate import shard_paths
+from tactomo_models.training.simulate import (
+    on_cores,
+    read_manifest,
+    read_shard,
+    shard_path,
+    shards_of,
+    writing,
+)
 
-SIGHTS = 10_000  # scenes of a set that are reconstructed, at most: a twentieth of a second each
+SIGHTS = "sights"  # begins the names of the files that hold them
+MOST_SIGHTS = 10_000  # scenes of a set that are reconstructed: a twentieth of a second each
 SNR_DB = (8.0, 60.0)  # of the changes, drawn evenly
 VOLTAGE_SNR_DB = (35.0, 70.0)  # of the voltages, for the rest of the scenes
 OF_VOLTAGE = 0.2  # share of scenes whose noise goes by the voltages
@@ -47,14 +56,20 @@ def make_sights(
     Raises:
         ModelError: a file is missing, damaged, or cannot be written; there is no network.
     """
-    from joblib import Parallel, delayed
+    from joblib import delayed
 
-    shards = [path for path in shard_paths(folder) if _first_scene(path) < scenes]
-    missing = [path for path in shards if not _sights_path(path).exists()]
-    yield round(scenes * (1 - len(missing) / len(shards)))
+    shards = [shard for shard in shards_of(read_manifest(folder).scenes) if shard[0] < scenes]
+    missing = {
+        first: size for first, size in shards if not shard_path(folder, first, SIGHTS).exists()
+    }
+    yield sum(size for _, size in shards) - sum(missing.values())
     as_json = description.model_dump_json(by_alias=True)
-    work = (delayed(_sight_shard)(as_json, str(path)) for path in missing)
-    yield from Parallel(n_jobs=jobs, return_as="generator_unordered")(work)
+    work = (
+        delayed(_sight_shard)(as_json, str(folder), first, size) for first, size in missing.items()
+    )
+    with on_cores(jobs) as parallel, closing(parallel(work)) as made:
+        for first in made:
+            yield missing[first]
 
 
 def read_sights(folder: Path) -> dict[str, Any]:
@@ -68,7 +83,10 @@ def read_sights(folder: Path) -> dict[str, Any]:
     Raises:
         ModelError: there are none, or they are damaged.
     """
-    paths = [path for path in map(_sights_path, shard_paths(folder)) if path.exists()]
+    all_paths = (
+        shard_path(folder, first, SIGHTS) for first, _ in shards_of(read_manifest(folder).scenes)
+    )
+    paths = [path for path in all_paths if path.exists()]
     if not paths:
         raise ModelError(
             f"{folder} holds nothing for the refining network to learn from; make it: "
@@ -81,17 +99,9 @@ def read_sights(folder: Path) -> dict[str, Any]:
     return {key: np.concatenate([shard[key] for shard in shards]) for key in shards[0]}
 
 
-def _first_scene(shard: Path) -> int:
-    return int(shard.stem.rpartition("-")[2])
-
-
-def _sights_path(shard: Path) -> Path:
-    return shard.with_name(shard.name.replace("scenes", "sights"))
-
-
-def _sight_shard(description: str, path: str) -> int:
-    """Reconstruct one shard's scenes that have contacts; says how many scenes it has."""
-    scenes, first = read_arrays(Path(path)), _first_scene(Path(path))
+def _sight_shard(description: str, folder: str, first: int, size: int) -> int:
+    """Reconstruct the scenes with contacts of the shard that begins with `first`; returns it."""
+    scenes = read_shard(shard_path(Path(folder), first), size)
     reconstructors = _reconstructors(description)
     made: dict[str, list[Any]] = {}
     for index in range(len(scenes["contacts"])):
@@ -103,15 +113,9 @@ def _sight_shard(description: str, path: str) -> int:
         one["number"] = np.int64(first + index)
         for key, value in one.items():
             made.setdefault(key, []).append(value)
-    target = _sights_path(Path(path))
-    try:
+    with writing(shard_path(Path(folder), first, SIGHTS)) as target:
         write_arrays(target, {key: np.stack(values) for key, values in made.items()})
-    except OSError as error:
-        raise ModelError(
-            f"cannot write {target}: {error.strerror}; free some space, then run the same command "
-            "again: it goes on where it stopped"
-        ) from error
-    return len(scenes["contacts"])
+    return first
 
 
 def _sight(

@@ -307,7 +307,7 @@ def simulate(
         closing(parallel(work)) as made,
     ):
         for first, arrays in made:
-            with _writing(shard_path(folder, first)) as path:
+            with writing(shard_path(folder, first)) as path:
                 write_arrays(path, arrays)
             yield missing[first]
 
@@ -380,7 +380,8 @@ def _format() -> int:
 
 
 @contextmanager
-def _writing(path: Path) -> Iterator[Path]:
+def writing(path: Path) -> Iterator[Path]:
+    """Say what to do where a file of a set cannot be written."""
     try:
         yield path
     except OSError as error:
@@ -412,7 +413,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
                 "folder, or delete this one"
             )
     content = json.dumps(asdict(manifest), indent=2) + "\n"
-    with _writing(path):
+    with writing(path):
         write_whole(path, lambda file: file.write(content.encode()))
 
 
@@ -495,12 +496,3 @@ def is_whole(path: Path, size: int) -> bool:
 
 def _length(arrays: Mapping[str, NDArray[Any]]) -> int:
     return min((len(array) for array in arrays.values()), default=0)
-
-
-def shard_paths(folder: Path) -> list[Path]:
-    """The files of a folder's scenes, in the order of their numbers.
-
-    Raises:
-        ModelError: the folder holds no scenes.
-    """
-    return [shard_path(folder, first) for first, _ in shards_of(read_manifest(folder).scenes)]
