@@ -54,7 +54,7 @@ def prefilter(basis: FloatArray, weight: FloatArray) -> Prefilter:
     """
     weighted = basis * weight[:, None]
     precision = np.eye(basis.shape[1]) + basis.T @ weighted
-    matrix = np.linalg.solve(precision, weighted.T)
-    known = 1 - np.diag(np.linalg.inv(precision))
+    covariance = np.linalg.inv(precision)
+    matrix, known = covariance @ weighted.T, 1 - np.diag(covariance)
     bands = np.array([band.mean() for band in np.array_split(known, BANDS)])
     return Prefilter(np.asarray(matrix, np.float64), bands)

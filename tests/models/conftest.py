@@ -17,6 +17,7 @@ from tactomo_models import (
     build_artifact,
     load_description,
 )
+from tactomo_models.forward import ForwardModel
 from threadpoolctl import threadpool_limits
 
 settings.register_profile("models", deadline=None)  # nothing here depends on the wall clock
@@ -74,3 +75,17 @@ def _one_thread() -> Iterator[None]:
 def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.delenv("CACHE_DIRECTORY", raising=False)
+
+
+@pytest.fixture
+def solves(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Counts forward solves."""
+    counted: list[int] = []
+    solve = ForwardModel.solve
+
+    def counting(self: ForwardModel, *arguments: object, **options: object) -> object:
+        counted.append(1)
+        return solve(self, *arguments, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(ForwardModel, "solve", counting)
+    return counted

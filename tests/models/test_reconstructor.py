@@ -22,7 +22,6 @@ from tactomo_models import (
     Tier,
     load_description,
 )
-from tactomo_models.forward import ForwardModel
 
 CENTRE = Press(0.0, 0.0, 180.0)
 
@@ -45,20 +44,6 @@ def error_mm(contact: Contact, press: Press) -> float:
 
 def nearest(frame: Reconstruction, press: Press) -> Contact:
     return min(frame.contacts, key=lambda contact: error_mm(contact, press))
-
-
-@pytest.fixture
-def solves(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Counts forward solves."""
-    counted: list[int] = []
-    solve = ForwardModel.solve
-
-    def counting(self: ForwardModel, *arguments: object, **options: object) -> object:
-        counted.append(1)
-        return solve(self, *arguments, **options)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(ForwardModel, "solve", counting)
-    return counted
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import typer
 from tactomo.cli.app import DEFAULT_DESCRIPTION, JsonOutput, examples
 from tactomo.cli.evaluate import Seeds, evaluate_app, shown
 from tactomo.cli.files import DescriptionOption
-from tactomo.cli.plot import prepare_picture
+from tactomo.cli.plot import prepare_folder
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
@@ -113,7 +113,7 @@ def paper(
     figures = _figures(figure)
     wanted = _methods(methods) if methods else DEFAULT_METHODS
     if picture is not None:
-        _prepare_folder(picture)
+        prepare_folder(picture)
     description = load_description(sensor)
     numbers = shown(range(sheets), sheets, "simulating sheets at rest")
     rigs = [Rig(description, seeds, number, snr_db=snr) for number in numbers]
@@ -177,16 +177,6 @@ def _methods(text: str) -> tuple[str, ...]:
             f"--methods {unknown[0]!r}: give names out of {', '.join(METHODS)}, with commas"
         )
     return names
-
-
-def _prepare_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise TactomoError(
-            f"cannot make the folder {folder}: {error.strerror}", "give one that you may write"
-        ) from error
-    prepare_picture(folder / "figure.png")
 
 
 def _because(left_out: dict[str, str]) -> str:

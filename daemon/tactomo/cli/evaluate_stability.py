@@ -16,7 +16,7 @@ import typer
 from tactomo.cli.app import DEFAULT_DESCRIPTION, JsonOutput, examples
 from tactomo.cli.evaluate import Seeds, evaluate_app, shown
 from tactomo.cli.files import DescriptionOption
-from tactomo.cli.plot import prepare_picture
+from tactomo.cli.plot import prepare_folder
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
@@ -76,8 +76,7 @@ def stability(
     regimes = _chosen("--regime", regime, REGIMES) or list(REGIMES)
     asked = _chosen("--methods", methods, METHODS)
     if picture is not None:
-        _make_folder(picture)
-        prepare_picture(picture / "overview.png")
+        prepare_folder(picture)
     description = load_description(sensor)
     chosen = asked or to_be_had(description, METHODS)
     cases = evaluate_regimes(description, regimes, chosen, seeds, count, jobs=jobs)
@@ -115,15 +114,6 @@ def _chosen(option: str, text: str | None, known: Iterable[str]) -> list[str]:
             choices = ", ".join(known)
             raise typer.BadParameter(f"{option} {name!r}: give one or more of {choices}")
     return list(dict.fromkeys(names))
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise TactomoError(
-            f"cannot make the folder {folder}: {error.strerror}", "choose another one"
-        ) from error
 
 
 def _write_csv(scores: Sequence[CaseScore], path: Path) -> None:

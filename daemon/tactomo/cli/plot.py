@@ -103,6 +103,21 @@ def prepare_picture(output: Path) -> None:
     prepare_file(output)
 
 
+def prepare_folder(folder: Path) -> None:
+    """Make sure before the work that pictures can be drawn into a folder, which is made.
+
+    Raises:
+        TactomoError: as `prepare_picture`, or the folder cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TactomoError(
+            f"cannot make the folder {folder}: {error.strerror}", "give one that you may write"
+        ) from error
+    prepare_picture(folder / "figure.png")
+
+
 def prepare_file(output: Path) -> None:
     """Make sure before the work that a file can be written; what it holds stays as it is.
 
