@@ -80,11 +80,13 @@ class Control:
 
     Attributes:
         address: where it is bound, once open.
+        turns: of the loop; the watchdog goes by them.
 
     """
 
     def __init__(self, handlers: Mapping[str, Handler], on_idle: Callable[[], None]) -> None:
         self.address = ""
+        self.turns = 0
         self._handlers = handlers
         self._on_idle = on_idle
         self._pending: list[tuple[list[bytes], Future[Result]]] = []
@@ -116,6 +118,7 @@ class Control:
 
     def _run(self) -> None:
         while not self._stopping.is_set():
+            self.turns += 1
             if self._socket.poll(POLL_WHILE_PENDING_MS if self._pending else POLL_MS):
                 self._receive()
             self._answer_pending()

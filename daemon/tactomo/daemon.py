@@ -20,6 +20,7 @@ they save, and the processor is shared with everything else on the robot.
 from __future__ import annotations
 
 import contextlib
+import os
 import signal
 import threading
 import time
@@ -59,6 +60,7 @@ from tactomo.publisher import Publisher
 from tactomo.recorder import Recorder, message_entry
 from tactomo.recording import REPLAY_SCHEME, Origin, Recording
 from tactomo.status import Status
+from tactomo.supervision import Supervision, notify
 
 WATCH_S: Final = 0.1
 
@@ -193,6 +195,7 @@ class Daemon:
 
     def wait(self) -> int:
         """Wait until the daemon is to stop, and return the exit status that it deserves."""
+        supervision = Supervision(self._turns, self._summary)
         while not self._stop_asked.wait(WATCH_S):
             if self.config.exit_at_end and self._pipeline.finished.is_set():
                 break
@@ -201,6 +204,7 @@ class Daemon:
             ):  # its traceback is on standard error
                 log.error("thread_died", next_step="please report the traceback above")
                 return 1
+            supervision.turn()
         return 0
 
     def run(self) -> int:
@@ -211,9 +215,11 @@ class Daemon:
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: self._stop_asked.set())
         self.start()
+        notify("READY=1", f"STATUS={self._summary()}")
         try:
             return self.wait()
         finally:
+            notify("STOPPING=1", "STATUS=stopping")
             self.stop()
             log.info("stopped")
 
@@ -242,6 +248,15 @@ class Daemon:
             self._recorder.start(config.record, config.record_maps)
         for part in self._threads:
             part.start()
+
+    def _turns(self) -> Mapping[str, int]:
+        """Return how often each thread went round its loop, of those that are not at their end."""
+        ports = {f"port-{port.index}": port.turns for port in self._ports if not port.has_ended}
+        parts = {"pipeline": self._pipeline.turns, "control": self._control.turns}
+        return {**parts, "publisher": self._publisher.turns, **ports}
+
+    def _summary(self) -> str:
+        return self._status.summary(self._publisher.subscribers)
 
     def _record_start(self, arguments: RecordStart) -> Mapping[str, Any]:
         path = Path(arguments.path) if arguments.path else _new_recording(self.config.name)
@@ -325,6 +340,7 @@ def _check_reference(
 
 def _make_reconstructor(config: DaemonConfig, description: SensorDescription) -> Reconstructor:
     log.info("loading", sensor_model=description.name)
+    notify(f"STATUS=loading the model of {description.name}, which is built the first time")
     budget_s = None if config.budget_ms is None else config.budget_ms * 1e-3
     artifact = load_or_build_artifact(description)
     return Reconstructor(description, artifact, tier=Tier(config.tier), budget_s=budget_s)
@@ -345,5 +361,7 @@ def _origin(config: DaemonConfig, description: SensorDescription) -> Origin:
 
 
 def _new_recording(sensor: str) -> Path:
+    """Return a path in the user's data folder, or in the one that systemd gives a service."""
     stamp = time.strftime("%Y%m%dT%H%M%S")
-    return user_data_path("tactomo") / "recordings" / f"{sensor}-{stamp}.mcap"
+    folder = Path(os.environ.get("STATE_DIRECTORY") or user_data_path("tactomo"))
+    return folder / "recordings" / f"{sensor}-{stamp}.mcap"

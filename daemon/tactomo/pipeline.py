@@ -65,6 +65,7 @@ class Pipeline:
         incomplete: dual scans of which one channel did not come.
         scan_rates: how often each channel's scans come.
         finished: set once every replayed port has ended and what came of it was published.
+        turns: of the loop, and frames; the watchdog goes by them.
 
     """
 
@@ -83,6 +84,7 @@ class Pipeline:
         self.incomplete = 0
         self.scan_rates = {channel: Rate() for channel in channels}
         self.finished = threading.Event()
+        self.turns = 0
         self._imaging = imaging
         self._channels = channels
         self._ports = ports
@@ -167,12 +169,14 @@ class Pipeline:
     def _run(self) -> None:
         self._begin()
         while not self._stopping.is_set():
+            self.turns += 1
             lost, resets = set(self._sync.lost), self._sync.resets
             ready = self._gather()
             self._tell_changes(lost, resets)
             for dual in ready if self._is_lossless else self._newest(ready):
                 if self._stopping.is_set():
                     break
+                self.turns += 1
                 reference = self._imaging.reference
                 self._imaging.process(dual, self._sync.lost)
                 if self._imaging.reference is not reference:

@@ -94,6 +94,7 @@ class PortReader:
         refusal: why this device's scans are not used; empty when they are.
         is_open: whether the device is there at present.
         has_ended: whether the replay behind the port is at its end.
+        turns: of the loop, device or no device; the watchdog goes by them.
 
     """
 
@@ -115,6 +116,7 @@ class PortReader:
         self.refusal = ""
         self.is_open = False
         self.has_ended = False
+        self.turns = 0
         self._baud = baud
         self._description = description
         self._recorder = recorder
@@ -160,6 +162,7 @@ class PortReader:
     def _run(self) -> None:
         self._ask()
         while not self._stopping.is_set():
+            self.turns += 1
             try:
                 self._read_once()
             except ReplayEnded as end:
@@ -291,6 +294,7 @@ class PortReader:
 
     def _reopen(self) -> None:
         while not self._stopping.wait(RETRY_S):
+            self.turns += 1
             try:
                 self.open()
             except (PortError, RecordingError):

@@ -54,6 +54,7 @@ class Publisher:
         subscribers: subscriptions in force; written by the thread.
         header: the newest frame's; written by the pipeline thread, sent with status and events.
         latency: from the last byte of a dual scan to the sending of its contacts.
+        turns: statuses sent; the watchdog goes by them.
 
     """
 
@@ -68,6 +69,7 @@ class Publisher:
         self.subscribers = 0
         self.header: Mapping[str, Any] = NO_FRAME_YET
         self.latency = Durations()
+        self.turns = 0
         self._sensor = sensor
         self._session = session
         self._status = status
@@ -166,6 +168,7 @@ class Publisher:
             if time.monotonic() >= status_at_s:
                 status_at_s += STATUS_PERIOD_S
                 self._send_status()
+                self.turns += 1
         self._send_queued()
 
     def _send_queued(self) -> None:

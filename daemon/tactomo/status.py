@@ -79,6 +79,15 @@ class Status:
             return "stale"
         return "taring" if self._imaging.is_taring else "running"
 
+    def summary(self, subscriptions: int) -> str:
+        """Return how the daemon is in one line, for `systemctl status`."""
+        state = self.state().replace("_", " ")
+        absent = [port.url for port in self._ports if not port.is_open and not port.has_ended]
+        if absent:
+            return f"{state}, {' and '.join(absent)} not there"
+        rate_hz = self._imaging.frame_rate.per_second()
+        return f"{state}: {rate_hz:.0f} frames/s, {subscriptions} subscriptions"
+
     def _calibration(self) -> dict[str, Any]:
         tier, modelled_ms = self._imaging.given
         source = self._imaging.calibration.source
