@@ -44,7 +44,7 @@ from tactomo_models import (
     load_or_build_artifact,
 )
 from tactomo_models.calibration import Calibration, calibration_for
-from tactomo_models.reconstruct import check_tier
+from tactomo_models.tier import check_tier
 from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
 

@@ -26,10 +26,11 @@ from tactomo_models.description import (
 )
 from tactomo_models.errors import ArtifactError, DataError, DescriptionError, ModelError
 from tactomo_models.plausibility import Flag
-from tactomo_models.reconstruct import METHODS, Reconstruction, Reconstructor, Tier
+from tactomo_models.reconstruct import Reconstruction, Reconstructor
 from tactomo_models.reference import Reference
 from tactomo_models.scene import Press
 from tactomo_models.simulator import SkinSimulator
+from tactomo_models.tier import METHODS, Tier
 
 __all__ = [
     "METHODS",

@@ -14,8 +14,9 @@ from threadpoolctl import threadpool_limits
 from tactomo_models.archive import read_arrays
 from tactomo_models.description import SensorDescription
 from tactomo_models.errors import DataError
-from tactomo_models.reconstruct import METHODS, Reconstruction, Reconstructor, Tier
+from tactomo_models.reconstruct import Reconstruction, Reconstructor
 from tactomo_models.reference import Reference, noise_of_reciprocity
+from tactomo_models.tier import METHODS, Tier
 
 FloatArray = NDArray[np.float64]
 Progress = Callable[[int, int], None]

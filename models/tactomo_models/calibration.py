@@ -27,7 +27,7 @@ from tactomo_models.archive import write_whole
 from tactomo_models.artifact import default_path
 from tactomo_models.description import SensorDescription
 from tactomo_models.errors import ArtifactError, explain
-from tactomo_models.reconstruct import METHODS, Tier, check_tier
+from tactomo_models.tier import METHODS, Tier, check_tier
 
 SHIPPED: Final = "shipped_calibration.json"
 AGAIN: Final = "run: tactomo bench --calibrate"

@@ -238,6 +238,27 @@ class SensorDescription(_Section):
         both: tuple[Modality, ...] = ("magnitude", "structure")
         return tuple(name for name in both if getattr(self, name) is not None)
 
+    def strongest_ratio(self, channel: Modality) -> float:
+        """Factor on a channel's conductivity where it is pressed hardest; never 1."""
+        if channel == "magnitude":
+            assert self.magnitude is not None
+            return 1 + self.magnitude.response.relative_change[-1]
+        assert self.structure is not None
+        return self.structure.saturated_ratio
+
+    def contrast(self, channel: Modality) -> float:
+        """The same as a factor above 1, up or down."""
+        ratio = self.strongest_ratio(channel)
+        return max(ratio, 1 / ratio)
+
+    def sign(self, channel: Modality) -> float:
+        """1.0 where pressing makes a channel conduct better, -1.0 where worse."""
+        return 1.0 if self.strongest_ratio(channel) > 1 else -1.0
+
+    def either_way(self, channel: Modality) -> bool:
+        """Whether objects may conduct better or worse than the sheet."""
+        return channel == "structure" and self.structure is not None and self.structure.either_way
+
     @property
     def electrode_count(self) -> int:
         """Number of electrodes of one sheet."""

@@ -13,25 +13,17 @@ counted in modelled work, so that a recording reconstructs exactly as the live s
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from enum import StrEnum, auto
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
-from tactomo_models.artifact import (
-    MODEL_ERROR,
-    TYPICAL_CHANGE,
-    Artifact,
-    central_target,
-    load_or_build_artifact,
-    nominal_noise_v,
-)
+from tactomo_models.artifact import Artifact, load_or_build_artifact
+from tactomo_models.changes import WRONG_WAY, Changes, MeasuredChannel, missing
 from tactomo_models.contacts import (
     AreaFinder,
     Areas,
@@ -45,53 +37,22 @@ from tactomo_models.contacts import (
     without_holes,
 )
 from tactomo_models.description import Modality, SensorDescription
-from tactomo_models.errors import DataError
 from tactomo_models.following import Freedom, ShapeFollower
 from tactomo_models.forward import ForwardModel
-from tactomo_models.network import (
-    NONE_TRAINED,
-    NetworkImage,
-    NetworkKind,
-    SensorNetworks,
-    load_network,
-)
+from tactomo_models.network import NONE_TRAINED, NetworkImage, SensorNetworks
 from tactomo_models.objects import ObjectFollower
 from tactomo_models.outlines import Outlines, ellipses_of
 from tactomo_models.paper_level_set import PaperLevelSet
-from tactomo_models.plausibility import (
-    Flag,
-    ScanCheck,
-    Wiring,
-    asymmetry_of,
-    examine_reference,
-)
+from tactomo_models.plausibility import Flag, Wiring
 from tactomo_models.redrawing import Drawing, MagnitudeData, Redrawer, SecondOpinion
-from tactomo_models.reference import Reference, noise_of_reciprocity
+from tactomo_models.reference import Reference
 from tactomo_models.shape_fit import Shape
-from tactomo_models.tikhonov import (
-    EVEN,
-    even_spread,
-    noise_figure_weight,
-    noser_spread,
-    prior_weight,
-    tikhonov_matrix,
-)
+from tactomo_models.tier import LINEAR, NETWORKS_OF, PAPER_NETWORKS, Tier, check_tier
 
 FloatArray = NDArray[np.float64]
 Image = NDArray[np.float32]
 
 DEFAULT_BUDGET_S = 0.05
-CHANGE_ERROR = 0.01  # least model error, as a share of a change and of a typical one
-MISMATCH_SHARE = 1 / 3  # of the reference's mismatch that is left in the changes
-# An uneven sheet has few degrees of freedom: errors of the model go together, about as many
-# voltages at a time, and average out so much less than noise does.
-CORRELATED = 10.0
-STILL_SHARE = 0.01  # of the model error's variance, that a still scene may change by
-MEDIAN_SQUARE = 0.455  # of a normal distribution of unit variance
-FALSE_ALARM = 1e-6  # chance that an unpressed frame of pure noise is taken for a pressed one
-TRACE = 1e-9  # relative noise of data that have none
-UNUSABLE = 1e3  # relative error of a voltage whose reference is zero or no number
-MOST_INVALID = 0.5  # share of voltages that may be invalid before the channel is given up
 BAD_MISFIT = 2.0  # the data are not explained: what is shown may be wrong
 SWAPPED = 2.0  # times the structure channel's signal that the magnitude channel's never reaches
 MUCH_MORE = 5.0  # ratio of the channels' contrasts (logarithms) for that
@@ -103,34 +64,8 @@ SURE_CONFIDENCE = 0.9  # ... from which one is, although the physics cannot expl
 SURE_SHARE = 0.85  # of the second opinion, from which contacts are its own: outlines know theirs
 UNSURE_MISFIT = 1.5  # of both channels together
 UNSURE_MAGNITUDE = 0.5  # uncertainty of all magnitudes together, share of themselves
-WRONG_WAY = 5.0  # standard uncertainties by which a conductivity may change against its sign
 
 
-class Tier(StrEnum):
-    """How much model a scene was given."""
-
-    AUTO = auto()  # as a request only: as much as the scene needs
-    QUIET = auto()  # nothing pressed: a test and no solve
-    TIKHONOV = auto()  # one linear step, every node alike
-    NOSER = auto()  # one linear step, nodes weighted by how well they are seen
-    PLS_PAPER = "pls-paper"  # the paper's level set, linear in the bare sheet's Jacobian, cold
-    FIT = auto()  # a few outlines on the structure channel, magnitudes fitted to their areas
-    LEVELSET = auto()  # a level set there instead: shapes of any form
-    NETWORK = auto()  # our fusion network alone
-    HYBRID = auto()  # the network proposes, outlines are refined and judged by the physics
-    CNN_SINGLE = "cnn-single"  # the paper's network, of the magnitude channel's Tikhonov image
-    CNN_MULTIMODAL = "cnn-multimodal"  # ... and of the structure channel's pls-paper image
-
-
-METHODS: Final = tuple(tier for tier in Tier if tier is not Tier.QUIET)  # that may be asked for
-LINEAR: Final = (Tier.TIKHONOV, Tier.NOSER)
-PAPER_NETWORKS: Final = (Tier.CNN_SINGLE, Tier.CNN_MULTIMODAL)
-NETWORKS_OF: Final[dict[Tier, tuple[NetworkKind, ...]]] = {  # what they cannot do without
-    Tier.NETWORK: ("network",),
-    Tier.HYBRID: ("network", "refiner"),
-    Tier.CNN_SINGLE: ("cnn-single",),
-    Tier.CNN_MULTIMODAL: ("cnn-multimodal",),
-}
 FREEDOM: Final = {Tier.FIT: Freedom.OUTLINES, Tier.LEVELSET: Freedom.LEVEL_SET}  # else as needed
 
 
@@ -167,79 +102,6 @@ class Reconstruction:
     confidence: float = float("nan")
 
 
-class _MadeWhenAsked(dict[Tier, Image]):
-    """Reconstruction matrices by method."""
-
-    def __init__(self, make: Callable[[Tier], Image]) -> None:
-        super().__init__()
-        self._make = make
-
-    def __missing__(self, method: Tier) -> Image:
-        self[method] = self._make(method)
-        return self[method]
-
-
-@dataclass(frozen=True)
-class _Channel:
-    """What is known of one channel since the last tare.
-
-    Attributes:
-        reference: (M,) volts; 0 where it is invalid.
-        valid: (M,) where there is a reference to measure changes against.
-        per_volt: (M,) relative change that a volt makes; 0 where the reference is invalid.
-        noise: (M,) variance of a relative change, by noise of scan and reference.
-        variance: (M,) that of a change where nothing presses, drift included.
-        mismatch: typical relative error of the model's prediction of the reference.
-        flags: what is wrong with the reference.
-        electrodes: those that the reference shows to be faulty.
-        check: what scans are held against.
-        total: (M,) weights of the changes whose sum is the change of the whole sheet in the
-            direction of pressing; 0 where objects change it either way.
-        matrices: (P, M) reconstruction matrix of each linear method for that noise, in single
-            precision: the rounding is far below the noise, and the product is bound by memory.
-            They take a tenth of a second, so that each is made when it is first needed.
-    """
-
-    reference: FloatArray
-    valid: NDArray[np.bool_]
-    per_volt: FloatArray
-    noise: FloatArray
-    variance: FloatArray
-    mismatch: float
-    flags: Flag
-    electrodes: tuple[int, ...]
-    check: ScanCheck
-    total: FloatArray
-    matrices: _MadeWhenAsked
-
-
-@dataclass(frozen=True)
-class _Data:
-    """Relative voltage changes of one scan.
-
-    Attributes:
-        change: (M,) 0 where it is invalid.
-        weight: (M,) inverse standard deviations, of noise and of model error; 0 where invalid.
-        spread: (M,) factor on variances because model errors go together.
-        between: (M,) variances of each of two frames' changes, where the scene is still.
-        quiet: whether nothing presses.
-    """
-
-    change: FloatArray
-    weight: FloatArray
-    spread: FloatArray
-    between: FloatArray
-    quiet: bool
-    signal: float  # rms of the changes over their noise
-    certainty: FloatArray  # (M,) inverse variances of the changes by noise; 0 where invalid
-
-    @property
-    def misfit(self) -> float:
-        """Misfit of a model in which nothing is pressed."""
-        count = max(int(np.count_nonzero(self.weight)), 1)
-        return float(np.sqrt(((self.weight * self.change) ** 2).sum() / count))
-
-
 @dataclass(frozen=True)
 class _Shown:
     """What was made of a shape: it serves again while the shape stays as it is."""
@@ -260,6 +122,7 @@ class Reconstructor:
         tier: the most that is done; `Tier.AUTO` does what the scene needs.
         budget_s: compute time a frame may take, on a machine of the 2.5 GHz class.
         redraw: whether the refining network has the last word on what the physics has found.
+        regularisation: factor on what a rule chooses for the linear methods.
 
     Raises:
         ArtifactError: the artifact or the tier's network cannot be used.
@@ -275,11 +138,13 @@ class Reconstructor:
         tier: Tier = Tier.AUTO,
         budget_s: float | None = None,
         redraw: bool = True,
+        regularisation: float = 1.0,
     ) -> None:
         self.description = description
         self._tier = tier
         self.budget_s = budget_s
         self._redraw = redraw
+        self._regularisation = regularisation
         if redraw:
             check_tier(description, tier)
         self._artifact = artifact or load_or_build_artifact(description)
@@ -294,7 +159,7 @@ class Reconstructor:
                 self._follower = ObjectFollower(self._forward, ratio, self._object_image)
             else:
                 self._follower = ShapeFollower(self._forward, ratio)
-        self._channels: dict[Modality, _Channel] = {}
+        self._channels: dict[Modality, MeasuredChannel] = {}
         self._tracker = Tracker()
         self._magnitudes = MagnitudeFollower(self._forward)
         self._shown: _Shown | None = None
@@ -303,8 +168,8 @@ class Reconstructor:
         self._left_out: list[str] = []
         self._networks = SensorNetworks(description)
         self._structure_answers_more = len(description.modalities) == 2 and bool(
-            np.log(_contrast(description, "structure"))
-            > MUCH_MORE * np.log(_contrast(description, "magnitude"))
+            np.log(description.contrast("structure"))
+            > MUCH_MORE * np.log(description.contrast("magnitude"))
         )
         self._make_ready()
 
@@ -317,7 +182,17 @@ class Reconstructor:
         volts = {"magnitude": reference.magnitude, "structure": reference.structure}
         noise = {"magnitude": reference.magnitude_noise, "structure": reference.structure_noise}
         self._channels = {
-            name: self._prepare(name, scan, noise[name], reference.scans)
+            name: MeasuredChannel(
+                self.description,
+                self._artifact,
+                self._forward,
+                self._wiring,
+                name,
+                scan,
+                noise[name],
+                reference.scans,
+                self._regularisation,
+            )
             for name in self.description.modalities
             if (scan := volts[name]) is not None
         }
@@ -346,66 +221,7 @@ class Reconstructor:
         _ = self._proposes
         if self.tier in LINEAR:
             for channel in self._channels.values():
-                _ = channel.matrices[self.tier]
-
-    def _prepare(
-        self, name: Modality, volts: FloatArray, noise: FloatArray | None, scans: int
-    ) -> _Channel:
-        if volts.shape != (self.description.measurements,):
-            raise DataError(
-                f"the {name} reference has shape {volts.shape}; sensor "
-                f"{self.description.name!r} has {self.description.measurements} voltages a scan"
-            )
-        predicted = self._forward.bare_voltages
-        if noise is None:
-            noise = noise_of_reciprocity(self.description, volts)
-        if noise is None:
-            noise = nominal_noise_v(volts)
-        contrast = _contrast(self.description, name)
-        verdict = examine_reference(
-            self._wiring, volts, predicted, noise / np.sqrt(scans), contrast
-        )
-        valid = verdict.usable
-        reference = np.where(valid, volts, 0.0)
-        per_volt = np.divide(1, np.abs(reference), out=np.zeros_like(reference), where=valid)
-        noise = np.where(valid, noise, 0.0)
-        relative = np.hypot(noise * per_volt * np.sqrt(1 + 1 / scans), MODEL_ERROR)
-        relative = np.where(valid, relative, UNUSABLE)
-        matrices = _MadeWhenAsked(lambda method: self._matrix(name, method, relative))
-        direction = 0.0 if self._either_way(name) else self._sign(name)
-        return _Channel(
-            reference=reference,
-            valid=valid,
-            per_volt=per_volt,
-            noise=np.maximum(relative**2 - MODEL_ERROR**2, TRACE**2),
-            variance=relative**2,
-            mismatch=_mismatch(reference[valid], predicted[valid]),
-            flags=verdict.flags,
-            electrodes=verdict.electrodes,
-            check=ScanCheck(
-                self._wiring,
-                reference,
-                noise,
-                valid,
-                contrast,
-                asymmetry_of(self._wiring, reference),
-            ),
-            total=direction * self._artifact.tikhonov.sum(axis=0),
-            matrices=matrices,
-        )
-
-    def _matrix(self, name: Modality, method: Tier, noise: FloatArray) -> Image:
-        jacobian = self._artifact.jacobian
-        if name == "magnitude":
-            even = even_spread(self._forward.node_areas_m2)
-            spread = noser_spread(jacobian, noise) if method is Tier.NOSER else even
-            weight = prior_weight(TYPICAL_CHANGE, spread)
-            return tikhonov_matrix(jacobian, noise, weight, spread).astype(np.float32)
-        # The structure channel changes far beyond what is linear: how much says no prior.
-        target = central_target(self.description, self._artifact.bare)
-        spread = noser_spread(jacobian, noise) if method is Tier.NOSER else EVEN
-        weight = noise_figure_weight(jacobian, noise, target, spread)
-        return tikhonov_matrix(jacobian, noise, weight, spread).astype(np.float32)
+                channel.matrix(self.tier)
 
     def reset(self) -> None:
         """Forget the warm start and which contacts were which."""
@@ -440,7 +256,7 @@ class Reconstructor:
         self._stage_s = {}
         self._left_out = [self._unusable_network] if self._unusable_network else []
         flags = Flag(0)
-        data: dict[Modality, _Data] = {}
+        data: dict[Modality, Changes] = {}
         with self._timed("data"):
             for name, scan in (("magnitude", magnitude), ("structure", structure)):
                 if name in self.description.modalities:
@@ -451,7 +267,7 @@ class Reconstructor:
         reason = "; ".join([made.reason, *self._left_out])
         return replace(made, reason=reason, stage_s=self._stage_s)
 
-    def _swapped(self, data: dict[Modality, _Data]) -> bool:
+    def _swapped(self, data: dict[Modality, Changes]) -> bool:
         """Tell whether the magnitude channel answers more than the structure channel.
 
         The structure channel's contrast is far the larger, so that no pressing does that.
@@ -464,51 +280,24 @@ class Reconstructor:
         self,
         name: Modality,
         scan: FloatArray | None,
-        data: dict[Modality, _Data],
+        data: dict[Modality, Changes],
         *,
         saturated: bool,
     ) -> Flag:
         """Put a channel's relative changes into `data`, or say by a flag why it has none."""
-        missing = Flag.MAGNITUDE_MISSING if name == "magnitude" else Flag.STRUCTURE_MISSING
         if scan is None:
-            return missing
-        if scan.shape != (self.description.measurements,):
-            raise DataError(
-                f"a {name} scan has shape {scan.shape}; sensor {self.description.name!r} has "
-                f"{self.description.measurements} voltages a scan"
-            )
+            return missing(name)
         channel = self._channels.get(name)
         if channel is None:
-            return missing | Flag.NO_REFERENCE
-        verdict = channel.check.examine(scan, saturated=saturated)
-        valid, flags = verdict.usable, channel.flags | verdict.flags
-        if electrodes := sorted({*channel.electrodes, *verdict.electrodes}):
+            return missing(name) | Flag.NO_REFERENCE
+        changes, flags, electrodes = channel.take(scan, saturated=saturated)
+        if electrodes:
             self._left_out.append(_named(name, electrodes))
-        count = int(np.count_nonzero(valid))
-        if count < (1 - MOST_INVALID) * len(scan) or not scan[valid].any():
-            return flags | missing | Flag.INVALID_VOLTAGE
-        change = np.where(valid, scan - channel.reference, 0.0) * channel.per_volt
-        square = change * change
-        grown = verdict.noise**2
-        variance = channel.variance * grown
-        # A model that is wrong about the reference is wrong about the changes, too, if less: most
-        # of its error divides out. Small changes share in the error of the large ones beside them.
-        share = max(CHANGE_ERROR, MISMATCH_SHARE * channel.mismatch)
-        typical = float(np.median(square[valid])) / MEDIAN_SQUARE
-        noise, error = channel.noise * grown, share**2 * (square + typical)
-        weight = valid / np.sqrt(noise + error)
-        spread = 1 + (CORRELATED - 1) * error / (noise + error)
-        statistic = float((square / variance).sum())
-        quiet = statistic < _noise_limit(count)
-        if not (quiet or electrodes) and _fell(channel.total * change, channel.total**2 * variance):
-            flags |= Flag.REFERENCE_MISMATCH
-        # What is far below the model's error is not worth a solve either.
-        between = noise + STILL_SHARE * error
-        signal = (statistic / count) ** 0.5
-        data[name] = _Data(change, weight, spread, between, quiet, signal, valid / variance)
+        if changes is not None:
+            data[name] = changes
         return flags
 
-    def _by_tier(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
+    def _by_tier(self, data: dict[Modality, Changes], flags: Flag) -> Reconstruction:
         if not data:
             return Reconstruction(
                 None, None, None, (), Tier.QUIET, "no usable scan", float("nan"), flags
@@ -536,7 +325,7 @@ class Reconstructor:
             return self._linear(data, flags, Tier.TIKHONOV, why)
         return self._by_shape(data, flags)
 
-    def _quiet(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
+    def _quiet(self, data: dict[Modality, Changes], flags: Flag) -> Reconstruction:
         blank = np.zeros((self.description.map.nodes_y, self.description.map.nodes_x), np.float32)
         magnitude = blank if "magnitude" in data else None
         misfit = max(d.misfit for d in data.values())
@@ -554,7 +343,7 @@ class Reconstructor:
         )
 
     def _linear(
-        self, data: dict[Modality, _Data], flags: Flag, method: Tier, reason: str
+        self, data: dict[Modality, Changes], flags: Flag, method: Tier, reason: str
     ) -> Reconstruction:
         """Linear images of both channels; areas above half of the clearest one's peak."""
         self._forget_shape()
@@ -589,18 +378,14 @@ class Reconstructor:
 
     def _linear_image(self, name: Modality, change: FloatArray, method: Tier) -> Image:
         """Linear image (P,) of the change in the channel's own direction; the rest cut off."""
-        signed = self._sign(name) * change
-        image = self._channels[name].matrices[method] @ signed.astype(np.float32)
-        return image if self._either_way(name) else np.maximum(image, 0.0, out=image)
+        signed = self.description.sign(name) * change
+        image = self._channels[name].matrix(method) @ signed.astype(np.float32)
+        return image if self.description.either_way(name) else np.maximum(image, 0.0, out=image)
 
     def _object_image(self, change: FloatArray) -> FloatArray:
         return self._linear_image("structure", change, Tier.NOSER).astype(np.float64)
 
-    def _either_way(self, name: Modality) -> bool:
-        structure = self.description.structure
-        return name == "structure" and structure is not None and structure.either_way
-
-    def _linear_magnitudes(self, areas: Areas, data: dict[Modality, _Data]) -> Magnitudes | None:
+    def _linear_magnitudes(self, areas: Areas, data: dict[Modality, Changes]) -> Magnitudes | None:
         """Magnitudes of a linear method: no forward solve, the bare sheet's Jacobian says all."""
         if "magnitude" not in data or not len(areas):
             return None
@@ -608,32 +393,27 @@ class Reconstructor:
         taken = data["magnitude"]
         return linear_magnitudes(tangent, taken.change, taken.weight, taken.spread)
 
-    def _sign(self, name: Modality) -> float:
-        if name == "magnitude":
-            assert self.description.magnitude is not None
-            return self.description.magnitude.response.sign
-        assert self.description.structure is not None
-        return 1.0 if self.description.structure.saturated_ratio > 1 else -1.0
-
     def _on_map(self, nodes: FloatArray | Image) -> FloatArray:
         shape = (self.description.map.nodes_y, self.description.map.nodes_x)
         return np.asarray(self._artifact.bare.map_weights @ nodes).reshape(shape)
 
-    def _by_network(self, data: dict[Modality, _Data], flags: Flag, reason: str) -> Reconstruction:
+    def _by_network(
+        self, data: dict[Modality, Changes], flags: Flag, reason: str
+    ) -> Reconstruction:
         """Our network's images; its shapes' areas carry what its map shows in them."""
         self._forget_shape()
         with self._timed("network"):
             image = self._network_image(data)
         return self._imaged(image, data, flags, Tier.NETWORK, reason)
 
-    def _network_image(self, data: dict[Modality, _Data]) -> NetworkImage:
+    def _network_image(self, data: dict[Modality, Changes]) -> NetworkImage:
         return self._networks.fusion.image(*self._network_data(data))
 
     def _network_data(
-        self, data: dict[Modality, _Data]
+        self, data: dict[Modality, Changes]
     ) -> tuple[dict[Modality, FloatArray], dict[Modality, FloatArray]]:
         """Changes in the direction of pressing, and their inverse variances by noise."""
-        changes = {name: self._sign(name) * d.change for name, d in data.items()}
+        changes = {name: self.description.sign(name) * d.change for name, d in data.items()}
         return changes, {name: d.certainty for name, d in data.items()}
 
     def network_inputs(self, magnitude: FloatArray, structure: FloatArray) -> FloatArray:
@@ -642,13 +422,13 @@ class Reconstructor:
             *self._network_data(self._taken(magnitude, structure))
         )
 
-    def _taken(self, magnitude: FloatArray, structure: FloatArray) -> dict[Modality, _Data]:
-        data: dict[Modality, _Data] = {}
+    def _taken(self, magnitude: FloatArray, structure: FloatArray) -> dict[Modality, Changes]:
+        data: dict[Modality, Changes] = {}
         self._take("magnitude", magnitude, data, saturated=False)
         self._take("structure", structure, data, saturated=False)
         return data
 
-    def _by_paper_network(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
+    def _by_paper_network(self, data: dict[Modality, Changes], flags: Flag) -> Reconstruction:
         """The paper's network; areas are where its map exceeds half of its peak."""
         self._forget_shape()
         network = self._networks.paper(NETWORKS_OF[self.tier][0])
@@ -659,7 +439,7 @@ class Reconstructor:
         return self._imaged(image, data, flags, self.tier, "as requested")
 
     def _preliminary_images(
-        self, data: dict[Modality, _Data], modalities: Collection[Modality]
+        self, data: dict[Modality, Changes], modalities: Collection[Modality]
     ) -> dict[Modality, FloatArray]:
         """What the paper's networks are given: see `network.preprocessed`; 0 without a scan."""
         blank = np.zeros((self.description.map.nodes_y, self.description.map.nodes_x))
@@ -667,7 +447,7 @@ class Reconstructor:
         if "magnitude" in data and "magnitude" in modalities:
             # The artifact's matrix, whose regularisation is fixed, as the paper's is: what a
             # network was trained on must not depend on the noise.
-            signed = self._sign("magnitude") * data["magnitude"].change
+            signed = self.description.sign("magnitude") * data["magnitude"].change
             images["magnitude"] = self._on_map(self._artifact.tikhonov @ signed)
         if "structure" in data and "structure" in modalities:
             images["structure"] = self._on_map(self._paper_shape(data["structure"]).coverage)
@@ -688,7 +468,7 @@ class Reconstructor:
     def _imaged(
         self,
         image: NetworkImage,
-        data: dict[Modality, _Data],
+        data: dict[Modality, Changes],
         flags: Flag,
         tier: Tier,
         reason: str,
@@ -719,7 +499,7 @@ class Reconstructor:
             confidence=image.confidence,
         )
 
-    def _by_shape(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction:
+    def _by_shape(self, data: dict[Modality, Changes], flags: Flag) -> Reconstruction:
         """Shapes on the structure channel, and a magnitude for each of their areas."""
         self._frames_held = 0
         with self._timed("shape"):
@@ -743,11 +523,11 @@ class Reconstructor:
                 flags |= Flag.LOW_CONFIDENCE
         magnitude, pressure = None, None
         if "magnitude" in data:
-            magnitude = own.map(self._sign("magnitude"))
+            magnitude = own.map(self.description.sign("magnitude"))
             kpa = np.array([c.pressure_kpa for c in contacts])
             pressure = _fused(shown.areas, kpa, own.pressed.shape)
         if second is not None and magnitude is not None:
-            other = second.drawing.map(self._sign("magnitude"))
+            other = second.drawing.map(self.description.sign("magnitude"))
             magnitude += second.share * (other - magnitude)
         return Reconstruction(
             map=None if magnitude is None else magnitude.astype(np.float32),
@@ -762,7 +542,7 @@ class Reconstructor:
         )
 
     def _unexplained(
-        self, shape: Shape, shown: Drawing, data: dict[Modality, _Data], strict: bool
+        self, shape: Shape, shown: Drawing, data: dict[Modality, Changes], strict: bool
     ) -> bool:
         """Tell whether the data say that something else presses.
 
@@ -776,7 +556,7 @@ class Reconstructor:
         return strict and bool(np.hypot(shape.misfit, other) > np.sqrt(2) * UNSURE_MISFIT)
 
     def _network_instead(
-        self, shape: Shape, data: dict[Modality, _Data], flags: Flag
+        self, shape: Shape, data: dict[Modality, Changes], flags: Flag
     ) -> Reconstruction:
         """Our network's frame where no shape with even pressures explains the data.
 
@@ -789,7 +569,7 @@ class Reconstructor:
         made = self._imaged(image, data, flags, Tier.NETWORK, "no even presses explain the data")
         return replace(made, misfit=shape.misfit)
 
-    def _drawing_of(self, shape: Shape, data: dict[Modality, _Data], solves: int) -> Drawing:
+    def _drawing_of(self, shape: Shape, data: dict[Modality, Changes], solves: int) -> Drawing:
         """The physics' account of a shape."""
         areas, pressed = self._areas_of(shape, data["structure"])
         fitted = self._fit_magnitudes(areas, data, solves)
@@ -799,7 +579,7 @@ class Reconstructor:
         return Drawing(areas, pressed, fitted)
 
     def _second_opinion(
-        self, own: Drawing, data: dict[Modality, _Data], solves: int
+        self, own: Drawing, data: dict[Modality, Changes], solves: int
     ) -> SecondOpinion | None:
         if not (self._redraw and self._proposes) or own.fitted is None:
             return None
@@ -807,7 +587,7 @@ class Reconstructor:
             taken = data["magnitude"]
             return self._redrawer.redraw(
                 own,
-                self._sign("magnitude"),
+                self.description.sign("magnitude"),
                 *self._network_data(data),
                 MagnitudeData(taken.change, taken.weight, taken.spread, taken.between),
                 solves,
@@ -817,7 +597,7 @@ class Reconstructor:
     def _redrawer(self) -> Redrawer:
         return Redrawer(self._forward, self._areas, self._networks.refiner)
 
-    def _held(self, data: dict[Modality, _Data], flags: Flag) -> Reconstruction | None:
+    def _held(self, data: dict[Modality, Changes], flags: Flag) -> Reconstruction | None:
         """Bridge a lost structure scan with the last shape, as long as it explains the other."""
         self._frames_held += 1
         if self._shown is None or self._frames_held > MOST_HELD:
@@ -840,7 +620,7 @@ class Reconstructor:
             flags=flags,
         )
 
-    def _shape_of(self, data: dict[Modality, _Data], budget_s: float) -> tuple[Shape, str]:
+    def _shape_of(self, data: dict[Modality, Changes], budget_s: float) -> tuple[Shape, str]:
         assert self._follower is not None
         structure = data["structure"]
         change, weight, spread = structure.change, structure.weight, structure.spread
@@ -854,7 +634,7 @@ class Reconstructor:
         propose = (lambda: self._proposed(data)) if self._proposes else None
         return self._follower.follow(change, weight, spread, between, budget_s, freedom, propose)
 
-    def _proposed(self, data: dict[Modality, _Data]) -> FloatArray:
+    def _proposed(self, data: dict[Modality, Changes]) -> FloatArray:
         """Ellipses that the network's shape suggests, to be refined and judged by the physics."""
         with self._timed("network"):
             pressed = self._network_image(data).structure
@@ -867,7 +647,7 @@ class Reconstructor:
         """Whether networks help the physics."""
         return self.tier is Tier.HYBRID or (self.tier is Tier.AUTO and not self._networks.missing)
 
-    def _paper_shape(self, structure: _Data) -> Shape:
+    def _paper_shape(self, structure: Changes) -> Shape:
         image = np.maximum(self._linear_image("structure", structure.change, Tier.TIKHONOV), 0.0)
         return self._paper.fit(structure.change, structure.weight, image)
 
@@ -884,7 +664,7 @@ class Reconstructor:
         return PaperLevelSet(self._forward, self._jacobian_by_node, ratio)
 
     def _magnitude_unexplained(
-        self, data: dict[Modality, _Data], fitted: Magnitudes | None, bad_misfit: float
+        self, data: dict[Modality, Changes], fitted: Magnitudes | None, bad_misfit: float
     ) -> bool:
         """Tell whether the contacts shown leave the magnitude channel's changes unexplained.
 
@@ -895,10 +675,10 @@ class Reconstructor:
             return False
         if fitted is None:
             return data["magnitude"].misfit > bad_misfit
-        wrong_way = self._sign("magnitude") * fitted.change < -WRONG_WAY * fitted.sigma
+        wrong_way = self.description.sign("magnitude") * fitted.change < -WRONG_WAY * fitted.sigma
         return fitted.misfit > bad_misfit or bool(wrong_way.any())
 
-    def _areas_of(self, shape: Shape, structure: _Data) -> tuple[Areas, FloatArray]:
+    def _areas_of(self, shape: Shape, structure: Changes) -> tuple[Areas, FloatArray]:
         """Areas of a shape and its map; those of the frame before while it has not moved."""
         assert self._follower is not None
         if self._shown is not None and self._shown.pressed is shape.pressed:
@@ -918,7 +698,7 @@ class Reconstructor:
         unasked = not self._shown.holes_sought and isinstance(shape.family, Outlines)
         return unasked and shape.converged and fitted.misfit > HOLLOW_MISFIT
 
-    def _hollowed(self, shape: Shape, magnitude: _Data) -> tuple[Areas, FloatArray]:
+    def _hollowed(self, shape: Shape, magnitude: Changes) -> tuple[Areas, FloatArray]:
         """The shape's areas and map with the holes of rings taken out."""
         assert self._shown is not None
         assert isinstance(shape.family, Outlines)
@@ -933,7 +713,7 @@ class Reconstructor:
         return areas, on_map
 
     def _fit_magnitudes(
-        self, areas: Areas, data: dict[Modality, _Data], solves: int
+        self, areas: Areas, data: dict[Modality, Changes], solves: int
     ) -> Magnitudes | None:
         if "magnitude" not in data:
             self._magnitudes.forget()
@@ -945,7 +725,8 @@ class Reconstructor:
         unknown = np.full(len(areas), np.nan)
         size, sigma = unknown, unknown
         if fitted is not None:
-            size, sigma = np.maximum(self._sign("magnitude") * fitted.change, 0.0), fitted.sigma
+            sign, sigma = self.description.sign("magnitude"), fitted.sigma
+            size = np.maximum(sign * fitted.change, 0.0)
         return self._contacts_of(areas, size, sigma)
 
     def _contacts_of(
@@ -976,16 +757,6 @@ class Reconstructor:
         self._stage_s[stage] = self._stage_s.get(stage, 0.0) + time.perf_counter() - start
 
 
-def check_tier(description: SensorDescription, tier: Tier) -> None:
-    """Make sure that a sensor can be reconstructed that way.
-
-    Raises:
-        ArtifactError: the network that it takes is missing or cannot be used.
-    """
-    for kind in NETWORKS_OF.get(tier, ()):
-        load_network(description, kind)
-
-
 def _unsure(drawing: Drawing) -> bool:
     """Tell whether the magnitudes are hardly known."""
     assert drawing.fitted is not None
@@ -994,45 +765,10 @@ def _unsure(drawing: Drawing) -> bool:
     return bool(unknown > UNSURE_MAGNITUDE**2 * known)
 
 
-@cache
-def _noise_limit(count: int) -> float:
-    """Sum of squares that noise alone in so many voltages stays below, but for false alarms."""
-    return float(chi2.isf(FALSE_ALARM, count))
-
-
-def _contrast(description: SensorDescription, name: Modality) -> float:
-    """Factor, above 1, by which pressing changes a channel's conductivity at most, up or down."""
-    if name == "magnitude":
-        assert description.magnitude is not None
-        ratio = 1 + description.magnitude.response.relative_change[-1]
-    else:
-        assert description.structure is not None
-        ratio = description.structure.saturated_ratio
-    return max(ratio, 1 / ratio)
-
-
-def _fell(total: FloatArray, variance: FloatArray) -> bool:
-    """Tell whether the sheet as a whole changed against the sign that pressing has.
-
-    Then less presses now than did at the tare.
-    """
-    return float(total.sum()) < -WRONG_WAY * float(np.sqrt(variance.sum()))
-
-
 def _named(name: Modality, electrodes: list[int]) -> str:
     """Say in words which electrodes are left out; they are counted from 0."""
     word = "electrode" if len(electrodes) == 1 else "electrodes"
     return f"{name} {word} {', '.join(map(str, electrodes))} left out"
-
-
-def _mismatch(reference: FloatArray, predicted: FloatArray) -> float:
-    """Typical relative error of a model that may be off by a common factor; 1 where none fits."""
-    ratio = reference / predicted
-    if len(ratio) == 0:
-        return 1.0
-    middle = float(np.median(ratio))
-    # 0.6745 standard deviations hold half of a normal distribution.
-    return float(np.median(np.abs(ratio / middle - 1))) / 0.6745
 
 
 def _fused(areas: Areas, values: FloatArray, shape: tuple[int, ...]) -> Image:

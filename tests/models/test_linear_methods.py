@@ -10,7 +10,7 @@ from noisy_skin import Skin
 from tactomo_models import Artifact, Press, Reconstructor, SensorDescription, Tier
 from tactomo_models.artifact import central_target, nominal_noise
 from tactomo_models.forward import ForwardModel
-from tactomo_models.reconstruct import LINEAR
+from tactomo_models.tier import LINEAR
 from tactomo_models.tikhonov import (
     EVEN,
     NOSER_POWER,

@@ -53,7 +53,7 @@ from tactomo_models.evaluation.paper_claims import SINGLE as SINGLE_CNN
 from tactomo_models.evaluation.scenes import MODALITIES, gap_m, outline_of
 from tactomo_models.evaluation.simulation import truth_of
 from tactomo_models.evaluation.still import reconstruct_scenes
-from tactomo_models.reconstruct import Tier
+from tactomo_models.tier import Tier
 
 FloatArray = NDArray[np.float64]
 SHORT = [replace(case, pressures_kpa=((200.0,),)) for case in SINGLE[:2]]

@@ -206,7 +206,7 @@ def test_regularisation_is_so_many_times_what_the_rule_chooses(
     plan = replace(case.plan, regularisation=1.0)
     right = by(method, replace(case, plan=plan), small_artifact).frame.map
     monkeypatch.setattr(
-        "tactomo_models.reconstruct.prior_weight",
+        "tactomo_models.changes.prior_weight",
         lambda *given: factor * linear.prior_weight(*given),
     )
     expected = by(method, replace(case, plan=plan), small_artifact).frame.map

@@ -43,7 +43,7 @@ from tactomo_models.batch import BUDGET_S
 from tactomo_models.evaluation.measures import DISTRUST
 from tactomo_models.evaluation.trade_off import BUDGETED
 from tactomo_models.mesh import mesh_sheet
-from tactomo_models.reconstruct import LINEAR
+from tactomo_models.tier import LINEAR
 from threadpoolctl import threadpool_limits
 
 from tactomo.twin import make_skin

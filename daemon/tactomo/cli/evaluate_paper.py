@@ -168,7 +168,7 @@ def _figures(text: str) -> set[int]:
 
 
 def _methods(text: str) -> tuple[str, ...]:
-    from tactomo_models.reconstruct import METHODS
+    from tactomo_models.tier import METHODS
 
     names = tuple(part.strip() for part in text.split(","))
     unknown = [name for name in names if name not in METHODS]

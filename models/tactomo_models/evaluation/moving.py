@@ -52,9 +52,10 @@ from tactomo_models.evaluation.simulation import (
     with_opposite_magnitude,
 )
 from tactomo_models.plausibility import Flag
-from tactomo_models.reconstruct import Reconstruction, Reconstructor, Tier
+from tactomo_models.reconstruct import Reconstruction, Reconstructor
 from tactomo_models.reference import Reference
 from tactomo_models.scene import Press
+from tactomo_models.tier import Tier
 
 FloatArray = NDArray[np.float64]
 Presses = dict[str, Press]

@@ -49,9 +49,10 @@ from tactomo_models.evaluation.scenes import (
 )
 from tactomo_models.evaluation.simulation import Truth, UnevenSkin, Volts, fine_mesh, truth_of
 from tactomo_models.evaluation.still import Outcome
-from tactomo_models.reconstruct import LINEAR, Reconstruction, Reconstructor, Tier
+from tactomo_models.reconstruct import Reconstruction, Reconstructor
 from tactomo_models.reference import Reference
 from tactomo_models.scene import Press
+from tactomo_models.tier import LINEAR, Tier
 from tactomo_models.training.presets import PAPER_CONTACTS, PAPER_CONTRAST, paper_presses
 
 FloatArray = NDArray[np.float64]
@@ -328,17 +329,9 @@ def measure_response(rigs: Iterable[Rig]) -> Iterator[Response]:
             scan = rig.scan(presses_of(rig.description, RESPONSE, (kpa,)) if kpa else ())
             # Both conduct better under pressure as shipped; else the image is turned over.
             changes = {n: (scan[n] - rest[n]) / np.abs(rest[n]) for n in MODALITIES}
-            signs = {n: _sign(rig.description, n) for n in MODALITIES}
+            signs = {n: rig.description.sign(n) for n in MODALITIES}
             peak = {n: float((matrix @ (signs[n] * changes[n])).max()) for n in MODALITIES}
             yield Response(rig.sheet, kpa, peak)
-
-
-def _sign(description: SensorDescription, name: Modality) -> float:
-    assert description.magnitude is not None
-    assert description.structure is not None
-    if name == "magnitude":
-        return description.magnitude.response.sign
-    return 1.0 if description.structure.saturated_ratio > 1 else -1.0
 
 
 @dataclass(frozen=True)

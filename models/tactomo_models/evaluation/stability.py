@@ -47,8 +47,9 @@ from tactomo_models.evaluation.simulation import (
     with_opposite_magnitude,
 )
 from tactomo_models.mesh import SheetMesh
-from tactomo_models.reconstruct import Reconstruction, Reconstructor, Tier
+from tactomo_models.reconstruct import Reconstruction, Reconstructor
 from tactomo_models.reference import Reference
+from tactomo_models.tier import Tier
 from tactomo_models.training.simulate import displaced
 
 FloatArray = NDArray[np.float64]
@@ -191,29 +192,6 @@ def _measure(
     return Reference.from_scans(rest["magnitude"], rest["structure"]), frames
 
 
-class _Misregularised(Reconstructor):
-    """A reconstructor whose linear methods have so many times the right regularisation."""
-
-    def __init__(
-        self,
-        description: SensorDescription,
-        artifact: Artifact,
-        factor: float,
-        *,
-        budget_s: float | None,
-    ) -> None:
-        super().__init__(description, artifact, budget_s=budget_s)
-        self._factor = factor
-
-    def _matrix(self, name: Modality, method: Tier, noise: FloatArray) -> NDArray[np.float32]:
-        # R = S²J'(JS²J' + λN)⁻¹, so that JR = I - λN(JS²J' + λN)⁻¹, and with fλ for λ it is
-        # R(I + (f - 1)(I - JR))⁻¹.
-        right = super()._matrix(name, method, noise).astype(np.float64)
-        one = np.eye(right.shape[1])
-        change = one + (self._factor - 1) * (one - self._artifact.jacobian @ right)
-        return np.asarray(np.linalg.solve(change.T, right.T).T, dtype=np.float32)
-
-
 @dataclass(frozen=True)
 class CaseScore:
     """How one case came out.
@@ -275,11 +253,10 @@ def reconstruct_case(case: Case, *methods: str, artifact: Artifact | None = None
     """
     artifact = artifact or _artifact(case.description)
     budget_s = BUDGET_S if len(case.frames) == 1 else None
-    if case.plan.regularisation == 1:
-        reconstructor = Reconstructor(case.description, artifact, budget_s=budget_s)
-    else:
-        factor = case.plan.regularisation
-        reconstructor = _Misregularised(case.description, artifact, factor, budget_s=budget_s)
+    factor = case.plan.regularisation
+    reconstructor = Reconstructor(
+        case.description, artifact, budget_s=budget_s, regularisation=factor
+    )
     outcomes = []
     with threadpool_limits(1):
         reconstructor.set_reference(case.reference)  # costs more than many a method

@@ -13,7 +13,8 @@ from tactomo_models.batch import BUDGET_S
 from tactomo_models.description import SensorDescription
 from tactomo_models.evaluation.measures import SceneScore, score
 from tactomo_models.evaluation.scenes import EvaluationScene
-from tactomo_models.reconstruct import Reconstruction, Reconstructor, Tier
+from tactomo_models.reconstruct import Reconstruction, Reconstructor
+from tactomo_models.tier import Tier
 
 
 @dataclass(frozen=True)

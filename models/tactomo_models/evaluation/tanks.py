@@ -36,9 +36,10 @@ from tactomo_models.evaluation.simulation import (
 )
 from tactomo_models.forward import ForwardModel
 from tactomo_models.mesh import SheetMesh
-from tactomo_models.reconstruct import Reconstruction, Reconstructor, Tier
+from tactomo_models.reconstruct import Reconstruction, Reconstructor
 from tactomo_models.reference import Reference, noise_of_reciprocity
 from tactomo_models.scene import Press
+from tactomo_models.tier import Tier
 
 FloatArray = NDArray[np.float64]
 Progress = Callable[[int, int], None]

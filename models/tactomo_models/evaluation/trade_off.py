@@ -21,7 +21,8 @@ from tactomo_models.evaluation import moving
 from tactomo_models.evaluation.measures import SceneScore, Summary, summarise
 from tactomo_models.evaluation.scenes import EvaluationScene
 from tactomo_models.evaluation.still import Variant, reconstruct_scenes
-from tactomo_models.reconstruct import DEFAULT_BUDGET_S, METHODS, Tier, check_tier
+from tactomo_models.reconstruct import DEFAULT_BUDGET_S
+from tactomo_models.tier import METHODS, Tier, check_tier
 
 SceneKind = Literal["still", "moving"]
 Done = Callable[[], None]

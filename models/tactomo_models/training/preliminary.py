@@ -17,8 +17,9 @@ import numpy as np
 from tactomo_models.archive import write_arrays
 from tactomo_models.description import Modality, SensorDescription
 from tactomo_models.evaluation.simulation import with_opposite_magnitude
-from tactomo_models.reconstruct import Reconstructor, Tier
+from tactomo_models.reconstruct import Reconstructor
 from tactomo_models.reference import Reference
+from tactomo_models.tier import Tier
 from tactomo_models.training.simulate import (
     is_whole,
     on_cores,

@@ -20,8 +20,9 @@ from tactomo_models.description import Modality, SensorDescription
 from tactomo_models.errors import ModelError
 from tactomo_models.evaluation.scenes import REFERENCE_SCANS, seed_of
 from tactomo_models.evaluation.simulation import with_opposite_magnitude
-from tactomo_models.reconstruct import Reconstructor, Tier
+from tactomo_models.reconstruct import Reconstructor
 from tactomo_models.reference import Reference
+from tactomo_models.tier import Tier
 from tactomo_models.training.simulate import (
     on_cores,
     read_manifest,

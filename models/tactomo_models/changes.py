@@ -1,0 +1,255 @@
+"""From volts to relative changes: what a scan says against the reference, and how surely.
+
+Relative changes (V - V_ref) / |V_ref| cancel current, gain and sheet resistance. Each carries two
+variances: of noise, as seen at the tare, and of the model's error, which grows with the change.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from tactomo_models.artifact import (
+    MODEL_ERROR,
+    TYPICAL_CHANGE,
+    Artifact,
+    central_target,
+    nominal_noise_v,
+)
+from tactomo_models.description import Modality, SensorDescription
+from tactomo_models.errors import DataError
+from tactomo_models.forward import ForwardModel
+from tactomo_models.plausibility import (
+    Flag,
+    ScanCheck,
+    Wiring,
+    asymmetry_of,
+    examine_reference,
+)
+from tactomo_models.reference import noise_of_reciprocity
+from tactomo_models.tier import Tier
+from tactomo_models.tikhonov import (
+    EVEN,
+    even_spread,
+    noise_figure_weight,
+    noser_spread,
+    prior_weight,
+    tikhonov_matrix,
+)
+
+FloatArray = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+CHANGE_ERROR = 0.01  # least model error, as a share of a change and of a typical one
+MISMATCH_SHARE = 1 / 3  # of the reference's mismatch that is left in the changes
+# An uneven sheet has few degrees of freedom: errors of the model go together, about as many
+# voltages at a time, and average out so much less than noise does.
+CORRELATED = 10.0
+STILL_SHARE = 0.01  # of the model error's variance, that a still scene may change by
+MEDIAN_SQUARE = 0.455  # of a normal distribution of unit variance
+FALSE_ALARM = 1e-6  # chance that an unpressed frame of pure noise is taken for a pressed one
+TRACE = 1e-9  # relative noise of data that have none
+UNUSABLE = 1e3  # relative error of a voltage whose reference is zero or no number
+MOST_INVALID = 0.5  # share of voltages that may be invalid before the channel is given up
+WRONG_WAY = 5.0  # standard uncertainties by which a conductivity may change against its sign
+
+
+@dataclass(frozen=True)
+class Changes:
+    """Relative voltage changes of one channel's scan.
+
+    Attributes:
+        change: (M,) 0 where it is invalid.
+        weight: (M,) inverse standard deviations, of noise and of model error; 0 where invalid.
+        spread: (M,) factor on variances because model errors go together.
+        between: (M,) variances of each of two frames' changes, where the scene is still.
+        quiet: whether nothing presses.
+        signal: root mean square of the changes over their noise.
+        certainty: (M,) inverse variances of the changes by noise; 0 where invalid.
+    """
+
+    change: FloatArray
+    weight: FloatArray
+    spread: FloatArray
+    between: FloatArray
+    quiet: bool
+    signal: float
+    certainty: FloatArray
+
+    @property
+    def misfit(self) -> float:
+        """Misfit of a model in which nothing is pressed."""
+        count = max(int(np.count_nonzero(self.weight)), 1)
+        return float(np.sqrt(((self.weight * self.change) ** 2).sum() / count))
+
+
+class Taken(NamedTuple):
+    """What is to be had of a scan."""
+
+    changes: Changes | None
+    """None where there is too little to go by; a flag says so."""
+    flags: Flag
+    electrodes: list[int]
+    """Those left out, ascending."""
+
+
+class MeasuredChannel:
+    """What is known of one channel since the last tare, and what its scans say against that.
+
+    Args:
+        description: the sensor.
+        artifact: what is precomputed for it.
+        forward: the model of its sheet.
+        wiring: which voltages belong to which electrodes.
+        name: the channel.
+        volts: (M,) of the unpressed sheet.
+        noise: (M,) standard deviation of one scan in volts; None where it is not known.
+        scans: how many `volts` is the mean of.
+        regularisation: factor on the linear methods' regularisation parameter.
+
+    Raises:
+        DataError: another number of voltages than the sensor has.
+    """
+
+    def __init__(
+        self,
+        description: SensorDescription,
+        artifact: Artifact,
+        forward: ForwardModel,
+        wiring: Wiring,
+        name: Modality,
+        volts: FloatArray,
+        noise: FloatArray | None,
+        scans: int,
+        regularisation: float,
+    ) -> None:
+        self._description, self._artifact, self._name = description, artifact, name
+        self._node_areas_m2 = forward.node_areas_m2
+        self._regularisation = regularisation
+        self._check_length(volts, f"the {name} reference")
+        if noise is None:
+            noise = noise_of_reciprocity(description, volts)
+        if noise is None:
+            noise = nominal_noise_v(volts)
+        predicted, contrast = forward.bare_voltages, description.contrast(name)
+        verdict = examine_reference(wiring, volts, predicted, noise / np.sqrt(scans), contrast)
+        self._flags, self._electrodes = verdict.flags, verdict.electrodes
+        valid = verdict.usable
+        reference = np.where(valid, volts, 0.0)
+        noise = np.where(valid, noise, 0.0)
+        self._reference = reference
+        self._per_volt = np.divide(1, np.abs(reference), out=np.zeros_like(reference), where=valid)
+        relative = np.hypot(noise * self._per_volt * np.sqrt(1 + 1 / scans), MODEL_ERROR)
+        self._relative = np.where(valid, relative, UNUSABLE)
+        self._noise = np.maximum(self._relative**2 - MODEL_ERROR**2, TRACE**2)
+        self._variance = self._relative**2  # of a change where nothing presses, drift included
+        # A model that is wrong about the reference is wrong about the changes, too, if less: most
+        # of its error divides out.
+        mismatch = _mismatch(reference[valid], predicted[valid])
+        self._error_share = max(CHANGE_ERROR, MISMATCH_SHARE * mismatch)
+        asymmetry = asymmetry_of(wiring, reference)
+        self._check = ScanCheck(wiring, reference, noise, valid, contrast, asymmetry)
+        # Weights of the changes whose sum is the whole sheet's, in the direction of pressing.
+        direction = 0.0 if description.either_way(name) else description.sign(name)
+        self._total = direction * artifact.tikhonov.sum(axis=0)
+        self._matrices: dict[Tier, Image] = {}
+
+    def take(self, scan: FloatArray, *, saturated: bool = False) -> Taken:
+        """Relative changes of a scan (M,), volts; `saturated` where its converter clipped.
+
+        Raises:
+            DataError: another number of voltages than the sensor has.
+        """
+        self._check_length(scan, f"a {self._name} scan")
+        verdict = self._check.examine(scan, saturated=saturated)
+        valid, flags = verdict.usable, self._flags | verdict.flags
+        electrodes = sorted({*self._electrodes, *verdict.electrodes})
+        count = int(np.count_nonzero(valid))
+        if count < (1 - MOST_INVALID) * len(scan) or not scan[valid].any():
+            return Taken(None, flags | missing(self._name) | Flag.INVALID_VOLTAGE, electrodes)
+        change = np.where(valid, scan - self._reference, 0.0) * self._per_volt
+        square = change * change
+        grown = verdict.noise**2
+        variance = self._variance * grown
+        # Small changes share in the error of the large ones beside them.
+        typical = float(np.median(square[valid])) / MEDIAN_SQUARE
+        noise, error = self._noise * grown, self._error_share**2 * (square + typical)
+        statistic = float((square / variance).sum())
+        quiet = statistic < _noise_limit(count)
+        total = self._total
+        if not (quiet or electrodes) and _fell(total * change, total**2 * variance):
+            flags |= Flag.REFERENCE_MISMATCH
+        changes = Changes(
+            change=change,
+            weight=valid / np.sqrt(noise + error),
+            spread=1 + (CORRELATED - 1) * error / (noise + error),
+            # What is far below the model's error is not worth a solve either.
+            between=noise + STILL_SHARE * error,
+            quiet=quiet,
+            signal=(statistic / count) ** 0.5,
+            certainty=valid / variance,
+        )
+        return Taken(changes, flags, electrodes)
+
+    def matrix(self, method: Tier) -> Image:
+        """Reconstruction matrix (P, M) of a linear method for the noise at hand.
+
+        In single precision: the rounding is far below the noise, and the product is bound by
+        memory. It takes a tenth of a second, so each is made when it is first needed.
+        """
+        if method not in self._matrices:
+            self._matrices[method] = self._make_matrix(method).astype(np.float32)
+        return self._matrices[method]
+
+    def _make_matrix(self, method: Tier) -> FloatArray:
+        jacobian, noise = self._artifact.jacobian, self._relative
+        noser = noser_spread(jacobian, noise) if method is Tier.NOSER else None
+        if self._name == "magnitude":
+            spread = even_spread(self._node_areas_m2) if noser is None else noser
+            weight = prior_weight(TYPICAL_CHANGE, spread)
+        else:  # it changes far beyond what is linear: how much says no prior
+            spread = EVEN if noser is None else noser
+            target = central_target(self._description, self._artifact.bare)
+            weight = noise_figure_weight(jacobian, noise, target, spread)
+        return tikhonov_matrix(jacobian, noise, self._regularisation * weight, spread)
+
+    def _check_length(self, volts: FloatArray, what: str) -> None:
+        if volts.shape != (self._description.measurements,):
+            raise DataError(
+                f"{what} has shape {volts.shape}; sensor {self._description.name!r} has "
+                f"{self._description.measurements} voltages a scan"
+            )
+
+
+def missing(name: Modality) -> Flag:
+    """The flag that says that a channel has nothing to show."""
+    return Flag.MAGNITUDE_MISSING if name == "magnitude" else Flag.STRUCTURE_MISSING
+
+
+@cache
+def _noise_limit(count: int) -> float:
+    """Sum of squares that noise alone in so many voltages stays below, but for false alarms."""
+    return float(chi2.isf(FALSE_ALARM, count))
+
+
+def _fell(total: FloatArray, variance: FloatArray) -> bool:
+    """Tell whether the sheet as a whole changed against the sign that pressing has.
+
+    Then less presses now than did at the tare.
+    """
+    return float(total.sum()) < -WRONG_WAY * float(np.sqrt(variance.sum()))
+
+
+def _mismatch(reference: FloatArray, predicted: FloatArray) -> float:
+    """Typical relative error of a model that may be off by a common factor; 1 where none fits."""
+    ratio = reference / predicted
+    if len(ratio) == 0:
+        return 1.0
+    middle = float(np.median(ratio))
+    # 0.6745 standard deviations hold half of a normal distribution.
+    return float(np.median(np.abs(ratio / middle - 1))) / 0.6745
