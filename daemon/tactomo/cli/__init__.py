@@ -20,7 +20,7 @@ from tactomo.cli import (
     models,
     models_training,
     plot,
-    service,
+    programs,
     steer,
     watch,
 )
@@ -43,7 +43,7 @@ COMMANDS = (
     models,
     models_training,
     plot,
-    service,
+    programs,
     steer,
     watch,
 )
