@@ -6,6 +6,7 @@ variances: of noise, as seen at the tare, and of the model's error, which grows 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
@@ -224,6 +225,14 @@ class MeasuredChannel:
                 f"{what} has shape {volts.shape}; sensor {self._description.name!r} has "
                 f"{self._description.measurements} voltages a scan"
             )
+
+
+def towards_pressing(
+    description: SensorDescription, data: Mapping[Modality, Changes]
+) -> tuple[dict[Modality, FloatArray], dict[Modality, FloatArray]]:
+    """Changes (M,) in the direction of pressing, and their inverse variances by noise."""
+    changes = {name: description.sign(name) * taken.change for name, taken in data.items()}
+    return changes, {name: taken.certainty for name, taken in data.items()}
 
 
 def missing(name: Modality) -> Flag:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactomo_models.artifact import Artifact, load_or_build_artifact
-from tactomo_models.changes import WRONG_WAY, Changes, MeasuredChannel, missing
+from tactomo_models.changes import WRONG_WAY, Changes, MeasuredChannel, missing, towards_pressing
 from tactomo_models.contacts import (
     AreaFinder,
     Areas,
@@ -44,7 +44,7 @@ from tactomo_models.objects import ObjectFollower
 from tactomo_models.outlines import Outlines, ellipses_of
 from tactomo_models.paper_level_set import PaperLevelSet
 from tactomo_models.plausibility import Flag, Wiring
-from tactomo_models.redrawing import Drawing, MagnitudeData, Redrawer, SecondOpinion
+from tactomo_models.redrawing import Drawing, Redrawer, SecondOpinion
 from tactomo_models.reference import Reference
 from tactomo_models.shape_fit import Shape
 from tactomo_models.tier import LINEAR, NETWORKS_OF, PAPER_NETWORKS, Tier, check_tier
@@ -407,19 +407,12 @@ class Reconstructor:
         return self._imaged(image, data, flags, Tier.NETWORK, reason)
 
     def _network_image(self, data: dict[Modality, Changes]) -> NetworkImage:
-        return self._networks.fusion.image(*self._network_data(data))
-
-    def _network_data(
-        self, data: dict[Modality, Changes]
-    ) -> tuple[dict[Modality, FloatArray], dict[Modality, FloatArray]]:
-        """Changes in the direction of pressing, and their inverse variances by noise."""
-        changes = {name: self.description.sign(name) * d.change for name, d in data.items()}
-        return changes, {name: d.certainty for name, d in data.items()}
+        return self._networks.fusion.image(*towards_pressing(self.description, data))
 
     def network_inputs(self, magnitude: FloatArray, structure: FloatArray) -> FloatArray:
         """What our network is given of a frame, (K,); the arguments are `reconstruct`'s."""
         return self._networks.fusion.filtered(
-            *self._network_data(self._taken(magnitude, structure))
+            *towards_pressing(self.description, self._taken(magnitude, structure))
         )
 
     def _taken(self, magnitude: FloatArray, structure: FloatArray) -> dict[Modality, Changes]:
@@ -584,18 +577,11 @@ class Reconstructor:
         if not (self._redraw and self._proposes) or own.fitted is None:
             return None
         with self._timed("network"):
-            taken = data["magnitude"]
-            return self._redrawer.redraw(
-                own,
-                self.description.sign("magnitude"),
-                *self._network_data(data),
-                MagnitudeData(taken.change, taken.weight, taken.spread, taken.between),
-                solves,
-            )
+            return self._redrawer.redraw(own, data, solves)
 
     @cached_property
     def _redrawer(self) -> Redrawer:
-        return Redrawer(self._forward, self._areas, self._networks.refiner)
+        return Redrawer(self.description, self._forward, self._areas, self._networks.refiner)
 
     def _held(self, data: dict[Modality, Changes], flags: Flag) -> Reconstruction | None:
         """Bridge a lost structure scan with the last shape, as long as it explains the other."""

@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tactomo_models.changes import Changes, towards_pressing
 from tactomo_models.contacts import AreaFinder, Areas, MagnitudeFollower, Magnitudes
-from tactomo_models.description import Modality
+from tactomo_models.description import Modality, SensorDescription
 from tactomo_models.forward import ForwardModel
 from tactomo_models.network import FusionNetwork, NetworkImage
 
@@ -67,32 +68,24 @@ class SecondOpinion:
     confidence: float
 
 
-@dataclass(frozen=True)
-class MagnitudeData:
-    """A frame of the magnitude channel: (M,) each, see `contacts.fit_magnitudes`.
-
-    Attributes:
-        change, weight, spread: relative changes, inverse standard deviations, factor on variances.
-        between: variances of each of two frames' changes, where the scene is still.
-    """
-
-    change: FloatArray
-    weight: FloatArray
-    spread: FloatArray
-    between: FloatArray
-
-
 class Redrawer:
     """Redraws frame after frame; what has not changed is not drawn again.
 
     Args:
+        description: the sensor.
         forward: the model of the sheet.
         areas: finds areas on its map.
         network: the refining one.
     """
 
-    def __init__(self, forward: ForwardModel, areas: AreaFinder, network: FusionNetwork) -> None:
-        self._areas, self._network = areas, network
+    def __init__(
+        self,
+        description: SensorDescription,
+        forward: ForwardModel,
+        areas: AreaFinder,
+        network: FusionNetwork,
+    ) -> None:
+        self._description, self._areas, self._network = description, areas, network
         self._magnitudes = MagnitudeFollower(forward)
         self.forget()
 
@@ -102,52 +95,41 @@ class Redrawer:
         self._last: tuple[Areas, FloatArray, Areas, NetworkImage] | None = None
 
     def redraw(
-        self,
-        own: Drawing,
-        sign: float,
-        changes: Mapping[Modality, FloatArray],
-        certainty: Mapping[Modality, FloatArray],
-        data: MagnitudeData,
-        solves: int,
+        self, own: Drawing, data: Mapping[Modality, Changes], solves: int
     ) -> SecondOpinion | None:
         """Redraw the physics' account of a frame; None where the network sees nothing.
 
         Args:
             own: the physics' account.
-            sign: direction of the magnitude channel's changes.
-            changes: of both channels, see `FusionNetwork.image`.
-            certainty: likewise.
-            data: the magnitude channel's.
+            data: both channels'.
             solves: forward solves allowed.
         """
-        areas, image = self._drawn(own, sign, changes, certainty, data)
-        fitted = self._magnitudes.fit(areas, data.change, data.weight, data.spread, solves=solves)
+        areas, image = self._drawn(own, data)
+        taken = data["magnitude"]
+        fitted = self._magnitudes.fit(
+            areas, taken.change, taken.weight, taken.spread, solves=solves
+        )
         if fitted is None or own.fitted is None or image.structure is None:
             return None
         better = np.log(own.fitted.misfit / fitted.misfit)
         share = float(1 / (1 + np.exp(-(better + HANDICAP) / DECISION)))
         return SecondOpinion(Drawing(areas, image.structure, fitted), share, image.confidence)
 
-    def _drawn(
-        self,
-        own: Drawing,
-        sign: float,
-        changes: Mapping[Modality, FloatArray],
-        certainty: Mapping[Modality, FloatArray],
-        data: MagnitudeData,
-    ) -> tuple[Areas, NetworkImage]:
+    def _drawn(self, own: Drawing, data: Mapping[Modality, Changes]) -> tuple[Areas, NetworkImage]:
+        taken = data["magnitude"]
         if self._last is not None:
             of, change, areas, image = self._last
-            valid = data.weight > 0
-            moved = (data.change - change)[valid] ** 2 / (2 * data.between[valid])
+            valid = taken.weight > 0
+            moved = (taken.change - change)[valid] ** 2 / (2 * taken.between[valid])
             if of is own.areas and float(moved.mean()) < STILL:
                 return areas, image
-        seen = (own.map(sign).astype(np.float32), own.pressed.astype(np.float32))
-        image = self._network.image(changes, certainty, seen)
+        shown = own.map(self._description.sign("magnitude"))
+        seen = (shown.astype(np.float32), own.pressed.astype(np.float32))
+        image = self._network.image(*towards_pressing(self._description, data), seen)
         assert image.structure is not None
         areas = self._areas.find(image.structure, self._areas.on_nodes(image.structure))
         areas = _placed_as(areas, own.areas)
-        self._last = (own.areas, data.change, areas, image)
+        self._last = (own.areas, taken.change, areas, image)
         return areas, image
 
 
