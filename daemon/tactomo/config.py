@@ -6,12 +6,10 @@ Every key has a default but `ports`. Errors name the file, the key, its value an
 
 from __future__ import annotations
 
-import ipaddress
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self
-from urllib.parse import urlsplit
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails
@@ -20,6 +18,7 @@ from tactomo_client.messages import check_sensor_name
 from tactomo_models import METHODS
 from tactomo_models.errors import explain
 
+from tactomo.endpoint import check_endpoint, is_local, needs_keys
 from tactomo.errors import ConfigError
 from tactomo.log import LogFormat, LogLevel
 
@@ -33,41 +32,26 @@ def _sensor_name(name: str) -> str:
         raise ValueError(error.next_step) from error
 
 
-def _local_endpoint(endpoint: str) -> str:
-    """Accept ``ipc://PATH`` and ``tcp://LOOPBACK:PORT``, where port 0 means any free one."""
-    if endpoint.startswith("ipc://") and len(endpoint) > len("ipc://"):
-        return endpoint
-    try:
-        parts = urlsplit(endpoint)
-        is_tcp = parts.scheme == "tcp" and parts.hostname and parts.port is not None
-    except ValueError:  # a port that is no number or is out of range
-        is_tcp = False
-    if not is_tcp or parts.path:
-        raise ValueError("use tcp://127.0.0.1:PORT, with port 0 for any free one, or ipc://PATH")
-    if not _is_loopback(parts.hostname or ""):
-        raise ValueError(
-            f"{parts.hostname} can be reached from other computers, and anybody there could read "
-            "the stream or command the daemon; use 127.0.0.1 or ipc://PATH"
-        )
-    return endpoint
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return host == "localhost" or ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
 def _method(name: str) -> str:
     if name not in METHODS:
         raise ValueError(f"use one of: {', '.join(METHODS)}")
     return name
 
 
-Endpoint = Annotated[str, AfterValidator(_local_endpoint)]
+Endpoint = Annotated[str, AfterValidator(check_endpoint)]
 TierName = Annotated[str, AfterValidator(_method)]
 BudgetMs = Annotated[float, Field(gt=0, le=10_000)]
+
+
+class Curve(BaseModel):
+    """Keys for addresses beyond this computer; `tactomo keys` makes and manages both."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    secret: Path
+    """The daemon's secret key, which only its user may read."""
+    clients: Path
+    """A folder of the public keys of those who may connect."""
 
 
 class DaemonConfig(BaseModel):
@@ -84,6 +68,8 @@ class DaemonConfig(BaseModel):
     baud: Annotated[int, Field(ge=1200, le=12_000_000)] = 921_600
     stream: Endpoint = DEFAULT_STREAM
     control: Endpoint = DEFAULT_CONTROL
+    curve: Curve | None = None
+    """Encrypt ``tcp://`` addresses and let in the listed clients only; needed beyond loopback."""
     tier: TierName = "auto"
     budget_ms: BudgetMs | None = None
     """Time that one reconstruction may take; None leaves it to the tier."""
@@ -106,6 +92,14 @@ class DaemonConfig(BaseModel):
     def _ports_differ(self) -> Self:
         if len(set(self.ports)) != len(self.ports):
             raise ValueError("ports: the two ports are the same one")
+        return self
+
+    @model_validator(mode="after")
+    def _addresses_are_guarded(self) -> Self:
+        for key in ("stream", "control"):
+            if self.curve is None and not is_local(getattr(self, key)):
+                error = needs_keys(getattr(self, key))
+                raise ValueError(f"{key} = {error.cause}; {error.next_step}")
         return self
 
 

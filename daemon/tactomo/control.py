@@ -1,8 +1,8 @@
 """The control thread: the only one that touches the control socket.
 
-Requests come from anybody on this computer, so each is bounded in size and checked whole before
-anything happens. A command whose outcome takes time (`tare`) is answered when it is known, and
-holds up no other client meanwhile.
+Requests come from anybody on this computer, or who has a key, so each is bounded in size and
+checked whole before anything happens. A command whose outcome takes time (`tare`) is answered when
+it is known, and holds up no other client meanwhile.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from tactomo_client.messages import decode_request, encode_error, encode_reply
 from tactomo_models.errors import explain
 
 from tactomo.config import BudgetMs, TierName
-from tactomo.endpoint import bind
+from tactomo.doorkeeper import CONTROL
+from tactomo.endpoint import bind, rebind
 from tactomo.errors import CommandError, TactomoError
 
 MAX_REQUEST_BYTES: Final = 64 * 1024
@@ -92,13 +93,23 @@ class Control:
         self._pending: list[tuple[list[bytes], Future[Result]]] = []
         self._socket: zmq.Socket[bytes]
         self._stopping = threading.Event()
+        self._cut = threading.Event()
         self._thread = threading.Thread(target=self._run, name="control")
 
-    def open(self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str) -> None:
+    def open(
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoint: str,
+        secret: bytes | None = None,
+    ) -> None:
         """Bind the control socket; raise AddressError where the address cannot be had."""
         self._socket = context.socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_REQUEST_BYTES)
-        self.address = bind(self._socket, endpoint, "control")
+        self.address = bind(self._socket, endpoint, CONTROL, secret=secret)
+
+    def cut_connections(self) -> None:
+        """Have every client connect anew, those who still may; for any thread."""
+        self._cut.set()
 
     def start(self) -> None:
         """Start the thread."""
@@ -122,6 +133,9 @@ class Control:
             if self._socket.poll(POLL_WHILE_PENDING_MS if self._pending else POLL_MS):
                 self._receive()
             self._answer_pending()
+            if self._cut.is_set():
+                self._cut.clear()
+                rebind(self._socket, self.address)
             self._on_idle()
         for _, future in self._pending:
             if not future.done():

@@ -10,6 +10,7 @@ pipeline      sync, the reconstructor     messages to the publisher, marks to th
 control       the control socket          commands to the pipeline; starts and stops the recorder
 publisher     the stream's socket         what it sent to the recorder, if that is asked for
 recorder-N    the file of recording N     nothing
+doorkeeper    the list of clients         nothing; runs where there are keys (Doorkeeper)
 ============  ==========================  =========================================================
 
 They stop in this order, so nobody hands anything to one that has gone. Numerical libraries are
@@ -50,6 +51,7 @@ from threadpoolctl import threadpool_limits
 
 from tactomo.config import DaemonConfig
 from tactomo.control import Control, Nothing, RecordStart, SetBudget, SetTier
+from tactomo.doorkeeper import Doorkeeper, load_server_keys
 from tactomo.errors import CommandError, ConfigError
 from tactomo.events import Severity
 from tactomo.imaging import Imaging
@@ -80,6 +82,7 @@ class Daemon:
     Raises:
         ModelError: the description or the artifact cannot be used.
         ConfigError: the ports are not all live, or not all of one recording.
+        KeysError: the secret key cannot be used.
         RecordingError, PortError: a replay URL leads to no recording.
 
     Attributes:
@@ -98,6 +101,8 @@ class Daemon:
         self.session = uuid.uuid4().hex
         self._undo = contextlib.ExitStack()
         self._stop_asked = threading.Event()
+        curve = config.curve
+        self._keys = None if curve is None else load_server_keys(curve.secret, curve.clients)
         description = load_description(config.description)
         self._description = description
         replay = read_replay(config.ports, description)
@@ -145,12 +150,13 @@ class Daemon:
                 "set_tier": self._set_tier,
                 "set_budget": self._set_budget,
             },
-            on_idle=self._recorder.check,
+            on_idle=self._check,
         )
         self._status = Status(
             description, self._ports, self._pipeline, self._imaging, self._recorder
         )
 
+        self._doorkeeper: Doorkeeper | None = None
         self._threads: list[Publisher | Control | Pipeline | PortReader] = [
             self._publisher,
             self._control,
@@ -199,9 +205,7 @@ class Daemon:
         while not self._stop_asked.wait(WATCH_S):
             if self.config.exit_at_end and self._pipeline.finished.is_set():
                 break
-            if not all(
-                part.is_alive for part in self._threads
-            ):  # its traceback is on standard error
+            if not self._all_alive():  # its traceback is on standard error
                 log.error("thread_died", next_step="please report the traceback above")
                 return 1
             supervision.turn()
@@ -236,9 +240,17 @@ class Daemon:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         undo.callback(context.term)
         undo.callback(self._recorder.close)
-        self._publisher.open(context, config.stream)
+        secret = None
+        if self._keys is not None:
+            secret = self._keys.secret
+            self._doorkeeper = Doorkeeper(
+                context, self._keys, self._on_event, self._cut_connections
+            )
+            self._doorkeeper.start()
+            undo.callback(self._doorkeeper.stop)
+        self._publisher.open(context, config.stream, secret)
         undo.callback(self._publisher.stop)
-        self._control.open(context, config.control)
+        self._control.open(context, config.control, secret)
         undo.callback(self._control.stop)
         undo.callback(self._pipeline.stop)
         for port in self._ports:
@@ -248,6 +260,22 @@ class Daemon:
             self._recorder.start(config.record, config.record_maps)
         for part in self._threads:
             part.start()
+
+    def _all_alive(self) -> bool:
+        doorkeeper = self._doorkeeper
+        has_door = doorkeeper is None or doorkeeper.is_alive
+        return has_door and all(part.is_alive for part in self._threads)
+
+    def _check(self) -> None:
+        """Look after what has no thread of its own; called by the control thread."""
+        self._recorder.check()
+        if self._doorkeeper is not None:
+            self._doorkeeper.check()
+
+    def _cut_connections(self) -> None:
+        """Have every client beyond this computer connect anew: one of them may not any more."""
+        self._publisher.cut_connections()
+        self._control.cut_connections()
 
     def _turns(self) -> Mapping[str, int]:
         """Return how often each thread went round its loop, of those that are not at their end."""

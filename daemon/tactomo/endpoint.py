@@ -1,45 +1,184 @@
-"""Binding the daemon's sockets, with an error that says what to do when that cannot be done."""
+"""Binding our sockets: only where it is safe, with an error that says what to do otherwise.
+
+Without keys an address must be one that no other computer can reach. An ``ipc://`` file may be
+connected to by its owner and group alone; what a killed daemon left of it is replaced. With keys
+(`tactomo.doorkeeper`) every ``tcp://`` address is encrypted and lets in the allowed clients only.
+"""
 
 from __future__ import annotations
 
+import ipaddress
+import os
 import socket as posix_socket
+import stat
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Final
+from urllib.parse import urlsplit
 
 import zmq
 
 from tactomo.errors import AddressError
 
+IPC: Final = "ipc://"
+HANDSHAKE_MS: Final = 3000
+"""Who has not finished the handshake by then is cut off."""
+REBIND_S: Final = 2.0
 
-def bind(socket: zmq.Socket[bytes], endpoint: str, purpose: str) -> str:
+
+def check_endpoint(endpoint: str) -> str:
+    """Return an endpoint that may be bound to: ``ipc://PATH`` or ``tcp://HOST:PORT``.
+
+    Port 0 means any free one. Raises ValueError for anything else, saying what may be used.
+    """
+    if endpoint.startswith(IPC) and endpoint[len(IPC) :][:1] not in ("", "@"):
+        return endpoint
+    try:
+        parts = urlsplit(endpoint)
+        is_tcp = parts.scheme == "tcp" and parts.hostname and parts.port is not None
+    except ValueError:  # a port that is no number or is out of range
+        is_tcp = False
+    if not is_tcp or parts.path:
+        raise ValueError("use tcp://127.0.0.1:PORT, with port 0 for any free one, or ipc://PATH")
+    return endpoint
+
+
+def is_local(endpoint: str) -> bool:
+    """Whether an endpoint can be reached from its own computer alone."""
+    host = urlsplit(endpoint).hostname or ""
+    try:
+        return endpoint.startswith(IPC) or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def bind(
+    socket: zmq.Socket[bytes],
+    endpoint: str,
+    purpose: str,
+    *,
+    secret: bytes | None = None,
+    option: str = "",
+) -> str:
     """Bind `socket` and return its address, with the port that was chosen where any would do.
 
     The socket is closed when that fails.
 
+    Args:
+        socket: a socket that has not been bound.
+        endpoint: where to.
+        purpose: what it is for, also the domain under which a `Doorkeeper` knows it.
+        secret: the server's secret CURVE key; None where the address needs none.
+        option: the command line's option for another address; by default named as the purpose.
+
     Raises:
-        AddressError: the address is in use or cannot be had.
+        AddressError: the address is in use, cannot be had, or can be reached from other computers
+            and there are no keys.
 
     """
+    option = option or f"--{purpose}"
     try:
-        if endpoint.startswith("ipc://") and _is_served(Path(endpoint.removeprefix("ipc://"))):
-            raise zmq.ZMQError(zmq.EADDRINUSE)
-        socket.bind(endpoint)
+        if secret is None and not is_local(endpoint):
+            raise needs_keys(endpoint)
+        _secure(socket, endpoint, purpose, secret)
+        _bind(socket, endpoint)
+    except AddressError:
+        socket.close()
+        raise
     except zmq.ZMQError as error:
         socket.close()
         if error.errno == zmq.EADDRINUSE:
             raise AddressError(
                 f"{endpoint} ({purpose}) is in use",
-                f"stop the daemon that runs already, or give another address with --{purpose}",
+                f"stop the daemon that runs already, or give another address with {option}",
                 "address_in_use",
             ) from error
         raise AddressError(
             f"cannot bind {endpoint} ({purpose}): {error.strerror}",
-            f"give another address with --{purpose}",
+            f"give another address with {option}",
         ) from error
-    return str(socket.getsockopt_string(zmq.LAST_ENDPOINT))
+    return str(socket.getsockopt_string(zmq.LAST_ENDPOINT)).rstrip("\0")
+
+
+def rebind(socket: zmq.Socket[bytes], address: str) -> None:
+    """Cut every connection to a bound socket; who is still allowed in connects again by itself.
+
+    Raises:
+        AddressError: another program has taken the address meanwhile.
+
+    """
+    socket.unbind(address)
+    deadline_s = time.monotonic() + REBIND_S
+    while True:
+        try:
+            _bind(socket, address)
+        except zmq.ZMQError as error:  # the old listener closes in the background
+            if time.monotonic() > deadline_s:
+                raise AddressError(
+                    f"cannot bind {address} again: {error.strerror}", "start the daemon again"
+                ) from error
+            time.sleep(0.001)
+        else:
+            return
+
+
+def needs_keys(endpoint: str) -> AddressError:
+    """Return the error for an address beyond this computer without keys."""
+    return AddressError(
+        f"{endpoint} can be reached from other computers, and anybody there could read the stream "
+        "or command the daemon",
+        "use tcp://127.0.0.1:PORT or ipc://PATH, or give it keys: `tactomo keys make NAME "
+        "--server` makes them and tells what to do with them",
+        "keys_needed",
+    )
+
+
+def _secure(socket: zmq.Socket[bytes], endpoint: str, purpose: str, secret: bytes | None) -> None:
+    socket.setsockopt(zmq.HANDSHAKE_IVL, HANDSHAKE_MS)
+    # A computer that lost power never closes its connections; the kernel's probes notice.
+    socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
+    socket.setsockopt(zmq.TCP_KEEPALIVE_IDLE, 30)
+    socket.setsockopt(zmq.TCP_KEEPALIVE_INTVL, 10)
+    socket.setsockopt(zmq.TCP_KEEPALIVE_CNT, 3)
+    if secret is not None and not endpoint.startswith(IPC):
+        socket.setsockopt(zmq.CURVE_SERVER, 1)
+        socket.setsockopt(zmq.CURVE_SECRETKEY, secret)
+        socket.setsockopt_string(zmq.ZAP_DOMAIN, purpose)
+        # Without this ZeroMQ lets everybody in when nobody is there to ask.
+        socket.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
+
+
+def _bind(socket: zmq.Socket[bytes], endpoint: str) -> None:
+    if not endpoint.startswith(IPC):
+        socket.bind(endpoint)
+        return
+    _check_file(endpoint, Path(endpoint.removeprefix(IPC)))
+    with _files_for_owner_and_group():
+        socket.bind(endpoint)
+
+
+def _check_file(endpoint: str, path: Path) -> None:
+    """Refuse what ZeroMQ would do: take the path away from whoever serves it, or delete a file."""
+    if path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
+        raise AddressError(
+            f"{path} is there and is no socket", f"remove it, or give another path than {endpoint}"
+        )
+    if _is_served(path):
+        raise zmq.ZMQError(zmq.EADDRINUSE)
+
+
+@contextmanager
+def _files_for_owner_and_group() -> Iterator[None]:
+    before = os.umask(0o117)  # the process's: for the moment of one system call
+    try:
+        yield
+    finally:
+        os.umask(before)
 
 
 def _is_served(path: Path) -> bool:
-    """Whether somebody listens there; ZeroMQ itself would take the path away from them."""
     with posix_socket.socket(posix_socket.AF_UNIX, posix_socket.SOCK_STREAM) as probe:
         try:
             probe.connect(str(path))

@@ -19,7 +19,8 @@ from typing import Any, Final, NamedTuple
 import zmq
 from tactomo_client.messages import CONTACTS, EVENT, STATUS, clock_id, encode_message, topic
 
-from tactomo.endpoint import bind
+from tactomo.doorkeeper import STREAM
+from tactomo.endpoint import bind, rebind
 from tactomo.frames import NO_FRAME_YET
 from tactomo.timing import Durations
 
@@ -81,14 +82,20 @@ class Publisher:
         self._last_status = b""
         self._queue: deque[_Outgoing] = deque(maxlen=MAX_QUEUED)
         self._stopping = threading.Event()
+        self._cut = threading.Event()
         self._socket: zmq.Socket[bytes]
         self._wake_reader = self._wake_writer = -1
         self._thread = threading.Thread(target=self._run, name="publisher")
 
-    def open(self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str) -> None:
+    def open(
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoint: str,
+        secret: bytes | None = None,
+    ) -> None:
         """Bind the stream's socket; raise AddressError where the address cannot be had."""
         self._socket = _make_socket(context)
-        self.address = bind(self._socket, endpoint, "stream")
+        self.address = bind(self._socket, endpoint, STREAM, secret=secret)
         self._wake_reader, self._wake_writer = os.pipe()
         os.set_blocking(self._wake_reader, False)
         os.set_blocking(self._wake_writer, False)
@@ -106,6 +113,11 @@ class Publisher:
         self._socket.close(LINGER_MS)
         for descriptor in (self._wake_reader, self._wake_writer):
             os.close(descriptor)
+
+    def cut_connections(self) -> None:
+        """Have every subscriber connect anew, those who still may; for any thread."""
+        self._cut.set()
+        self._wake()
 
     @property
     def is_alive(self) -> bool:
@@ -165,6 +177,9 @@ class Publisher:
                 else:
                     os.read(self._wake_reader, 4096)
             self._send_queued()
+            if self._cut.is_set():
+                self._cut.clear()
+                rebind(self._socket, self.address)
             if time.monotonic() >= status_at_s:
                 status_at_s += STATUS_PERIOD_S
                 self._send_status()
@@ -206,6 +221,8 @@ class Publisher:
             self._socket.send(self._last_status, zmq.DONTWAIT)
 
     def _wake(self) -> None:
+        if self._wake_writer < 0:  # not open yet
+            return
         with contextlib.suppress(BlockingIOError):  # full of reasons to wake up already
             os.write(self._wake_writer, b"\0")
 

@@ -19,7 +19,8 @@ LIGHT = Contact(5, -1.0, 2.0, 300.0, None, None, None)
 
 
 def example() -> str:
-    scripts: list[str] = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text("utf-8"), re.S)
+    text = DOCUMENT.read_text("utf-8").partition("\n## A complete client\n")[2]
+    scripts: list[str] = re.findall(r"```python\n(.*?)```", text, re.S)
     assert len(scripts) == 1
     return scripts[0]
 

@@ -25,7 +25,8 @@ from tactomo.config import load_config
 from tactomo.daemon import Daemon
 from tactomo.log import configure_logging
 from tactomo.recording import open_recording
-from tactomo_client import request
+from tactomo_client import Keys, request
+from tactomo_client.keys import secure
 from tactomo_client.messages import KINDS, Message, decode_message, topic
 from tactomo_models import Contact, Flag, Modality, Reconstruction, Reference, Tier
 from tactomo_models.calibration import Calibration
@@ -182,13 +183,20 @@ class Skin:
 class Listener:
     """Subscribes to all kinds of one sensor's messages and keeps them."""
 
-    def __init__(self, address: str, sensor: str, kinds: tuple[str, ...] = KINDS) -> None:
+    def __init__(
+        self,
+        address: str,
+        sensor: str,
+        kinds: tuple[str, ...] = KINDS,
+        keys: Keys | None = None,
+    ) -> None:
         self.messages: list[Message] = []
         self.socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
         self.socket.setsockopt(zmq.LINGER, 0)
         self.socket.setsockopt(zmq.RCVHWM, 0)
         for kind in kinds:
             self.socket.setsockopt(zmq.SUBSCRIBE, topic(sensor, kind))
+        secure(self.socket, address, keys)
         self.socket.connect(address)
 
     def receive(self) -> None:
@@ -278,13 +286,17 @@ class Memory:
 class Bench:
     """A daemon in this process, with its skin and a listener."""
 
-    def __init__(self, daemon: Daemon, skin: Skin, listener: Listener) -> None:
+    def __init__(
+        self, daemon: Daemon, skin: Skin, listener: Listener, keys: Keys | None = None
+    ) -> None:
         self.daemon = daemon
+        self.keys = keys
         self.skin = skin
         self.listener = listener
 
     def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
-        return request(command, self.daemon.control_address, PATIENCE_S, **arguments)
+        address = self.daemon.control_address
+        return request(command, address, PATIENCE_S, keys=self.keys, **arguments)
 
     def until(self, condition: Callable[[], Any]) -> Any:
         """Wait for the condition and return its value."""
@@ -327,7 +339,7 @@ def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Cal
     """Start a daemon: ``bench(ports=1, **config)``; everything is stopped later.
 
     It has the reconstructor above, each frame of which takes `seconds`, or the `real` one; and a
-    `calibration`, or this machine's.
+    `calibration`, or this machine's. What listens to it and asks it has `keys`.
     """
     daemons: list[Daemon] = []
     listeners: list[Listener] = []
@@ -337,6 +349,7 @@ def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Cal
         seconds: float = 0.0,
         real: bool = False,
         calibration: Calibration | None = None,
+        keys: Keys | None = None,
         **config: Any,
     ) -> Bench:
         folder = tmp_path / f"ports-{len(daemons)}"
@@ -357,10 +370,10 @@ def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Cal
         )
         daemon.start()
         daemons.append(daemon)
-        listener = Listener(daemon.stream_address, "left")
+        listener = Listener(daemon.stream_address, "left", keys=keys)
         listeners.append(listener)
         listener.wait("status", lambda _: True)  # every subscription is in force now
-        return Bench(daemon, skin, listener)
+        return Bench(daemon, skin, listener, keys)
 
     yield start
     for daemon in daemons:

@@ -13,8 +13,15 @@ them. Needs pyzmq, msgpack and numpy, and nothing of the daemon.
 """
 
 from tactomo_client.control import request
-from tactomo_client.errors import ClientError, ControlError, MessageError, StreamTimeout
+from tactomo_client.errors import (
+    ClientError,
+    ControlError,
+    KeysError,
+    MessageError,
+    StreamTimeout,
+)
 from tactomo_client.frame import Contact, Frame
+from tactomo_client.keys import Keys
 from tactomo_client.messages import (
     DEFAULT_CONTROL,
     DEFAULT_STREAM,
@@ -30,6 +37,8 @@ __all__ = [
     "Contact",
     "ControlError",
     "Frame",
+    "Keys",
+    "KeysError",
     "MessageError",
     "StreamTimeout",
     "Subscription",

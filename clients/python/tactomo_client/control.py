@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+import time
+from pathlib import Path
+from typing import Any, Final
 
 import zmq
 
 from tactomo_client.errors import ControlError
+from tactomo_client.keys import Handshakes, Keys, as_keys, secure
 from tactomo_client.messages import (
     DEFAULT_CONTROL,
     MAX_MESSAGE_BYTES,
@@ -14,9 +17,16 @@ from tactomo_client.messages import (
     encode_request,
 )
 
+LOOK_S: Final = 0.1
+
 
 def request(
-    command: str, address: str = DEFAULT_CONTROL, timeout_s: float = 2.0, **arguments: Any
+    command: str,
+    address: str = DEFAULT_CONTROL,
+    timeout_s: float = 2.0,
+    *,
+    keys: Keys | str | Path | None = None,
+    **arguments: Any,
 ) -> dict[str, Any]:
     """Send one command and return its result.
 
@@ -24,27 +34,43 @@ def request(
         command: one of the control commands of STREAM.md, for example ``tare``.
         address: the control socket of the daemon, or of the twin.
         timeout_s: how long to wait for the reply, seconds.
+        keys: keys, or the folder that holds them, for a daemon beyond this computer.
         **arguments: the command's arguments, for example ``tier="quiet"``.
 
     Raises:
         ControlError: the command was refused, or nothing answered (`name` is then ``no_answer``).
+        KeysError: the keys cannot be used, or the server does not let them in.
         MessageError: what answered does not speak this protocol.
 
     """
     message = encode_request(command, arguments)
+    used = as_keys(keys)
     # A socket per command: after an unanswered request a REQ socket cannot send another.
     socket: zmq.Socket[bytes]
     with zmq.Context.instance().socket(zmq.REQ) as socket:
         socket.setsockopt(zmq.LINGER, 0)
         socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
+        secure(socket, address, used)
+        handshakes = Handshakes(socket)
         try:
             socket.connect(address)
+            socket.send(message)
+            deadline_s = time.monotonic() + timeout_s
+            while not socket.poll(_wait_ms(deadline_s)):
+                if refusal := handshakes.refusal(address, used):
+                    raise refusal
+                if time.monotonic() >= deadline_s:
+                    raise no_answer(address, timeout_s)
+            return decode_reply(socket.recv())
         except zmq.ZMQError as error:
             raise bad_address(address, error) from error
-        socket.send(message)
-        if not socket.poll(round(timeout_s * 1000)):
-            raise no_answer(address, timeout_s)
-        return decode_reply(socket.recv())
+        finally:
+            handshakes.close()
+
+
+def _wait_ms(deadline_s: float) -> int:
+    """Return how long to wait before a look at why there is no answer; rounded up."""
+    return int(min(LOOK_S, max(0.0, deadline_s - time.monotonic())) * 1000) + 1
 
 
 def no_answer(address: str, timeout_s: float) -> ControlError:

@@ -5,7 +5,9 @@ ClientError
 │                   or its version is another one
 ├── ControlError    a command was refused, or nothing answered it: `tactomo tare` while
 │                   somebody presses the skin, the daemon is not running
-└── StreamTimeout   no frame came within `timeout_s`: the cable is out, the name is misspelt
+├── StreamTimeout   no frame came within `timeout_s`: the cable is out, the name is misspelt
+└── KeysError       keys cannot be used (the file is missing, others may read it), or the server
+                    does not let them in: the client is not on its list, it is another server
 """
 
 from __future__ import annotations
@@ -44,3 +46,10 @@ class StreamTimeout(ClientError, TimeoutError):  # noqa: N818 - named for what h
 
     def __init__(self, cause: str, next_step: str = "") -> None:
         super().__init__(cause, next_step, name="stream_timeout")
+
+
+class KeysError(ClientError):
+    """Keys that cannot be used, or that a server does not let in; `name` says which."""
+
+    def __init__(self, cause: str, next_step: str = "", name: str = "bad_keys") -> None:
+        super().__init__(cause, next_step, name)

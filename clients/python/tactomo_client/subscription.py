@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 import time
 import weakref
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Final, Literal, Self
 
 import zmq
 
 from tactomo_client.control import bad_address
-from tactomo_client.errors import MessageError, StreamTimeout
+from tactomo_client.errors import ControlError, KeysError, MessageError, StreamTimeout
 from tactomo_client.frame import Frame, frame_from_message
+from tactomo_client.keys import Handshakes, Keys, as_keys, secure
 from tactomo_client.messages import (
     DEFAULT_STREAM,
     MAX_MESSAGE_BYTES,
     decode_message,
     topic,
 )
+
+KNOCK_PERIOD_S: Final = 1.0
+"""How often a client that was not let in tries again."""
 
 
 def subscribe(
@@ -29,6 +36,7 @@ def subscribe(
     latest_only: bool = False,
     stale_after_s: float = 0.5,
     timeout_s: float | None = None,
+    keys: Keys | str | Path | None = None,
 ) -> Subscription:
     """Subscribe to one sensor's frames.
 
@@ -45,13 +53,15 @@ def subscribe(
         stale_after_s: the age in seconds from which `Frame.is_stale` is true.
         timeout_s: how long the iteration waits for a frame before it raises StreamTimeout; None
             waits for ever (Ctrl-C interrupts it).
+        keys: keys, or the folder that holds them, for a daemon beyond this computer.
 
     Raises:
         MessageError: `sensor` cannot be a sensor's name.
         ControlError: `address` is not an address.
+        KeysError: the keys cannot be used.
 
     """
-    return Subscription(sensor, address, kind, latest_only, stale_after_s, timeout_s)
+    return Subscription(sensor, address, kind, latest_only, stale_after_s, timeout_s, as_keys(keys))
 
 
 class Subscription(Iterator[Frame]):
@@ -73,6 +83,7 @@ class Subscription(Iterator[Frame]):
         latest_only: bool,
         stale_after_s: float,
         timeout_s: float | None,
+        keys: Keys | None,
     ) -> None:
         if kind not in ("map", "contacts"):
             raise MessageError(f"cannot subscribe to {kind!r}", "use kind='map' or 'contacts'")
@@ -84,21 +95,37 @@ class Subscription(Iterator[Frame]):
         self.missed = 0
         self.malformed = 0
         self._newest: Frame | None = None
+        self._keys = keys
+        self._knock_at_s = 0.0
         prefix = topic(sensor, kind)
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
-        connect_subscriber(self._socket, address, [prefix], latest_only=latest_only)
-        self._closed = weakref.finalize(self, self._socket.close)
+        self._handshakes = Handshakes(self._socket)
+        self._closed = weakref.finalize(self, _close, self._handshakes, self._socket)
+        try:
+            connect_subscriber(self._socket, address, [prefix], latest_only=latest_only, keys=keys)
+        except ControlError:
+            self._closed()
+            raise
 
     def __next__(self) -> Frame:
-        """Wait for the next frame; raise StreamTimeout when it does not come in time."""
-        deadline = None if self.timeout_s is None else time.monotonic() + self.timeout_s
+        """Wait for the next frame.
+
+        Raises:
+            StreamTimeout: it does not come in time.
+            KeysError: the server does not let this client in. The next call knocks once more.
+
+        """
+        deadline_s = math.inf if self.timeout_s is None else time.monotonic() + self.timeout_s
         while self._closed.alive:
-            wait_s = None if deadline is None else max(0.0, deadline - time.monotonic())
+            wait_s = min(KNOCK_PERIOD_S, max(0.0, deadline_s - time.monotonic()))
             # zmq waits in whole milliseconds: round up, or the last one is spent spinning.
-            if not self._socket.poll(None if wait_s is None else int(wait_s * 1000) + 1):
+            if self._socket.poll(int(wait_s * 1000) + 1):
+                if frame := self._receive():
+                    return frame
+            elif refusal := self._knock_again():
+                raise refusal
+            elif time.monotonic() >= deadline_s:
                 raise self._timeout()
-            if frame := self._receive():
-                return frame
         raise StopIteration
 
     def latest(self) -> Frame | None:
@@ -108,6 +135,8 @@ class Subscription(Iterator[Frame]):
         """
         while self._closed.alive and self._socket.poll(0):
             self._receive()
+        if self._closed.alive and self.is_stale:
+            self._knock_again()
         return self._newest
 
     @property
@@ -144,6 +173,17 @@ class Subscription(Iterator[Frame]):
         self._newest = frame
         return frame
 
+    def _knock_again(self) -> KeysError | None:
+        """Return why the server does not let us in, if so, and try again from time to time.
+
+        ZeroMQ itself never tries again where a key was refused.
+        """
+        refusal = self._handshakes.refusal(self.address, self._keys)
+        if refusal and time.monotonic() >= self._knock_at_s:
+            self._knock_at_s = time.monotonic() + KNOCK_PERIOD_S
+            reconnect(self._socket, self.address)
+        return refusal
+
     def _timeout(self) -> StreamTimeout:
         last = "none came before" if self._newest is None else "the stream has stopped"
         return StreamTimeout(
@@ -154,8 +194,20 @@ class Subscription(Iterator[Frame]):
         )
 
 
+def reconnect(socket: zmq.Socket[Any], address: str) -> None:
+    """Drop a connection and make it anew; what is subscribed to stays so."""
+    with contextlib.suppress(zmq.ZMQError):  # it may be gone altogether
+        socket.disconnect(address)
+    socket.connect(address)
+
+
 def connect_subscriber(
-    socket: zmq.Socket[Any], address: str, topics: Iterable[bytes], *, latest_only: bool = False
+    socket: zmq.Socket[Any],
+    address: str,
+    topics: Iterable[bytes],
+    *,
+    latest_only: bool = False,
+    keys: Keys | None = None,
 ) -> None:
     """Set up a SUB socket (a plain or an asyncio one) as STREAM.md recommends, and connect it.
 
@@ -168,6 +220,7 @@ def connect_subscriber(
     # A computer that lost power never closes its connections; heartbeats notice.
     socket.setsockopt(zmq.HEARTBEAT_IVL, 1000)
     socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, 3000)
+    secure(socket, address, keys)
     if latest_only:
         socket.setsockopt(zmq.CONFLATE, 1)
     for prefix in topics:
@@ -177,3 +230,8 @@ def connect_subscriber(
     except zmq.ZMQError as error:
         socket.close()
         raise bad_address(address, error) from error
+
+
+def _close(handshakes: Handshakes, socket: zmq.Socket[bytes]) -> None:
+    handshakes.close()
+    socket.close()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM, ClientError
+from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM, ClientError, Keys
 
 from tactomo_viewer.server import DEFAULT_HOST, DEFAULT_PORT, serve
 
@@ -21,8 +21,10 @@ def main() -> int:
     parser.add_argument("--twin", help="the twin's control socket, to press the simulated skin")
     parser.add_argument("--host", default=DEFAULT_HOST, help="default: %(default)s")
     parser.add_argument("--port", type=int, default=DEFAULT_PORT, help="default: %(default)s")
+    parser.add_argument("--keys", help="folder of keys, for a daemon beyond this computer")
     options = parser.parse_args()
     try:
+        options.keys = options.keys and Keys.load(options.keys)
         serve(**vars(options))
     except ClientError as error:
         print(f"{parser.prog}: {error.cause}", error.next_step, sep="\n  ", file=sys.stderr)

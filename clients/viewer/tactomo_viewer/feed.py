@@ -10,13 +10,15 @@ from typing import Any
 
 import zmq
 import zmq.asyncio
-from tactomo_client import Frame, MessageError
+from tactomo_client import Frame, Keys, MessageError
 from tactomo_client.frame import frame_from_message
 from tactomo_client.messages import EVENT, MAP, STATUS, decode_message, topic
-from tactomo_client.subscription import connect_subscriber
+from tactomo_client.subscription import connect_subscriber, reconnect
 
 STALE_AFTER_S = 0.5
 EVENTS_KEPT = 100
+SILENCE_MS = 5000
+"""After such a silence (a status comes every second) the connection is made anew."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,9 @@ class Feed:
 
     """
 
-    def __init__(self, sensor: str, address: str, on_change: Callable[[], None]) -> None:
+    def __init__(
+        self, sensor: str, address: str, keys: Keys | None, on_change: Callable[[], None]
+    ) -> None:
         self.frame: Frame | None = None
         self.status: Status | None = None
         self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
@@ -64,13 +68,17 @@ class Feed:
         self._on_change = on_change
         topics = [topic(sensor, kind) for kind in (MAP, STATUS, EVENT)]
         self._socket = zmq.asyncio.Context.instance().socket(zmq.SUB)
-        connect_subscriber(self._socket, address, topics)
+        self._address = address
+        connect_subscriber(self._socket, address, topics, keys=keys)
 
     async def run(self) -> None:
         """Read until cancelled, then close the socket."""
         with self._socket:
             while True:
-                self._take(await self._socket.recv(), time.monotonic_ns())
+                if await self._socket.poll(SILENCE_MS):
+                    self._take(await self._socket.recv(), time.monotonic_ns())
+                else:  # ZeroMQ does not knock again where a key was refused
+                    reconnect(self._socket, self._address)
 
     def _take(self, data: bytes, received_ns: int) -> None:
         try:

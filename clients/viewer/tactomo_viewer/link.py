@@ -7,15 +7,18 @@ from typing import Any
 
 import zmq
 import zmq.asyncio
+from tactomo_client import Keys
 from tactomo_client.control import bad_address, no_answer
+from tactomo_client.keys import secure
 from tactomo_client.messages import MAX_MESSAGE_BYTES, decode_reply, encode_request
 
 
 class ControlLink:
     """One control socket. Commands are sent one at a time, in the order of the calls."""
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, keys: Keys | None = None) -> None:
         self.address = address
+        self._keys = keys
         self._turn = asyncio.Lock()
         self._socket: zmq.asyncio.Socket | None = None
 
@@ -54,6 +57,7 @@ class ControlLink:
         socket = zmq.asyncio.Context.instance().socket(zmq.REQ)
         socket.setsockopt(zmq.LINGER, 0)
         socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
+        secure(socket, self.address, self._keys)
         try:
             socket.connect(self.address)
         except zmq.ZMQError as error:

@@ -18,7 +18,7 @@ from urllib.parse import urlsplit
 
 from aiohttp import WSCloseCode, web
 from aiohttp.typedefs import Handler, Middleware
-from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM, ClientError
+from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM, ClientError, Keys
 
 from tactomo_viewer.browser import Browser
 from tactomo_viewer.feed import Feed
@@ -53,6 +53,7 @@ def serve(
     twin: str | None = None,
     host: str = DEFAULT_HOST,
     port: int = DEFAULT_PORT,
+    keys: Keys | None = None,
 ) -> None:
     """Serve the viewer until SIGINT or SIGTERM; prints its URL on stdout once it can be opened.
 
@@ -63,13 +64,14 @@ def serve(
         twin: the twin's control socket, where there is a twin.
         host: the address to listen on; on any but a loopback one the viewer only shows.
         port: the port to listen on; 0 takes a free one.
+        keys: for a daemon beyond this computer.
 
     Raises:
         ViewerError: the address cannot be listened on.
         ClientError: `sensor` is no sensor's name, or `stream` no address.
 
     """
-    asyncio.run(_serve(make_app(sensor, stream, control, twin, host), host, port))
+    asyncio.run(_serve(make_app(sensor, stream, control, twin, host, keys), host, port))
 
 
 async def _serve(app: web.Application, host: str, port: int) -> None:
@@ -104,9 +106,10 @@ def make_app(
     control: str = DEFAULT_CONTROL,
     twin: str | None = None,
     host: str = DEFAULT_HOST,
+    keys: Keys | None = None,
 ) -> web.Application:
     """Return the viewer as an aiohttp application; arguments as for `serve`."""
-    viewer = _Viewer(sensor, stream, control, twin, host)
+    viewer = _Viewer(sensor, stream, control, twin, host, keys)
     app = web.Application(middlewares=[_only_for(host)])
     app.cleanup_ctx.append(viewer.running)
     app.on_shutdown.append(viewer.say_goodbye)
@@ -122,19 +125,27 @@ def make_app(
 class _Viewer:
     """What all open pages share: one feed, one link to the daemon and one to the twin."""
 
-    def __init__(self, sensor: str, stream: str, control: str, twin: str | None, host: str) -> None:
+    def __init__(
+        self,
+        sensor: str,
+        stream: str,
+        control: str,
+        twin: str | None,
+        host: str,
+        keys: Keys | None,
+    ) -> None:
         may_command = is_loopback(host)
         self._about = {"sensor": sensor, "stream": stream, "read_only": not may_command}
         self._browsers: set[Browser] = set()
         self._sockets: set[web.WebSocketResponse] = set()
-        self._daemon = ControlLink(control) if may_command else None
+        self._daemon = ControlLink(control, keys) if may_command else None
         self._twin = ControlLink(twin) if may_command and twin else None
         self._twin_answers = False
-        self._sensor, self._stream = sensor, stream
+        self._sensor, self._stream, self._keys = sensor, stream, keys
         self._feed: Feed
 
     async def running(self, _: web.Application) -> AsyncIterator[None]:
-        self._feed = Feed(self._sensor, self._stream, self._wake)
+        self._feed = Feed(self._sensor, self._stream, self._keys, self._wake)
         tasks = [asyncio.create_task(self._feed.run()), asyncio.create_task(self._watch_twin())]
         yield
         for task in tasks:

@@ -14,6 +14,7 @@ DEFAULT_STREAM = "tcp://127.0.0.1:5560"
 DEFAULT_CONTROL = "tcp://127.0.0.1:5561"
 DEFAULT_TWIN_CONTROL = "tcp://127.0.0.1:5562"
 DEFAULT_VIEWER_PORT = 8750
+KEYS_VARIABLE = "TACTOMO_KEYS"
 
 RUN = "Run"
 STEER = "Steer a running daemon"
@@ -22,7 +23,7 @@ BUILD = "Models and measures"
 
 ORDER = (
     *("demo", "daemon", "twin", "viewer"),
-    *("status", "watch", "tare", "record", "tier", "poke"),
+    *("status", "watch", "tare", "record", "tier", "poke", "keys"),
     *("info", "import", "replay", "reconstruct", "plot"),
     *("models", "bench", "bench-solves", "evaluate"),
 )
@@ -80,6 +81,15 @@ StreamAddress: TypeAlias = Annotated[
 ]
 ControlAddress: TypeAlias = Annotated[
     str, typer.Option("--control", help="Address of the daemon's control socket.")
+]
+KeysFolder: TypeAlias = Annotated[
+    Path | None,
+    typer.Option(
+        "--keys",
+        envvar=KEYS_VARIABLE,
+        help="Folder of keys, for a daemon beyond this computer: see `tactomo keys`.",
+        show_default=False,
+    ),
 ]
 JsonOutput: TypeAlias = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
 Announce: TypeAlias = Annotated[

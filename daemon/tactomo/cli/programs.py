@@ -19,6 +19,7 @@ from tactomo.cli.app import (
     Announce,
     ControlAddress,
     Description,
+    KeysFolder,
     Method,
     RecordingFile,
     SensorName,
@@ -225,11 +226,15 @@ def viewer(
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="Port of the page; 0 takes a free one.")
     ] = DEFAULT_VIEWER_PORT,
+    keys: KeysFolder = None,
 ) -> None:
     """Serve a web page that shows the maps and contacts of a running daemon."""
+    from tactomo_client.keys import as_keys
     from tactomo_viewer import serve
 
-    serve(sensor, stream=stream, control=control, twin=twin, host=host, port=port)
+    serve(
+        sensor, stream=stream, control=control, twin=twin, host=host, port=port, keys=as_keys(keys)
+    )
 
 
 @app.command(

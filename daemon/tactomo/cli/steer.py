@@ -15,6 +15,7 @@ from tactomo.cli.app import (
     STEER,
     ControlAddress,
     JsonOutput,
+    KeysFolder,
     Method,
     app,
     examples,
@@ -30,11 +31,15 @@ TARE_TIMEOUT_S = 30.0
     rich_help_panel=STEER,
     epilog=examples("tactomo status", "tactomo status --json | jq .latency_ms"),
 )
-def status(control: ControlAddress = DEFAULT_CONTROL, as_json: JsonOutput = False) -> None:
+def status(
+    control: ControlAddress = DEFAULT_CONTROL,
+    keys: KeysFolder = None,
+    as_json: JsonOutput = False,
+) -> None:
     """Show how the daemon is: ports, rates, latency, the time of each stage, what was lost."""
     from tactomo_client import request
 
-    answer = request("status", control)
+    answer = request("status", control, keys=keys)
     if as_json:
         typer.echo(json.dumps(answer, indent=2, default=str))
         return
@@ -47,7 +52,7 @@ def status(control: ControlAddress = DEFAULT_CONTROL, as_json: JsonOutput = Fals
     rich_help_panel=STEER,
     epilog=examples("tactomo tare"),
 )
-def tare(control: ControlAddress = DEFAULT_CONTROL) -> None:
+def tare(control: ControlAddress = DEFAULT_CONTROL, keys: KeysFolder = None) -> None:
     """Take a new reference: the next scans of the *unloaded* skin count as "nothing pressed".
 
     Leave the skin alone for a second, then run this. Needed after mounting the skin, after a
@@ -55,7 +60,7 @@ def tare(control: ControlAddress = DEFAULT_CONTROL) -> None:
     """
     from tactomo_client import request
 
-    answer = request("tare", control, timeout_s=TARE_TIMEOUT_S)
+    answer = request("tare", control, TARE_TIMEOUT_S, keys=keys)
     typer.echo(f"new reference from {answer.get('scans', '?')} dual scans")
 
 
@@ -82,6 +87,7 @@ def record(
         typer.Option(min=0.1, help="For FILE: how long; until Ctrl-C when left out."),
     ] = None,
     control: ControlAddress = DEFAULT_CONTROL,
+    keys: KeysFolder = None,
 ) -> None:
     """Record what the ports say (every byte, with its time) into an MCAP file.
 
@@ -93,17 +99,17 @@ def record(
     if what not in ("start", "stop"):
         if path is not None:
             raise typer.BadParameter("give one file, or `start FILE`")
-        _record_for(Path(what), seconds, control)
+        _record_for(Path(what), seconds, control, keys)
         return
     if seconds is not None:
         raise typer.BadParameter("--seconds goes with FILE, not with start or stop")
     if what == "stop":
         if path is not None:
             raise typer.BadParameter("stop takes no file")
-        _tell_recorded(request("record_stop", control, timeout_s=10.0))
+        _tell_recorded(request("record_stop", control, 10.0, keys=keys))
         return
     arguments = {} if path is None else {"path": str(path.absolute())}
-    answer = request("record_start", control, timeout_s=10.0, **arguments)
+    answer = request("record_start", control, 10.0, keys=keys, **arguments)
     typer.echo(f"recording to {answer['path']}")
 
 
@@ -120,13 +126,14 @@ def tier(
         float | None, typer.Option(min=0.1, help="Time that one reconstruction may take.")
     ] = None,
     control: ControlAddress = DEFAULT_CONTROL,
+    keys: KeysFolder = None,
 ) -> None:
     """Choose how much model a frame is given, while the daemon runs."""
     from tactomo_client import request
 
-    answer = request("set_tier", control, tier=name)
+    answer = request("set_tier", control, keys=keys, tier=name)
     if budget_ms is not None:
-        request("set_budget", control, budget_ms=budget_ms)
+        request("set_budget", control, keys=keys, budget_ms=budget_ms)
     typer.echo(f"tier {answer.get('tier', name)}")
 
 
@@ -244,11 +251,11 @@ def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-def _record_for(path: Path, seconds: float | None, control: str) -> None:
+def _record_for(path: Path, seconds: float | None, control: str, keys: Path | None) -> None:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
     from tactomo_client import request
 
-    started = request("record_start", control, timeout_s=10.0, path=str(path.absolute()))
+    started = request("record_start", control, 10.0, keys=keys, path=str(path.absolute()))
     size = TextColumn("{task.fields[size]}")
     columns = (TextColumn("recording"), BarColumn(), TimeElapsedColumn(), size)
     begin_s = time.monotonic()
@@ -256,7 +263,9 @@ def _record_for(path: Path, seconds: float | None, control: str) -> None:
         with Progress(*columns, transient=True) as progress:
             task = progress.add_task(started["path"], total=seconds, size="")
             while seconds is None or time.monotonic() - begin_s < seconds:
-                recorded = (request("status", control).get("recording") or {}).get("bytes", 0)
+                recorded = (request("status", control, keys=keys).get("recording") or {}).get(
+                    "bytes", 0
+                )
                 passed_s = time.monotonic() - begin_s
                 progress.update(task, completed=passed_s, size=f"{recorded / 1e6:.1f} MB")
                 left_s = 0.5 if seconds is None else seconds - passed_s
@@ -264,7 +273,7 @@ def _record_for(path: Path, seconds: float | None, control: str) -> None:
     except KeyboardInterrupt:
         pass  # the way to end a recording without --seconds
     finally:
-        _tell_recorded(request("record_stop", control, timeout_s=10.0))
+        _tell_recorded(request("record_stop", control, 10.0, keys=keys))
 
 
 def _tell_recorded(answer: dict[str, Any]) -> None:

@@ -12,6 +12,7 @@ from tactomo.cli.app import (
     DEFAULT_NAME,
     DEFAULT_STREAM,
     STEER,
+    KeysFolder,
     SensorName,
     StreamAddress,
     app,
@@ -21,7 +22,7 @@ from tactomo.cli.app import (
 if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.text import Text
-    from tactomo_client import Frame
+    from tactomo_client import Frame, Keys
 
 REFRESH_HZ = 12.0
 STALE_S = 0.5
@@ -42,14 +43,16 @@ def watch(
     seconds: Annotated[
         float | None, typer.Option(min=0.0, help="Stop after this long; until Ctrl-C without it.")
     ] = None,
+    keys: KeysFolder = None,
 ) -> None:
     """Show the pressure map, the contacts and the daemon's health live in the terminal.
 
     Without a terminal (in a pipe) it prints one line a frame instead. Ctrl-C ends it.
     """
     from rich.console import Console
+    from tactomo_client.keys import as_keys
 
-    view = View(sensor, stream)
+    view = View(sensor, stream, as_keys(keys))
     console = Console()
     end_s = float("inf") if seconds is None else time.monotonic() + seconds
     try:
@@ -66,10 +69,12 @@ def watch(
 class View:
     """The newest frame, status and event of one sensor."""
 
-    def __init__(self, sensor: str, stream: str) -> None:
+    def __init__(self, sensor: str, stream: str, keys: Keys | None = None) -> None:
         import zmq
-        from tactomo_client.control import bad_address
+        from tactomo_client import ClientError
+        from tactomo_client.keys import Handshakes
         from tactomo_client.messages import EVENT, MAP, STATUS, topic
+        from tactomo_client.subscription import connect_subscriber
 
         self.sensor = sensor
         self.stream = stream
@@ -77,18 +82,23 @@ class View:
         self.status: dict[str, Any] = {}
         self.status_s = 0.0
         self.event: dict[str, Any] = {}
+        self._keys = keys
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        for kind in (MAP, STATUS, EVENT):
-            self._socket.subscribe(topic(sensor, kind))
+        self._handshakes = Handshakes(self._socket)
+        topics = [topic(sensor, kind) for kind in (MAP, STATUS, EVENT)]
         try:
-            self._socket.connect(stream)
-        except zmq.ZMQError as error:
-            self._socket.close()
-            raise bad_address(stream, error) from error
+            connect_subscriber(self._socket, stream, topics, keys=keys)
+        except ClientError:
+            self.close()
+            raise
 
     def update(self, wait_s: float) -> bool:
-        """Take in what has come, waiting for it at most `wait_s`; tell whether a frame came."""
+        """Take in what has come, waiting for it at most `wait_s`; tell whether a frame came.
+
+        Raises:
+            KeysError: the server does not let us in.
+
+        """
         from tactomo_client import MessageError
 
         new = False
@@ -98,10 +108,13 @@ class View:
                 new |= self._take(self._socket.recv())
             except MessageError:
                 continue  # another program publishes there; ours will show, or its silence will
+        if refusal := self._handshakes.refusal(self.stream, self._keys):
+            raise refusal
         return new
 
     def close(self) -> None:
         """Close the subscription."""
+        self._handshakes.close()
         self._socket.close()
 
     @property
