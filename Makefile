@@ -8,7 +8,7 @@ TRAIN_READY := $(VENV)/.ready-train
 LOCKED := pyproject.toml --universal --python-version 3.11 --generate-hashes \
   --no-emit-package tactomo-client --no-emit-package tactomo
 
-.PHONY: help run test test-slow test-train lint format bench lock clean
+.PHONY: help run test test-slow test-train faults soak lint format bench lock clean
 
 help:            ## list these targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -24,6 +24,12 @@ test-slow: $(READY)  ## the tests too long for every run
 
 test-train: $(TRAIN_READY)  ## the tests of training; installs PyTorch
 	$(BIN)/pytest -m train $(ARGS)
+
+faults: $(READY) ## every fault and measure (an hour), then docs/reliability.md from them
+	$(BIN)/pytest tests/faults -m '' --reliability docs/reliability.md $(ARGS)
+
+soak: $(READY)   ## a million dual scans as fast as they are taken
+	$(BIN)/pytest tests/faults -m '' -k soak $(ARGS)
 
 lint: $(READY)   ## ruff and mypy --strict
 	$(BIN)/ruff check .

@@ -28,6 +28,15 @@ CHROMIUM_OPTIONS = (
 )
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--reliability", metavar="PAGE", help="write what the fault suite finds to this page"
+    )
+    parser.addoption(
+        "--scale", type=float, default=1.0, help="of the fault suite's long measures, do this share"
+    )
+
+
 @pytest.fixture(scope="session")
 def _chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[webdriver.Chrome]:
     program = shutil.which("chromium") or shutil.which("chromium-browser")

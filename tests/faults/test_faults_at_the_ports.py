@@ -1,0 +1,352 @@
+"""Faults between the skin and the daemon: cables, noise, lost channels, devices that restart."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from daemon_process import DaemonProcess, wait_until
+from ears import Ears
+from pty_skin import Playing, PtySkin, Scenes, still
+from tactomo.twin import Twin, TwinConfig
+from tactomo_client import request
+from tactomo_client.messages import array_from_wire
+from tactomo_models import SensorDescription, SkinSimulator
+from tactomo_protocol import Channel, encode
+
+Start = Callable[..., DaemonProcess]
+Play = Callable[..., Playing]
+Listen = Callable[..., Ears]
+Figure = Callable[[str], None]
+
+BACK_S = 1.0
+
+
+def seconds_to_the_next_frame(ears: Ears, counter: int, begin_s: float) -> float:
+    """Wait for a frame of both channels, of a dual scan after number `counter`."""
+    frame = ears.wait(
+        lambda heard: heard.fields["scan_counter"] > counter and not heard.fields["flags"],
+        "a frame of both channels",
+        max(0, len(ears.heard) - 5),
+    )
+    return frame.arrived_ns * 1e-9 - begin_s
+
+
+def wait_until_told(daemon: DaemonProcess, event: str, times: int = 1) -> None:
+    wait_until(lambda: len(daemon.told(event)) >= times, f"{times} {event} in its log")
+
+
+def unplug_and_replug(times: int, daemon: DaemonProcess, skin: PtySkin, ears: Ears) -> list[float]:
+    """Pull all cables and put them back; returns how long the frames took to come again."""
+    out_s = np.random.default_rng(0).uniform(0.05, 0.5, times)
+    took_s = []
+    for pause_s in out_s:
+        lost = len(daemon.told("port_lost"))
+        skin.unplug()
+        wait_until_told(daemon, "port_lost", lost + 2)
+        time.sleep(pause_s)
+        begin_s = time.monotonic()
+        skin.plug()
+        took_s.append(seconds_to_the_next_frame(ears, skin.counter, begin_s))
+    return took_s
+
+
+@pytest.mark.faults
+@pytest.mark.timeout(600)
+@pytest.mark.fault(
+    "Both cables pulled and put back 100 times",
+    "frames again within 1 s; threads and descriptors as before",
+    "both pseudo-terminals closed for 0.05 to 0.5 s and made anew under the same names, at 20 dual "
+    "scans/s",
+)
+def test_unplugged_and_replugged(
+    tared: Start, skin: PtySkin, scenes: Scenes, play: Play, listen: Listen, figure: Figure
+) -> None:
+    daemon = tared()
+    ears = listen(daemon)
+    play(still(scenes.rest))
+    unplug_and_replug(3, daemon, skin, ears)
+    before = daemon.threads, daemon.descriptors, daemon.rss_mb
+    took_s = unplug_and_replug(100, daemon, skin, ears)
+    after = daemon.threads, daemon.descriptors, daemon.rss_mb
+    figure(
+        f"median {np.median(took_s):.2f} s, worst {max(took_s):.2f} s; threads {before[0]} and "
+        f"{after[0]}, descriptors {before[1]} and {after[1]}, memory {after[2] - before[2]:+.1f} MB"
+    )
+    assert max(took_s) < BACK_S
+    assert after[:2] == before[:2]
+    assert after[2] - before[2] < 10
+
+
+class Corrupter:
+    """Damages what a skin sends: a share of all bytes, in runs of `length`."""
+
+    def __init__(self, skin: PtySkin, share: float, length: int) -> None:
+        self.damaged: dict[int, set[Channel]] = {}
+        self._rng = np.random.default_rng(2)
+        self._start_share = share / length
+        self._length = length
+        self._skin = skin
+
+    def say(self, volts: Any) -> int:
+        """Send the next dual scan, damaged where chance has it."""
+        skin = self._skin
+        counter = skin.counter
+        skin.counter += 1
+        skin.attend()
+        for channel, values in volts.items():
+            data = encode(skin.scan(channel, counter, values))
+            sent = self._damage(data)
+            if sent != data:
+                self.damaged.setdefault(counter, set()).add(channel)
+            skin.send(skin.lines[channel], sent)
+        return counter
+
+    def _damage(self, data: bytes) -> bytes:
+        hit = np.zeros(len(data), bool)
+        for begin in np.flatnonzero(self._rng.random(len(data)) < self._start_share):
+            hit[begin : begin + self._length] = True
+        noise = self._rng.integers(0, 256, len(data), dtype=np.uint8)
+        return np.where(hit, noise, np.frombuffer(data, np.uint8)).astype(np.uint8).tobytes()
+
+
+@pytest.mark.parametrize(
+    ("share", "length", "how"),
+    [
+        pytest.param(0.01, 50, "in runs of 50", marks=pytest.mark.faults),
+        pytest.param(0.01, 1, "one here, one there", marks=pytest.mark.faults),
+        (0.5, 100, "in runs of 100"),
+    ],
+)
+@pytest.mark.fault(
+    "{share:.0%} of all bytes corrupted, {how}",
+    "every frame comes of scans that arrived intact, voltages equal to those sent; every intact "
+    "scan is used or counted as dropped; frames of both channels within 1 s of the end",
+    "500 dual scans at 100/s, random bytes put in the place of the sent ones",
+)
+def test_corrupted_bytes(
+    tared: Start,
+    skin: PtySkin,
+    scenes: Scenes,
+    listen: Listen,
+    play: Play,
+    figure: Figure,
+    share: float,
+    length: int,
+    how: str,
+) -> None:
+    daemon = tared()
+    ears = listen(daemon, "scan", "contacts")
+    wait_until(lambda: daemon.status()["subscribers"] == 2, "the subscriptions")
+    before = daemon.status()
+    packets = sum(port["packets"] for port in before["ports"])
+    sent: dict[tuple[int, Channel], Any] = {}
+    plain, corrupter = skin.scan, Corrupter(skin, share, length)
+
+    def scan(channel: Channel, counter: int, volts: Any) -> Any:
+        made = plain(channel, counter, volts)
+        sent[counter, channel] = made.volts(skin.hello(skin.lines[channel]).volts_per_count)
+        return made
+
+    skin.scan = scan  # type: ignore[method-assign]
+    first = skin.counter
+    for volts in [scenes.rest] * 500:
+        corrupter.say(volts)
+        time.sleep(0.01)
+    last = skin.counter - 1
+    time.sleep(0.3)
+    begin_s = time.monotonic()
+    play(still(scenes.rest))
+    complete = ears.wait(
+        lambda h: (
+            h.kind == "contacts" and h.fields["scan_counter"] > last and not h.fields["flags"]
+        ),
+        "a frame without flags",
+    )
+    back_s = complete.arrived_ns * 1e-9 - begin_s
+    status = daemon.status()
+    published = [h for h in ears.of("scan") if first <= h.fields["scan_counter"] <= last]
+    intact = {key for key in sent if first <= key[0] <= last} - {
+        (counter, channel)
+        for counter, channels in corrupter.damaged.items()
+        for channel in channels
+    }
+    used = {
+        (heard.fields["scan_counter"], channel)
+        for heard in published
+        for channel in Channel
+        if heard.fields[channel.name.lower()] is not None
+    }
+    corrupt = sum(port["corrupt"] for port in status["ports"])
+    dropped = status["dropped_scans"] - before["dropped_scans"]
+    figure(
+        f"{len(intact)} of 1000 scans intact, of {len({counter for counter, _ in intact})} dual "
+        f"scans = {len(published)} published + {dropped} dropped; {corrupt} damaged packets "
+        f"counted; whole again after {back_s:.2f} s"
+    )
+    for heard in published:
+        for channel in Channel:
+            volts = heard.fields[channel.name.lower()]
+            if volts is not None:
+                expected = sent[heard.fields["scan_counter"], channel]
+                assert np.array_equal(array_from_wire(volts), expected)
+    assert used <= intact
+    assert len(published) + dropped == len({counter for counter, _ in intact})
+    assert corrupt >= 1000 - len(intact)
+    assert sum(port["packets"] for port in status["ports"]) - packets >= len(intact)
+    assert back_s < BACK_S
+
+
+@pytest.mark.faults
+@pytest.mark.fault(
+    "10 MB of noise on one of two ports",
+    "the other channel's frames go on; memory flat; both channels within 1 s of its end",
+    "random bytes as fast as they are read, the other port at 20 scans/s",
+)
+def test_a_burst_of_noise(
+    tared: Start, skin: PtySkin, scenes: Scenes, listen: Listen, play: Play, figure: Figure
+) -> None:
+    daemon = tared()
+    ears = listen(daemon)
+    rss_mb = daemon.rss_mb
+    line = skin.lines[Channel.STRUCTURE]
+    only = {Channel.MAGNITUDE: scenes.rest[Channel.MAGNITUDE]}
+    playing = play(still(only))
+    noise = np.random.default_rng(3).bytes(1_000_000)
+    begin_s = time.monotonic()
+    for _ in range(10):
+        skin.send(line, noise)
+    took_s = time.monotonic() - begin_s
+    meanwhile = len(ears.heard)
+    grown_mb = daemon.rss_mb - rss_mb
+    playing.stop()
+    last, end_s = skin.counter - 1, time.monotonic()
+    play(still(scenes.rest))
+    back = ears.wait(
+        lambda h: h.fields["scan_counter"] > last and not h.fields["flags"], "both channels"
+    )
+    back_s = back.arrived_ns * 1e-9 - end_s
+    figure(
+        f"read in {took_s:.1f} s ({10 / took_s:.0f} MB/s), {meanwhile} frames meanwhile, memory "
+        f"{grown_mb:+.1f} MB, both channels after {back_s:.2f} s"
+    )
+    assert meanwhile >= 0.7 * took_s * 20 - 3
+    assert grown_mb < 20
+    assert back_s < BACK_S
+
+
+@pytest.fixture(scope="module")
+def twin_skin(description: SensorDescription) -> SkinSimulator:
+    return SkinSimulator(description, 4e-3, unevenness=0.03, impedance_spread=0.1)
+
+
+@pytest.fixture
+def twin(
+    tmp_path: Path, description: SensorDescription, twin_skin: SkinSimulator
+) -> Iterator[Callable[[], Twin]]:
+    """Power up a twin on two lines of fixed names."""
+    running: list[Twin] = []
+
+    def begin() -> Twin:
+        config = TwinConfig(
+            description, ports=2, control="tcp://127.0.0.1:0", link_folder=tmp_path / "lines"
+        )
+        running.append(Twin(config, twin_skin))
+        running[-1].start()
+        return running[-1]
+
+    yield begin
+    for one in running:
+        one.stop()
+
+
+@pytest.mark.faults
+@pytest.mark.timeout(300)
+@pytest.mark.fault(
+    "One channel lost for a minute",
+    "flagged, maps go on at the same rate, both channels within 1 s of its return",
+    "the twin says nothing of the structure channel for 60 s, a press of 180 kPa on it",
+)
+def test_a_channel_is_lost_for_a_minute(
+    twin: Callable[[], Twin], start: Start, listen: Listen, figure: Figure
+) -> None:
+    device = twin()
+    daemon = start(list(device.ports))
+    ears = listen(daemon, "map")
+    wait_until_told(daemon, "tared")
+    request("press", device.control, x_mm=10.0, y_mm=-10.0)
+    whole = ears.wait(lambda h: not h.fields["flags"] and h.fields["contacts"], "a contact")
+    muted_s = time.monotonic()
+    request("mute", device.control, channel="structure", seconds=60.0)
+    began = len(ears.heard)
+    missing = ears.wait(lambda h: "structure_missing" in h.fields["flags"], "the flag", began)
+    time.sleep(max(0.0, muted_s + 60.0 - time.monotonic()))
+    during = ears.heard[began:]
+    back = ears.wait(lambda h: not h.fields["flags"], "both channels", len(ears.heard))
+    gaps_s = np.diff([heard.arrived_ns * 1e-9 for heard in during])
+    flagged = [heard for heard in during if "structure_missing" in heard.fields["flags"]]
+    seen = [heard for heard in flagged if heard.fields["contacts"]]
+    back_s = back.arrived_ns * 1e-9 - muted_s - 60.0
+    figure(
+        f"flagged after {missing.arrived_ns * 1e-9 - muted_s:.2f} s; {len(during)} maps in 60 s, "
+        f"the contact in {len(seen) / len(flagged):.0%} of them, longest gap {gaps_s.max():.2f} s; "
+        f"both channels {back_s:.2f} s after the return"
+    )
+    assert whole.fields["structure"] is not None
+    assert all(heard.fields["map"] is not None for heard in flagged)
+    assert len(during) > 0.9 * 60 * 20
+    assert gaps_s.max() < 0.5
+    assert back_s < BACK_S
+
+
+@pytest.mark.faults
+@pytest.mark.fault(
+    "The device restarts: counter and clock at 0 again, cables pulled for a moment",
+    "told as an event; frames again within 1 s of its return, on the old reference",
+    "the twin is stopped and a new one started under the same names",
+)
+def test_the_device_restarts(
+    twin: Callable[[], Twin], start: Start, listen: Listen, figure: Figure
+) -> None:
+    device = twin()
+    daemon = start(list(device.ports))
+    ears = listen(daemon)
+    wait_until_told(daemon, "tared")
+    device.stop()
+    wait_until_told(daemon, "port_lost", 2)
+    heard, begin_s = len(ears.heard), time.monotonic()
+    twin()
+    back = ears.wait(lambda h: not h.fields["flags"], "frames again", heard)
+    back_s = back.arrived_ns * 1e-9 - begin_s
+    wait_until_told(daemon, "device_restarted")
+    figure(f"{back_s:.2f} s, first counter {back.fields['scan_counter']}")
+    assert back_s < BACK_S + 1.0  # the twin's own start is in it
+    assert len(daemon.told("tared")) == 1
+
+
+@pytest.mark.fault(
+    "The two boards plugged into each other's place",
+    "each channel is known by what its board says of itself: frames go on without a flag",
+    "both cables pulled, put back crosswise at 20 dual scans/s",
+)
+def test_the_boards_are_exchanged(
+    tared: Start, skin: PtySkin, scenes: Scenes, listen: Listen, play: Play, figure: Figure
+) -> None:
+    daemon = tared()
+    ears = listen(daemon)
+    skin.unplug()
+    wait_until_told(daemon, "port_lost", 2)
+    first, second = Channel
+    skin.lines[first], skin.lines[second] = skin.lines[second], skin.lines[first]
+    skin.plug()
+    begin_s, last = time.monotonic(), skin.counter - 1
+    play(still(scenes.rest))
+    frame = ears.wait(lambda h: h.fields["scan_counter"] > last and not h.fields["flags"], "frames")
+    figure(f"frames without a flag after {frame.arrived_ns * 1e-9 - begin_s:.2f} s")
+    time.sleep(1.0)
+    late = [h for h in ears.heard if h.arrived_ns > frame.arrived_ns]
+    assert not any(heard.fields["flags"] for heard in late)

@@ -1,0 +1,131 @@
+"""Too much to do: scans that come too fast, a daemon that is stopped for a while or told to end."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from daemon_process import DaemonProcess, wait_until
+from ears import Ears, percentiles
+from pty_skin import Playing, PtySkin, Scenes, moving, still
+from tactomo.recording import open_recording
+
+Start = Callable[..., DaemonProcess]
+Play = Callable[..., Playing]
+Listen = Callable[..., Ears]
+Figure = Callable[[str], None]
+
+STOPPED_S = 5.0
+OVERLOAD_S = 15.0
+
+
+def at_rest(daemon: DaemonProcess) -> dict[str, Any]:
+    """Return the status once nothing comes any more."""
+    seen: list[tuple[int, int]] = []
+
+    def is_at_rest() -> bool:
+        status = daemon.status()
+        packets = sum(port["packets"] for port in status["ports"])
+        seen.append((packets, status["dropped_scans"]))
+        return len(seen) > 3 and len(set(seen[-3:])) == 1
+
+    wait_until(is_at_rest, "the daemon to come to rest", step_s=0.1)
+    return daemon.status()
+
+
+@pytest.mark.faults
+@pytest.mark.timeout(200)
+@pytest.mark.fault(
+    "Scans at 10 times the rate that can be reconstructed",
+    "the newest wins; each dual scan is published or counted as dropped, exactly; no frame is "
+    "older than two reconstructions when it is published (p99)",
+    "two contacts that jump with each dual scan, for 15 s, at ten times the rate at which the "
+    "daemon publishes when flooded",
+)
+def test_ten_times_too_fast(
+    tared: Start, skin: PtySkin, scenes: Scenes, play: Play, listen: Listen, figure: Figure
+) -> None:
+    daemon = tared()
+    flood = play(moving(scenes.two[::7]), 300.0)
+    time.sleep(4.0)
+    possible_hz = daemon.status()["rates"]["frames_hz"]
+    flood.stop()
+    before = at_rest(daemon)
+    ears = listen(daemon)
+    wait_until(lambda: daemon.status()["subscribers"] == 1, "the subscription")
+    begin_s = time.monotonic()
+    playing = play(moving(scenes.two[::7]), 10 * possible_hz)
+    time.sleep(OVERLOAD_S)
+    sent = playing.stop()
+    rate_hz = sent / (time.monotonic() - begin_s)
+    after = at_rest(daemon)
+    dropped = after["dropped_scans"] - before["dropped_scans"]
+    frame_ms = after["stage_ms"]["reconstruct"]
+    ages_ms = [heard.published_age_ms for heard in ears.heard]
+    figure(
+        f"{possible_hz:.0f}/s possible, {rate_hz:.0f}/s sent: {sent} = {len(ears.heard)} "
+        f"published + {dropped} dropped; a reconstruction p50 {frame_ms['p50']:.0f}, p99 "
+        f"{frame_ms['p99']:.0f} ms; age {percentiles(ages_ms)}"
+    )
+    assert len(ears.heard) + dropped == sent
+    assert ears.heard[-1].fields["scan_counter"] == skin.counter - 1
+    assert np.percentile(ages_ms, 99) < 2 * frame_ms["p99"] + 10
+
+
+@pytest.mark.faults
+@pytest.mark.fault(
+    "The daemon is stopped for 5 s and continued (SIGSTOP, as a suspended virtual machine)",
+    "no frame pretends to be younger than it is by more than 0.5 s; fresh frames within 1 s",
+    "20 dual scans/s throughout; each frame's age against the time at which it was sent",
+)
+def test_the_daemon_is_stopped_for_a_while(
+    tared: Start, scenes: Scenes, play: Play, listen: Listen, figure: Figure
+) -> None:
+    daemon = tared()
+    ears = listen(daemon)
+    playing = play(still(scenes.rest))
+    ears.wait(lambda _: True, "a frame")
+    daemon.signal(signal.SIGSTOP)
+    time.sleep(STOPPED_S)
+    continued_s = time.monotonic()
+    before = len(ears.heard)
+    daemon.signal(signal.SIGCONT)
+    time.sleep(2.0)
+    playing.stop()
+    after = ears.heard[before:]
+    too_young_s = [
+        (heard.fields["acquired_monotonic_ns"] - playing.sent[heard.fields["scan_counter"]]) * 1e-9
+        for heard in after
+    ]
+    fresh = next(heard for heard in after if heard.age_ms < 100 and heard.arrived_ns > 0)
+    wrong = [young for young in too_young_s if young > 0.5]
+    figure(
+        f"frames again after {fresh.arrived_ns * 1e-9 - continued_s:.2f} s; {len(wrong)} of "
+        f"{len(after)} frames too young, the worst by {max(too_young_s):.2f} s"
+    )
+    assert not wrong
+
+
+@pytest.mark.fault(
+    "SIGTERM under full load",
+    "ends within 2 s, with exit status 0 and the recording complete",
+    "two contacts that jump at 300 dual scans/s, recording with maps, a subscriber to all",
+)
+def test_sigterm_under_full_load(
+    tared: Start, scenes: Scenes, play: Play, listen: Listen, figure: Figure, tmp_path: Path
+) -> None:
+    path = tmp_path / "load.mcap"
+    daemon = tared(record=str(path), record_maps=True)
+    listen(daemon, "map", "contacts", "scan", "status", "event")
+    playing = play(moving(scenes.two[::7]), 300.0)
+    time.sleep(3.0)
+    took_s = daemon.stop()
+    playing.stop()
+    figure(f"{took_s:.2f} s")
+    assert took_s < 2.0
+    assert open_recording(path).summary.is_complete

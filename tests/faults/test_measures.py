@@ -1,0 +1,184 @@
+"""What is measured rather than broken: latency under load, idle processor time, a million scans."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+import zmq
+from daemon_process import SENSOR, DaemonProcess, wait_until
+from ears import Ears, percentiles
+from pty_skin import Playing, PtySkin, Scenes, Volts, moving, still
+from tactomo_client.messages import decode_message, topic
+
+Start = Callable[..., DaemonProcess]
+Play = Callable[..., Playing]
+Listen = Callable[..., Ears]
+Figure = Callable[[str], None]
+
+SETTLE_S = 3.0
+IDLE_S = 60.0
+IDLE_CPU = 0.03
+SOAK_SCANS = 1_000_000
+CONTACT_EVERY, CONTACT_FOR = 1000, 10
+"""Of so many dual scans, so many in a row show a contact that moves."""
+MEMORY_MB = 10.0
+
+LOADS = [(0, 0), (2, 0), (2, -5), (4, 0)]
+SCENES = [("nothing pressed", 100, 20_000), ("one moving contact", 25, 5_000)]
+CASES = [(*scene, *load) for scene, load in itertools.product(SCENES, LOADS)]
+CASES.append(("two moving contacts", 10, 2_000, 0, 0))
+
+
+@pytest.mark.faults
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(("scene", "rate", "frames", "loops", "nice"), CASES)
+@pytest.mark.measure(
+    "Latency: {scene}, {rate}/s; {loops} busy loops, daemon at nice {nice}",
+    "none; told as it is",
+    "{frames} frames",
+)
+def test_latency(
+    tared: Start,
+    scenes: Scenes,
+    play: Play,
+    listen: Listen,
+    figure: Figure,
+    busy: Callable[[int], None],
+    scale: float,
+    scene: str,
+    rate: int,
+    frames: int,
+    loops: int,
+    nice: int,
+) -> None:
+    daemon = tared(nice=nice)
+    busy(loops)
+    ears = listen(daemon)
+    volts = {
+        "nothing pressed": still(scenes.rest),
+        "one moving contact": moving(scenes.one),
+        "two moving contacts": moving(scenes.two),
+    }[scene]
+    playing = play(volts, rate)
+    time.sleep(SETTLE_S)
+    first, wanted = len(ears.heard), max(200, round(frames * scale))
+    wait_until(lambda: len(ears.heard) >= first + wanted, "the frames", 800.0, 0.1)
+    playing.stop()
+    heard = ears.heard[first:]
+    dropped = daemon.status()["dropped_scans"]
+    figure(
+        f"published {percentiles([h.published_age_ms for h in heard])}; arrived "
+        f"{percentiles([h.age_ms for h in heard])}; {dropped} dropped"
+    )
+
+
+@pytest.mark.faults
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("rate", [5, 20])
+@pytest.mark.measure(
+    "Processor time at {rate} Hz with nothing pressed",
+    "below 3 % of a core at 5 Hz",
+    "user and system time of the whole process over 60 s, one subscriber to contacts",
+)
+def test_idle_processor_time(
+    tared: Start,
+    scenes: Scenes,
+    play: Play,
+    listen: Listen,
+    figure: Figure,
+    scale: float,
+    rate: int,
+) -> None:
+    daemon = tared()
+    listen(daemon)
+    play(still(scenes.rest), rate)
+    time.sleep(SETTLE_S)
+    begin_cpu_s, begin_s = daemon.cpu_s, time.monotonic()
+    time.sleep(max(5.0, IDLE_S * scale))
+    share = (daemon.cpu_s - begin_cpu_s) / (time.monotonic() - begin_s)
+    figure(f"{share:.2%} of a core")
+    assert rate > 5 or share < IDLE_CPU
+
+
+def soak_scene(scenes: Scenes, scans: int) -> Iterator[Volts]:
+    """Mostly the bare skin, now and then a contact that moves."""
+    path = moving(scenes.one)
+    for number in range(scans):
+        yield next(path) if number % CONTACT_EVERY < CONTACT_FOR else scenes.rest
+
+
+class Newest:
+    """A subscriber that keeps the newest message alone, however many there are."""
+
+    def __init__(self, address: str) -> None:
+        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.CONFLATE, 1)
+        self._socket.setsockopt(zmq.SUBSCRIBE, topic(SENSOR, "contacts"))
+        self._socket.connect(address)
+
+    def take(self) -> tuple[int, int]:
+        """Return how many frames have been published and the newest one's counter."""
+        assert self._socket.poll(60_000), "a frame"
+        fields = decode_message(self._socket.recv()).fields
+        return fields["sequence"], fields["scan_counter"]
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def wait_for_sent(playing: Playing, scans: int) -> None:
+    wait_until(lambda: len(playing.sent) >= scans, f"{scans} scans to be sent", 3600.0, 0.1)
+
+
+@pytest.mark.faults
+@pytest.mark.timeout(7200)
+@pytest.mark.measure(
+    "Soak: a million dual scans as fast as they are taken",
+    "memory flat (within 10 MB from 10 % on), threads and descriptors as at the start; every dual "
+    "scan published or counted as dropped, exactly",
+    "lossless over two pseudo-terminals; in each 1000 dual scans 10 in a row with a moving contact",
+)
+def test_soak(
+    tared: Start, skin: PtySkin, scenes: Scenes, play: Play, figure: Figure, scale: float
+) -> None:
+    daemon = tared(lossless=True)
+    newest = Newest(daemon.stream)
+    wait_until(lambda: daemon.status()["subscribers"] == 1, "the subscription")
+    play(iter([scenes.rest]), None).join()
+    before, _ = newest.take()
+    dropped = daemon.status()["dropped_scans"]
+    scans = max(5_000, round(SOAK_SCANS * scale))
+    threads, descriptors = daemon.threads, daemon.descriptors
+    begin_s = time.monotonic()
+    playing = play(soak_scene(scenes, scans), None)
+    rss_mb = []
+    for tenth in range(1, 11):
+        wait_for_sent(playing, scans * tenth // 10)
+        rss_mb.append(daemon.rss_mb)
+        print(
+            f"  soak: {len(playing.sent)} dual scans, {time.monotonic() - begin_s:.0f} s, "
+            f"{rss_mb[-1]:.1f} MB, {daemon.threads} threads, {daemon.descriptors} descriptors",
+            file=sys.__stderr__,
+            flush=True,
+        )
+    playing.join()
+    last = skin.counter - 1
+    published = next(count for count, at in iter(newest.take, None) if at == last) - before
+    took_s = time.monotonic() - begin_s
+    status = daemon.status()
+    newest.close()
+    dropped = status["dropped_scans"] - dropped
+    figure(
+        f"{scans} sent = {published} published + {dropped} dropped in {took_s / 60:.1f} min "
+        f"({scans / took_s:.0f}/s); memory {rss_mb[0]:.1f} MB at 10 %, {rss_mb[4]:.1f} at 50 %, "
+        f"{rss_mb[9]:.1f} at 100 %; threads {threads} and {daemon.threads}, descriptors "
+        f"{descriptors} and {daemon.descriptors}"
+    )
+    assert published + dropped == scans
+    assert max(rss_mb) - rss_mb[0] < MEMORY_MB
+    assert (daemon.threads, daemon.descriptors) == (threads, descriptors)

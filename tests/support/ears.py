@@ -1,0 +1,97 @@
+"""A subscriber that keeps what it hears and when, from a thread of its own."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import zmq
+from tactomo_client.messages import decode_message, topic
+
+PATIENCE_S = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """One message and its arrival."""
+
+    kind: str
+    arrived_ns: int
+    fields: dict[str, Any]
+
+    @property
+    def age_ms(self) -> float:
+        """How old the data were when they arrived here."""
+        return float((self.arrived_ns - self.fields["acquired_monotonic_ns"]) * 1e-6)
+
+    @property
+    def published_age_ms(self) -> float:
+        """How old they were when they were published."""
+        return float(self.fields["age_ns"] * 1e-6)
+
+
+class Ears:
+    """Hears `kinds` of one sensor until closed; usable in a `with` block."""
+
+    def __init__(self, address: str, sensor: str = "skin", kinds: tuple[str, ...] = ("contacts",)):
+        self.heard: list[Heard] = []
+        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.RCVHWM, 0)
+        for kind in kinds:
+            self._socket.setsockopt(zmq.SUBSCRIBE, topic(sensor, kind))
+        self._socket.connect(address)
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="ears")
+        self._thread.start()
+
+    def of(self, kind: str) -> list[Heard]:
+        """Return what came of one kind so far."""
+        return [heard for heard in list(self.heard) if heard.kind == kind]
+
+    def wait(
+        self,
+        condition: Callable[[Heard], Any],
+        what: str,
+        since: int = 0,
+        patience_s: float = PATIENCE_S,
+    ) -> Heard:
+        """Wait for a message from number `since` on that satisfies the condition."""
+        deadline = time.monotonic() + patience_s
+        while True:
+            while since < len(self.heard):
+                if condition(self.heard[since]):
+                    return self.heard[since]
+                since += 1
+            assert time.monotonic() < deadline, f"waited {patience_s:g} s in vain for {what}"
+            time.sleep(0.002)
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._closing.set()
+        self._thread.join()
+        self._socket.close()
+
+    def __enter__(self) -> Ears:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            if self._socket.poll(50):
+                data = self._socket.recv()
+                arrived_ns = time.monotonic_ns()
+                message = decode_message(data)
+                self.heard.append(Heard(message.kind, arrived_ns, message.fields))
+
+
+def percentiles(values: list[float]) -> str:
+    """Say p50, p99, p99.9 and the worst of some milliseconds."""
+    p50, p99, p999 = np.percentile(values, (50, 99, 99.9))
+    return f"p50 {p50:.2f}, p99 {p99:.2f}, p99.9 {p999:.2f}, worst {max(values):.2f} ms"

@@ -1,0 +1,116 @@
+"""docs/reliability.md: one row for each fault that was tried, as the test that tried it says."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+FIGURE = pytest.StashKey[str]()
+MARKERS = ("fault", "measure")
+_NO_FIGURE = "as promised"
+
+_PAGE = """\
+# Reliability
+
+What is done to the daemon, what it promises then, how that was tried, and what came of it. Written
+by `make faults`, which runs all of it again on the machine at hand ({minutes} minutes); do not edit
+it. Every fault is done to a real `tactomo daemon` process on real pseudo-terminals and real ZeroMQ
+sockets. The tests are in `tests/faults`; a row is a test.
+
+Machine: {machine}.{failures}
+
+## Faults
+
+{faults}
+
+## Measures
+
+Latency is the age of the data: from the moment at which the daemon had read the last byte of a dual
+scan to its publication (*published*), and to its arrival in another process (*arrived*).
+
+{measures}
+"""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the page."""
+
+    table: str
+    fault: str
+    promise: str
+    tried: str
+    figure: str
+    outcome: str
+    seconds: float
+
+
+def row_of(item: pytest.Item, report: pytest.TestReport) -> Row | None:
+    """Return the row that a finished test makes; None for a stage of it that makes none."""
+    marker = next((m for name in MARKERS if (m := item.get_closest_marker(name))), None)
+    if marker is None or (report.when != "call" and report.passed):
+        return None
+    if report.when == "teardown":
+        return None
+    case = getattr(item, "callspec", None)
+    fault, promise, tried = (text.format(**(case.params if case else {})) for text in marker.args)
+    figure = item.stash.get(FIGURE, _NO_FIGURE)
+    if report.skipped:
+        figure = f"not tried: {_reason(report)}"
+    if report.failed:
+        figure = f"**not kept**: {_complaint(report)} ({item.stash.get(FIGURE, 'no figure')})"
+    return Row(marker.name, fault, promise, tried, figure, report.outcome, report.duration)
+
+
+def write_page(path: Path, rows: list[Row]) -> None:
+    """Write the page whole."""
+    failed = sum(row.outcome == "failed" for row in rows)
+    path.write_text(
+        _PAGE.format(
+            minutes=max(1, round(sum(row.seconds for row in rows) / 60)),
+            machine=_machine(),
+            failures=f" **{failed} promises were not kept.**" if failed else "",
+            faults=_table(("Fault", "Promise", "How it was tried", "Figure"), rows, "fault"),
+            measures=_table(("Measure", "Aim", "How", "Figure"), rows, "measure"),
+        ),
+        encoding="utf-8",
+    )
+
+
+def _table(head: tuple[str, ...], rows: list[Row], table: str) -> str:
+    lines = [head, ("---",) * len(head)]
+    lines += [(r.fault, r.promise, r.tried, r.figure) for r in rows if r.table == table]
+    return "\n".join(
+        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
+    )
+
+
+def _reason(report: pytest.TestReport) -> str:
+    reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
+    return reason.removeprefix("Skipped: ")
+
+
+def _complaint(report: pytest.TestReport) -> str:
+    crash = getattr(report.longrepr, "reprcrash", None)
+    text = crash.message if crash is not None else str(report.longrepr)
+    return re.sub(r"\s+", " ", text.splitlines()[0] if text else "")[:160]
+
+
+def _machine() -> str:
+    """Name the processor, the cores that may be used, the memory and the versions."""
+    try:
+        info = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        info = ""
+    found = re.search(r"model name\s*:\s*(.+)", info)
+    cores = len(os.sched_getaffinity(0))
+    memory_gb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
+    return (
+        f"{found[1] if found else platform.machine()}, {cores} cores, {memory_gb:.0f} GB, "
+        f"Linux {platform.release().split('-')[0]}, Python {platform.python_version()}"
+    )
