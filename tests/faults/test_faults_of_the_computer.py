@@ -141,7 +141,8 @@ def wait_for_wall_clock(ears: Ears, ahead_s: float) -> None:
     """Wait for a frame by whose wall clock it is `ahead_s` later than here."""
 
     def is_set(heard: Heard) -> bool:
-        return abs(heard.fields["acquired_realtime_ns"] * 1e-9 - time.time() - ahead_s) < 60
+        wall_clock_s = float(heard.fields["acquired_realtime_ns"] * 1e-9)
+        return abs(wall_clock_s - time.time() - ahead_s) < 60
 
     ears.wait(is_set, f"a wall clock {ahead_s:g} s ahead")
 
