@@ -7,6 +7,7 @@ scale. One that does not belong to the sensor at hand is refused with the reason
 from __future__ import annotations
 
 import io
+import os
 from base64 import b64decode
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,7 +17,6 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
-import onnxruntime as ort
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
@@ -24,6 +24,10 @@ from tactomo_models.artifact import cache_folder
 from tactomo_models.description import Modality, SensorDescription
 from tactomo_models.errors import ArtifactError
 from tactomo_models.prefilter import BANDS, Prefilter, prefilter
+
+# From 1.31 on it would report to its maker from every computer, by a thread that its import starts.
+os.environ["ORT_DISABLE_TELEMETRY"] = "1"
+import onnxruntime as ort
 
 FloatArray = NDArray[np.float64]
 Image = NDArray[np.float32]
