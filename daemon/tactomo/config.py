@@ -40,6 +40,7 @@ def _method(name: str) -> str:
 
 Endpoint = Annotated[str, AfterValidator(check_endpoint)]
 TierName = Annotated[str, AfterValidator(_method)]
+DeviceId = Annotated[str, Field(min_length=1, max_length=64)]
 BudgetMs = Annotated[float, Field(gt=0, le=10_000)]
 
 
@@ -65,6 +66,10 @@ class DaemonConfig(BaseModel):
     """A shipped sensor description's name, or the path of a TOML file."""
     ports: Annotated[tuple[str, ...], Field(min_length=1, max_length=MAX_PORTS)]
     """Device paths or pyserial URLs: one that carries both channels, or one for each."""
+    device_ids: tuple[DeviceId, ...] = ()
+    """The devices that make up this sensor, as their hello says; empty accepts any."""
+    wait_for_ports: bool = False
+    """Start without a port that cannot be opened yet, and wait for it."""
     baud: Annotated[int, Field(ge=1200, le=12_000_000)] = 921_600
     stream: Endpoint = DEFAULT_STREAM
     control: Endpoint = DEFAULT_CONTROL

@@ -135,6 +135,7 @@ class Daemon:
                 url,
                 config.baud,
                 description,
+                config.device_ids,
                 self._recorder,
                 self._pipeline.deliver,
                 self._on_event,
@@ -178,7 +179,8 @@ class Daemon:
         """Open everything and start all threads; on failure, what was opened is closed again.
 
         Raises:
-            PortError: a port cannot be used; one that vanishes later is waited for instead.
+            PortError: a port cannot be used and `wait_for_ports` is off; one that vanishes later
+                is waited for in any case.
             AddressError: an address is in use.
             RecordingError: the recording cannot be created.
 
@@ -254,7 +256,7 @@ class Daemon:
         undo.callback(self._control.stop)
         undo.callback(self._pipeline.stop)
         for port in self._ports:
-            port.open()
+            port.open(or_wait=config.wait_for_ports)
             undo.callback(port.stop)
         if config.record is not None:
             self._recorder.start(config.record, config.record_maps)

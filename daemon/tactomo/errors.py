@@ -3,8 +3,9 @@
 TactomoError
 ├── ConfigError      the configuration cannot be used: `tactomo daemon skin.toml` where the file
 │                    is not TOML, has an unknown key or a value out of range
-├── PortError        a serial port cannot be used: the path does not exist, is no serial device,
-│                    may not be opened by this user
+├── PortError        a serial port cannot be used: it is no serial device, may not be opened by
+│   │                this user
+│   ├── PortAbsentError  ... or is not there: the cable is out, the path has a typing error
 │   └── PortBusyError    ... or another process holds it: a terminal program was left open
 ├── AddressError     a socket cannot be bound: a second daemon runs with the same configuration
 ├── CommandError     a control command was refused: its argument is out of range, or there is
@@ -47,6 +48,12 @@ class PortError(TactomoError):
     """A serial port cannot be used."""
 
     name = "port_unusable"
+
+
+class PortAbsentError(PortError):
+    """A serial port is not there."""
+
+    name = "port_absent"
 
 
 class PortBusyError(PortError):

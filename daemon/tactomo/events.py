@@ -19,15 +19,16 @@ class OnEvent(Protocol):
 
 
 class RateLimit:
-    """Lets one event of a kind pass per second; for use by one thread."""
+    """Lets one event of a kind pass per second, or other period; for use by one thread."""
 
-    def __init__(self) -> None:
-        self._passed_s = -EVENT_PERIOD_S
+    def __init__(self, period_s: float = EVENT_PERIOD_S) -> None:
+        self._period_s = period_s
+        self._passed_s = -period_s
 
     def allows(self) -> bool:
         """Whether an event may be told now; if so, the next one waits."""
         now_s = time.monotonic()
-        if now_s - self._passed_s < EVENT_PERIOD_S:
+        if now_s - self._passed_s < self._period_s:
             return False
         self._passed_s = now_s
         return True

@@ -106,12 +106,16 @@ def port_fields(port: PortReader) -> dict[str, Any]:
     return {
         "url": port.url,
         "connected": port.is_open,
+        "state": port.state,
+        "problem": port.problem or None,
         "device": port.hello and _device(port.hello),
         "refusal": port.refusal or None,
         "bytes": port.bytes_read,
         "packets": port.counts.packets,
         "corrupt": port.counts.corrupt,
         "unused_scans": port.unused,
+        "reopened": port.reopened,
+        "latency_timer_ms": port.latency_timer_ms,
     }
 
 

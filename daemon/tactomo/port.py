@@ -1,24 +1,24 @@
 """A serial port and the thread that reads it: bytes to packets to scans, stamped on arrival.
 
 The thread outlives its device. When the cable is pulled it says so, tries the port again several
-times a second, and starts the device anew once it is back. Whatever bytes come, they are counted;
-none of them raises.
+times a second, and starts the device anew once it is back. A device that does not speak is asked
+again, then the port is closed and opened in case its adapter hangs. Whatever bytes come, they are
+counted; none of them raises.
 
-After `open`, only the thread touches the serial object. What others may read (`bytes_read`,
-`counts`, `unused`, `hello`, `refusal`, `is_open`, `has_ended`) is written by the thread alone.
+Once the thread has started, only it touches the connection. What others may read, all that has no
+underscore, is written by the thread alone.
 """
 
 from __future__ import annotations
 
-import contextlib
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-import serial
 from numpy.typing import NDArray
 from tactomo_models import SensorDescription
 from tactomo_protocol import (
@@ -37,19 +37,20 @@ from tactomo_protocol import (
     encode,
 )
 
-from tactomo.errors import PortError, RecordingError
+from tactomo.adapters import ROOT
+from tactomo.connection import Connection
 from tactomo.events import OnEvent, RateLimit
-from tactomo.open_serial import open_serial
+from tactomo.liveness import PATIENCE_S, DeviceState, Liveness
+from tactomo.open_serial import other_holders
 from tactomo.protocol_replay import ReplayEnded
 from tactomo.recorder import Recorder, hello_entry, port_entry
+from tactomo.recording import REPLAY_SCHEME
 
 RETRY_S: Final = 0.25
 ASK_AGAIN_S: Final = 1.5
 """How long a device may say no hello, or send no scan, before it is asked again."""
-
-# What pyserial raises when a device goes away in the middle of a call: TypeError where its
-# descriptor has become None.
-_DEVICE_GONE = (OSError, TypeError)
+TROUBLE_PERIOD_S: Final = 30.0
+"""How often at most a device is said to be in trouble: some come and go for hours."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,6 +86,17 @@ class Delivery(NamedTuple):
 class PortReader:
     """One port. `open` it, `start` its thread, `stop` it.
 
+    Args:
+        index: its number among the sensor's ports.
+        url: a device's path or a pyserial URL.
+        baud: of a real UART.
+        description: the sensor that the device must fit.
+        device_ids: those that may speak here; any where it is empty.
+        recorder: gets every byte while it records.
+        deliver: called by the thread with what each read brought.
+        on_event: told what happens.
+        root: the folder of `/sys` and `/dev`.
+
     Attributes:
         bytes_read: since the start, over all connections.
         counts: the decoder's counts, likewise.
@@ -92,7 +104,7 @@ class PortReader:
             the sensor, of another length or of a channel that the sensor does not have.
         hello: the newest one; None before the first.
         refusal: why this device's scans are not used; empty when they are.
-        is_open: whether the device is there at present.
+        reopened: how often the port was opened again because the device did not speak.
         has_ended: whether the replay behind the port is at its end.
         turns: of the loop, device or no device; the watchdog goes by them.
 
@@ -104,9 +116,11 @@ class PortReader:
         url: str,
         baud: int,
         description: SensorDescription,
+        device_ids: Collection[str],
         recorder: Recorder,
         deliver: Callable[[Delivery], None],
         on_event: OnEvent,
+        root: Path = ROOT,
     ) -> None:
         self.index = index
         self.url = url
@@ -114,22 +128,28 @@ class PortReader:
         self.unused = 0
         self.hello: Hello | None = None
         self.refusal = ""
-        self.is_open = False
+        self.reopened = 0
         self.has_ended = False
         self.turns = 0
         self._baud = baud
         self._description = description
+        self._device_ids = device_ids
         self._recorder = recorder
         self._deliver = deliver
         self._on_event = on_event
-        self._serial: serial.Serial | None = None
+        self._connection = Connection(url, baud, on_event, root)
+        self._is_replay = url.startswith(f"{REPLAY_SCHEME}://")
+        self._liveness = Liveness()
         self._decoder = Decoder()
         self._tail = b""  # bytes from the last delimiter on, where a recording may begin
         self._recording = 0  # number of the recording that has the last chunk
+        self._is_known = False  # the device that is plugged in has said hello
         self._asked_s = 0.0  # when the device was last asked, or last sent a scan
         self._request = 0
         self._corrupt_told = 0
         self._corrupt_limit = RateLimit()
+        self._trouble_told: DeviceState | None = None
+        self._trouble_limit = RateLimit(TROUBLE_PERIOD_S)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"port-{index}")
 
@@ -138,10 +158,44 @@ class PortReader:
         """What the decoder has met so far."""
         return self._decoder.counts
 
-    def open(self) -> None:
-        """Open the port; raise PortError, PortBusyError or RecordingError."""
-        self._serial = open_serial(self.url, self._baud)
-        self.is_open = True
+    @property
+    def is_open(self) -> bool:
+        """Whether the device is there at present."""
+        return self._connection.is_open
+
+    @property
+    def latency_timer_ms(self) -> int | None:
+        """How long an FTDI adapter holds bytes back; None for other ports."""
+        return self._connection.latency_timer_ms
+
+    @property
+    def state(self) -> str:
+        """How the port does, in one word of STREAM.md."""
+        if self.has_ended:
+            return "ended"
+        if not self.is_open:
+            return "closed"
+        return "refused" if self.refusal else str(self._liveness.state)
+
+    @property
+    def problem(self) -> str:
+        """Why the port is closed or of no use, for people; empty where all is well."""
+        return self._connection.problem or self.refusal or self._trouble(self._liveness.state)
+
+    def open(self, or_wait: bool = False) -> None:
+        """Open the port.
+
+        Args:
+            or_wait: where that cannot be done yet, say why and let the thread try again.
+
+        Raises:
+            PortError, RecordingError: the port cannot be opened, and nobody is to wait for it.
+
+        """
+        if or_wait:
+            self._connection.try_open()
+        else:
+            self._connection.open()
 
     def start(self) -> None:
         """Start reading."""
@@ -152,7 +206,7 @@ class PortReader:
         self._stopping.set()
         if self._thread.is_alive():
             self._thread.join()
-        self._close()
+        self._connection.close()
 
     @property
     def is_alive(self) -> bool:
@@ -160,31 +214,58 @@ class PortReader:
         return self._thread.is_alive() or self.has_ended
 
     def _run(self) -> None:
-        self._ask()
-        while not self._stopping.is_set():
-            self.turns += 1
-            try:
-                self._read_once()
-            except ReplayEnded as end:
-                self._end(str(end))
-                return
-            except _DEVICE_GONE as error:
-                self._lose(str(error))
-                self._reopen()
+        if self._connection.is_open:
+            self._greet_newcomer()
+        try:
+            while not self._stopping.is_set():
+                self.turns += 1
+                if self._connection.is_open:
+                    self._read_once()
+                else:
+                    self._wait_for_device()
+        except ReplayEnded as end:
+            self._end(str(end))
 
     def _read_once(self) -> None:
         """Wait for bytes, for a bounded time, and pass on what they hold."""
-        port = self._serial
-        if port is None:
-            raise OSError("the port is closed")
-        data = port.read(1)
+        data = self._connection.read()
+        # The clocks are read here, before anything else is done with the bytes.
+        realtime_ns, monotonic_ns = time.time_ns(), time.monotonic_ns()
         if data:
-            data += port.read(port.in_waiting)
-            # The clocks are read here, before anything else is done with the bytes.
-            realtime_ns, monotonic_ns = time.time_ns(), time.monotonic_ns()
-            clock_ns = getattr(port, "clock_ns", monotonic_ns)
+            clock_ns = self._connection.clock_ns(monotonic_ns)
             self._take(data, realtime_ns, monotonic_ns, clock_ns)
-        if time.monotonic() - self._asked_s > ASK_AGAIN_S:
+        if not self._is_replay and self._connection.is_open:
+            self._attend(monotonic_ns * 1e-9)
+
+    def _wait_for_device(self) -> None:
+        """Try the port once more, after a while."""
+        self._tail = b""
+        self._trouble_told = None
+        if not self._stopping.wait(RETRY_S) and self._connection.try_open():
+            self._on_event("port_back", "info", self.url)
+            self._greet_newcomer()
+
+    def _greet_newcomer(self) -> None:
+        """Make a new start with whichever device is at the port now."""
+        self._is_known = False
+        self._liveness.opened(time.monotonic())
+        self._ask()
+
+    def _attend(self, now_s: float) -> None:
+        """See to a device that does not do as it should."""
+        if now_s - self._asked_s > ASK_AGAIN_S:
+            self._ask()
+        self._tell_trouble(self._liveness.judge(now_s))
+        if self._liveness.is_reopening_due(now_s):
+            self._reopen()
+
+    def _reopen(self) -> None:
+        """Close and open the port: what a USB bridge that hangs often needs."""
+        self._connection.close()
+        self._tail = b""
+        if self._connection.try_open():
+            self.reopened += 1
+            self._liveness.reopened(time.monotonic())
             self._ask()
 
     def _take(self, data: bytes, realtime_ns: int, monotonic_ns: int, clock_ns: int) -> None:
@@ -208,6 +289,9 @@ class PortReader:
                         recording,
                     )
                 )
+        now_s = monotonic_ns * 1e-9
+        found = sum(isinstance(packet, Scan) for packet in packets)
+        self._liveness.heard(now_s, len(packets), found)
         if packets:
             channels = None if self.hello is None else self.hello.channels
             self._deliver(Delivery(self.index, clock_ns, tuple(scans), channels))
@@ -245,7 +329,8 @@ class PortReader:
         elif isinstance(packet, Scan):
             self._asked_s = time.monotonic()
             hello = self.hello
-            if hello is not None and not self.refusal and self._fits(packet, hello):
+            is_usable = self._is_known and not self.refusal
+            if hello is not None and is_usable and self._fits(packet, hello):
                 return packet.volts(hello.volts_per_count)
             self.unused += 1
         return None
@@ -255,66 +340,105 @@ class PortReader:
         return is_known and len(scan.samples) == hello.samples_per_scan
 
     def _greet(self, hello: Hello) -> None:
-        if hello == self.hello:
+        self._is_known = True
+        before = self.hello
+        if hello == before:
             return
-        self.refusal = contradiction(hello, self._description)
         self.hello = hello
+        is_foreign = bool(self._device_ids) and hello.device_id not in self._device_ids
+        self.refusal = (
+            f"{hello.device_id} is not one of this sensor's devices, {', '.join(self._device_ids)}"
+            if is_foreign
+            else contradiction(hello, self._description)
+        )
         if self.refusal:
+            self._tell_refusal(hello, is_foreign)
+        elif before is not None and before.device_id != hello.device_id:
             self._on_event(
-                "device_refused",
-                "error",
-                f"{self.url}: {hello.device_id} does not fit {self._description.name}: "
-                f"{self.refusal}; its scans are not used",
-                "give the daemon the description of the sensor that is connected",
+                "device_changed",
+                "warning",
+                f"{self.url}: {hello.device_id} is where {before.device_id} was",
+                "tare, if another skin was plugged in; `device_ids` keeps foreign ones out",
             )
+
+    def _tell_refusal(self, hello: Hello, is_foreign: bool) -> None:
+        name = self._description.name
+        why = (
+            self.refusal if is_foreign else f"{hello.device_id} does not fit {name}: {self.refusal}"
+        )
+        self._on_event(
+            "device_refused",
+            "error",
+            f"{self.url}: {why}; its scans are not used",
+            "plug it in elsewhere, or name its port by /dev/serial/by-id or by-path: see "
+            "`tactomo ports`; a device that was replaced belongs into `device_ids`"
+            if is_foreign
+            else "give the daemon the description of the sensor that is connected",
+        )
 
     def _ask(self) -> None:
         """Ask the device who it is and to start; harmless where it has started already."""
         self._asked_s = time.monotonic()
         for code in (CommandCode.IDENTIFY, CommandCode.START):
             self._request = (self._request + 1) % 256
-            try:
-                if self._serial is not None:
-                    self._serial.write(encode(Command(code, self._request)))
-            except serial.SerialTimeoutException:
-                return  # it does not listen; it may still speak
-            except _DEVICE_GONE:
-                return  # the next read finds out and deals with it
+            if not self._connection.write(encode(Command(code, self._request))):
+                return
 
-    def _lose(self, reason: str) -> None:
-        self._close()
-        self._tail = b""
-        if not self._stopping.is_set():
-            self._on_event(
-                "port_lost",
-                "error",
-                f"{self.url}: {reason}",
-                "check the cable; the port is tried again until it is back",
-            )
+    def _trouble(self, state: DeviceState) -> str:
+        """Return in words what is the matter with a device in this state; empty if nothing is."""
+        hello = self.hello
+        if state is DeviceState.SILENT:
+            return f"nothing came for {PATIENCE_S:g} s"
+        if state is DeviceState.GARBAGE:
+            return f"bytes come, but no packet at {self._baud} baud"
+        if state is DeviceState.IDLE and (hello is None or hello.scan_rate_hz > 0):
+            return "the device speaks, but sends no scans"
+        return ""
 
-    def _reopen(self) -> None:
-        while not self._stopping.wait(RETRY_S):
-            self.turns += 1
-            try:
-                self.open()
-            except (PortError, RecordingError):
-                continue
-            self._on_event("port_back", "info", self.url)
-            self._ask()
+    def _tell_trouble(self, state: DeviceState) -> None:
+        """Tell when a device falls into trouble and when it is out of it again."""
+        if state is self._trouble_told or state is DeviceState.STARTING:
             return
+        trouble = self._trouble(state)
+        if not trouble and self._trouble_told is not None:
+            self._on_event("device_speaks", "info", self.url)
+            self._trouble_told = None
+        elif trouble and self._trouble_limit.allows():
+            self._trouble_told = state
+            detail = f"{self.url}: {trouble}{self._sharers()}"
+            if state is DeviceState.SILENT:
+                self._on_event(
+                    "device_silent",
+                    "warning",
+                    detail,
+                    "check its power; it is asked again, and the port is opened anew",
+                )
+            elif state is DeviceState.GARBAGE:
+                self._on_event(
+                    "device_garbled",
+                    "warning",
+                    detail,
+                    "wrong baud rate, or no skin: set `baud` to the firmware's; "
+                    "`tactomo ports` shows what is where",
+                )
+            else:
+                self._on_event(
+                    "device_idle",
+                    "warning",
+                    detail,
+                    "it is asked to start again and again; check its trigger, or reset it",
+                )
+
+    def _sharers(self) -> str:
+        """Name those who take bytes away, which only root can."""
+        sharers = "; ".join(map(str, other_holders(self.url)))
+        return f"; another process has the port open, too ({sharers})" if sharers else ""
 
     def _end(self, reason: str) -> None:
-        self._close()
+        self._connection.close()
         self.has_ended = True
         self._deliver(Delivery(self.index, 0, (), has_ended=True))
         self._on_event("replay_ended", "info", f"{self.url}: {reason}")
-
-    def _close(self) -> None:
-        self.is_open = False
-        port, self._serial = self._serial, None
-        if port is not None:
-            with contextlib.suppress(*_DEVICE_GONE):  # it is gone: nothing is left to close
-                port.close()
 
     def _tell_corrupt(self) -> None:
         corrupt = self._decoder.counts.corrupt
@@ -322,7 +446,8 @@ class PortReader:
             self._on_event(
                 "corrupt_packets",
                 "warning",
-                f"{self.url}: {corrupt - self._corrupt_told} damaged, {corrupt} since the start",
+                f"{self.url}: {corrupt - self._corrupt_told} damaged, {corrupt} since the start"
+                f"{self._sharers()}",
                 "check the cable, its shield and the baud rate",
             )
             self._corrupt_told = corrupt

@@ -74,7 +74,8 @@ class Status:
         """Return the daemon's state in one word."""
         last_ns = self._imaging.last_monotonic_ns
         if not last_ns:
-            return "waiting_for_data"
+            is_waiting = any(port.state == "closed" for port in self._ports)
+            return "waiting_for_port" if is_waiting else "waiting_for_data"
         if time.monotonic_ns() - last_ns > STALE_S * 1e9:
             return "stale"
         return "taring" if self._imaging.is_taring else "running"

@@ -101,14 +101,14 @@ def test_the_methods_are_the_models() -> None:
 def test_every_key_of_the_configuration_has_a_flag_with_its_default() -> None:
     daemon = get_command(app).commands["daemon"]  # type: ignore[attr-defined]
     flags = {option.opts[0].lstrip("-"): option for option in daemon.params}
-    renamed = {"name": "sensor", "ports": "port"}
+    renamed = {"name": "sensor", "ports": "port", "device_ids": "device-id"}
     for key, field in DaemonConfig.model_fields.items():
         if key == "curve":  # a table of two paths: for the file alone
             continue
         flag = flags[renamed.get(key, key.replace("_", "-"))]
         # A flag that is not given must not win over the file, so defaults stand in the help.
         assert not flag.default
-        if field.default not in (None, False) and not field.is_required():
+        if field.default not in (None, False, ()) and not field.is_required():
             shown = f"{field.default:g}" if isinstance(field.default, float) else field.default
             assert f"[{shown}" in flag.help
 

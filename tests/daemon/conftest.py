@@ -321,6 +321,20 @@ def _readable_logs() -> None:
 
 
 @pytest.fixture
+def until() -> Callable[[Callable[[], Any]], Any]:
+    """Wait for a condition and return its value: ``until(lambda: ...)``."""
+    return wait_until
+
+
+@pytest.fixture
+def line(tmp_path: Path) -> Iterator[Line]:
+    """One line on its own, plugged in."""
+    made = Line(tmp_path / "skin")
+    yield made
+    made.unplug()
+
+
+@pytest.fixture
 def make_skin() -> Iterator[Callable[[Path, int], Any]]:
     """Make a skin: ``make_skin(folder, ports)``."""
     skins: list[Skin] = []
@@ -340,6 +354,7 @@ def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Cal
 
     It has the reconstructor above, each frame of which takes `seconds`, or the `real` one; and a
     `calibration`, or this machine's. What listens to it and asks it has `keys`.
+    The cables are in, unless `is_plugged` says otherwise.
     """
     daemons: list[Daemon] = []
     listeners: list[Listener] = []
@@ -350,11 +365,14 @@ def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Cal
         real: bool = False,
         calibration: Calibration | None = None,
         keys: Keys | None = None,
+        is_plugged: bool = True,
         **config: Any,
     ) -> Bench:
         folder = tmp_path / f"ports-{len(daemons)}"
         folder.mkdir()
         skin = make_skin(folder, ports)
+        if not is_plugged:
+            skin.close()
         settings = {
             "name": "left",
             "ports": [str(line.path) for line in skin.lines],

@@ -60,6 +60,13 @@ def daemon(
         list[str] | None,
         typer.Option("--port", "-p", help="Serial device or pyserial URL; twice for two boards."),
     ] = None,
+    device_id: Annotated[
+        list[str] | None,
+        typer.Option(help="Accept this device alone, see `tactomo ports --ask`; twice for two."),
+    ] = None,
+    wait_for_ports: Annotated[
+        bool, typer.Option("--wait-for-ports", help="Start even where a port is not there yet.")
+    ] = False,
     baud: Annotated[
         int | None, typer.Option(help="Of a real UART; USB takes any. [921600]")
     ] = None,
@@ -109,6 +116,8 @@ def daemon(
         name=sensor,
         description=description,
         ports=tuple(port) if port else None,
+        device_ids=tuple(device_id) if device_id else None,
+        wait_for_ports=wait_for_ports or None,
         baud=baud,
         stream=stream,
         control=control,

@@ -225,12 +225,13 @@ def _status_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _port_line(port: dict[str, Any]) -> str:
     device = port.get("device") or {}
-    state = "open" if port.get("connected") else "[red]not open[/]"
-    corrupt = port.get("corrupt", 0)
+    state = port.get("state") if port.get("connected") else "[red]not open[/]"
+    corrupt, problem = port.get("corrupt", 0), port.get("problem")
     return (
         f"{port.get('url')} ({state}), {device.get('device_id', 'no hello yet')}, "
         f"{', '.join(device.get('channels', [])) or '-'}; {port.get('packets', 0)} packets, "
         + (f"[yellow]{corrupt} corrupt[/]" if corrupt else "none corrupt")
+        + (f"; [yellow]{problem}[/]" if problem else "")
     )
 
 

@@ -54,7 +54,7 @@ export function verdict(state, now) {
   if (fields.state === "taring") {
     return banner("taring", "info", "Taring.", "Measuring the unloaded skin: do not touch it.");
   }
-  if (fields.state === "waiting_for_data") {
+  if (fields.state.startsWith("waiting")) {
     return banner("no-data", "warning", "No data yet.", portsInWords(fields.ports));
   }
   const age = ageOf(frame, now);
@@ -82,6 +82,8 @@ function portsInWords(ports) {
   if (refused) return `${refused.url}: the device does not fit the sensor's description: ${refused.refusal}.`;
   const closed = (ports ?? []).filter((port) => !port.connected).map((port) => port.url);
   if (closed.length) return `Not connected: ${closed.join(", ")}.`;
+  const troubled = (ports ?? []).find((port) => port.problem);
+  if (troubled) return `${troubled.url}: ${troubled.problem}.`;
   return ports?.length ? "The port is open, but no scans come." : "";
 }
 

@@ -4,7 +4,7 @@ import { explainFlag } from "./health.js";
 
 const EVENTS_SHOWN = 50;
 const SOURCES = { twin: "simulated skin", device: "device", replay: "replay" };
-const STATES = { waiting_for_data: "no data yet", taring: "taring", running: "running", stale: "stale" };
+const STATES = { waiting_for_port: "no port yet", waiting_for_data: "no data yet", taring: "taring", running: "running", stale: "stale" };
 
 export const byId = (id) => document.getElementById(id);
 
