@@ -446,8 +446,7 @@ class PortReader:
             self._on_event(
                 "corrupt_packets",
                 "warning",
-                f"{self.url}: {corrupt - self._corrupt_told} damaged, {corrupt} since the start"
-                f"{self._sharers()}",
+                f"{self.url}: {corrupt - self._corrupt_told} damaged, {corrupt} since the start",
                 "check the cable, its shield and the baud rate",
             )
             self._corrupt_told = corrupt
