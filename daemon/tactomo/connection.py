@@ -16,7 +16,7 @@ import serial
 from tactomo.adapters import LOW_LATENCY_MS, ROOT
 from tactomo.errors import PortAbsentError, TactomoError
 from tactomo.events import OnEvent, RateLimit
-from tactomo.open_serial import DEVICE_GONE, lower_latency, open_serial
+from tactomo.open_serial import DEVICE_GONE, is_path, lower_latency, open_serial
 from tactomo.protocol_replay import ReplayEnded
 
 MAX_READ_BYTES: Final = 65_536
@@ -110,7 +110,9 @@ class Connection:
 
     def _lose(self, error: Exception) -> None:
         self.close()
-        self.problem = str(error)
+        # pyserial's words for it are a guess, and the same for several causes.
+        has_gone = is_path(self.url) and not os.path.exists(self.url)
+        self.problem = "the device has gone" if has_gone else str(error)
         self._tell_closed("check the cable; the port is tried again until it is back")
 
     def _note(self, error: TactomoError) -> None:

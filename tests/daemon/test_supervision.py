@@ -119,7 +119,7 @@ def test_a_daemon_without_data_is_ready_alive_and_says_when_it_stops(
     # At half of the time. Later on a busy computer, but no sooner.
     assert all(b - a > 0.4 * WATCHDOG_S for a, b in itertools.pairwise(fed_s))
     skin.lines[0].unplug()
-    manager.wait("STATUS=waiting for data, ")
+    manager.wait("STATUS=waiting for port, ")
     manager.wait("WATCHDOG=1", manager.wait("WATCHDOG=1", time.monotonic()))  # without a device
     process.send_signal(signal.SIGTERM)
     manager.wait("STOPPING=1")
