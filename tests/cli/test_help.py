@@ -92,7 +92,7 @@ def test_the_methods_are_the_models() -> None:
     example = (root / "deploy/daemon.example.toml").read_text("utf-8")
     assert all(f'"{method}"' in example for method in METHODS)
     for command in ("reconstruct", "daemon", "tier"):
-        shown = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "200"})
+        shown = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "240"})
         assert all(method in shown.output for method in METHODS)
         if command == "reconstruct":
             assert "noise figure" in " ".join(shown.output.split()), "the rule is stated"

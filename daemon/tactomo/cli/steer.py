@@ -225,7 +225,7 @@ def _status_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _port_line(port: dict[str, Any]) -> str:
     device = port.get("device") or {}
-    state = port.get("state") if port.get("connected") else "[red]not open[/]"
+    state = port.get("state", "open") if port.get("connected") else "[red]not open[/]"
     corrupt, problem = port.get("corrupt", 0), port.get("problem")
     return (
         f"{port.get('url')} ({state}), {device.get('device_id', 'no hello yet')}, "
