@@ -15,6 +15,7 @@ current computed tomography", SIAM J. Appl. Math. 52 (1992); Jacobian: the paper
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -132,6 +133,15 @@ def scan_voltages(description: SensorDescription, transfer: FloatArray) -> Float
     into = transfer[measure[0], drive[0]] - transfer[measure[1], drive[0]]
     out_of = transfer[measure[0], drive[1]] - transfer[measure[1], drive[1]]
     return np.asarray(into - out_of)
+
+
+def exchanged(transfer: FloatArray, order: Sequence[int]) -> FloatArray:
+    """Transfer resistances (L, L) where the device's lead i is on electrode order[i].
+
+    Potentials are against the last lead's electrode, by which the currents leave.
+    """
+    moved = transfer[np.ix_(order, order)]
+    return np.asarray(moved - moved[-1:] - moved[:, -1:] + moved[-1, -1])
 
 
 def volts_per_unit(description: SensorDescription) -> float:

@@ -22,12 +22,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntFlag
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactomo_models.description import SensorDescription
-from tactomo_models.pattern import reciprocal_pairs
+from tactomo_models.pattern import Pairs, reciprocal_pairs
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -94,11 +94,25 @@ class Verdict:
     noise: float = 1.0
 
 
+class Layout(Protocol):
+    """Which electrodes every voltage is of: a sensor's description, or a pattern alone."""
+
+    @property
+    def pairs(self) -> Pairs:
+        """Drive and measuring pairs of every voltage."""
+        ...
+
+    @property
+    def electrode_count(self) -> int:
+        """Number of electrodes."""
+        ...
+
+
 class Wiring:
     """Which voltages belong together: reciprocal ones, and those of a pair or an electrode."""
 
-    def __init__(self, description: SensorDescription) -> None:
-        pairs, electrodes = description.pairs, description.electrode_count
+    def __init__(self, layout: Layout) -> None:
+        pairs, electrodes = layout.pairs, layout.electrode_count
         self.reciprocal = reciprocal_pairs(pairs)
         ends = np.hstack([pairs.drive, pairs.measure])
         self.electrodes = (ends == np.arange(electrodes)[:, None, None]).any(axis=2)
@@ -107,6 +121,19 @@ class Wiring:
         self.pairs = np.array(
             [(pairs.drive == p).all(axis=1) | (pairs.measure == p).all(axis=1) for p in driven]
         )
+
+    def blamed(self, wrong: BoolArray) -> tuple[int, ...]:
+        """Electrodes that share most of the wrong voltages (M,) and have most of theirs wrong."""
+        touches = self.electrodes
+        enough = np.maximum(BLAMED_LEAST, BLAMED_SHARE * touches.sum(axis=1))
+        blamed: list[int] = []
+        while True:
+            counts = (touches & wrong).sum(axis=1)
+            worst = int(counts.argmax())
+            if counts[worst] < enough[worst]:
+                return tuple(sorted(blamed))
+            blamed.append(worst)
+            wrong = wrong & ~touches[worst]
 
 
 def _cross(drive: NDArray[np.intp], measure: NDArray[np.intp]) -> BoolArray:
@@ -204,7 +231,7 @@ class ScanCheck:
             wrong |= suspect
         if not wrong.any():
             return Verdict(usable, flags, (), noise)
-        electrodes = self._blamed(wrong)
+        electrodes = self._wiring.blamed(wrong)
         if electrodes:
             flags |= Flag.ELECTRODE_FAULT
             left_out = self._wiring.electrodes[list(electrodes)].any(axis=0)
@@ -246,19 +273,6 @@ class ScanCheck:
         unequal[j[bad]] = True
         return noise, unequal
 
-    def _blamed(self, wrong: BoolArray) -> tuple[int, ...]:
-        """Electrodes that share most of the wrong voltages and have most of theirs wrong."""
-        touches = self._wiring.electrodes
-        enough = np.maximum(BLAMED_LEAST, BLAMED_SHARE * touches.sum(axis=1))
-        blamed: list[int] = []
-        while True:
-            counts = (touches & wrong).sum(axis=1)
-            worst = int(counts.argmax())
-            if counts[worst] < enough[worst]:
-                return tuple(sorted(blamed))
-            blamed.append(worst)
-            wrong = wrong & ~touches[worst]
-
 
 def examine_reference(
     wiring: Wiring,
@@ -298,9 +312,8 @@ def examine_reference(
     noisy = usable & (noise > OUTLIER * np.median(noise[usable]))
     verdict = check.examine(volts, suspect=noisy | ~usable)
     flags = verdict.flags if usable.all() else verdict.flags | Flag.INVALID_VOLTAGE
-    if _rewired(wiring, volts * np.sign(predicted), noise) or _deviates(
-        volts, predicted, noise, verdict.usable
-    ):
+    is_rewired = _rewired(wiring, volts * np.sign(predicted), noise)
+    if is_rewired or deviation(volts, predicted, noise, verdict.usable) > MOST_DEVIATION:
         flags |= Flag.REFERENCE_MISMATCH
     if _asymmetry(wiring, volts) > MOST_ASYMMETRY:
         flags |= Flag.NOISE_HIGH
@@ -315,12 +328,12 @@ def _rewired(wiring: Wiring, along: FloatArray, noise: FloatArray) -> bool:
     return int(np.count_nonzero(against[i] & against[j] & agree)) >= BLAMED_LEAST
 
 
-def _deviates(
+def deviation(
     volts: FloatArray, predicted: FloatArray, noise: FloatArray, usable: BoolArray
-) -> bool:
-    """Tell whether a reference is farther from the model than an uneven sheet would be."""
+) -> float:
+    """How far a reference (M,) is from the model, rms: 1 is what an uneven sheet leads to."""
     error = (volts - predicted) / np.hypot(noise, UNEVEN * np.abs(predicted))
-    return not usable.any() or float(np.sqrt(np.mean(error[usable] ** 2))) > MOST_DEVIATION
+    return float(np.sqrt(np.mean(error[usable] ** 2))) if usable.any() else np.inf
 
 
 def _asymmetry(wiring: Wiring, volts: FloatArray) -> float:

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from tactomo_models import SensorDescription, SkinSimulator
-from tactomo_models.evaluation.faults import exchanged
-from tactomo_models.forward import ForwardModel
+from tactomo_models.forward import ForwardModel, exchanged
 
 FloatArray = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""What a broken lead or a wrong order of leads does to the voltages of a skin.
+"""What a broken lead does to the voltages of a skin.
 
 Made from what an ideal device would read. A device drives a current of limited voltage and reads
 each electrode against its ground, so a lead that is open carries no current and reads whatever the
@@ -7,7 +7,7 @@ input floats to: contact impedance alone changes little in four-wire voltages.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,12 +53,3 @@ def with_lead(
         )
         made[rows] = read[:-1] - read[1:]
     return made
-
-
-def exchanged(transfer: FloatArray, order: Sequence[int]) -> FloatArray:
-    """Transfer resistances (L, L) where the device's lead i is on electrode order[i].
-
-    Potentials are against the last lead's electrode, by which the currents leave.
-    """
-    moved = transfer[np.ix_(order, order)]
-    return np.asarray(moved - moved[-1:] - moved[:, -1:] + moved[-1, -1])

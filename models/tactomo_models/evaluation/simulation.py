@@ -22,8 +22,7 @@ from tactomo_models.description import (
     StructureChannel,
     StructureResponse,
 )
-from tactomo_models.evaluation.faults import exchanged
-from tactomo_models.forward import scan_voltages, transfer_resistances, volts_per_unit
+from tactomo_models.forward import exchanged, scan_voltages, transfer_resistances, volts_per_unit
 from tactomo_models.mesh import SheetMesh, electrode_facets, mesh_sheet
 from tactomo_models.scene import Press, Shape, strongest
 from tactomo_models.simulator import conductivity_ratio, smooth_noise
