@@ -18,7 +18,7 @@ merit; Asfaw & Adler (2005), see `plausibility`, on erroneous electrodes.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -99,7 +99,7 @@ class Finding:
     level: Level
     detail: str
     next_step: str = ""
-    figures: dict[str, float | list[float] | list[int] | None] = field(default_factory=dict)
+    figures: Mapping[str, float | list[float] | list[int] | None] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -221,7 +221,7 @@ class _Examined:
         self.noise = noise_about_line(at_rest)
         self.is_moving = _moves(wiring, at_rest)
         self.has_noise = self.count >= FEWEST_FOR_NOISE and not self.is_moving
-        self.is_frozen = self.count >= 2 and not np.ptp(at_rest, axis=0).any()
+        self.is_frozen = self.count >= 3 and not self.noise.any()
         self.snr_db = _decibels(np.abs(self.mean), self.noise)
         excess = _excess_noise(self.mean, self.noise)
         self.electrode_noise = np.array([np.median(excess[t]) for t in self.wiring.electrodes])
@@ -242,7 +242,8 @@ class _Examined:
 
     def _each(self, scans: FloatArray, contrast: float) -> list[tuple[Flag, tuple[int, ...]]]:
         """What is wrong with each single scan, by laws that hold whatever presses."""
-        usable = self.verdict.usable & (self.mean != 0)
+        bad = list(self.verdict.electrodes)
+        usable = (self.mean != 0) & ~self.wiring.electrodes[bad].any(axis=0)
         own = asymmetry_of(self.wiring, self.mean)
         check = ScanCheck(self.wiring, self.mean, self.noise, usable, contrast, own)
         verdicts = [check.examine(scan) for scan in scans]
@@ -429,7 +430,7 @@ def _deviation(volts: FloatArray, expected: FloatArray, noise: FloatArray) -> fl
 
 
 def _scans_found(count: int, lost: int, still: slice, is_moved: bool) -> Finding:
-    figures: dict[str, float | list[float] | list[int] | None] = {"scans": float(count)}
+    figures = {"scans": float(count)}
     if is_moved:
         which = f"{still.start} to {still.stop - 1}, the stillest, are looked at"
         whole = still.stop - still.start == count
@@ -448,7 +449,7 @@ def _scans_found(count: int, lost: int, still: slice, is_moved: bool) -> Finding
             "check the converter and the firmware",
             figures,
         )
-    return Finding("scans", Level.OK, f"{count} scans", "", figures)
+    return Finding("scans", Level.OK, f"{count} scan(s)", "", figures)
 
 
 def _snr_found(examined: _Examined) -> Finding:
@@ -456,7 +457,7 @@ def _snr_found(examined: _Examined) -> Finding:
         return Finding(
             "snr",
             Level.ADVICE,
-            "the scans repeat exactly: there is no noise at all",
+            "there is no noise at all",
             "a real converter has some; is it simulated, or does the firmware send one scan again?",
         )
     if examined.is_moving:
@@ -464,11 +465,10 @@ def _snr_found(examined: _Examined) -> Finding:
         return Finding("snr", Level.UNKNOWN, "not known: something moves all the time", step)
     if not examined.has_noise:
         step = f"give at least {FEWEST_FOR_NOISE} scans of the unpressed skin"
-        return Finding("snr", Level.UNKNOWN, f"not known from {examined.count} scans", step)
+        return Finding("snr", Level.UNKNOWN, f"not known from {examined.count} scan(s)", step)
     good = examined.good
-    overall = float(
-        20 * np.log10(max(_rms(examined.mean[good]), TINY) / _rms(examined.noise[good]))
-    )
+    signal, noise = _rms(examined.mean[good]), _rms(examined.noise[good])
+    overall = float(20 * np.log10(max(signal, TINY) / max(noise, TINY)))
     level, step = Level.OK, ""
     if overall < GOOD_SNR_DB:
         level = Level.BROKEN if overall < POOR_SNR_DB else Level.FAULT
@@ -653,7 +653,6 @@ def _drift_found(still: FloatArray, times_s: FloatArray | None) -> Finding:
         level, step = Level.ADVICE, "let it warm up; tare now and then"
     if abs(percent) > max(DRIFT_POOR, SIGNIFICANT * sigma):
         level, step = Level.FAULT, "let it warm up; look for moisture, strain or a weak contact"
-    figures: dict[str, float | list[float] | list[int] | None]
     figures = {"percent_per_min": percent, "sigma_percent_per_min": sigma}
     detail = f"{percent:+.2f} % a minute (standard uncertainty {sigma:.2f})"
     return Finding("drift", level, detail, step, figures)
@@ -679,7 +678,7 @@ def pattern_of_zeros(scans: FloatArray) -> PatternLayout:
     their difference}, which tells both offsets. `without_zeros` leaves them out.
 
     Raises:
-        DataError: the number of voltages is no square, or the zeros fit no pattern.
+        DataError: the number of voltages is no square, or the zeros do not fit just one pattern.
     """
     count = round(np.sqrt(scans.shape[1]))
     if count * count != scans.shape[1]:
@@ -689,13 +688,17 @@ def pattern_of_zeros(scans: FloatArray) -> PatternLayout:
         )
     zero = (scans == 0).all(axis=0).reshape(count, count)
     always = [n for n in range(count) if np.all(zero[range(count), (np.arange(count) + n) % count])]
-    for drive, measure in itertools.product(range(1, count // 2 + 1), repeat=2):
-        if {0, drive, -measure % count, (drive - measure) % count} == set(always):
-            return PatternLayout(scan_pairs(count, drive, measure), count)
-    raise DataError(
-        f"scans of {count} x {count} voltages have no zeros that tell which electrodes drive; "
-        "give --description, or a lookup of electrodes"
-    )
+    fits = [
+        (drive, measure)
+        for drive, measure in itertools.product(range(1, count // 2 + 1), repeat=2)
+        if {0, drive, -measure % count, (drive - measure) % count} == set(always)
+    ]
+    if len(fits) != 1:
+        raise DataError(
+            f"the zeros of these {count} x {count} voltages fit {len(fits)} patterns of drive and "
+            "measuring pairs; give --description, or a lookup of electrodes"
+        )
+    return PatternLayout(scan_pairs(count, *fits[0]), count)
 
 
 def without_zeros(layout: PatternLayout, scans: FloatArray) -> FloatArray:

@@ -23,7 +23,7 @@ BUILD = "Models and measures"
 
 ORDER = (
     *("demo", "daemon", "twin", "viewer"),
-    *("status", "watch", "tare", "record", "tier", "poke", "keys"),
+    *("status", "doctor", "watch", "tare", "record", "tier", "poke", "keys"),
     *("info", "import", "replay", "reconstruct", "plot"),
     *("models", "bench", "bench-solves", "evaluate"),
 )

@@ -172,7 +172,7 @@ def import_scans(
     from tactomo.cli.imported import read_scans
     from tactomo.recorder import write_recording
 
-    reference = _frames(reference_frames)
+    reference = frame_slice(reference_frames)
     description = load_description(sensor)
     known = None if channel is None else Channel[channel.upper()]
     read = read_scans(scans, description, known)
@@ -202,7 +202,7 @@ def _portable(description: str) -> str:
     return str(path.absolute()) if path.exists() else description
 
 
-def _frames(text: str | None) -> slice | None:
+def frame_slice(text: str | None) -> slice | None:
     """Return the slice that "0:20" means."""
     if text is None:
         return None

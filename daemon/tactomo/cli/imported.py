@@ -30,6 +30,7 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 from tactomo_models import Reference, SensorDescription
+from tactomo_models.plausibility import Layout
 from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag
 
 from tactomo.errors import TactomoError
@@ -150,7 +151,9 @@ def read_scans(path: Path, description: SensorDescription, channel: Channel | No
     """
     arrays = load_arrays(path)
     if "volts" in arrays and "injection" in arrays:
-        return _single_ended(path, arrays, description, channel or _only_channel(description))
+        channel = channel or _only_channel(description)
+        volts, time_s, notes = single_ended(path, arrays, description)
+        return Scans({channel: volts}, time_s, notes=notes)
     if any(name in arrays for name in _CHANNELS):
         return _batch(path, arrays, description)
     raise ImportFileError(
@@ -206,19 +209,30 @@ def _batch(path: Path, arrays: dict[str, NDArray[Any]], description: SensorDescr
     return Scans(volts, _times(path, arrays, len(next(iter(volts.values())))), reference)
 
 
-def _single_ended(
-    path: Path, arrays: dict[str, NDArray[Any]], description: SensorDescription, channel: Channel
-) -> Scans:
+def single_ended(
+    path: Path, arrays: dict[str, NDArray[Any]], layout: Layout
+) -> tuple[FloatArray, FloatArray | None, tuple[str, ...]]:
+    """Return single-ended readings as differences (T, M), their times, and notes for people.
+
+    Args:
+        path: where they are from, for errors.
+        arrays: with `volts`, `injection` and maybe `t`.
+        layout: the sensor whose pattern the differences are to follow.
+
+    Raises:
+        ImportFileError: they do not fit the sensor, or are out of phase with the current.
+
+    """
     injection = _checked(path, "injection", arrays["injection"], (-1, 2)).astype(int)
-    electrodes = description.electrode_count
+    electrodes = layout.electrode_count
     raw = arrays["volts"]
     if raw.shape[1:] != (len(injection), electrodes) or raw.dtype.kind not in "fciu":
         raise ImportFileError(
             f"{path}: volts is {raw.dtype} {raw.shape}",
-            f"it must be numbers (T, {len(injection)}, {electrodes}) for {description.name}",
+            f"it must be numbers (T, {len(injection)}, {electrodes})",
         )
-    rows, signs = _injection_rows(path, injection - injection.min(), description)
-    plus, minus = description.pairs.measure.T
+    rows, signs = _injection_rows(path, injection - injection.min(), layout)
+    plus, minus = layout.pairs.measure.T
     differences = signs * (raw[:, rows, plus] - raw[:, rows, minus])
     quadrature = float(np.linalg.norm(differences.imag) / np.linalg.norm(differences))
     notes = () if raw.dtype.kind != "c" else (f"real part taken; {quadrature:.0%} is quadrature",)
@@ -228,20 +242,20 @@ def _single_ended(
             "multiply volts by the phase factor of a resistor's reading, then import again",
         )
     volts = np.asarray(differences.real, dtype=np.float64)
-    return Scans({channel: volts}, _times(path, arrays, len(raw)), notes=notes)
+    return volts, _times(path, arrays, len(raw)), notes
 
 
 def _injection_rows(
-    path: Path, injection: NDArray[np.int_], description: SensorDescription
+    path: Path, injection: NDArray[np.int_], layout: Layout
 ) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
     """Return, for each voltage, its row in the file and the sign of the current there."""
     where = {(sink, source): (row, -1) for row, (source, sink) in enumerate(injection.tolist())}
     where |= {(source, sink): (row, 1) for row, (source, sink) in enumerate(injection.tolist())}
-    wanted = [tuple(pair) for pair in description.pairs.drive.tolist()]
+    wanted = [tuple(pair) for pair in layout.pairs.drive.tolist()]
     missing = sorted(set(wanted) - where.keys())
     if missing:
         raise ImportFileError(
-            f"{path} has no injection {missing[0]}, which the pattern of {description.name} needs",
+            f"{path} has no injection {missing[0]}, which the sensor's pattern needs",
             "give the description of the sensor that was measured with --sensor",
         )
     rows, signs = np.array([where[pair] for pair in wanted]).T

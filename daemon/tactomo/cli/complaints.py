@@ -1,0 +1,130 @@
+"""What is wrong with a running daemon, by its status alone, worst first and with a next step.
+
+`tactomo status` shows it at the top, `tactomo doctor` beside what it measures itself. Nothing here
+imports more than the standard library: a status is asked for often.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+CORRUPT_NOTED = 1e-3  # share of packets: a line that loses one now and then still serves
+DROPPED_NOTED = 1e-2  # share of the dual scans
+LATENCY_TIMER_MS = 2  # what an FTDI adapter holds back for longer is felt
+
+FLAG_ADVICE: Mapping[str, tuple[str, str]] = {
+    "magnitude_missing": (
+        "no scans of the magnitude channel",
+        "check that channel's port and cable; until then nobody knows how hard is pressed",
+    ),
+    "structure_missing": (
+        "no scans of the structure channel",
+        "check that channel's port and cable; until then shapes are coarser",
+    ),
+    "no_reference": ("not tared yet", "leave the skin alone and run `tactomo tare`"),
+    "reference_mismatch": (
+        "the reference does not look like this sensor unloaded",
+        "take everything off the skin and run `tactomo tare`; is it the right sensor?",
+    ),
+    "misfit_high": (
+        "the model does not explain the data",
+        "take everything off and run `tactomo tare`; if it stays, run `tactomo doctor`",
+    ),
+    "not_converged": (
+        "the reconstruction ran out of its time",
+        "raise the budget, or free the processor",
+    ),
+    "invalid_voltage": (
+        "some voltages cannot be right and were left out",
+        "run `tactomo doctor` to find the lead",
+    ),
+    "saturated": ("the converter clips", "lower the gain or the current"),
+    "electrode_fault": (
+        "an electrode reads nonsense and was left out",
+        "check its lead and contact, then run `tactomo tare`",
+    ),
+    "noise_high": (
+        "voltages that should be equal differ widely",
+        "look for interference or a loose ground; `tactomo doctor` measures it",
+    ),
+    "low_confidence": (
+        "the network expects this map to be wrong",
+        "do not act on it; run `tactomo tare`, and `tactomo doctor` if it stays",
+    ),
+    "channels_swapped": (
+        "the magnitude channel changes more than the structure channel",
+        "exchange the two plugs, then run `tactomo tare`",
+    ),
+}
+STATES: Mapping[str, tuple[str, str]] = {
+    "waiting_for_data": ("no scan has come yet", "check the ports below"),
+    "stale": ("scans have stopped coming", "check the ports below"),
+}
+
+
+class Complaint(NamedTuple):
+    """One thing that is wrong: `severity` is warning or error."""
+
+    severity: str
+    what: str
+    next_step: str
+
+
+def complaints(status: Mapping[str, Any]) -> list[Complaint]:
+    """Return what is wrong by a status message, errors first; empty where all is well."""
+    found = [
+        *_of_state(status),
+        *(each for port in status.get("ports") or [] for each in _of_port(port)),
+        *_of_flags(status),
+        *_of_losses(status),
+    ]
+    return sorted(found, key=lambda complaint: complaint.severity != "error")
+
+
+def _of_state(status: Mapping[str, Any]) -> Iterator[Complaint]:
+    known = STATES.get(str(status.get("state")))
+    if known is not None:
+        yield Complaint("error", *known)
+
+
+def _of_port(port: Mapping[str, Any]) -> Iterator[Complaint]:
+    url = port.get("url")
+    if not port.get("connected"):
+        step = "plug it in, or check the cable; it is tried again until it is there"
+        yield Complaint("error", f"{url} is not open", step)
+    if port.get("refusal"):
+        step = "give the daemon the description of the sensor that is connected"
+        yield Complaint("error", f"{url}: its device is refused: {port['refusal']}", step)
+    if port.get("connected") and not port.get("device"):
+        step = "is it the right port and baud rate? does the firmware speak the protocol?"
+        yield Complaint("error", f"{url}: its device has not said hello", step)
+    packets, corrupt = port.get("packets") or 0, port.get("corrupt") or 0
+    if corrupt > CORRUPT_NOTED * (packets + corrupt):
+        share = f"{corrupt} of {packets + corrupt} packets came damaged"
+        step = "check the cable, its shield and the baud rate"
+        yield Complaint("warning", f"{url}: {share}", step)
+    timer_ms = port.get("latency_timer_ms") or 0
+    if timer_ms > LATENCY_TIMER_MS:
+        step = "set it to 1 ms, as the udev rule of tactomo does"
+        yield Complaint("warning", f"{url}: its adapter holds bytes back for {timer_ms} ms", step)
+
+
+def _of_flags(status: Mapping[str, Any]) -> Iterator[Complaint]:
+    for flag in status.get("flags") or []:
+        what, step = FLAG_ADVICE.get(flag, (flag.replace("_", " "), ""))
+        because = status.get("tier_reason") if flag == "electrode_fault" else None
+        yield Complaint("warning", f"{what} ({because})" if because else what, step)
+
+
+def _of_losses(status: Mapping[str, Any]) -> Iterator[Complaint]:
+    rate_hz = (status.get("rates") or {}).get("magnitude_hz") or 0.0
+    expected = rate_hz * (status.get("uptime_s") or 0.0)
+    dropped = status.get("dropped_scans") or 0
+    if expected and dropped > DROPPED_NOTED * expected:
+        step = "give the daemon more of the processor, or set a faster tier or a budget"
+        yield Complaint("warning", f"{dropped} dual scans were left out, {expected:.0f} came", step)
+    incomplete = status.get("incomplete_scans") or 0
+    if expected and incomplete > DROPPED_NOTED * expected:
+        step = "check the cable of the channel that is missing; if it comes late, sync_wait_ms"
+        yield Complaint("warning", f"{incomplete} dual scans lacked a channel", step)

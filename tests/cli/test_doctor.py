@@ -1,0 +1,202 @@
+"""`tactomo doctor` on files as people have them, and on a daemon that runs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from tactomo_client import request
+from tactomo_models import SensorDescription, load_description, load_or_build_artifact
+from tactomo_models.forward import scan_voltages
+from tactomo_models.pattern import reciprocal_pairs, scan_pairs
+from whole_system import SENSOR, Demo, repository, running_demo
+
+Run = Callable[..., Any]
+FloatArray = NDArray[np.float64]
+
+SHARED = repository().parent / "shared/data"
+measured = pytest.mark.skipif(not SHARED.is_dir(), reason="measured data are not here")
+NOISE = 1e-3
+
+
+@pytest.fixture(scope="module")
+def paper() -> SensorDescription:
+    return load_description("paper_square")
+
+
+@pytest.fixture(scope="module")
+def rest(paper: SensorDescription) -> FloatArray:
+    """Volts that differ from the model's by some per cent, reciprocal ones alike."""
+    volts: FloatArray = scan_voltages(paper, load_or_build_artifact(paper).bare.transfer)
+    i, j = reciprocal_pairs(paper.pairs).T
+    factors = 1 + 0.03 * np.random.default_rng(4).standard_normal(len(i))
+    volts[i] *= factors
+    volts[j] *= factors
+    return volts
+
+
+def noisy(volts: FloatArray, count: int = 40) -> FloatArray:
+    size = np.sqrt(np.mean(volts**2))
+    rng = np.random.default_rng(1)
+    made: FloatArray = volts + NOISE * size * rng.standard_normal((count, len(volts)))
+    return made
+
+
+def report(outcome: Any) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(outcome.stdout)
+    return found
+
+
+def about(findings: list[dict[str, Any]], what: str) -> dict[str, Any]:
+    return next(finding for finding in findings if finding["about"] == what)
+
+
+def test_a_healthy_batch(tactomo: Run, rest: FloatArray) -> None:
+    np.savez("in.npz", magnitude=noisy(rest), structure=noisy(rest), t=np.arange(40) / 10)
+    outcome = tactomo("doctor", "in.npz", "--json")
+    assert outcome.returncode == 0
+    found = report(outcome)
+    assert found["verdict"] == "healthy"
+    assert found["channels"].keys() == {"magnitude", "structure"}
+    for channel in found["channels"].values():
+        assert about(channel["findings"], "snr")["snr_db"] == pytest.approx(60, abs=1)
+        assert channel["electrodes"] == ["good"] * 16
+    assert found["stream"] == []
+
+
+def test_a_table_names_the_electrode_and_the_picture_is_drawn(
+    tactomo: Run, rest: FloatArray, paper: SensorDescription
+) -> None:
+    ends = np.hstack([paper.pairs.drive, paper.pairs.measure])
+    np.savez("in.npz", structure=noisy(np.where((ends == 3).any(axis=1), 1e-6, 1.0) * rest))
+    outcome = tactomo("doctor", "in.npz", "--picture", "in.png")
+    assert outcome.returncode == 1
+    assert "electrode 3 reads next to nothing" in outcome.stdout
+    assert "check its lead" in outcome.stdout
+    assert "ill: see what is marked" in outcome.stdout
+    assert Path("in.png").read_bytes().startswith(b"\x89PNG")
+
+
+def every_pair(electrodes: int, volts: FloatArray) -> FloatArray:
+    """Scans of adjacent pairs as every drive by every measuring pair, zero where it cannot be."""
+    pairs = scan_pairs(electrodes)
+    full = np.zeros((len(volts), electrodes, electrodes))
+    full[:, pairs.drive[:, 0], pairs.measure[:, 0]] = volts
+    return full.reshape(len(volts), -1)
+
+
+def test_an_unknown_device_is_read_by_its_zeros(tactomo: Run, rest: FloatArray) -> None:
+    np.savez("in.npz", baseline=every_pair(16, np.abs(noisy(rest))), dv=np.zeros((3, 256)))
+    outcome = tactomo("doctor", "in.npz", "--json")
+    assert outcome.returncode == 0, outcome.stdout
+    assert "by the zeros, drive k to k+1, measure m to m+1" in " ".join(report(outcome)["notes"])
+
+
+def test_voltages_in_no_order_are_a_broken_device(tactomo: Run, rest: FloatArray) -> None:
+    mixed = np.random.default_rng(0).permutation(rest)
+    np.savez("in.npz", mine=noisy(mixed))
+    outcome = tactomo("doctor", "in.npz", "--array", "mine")
+    assert outcome.returncode == 1
+    assert "broken: nothing" in outcome.stdout
+
+
+def test_a_lookup_says_the_order(tactomo: Run, rest: FloatArray, paper: SensorDescription) -> None:
+    order = np.random.default_rng(0).permutation(208)
+    table = np.hstack([paper.pairs.drive, paper.pairs.measure])[order]
+    np.savez("in.npz", empty=noisy(rest)[:, order], how=table)
+    outcome = tactomo("doctor", "in.npz", "--lookup", "how", "--json")
+    assert outcome.returncode == 0, outcome.stdout
+    assert about(report(outcome)["channels"]["empty"]["findings"], "reciprocity")["level"] == "ok"
+
+
+def test_complex_scans_are_turned(tactomo: Run, rest: FloatArray) -> None:
+    np.savez("in.npz", reference=noisy(rest) * np.exp(0.5j), frames_=np.zeros(1))
+    outcome = tactomo("doctor", "in.npz", "--frames", "0:10", "--json")
+    assert outcome.returncode == 0, outcome.stdout
+    assert "turned by -29 degrees; 0% is out of phase" in " ".join(report(outcome)["notes"])
+
+
+@pytest.mark.parametrize(
+    ("arrays", "arguments", "says"),
+    [
+        ({"dv": (5, 208)}, [], "holds changes of voltages"),
+        ({"other": (5, 208)}, [], "name the array of scans at rest with --array"),
+        ({"rest": (5, 7)}, [], "give --description, or a lookup"),
+        ({"rest": (5, 256)}, [], "fit 0 patterns"),
+        ({"rest": (2, 5, 208)}, [], "it must be numbers, (T, voltages)"),
+        ({"rest": (5, 208), "lookup": (4, 4)}, [], "source, sink, v+, v-"),
+        ({"rest": (5, 208)}, ["--frames", "7:9"], "give other --frames"),
+        ({"rest": (5, 208)}, ["-d", "nosuch"], "cannot read the sensor description"),
+    ],
+)
+def test_what_cannot_be_examined_is_said(
+    tactomo: Run, arrays: dict[str, tuple[int, ...]], arguments: list[str], says: str
+) -> None:
+    np.savez("in.npz", **{name: np.ones(shape) for name, shape in arrays.items()})  # type: ignore[arg-type]
+    outcome = tactomo("doctor", "in.npz", *arguments)
+    assert outcome.returncode == 1
+    assert says in outcome.stderr
+    assert "Traceback" not in outcome.stderr
+
+
+def test_a_recording_is_examined_by_its_own_scans(tactomo: Run, rest: FloatArray) -> None:
+    np.savez("in.npz", magnitude=noisy(rest), structure=noisy(rest))
+    assert tactomo("import", "in.npz", "in.mcap", "--rate", "10").returncode == 0
+    outcome = tactomo("doctor", "in.mcap", "--json")
+    assert outcome.returncode == 0, outcome.stdout
+    found = report(outcome)
+    assert about(found["stream"], "packets")["packets"] >= 80
+    assert about(found["stream"], "lost_scans")["number"] == 0
+    drift = about(found["channels"]["magnitude"]["findings"], "drift")
+    assert abs(drift["percent_per_min"]) < 0.5
+
+
+def test_nobody_there(tactomo: Run) -> None:
+    outcome = tactomo("doctor", "--stream", "ipc:///nowhere/at/all", "--seconds", "1")
+    assert outcome.returncode == 1
+    assert "no daemon answers at ipc:///nowhere/at/all" in outcome.stderr
+
+
+@measured
+def test_the_broken_device_is_called_broken(tactomo: Run) -> None:
+    outcome = tactomo("doctor", SHARED / "skin_bad_device_32el.npz")
+    assert outcome.returncode == 1
+    assert "broken: nothing that comes from this device can be trusted" in outcome.stdout
+    assert "67.8%" in outcome.stdout
+
+
+@measured
+@pytest.mark.parametrize("arguments", [[], ["-d", "tank_disc"], ["--frames", "0:20"]])
+def test_the_tank_is_not(tactomo: Run, arguments: list[str]) -> None:
+    outcome = tactomo("doctor", SHARED / "tank_sciospec_20fps.npz", *arguments, "--json")
+    assert outcome.returncode == 0
+    assert report(outcome)["verdict"] == "healthy"
+
+
+@pytest.fixture(scope="module")
+def demo() -> Iterator[Demo]:
+    with running_demo() as running:
+        yield running
+
+
+def test_a_running_daemon(tactomo: Run, demo: Demo) -> None:
+    look = ("doctor", "-s", SENSOR, "--stream", demo.stream, "--seconds", "2", "--json")
+    request("tare", demo.control, 30.0)
+    found = report(tactomo(*look))
+    for channel in found["channels"].values():
+        assert channel["verdict"] == "healthy"
+        assert about(channel["findings"], "snr")["snr_db"] > 50
+    assert about(found["stream"], "frames")["pressed"] == 0
+    assert about(found["stream"], "latency")["p50_ms"] > 0
+    request("noise", demo.twin, noise_v=0.02)
+    request("garbage", demo.twin, count=4000)
+    outcome = tactomo(*look)
+    assert outcome.returncode == 1
+    found = report(outcome)
+    for channel in found["channels"].values():
+        assert about(channel["findings"], "snr")["level"] in ("fault", "broken")
