@@ -8,7 +8,7 @@ TRAIN_READY := $(VENV)/.ready-train
 LOCKED := pyproject.toml --universal --python-version 3.11 --generate-hashes \
   --no-emit-package tactomo-client --no-emit-package tactomo
 
-.PHONY: help run test test-slow test-train faults soak lint format bench lock clean
+.PHONY: help run test test-slow test-train faults soak lint format bench deb lock clean
 
 help:            ## list these targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -42,6 +42,9 @@ format: $(READY) ## let ruff rewrite what it can
 
 bench: $(READY)  ## latency and time per frame on this machine
 	$(BIN)/tactomo bench $(ARGS)
+
+deb: $(READY)    ## the Debian package, for this distribution and processor, in dist/
+	deploy/debian/build.sh $(BIN)/python
 
 lock:            ## refresh the lock files (needs uv on the PATH)
 	uv pip compile $(LOCKED) --extra dev -o requirements.lock

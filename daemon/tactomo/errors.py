@@ -10,7 +10,8 @@ TactomoError
 ├── AddressError     a socket cannot be bound: a second daemon runs with the same configuration
 ├── CommandError     a control command was refused: its argument is out of range, or there is
 │                    nothing to tare against yet
-└── RecordingError   a recording cannot be written or read: the disk is full, the file is not MCAP
+├── RecordingError   a recording cannot be written or read: the disk is full, the file is not MCAP
+└── ServiceError     the service cannot be installed: this is not root, or not systemd's computer
 
 They are raised for what a user can cause. A program shows `cause` and `next_step` and exits with
 status 1; a traceback is for a mistake of ours.
@@ -78,3 +79,9 @@ class RecordingError(TactomoError):
     """A recording cannot be written or read."""
 
     name = "bad_recording"
+
+
+class ServiceError(TactomoError):
+    """The service cannot be installed, removed or asked."""
+
+    name = "service_unusable"

@@ -216,7 +216,7 @@ def test_the_papers_network_is_not_asked_about_half_of_a_frame(
 
 
 def test_nothing_is_reported_to_the_maker_of_the_runtime(tmp_path: Path) -> None:
-    """A runtime that reports keeps a number of the computer in its user's home, from its import on."""
+    """One that reports keeps a number of the computer in its user's home, from its import on."""
     home = {**os.environ, "HOME": str(tmp_path)}
     home.pop("XDG_CACHE_HOME", None)
     subprocess.run([sys.executable, "-c", "import tactomo_models.network"], env=home, check=True)

@@ -24,6 +24,7 @@ from tactomo.cli import (
     plot,
     programs,
     steer,
+    systemd,
     watch,
 )
 from tactomo.cli.app import app
@@ -49,6 +50,7 @@ COMMANDS = (
     plot,
     programs,
     steer,
+    systemd,
     watch,
 )
 

@@ -20,11 +20,13 @@ RUN = "Run"
 STEER = "Steer a running daemon"
 FILES = "Recordings and files"
 BUILD = "Models and measures"
+SERVICE = "On a robot"
 
 ORDER = (
     *("demo", "daemon", "twin", "viewer"),
     *("status", "doctor", "watch", "tare", "record", "tier", "poke", "keys"),
     *("info", "import", "replay", "reconstruct", "plot"),
+    "service",
     *("models", "bench", "bench-solves", "evaluate"),
 )
 
