@@ -6,11 +6,13 @@ Every key has a default but `ports`. Errors name the file, the key, its value an
 
 from __future__ import annotations
 
+import os
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self
 
+from platformdirs import user_data_path
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM, MessageError
@@ -23,6 +25,9 @@ from tactomo.errors import ConfigError
 from tactomo.log import LogFormat, LogLevel
 
 MAX_PORTS = 2
+
+_IN_TABLES = {"record": ("recording", "file"), "record_maps": ("recording", "maps")}
+"""Flags whose key is in a table of the file."""
 
 
 def _sensor_name(name: str) -> str:
@@ -55,6 +60,46 @@ class Curve(BaseModel):
     """A folder of the public keys of those who may connect."""
 
 
+class RecordingConfig(BaseModel):
+    """Where recordings go, how they are cut into files, and which of those are kept."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    file: Path | None = None
+    """Record to this one file from the start; it is not cut and not deleted."""
+    at_start: bool = False
+    """Record to the folder from the start."""
+    maps: bool = False
+    """Put maps and contacts into recordings, beside the raw bytes."""
+    folder: Path | None = None
+    """Where recordings without a name of their own go, cut into files as follows."""
+    rotate_mb: Annotated[float, Field(ge=0.01, le=100_000)] = 256.0
+    rotate_minutes: Annotated[float, Field(ge=0.01, le=1440)] = 60.0
+    keep_gb: Annotated[float, Field(ge=0)] = 10.0
+    """Of this sensor's files in the folder, the newest so many; 0 for no limit."""
+    keep_days: Annotated[float, Field(ge=0)] = 0.0
+    """Likewise by age."""
+    reserve_mb: Annotated[float, Field(ge=0)] = 200.0
+    """What recording leaves free on the disk, or a tenth of it if that is less."""
+    sync_s: Annotated[float, Field(ge=0, le=3600)] = 5.0
+    """How much may be lost with the power; 0 leaves it to the operating system."""
+
+    @model_validator(mode="after")
+    def _agree(self) -> Self:
+        if self.file is not None and self.at_start:
+            raise ValueError("file and at_start: give one of them")
+        if self.keep_gb and self.keep_gb * 1e3 < 4 * self.rotate_mb:
+            raise ValueError("keep_gb has no room for four files of rotate_mb each")
+        return self
+
+    @property
+    def folder_path(self) -> Path:
+        """The folder; by default the service's own or the user's."""
+        state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+        default = Path(state) if state else user_data_path("tactomo")
+        return (self.folder or default / "recordings").absolute()
+
+
 class DaemonConfig(BaseModel):
     """What one daemon serves: one sensor, read over one port or two."""
 
@@ -84,10 +129,7 @@ class DaemonConfig(BaseModel):
     """How long a scan waits for the other channel's scan of the same instant."""
     lossless: bool = False
     """Reconstruct every dual scan, however late, instead of the newest one."""
-    record: Path | None = None
-    """Start recording to this file at once."""
-    record_maps: bool = False
-    """Put maps and contacts into recordings, beside the raw bytes."""
+    recording: RecordingConfig = RecordingConfig()
     exit_at_end: bool = False
     """Stop once every replayed port has reached the end of its recording."""
     log_level: LogLevel = "info"
@@ -113,7 +155,7 @@ def load_config(path: str | Path | None = None, **overrides: Any) -> DaemonConfi
 
     Args:
         path: a TOML file; None for defaults and flags alone.
-        **overrides: values by key that win over the file's; None means "not given".
+        **overrides: values by flag that win over the file's; None means "not given".
 
     Raises:
         ConfigError: the file cannot be read or is not TOML, or a key is unknown, missing or
@@ -123,7 +165,7 @@ def load_config(path: str | Path | None = None, **overrides: Any) -> DaemonConfi
     given = {key: value for key, value in overrides.items() if value is not None}
     values = {} if path is None else _read_toml(Path(path))
     try:
-        return DaemonConfig.model_validate({**values, **given})
+        return DaemonConfig.model_validate(_override(values, given))
     except ValidationError as error:
         complaints = [f"{_source(item, path, given)}: {explain(item)}" for item in error.errors()]
         raise ConfigError(
@@ -145,6 +187,20 @@ def _read_toml(path: Path) -> dict[str, Any]:
         ) from error
 
 
+def _override(values: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the file's values with those of the flags in their places."""
+    merged = dict(values)
+    for flag, value in given.items():
+        table, key = _IN_TABLES.get(flag, (None, flag))
+        if table is None:
+            merged[key] = value
+        elif isinstance(merged.setdefault(table, {}), dict):  # else it is complained about
+            merged[table] = {**merged[table], key: value}
+    return merged
+
+
 def _source(item: ErrorDetails, path: str | Path | None, given: Mapping[str, Any]) -> str:
-    is_flag = path is None or (item["loc"] and item["loc"][0] in given)
+    flags = {_IN_TABLES.get(flag, (flag,)) for flag in given}
+    loc = tuple(item["loc"])
+    is_flag = path is None or loc[:1] in flags or loc[:2] in flags
     return "command line" if is_flag else str(path)

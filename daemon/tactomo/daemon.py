@@ -7,10 +7,10 @@ thread        owns                        hands on
 ============  ==========================  =========================================================
 port-0, -1    a serial port, a decoder    scans to the pipeline, bytes to the recorder
 pipeline      sync, the reconstructor     messages to the publisher, marks to the recorder
-control       the control socket          commands to the pipeline; starts and stops the recorder
+control       the control socket          commands to the pipeline and to the recorder
 publisher     the stream's socket         what it sent to the recorder, if that is asked for
-recorder-N    the file of recording N     nothing
 doorkeeper    the list of clients         nothing; runs where there are keys (Doorkeeper)
+recorder      the files of recordings     nothing
 ============  ==========================  =========================================================
 
 They stop in this order, so nobody hands anything to one that has gone. Numerical libraries are
@@ -21,19 +21,18 @@ they save, and the processor is shared with everything else on the robot.
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import threading
 import time
 import uuid
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
 import structlog
 import zmq
-from platformdirs import user_data_path
 from tactomo_client.messages import EVENT, SCHEMA, STATUS
 from tactomo_models import (
     ArtifactError,
@@ -50,7 +49,7 @@ from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
 
 from tactomo.config import DaemonConfig
-from tactomo.control import Control, Nothing, RecordStart, SetBudget, SetTier
+from tactomo.control import Control, RecordStart, SetBudget, SetTier
 from tactomo.doorkeeper import Doorkeeper, load_server_keys
 from tactomo.errors import CommandError, ConfigError
 from tactomo.events import Severity
@@ -59,8 +58,9 @@ from tactomo.pipeline import Pipeline, Replay
 from tactomo.port import PortReader
 from tactomo.protocol_replay import parse_replay_url
 from tactomo.publisher import Publisher
-from tactomo.recorder import Recorder, message_entry
+from tactomo.recorder import Recorder
 from tactomo.recording import REPLAY_SCHEME, Origin, Recording
+from tactomo.recording_writer import message_entry
 from tactomo.status import Status
 from tactomo.supervision import Supervision, notify
 
@@ -107,7 +107,7 @@ class Daemon:
         self._description = description
         replay = read_replay(config.ports, description)
         channels = tuple(c for c in Channel if c.name.lower() in description.modalities)
-        self._recorder = Recorder(_origin(config, description), self._on_event)
+        self._recorder = Recorder(_origin(config, description), config.recording, self._on_event)
         self._publisher = Publisher(
             config.name, self.session, self._status_fields, self._record_message
         )
@@ -147,7 +147,7 @@ class Daemon:
                 "status": lambda _: self.status(),
                 "tare": lambda _: self._pipeline.tare(),
                 "record_start": self._record_start,
-                "record_stop": self._record_stop,
+                "record_stop": lambda _: self._recorder.stop(),
                 "set_tier": self._set_tier,
                 "set_budget": self._set_budget,
             },
@@ -258,8 +258,7 @@ class Daemon:
         for port in self._ports:
             port.open(or_wait=config.wait_for_ports)
             undo.callback(port.stop)
-        if config.record is not None:
-            self._recorder.start(config.record, config.record_maps)
+        self._recorder.open()
         for part in self._threads:
             part.start()
 
@@ -288,13 +287,8 @@ class Daemon:
     def _summary(self) -> str:
         return self._status.summary(self._publisher.subscribers)
 
-    def _record_start(self, arguments: RecordStart) -> Mapping[str, Any]:
-        path = Path(arguments.path) if arguments.path else _new_recording(self.config.name)
-        return {"path": str(self._recorder.start(path, self.config.record_maps))}
-
-    def _record_stop(self, _: Nothing) -> Mapping[str, Any]:
-        path, length = self._recorder.stop()
-        return {"path": str(path), "bytes": length}
+    def _record_start(self, arguments: RecordStart) -> Future[Mapping[str, Any]]:
+        return self._recorder.start(Path(arguments.path) if arguments.path else None)
 
     def _set_tier(self, arguments: SetTier) -> Mapping[str, Any]:
         tier = Tier(arguments.tier)
@@ -388,10 +382,3 @@ def _origin(config: DaemonConfig, description: SensorDescription) -> Origin:
         ports=config.ports,
         version=version("tactomo"),
     )
-
-
-def _new_recording(sensor: str) -> Path:
-    """Return a path in the user's data folder, or in the one that systemd gives a service."""
-    stamp = time.strftime("%Y%m%dT%H%M%S")
-    folder = Path(os.environ.get("STATE_DIRECTORY") or user_data_path("tactomo"))
-    return folder / "recordings" / f"{sensor}-{stamp}.mcap"

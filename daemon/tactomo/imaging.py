@@ -31,8 +31,9 @@ from tactomo.errors import CommandError
 from tactomo.events import OnEvent, RateLimit
 from tactomo.frames import contacts_fields, frame_header, map_fields, scan_fields, scan_header
 from tactomo.publisher import Publisher
-from tactomo.recorder import ActiveRecording, Recorder, mark_entry, reference_entry
+from tactomo.recorder import ActiveRecording, Recorder
 from tactomo.recording import Mark, ScanKey
+from tactomo.recording_writer import mark_entry, reference_entry
 from tactomo.sync import DualScan
 from tactomo.tare import Tare
 from tactomo.timing import Durations, Rate
@@ -141,8 +142,7 @@ class Imaging:
         """Measure changes against `reference` from the next dual scan on."""
         self._reconstructor.set_reference(reference)
         self.reference, self.reference_realtime_ns = reference, realtime_ns
-        if self._marked is not None:
-            self._marked.add(reference_entry(reference, time.monotonic_ns(), realtime_ns))
+        self._record_reference()
 
     def start_tare(self, answer: Future[Mapping[str, Any]] | None = None) -> None:
         """Take a reference from the dual scans to come; `answer` gets its `scans`, or why not."""
@@ -177,7 +177,8 @@ class Imaging:
         if self._marked is not None and dual.recording == self._marked.number:
             keys = tuple(ScanKey(s.channel, s.counter, s.device_us) for s in dual.scans)
             tier, budget_ms = self.given
-            done = Mark(keys, str(tier), budget_ms)
+            number = self._marked.references or None
+            done = Mark(keys, str(tier), budget_ms, reference_number=number)
             self._marked.add(mark_entry(done, time.monotonic_ns(), time.time_ns()))
         self._go_on_taring(volts, lost)
 
@@ -186,6 +187,8 @@ class Imaging:
         if self.given != (mark.tier, mark.budget_ms):
             self._asked = (Tier(mark.tier), mark.budget_ms)
             self._give(*self._asked)
+        if mark.is_cold:
+            self._reconstructor.reset()
         if mark.reference is not None:
             self.use_reference(mark.reference, time.time_ns())
 
@@ -193,6 +196,7 @@ class Imaging:
         """Begin to mark frames with the first dual scan that a recording holds whole.
 
         Frames depend on those before them; from here on, a replay can do the same from the start.
+        Which contacts are which is not forgotten: whoever follows one need not know of recordings.
         """
         active = self._recorder.active
         if active is self._marked:
@@ -201,10 +205,16 @@ class Imaging:
             self._marked = None
         elif dual.recording == active.number:
             self._marked = active
-            self._reconstructor.reset()
-            if self.reference is not None:
-                entry = reference_entry(self.reference, time.monotonic_ns(), time.time_ns())
-                active.add(entry)
+            active.previous = None
+            self._reconstructor.forget_shape()
+            self._record_reference()
+
+    def _record_reference(self) -> None:
+        if self.reference is not None and self._marked is not None:
+            self._marked.references += 1
+            number = self._marked.references
+            times = (time.monotonic_ns(), self.reference_realtime_ns)
+            self._marked.add(reference_entry(self.reference, number, *times))
 
     def _reconstruct(self, volts: Volts, saturated: list[Modality]) -> Reconstruction | None:
         started_s = time.perf_counter()

@@ -43,8 +43,9 @@ from tactomo.events import OnEvent, RateLimit
 from tactomo.liveness import PATIENCE_S, DeviceState, Liveness
 from tactomo.open_serial import other_holders
 from tactomo.protocol_replay import ReplayEnded
-from tactomo.recorder import Recorder, hello_entry, port_entry
+from tactomo.recorder import ActiveRecording, Recorder
 from tactomo.recording import REPLAY_SCHEME
+from tactomo.recording_writer import hello_entry, port_entry
 
 RETRY_S: Final = 0.25
 ASK_AGAIN_S: Final = 1.5
@@ -299,21 +300,30 @@ class PortReader:
 
     def _record(self, data: bytes, realtime_ns: int, monotonic_ns: int) -> int:
         """Give the bytes to the recording that runs, if any; returns its number or 0."""
+        times = (monotonic_ns, realtime_ns)
         active = self._recorder.active
-        if active is not None:
-            times = (monotonic_ns, realtime_ns)
-            if active.number != self._recording:
-                # A recording begins with the hello in force and at a delimiter, so that its first
-                # packet is whole and what it means is known.
-                if self.hello is not None:
-                    active.add(hello_entry(self.index, self.hello, *times))
-                if self._tail:
-                    active.add(port_entry(self.index, self._tail, *times))
-            active.add(port_entry(self.index, data, *times))
-        self._recording = 0 if active is None else active.number
+        is_taken = active is not None and self._record_to(active, data, times)
+        if not is_taken and self._recorder.active is not active:  # it has just given way to it
+            active = self._recorder.active
+            is_taken = active is not None and self._record_to(active, data, times)
+        self._recording = active.number if active is not None and is_taken else 0
         delimiter = data.rfind(0)
         self._tail = (self._tail + data)[-MAX_FRAME_BYTES:] if delimiter < 0 else data[delimiter:]
         return self._recording
+
+    def _record_to(self, active: ActiveRecording, data: bytes, times: tuple[int, int]) -> bool:
+        entries = [port_entry(self.index, data, *times)]
+        if active.number != self._recording:
+            # A recording begins with the hello in force and at a delimiter, so that its first
+            # packet is whole and what it means is known.
+            if self._tail:
+                entries.insert(0, port_entry(self.index, self._tail, *times))
+            if self.hello is not None:
+                entries.insert(0, hello_entry(self.index, self.hello, *times))
+        previous = active.previous
+        if previous is not None and self._recording in (previous.number, active.number):
+            previous.add(entries[-1])
+        return active.add(*entries)
 
     def _handle(self, packet: Packet) -> NDArray[np.float64] | None:
         """Take note of a packet; returns a scan's volts if they may be used."""

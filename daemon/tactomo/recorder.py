@@ -1,337 +1,516 @@
-"""Writing recordings: while the daemon runs, or at once from scans that came from elsewhere.
+"""Recording while the daemon runs: into one file, or into a folder of files that come and go.
 
-The layout of the file is `recording`'s. Every recording has a thread of its own that alone touches
-the file; the others only put entries into its queue, so a slow disk delays nobody. A recording
-that cannot go on (the disk is full or too slow) ends with an event, and the daemon goes on.
+One thread touches the files; the others only put entries into a recording's queue, so a disk that
+is slow, full or stuck delays nobody. The queue is bounded in bytes. A recording that cannot go on
+ends with an event, and the daemon goes on; one into a folder begins again by itself once the disk
+has room.
 """
 
 from __future__ import annotations
 
 import contextlib
-import errno
+import os
 import queue
 import threading
 import time
-from collections.abc import Iterable
-from importlib.metadata import version
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, InvalidStateError
 from pathlib import Path
-from typing import IO, Any, Final, NamedTuple
+from typing import Any, Final
 
-import msgpack  # type: ignore[import-untyped]
-from mcap.writer import Writer
-from tactomo_client.messages import array_to_wire
-from tactomo_models import Reference
-from tactomo_protocol import Hello, Scan, encode
+import structlog
 
-from tactomo.errors import CommandError, RecordingError
+from tactomo.config import RecordingConfig
+from tactomo.errors import CommandError, RecordingError, TactomoError
 from tactomo.events import OnEvent
-from tactomo.recording import PROFILE, REFERENCE_ARRAYS, Mark, Origin
+from tactomo.recording import Origin
+from tactomo.recording_writer import Entry, RecordingWriter, create
+from tactomo.rotation import is_ours, list_recordings, next_path, to_delete
 
 FLUSH_S: Final = 0.2
-MAX_QUEUED: Final = 20_000
-"""Entries that a stalled disk may hold up before the recording is given up: minutes of them."""
-CHUNK_BYTES: Final = 1 << 20
-HELLO_PERIOD_S: Final = 1.0
-_RAW, _MSGPACK, _STREAM = "application/octet-stream", "msgpack", "tactomo-stream"
+MAX_QUEUED_BYTES: Final = 64 << 20
+"""What may wait for a stuck disk: half an hour of raw bytes, two minutes with maps."""
+ENTRY_BYTES: Final = 300
+"""What an entry takes beside its data."""
+LOOK_S: Final = 1.0
+RETRY_S: Final = 10.0
+OVERLAP_S: Final = 2.0
+"""How long, at most, a file goes on when the next one has begun."""
+STALL_S: Final = 5.0
+START_S: Final = 10.0
+STOP_S: Final = 3.0
+MOST_RESERVED: Final = 0.1
+"""Of a disk; what is left of a small one is for recordings."""
+RESUME_RESERVES: Final = 2
+LEAST_ROOM: Final = 1 << 20
 
-
-class Entry(NamedTuple):
-    """One message on its way into a recording."""
-
-    topic: str
-    encoding: str
-    data: bytes
-    monotonic_ns: int
-    realtime_ns: int
-
-
-def port_entry(port: int, data: bytes, monotonic_ns: int, realtime_ns: int) -> Entry:
-    """What one read of a port returned, with its times."""
-    return Entry(f"port/{port}", _RAW, data, monotonic_ns, realtime_ns)
-
-
-def hello_entry(port: int, hello: Hello, monotonic_ns: int, realtime_ns: int) -> Entry:
-    """The hello in force on a port, as the frame it would come in."""
-    return Entry(f"port/{port}/hello", _RAW, encode(hello), monotonic_ns, realtime_ns)
-
-
-def reference_entry(reference: Reference, monotonic_ns: int, realtime_ns: int) -> Entry:
-    """The reference that holds from here on."""
-    fields: dict[str, Any] = {"scans": reference.scans}
-    for name in REFERENCE_ARRAYS:
-        array = getattr(reference, name)
-        fields[name] = None if array is None else array_to_wire(array)
-    return Entry("reference", _MSGPACK, msgpack.packb(fields), monotonic_ns, realtime_ns)
-
-
-def mark_entry(mark: Mark, monotonic_ns: int, realtime_ns: int) -> Entry:
-    """A dual scan that was reconstructed; a new reference is an entry of its own, before it."""
-    fields = {"scans": mark.scans, "tier": mark.tier, "budget_ms": mark.budget_ms}
-    return Entry("frame", _MSGPACK, msgpack.packb(fields), monotonic_ns, realtime_ns)
-
-
-def message_entry(kind: str, data: bytes, monotonic_ns: int, realtime_ns: int) -> Entry:
-    """A stream message exactly as published."""
-    return Entry(kind, _STREAM, data, monotonic_ns, realtime_ns)
-
-
-class RecordingWriter:
-    """Writes one recording; for use by one thread. Its methods raise OSError as files do."""
-
-    def __init__(self, path: Path, origin: Origin) -> None:
-        self._file: IO[bytes] = path.open("xb")
-        self._channels: dict[str, int] = {}
-        self._clock_offset_ns = time.time_ns() - time.monotonic_ns()
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES)
-        self._writer.start(profile=PROFILE, library=f"tactomo {origin.version}")
-        metadata = {
-            "sensor": origin.sensor,
-            "description": origin.description,
-            "description_sha256": origin.description_sha256,
-            "ports": "\n".join(origin.ports),
-            "version": origin.version,
-        }
-        self._writer.add_metadata(PROFILE, metadata)
-        self.flush()
-
-    def add(self, entry: Entry) -> None:
-        """Add one message."""
-        channel = self._channels.get(entry.topic)
-        if channel is None:
-            channel = self._writer.register_channel(entry.topic, entry.encoding, schema_id=0)
-            self._channels[entry.topic] = channel
-        log_time = self._clock_offset_ns + entry.monotonic_ns
-        self._writer.add_message(channel, log_time, entry.data, entry.realtime_ns)
-
-    def flush(self) -> int:
-        """Hand everything to the operating system, so that this process may be killed.
-
-        Returns the length of the file.
-        """
-        self._writer.flush()  # type: ignore[no-untyped-call]
-        return self._file.tell()
-
-    def close(self) -> int:
-        """Finish the file with its index; returns its length."""
-        try:
-            self._writer.finish()  # type: ignore[no-untyped-call]
-            self._file.flush()
-            return self._file.tell()
-        finally:
-            self._close_file()
-
-    def abandon(self) -> None:
-        """Close the file as it is, after a write has failed."""
-        self._close_file()
-
-    def _close_file(self) -> None:
-        try:
-            self._file.close()
-        except OSError:  # what is buffered cannot be written, and that was reported already
-            self._file.raw.close()  # type: ignore[attr-defined]
+log = structlog.get_logger()
 
 
 class ActiveRecording:
-    """A recording in progress: a queue that any thread may fill, a thread that empties it.
+    """A recording in progress: a queue that any thread may fill and the recorder's thread empties.
 
     Attributes:
-        number: tells it from the daemon's other recordings; above 0.
-        bytes_written: length of the file at the last flush.
-        failure: why it had to be given up; empty while all is well.
+        number: tells it from the daemon's other recordings; rises from 1.
+        previous: the file before it, as long as that gets the ports' bytes, too. The pipeline's
+            thread ends that, or the recorder's when it has waited long enough.
+        references: how many references were added; the pipeline's thread counts.
+        bytes_written: length of the file at the last flush; written by the recorder's thread.
+        is_overflowed: the queue was full once, and nothing is taken any more.
+        is_empty: nothing was written yet; written by the recorder's thread.
 
     """
 
-    def __init__(self, number: int, path: Path, writer: RecordingWriter, with_maps: bool) -> None:
+    def __init__(
+        self,
+        number: int,
+        path: Path,
+        writer: RecordingWriter,
+        with_maps: bool,
+        previous: ActiveRecording | None = None,
+    ) -> None:
         self.number = number
         self.path = path
         self.with_maps = with_maps
-        self.bytes_written = 0  # written by the recorder thread, like the next one
-        self.failure = ""
+        self.previous = previous
+        self.references = 0
+        self.bytes_written = 0
+        self.is_overflowed = False
+        self.is_empty = True
+        self._begin_s = time.monotonic()
         self._writer = writer
-        self._queue: queue.SimpleQueue[Entry | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._run, name=f"recorder-{number}")
-        self._thread.start()
+        self._lock = threading.Lock()
+        self._entries: list[Entry] = []  # this and the next three under the lock
+        self._queued_bytes = 0
+        self._has_ended = False
+        self._is_told = False
+        self._synced_s = self._begin_s
 
-    def add(self, *entries: Entry) -> None:
-        """Add entries in order; never waits, and does nothing once the recording has ended."""
+    @property
+    def age_s(self) -> float:
+        """How long ago it began."""
+        return time.monotonic() - self._begin_s
+
+    @property
+    def queued_bytes(self) -> int:
+        """What waits for the disk."""
+        return self._queued_bytes
+
+    def add(self, *entries: Entry) -> bool:
+        """Add entries in order, all or none; never waits. False: it takes no more."""
+        size = sum(len(entry.data) + ENTRY_BYTES for entry in entries)
+        with self._lock:
+            if self._has_ended or self.is_overflowed:
+                return False
+            if self._queued_bytes + size > MAX_QUEUED_BYTES:
+                self.is_overflowed = True
+                return False
+            self._entries += entries
+            self._queued_bytes += size
+        return True
+
+    def tell_once(self) -> bool:
+        """Whether nobody has told yet that it failed; then the caller does."""
+        with self._lock:
+            is_first, self._is_told = not self._is_told, True
+        return is_first
+
+    def write(self) -> None:
+        """Write what was added, and hand it to the operating system."""
+        with self._lock:
+            entries, self._entries = self._entries, []
         for entry in entries:
-            self._queue.put(entry)
-
-    def finish(self) -> None:
-        """Write what was added so far and close the file."""
-        self._queue.put(None)
-        self._thread.join()
-
-    def _run(self) -> None:
-        try:
-            self._write_until_finished()
-            self.bytes_written = self._writer.close()
-        except Exception as error:  # a recording may fail, but never without a word
-            self.failure = getattr(error, "strerror", None) or str(error) or repr(error)
-            self._writer.abandon()
-
-    def _write_until_finished(self) -> None:
-        flush_at = time.monotonic() + FLUSH_S
-        while True:
-            wait_s = flush_at - time.monotonic()
-            if wait_s <= 0:
-                self.bytes_written = self._writer.flush()
-                flush_at = time.monotonic() + FLUSH_S
-                continue
-            try:
-                entry = self._queue.get(timeout=wait_s)
-            except queue.Empty:
-                continue
-            if entry is None:
-                return
-            if self._queue.qsize() > MAX_QUEUED:
-                raise OSError(errno.EIO, "the disk is too slow")
             self._writer.add(entry)
+            self.is_empty = False
+        self.bytes_written = self._writer.flush()
+        with self._lock:
+            self._queued_bytes -= sum(len(entry.data) + ENTRY_BYTES for entry in entries)
+
+    def sync(self, period_s: float) -> None:
+        """Have what was written outlive a loss of power, once a period; 0 leaves that to chance."""
+        if period_s and time.monotonic() - self._synced_s >= period_s:
+            self._writer.sync()
+            self._synced_s = time.monotonic()
+
+    def finish(self, sync: bool) -> None:
+        """Write what was added so far and close the file with its index."""
+        with self._lock:
+            self._has_ended = True
+        self.write()
+        if sync:
+            self._writer.sync()
+        self.bytes_written = self._writer.close()
+
+    def abandon(self) -> None:
+        """Close the file as it is, and forget what was not written."""
+        with self._lock:
+            self._has_ended = True
+            self._entries, self._queued_bytes = [], 0
+        self._writer.abandon()
+
+    @property
+    def is_deleted(self) -> bool:
+        """Whether somebody has deleted the file."""
+        return self._writer.is_deleted
 
 
 class Recorder:
-    """Starts and stops recordings, one at a time.
+    """Starts, cuts and stops recordings, one at a time.
 
-    `active` is the recording that runs. The control thread writes it; every other thread reads it
-    once and uses what it got, which stays harmless after the recording has ended.
+    Its thread does everything that touches a file; `start` and `stop` ask it to. What others may
+    read is written by that thread alone; every thread reads `active` once and uses what it got,
+    which stays harmless after the recording has ended.
+
+    Attributes:
+        active: the recording that runs; None while there is none.
+        files: how many files were begun since the start.
+        deleted: how many were deleted to keep to the rules.
+        failures: how often a recording could not go on.
+        waits_for: why a recording that is wanted does not run; empty while none does.
+
     """
 
-    def __init__(self, origin: Origin, on_event: OnEvent) -> None:
+    def __init__(self, origin: Origin, rules: RecordingConfig, on_event: OnEvent) -> None:
         self.active: ActiveRecording | None = None
+        self.files = 0
+        self.deleted = 0
+        self.failures = 0
+        self.waits_for = ""
         self._origin = origin
+        self._rules = rules
         self._on_event = on_event
-        self._number = 0
+        self._folder: Path | None = None  # where a set of files is recorded, or is to be
+        self._ending: ActiveRecording | None = None  # the file before, while that goes on
+        self._last = (Path(), 0)  # the newest file that was closed
+        self._next_try_s = self._next_look_s = 0.0
+        self._requests: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = (
+            queue.SimpleQueue()
+        )
+        self._wake = threading.Event()
+        self._stopping = False
+        self._busy_since_s: float | None = None  # None while the thread rests
+        self._is_stalled = self._is_dead = False  # as far as the control thread has told
+        # A daemon thread: should the disk never answer again, the process must still end.
+        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
 
-    def start(self, path: Path, with_maps: bool = False) -> Path:
-        """Begin a recording and return its absolute path.
+    def open(self) -> None:
+        """Start the thread, and what is to be recorded from the start.
 
         Raises:
-            CommandError: one runs already.
-            RecordingError: the file exists, or cannot be created.
+            RecordingError: the file to be recorded to cannot be created. A folder that cannot be
+                used, or a disk without room, is told as an event and tried again.
 
         """
-        self.check()
+        self._thread.start()
+        if self._rules.file is not None:
+            _wait_for(self.start(self._rules.file))
+        elif self._rules.at_start:
+            _wait_for(self._ask(self._keep_recording))
+
+    def start(self, path: Path | None) -> Future[Mapping[str, Any]]:
+        """Ask for a recording: to a file, or with None to the folder, cut into files.
+
+        The future gets its absolute `path`, or CommandError where one runs already, or
+        RecordingError where the file exists or cannot be created, or the disk has no room.
+        """
+        return self._ask(lambda: self._start(None if path is None else path.absolute()))
+
+    def stop(self) -> Future[Mapping[str, Any]]:
+        """Ask for the recording's end.
+
+        The future gets `path` and length in `bytes` of the file, the last one of a set; or
+        CommandError where none runs, or RecordingError where it could not be written to its end.
+        """
+        return self._ask(self._stop)
+
+    def close(self) -> None:
+        """End the recording, if one runs, and the thread; a disk that hangs is not waited for."""
+        self._stopping = True
+        self._wake.set()
+        if self._thread.is_alive():
+            self._thread.join(STOP_S)
+        if self._thread.is_alive() and self.active is not None:
+            self._tell_failure(self.active, "the disk does not answer, and the daemon stops")
+
+    def check(self) -> None:
+        """Tell what the thread cannot tell itself; called now and then by the control thread."""
+        active, busy_since_s = self.active, self._busy_since_s
+        if active is not None and active.is_overflowed:
+            self._tell_failure(active, _TOO_SLOW)
+        if not self._thread.is_alive() and not self._is_dead:
+            self._is_dead, self.active = True, None
+            self._on_event("recording_failed", "error", "the recorder's thread died", _REPORT)
+        waits_s = 0.0 if busy_since_s is None else time.monotonic() - busy_since_s
+        if (waits_s > STALL_S) != self._is_stalled:
+            self._is_stalled = not self._is_stalled
+            self._tell_stall(waits_s)
+
+    def _tell_stall(self, waits_s: float) -> None:
+        if self._is_stalled:
+            self._on_event(
+                "recording_stalled",
+                "warning",
+                f"the disk has not answered for {waits_s:.0f} s; up to "
+                f"{MAX_QUEUED_BYTES >> 20} MB wait in memory",
+                "look at the disk (dmesg), or record to another one",
+            )
+        else:
+            self._on_event("recording_resumed", "info", "the disk answers again")
+
+    def _ask(self, work: Callable[[], Any]) -> Future[Any]:
+        answer: Future[Any] = Future()
+        self._requests.put((work, answer))
+        self._wake.set()
+        return answer
+
+    # From here on: the recorder's thread.
+
+    def _run(self) -> None:
+        while not self._stopping:
+            is_idle = self.active is None and self._folder is None
+            self._wake.wait(None if is_idle else FLUSH_S)
+            self._wake.clear()
+            self._busy_since_s = time.monotonic()
+            self._answer_requests()
+            self._guard(self._write)
+            if self._busy_since_s >= self._next_look_s:
+                self._next_look_s = self._busy_since_s + LOOK_S
+                self._guard(self._look_after)
+            self._busy_since_s = None
+        self._busy_since_s = time.monotonic()
+        with contextlib.suppress(TactomoError):  # nothing runs; or it failed and that was told
+            self._stop()
+        self._answer_requests()
+        self._busy_since_s = None
+
+    def _answer_requests(self) -> None:
+        while not self._requests.empty():
+            work, answer = self._requests.get()
+            with contextlib.suppress(InvalidStateError):  # nobody waits for it any more
+                try:
+                    answer.set_result(work())
+                except TactomoError as error:
+                    answer.set_exception(error)
+                except OSError as error:
+                    reason = error.strerror or str(error)
+                    answer.set_exception(RecordingError(reason, _TRY_ELSEWHERE, "cannot_write"))
+
+    def _guard(self, work: Callable[[], None]) -> None:
+        """Do a part of the work; where it fails the recording ends, and not the thread."""
+        try:
+            work()
+        except Exception as error:  # of any kind: a recording may fail, but never without a word
+            if not isinstance(error, OSError | RecordingError):
+                log.exception("recording_failed")
+            self._give_up(getattr(error, "strerror", None) or str(error) or repr(error))
+
+    def _start(self, path: Path | None) -> Mapping[str, Any]:
         if self.active is not None:
             raise CommandError(
                 f"a recording runs already: {self.active.path}",
                 "stop it with record_stop first",
                 "already_recording",
             )
-        path = path.absolute()
-        writer = _create(path, self._origin)
-        self._number += 1
-        self.active = ActiveRecording(self._number, path, writer, with_maps)
-        self._on_event("recording_started", "info", str(path))
-        return path
+        folder = self._rules.folder_path if path is None else None
+        self.active = self._create(path)
+        self._folder, self.waits_for = folder, ""
+        self._on_event("recording_started", "info", str(self.active.path))
+        self._delete_old()
+        return {"path": str(self.active.path)}
 
-    def stop(self) -> tuple[Path, int]:
-        """End the recording; return its path and its length in bytes.
+    def _keep_recording(self) -> None:
+        """Record to the folder, now or as soon as that can be done."""
+        try:
+            self._start(None)
+        except (OSError, RecordingError) as error:
+            self._folder = self._rules.folder_path
+            self._on_event("recording_failed", "error", str(error), self._wait(str(error)))
+
+    def _create(
+        self, path: Path | None, previous: ActiveRecording | None = None, reserves: int = 1
+    ) -> ActiveRecording:
+        """Begin a file, the next one of the folder if none is named.
 
         Raises:
-            CommandError: none runs.
-            RecordingError: it could not be written to its end.
+            RecordingError: it cannot be created, or less than so many reserves are free.
+            OSError: the folder cannot be read.
 
         """
-        active, self.active = self.active, None
-        if active is None:
+        folder = self._rules.folder_path if path is None else path.parent
+        free, reserve = self._room(folder)
+        if free < max(reserve * reserves, LEAST_ROOM):
+            raise RecordingError(_no_room(free, reserve), "make room on the disk", "cannot_write")
+        if path is None:
+            path = next_path(folder, self._origin.sensor, time.time())
+        writer = create(path, self._origin)
+        self.files += 1
+        return ActiveRecording(self.files, path, writer, self._rules.maps, previous)
+
+    def _stop(self) -> Mapping[str, Any]:
+        active, is_wanted = self.active, self._folder is not None
+        self.active, self._folder, self.waits_for = None, None, ""
+        if active is not None:
+            self._finish(active)
+            detail = f"{active.path}: {active.bytes_written} bytes"
+            self._on_event("recording_stopped", "info", detail)
+        elif not is_wanted:
             raise CommandError(
                 "nothing is being recorded", "start with record_start", "not_recording"
             )
-        active.finish()
-        if active.failure:
-            self._tell_failure(active)
-            raise RecordingError(
-                f"{active.path}: {active.failure}", _HOW_TO_READ_THE_REST, "cannot_write"
-            )
-        self._on_event("recording_stopped", "info", f"{active.path}: {active.bytes_written} bytes")
-        return active.path, active.bytes_written
+        path, length = self._last
+        return {"path": str(path), "bytes": length}
 
-    def close(self) -> None:
-        """End the recording, if one runs; a failure is told as an event."""
-        if self.active is not None:
-            with contextlib.suppress(RecordingError):
-                self.stop()
+    def _finish(self, recording: ActiveRecording) -> None:
+        """Close a file that nobody adds to any more, with its index."""
+        self._finish_previous()
+        try:
+            recording.finish(self._rules.sync_s > 0)
+        except OSError as error:
+            recording.abandon()
+            reason = error.strerror or str(error)
+            self._tell_failure(recording, reason)
+            raise RecordingError(f"{recording.path}: {reason}", _REST, "cannot_write") from error
+        self._last = (recording.path, recording.bytes_written)
 
-    def check(self) -> None:
-        """Notice a recording that had to be given up; called now and then by the control thread."""
+    def _finish_previous(self) -> None:
+        previous, self._ending = self._ending, None
+        if previous is not None:
+            if self.active is not None:
+                self.active.previous = None
+            with contextlib.suppress(RecordingError):  # told; the newer file may go on
+                self._finish(previous)
+
+    def _write(self) -> None:
+        active, ending = self.active, self._ending
+        if active is None:
+            return
+        if ending is not None:
+            ending.write()
+            # The pipeline has come over, or nothing comes that it could come over with.
+            if active.previous is None or active.age_s > OVERLAP_S:
+                self._finish_previous()
+        active.write()
+        if active.is_overflowed:
+            self._stop_early(active, _TOO_SLOW)
+        else:
+            active.sync(self._rules.sync_s)
+
+    def _look_after(self) -> None:
+        """Is the file still there, is there room, is it time for the next file, or to try again?"""
         active = self.active
-        if active is not None and active.failure:
-            self.active = None
-            active.finish()
-            self._tell_failure(active)
+        if active is None:
+            self._try_again()
+            return
+        if active.is_deleted:
+            raise RecordingError("the file was deleted")
+        free, reserve = self._room(active.path.parent)
+        if free < reserve:
+            self._stop_early(active, _no_room(free, reserve))
+        elif self._folder is not None and self._is_due(active):
+            self._rotate(active)
 
-    def _tell_failure(self, active: ActiveRecording) -> None:
-        self._on_event(
-            "recording_failed",
-            "error",
-            f"{active.path}: {active.failure} after {active.bytes_written} bytes",
-            _HOW_TO_READ_THE_REST,
-        )
+    def _is_due(self, active: ActiveRecording) -> bool:
+        is_full = active.bytes_written >= self._rules.rotate_mb * 1e6
+        is_old = active.age_s >= self._rules.rotate_minutes * 60 and not active.is_empty
+        may = self._ending is None and time.monotonic() >= self._next_try_s
+        return may and (is_full or is_old)
+
+    def _rotate(self, active: ActiveRecording) -> None:
+        """Go on in the next file; both get the ports' bytes until the pipeline has come over."""
+        try:
+            following = self._create(None, previous=active)
+        except (OSError, RecordingError) as error:
+            self._next_try_s = time.monotonic() + RETRY_S
+            self._on_event(
+                "rotation_failed", "warning", f"{error}; going on in {active.path}", _TRIED_AGAIN
+            )
+            return
+        self._ending, self.active = active, following
+        self._on_event("recording_rotated", "info", f"{following.path}, after {active.path}")
+        self._delete_old()
+
+    def _try_again(self) -> None:
+        """Record to the folder again, once there is room and a little to spare."""
+        if self._folder is None or time.monotonic() < self._next_try_s:
+            return
+        try:
+            self.active = self._create(None, reserves=RESUME_RESERVES)
+        except (OSError, RecordingError) as error:
+            self._wait(str(error))
+            return
+        self.waits_for = ""
+        self._on_event("recording_resumed", "info", str(self.active.path))
+        self._delete_old()
+
+    def _stop_early(self, active: ActiveRecording, reason: str) -> None:
+        """End a recording in good order before it has to."""
+        self.active = None
+        with contextlib.suppress(RecordingError):  # told
+            self._finish(active)
+        self._tell_failure(active, reason)
+
+    def _give_up(self, reason: str) -> None:
+        """Leave what is being written as it is."""
+        active, ending = self.active, self._ending
+        self.active = self._ending = None
+        for recording in (ending, active):
+            if recording is not None:
+                recording.abandon()
+                self._tell_failure(recording, reason)
+
+    def _delete_old(self) -> None:
+        if self._folder is None or self.active is None:
+            return
+        sensor, path = self._origin.sensor, self.active.path
+        try:
+            kept = list_recordings(self._folder, sensor)
+            ours = [one for one in kept if one.path == path or is_ours(one.path, sensor)]
+            for deletion in to_delete(ours, self._rules):
+                deletion.path.unlink()
+                self.deleted += 1
+                self._on_event("recording_deleted", "info", f"{deletion.path}: {deletion.reason}")
+        except OSError as error:  # the next file's beginning tries again
+            log.warning("recording_not_deleted", detail=str(error))
+
+    def _room(self, folder: Path) -> tuple[int, int]:
+        """Return the bytes that are free where a folder is or will be, and those to be left so."""
+        while not folder.is_dir() and folder != folder.parent:
+            folder = folder.parent
+        disk = os.statvfs(folder)
+        reserve = min(self._rules.reserve_mb * 1e6, MOST_RESERVED * disk.f_blocks * disk.f_frsize)
+        return disk.f_bavail * disk.f_frsize, round(reserve)
+
+    def _wait(self, reason: str) -> str:
+        """Try again later what is to go on; returns the next step for people."""
+        self._next_try_s = time.monotonic() + RETRY_S
+        if self._folder is None:
+            return _REST
+        self.waits_for = reason
+        return _TRIED_AGAIN
+
+    def _tell_failure(self, recording: ActiveRecording, reason: str) -> None:
+        """Tell once that a recording could not go on; for any thread."""
+        if recording.tell_once():
+            self.failures += 1
+            detail = f"{recording.path}: {reason}, after {recording.bytes_written} bytes"
+            self._on_event("recording_failed", "error", detail, self._wait(reason))
 
 
-_HOW_TO_READ_THE_REST = "make room on the disk; what was written until then can be replayed"
+_REST: Final = "make room on the disk; what was written until then can be replayed"
+_TRIED_AGAIN: Final = "make room on the disk, or see that it can be written; it is tried again"
+_TRY_ELSEWHERE: Final = "give a path in a folder that you may write to"
+_REPORT: Final = "please report the traceback in the log"
+_TOO_SLOW: Final = f"the disk is too slow: {MAX_QUEUED_BYTES >> 20} MB wait for it"
 
 
-def _create(path: Path, origin: Origin) -> RecordingWriter:
+def _no_room(free: int, reserve: int) -> str:
+    return f"{free / 1e6:.0f} MB are free on the disk, {reserve / 1e6:.0f} MB are kept in reserve"
+
+
+def _wait_for(answer: Future[Any]) -> None:
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return RecordingWriter(path, origin)
-    except FileExistsError as error:
+        answer.result(START_S)
+    except TimeoutError as error:
         raise RecordingError(
-            f"{path} exists already", "give another path", "cannot_write"
-        ) from error
-    except (OSError, ValueError) as error:  # ValueError: a NUL byte in the path
-        raise RecordingError(
-            f"cannot create {path}: {getattr(error, 'strerror', None) or error}",
-            "give a path in a folder that you may write to",
-            "cannot_write",
-        ) from error
-
-
-def write_recording(
-    path: str | Path,
-    hello: Hello,
-    scans: Iterable[tuple[float, Scan]],
-    *,
-    sensor: str,
-    description: str,
-    description_sha256: str,
-    reference: Reference | None = None,
-) -> int:
-    """Write a recording of scans that came from elsewhere, as one port would have said them.
-
-    Args:
-        path: the file to write; it must not exist.
-        hello: what the device would have said it is; repeated every second.
-        scans: each with its time in seconds since the first, ascending.
-        sensor: the sensor's name.
-        description: the sensor description's name or path.
-        description_sha256: that description's hash.
-        reference: the reference to be used on replay; None leaves that to the replay's tare.
-
-    Returns the length of the file in bytes.
-
-    Raises:
-        RecordingError: the file exists or cannot be written.
-
-    """
-    origin = Origin(sensor, description, description_sha256, ("import",), version("tactomo"))
-    path = Path(path).absolute()
-    writer = _create(path, origin)
-    monotonic_ns, realtime_ns = time.monotonic_ns(), time.time_ns()
-    hello_at_s = -HELLO_PERIOD_S
-    try:
-        if reference is not None:
-            writer.add(reference_entry(reference, monotonic_ns, realtime_ns))
-        for time_s, scan in scans:
-            data = encode(scan)
-            if time_s - hello_at_s >= HELLO_PERIOD_S:
-                data, hello_at_s = encode(hello) + data, time_s
-            after_ns = round(time_s * 1e9)
-            writer.add(port_entry(0, data, monotonic_ns + after_ns, realtime_ns + after_ns))
-        return writer.close()
-    except OSError as error:
-        writer.abandon()
-        raise RecordingError(
-            f"cannot write {path}: {error.strerror}", "make room on the disk", "cannot_write"
+            f"the disk has not answered for {START_S:g} s", _TRY_ELSEWHERE, "cannot_write"
         ) from error

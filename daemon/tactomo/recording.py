@@ -10,42 +10,64 @@ port/N/hello   raw         one whole frame: the hello in force when the recordin
 reference      msgpack     the reference that holds from here on: volts and noise of each channel
 frame          msgpack     a dual scan that the daemon reconstructed: channel, counter and device
                            time of each of its scans, the tier and the budget (ms of modelled
-                           work, not of time) that it was reconstructed with
-map, contacts  stream      messages exactly as published, if asked for
+                           work, not of time) that it was reconstructed with, the number of the
+                           reference in force, and whether it started cold
+map, contacts  stream      messages exactly as published, if asked for; scan likewise, as long as
+                           anybody subscribes to it
 =============  ==========  =======================================================================
+
+A recording that is cut into several files says all of this in each: any of them can be replayed
+alone. At a cut, the ports' bytes go into both files until the pipeline has come over to the new
+one, so every dual scan lies whole in the file that has its mark.
 
 `log_time` is a steady clock: the wall clock when the recording began plus the monotonic time
 since. `publish_time` is the wall clock itself. The metadata record ``tactomo`` says which sensor
 it was.
 
 The file of a daemon that was killed ends somewhere in its last chunk. Everything here reads with
-MCAP's streaming reader, so such a file opens like any other, up to its last complete chunk.
+MCAP's streaming reader, so such a file opens like any other, up to its last complete chunk. What
+lies beyond damage in the middle is for `recovery`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import IO, Final, NamedTuple
 from urllib.parse import quote
 
 import msgpack  # type: ignore[import-untyped]
 from mcap.exceptions import InvalidMagic
 from mcap.records import Channel as McapChannel
+from mcap.records import Chunk as McapChunk
 from mcap.records import Footer, Header, McapRecord, Message, Metadata
-from mcap.stream_reader import StreamReader
+from mcap.stream_reader import StreamReader, breakup_chunk
 from tactomo_client.messages import array_from_wire
 from tactomo_models import Reference
 from tactomo_protocol import Channel, Decoder, Hello, Scan
 
 from tactomo.errors import RecordingError
+from tactomo.intact_chunks import MAX_RECORD_BYTES, intact_chunks
 
 PROFILE: Final = "tactomo"
+RECOVERED: Final = "tactomo-recovered"
 REFERENCE_ARRAYS: Final = ("magnitude", "structure", "magnitude_noise", "structure_noise")
 REPLAY_SCHEME: Final = "replay"
-_MAX_RECORD_BYTES: Final = 64 << 20
+CHANNELS: Final[Mapping[str, str]] = {
+    "reference": "msgpack",
+    "frame": "msgpack",
+    "map": "tactomo-stream",
+    "contacts": "tactomo-stream",
+    "scan": "tactomo-stream",
+    **{
+        f"port/{port}{hello}": "application/octet-stream"
+        for port in (0, 1)
+        for hello in ("", "/hello")
+    },
+}
+"""Encoding of each topic, in the order of their MCAP channel numbers from 1."""
 
 
 class ScanKey(NamedTuple):
@@ -65,6 +87,10 @@ class Mark:
     budget_ms: float | None
     reference: Reference | None = None
     """A reference to be put in force just before it."""
+    reference_number: int | None = None
+    """Which of the recording's references was in force, from 1; None for none."""
+    is_cold: bool = False
+    """Whether what came before is unknown, so that the reconstruction starts anew with it."""
 
 
 class Chunk(NamedTuple):
@@ -94,6 +120,10 @@ class Summary:
     file_bytes: int
     is_complete: bool = False
     """False where the file ends in the middle: its writer was killed, or the disk was full."""
+    has_more: bool = False
+    """Whether intact data lie beyond the damage that ends it here: `tactomo recover` gets them."""
+    recovered_gaps: int | None = None
+    """How many gaps `tactomo recover` had to leave in it; None for a recording as it was made."""
     start_ns: int = 0
     """When the first byte was read, nanoseconds since 1970, on the steady clock."""
     end_ns: int = 0
@@ -183,9 +213,12 @@ def _summarise(path: Path, origin: Origin) -> Summary:
     """Read a whole recording; its decoders are the daemon's own."""
     summary = Summary(origin, path.stat().st_size)
     decoders = [Decoder() for _ in origin.ports]
-    for topic, record in _records(path):
+    stops: list[int] = []
+    for topic, record in _records(path, stops.append):
         if isinstance(record, Footer):
             summary.is_complete = True
+        elif isinstance(record, Metadata) and record.name == RECOVERED:
+            summary.recovered_gaps = int(record.metadata.get("gaps", "0"))
         elif isinstance(record, Message):
             kind, _, rest = topic.partition("/")
             summary.frames += kind == "frame"
@@ -196,7 +229,14 @@ def _summarise(path: Path, origin: Origin) -> Summary:
                     _count_bytes(summary, int(number), record)
                 _count_packets(summary, decoders[int(number)], record.data)
     summary.corrupt = sum(decoder.counts.corrupt for decoder in decoders)
+    summary.has_more = bool(stops) and _has_chunks(path, stops[0])
     return summary
+
+
+def _has_chunks(path: Path, start: int) -> bool:
+    """Whether an intact chunk begins at or after a position in the file."""
+    with path.open("rb") as file:
+        return any(True for _ in intact_chunks(file, start))
 
 
 def _count_bytes(summary: Summary, port: int, message: Message) -> None:
@@ -239,32 +279,52 @@ def _messages(path: Path) -> Iterator[tuple[str, Message]]:
             yield topic, record
 
 
-def _records(path: Path) -> Iterator[tuple[str, McapRecord]]:
-    """Yield the file's records up to its end or to the first damage; messages with their topic."""
+def _records(
+    path: Path, on_damage: Callable[[int], None] = lambda _: None
+) -> Iterator[tuple[str, McapRecord]]:
+    """Yield the file's records up to its end or to the first damage; messages with their topic.
+
+    `on_damage` is told where the last thing that could be read ends.
+    """
     topics: dict[int, str] = {}
+    with _open(path) as file:
+        reader = StreamReader(
+            file, emit_chunks=True, validate_crcs=True, record_size_limit=MAX_RECORD_BYTES
+        )
+        records = iter(reader.records)
+        end = 0
+        while True:
+            try:
+                record = next(records)
+                inside = (
+                    breakup_chunk(record, validate_crc=True)
+                    if isinstance(record, McapChunk)
+                    else [record]
+                )
+            except StopIteration:
+                return
+            except InvalidMagic as error:
+                if not end:
+                    raise _not_a_recording(path, "is not an MCAP file") from error
+                on_damage(end)  # it is the closing one that is cut off
+                return
+            except Exception:  # damage can fail in any layer: disk, struct, zstd, utf-8, CRC
+                on_damage(end)
+                return
+            end = file.tell()
+            for each in inside:
+                if isinstance(each, McapChannel):
+                    topics[each.id] = each.topic
+                yield topics.get(getattr(each, "channel_id", 0), ""), each
+
+
+def _open(path: Path) -> IO[bytes]:
     try:
-        file = path.open("rb")
+        return path.open("rb")
     except OSError as error:
         raise RecordingError(
             f"cannot open the recording {path}: {error.strerror}", "give the path of a .mcap file"
         ) from error
-    with file:
-        reader = StreamReader(file, validate_crcs=True, record_size_limit=_MAX_RECORD_BYTES)
-        records = iter(reader.records)
-        while True:
-            try:
-                record = next(records)
-            except StopIteration:
-                return
-            except InvalidMagic as error:
-                if topics:  # it is the closing one that is cut off
-                    return
-                raise _not_a_recording(path, "is not an MCAP file") from error
-            except Exception:  # damage can fail in any layer: disk, struct, zstd, utf-8, CRC
-                return
-            if isinstance(record, McapChannel):
-                topics[record.id] = record.topic
-            yield topics.get(getattr(record, "channel_id", 0), ""), record
 
 
 def _not_a_recording(path: Path, reason: str) -> RecordingError:
@@ -286,4 +346,10 @@ def _read_reference(data: bytes) -> Reference:
 def _read_mark(data: bytes) -> Mark:
     fields = msgpack.unpackb(data)
     scans = tuple(ScanKey(Channel(c), counter, device) for c, counter, device in fields["scans"])
-    return Mark(scans=scans, tier=fields["tier"], budget_ms=fields["budget_ms"])
+    return Mark(
+        scans=scans,
+        tier=fields["tier"],
+        budget_ms=fields["budget_ms"],
+        reference_number=fields.get("reference"),
+        is_cold=fields.get("cold", False),
+    )

@@ -66,7 +66,13 @@ class Status:
             "tier_requested": str(imaging.tier),
             "budget_ms": imaging.budget_ms,
             "calibration": self._calibration(),
-            "recording": active and {"path": str(active.path), "bytes": active.bytes_written},
+            "recording": active
+            and {
+                "path": str(active.path),
+                "bytes": active.bytes_written,
+                "queued_bytes": active.queued_bytes,
+            },
+            "recorder": self._recorder_fields(),
             "subscribers": subscribers,
         }
 
@@ -88,6 +94,15 @@ class Status:
             return f"{state}, {' and '.join(absent)} not there"
         rate_hz = self._imaging.frame_rate.per_second()
         return f"{state}: {rate_hz:.0f} frames/s, {subscriptions} subscriptions"
+
+    def _recorder_fields(self) -> dict[str, Any]:
+        recorder = self._recorder
+        return {
+            "files": recorder.files,
+            "deleted": recorder.deleted,
+            "failures": recorder.failures,
+            "waits_for": recorder.waits_for or None,
+        }
 
     def _calibration(self) -> dict[str, Any]:
         tier, modelled_ms = self._imaging.given

@@ -48,9 +48,11 @@ class DualScan:
 
     @property
     def recording(self) -> int:
-        """Which recording holds all of its bytes; 0 where none does."""
-        recordings = {scan.recording for scan in self.scans}
-        return recordings.pop() if len(recordings) == 1 else 0
+        """Which recording holds all of its bytes; 0 where none does.
+
+        Where its scans came before and after a recording was cut, the older file holds both.
+        """
+        return min(scan.recording for scan in self.scans)
 
 
 class Joiner(Protocol):

@@ -226,9 +226,10 @@ class Reconstructor:
     def reset(self) -> None:
         """Forget the warm start and which contacts were which."""
         self._tracker.clear()
-        self._forget_shape()
+        self.forget_shape()
 
-    def _forget_shape(self) -> None:
+    def forget_shape(self) -> None:
+        """Forget the warm start; contacts keep their identities."""
         if self._follower:
             self._follower.forget()
         self._magnitudes.forget()
@@ -304,7 +305,7 @@ class Reconstructor:
             )
         if all(d.quiet for d in data.values()):
             self._tracker.update(np.zeros((0, 2)))
-            self._forget_shape()
+            self.forget_shape()
             return self._quiet(data, flags)
         if self.tier in LINEAR:
             return self._linear(data, flags, self.tier, "as requested")
@@ -346,7 +347,7 @@ class Reconstructor:
         self, data: dict[Modality, Changes], flags: Flag, method: Tier, reason: str
     ) -> Reconstruction:
         """Linear images of both channels; areas above half of the clearest one's peak."""
-        self._forget_shape()
+        self.forget_shape()
         with self._timed(method):
             images = {name: self._linear_image(name, d.change, method) for name, d in data.items()}
             maps = {name: self._on_map(image) for name, image in images.items()}
@@ -401,7 +402,7 @@ class Reconstructor:
         self, data: dict[Modality, Changes], flags: Flag, reason: str
     ) -> Reconstruction:
         """Our network's images; its shapes' areas carry what its map shows in them."""
-        self._forget_shape()
+        self.forget_shape()
         with self._timed("network"):
             image = self._network_image(data)
         return self._imaged(image, data, flags, Tier.NETWORK, reason)
@@ -423,7 +424,7 @@ class Reconstructor:
 
     def _by_paper_network(self, data: dict[Modality, Changes], flags: Flag) -> Reconstruction:
         """The paper's network; areas are where its map exceeds half of its peak."""
-        self._forget_shape()
+        self.forget_shape()
         network = self._networks.paper(NETWORKS_OF[self.tier][0])
         with self._timed("images"):
             images = self._preliminary_images(data, network.modalities)
@@ -612,7 +613,7 @@ class Reconstructor:
         change, weight, spread = structure.change, structure.weight, structure.spread
         between = structure.between
         if self.tier is Tier.PLS_PAPER:
-            self._forget_shape()  # it starts cold, always
+            self.forget_shape()  # it starts cold, always
             return self._paper_shape(structure), "as requested"
         if isinstance(self._follower, ObjectFollower):
             return self._follower.follow(change, weight, budget_s)

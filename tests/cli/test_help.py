@@ -20,6 +20,9 @@ from typer.testing import CliRunner
 
 Run = Callable[..., Any]
 
+TABLES = {"curve", "recording"}
+"""Keys of the configuration that hold others, which have flags only where one is often wanted."""
+
 
 @pytest.mark.parametrize(
     "command",
@@ -103,7 +106,7 @@ def test_every_key_of_the_configuration_has_a_flag_with_its_default() -> None:
     flags = {option.opts[0].lstrip("-"): option for option in daemon.params}
     renamed = {"name": "sensor", "ports": "port", "device_ids": "device-id"}
     for key, field in DaemonConfig.model_fields.items():
-        if key == "curve":  # a table of two paths: for the file alone
+        if key in TABLES:
             continue
         flag = flags[renamed.get(key, key.replace("_", "-"))]
         # A flag that is not given must not win over the file, so defaults stand in the help.

@@ -238,6 +238,9 @@ class Memory:
         self.reset()
 
     def reset(self) -> None:
+        self.forget_shape()
+
+    def forget_shape(self) -> None:
         self._before = np.zeros((51, 51), np.float32)
 
     def reconstruct(

@@ -6,7 +6,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from tactomo.config import DaemonConfig, load_config
+from tactomo.config import DaemonConfig, RecordingConfig, load_config
 from tactomo.errors import ConfigError
 
 EXAMPLE = Path(__file__).parents[2] / "deploy" / "daemon.example.toml"
@@ -40,6 +40,12 @@ def config_file(folder: Path, text: str) -> Path:
         ("ports = ['a']\ncontrol = 'tcp://127.0.0.1'", "use tcp://127.0.0.1:PORT"),
         ("ports = ['a']\ncontrol = 'tcp://127.0.0.1:99999'", "use tcp://127.0.0.1:PORT"),
         ("ports = ['a']\ncontrol = 'udp://127.0.0.1:1'", "use tcp://127.0.0.1:PORT"),
+        ("ports = ['a']\nrecording = 'yes'", "recording = 'yes'"),
+        ("ports = ['a']\n[recording]\nrotate_mb = 0", "recording.rotate_mb = 0"),
+        ("ports = ['a']\n[recording]\nrotate_minutes = 2000", "less than or equal to 1440"),
+        ("ports = ['a']\n[recording]\nkeep_gb = 0.9", "no room for four files"),
+        ("ports = ['a']\n[recording]\nfile = 'a'\nat_start = true", "give one of them"),
+        ("ports = ['a']\n[recording]\nmap = true", "unknown key recording.map"),
     ],
 )
 def test_a_bad_file_is_refused_with_the_reason(tmp_path: Path, text: str, said: str) -> None:
@@ -65,6 +71,17 @@ def test_flags_win_and_are_blamed_themselves(tmp_path: Path) -> None:
         load_config(path, tare_scans=0)
 
 
+def test_flags_reach_into_tables(tmp_path: Path) -> None:
+    path = config_file(tmp_path, "ports = ['a']\n[recording]\nmaps = true\nsync_s = 1")
+    recording = load_config(path, record=tmp_path / "a.mcap").recording
+    assert (recording.file, recording.maps, recording.sync_s) == (tmp_path / "a.mcap", True, 1)
+    with pytest.raises(ConfigError, match=r"command line: recording.maps = 3"):
+        load_config(path, record_maps=3)
+    path.write_text("ports = ['a']\nrecording = 'yes'")
+    with pytest.raises(ConfigError, match=r"skin.toml: recording = 'yes'"):
+        load_config(path, record_maps=True)
+
+
 @pytest.mark.parametrize(
     "endpoint",
     ["tcp://127.0.0.1:0", "tcp://localhost:5560", "tcp://[::1]:5560", "ipc:///run/tactomo/left"],
@@ -79,5 +96,8 @@ def test_the_example_shows_every_key_and_loads() -> None:
     # Keys without a value in the example are there as comments.
     commented = [line.removeprefix("# ") for line in text.splitlines() if " = " in line]
     shown = {line.partition(" = ")[0] for line in commented}
-    assert set(DaemonConfig.model_fields) <= shown
+    tables = {"recording": RecordingConfig}
+    assert set(DaemonConfig.model_fields) - tables.keys() <= shown
+    assert all(f"[{name}]" in text for name in tables)
+    assert all(set(table.model_fields) <= shown for table in tables.values())
     assert tomllib.loads(text)

@@ -44,6 +44,12 @@ except TactomoError as error:
 """
 
 
+def toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {toml(each)}" for key, each in value.items()) + "}"
+    return json.dumps(value)
+
+
 class Process:
     """A daemon in a process of its own, on a skin of this one."""
 
@@ -57,9 +63,7 @@ class Process:
             **config,
         }
         path = folder / "daemon.toml"
-        path.write_text(
-            "".join(f"{key} = {json.dumps(value)}\n" for key, value in settings.items())
-        )
+        path.write_text("".join(f"{key} = {toml(value)}\n" for key, value in settings.items()))
         self.popen = subprocess.Popen(
             [sys.executable, "-c", PROGRAM, str(path)],
             stderr=subprocess.PIPE,
@@ -130,7 +134,7 @@ def test_nothing_is_left_after_a_start_that_failed(bench: Start, tmp_path: Path)
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_stops_it_within_a_second(spawn: Start, tmp_path: Path, number: int) -> None:
-    process, _ = spawn(record=str(tmp_path / "skin.mcap"))
+    process, _ = spawn(recording={"file": str(tmp_path / "skin.mcap")})
     begin_s = time.monotonic()
     process.popen.send_signal(number)
     assert process.popen.wait(30) == 0
@@ -142,7 +146,7 @@ def test_a_killed_daemons_recording_opens_up_to_its_last_flush(
     spawn: Start, replay: Start, tmp_path: Path
 ) -> None:
     path = tmp_path / "skin.mcap"
-    process, skin = spawn(record=str(path))
+    process, skin = spawn(recording={"file": str(path)})
     skin.introduce()
     for _ in range(10):
         skin.scan()

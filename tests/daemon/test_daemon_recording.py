@@ -11,8 +11,8 @@ import pytest
 from tactomo.config import load_config
 from tactomo.daemon import Daemon
 from tactomo.errors import ConfigError, PortError, RecordingError
-from tactomo.recorder import write_recording
 from tactomo.recording import open_recording
+from tactomo.recording_writer import write_recording
 from tactomo_client.messages import array_from_wire
 from tactomo_models import Reference
 from tactomo_models.calibration import Calibration, Row

@@ -170,7 +170,7 @@ def import_scans(
     from tactomo_protocol import Channel
 
     from tactomo.cli.imported import read_scans
-    from tactomo.recorder import write_recording
+    from tactomo.recording_writer import write_recording
 
     reference = frame_slice(reference_frames)
     description = load_description(sensor)

@@ -69,7 +69,7 @@ def tare(control: ControlAddress = DEFAULT_CONTROL, keys: KeysFolder = None) -> 
     epilog=examples(
         "tactomo record grasp.mcap --seconds 10",
         "tactomo record start grasp.mcap",
-        "tactomo record start        (the daemon chooses a name)",
+        "tactomo record start        (into the daemon's folder)",
         "tactomo record stop",
     ),
 )
@@ -92,7 +92,9 @@ def record(
     """Record what the ports say (every byte, with its time) into an MCAP file.
 
     The daemon writes the file, so it keeps recording when this command ends, and the path is one
-    on the daemon's computer. `tactomo replay` plays it again.
+    on the daemon's computer. Without a path it records into its folder, cut into files of which
+    the newest are kept, as its configuration says under [recording]. `tactomo replay` plays a file
+    again; each of several replays by itself.
     """
     from tactomo_client import request
 
@@ -214,13 +216,17 @@ def _status_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
             f"{status.get('incomplete_scans', 0)} incomplete",
         ),
         ("reference", f"{reference['scans']} dual scans" if reference else "none yet"),
-        (
-            "recording",
-            f"{recording['path']} ({recording['bytes'] / 1e6:.1f} MB)" if recording else "off",
-        ),
+        ("recording", _recording(recording, status.get("recorder") or {})),
         ("subscribers", str(status.get("subscribers", "-"))),
     ]
     return rows
+
+
+def _recording(recording: dict[str, Any] | None, recorder: dict[str, Any]) -> str:
+    if recording:
+        return f"{recording['path']} ({recording['bytes'] / 1e6:.1f} MB)"
+    waits_for = recorder.get("waits_for")
+    return f"[red]waits:[/] {waits_for}" if waits_for else "off"
 
 
 def _port_line(port: dict[str, Any]) -> str:

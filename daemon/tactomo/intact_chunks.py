@@ -1,0 +1,90 @@
+"""The intact chunks of an MCAP file that may be damaged anywhere.
+
+MCAP's own reader goes from record to record by their lengths, so it ends at the first damage.
+Here, chunks are found by what they look like, and each is checked by its own CRC-32. One that was
+compressed by zstd, as all of ours are, looks like this (lengths in bytes)::
+
+    06 | length 8 | start 8 | end 8 | full size 8 | crc 4 | 04 00 00 00 "zstd" | size 8 | data
+
+After it come its message indexes, one for each channel in it, which nothing here needs.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from typing import IO, Final, NamedTuple
+
+from mcap.records import Channel, Chunk, Message
+from mcap.stream_reader import breakup_chunk
+
+MAX_RECORD_BYTES: Final = 64 << 20
+_MARK: Final = b"\x04\0\0\0zstd"
+_BEFORE_MARK: Final = 37
+_HEADER: Final = struct.Struct("<BQQQQI8sQ")
+_WINDOW_BYTES: Final = 1 << 20
+
+
+class IntactChunk(NamedTuple):
+    """A chunk, with where it lies in the file."""
+
+    start: int
+    end: int
+    end_of_index: int
+    """Where its message indexes end and the next chunk begins, if nothing is damaged."""
+    messages: list[Message]
+    channels: list[Channel]
+
+
+def intact_chunks(file: IO[bytes], start: int = 0) -> Iterator[IntactChunk]:
+    """Yield every chunk from `start` on that its CRC confirms.
+
+    Raises:
+        OSError: the disk cannot read it.
+
+    """
+    while (mark := _find_mark(file, start)) is not None:
+        found = _read_chunk(file, mark - _BEFORE_MARK)
+        if found is not None:
+            yield found
+        start = mark + 1 - _BEFORE_MARK if found is None else found.end
+
+
+def _find_mark(file: IO[bytes], start: int) -> int | None:
+    """Return where the next mark is, with room for what comes before it."""
+    position = start + _BEFORE_MARK
+    file.seek(position)
+    window = b""
+    while more := file.read(_WINDOW_BYTES):
+        window = window[-len(_MARK) + 1 :] + more
+        position += len(more)
+        at = window.find(_MARK)
+        if at >= 0:
+            return position - len(window) + at
+    return None
+
+
+def _read_chunk(file: IO[bytes], start: int) -> IntactChunk | None:
+    """Return the chunk that begins at `start`; None where there is none, or a damaged one."""
+    file.seek(start)
+    header = file.read(_HEADER.size)
+    if len(header) < _HEADER.size:
+        return None
+    _, _, start_ns, end_ns, uncompressed, crc, _, size = _HEADER.unpack(header)
+    if not crc or max(size, uncompressed) > MAX_RECORD_BYTES:
+        return None
+    data = file.read(size)
+    chunk = Chunk("zstd", data, end_ns, start_ns, crc, uncompressed)
+    try:
+        records = breakup_chunk(chunk, validate_crc=True)
+    except Exception:  # damage can fail in any layer: zstd, memory, CRC, struct, utf-8
+        return None
+    end = start + len(header) + len(data)
+    messages = [record for record in records if isinstance(record, Message)]
+    channels = [record for record in records if isinstance(record, Channel)]
+    return IntactChunk(start, end, end + _index_bytes(messages), messages, channels)
+
+
+def _index_bytes(messages: list[Message]) -> int:
+    """Return the length of a chunk's message indexes."""
+    return 15 * len({message.channel_id for message in messages}) + 16 * len(messages)
