@@ -38,6 +38,7 @@ from tactomo.sync import DualScan
 from tactomo.tare import Tare
 from tactomo.timing import Durations, Rate
 
+REPEAT_REFERENCE_S: Final = 60.0
 NO_DATA_S: Final = 3.0
 """How long a tare on command waits for usable dual scans before it gives up."""
 
@@ -96,6 +97,7 @@ class Imaging:
         self._tare: Tare | None = None
         self._tare_deadline_s = 0.0
         self._marked: ActiveRecording | None = None  # the recording that gets marks
+        self._repeat_reference_s = 0.0
         self._failure_limit = RateLimit()
         budget_s = reconstructor.budget_s
         self._ask(reconstructor.tier, None if budget_s is None else budget_s * 1e3)
@@ -142,7 +144,9 @@ class Imaging:
         """Measure changes against `reference` from the next dual scan on."""
         self._reconstructor.set_reference(reference)
         self.reference, self.reference_realtime_ns = reference, realtime_ns
-        self._record_reference()
+        if self._marked is not None:
+            self._marked.references += 1
+            self._record_reference()
 
     def start_tare(self, answer: Future[Mapping[str, Any]] | None = None) -> None:
         """Take a reference from the dual scans to come; `answer` gets its `scans`, or why not."""
@@ -200,6 +204,8 @@ class Imaging:
         """
         active = self._recorder.active
         if active is self._marked:
+            if time.monotonic() >= self._repeat_reference_s:
+                self._record_reference()
             return
         if active is None:
             self._marked = None
@@ -207,11 +213,14 @@ class Imaging:
             self._marked = active
             active.previous = None
             self._reconstructor.forget_shape()
-            self._record_reference()
+            if self.reference is not None:
+                active.references += 1
+                self._record_reference()
 
     def _record_reference(self) -> None:
+        """Put the reference into the recording, and again every minute: some of it may be lost."""
+        self._repeat_reference_s = time.monotonic() + REPEAT_REFERENCE_S
         if self.reference is not None and self._marked is not None:
-            self._marked.references += 1
             number = self._marked.references
             times = (time.monotonic_ns(), self.reference_realtime_ns)
             self._marked.add(reference_entry(self.reference, number, *times))

@@ -7,7 +7,8 @@ topic          encoding    message
 =============  ==========  =======================================================================
 port/N         raw         bytes of port N exactly as read; the first ones start at a delimiter
 port/N/hello   raw         one whole frame: the hello in force when the recording began
-reference      msgpack     the reference that holds from here on: volts and noise of each channel
+reference      msgpack     the reference that holds from here on: its number in this recording,
+                           volts and noise of each channel; repeated every minute
 frame          msgpack     a dual scan that the daemon reconstructed: channel, counter and device
                            time of each of its scans, the tier and the budget (ms of modelled
                            work, not of time) that it was reconstructed with, the number of the
@@ -31,15 +32,18 @@ lies beyond damage in the middle is for `recovery`.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import IO, Final, NamedTuple
+from typing import IO, Any, Final, NamedTuple
 from urllib.parse import quote
 
 import msgpack  # type: ignore[import-untyped]
 from mcap.exceptions import InvalidMagic
+from mcap.reader import make_reader
 from mcap.records import Channel as McapChannel
 from mcap.records import Chunk as McapChunk
 from mcap.records import Footer, Header, McapRecord, Message, Metadata
@@ -142,6 +146,23 @@ class Summary:
         """Seconds from the first bytes read to the last ones."""
         return (self.end_ns - self.start_ns) * 1e-9
 
+    @property
+    def ending(self) -> str:
+        """How the file ends, in words; empty where it is whole."""
+        if self.is_complete:
+            return ""
+        if self.has_more:
+            return "damaged, with intact data beyond; `tactomo recover` gets them"
+        return "cut off; `tactomo recover` makes it whole for other tools"
+
+
+class Span(NamedTuple):
+    """When a recording began and ended, on the steady clock; 0 where nothing is in it."""
+
+    start_ns: int
+    end_ns: int
+    is_complete: bool
+
 
 class Recording:
     """A recording opened for reading; every call reads the file anew, from its start."""
@@ -154,6 +175,11 @@ class Recording:
     def summary(self) -> Summary:
         """What is in it, counted by reading all of it once."""
         return _summarise(self.path, self.origin)
+
+    @cached_property
+    def span(self) -> Span:
+        """When it began and ended, without reading what is in it."""
+        return _read_span(self.path)
 
     @cached_property
     def start_ns(self) -> int:
@@ -172,11 +198,14 @@ class Recording:
         """Return the dual scans that were reconstructed, each with the reference before it."""
         marks: list[Mark] = []
         reference: Reference | None = None
+        number: int | None = None
         for topic, message in _messages(self.path):
             if topic == "reference":
-                reference = _read_reference(message.data)
+                before, number = number, read_reference_number(message.data)
+                if number is None or number != before:  # else it is repeated
+                    reference = _read_reference(message.data)
             elif topic == "frame":
-                marks.append(replace(_read_mark(message.data), reference=reference))
+                marks.append(replace(read_mark(message.data), reference=reference))
                 reference = None
         return marks
 
@@ -212,7 +241,8 @@ def open_recording(path: str | Path) -> Recording:
 def _summarise(path: Path, origin: Origin) -> Summary:
     """Read a whole recording; its decoders are the daemon's own."""
     summary = Summary(origin, path.stat().st_size)
-    decoders = [Decoder() for _ in origin.ports]
+    decoders: defaultdict[int, Decoder] = defaultdict(Decoder)
+    references: set[int | None] = set()
     stops: list[int] = []
     for topic, record in _records(path, stops.append):
         if isinstance(record, Footer):
@@ -222,13 +252,15 @@ def _summarise(path: Path, origin: Origin) -> Summary:
         elif isinstance(record, Message):
             kind, _, rest = topic.partition("/")
             summary.frames += kind == "frame"
-            summary.references += kind == "reference"
+            if kind == "reference":
+                references.add(read_reference_number(record.data))
             if kind == "port":
                 number, _, extra = rest.partition("/")
                 if not extra:
                     _count_bytes(summary, int(number), record)
                 _count_packets(summary, decoders[int(number)], record.data)
-    summary.corrupt = sum(decoder.counts.corrupt for decoder in decoders)
+    summary.corrupt = sum(decoder.counts.corrupt for decoder in decoders.values())
+    summary.references = len(references)
     summary.has_more = bool(stops) and _has_chunks(path, stops[0])
     return summary
 
@@ -253,6 +285,22 @@ def _count_packets(summary: Summary, decoder: Decoder, data: bytes) -> None:
             summary.hellos.append(packet)
 
 
+def _read_span(path: Path) -> Span:
+    with open_file(path) as file:
+        with suppress(Exception):  # cut or damaged: then its chunks tell
+            summary = make_reader(file).get_summary()
+            if summary is not None and summary.statistics is not None:
+                known = summary.statistics
+                return Span(known.message_start_time, known.message_end_time, True)
+        file.seek(0)
+        times: list[tuple[int, int]] = []
+        with suppress(Exception):  # up to the damage
+            for record in StreamReader(file, emit_chunks=True).records:
+                if isinstance(record, McapChunk):
+                    times.append((record.message_start_time, record.message_end_time))
+        return Span(times[0][0] if times else 0, times[-1][1] if times else 0, False)
+
+
 def _read_origin(path: Path) -> Origin:
     header = metadata = None
     for _, record in _records(path):
@@ -263,6 +311,11 @@ def _read_origin(path: Path) -> Origin:
             break
     if header is None or header.profile != PROFILE or metadata is None:
         raise _not_a_recording(path, "was not made by tactomo")
+    return to_origin(metadata)
+
+
+def to_origin(metadata: Mapping[str, str]) -> Origin:
+    """Return what a recording's metadata record says that it is of."""
     ports = tuple(metadata.get("ports", "").split("\n"))
     return Origin(
         sensor=metadata.get("sensor", ""),
@@ -287,7 +340,7 @@ def _records(
     `on_damage` is told where the last thing that could be read ends.
     """
     topics: dict[int, str] = {}
-    with _open(path) as file:
+    with open_file(path) as file:
         reader = StreamReader(
             file, emit_chunks=True, validate_crcs=True, record_size_limit=MAX_RECORD_BYTES
         )
@@ -318,7 +371,8 @@ def _records(
                 yield topics.get(getattr(each, "channel_id", 0), ""), each
 
 
-def _open(path: Path) -> IO[bytes]:
+def open_file(path: Path) -> IO[bytes]:
+    """Open a recording's file as it is; raise RecordingError where that cannot be done."""
     try:
         return path.open("rb")
     except OSError as error:
@@ -335,7 +389,7 @@ def _not_a_recording(path: Path, reason: str) -> RecordingError:
 
 
 def _read_reference(data: bytes) -> Reference:
-    fields = msgpack.unpackb(data)
+    fields = _fields(data, "scans", *REFERENCE_ARRAYS)
     arrays = {
         name: None if fields[name] is None else array_from_wire(fields[name])
         for name in REFERENCE_ARRAYS
@@ -343,13 +397,40 @@ def _read_reference(data: bytes) -> Reference:
     return Reference(scans=fields["scans"], **arrays)
 
 
-def _read_mark(data: bytes) -> Mark:
-    fields = msgpack.unpackb(data)
-    scans = tuple(ScanKey(Channel(c), counter, device) for c, counter, device in fields["scans"])
+def read_reference_number(data: bytes) -> int | None:
+    """Return which of its recording's references a message holds; None in old recordings."""
+    number: int | None = _fields(data).get("number")
+    return number
+
+
+def read_mark(data: bytes) -> Mark:
+    """Read a message of the topic ``frame``; raise RecordingError where it is none."""
+    fields = _fields(data, "scans", "tier", "budget_ms")
+    try:
+        keys = [ScanKey(Channel(c), counter, device) for c, counter, device in fields["scans"]]
+    except (TypeError, ValueError) as error:
+        raise _malformed() from error
     return Mark(
-        scans=scans,
+        scans=tuple(keys),
         tier=fields["tier"],
         budget_ms=fields["budget_ms"],
         reference_number=fields.get("reference"),
         is_cold=fields.get("cold", False),
+    )
+
+
+def _fields(data: bytes, *needed: str) -> dict[str, Any]:
+    try:
+        fields = msgpack.unpackb(data)
+    except Exception as error:  # msgpack raises of many kinds
+        raise _malformed() from error
+    if not isinstance(fields, dict) or not fields.keys() >= set(needed):
+        raise _malformed()
+    return fields
+
+
+def _malformed() -> RecordingError:
+    return RecordingError(
+        "the recording holds what tactomo does not write",
+        "it was made by another version or another program: record anew",
     )

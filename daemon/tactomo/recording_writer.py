@@ -50,7 +50,7 @@ def hello_entry(port: int, hello: Hello, monotonic_ns: int, realtime_ns: int) ->
 def reference_entry(
     reference: Reference, number: int, monotonic_ns: int, realtime_ns: int
 ) -> Entry:
-    """The reference that holds from here on, the `number`-th of its recording."""
+    """The reference that holds, the `number`-th of its recording; repeated, it changes nothing."""
     fields: dict[str, Any] = {"number": number, "scans": reference.scans}
     for name in REFERENCE_ARRAYS:
         array = getattr(reference, name)
@@ -60,18 +60,20 @@ def reference_entry(
 
 def mark_entry(mark: Mark, monotonic_ns: int, realtime_ns: int) -> Entry:
     """A dual scan that was reconstructed; a new reference is an entry of its own, before it."""
-    return Entry("frame", msgpack.packb(mark_fields(mark)), monotonic_ns, realtime_ns)
+    return Entry("frame", pack_mark(mark), monotonic_ns, realtime_ns)
 
 
-def mark_fields(mark: Mark) -> dict[str, Any]:
-    """Return what a mark says, as it is written."""
-    return {
+def pack_mark(mark: Mark) -> bytes:
+    """Return a mark as it is written."""
+    fields = {
         "scans": mark.scans,
         "tier": mark.tier,
         "budget_ms": mark.budget_ms,
         "reference": mark.reference_number,
         "cold": mark.is_cold,
     }
+    packed: bytes = msgpack.packb(fields)
+    return packed
 
 
 def message_entry(kind: str, data: bytes, monotonic_ns: int, realtime_ns: int) -> Entry:

@@ -25,7 +25,7 @@ SERVICE = "On a robot"
 ORDER = (
     *("demo", "daemon", "twin", "viewer"),
     *("status", "doctor", "watch", "tare", "record", "tier", "poke", "keys"),
-    *("info", "import", "replay", "reconstruct", "plot"),
+    *("info", "import", "replay", "recover", "reconstruct", "plot"),
     "service",
     *("models", "bench", "bench-solves", "evaluate"),
 )

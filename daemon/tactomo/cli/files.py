@@ -29,19 +29,27 @@ DescriptionOption = Annotated[
 
 @app.command(
     rich_help_panel=FILES,
-    epilog=examples("tactomo info grasp.mcap", "tactomo info paper_square", "tactomo info my.toml"),
+    epilog=examples(
+        "tactomo info grasp.mcap",
+        "tactomo info ~/.local/share/tactomo/recordings",
+        "tactomo info paper_square",
+        "tactomo info my.toml",
+    ),
 )
 def info(
     what: Annotated[
         str,
         typer.Argument(
-            help="A recording (.mcap), a built artifact (.npz), or a sensor description: a shipped "
-            "name or a TOML file."
+            help="A recording (.mcap), a folder of them, a built artifact (.npz), or a sensor "
+            "description: a shipped name or a TOML file."
         ),
     ],
     as_json: JsonOutput = False,
 ) -> None:
-    """Describe a recording, a built artifact or a sensor description."""
+    """Describe a recording, a folder of recordings, a built artifact or a sensor description."""
+    if Path(what).is_dir():
+        _show_folder(Path(what), as_json)
+        return
     facts = _facts(what)
     if as_json:
         typer.echo(json.dumps(facts, indent=2))
@@ -53,6 +61,47 @@ def info(
     for name, value in facts.items():
         table.add_row(f"[bold]{name}[/]", _words(value))
     Console().print(table)
+
+
+def _show_folder(folder: Path, as_json: bool) -> None:
+    """List the recordings in a folder by their names, which is by their age."""
+    rows = [_recording_line(path) for path in sorted(folder.glob("*.mcap"))]
+    if as_json:
+        typer.echo(json.dumps(rows, indent=2))
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=str(folder))
+    for name in ("recording", "sensor", "began", "seconds", "MB", "ends"):
+        table.add_column(name, justify="right" if name in ("seconds", "MB") else "left")
+    for row in rows:
+        table.add_row(*(str(value) for value in row.values()))
+    Console().print(table)
+
+
+def _recording_line(path: Path) -> dict[str, Any]:
+    from tactomo.errors import RecordingError
+    from tactomo.recording import open_recording
+
+    line = {"recording": path.name, "sensor": "", "began": "", "seconds": 0.0}
+    line["MB"] = round(path.lstat().st_size / 1e6, 2)
+    try:
+        recording = open_recording(path)
+    except RecordingError:
+        return {**line, "ends": "no recording, or nothing of it can be read"}
+    span = recording.span
+    return {
+        **line,
+        "sensor": recording.origin.sensor,
+        "began": _date(span.start_ns),
+        "seconds": round((span.end_ns - span.start_ns) * 1e-9, 1),
+        "ends": "whole" if span.is_complete else "cut or damaged, or being written",
+    }
+
+
+def _date(time_ns: int) -> str:
+    return datetime.fromtimestamp(time_ns * 1e-9).isoformat(" ", "seconds")
 
 
 def _facts(what: str) -> dict[str, Any]:
@@ -70,10 +119,10 @@ def _facts(what: str) -> dict[str, Any]:
 
 def _recording_facts(recording: Recording) -> dict[str, Any]:
     summary = recording.summary
-    return {
+    facts: dict[str, Any] = {
         "sensor": summary.origin.sensor,
         "description": summary.origin.description,
-        "began": datetime.fromtimestamp(summary.start_ns * 1e-9).isoformat(" ", "seconds"),
+        "began": _date(summary.start_ns),
         "seconds": round(summary.duration_s, 3),
         "bytes": summary.file_bytes,
         "complete": summary.is_complete,
@@ -88,6 +137,11 @@ def _recording_facts(recording: Recording) -> dict[str, Any]:
         "references": summary.references,
         "recorded by": f"tactomo {summary.origin.version}",
     }
+    if summary.ending:
+        facts["ends"] = summary.ending
+    if summary.recovered_gaps is not None:
+        facts["recovered with gaps"] = summary.recovered_gaps
+    return facts
 
 
 def _array_facts(path: Path) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tactomo.cli.app import FILES, RecordingFile, app, examples
+from tactomo.cli.programs import warn_of_damage
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ def plot(
     from tactomo.recording import open_recording
 
     opened = open_recording(recording)
+    warn_of_damage(opened)
     sensor = description or opened.summary.origin.description
     points = _read_contacts(recording) if opened.summary.is_complete else []
     if not points:

@@ -30,6 +30,7 @@ from tactomo.cli.app import (
 
 if TYPE_CHECKING:
     from tactomo.config import DaemonConfig
+    from tactomo.recording import Recording
 
 LogLevel = Literal["debug", "info", "warning", "error"]
 LogFormat = Literal["auto", "text", "json"]
@@ -305,13 +306,19 @@ def replay(
         lossless=True if factor == 0 else None,
         exit_at_end=not stay,
     )
-    if not opened.summary.is_complete:
+    warn_of_damage(opened)
+    raise typer.Exit(_run_daemon(settings))
+
+
+def warn_of_damage(recording: Recording) -> None:
+    """Tell on standard error that a recording is not all there."""
+    summary = recording.summary
+    if summary.ending:
         typer.echo(
-            f"{recording} was cut off: playing the {opened.summary.duration_s:.1f} s that are "
-            "there",
+            f"{recording.path} is {summary.ending}. There are {summary.duration_s:.1f} s up to "
+            "where it ends",
             err=True,
         )
-    raise typer.Exit(_run_daemon(settings))
 
 
 def _run_daemon(settings: DaemonConfig) -> int:
