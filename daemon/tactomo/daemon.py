@@ -109,7 +109,7 @@ class Daemon:
         channels = tuple(c for c in Channel if c.name.lower() in description.modalities)
         self._recorder = Recorder(_origin(config, description), config.recording, self._on_event)
         self._publisher = Publisher(
-            config.name, self.session, self._status_fields, self._record_message
+            config.name, self.session, self._status_fields, self._record_message, self._on_event
         )
         self._imaging = Imaging(
             description,

@@ -20,15 +20,15 @@ import zmq
 from tactomo_client.messages import CONTACTS, EVENT, STATUS, clock_id, encode_message, topic
 
 from tactomo.doorkeeper import STREAM
-from tactomo.endpoint import bind, rebind
+from tactomo.events import OnEvent
 from tactomo.frames import NO_FRAME_YET
+from tactomo.subscriptions import SUBSCRIBERS_CUT, Subscribers
 from tactomo.timing import Durations
 
 STATUS_PERIOD_S: Final = 1.0
 LINGER_MS: Final = 200
 """How long messages that were sent may take to leave when the daemon stops."""
 QUEUED_PER_SUBSCRIBER: Final = 64
-MAX_SUBSCRIPTION_BYTES: Final = 1024
 MAX_QUEUED: Final = 1024
 
 
@@ -49,6 +49,7 @@ class Publisher:
         session: identity of this run of the daemon.
         status: returns the current fields of a `status` message; called by the thread.
         on_sent: called by the thread with kind and bytes of each frame's message just sent.
+        on_event: told of a flood of subscriptions.
 
     Attributes:
         address: where it is bound, once open.
@@ -65,6 +66,7 @@ class Publisher:
         session: str,
         status: Callable[[], Mapping[str, Any]],
         on_sent: Callable[[str, bytes], None],
+        on_event: OnEvent,
     ) -> None:
         self.address = ""
         self.subscribers = 0
@@ -75,9 +77,11 @@ class Publisher:
         self._session = session
         self._status = status
         self._on_sent = on_sent
+        self._on_event = on_event
         self._sequence: Counter[str] = Counter()  # the last one of each kind, under _lock
         self._lock = threading.Lock()
-        self._subscriptions: Counter[bytes] = Counter()  # this thread's own
+        self._readers: Subscribers  # this thread's own, as are _socket and _cuts_*
+        self._cuts_seen = self._cuts_told = 0
         self._prefixes: frozenset[bytes] = frozenset()  # a copy for the other threads
         self._last_status = b""
         self._queue: deque[_Outgoing] = deque(maxlen=MAX_QUEUED)
@@ -94,8 +98,10 @@ class Publisher:
         secret: bytes | None = None,
     ) -> None:
         """Bind the stream's socket; raise AddressError where the address cannot be had."""
-        self._socket = _make_socket(context)
-        self.address = bind(self._socket, endpoint, STREAM, secret=secret)
+        self._socket = context.socket(zmq.XPUB)
+        self._socket.setsockopt(zmq.SNDHWM, QUEUED_PER_SUBSCRIBER)
+        self._readers = Subscribers(self._socket, endpoint, STREAM, secret)
+        self.address = self._readers.address
         self._wake_reader, self._wake_writer = os.pipe()
         os.set_blocking(self._wake_reader, False)
         os.set_blocking(self._wake_writer, False)
@@ -179,10 +185,11 @@ class Publisher:
             self._send_queued()
             if self._cut.is_set():
                 self._cut.clear()
-                rebind(self._socket, self.address)
+                self._readers.cut()
             if time.monotonic() >= status_at_s:
                 status_at_s += STATUS_PERIOD_S
                 self._send_status()
+                self._tell_cuts()
                 self.turns += 1
         self._send_queued()
 
@@ -203,20 +210,20 @@ class Publisher:
     def _send_status(self) -> None:
         self._last_status = self._send(self._number(STATUS, self.header, self._status()))
 
+    def _tell_cuts(self) -> None:
+        """Tell that subscribers were cut off, a second later: then they are back to hear it."""
+        if self._cuts_seen > self._cuts_told:
+            self._cuts_told = self._cuts_seen
+            self._on_event("subscribers_cut", "warning", *SUBSCRIBERS_CUT)
+        self._cuts_seen = self._readers.cuts
+
     def _read_subscriptions(self) -> None:
         """Take note of who comes and goes; a newcomer to the status gets the last one at once."""
-        repeat = False
-        while self._socket.poll(0):
-            message = self._socket.recv()
-            joins, prefix = message[:1] == b"\1", message[1:]
-            if joins:
-                self._subscriptions[prefix] += 1
-                repeat = repeat or topic(self._sensor, STATUS).startswith(prefix)
-            elif message[:1] == b"\0":
-                self._subscriptions[prefix] -= 1
-        self._subscriptions = +self._subscriptions
-        self._prefixes = frozenset(self._subscriptions)
-        self.subscribers = self._subscriptions.total()
+        status, repeat = topic(self._sensor, STATUS), False
+        for joins, prefix in self._readers.changes():
+            repeat = repeat or (joins and status.startswith(prefix))
+        self._prefixes = frozenset(self._readers.prefixes)
+        self.subscribers = self._readers.prefixes.total()
         if repeat and self._last_status:
             self._socket.send(self._last_status, zmq.DONTWAIT)
 
@@ -225,12 +232,3 @@ class Publisher:
             return
         with contextlib.suppress(BlockingIOError):  # full of reasons to wake up already
             os.write(self._wake_writer, b"\0")
-
-
-def _make_socket(context: zmq.Context[zmq.Socket[bytes]]) -> zmq.Socket[bytes]:
-    socket = context.socket(zmq.XPUB)
-    # Every single subscription and its end is reported, not only the first and the last of many.
-    socket.setsockopt(zmq.XPUB_VERBOSER, 1)
-    socket.setsockopt(zmq.SNDHWM, QUEUED_PER_SUBSCRIBER)
-    socket.setsockopt(zmq.MAXMSGSIZE, MAX_SUBSCRIPTION_BYTES)
-    return socket

@@ -13,6 +13,7 @@ DEFAULT_DESCRIPTION = "paper_square"
 DEFAULT_STREAM = "tcp://127.0.0.1:5560"
 DEFAULT_CONTROL = "tcp://127.0.0.1:5561"
 DEFAULT_TWIN_CONTROL = "tcp://127.0.0.1:5562"
+DEFAULT_PROXY_STREAM = "tcp://127.0.0.1:5570"
 DEFAULT_VIEWER_PORT = 8750
 KEYS_VARIABLE = "TACTOMO_KEYS"
 
@@ -23,7 +24,7 @@ BUILD = "Models and measures"
 SERVICE = "On a robot"
 
 ORDER = (
-    *("demo", "daemon", "twin", "viewer"),
+    *("demo", "daemon", "proxy", "twin", "viewer"),
     *("status", "doctor", "watch", "tare", "record", "tier", "poke", "keys"),
     *("info", "import", "replay", "recover", "reconstruct", "plot"),
     "service",

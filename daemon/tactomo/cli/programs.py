@@ -1,4 +1,4 @@
-"""`tactomo daemon`, `twin`, `viewer` and `replay`: the programs that keep running."""
+"""`tactomo daemon`, `proxy`, `twin`, `viewer` and `replay`: the programs that keep running."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from tactomo.cli.app import (
     DEFAULT_CONTROL,
     DEFAULT_DESCRIPTION,
     DEFAULT_NAME,
+    DEFAULT_PROXY_STREAM,
     DEFAULT_STREAM,
     DEFAULT_TWIN_CONTROL,
     DEFAULT_VIEWER_PORT,
@@ -248,6 +249,53 @@ def viewer(
 
 
 @app.command(
+    rich_help_panel=RUN,
+    epilog=examples(
+        "tactomo proxy --from ipc:///run/tactomo/left.stream --from ipc:///run/tactomo/right.stream",
+        "tactomo proxy --from ... --bind tcp://0.0.0.0:5570 --secret robot.key_secret",
+    ),
+)
+def proxy(
+    sources: Annotated[
+        list[str], typer.Option("--from", help="A daemon's stream; once for each daemon.")
+    ],
+    bind: Annotated[
+        str, typer.Option(help="Where all of them are to be had.")
+    ] = DEFAULT_PROXY_STREAM,
+    secret: Annotated[
+        Path | None,
+        typer.Option(help="Secret key of this server, for an address beyond this computer."),
+    ] = None,
+    clients: Annotated[
+        Path | None,
+        typer.Option(help="Folder of those who may connect. [NAME.clients beside the secret key]"),
+    ] = None,
+    keys: KeysFolder = None,
+    log_level: Annotated[LogLevel, typer.Option(help="The least severe that is logged.")] = "info",
+    log_format: Annotated[
+        LogFormat, typer.Option(help="text, json, or auto: text on a terminal.")
+    ] = "auto",
+) -> None:
+    """Pass on the streams of several daemons at one address, until stopped.
+
+    Each skin has a daemon of its own; this gives them one address, and one door to the outside. The
+    daemons' control sockets stay where they are.
+    """
+    from tactomo_client.keys import as_keys
+
+    from tactomo.doorkeeper import load_server_keys
+    from tactomo.keys import CLIENTS_SUFFIX
+    from tactomo.log import configure_logging
+    from tactomo.proxy import Proxy, serve
+
+    configure_logging(log_level, log_format)
+    served = None
+    if secret is not None:
+        served = load_server_keys(secret, clients or secret.with_suffix(CLIENTS_SUFFIX))
+    serve(Proxy(sources, _endpoint(bind), served, as_keys(keys)))
+
+
+@app.command(
     rich_help_panel=FILES,
     epilog=examples(
         "tactomo replay grasp.mcap --viewer",
@@ -328,6 +376,15 @@ def _run_daemon(settings: DaemonConfig) -> int:
 
     configure_logging(settings.log_level, settings.log_format)
     return Daemon(settings).run()
+
+
+def _endpoint(text: str) -> str:
+    from tactomo.endpoint import check_endpoint
+
+    try:
+        return check_endpoint(text)
+    except ValueError as error:
+        raise typer.BadParameter(f"--bind {text}: {error}") from error
 
 
 def _speed(text: str) -> float:
