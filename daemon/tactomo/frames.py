@@ -108,7 +108,7 @@ def port_fields(port: PortReader) -> dict[str, Any]:
         "connected": port.is_open,
         "state": port.state,
         "problem": port.problem or None,
-        "device": port.hello and _device(port.hello),
+        "device": port.hello and device_fields(port.hello),
         "refusal": port.refusal or None,
         "bytes": port.bytes_read,
         "packets": port.counts.packets,
@@ -119,14 +119,8 @@ def port_fields(port: PortReader) -> dict[str, Any]:
     }
 
 
-def magnitude_max(description: SensorDescription) -> float | None:
-    """Return the top of a sensible colour scale for the map, a ratio."""
-    if description.magnitude is None:
-        return None
-    return max(abs(change) for change in description.magnitude.response.relative_change)
-
-
-def _device(hello: Hello) -> dict[str, Any]:
+def device_fields(hello: Hello) -> dict[str, Any]:
+    """Return what `status` says about a device."""
     return {
         "device_id": hello.device_id,
         "firmware": hello.firmware,
@@ -135,6 +129,13 @@ def _device(hello: Hello) -> dict[str, Any]:
         "samples_per_scan": hello.samples_per_scan,
         "scan_rate_hz": hello.scan_rate_hz,
     }
+
+
+def magnitude_max(description: SensorDescription) -> float | None:
+    """Return the top of a sensible colour scale for the map, a ratio."""
+    if description.magnitude is None:
+        return None
+    return max(abs(change) for change in description.magnitude.response.relative_change)
 
 
 def _contact(contact: Contact) -> dict[str, Any]:

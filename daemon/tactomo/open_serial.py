@@ -70,9 +70,9 @@ def is_path(url: str) -> bool:
     return "://" not in url
 
 
-def other_holders(url: str) -> list[Holder]:
+def other_holders(url: str, root: Path = ROOT) -> list[Holder]:
     """Return the other processes that use the port, as far as this user may see."""
-    found = holders(url) if is_path(url) else []
+    found = holders(url, root) if is_path(url) else []
     return [who for who in found if who.pid != os.getpid() and not who.is_far_end]
 
 
@@ -88,6 +88,15 @@ def lower_latency(port: serial.Serial, root: Path = ROOT) -> int | None:
             port.set_low_latency_mode(True)
         timer_ms = latency_timer_ms(path, root)
     return timer_ms
+
+
+def how_to_grant(path: str) -> str:
+    """Say how a user gets to open a device."""
+    with contextlib.suppress(OSError, KeyError):
+        about = os.stat(path)
+        if about.st_mode & stat.S_IWGRP and about.st_gid != 0:
+            return f"`sudo usermod -aG {Path(path).group()} $USER`"
+    return "let root make it accessible (its group may not write to it)"
 
 
 def _claim(port: serial.Serial, path: str, baud: int) -> None:
@@ -119,7 +128,7 @@ def _explain(url: str, baud: int, error: Exception) -> PortError:
         )
     if number in (errno.EACCES, errno.EPERM):
         return PortError(
-            f"{url} may not be opened by this user", f"{_grant(url)}, then log in again"
+            f"{url} may not be opened by this user", f"{how_to_grant(url)}, then log in again"
         )
     if not is_path(url) or number is not None or _is_device(url):
         return PortError(f"cannot open {url} at {baud} baud: {error}", "check port and baud rate")
@@ -134,15 +143,6 @@ def _busy(url: str, by: list[Holder]) -> PortBusyError:
         if by
         else f"`sudo fuser -v {url}` shows it; stop it, or give another port",
     )
-
-
-def _grant(path: str) -> str:
-    """Say how a user gets to open a device."""
-    with contextlib.suppress(OSError, KeyError):
-        about = os.stat(path)
-        if about.st_mode & stat.S_IWGRP and about.st_gid != 0:
-            return f"`sudo usermod -aG {Path(path).group()} $USER`"
-    return "let root make it accessible (its group may not write to it)"
 
 
 def _is_device(path: str) -> bool:

@@ -28,6 +28,8 @@ def config_file(folder: Path, text: str) -> Path:
         ("ports = ['a', 'b', 'c']", "at most 2"),
         ("ports = ['a', 'a']", "the two ports are the same"),
         ("ports = 'a'", "ports = 'a'"),
+        ("ports = ['a']\ndevice_ids = ['']", "device_ids"),
+        ("ports = ['a']\nwait_for_ports = 'yes please'", "wait_for_ports"),
         ("ports = ['a']\nbaud = 'fast'", "baud = 'fast'"),
         ("ports = ['a']\ntare_scans = 1", "greater than or equal to 2"),
         ("ports = ['a']\nsync_wait_ms = nan", "sync_wait_ms = nan"),

@@ -132,6 +132,40 @@ def test_the_wrong_device_is_refused_and_not_reconstructed(
     assert (port["refusal"], port["unused_scans"]) == (None, 2)
 
 
+def test_a_device_of_another_skin_is_refused_by_its_name(bench: Start) -> None:
+    b = bench(ports=2, device_ids=["ours-a", "ours-b"])
+    first, second = b.skin.lines
+    first.hello, ours = replace(first.hello, device_id="theirs"), replace(first.hello)
+    second.hello = replace(second.hello, device_id="ours-a")  # whichever port it is at
+    b.skin.introduce()
+    refused = b.listener.event("device_refused")
+    assert "theirs is not one of this sensor's devices, ours-a, ours-b" in refused["detail"]
+    assert "by-path" in refused["next_step"]
+    b.skin.scan()
+    status = b.listener.wait("status", lambda s: s["ports"][0]["unused_scans"])
+    assert [port["state"] for port in status["ports"]] == ["refused", "running"]
+    first.say(replace(ours, device_id="ours-b"))
+    for _ in range(3):
+        b.step()
+    b.listener.event("tared")
+    assert b.ask("status")["ports"][0]["refusal"] is None
+
+
+def test_a_device_that_takes_the_place_of_another_is_told(bench: Start) -> None:
+    b = bench()
+    b.tare()
+    line = b.skin.lines[0]
+    line.unplug()
+    b.listener.event("port_lost")
+    line.hello = replace(line.hello, device_id="bench-2")
+    line.plug()
+    line.introduce()
+    event = b.listener.event("device_changed")
+    assert "bench-2 is where bench-1 was" in event["detail"]
+    assert "tare" in event["next_step"]
+    assert b.step()["flags"] == []
+
+
 def test_a_command_that_the_device_refuses_is_told(bench: Start) -> None:
     b = bench()
     b.tare()

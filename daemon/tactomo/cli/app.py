@@ -24,7 +24,7 @@ BUILD = "Models and measures"
 SERVICE = "On a robot"
 
 ORDER = (
-    *("demo", "daemon", "proxy", "twin", "viewer"),
+    *("demo", "daemon", "ports", "proxy", "twin", "viewer"),
     *("status", "doctor", "watch", "tare", "record", "tier", "poke", "keys"),
     *("info", "import", "replay", "recover", "reconstruct", "plot"),
     "service",

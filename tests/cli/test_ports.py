@@ -1,0 +1,130 @@
+"""`tactomo ports`: what a machine with adapters shows, and asking a device who it is."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import pty
+import threading
+import tty
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fake_machine import FakeMachine
+from rich.console import Console
+from tactomo.cli.ports import question, survey, table
+from tactomo.identify import identify
+from tactomo_protocol import Channel, Command, Decoder, Hello, SampleFormat, encode
+
+Run = Callable[..., Any]
+
+HELLO = Hello(
+    device_id="skin-7f3a",
+    firmware="1.2.3",
+    channels=(Channel.MAGNITUDE,),
+    electrodes=16,
+    drive_offset=1,
+    measure_offset=1,
+    samples_per_scan=208,
+    sample_format=SampleFormat.INT16,
+    volts_per_count=1e-6,
+    scan_rate_hz=20.0,
+)
+
+
+@pytest.fixture
+def device() -> Iterator[Callable[[bytes], str]]:
+    """Start a device that answers whatever it is asked with these bytes; returns its path."""
+    ends: list[int] = []
+    threads: list[threading.Thread] = []
+
+    def answer(end: int, reply: bytes) -> None:
+        decoder = Decoder()
+        while True:
+            try:
+                data = os.read(end, 4096)
+            except OSError:  # the test is over
+                return
+            if any(isinstance(packet, Command) for packet in decoder.feed(data)):
+                os.write(end, reply)
+
+    def start(reply: bytes) -> str:
+        device_end, host_end = pty.openpty()
+        tty.setraw(host_end)
+        ends.extend((device_end, host_end))
+        threads.append(threading.Thread(target=answer, args=(device_end, reply)))
+        threads[-1].start()
+        return os.ttyname(host_end)
+
+    yield start
+    for end in reversed(ends):  # the host's end first, which ends the read at the other
+        os.close(end)
+    for thread in threads:
+        thread.join()
+
+
+def shown(machine: FakeMachine, *paths: str) -> str:
+    console = Console(file=io.StringIO(), width=200)
+    console.print(table(survey(paths, machine.root), {}))
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+def test_adapters_are_shown_with_their_names_holders_and_troubles(tmp_path: Path) -> None:
+    machine = FakeMachine(tmp_path / "machine")
+    machine.plug_ftdi("ttyUSB0", "1-3", "A50285BI")
+    machine.plug_ch340("ttyUSB1", "1-1")
+    machine.plug_ch340("ttyUSB2", "1-2")
+    machine.run(812, "screen /dev/ttyUSB0", "/dev/ttyUSB0")
+    machine.run(70, "ModemManager")
+    text = shown(machine)
+    assert "FTDI FT232R USB UART (0403:6001, ftdi_sio, serial number A50285BI)" in text
+    assert "/dev/serial/by-id/usb-FTDI_FT232R_USB_UART_A50285BI-if00-port0" in text
+    assert "pid 812: screen /dev/ttyUSB0" in text
+    assert "holds bytes back for up to 16 ms" in text
+    assert "looks the same as /dev/ttyUSB2" in text
+    assert "/dev/serial/by-id/usb-1a86" not in text
+    assert text.count("ModemManager runs") == 3
+    assert "ttyUSB1" not in shown(machine, "/dev/ttyUSB0")
+
+
+def test_nothing_there_says_what_to_do(tactomo: Run) -> None:
+    result = tactomo("ports")
+    assert result.returncode == 0
+    if "ttyUSB" not in result.stdout and "ttyACM" not in result.stdout:
+        assert "no USB adapter is there" in result.stdout
+        assert "tactomo twin" in result.stdout
+
+
+def test_a_device_is_asked_who_it_is(tactomo: Run, device: Callable[[bytes], str]) -> None:
+    path = device(encode(HELLO))
+    result = tactomo("ports", path, "--ask", "--json")
+    (port,) = json.loads(result.stdout)["ports"]
+    assert port["device"]["device_id"] == "skin-7f3a"
+    assert port["no_device_because"] is None
+    text = " ".join(tactomo("ports", path, "--ask").stdout.split())
+    assert "skin-7f3a: magnitude; 20 scans/s; firmware 1.2.3" in text
+
+
+@pytest.mark.parametrize(
+    ("reply", "says"),
+    [
+        (b"", "no answer"),
+        (b"\xf8\x00\x7f\x06", "no packet at 115200 baud"),
+        (encode(Command(1, 1)), "packets, but no hello"),
+    ],
+)
+def test_who_does_not_say_hello_is_no_skin(
+    device: Callable[[bytes], str], reply: bytes, says: str
+) -> None:
+    answer = identify(device(reply), 115_200, patience_s=0.3)
+    assert answer.hello is None
+    assert says in answer.problem
+
+
+def test_a_port_that_cannot_be_opened_says_why(tmp_path: Path) -> None:
+    path = str(tmp_path / "nowhere")
+    assert "does not exist" in question([path], 921_600)[path].problem
