@@ -21,6 +21,7 @@ they save, and the processor is shared with everything else on the robot.
 from __future__ import annotations
 
 import contextlib
+import gc
 import signal
 import threading
 import time
@@ -221,6 +222,9 @@ class Daemon:
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda *_: self._stop_asked.set())
         self.start()
+        # What is there now stays: never looked through again, which would take tenths of a second.
+        gc.collect()
+        gc.freeze()
         notify("READY=1", f"STATUS={self._summary()}")
         try:
             return self.wait()

@@ -350,3 +350,65 @@ def test_the_boards_are_exchanged(
     time.sleep(1.0)
     late = [h for h in ears.heard if h.arrived_ns > frame.arrived_ns]
     assert not any(heard.fields["flags"] for heard in late)
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize(
+    ("what", "event"), [("nothing", "device_silent"), ("noise at 2 kB/s", "device_garbled")]
+)
+@pytest.mark.fault(
+    "A device whose port stays open but says {what} for 10 s",
+    "told as {event} after 3 s; asked again and its port opened anew meanwhile; frames within 1 s "
+    "of its speaking again",
+    "both lines, 20 dual scans/s before and after",
+)
+def test_a_device_of_no_use(
+    tared: Start,
+    skin: PtySkin,
+    scenes: Scenes,
+    listen: Listen,
+    play: Play,
+    figure: Figure,
+    what: str,
+    event: str,
+) -> None:
+    daemon = tared()
+    ears = listen(daemon)
+    noise = np.random.default_rng(5)
+    begin_s = time.monotonic()
+    while time.monotonic() < begin_s + 10.0:
+        for line in skin.each if event == "device_garbled" else []:
+            skin.send(line, noise.bytes(100))
+        time.sleep(0.05)
+    last, speaks_s = skin.counter - 1, time.monotonic()
+    play(still(scenes.rest))
+    back_s = seconds_to_the_next_frame(ears, last, speaks_s)
+    status = daemon.status()
+    reopened = [port["reopened"] for port in status["ports"]]
+    figure(f"ports opened anew {reopened} times; frames after {back_s:.2f} s")
+    assert daemon.told(event)[0]["next_step"]
+    assert min(reopened) >= 1
+    assert back_s < BACK_S
+
+
+@pytest.mark.faults
+@pytest.mark.fault(
+    "The daemon started before its ports are there",
+    "it waits, says so, and publishes within 1.5 s of their coming, the tare included",
+    "wait_for_ports, the cables put in 3 s after it is ready, 100 dual scans/s",
+)
+def test_ports_that_come_later(
+    start: Start, skin: PtySkin, scenes: Scenes, listen: Listen, play: Play, figure: Figure
+) -> None:
+    skin.unplug()
+    daemon = start(skin.paths, wait_for_ports=True)
+    state = daemon.status()["state"]
+    ears = listen(daemon)
+    time.sleep(3.0)
+    skin.plug()
+    begin_s = time.monotonic()
+    play(still(scenes.rest), 100.0)
+    back_s = seconds_to_the_next_frame(ears, 0, begin_s)
+    figure(f"state before: {state}; first measured frame after {back_s:.2f} s, the tare included")
+    assert state == "waiting_for_port"
+    assert back_s < BACK_S + 0.5

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import socket as posix
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -27,27 +28,30 @@ KILLS = 10
 DAY_S = 86_400
 FAKETIME = "/usr/lib/{}-linux-gnu/faketime/libfaketimeMT.so.1"
 
-# A daemon whose reconstruction raises where a file says so: once for a file, always for a folder.
-RAISING = """
-import os, sys
+# A daemon whose reconstruction raises where a file says so, once for a file, always for a folder;
+# and hangs for as long as there is a file of another name.
+INJECTED = """
+import sys, time
 from pathlib import Path
 from tactomo.config import load_config
 from tactomo.daemon import Daemon
 from tactomo.log import configure_logging
 from tactomo_models import Reconstructor, load_description, load_or_build_artifact
 
-class Raising(Reconstructor):
+class Injected(Reconstructor):
     def reconstruct(self, *arguments, **options):
         trigger = Path(sys.argv[1]).with_name("raise")
         if trigger.exists():
             if trigger.is_file():
                 trigger.unlink()
             raise ZeroDivisionError("made to fail")
+        while Path(sys.argv[1]).with_name("hang").exists():
+            time.sleep(0.01)
         return super().reconstruct(*arguments, **options)
 
 configure_logging("info", "json")
 description = load_description("paper_square")
-reconstructor = Raising(description, load_or_build_artifact(description))
+reconstructor = Injected(description, load_or_build_artifact(description))
 sys.exit(Daemon(load_config(sys.argv[1]), reconstructor=reconstructor).run())
 """
 
@@ -212,7 +216,7 @@ def test_a_reconstruction_that_raises(
     tmp_path: Path,
     when: str,
 ) -> None:
-    daemon = tared(program=RAISING)
+    daemon = tared(program=INJECTED)
     ears = listen(daemon, "contacts", "status")
     playing = play(still(scenes.rest), 50.0)
     ears.wait(lambda h: h.kind == "contacts", "a frame")
@@ -273,3 +277,49 @@ def test_the_networks_vanish(
     figure(f"tier with a contact: {said[0]} while it runs, {said[1]} after the restart")
     assert said[0] == "hybrid"
     assert said[1] != "hybrid"
+
+
+@pytest.mark.faults
+@pytest.mark.fault(
+    "A reconstruction that hangs for 8 s",
+    "the service manager's watchdog is fed no more, though every other thread runs; fed again when "
+    "it goes on",
+    "a reconstructor that hangs while a file exists, in an otherwise usual daemon; a watchdog of "
+    "2 s on a socket as systemd's",
+)
+def test_a_reconstruction_that_hangs(
+    tared: Start, scenes: Scenes, play: Play, figure: Figure, tmp_path: Path
+) -> None:
+    address = tmp_path / "notify"
+    with posix.socket(posix.AF_UNIX, posix.SOCK_DGRAM) as manager:
+        manager.bind(str(address))
+        manager.setblocking(False)
+        environment = {"NOTIFY_SOCKET": str(address), "WATCHDOG_USEC": "2000000"}
+        daemon = tared(program=INJECTED, environment=environment)
+        play(still(scenes.rest))
+        healthy = fed(manager, 5.0)
+        (tmp_path / "hang").write_text("")
+        fed(manager, 2.0)
+        hanging = fed(manager, 6.0)
+        answered = daemon.answers()
+        (tmp_path / "hang").unlink()
+        again = fed(manager, 5.0)
+    figure(
+        f"fed {healthy} times in 5 s before, {hanging} times from 2 to 8 s of hanging, {again} "
+        f"times in the 5 s after it; the control socket answered meanwhile"
+    )
+    assert healthy >= 3
+    assert hanging == 0
+    assert again >= 2
+    assert answered
+
+
+def fed(manager: posix.socket, seconds: float) -> int:
+    """Return how often the watchdog is fed in so many seconds."""
+    end_s, times = time.monotonic() + seconds, 0
+    while time.monotonic() < end_s:
+        try:
+            times += manager.recv(4096).count(b"WATCHDOG=1")
+        except BlockingIOError:
+            time.sleep(0.02)
+    return times

@@ -42,7 +42,7 @@ class DaemonProcess:
             as its argument; None for the command that users start.
         environment: what its environment has beyond this one's.
         ready: wait until it is ready.
-        nice: niceness of all its threads.
+        under: the command that it is run under, such as ("nice", "-n", "-5").
         **config: keys of its configuration.
 
     """
@@ -55,7 +55,7 @@ class DaemonProcess:
         program: str | None = None,
         environment: Mapping[str, str] | None = None,
         ready: bool = True,
-        nice: int = 0,
+        under: Sequence[str] = (),
         **config: Any,
     ) -> None:
         number = len(list(folder.glob("daemon-*.toml")))
@@ -66,7 +66,7 @@ class DaemonProcess:
         run = ["-m", "tactomo.cli", "daemon"] if program is None else ["-c", program]
         with self.log_path.open("wb") as log:
             self.popen = subprocess.Popen(
-                [*["nice", "-n", str(nice)] * bool(nice), sys.executable, *run, str(path)],
+                [*under, sys.executable, *run, str(path)],
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
