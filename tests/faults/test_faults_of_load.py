@@ -120,7 +120,7 @@ def test_sigterm_under_full_load(
     tared: Start, scenes: Scenes, play: Play, listen: Listen, figure: Figure, tmp_path: Path
 ) -> None:
     path = tmp_path / "load.mcap"
-    daemon = tared(record=str(path), record_maps=True)
+    daemon = tared(recording={"file": str(path), "maps": True})
     listen(daemon, "map", "contacts", "scan", "status", "event")
     playing = play(moving(scenes.two[::7]), 300.0)
     time.sleep(3.0)
