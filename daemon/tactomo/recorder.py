@@ -239,7 +239,8 @@ class Recorder:
             self._tell_failure(active, _TOO_SLOW)
         if not self._thread.is_alive() and not self._is_dead:
             self._is_dead, self.active = True, None
-            self._on_event("recording_failed", "error", "the recorder's thread died", _REPORT)
+            self.failures += 1
+            self._on_event("recording_failed", "error", _DIED, _REPORT)
         waits_s = 0.0 if busy_since_s is None else time.monotonic() - busy_since_s
         if (waits_s > STALL_S) != self._is_stalled:
             self._is_stalled = not self._is_stalled
@@ -258,6 +259,8 @@ class Recorder:
             self._on_event("recording_resumed", "info", "the disk answers again")
 
     def _ask(self, work: Callable[[], Any]) -> Future[Any]:
+        if self._is_dead:
+            raise RecordingError(_DIED, _REPORT, "cannot_write")
         answer: Future[Any] = Future()
         self._requests.put((work, answer))
         self._wake.set()
@@ -291,8 +294,8 @@ class Recorder:
                     answer.set_result(work())
                 except TactomoError as error:
                     answer.set_exception(error)
-                except OSError as error:
-                    reason = error.strerror or str(error)
+                except Exception as error:  # whoever asked is told, and the thread goes on
+                    reason = _reason(error)
                     answer.set_exception(RecordingError(reason, _TRY_ELSEWHERE, "cannot_write"))
 
     def _guard(self, work: Callable[[], None]) -> None:
@@ -300,9 +303,7 @@ class Recorder:
         try:
             work()
         except Exception as error:  # of any kind: a recording may fail, but never without a word
-            if not isinstance(error, OSError | RecordingError):
-                log.exception("recording_failed")
-            self._give_up(getattr(error, "strerror", None) or str(error) or repr(error))
+            self._give_up(_reason(error))
 
     def _start(self, path: Path | None) -> Mapping[str, Any]:
         if self.active is not None:
@@ -324,6 +325,7 @@ class Recorder:
             self._start(None)
         except (OSError, RecordingError) as error:
             self._folder = self._rules.folder_path
+            self.failures += 1
             self._on_event("recording_failed", "error", str(error), self._wait(str(error)))
 
     def _create(
@@ -496,11 +498,19 @@ class Recorder:
             self._on_event("recording_failed", "error", detail, self._wait(reason))
 
 
-_REST: Final = "make room on the disk; what was written until then can be replayed"
+_REST: Final = "see to the disk, then record anew; what was written until then can be replayed"
 _TRIED_AGAIN: Final = "make room on the disk, or see that it can be written; it is tried again"
 _TRY_ELSEWHERE: Final = "give a path in a folder that you may write to"
-_REPORT: Final = "please report the traceback in the log"
+_DIED: Final = "the recorder's thread died"
+_REPORT: Final = "restart the daemon, and please report the traceback in its log"
 _TOO_SLOW: Final = f"the disk is too slow: {MAX_QUEUED_BYTES >> 20} MB wait for it"
+
+
+def _reason(error: Exception) -> str:
+    """Return what to tell of an error; the traceback of a mistake of ours goes to the log."""
+    if not isinstance(error, OSError | TactomoError):
+        log.exception("recording_failed")
+    return getattr(error, "strerror", None) or str(error) or repr(error)
 
 
 def _no_room(free: int, reserve: int) -> str:

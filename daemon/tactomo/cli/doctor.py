@@ -150,9 +150,12 @@ def _of_file(
 
     suffix = what.suffix.lower()
     if suffix == ".mcap":
+        from tactomo.cli.programs import warn_of_damage
         from tactomo.recording import open_recording
 
-        return of_recording(open_recording(what), description, frames)
+        recording = open_recording(what)
+        warn_of_damage(recording)
+        return of_recording(recording, description, frames)
     if suffix == ".npz":
         return of_arrays(what, description, array, lookup, frames)
     raise DoctorError(f"{what} is neither .mcap nor .npz", "give a recording, scans, or no file")
