@@ -88,7 +88,7 @@ class ActiveRecording:
 
     @property
     def age_s(self) -> float:
-        """How long ago it began."""
+        """How long ago the first of it was written, or the file begun."""
         return time.monotonic() - self._begin_s
 
     @property
@@ -119,9 +119,10 @@ class ActiveRecording:
         """Write what was added, and hand it to the operating system."""
         with self._lock:
             entries, self._entries = self._entries, []
+        if entries and self.is_empty:
+            self.is_empty, self._begin_s = False, time.monotonic()
         for entry in entries:
             self._writer.add(entry)
-            self.is_empty = False
         self.bytes_written = self._writer.flush()
         with self._lock:
             self._queued_bytes -= sum(len(entry.data) + ENTRY_BYTES for entry in entries)

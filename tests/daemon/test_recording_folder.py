@@ -182,6 +182,16 @@ def test_the_file_being_written_stays() -> None:
     assert gone([kept(0, 0, 1, size=10**12)], RecordingConfig(keep_gb=2, keep_days=1)) == []
 
 
+def test_a_file_is_as_old_as_what_is_in_it(bench: Start, tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    b = bench(recording={"folder": folder, "at_start": True, "rotate_minutes": 0.02})
+    time.sleep(2.5)  # twice as long, but nothing came
+    b.tare()
+    assert len(list(folder.iterdir())) == 1
+    while len(list(folder.iterdir())) == 1:
+        b.step()
+
+
 def test_links_and_folders_are_not_recordings(tmp_path: Path) -> None:
     name = "left-000001-20260101T000000Z.mcap"
     (tmp_path / name).mkdir()

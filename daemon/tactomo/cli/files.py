@@ -64,7 +64,10 @@ def info(
 
 
 def _show_folder(folder: Path, as_json: bool) -> None:
-    """List the recordings in a folder by their names, which is by their age."""
+    """List the recordings in a folder by their names, which is by their age.
+
+    One that is not closed is being written, or was cut off, or is damaged.
+    """
     rows = [_recording_line(path) for path in sorted(folder.glob("*.mcap"))]
     if as_json:
         typer.echo(json.dumps(rows, indent=2))
@@ -74,7 +77,8 @@ def _show_folder(folder: Path, as_json: bool) -> None:
 
     table = Table(title=str(folder))
     for name in ("recording", "sensor", "began", "seconds", "MB", "ends"):
-        table.add_column(name, justify="right" if name in ("seconds", "MB") else "left")
+        is_number = name in ("seconds", "MB")
+        table.add_column(name, justify="right" if is_number else "left", no_wrap=True)
     for row in rows:
         table.add_row(*(str(value) for value in row.values()))
     Console().print(table)
@@ -89,14 +93,14 @@ def _recording_line(path: Path) -> dict[str, Any]:
     try:
         recording = open_recording(path)
     except RecordingError:
-        return {**line, "ends": "no recording, or nothing of it can be read"}
+        return {**line, "ends": "no recording"}
     span = recording.span
     return {
         **line,
         "sensor": recording.origin.sensor,
         "began": _date(span.start_ns),
         "seconds": round((span.end_ns - span.start_ns) * 1e-9, 1),
-        "ends": "whole" if span.is_complete else "cut or damaged, or being written",
+        "ends": "whole" if span.is_complete else "not closed",
     }
 
 
@@ -140,7 +144,7 @@ def _recording_facts(recording: Recording) -> dict[str, Any]:
     if summary.ending:
         facts["ends"] = summary.ending
     if summary.recovered_gaps is not None:
-        facts["recovered with gaps"] = summary.recovered_gaps
+        facts["recovered, parts missing"] = summary.recovered_gaps
     return facts
 
 
@@ -183,7 +187,7 @@ def _words(value: Any) -> str:
     if isinstance(value, list):
         return "\n".join(str(each) for each in value) or "none"
     if isinstance(value, bool):
-        return "yes" if value else "no, it was cut off"
+        return "yes" if value else "no"
     return str(value)
 
 
