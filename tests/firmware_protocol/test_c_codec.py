@@ -1,0 +1,236 @@
+"""The C library and the Python codec, each written from PROTOCOL.md, agree on every byte."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from any_packets import PACKETS, SMALL_PACKETS
+from c_firmware import C_FOLDER, Speaker, answered, build, f64_bits, need, text_bytes
+from cobs import cobs
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from tactomo_protocol import Command, Decoder, DecoderCounts, Packet, encode, vectors
+
+VECTORS = C_FOLDER.parent / "vectors"
+COMMAND_TYPE = 0x81
+JsonMap = dict[str, Any]
+# One program serves all examples.
+quickly = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def load(name: str) -> list[JsonMap]:
+    found: list[JsonMap] = json.loads((VECTORS / name).read_text("utf-8"))["vectors"]
+    return found
+
+
+def named(vector: JsonMap) -> str:
+    return str(vector["name"])
+
+
+# --- what a device must make of a stream, by the Python decoder -----------------------------------
+
+
+def is_malformed_otherwise(encoded: bytes) -> bool:
+    """Whether a frame is malformed, but of a type that a device does not know."""
+    decoder = Decoder()
+    decoder.feed(b"\0" + encoded + b"\0")
+    return bool(decoder.counts.malformed) and cobs.decode(encoded)[1] != COMMAND_TYPE
+
+
+def seen_by_device(stream: bytes) -> tuple[list[Packet], DecoderCounts]:
+    """Commands and counts: to a device each other type is unknown, whatever its body."""
+    decoder = Decoder()
+    packets = decoder.feed(stream)
+    commands: list[Packet] = [packet for packet in packets if isinstance(packet, Command)]
+    others = sum(map(is_malformed_otherwise, filter(None, stream.split(b"\0")[1:-1])))
+    counts = decoder.counts
+    return commands, replace(
+        counts,
+        packets=counts.packets + others,
+        malformed=counts.malformed - others,
+        unknown_type=counts.packets + others - len(commands),
+    )
+
+
+def assert_same(speaker: Speaker, stream: bytes, run: int | None = None) -> None:
+    commands, counts = speaker.parse(stream, run)
+    expected, expected_counts = seen_by_device(stream)
+    assert list(map(vectors.fields, commands)) == list(map(vectors.fields, expected))
+    assert counts == expected_counts
+
+
+# --- the shared vectors ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("vector", load("packets.json"), ids=named)
+def test_each_vector_is_encoded(speaker: Speaker, vector: JsonMap) -> None:
+    frame = bytes.fromhex(vector["frame"])
+    [packet] = Decoder().feed(frame)
+    assert vectors.fields(packet) == vector["fields"]
+    assert speaker.encode(packet) == frame
+
+
+@pytest.mark.parametrize("vector", load("packets.json"), ids=named)
+def test_each_command_is_decoded_and_the_rest_ignored(speaker: Speaker, vector: JsonMap) -> None:
+    commands, counts = speaker.parse(bytes.fromhex(vector["frame"]))
+    is_command = vector["fields"]["packet"] == "command"
+    assert [vectors.fields(c) for c in commands] == [vector["fields"]] * is_command
+    assert counts == DecoderCounts(packets=1, unknown_type=int(not is_command))
+
+
+@pytest.mark.parametrize("vector", load("streams.json"), ids=named)
+def test_each_stream_gives_its_commands_and_counts(speaker: Speaker, vector: JsonMap) -> None:
+    stream = bytes.fromhex(vector["stream"])
+    expected = [fields for fields in vector["packets"] if fields["packet"] == "command"]
+    same = ("crc_errors", "cobs_errors", "oversize", "wrong_version")
+    for run in (None, 1, 2, 7, 64):
+        commands, counts = speaker.parse(stream, run)
+        assert [vectors.fields(command) for command in commands] == expected
+        assert {name: getattr(counts, name) for name in same} == {
+            name: vector["counts"][name] for name in same
+        }
+    assert_same(speaker, stream)
+
+
+# --- any packets, any bytes -----------------------------------------------------------------------
+
+
+@quickly
+@given(PACKETS)
+def test_both_encode_any_packet_alike(sanitized: Speaker, packet: Packet) -> None:
+    assert sanitized.encode(packet) == encode(packet)
+
+
+FRAMES = SMALL_PACKETS.map(encode)
+PIECES = st.one_of(
+    FRAMES,
+    st.builds(lambda frame, n: frame[:n], FRAMES, st.integers(0, 40)),
+    st.builds(
+        lambda frame, at, bit: bytes(b ^ (1 << bit) * (i == at) for i, b in enumerate(frame)),
+        FRAMES,
+        st.integers(0, 40),
+        st.integers(0, 7),
+    ),
+    st.lists(st.sampled_from([0, 1, 2, 3, 0xFF]), max_size=8).map(bytes),
+    st.binary(max_size=40),
+    st.builds(lambda n: b"\x01" * n, st.integers(4130, 4145)),
+)
+
+
+@quickly
+@given(st.lists(PIECES, max_size=8).map(b"".join), st.integers(1, 30))
+def test_both_make_the_same_of_any_stream(sanitized: Speaker, stream: bytes, run: int) -> None:
+    assert_same(sanitized, stream, run)
+
+
+# --- what a sender must not send ------------------------------------------------------------------
+
+HELLO = ("3", "2", "208", "16", "1", "1", f64_bits(1e-6), f64_bits(20.0), "6161", "31")
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        *((0, value) for value in (0, 4)),
+        *((1, value) for value in (0, 4)),
+        *((2, value) for value in (0, 1025)),
+        *((3, value) for value in (0, 1)),
+        *((field, value) for field in (4, 5) for value in (0, 16)),
+        *((6, f64_bits(value)) for value in (0.0, -1.0, float("inf"), float("nan"))),
+        *((7, f64_bits(value)) for value in (-1.0, float("inf"), float("nan"))),
+        *((field, "-") for field in (8, 9)),
+        *((field, "61" * 65) for field in (8, 9)),
+        *((8, text_bytes(text)) for text in ("a\x1bb", "\x7f", "\x85", "\udcff", "ab\udcc3")),
+        *((8, code) for code in ("c080", "eda080", "f4908080", "e08080", "f0808080", "c3", "80")),
+    ],
+)
+def test_a_hello_against_the_rules_is_not_encoded(
+    sanitized: Speaker, field: int, value: object
+) -> None:
+    assert answered(sanitized.ask("hello", *HELLO))
+    fields: list[object] = [*HELLO]
+    fields[field] = value
+    assert not answered(sanitized.ask("hello", *fields))
+
+
+@pytest.mark.parametrize(
+    "scan", ["2 0 0 0 1 1", "0 0 0 0 0 1", "0 0 0 0 4 1", "0 0 0 0 1 0", "0 0 0 0 1 1025"]
+)
+def test_a_scan_against_the_rules_is_not_encoded(sanitized: Speaker, scan: str) -> None:
+    assert answered(sanitized.ask("scan 1 0 0 0 1 1 0000"))
+    assert not answered(sanitized.ask("scan", scan, "00" * 2050))
+
+
+def test_there_is_no_status_4(sanitized: Speaker) -> None:
+    assert not answered(sanitized.ask("acknowledge 0 0 4"))
+
+
+def test_any_text_is_judged_as_python_judges_it(sanitized: Speaker) -> None:
+    """Every first byte of a character with second bytes at each edge, in full length."""
+    edges = (0x7F, 0x80, 0x8F, 0x90, 0x9F, 0xA0, 0xBF, 0xC0)
+    verdicts: Counter[bool] = Counter()
+    for first in range(0x20, 0x100):
+        for second in edges:
+            for tail in (b"", b"\x80", b"\x80\x80"):
+                text = bytes([first, second]) + tail
+                is_sent = bool(answered(sanitized.ask("hello", *HELLO[:8], text.hex(), "31")))
+                assert is_sent == may_be_sent(text), text.hex()
+                verdicts[is_sent] += 1
+    assert min(verdicts.values()) > 100
+
+
+def may_be_sent(text: bytes) -> bool:
+    try:
+        decoded = text.decode("utf-8")
+    except UnicodeDecodeError:
+        return False
+    return not any(ord(c) < 0x20 or 0x7F <= ord(c) < 0xA0 for c in decoded)
+
+
+# --- compilers and fuzzers ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("compiler", ["gcc", "clang", "arm-none-eabi-gcc"])
+def test_the_library_compiles_without_a_warning(tmp_path: Path, compiler: str) -> None:
+    need(compiler)
+    if compiler == "arm-none-eabi-gcc":
+        header = subprocess.run(
+            [compiler, "-E", "-xc", "-"], input=b"#include <string.h>", capture_output=True
+        )
+        if header.returncode != 0:
+            pytest.skip("needs the newlib of arm-none-eabi-gcc")
+    build("example_firmware.o", tmp_path, compiler)
+    for source in ("tactomo_protocol.c", "tactomo_device.c"):
+        command = [compiler, "-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion"]
+        done = subprocess.run(
+            [*command, "-Werror", "-Os", "-c", "-o", tmp_path / "out.o", C_FOLDER / source],
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("fuzzer", ["fuzz_parser", "fuzz_encoder", "fuzz_device"])
+def test_a_fuzzer_finds_nothing_in_a_moment(tmp_path: Path, fuzzer: str) -> None:
+    """Always the same inputs; `make fuzz` goes on for as long as one likes."""
+    need("clang")
+    (tmp_path / "try.c").write_text("int LLVMFuzzerTestOneInput(void) { return 0; }\n")
+    tried = ["clang", "-fsanitize=fuzzer,address", "-o", tmp_path / "try", tmp_path / "try.c"]
+    if subprocess.run(tried, capture_output=True).returncode != 0:
+        pytest.skip("this clang has no libFuzzer (Debian: libclang-rt-14-dev)")
+    program = build(fuzzer, tmp_path)
+    seeds = tmp_path / "seeds"
+    subprocess.run(
+        [shutil.which("python3") or "python", C_FOLDER / "tests" / "make_seeds.py", seeds],
+        check=True,
+    )
+    options = ["-seed=1", "-runs=1500", "-max_total_time=5", f"-artifact_prefix={tmp_path}/"]
+    done = subprocess.run([program, *options, seeds], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-4000:]
