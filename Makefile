@@ -8,7 +8,7 @@ TRAIN_READY := $(VENV)/.ready-train
 LOCKED := pyproject.toml --universal --python-version 3.11 --generate-hashes \
   --no-emit-package tactomo-client --no-emit-package tactomo
 
-.PHONY: help run test test-slow test-train faults soak lint format bench deb lock clean
+.PHONY: help run test test-slow test-train faults soak firmware fuzz lint format bench deb lock clean
 
 help:            ## list these targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -30,6 +30,12 @@ faults: $(READY) ## every fault and measure (an hour), then docs/reliability.md 
 
 soak: $(READY)   ## a million dual scans as fast as they are taken
 	$(BIN)/pytest tests/faults -m '' -k soak $(ARGS)
+
+firmware:        ## the C firmware library's emulator of a skin: firmware_protocol/c/build
+	$(MAKE) -C firmware_protocol/c
+
+fuzz:            ## a minute of each C fuzzer; needs clang (make fuzz FUZZ_SECONDS=3600)
+	$(MAKE) -C firmware_protocol/c fuzz
 
 lint: $(READY)   ## ruff and mypy --strict
 	$(BIN)/ruff check .

@@ -32,13 +32,14 @@ static bool is_external(const tactomo_settings *settings)
 
 static bool is_too_fast(const tactomo_settings *settings, double rate_hz)
 {
-    return rate_hz * settings->shortest_period_us > 1e6;
+    return rate_hz > 1e6 / settings->shortest_period_us;
 }
 
+/* Division and comparison are all the double arithmetic here: the rest would cost 5 KB on an M0+. */
 static uint32_t nearest_period_us(double rate_hz)
 {
-    double period_us = 1e6 / rate_hz + 0.5;
-    return period_us < LONGEST_PERIOD_US ? (uint32_t)period_us : LONGEST_PERIOD_US;
+    double halves = 2e6 / rate_hz;
+    return halves < 2.0 * LONGEST_PERIOD_US ? ((uint32_t)halves + 1) / 2 : LONGEST_PERIOD_US;
 }
 
 static void keep_period(tactomo_device *device, uint32_t period_us)

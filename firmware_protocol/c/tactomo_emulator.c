@@ -39,8 +39,9 @@ static const char help[] =
     "\n"
     "VOLTAGES.csv holds one dual scan a line: the magnitude channel's voltages, then the\n"
     "structure channel's, in volts, separated by commas or blanks; a # begins a comment.\n"
-    "Its lines are sent in turn, over and over. README.md shows how to make one with\n"
-    "presses in it. Without a file the skin rests: an even disc, nothing pressed.\n"
+    "Its lines are sent in turn from START on, over and over; the first twenty should be of\n"
+    "the bare skin, for the daemon's reference. README.md shows how to make one with presses\n"
+    "in it. Without a file the skin rests: an even disc, nothing pressed.\n"
     "\n"
     "The skin:\n"
     "  --ports 1|2        one port for both channels, or two boards with a sync line [1]\n"
@@ -383,7 +384,16 @@ static void send_channels(board *self, const options *asked, const scene *shown,
     }
 }
 
-/* The leader's pulse reaches the follower at once, and a long one zeroes its counter. */
+static bool is_any_scanning(const options *asked)
+{
+    bool is_scanning = false;
+    for (int i = 0; i < asked->ports; i++)
+        is_scanning |= boards[i].device.scanning;
+    return is_scanning;
+}
+
+/* The leader's pulse reaches the follower at once, and a long one zeroes its counter. The file's
+ * first line is for the first dual scan after START. */
 static void scan_all(const options *asked, const scene *shown)
 {
     static size_t taken;
@@ -398,7 +408,7 @@ static void scan_all(const options *asked, const scene *shown)
         if (!is_dropped)
             send_channels(&boards[i], asked, shown, counter, taken % shown->lines);
     }
-    taken++;
+    taken = is_any_scanning(asked) ? taken + 1 : 0;
 }
 
 /* --- The boards ------------------------------------------------------------------------------- */

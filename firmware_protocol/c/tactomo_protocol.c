@@ -1,5 +1,6 @@
 #include "tactomo_protocol.h"
 
+#include <float.h>
 #include <string.h>
 
 typedef char tactomo_needs_a_double_of_8_bytes[sizeof(double) == 8 ? 1 : -1];
@@ -203,7 +204,7 @@ static uint8_t text_length(const char *text)
 
 static bool is_finite(double value)
 {
-    return value - value == 0.0;
+    return value >= -DBL_MAX && value <= DBL_MAX;
 }
 
 static bool is_offset(uint8_t offset, uint8_t electrodes)
