@@ -26,10 +26,10 @@
 
 enum { MOST_BOARDS = 2, TRANSMIT_BYTES = 12288, CONVERTER_LIMIT = 8388607 };
 enum { FASTEST_PERIOD_US = 1000, POLL_MS = 1, LONGEST_PATH = 4096 };
-enum { BAD_USAGE = 2 };
+enum { BAD_USAGE = 2, MOST_SCENES = 16 };
 
 static const char help[] =
-    "Usage: tactomo_emulator [OPTIONS] [VOLTAGES.csv]\n"
+    "Usage: tactomo_emulator [OPTIONS] [VOLTAGES.csv ...]\n"
     "\n"
     "A tactile skin without hardware: the C firmware library behind pseudo-terminals.\n"
     "Prints a path for each port; the daemon reads them like any serial device:\n"
@@ -39,9 +39,9 @@ static const char help[] =
     "\n"
     "VOLTAGES.csv holds one dual scan a line: the magnitude channel's voltages, then the\n"
     "structure channel's, in volts, separated by commas or blanks; a # begins a comment.\n"
-    "Its lines are sent in turn from START on, over and over; the first twenty should be of\n"
-    "the bare skin, for the daemon's reference. README.md shows how to make one with presses\n"
-    "in it. Without a file the skin rests: an even disc, nothing pressed.\n"
+    "Its lines are sent in turn, over and over. Enter goes on to the next file, and after the\n"
+    "last one to the first: give a bare skin and a pressed one, and Enter presses and lifts.\n"
+    "README.md shows how to make them. Without a file the skin rests: an even disc.\n"
     "\n"
     "The skin:\n"
     "  --ports 1|2        one port for both channels, or two boards with a sync line [1]\n"
@@ -78,7 +78,7 @@ typedef struct {
     unsigned long corrupt_every;
     const char *link_folder;
     const char *id;
-    const char *file;
+    char **files; /* ends with NULL */
 } options;
 
 /* Voltages to replay: lines of channels * samples, in volts. */
@@ -317,7 +317,8 @@ static long read_line(char *line, scene *read, size_t at)
     return n;
 }
 
-static void check_line(const options *asked, const scene *read, size_t number, long n)
+static void check_line(const char *path, const options *asked, const scene *read, size_t number,
+                       long n)
 {
     char what[160];
     bool fits = n == (long)read->samples || n == 2 * (long)read->samples;
@@ -329,30 +330,48 @@ static void check_line(const options *asked, const scene *read, size_t number, l
         snprintf(what, sizeof what, "line %zu has %ld voltages where %zu (or %zu: both channels) "
                  "belong to %d electrodes", number, n, read->samples, 2 * read->samples,
                  asked->electrodes);
-    refuse(what, asked->file);
+    refuse(what, path);
 }
 
-static scene load_scene(const options *asked)
+static scene load_scene(const char *path, const options *asked)
 {
     scene read = {NULL, 0, (size_t)(asked->electrodes * (asked->electrodes - 3)), 2};
-    FILE *file = fopen(asked->file, "r");
+    FILE *file = fopen(path, "r");
     char *line = NULL;
     size_t length = 0;
     if (file == NULL)
-        fail(asked->file, "give a file of voltages that is there, or none for a skin at rest");
+        fail(path, "give a file of voltages that is there, or none for a skin at rest");
     for (size_t number = 1; getline(&line, &length, file) > 0; number++) {
         long n = read_line(line, &read, read.lines * read.channels * read.samples);
         if (n == 0)
             continue;
-        check_line(asked, &read, number, n);
+        check_line(path, asked, &read, number, n);
         read.channels = (size_t)n / read.samples;
         read.lines++;
     }
     free(line);
     fclose(file);
     if (read.lines == 0)
-        refuse("no voltages in", asked->file);
+        refuse("no voltages in", path);
     return read;
+}
+
+/* Loads the files, or makes the skin at rest; returns how many scenes there are. */
+static size_t load_scenes(const options *asked, scene *into)
+{
+    size_t n = 0;
+    for (; asked->files[n] != NULL && n < MOST_SCENES; n++) {
+        into[n] = load_scene(asked->files[n], asked);
+        if (into[n].channels < (size_t)asked->ports)
+            refuse("two ports need both channels, and one alone is in", asked->files[n]);
+        if (into[n].channels != into[0].channels)
+            refuse("it has other channels than the first file", asked->files[n]);
+    }
+    if (asked->files[n] != NULL)
+        refuse("that is one file too many", asked->files[n]);
+    if (n == 0)
+        into[n++] = resting_scene(asked);
+    return n;
 }
 
 /* Converts one channel of one line into counts; returns the scan's flags. */
@@ -384,16 +403,7 @@ static void send_channels(board *self, const options *asked, const scene *shown,
     }
 }
 
-static bool is_any_scanning(const options *asked)
-{
-    bool is_scanning = false;
-    for (int i = 0; i < asked->ports; i++)
-        is_scanning |= boards[i].device.scanning;
-    return is_scanning;
-}
-
-/* The leader's pulse reaches the follower at once, and a long one zeroes its counter. The file's
- * first line is for the first dual scan after START. */
+/* The leader's pulse reaches the follower at once, and a long one zeroes its counter. */
 static void scan_all(const options *asked, const scene *shown)
 {
     static size_t taken;
@@ -408,7 +418,7 @@ static void scan_all(const options *asked, const scene *shown)
         if (!is_dropped)
             send_channels(&boards[i], asked, shown, counter, taken % shown->lines);
     }
-    taken = is_any_scanning(asked) ? taken + 1 : 0;
+    taken++;
 }
 
 /* --- The boards ------------------------------------------------------------------------------- */
@@ -498,16 +508,33 @@ static void do_what_signals_ask(const options *asked, const scene *shown)
     }
 }
 
-static void wait_for_bytes(const options *asked)
+/* A program in the background would be stopped for reading its terminal. */
+static bool may_read_terminal(void)
 {
-    struct pollfd lines[MOST_BOARDS];
-    for (int i = 0; i < asked->ports; i++)
-        lines[i] = (struct pollfd){.fd = boards[i].line, .events = POLLIN};
-    poll(lines, (nfds_t)asked->ports, POLL_MS);
+    return !isatty(STDIN_FILENO) || tcgetpgrp(STDIN_FILENO) == getpgrp();
 }
 
-static void run(const options *asked, const scene *shown)
+/* Waits for bytes from a host, for a moment; returns whether Enter was pressed meanwhile. */
+static bool wait_for_bytes(const options *asked)
 {
+    static int input = STDIN_FILENO;
+    struct pollfd lines[MOST_BOARDS + 1];
+    char typed[64];
+    ssize_t got;
+    for (int i = 0; i < asked->ports; i++)
+        lines[i] = (struct pollfd){.fd = boards[i].line, .events = POLLIN};
+    lines[asked->ports] = (struct pollfd){.fd = may_read_terminal() ? input : -1, .events = POLLIN};
+    if (poll(lines, (nfds_t)asked->ports + 1, POLL_MS) <= 0 || lines[asked->ports].revents == 0)
+        return false;
+    got = read(input, typed, sizeof typed);
+    if (got <= 0)
+        input = -1; /* nobody will press it any more */
+    return got > 0 && memchr(typed, '\n', (size_t)got) != NULL;
+}
+
+static void run(const options *asked, const scene *scenes, size_t scene_count)
+{
+    const scene *shown = scenes;
     while (!ending) {
         do_what_signals_ask(asked, shown);
         if (tactomo_device_is_due(&boards[0].device))
@@ -517,7 +544,10 @@ static void run(const options *asked, const scene *shown)
             empty_transmit_buffer(&boards[i]);
             tell(&boards[i], i);
         }
-        wait_for_bytes(asked);
+        if (wait_for_bytes(asked)) {
+            shown = shown + 1 < scenes + scene_count ? shown + 1 : scenes;
+            say("showing scene %d of %zu", (int)(shown - scenes) + 1, scene_count);
+        }
     }
 }
 
@@ -569,9 +599,7 @@ static options read_options(int argc, char **argv)
     int letter;
     while ((letter = getopt_long(argc, argv, "h", known, NULL)) != -1)
         set_option(&asked, letter);
-    if (optind + 1 < argc)
-        refuse("one file of voltages, not also", argv[optind + 1]);
-    asked.file = argv[optind];
+    asked.files = argv + optind;
     return asked;
 }
 
@@ -594,19 +622,19 @@ static void listen_to_signals(void)
 int main(int argc, char **argv)
 {
     options asked = read_options(argc, argv);
-    scene shown = asked.file == NULL ? resting_scene(&asked) : load_scene(&asked);
-    if (shown.channels < (size_t)asked.ports)
-        refuse("two ports need both channels, and one alone is in", asked.file);
+    scene scenes[MOST_SCENES];
+    size_t scene_count = load_scenes(&asked, scenes);
     listen_to_signals();
     for (int i = 0; i < asked.ports; i++) {
-        make_board(&boards[i], &asked, shown.channels);
-        power_up(&boards[i], &asked, &shown);
+        make_board(&boards[i], &asked, scenes->channels);
+        power_up(&boards[i], &asked, scenes);
         plug_in(&boards[i]);
     }
-    run(&asked, &shown);
+    run(&asked, scenes, scene_count);
     for (int i = 0; i < asked.ports; i++)
         if (boards[i].line >= 0)
             pull_out(&boards[i]);
-    free(shown.volts);
+    while (scene_count > 0)
+        free(scenes[--scene_count].volts);
     return EXIT_SUCCESS;
 }

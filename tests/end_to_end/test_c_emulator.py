@@ -26,7 +26,11 @@ class Emulator:
         self._errors = folder / "emulator.log"
         with self._errors.open("wb") as errors:
             self.popen = subprocess.Popen(
-                list(map(str, command)), stdout=subprocess.PIPE, stderr=errors, text=True
+                list(map(str, command)),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                text=True,
             )
         assert self.popen.stdout is not None
         ports = options[options.index("--ports") + 1] if "--ports" in options else 1
@@ -36,6 +40,22 @@ class Emulator:
     def said(self) -> str:
         """Return what it wrote about itself."""
         return self._errors.read_text()
+
+    @property
+    def resets(self) -> int:
+        """How often the last board was reset."""
+        return self.said().count("port1: reset")
+
+    def press_enter(self) -> None:
+        """Show the next file."""
+        assert self.popen.stdin is not None
+        print(file=self.popen.stdin, flush=True)
+
+    def reset(self, number: int) -> None:
+        """Send a signal that resets the last board, and wait until it did."""
+        before = self.resets
+        self.popen.send_signal(number)
+        wait_until(lambda: self.resets > before, "the reset")
 
     def signal(self, number: int) -> None:
         """Send a signal."""
@@ -58,12 +78,12 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def press_csv(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The file that the README's Python makes."""
+def presses(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The files that the README's Python makes: a bare skin, and a press."""
     folder = tmp_path_factory.mktemp("press")
     [code] = re.findall(r"```python\n(.*?)```", (C_FOLDER / "README.md").read_text(), re.DOTALL)
     subprocess.run([sys.executable, "-c", code], cwd=folder, check=True)
-    return folder / "press.csv"
+    return folder / "bare.csv", folder / "press.csv"
 
 
 class Rig:
@@ -123,11 +143,12 @@ def rigs() -> Iterator[list[Rig]]:
 
 @pytest.mark.parametrize("ports", [1, 2])
 def test_a_press_on_the_emulator_is_found_where_it_was(
-    rigs: list[Rig], program: Path, press_csv: Path, tmp_path: Path, ports: int
+    rigs: list[Rig], program: Path, presses: tuple[Path, Path], tmp_path: Path, ports: int
 ) -> None:
-    rig = Rig(program, tmp_path, "--ports", ports, press_csv)
+    rig = Rig(program, tmp_path, "--ports", ports, *presses)
     rigs.append(rig)
     rig.event(0, "tared")
+    rig.emulator.press_enter()
     pressed = rig.frame(0, "a contact", lambda fields: len(fields["contacts"]) == 1)
     [contact] = pressed["contacts"]
     assert contact["x_mm"] == pytest.approx(30, abs=3)
@@ -135,6 +156,9 @@ def test_a_press_on_the_emulator_is_found_where_it_was(
     for port in rig.ports():
         assert port["corrupt"] == 0
         assert port["device"]["device_id"].startswith("twin-emulator")
+    rig.emulator.press_enter()
+    lifted = len(rig.ears.heard)
+    rig.frame(lifted, "the lift", lambda fields: not fields["contacts"])
     rig.stop()
 
 
@@ -142,10 +166,9 @@ def test_resets_silence_and_unplugging_pass(rigs: list[Rig], program: Path, tmp_
     rig = Rig(program, tmp_path, "--ports", 2, "--away", 0.5, **QUICK)
     rigs.append(rig)
     rig.flow("the start")
-    for resets, number in enumerate((signal.SIGHUP, signal.SIGUSR2, signal.SIGUSR1), 1):
+    for number in (signal.SIGHUP, signal.SIGUSR1):
         since = len(rig.ears.heard)
-        rig.emulator.signal(number)
-        wait_until(lambda: rig.emulator.said().count("port1: reset") == resets, "the reset")
+        rig.emulator.reset(number)
         if number == signal.SIGUSR1:
             rig.event(since, "port_lost")
         rig.flow(signal.Signals(number).name)
@@ -156,6 +179,7 @@ def test_resets_silence_and_unplugging_pass(rigs: list[Rig], program: Path, tmp_
     rig.stop()
 
 
+@pytest.mark.slow
 def test_damage_and_gaps_are_counted_and_survived(
     rigs: list[Rig], program: Path, tmp_path: Path
 ) -> None:
@@ -180,7 +204,8 @@ def test_damage_and_gaps_are_counted_and_survived(
         (("short.csv",), "line 1 has 3 voltages where 208 (or 416: both channels)"),
         (("empty.csv",), "no voltages in: empty.csv"),
         (("--ports", "2", "single.csv"), "two ports need both channels"),
-        (("empty.csv", "short.csv"), "one file of voltages, not also: short.csv"),
+        (("both.csv", "single.csv"), "it has other channels than the first file: single.csv"),
+        (("both.csv",) * 17, "that is one file too many: both.csv"),
         (("--wrong",), "--help shows"),
     ],
 )
@@ -191,6 +216,7 @@ def test_what_the_emulator_cannot_do_is_said(
     (tmp_path / "short.csv").write_text("0.1 0.2;0.3\n")
     (tmp_path / "empty.csv").write_text("\n# nothing\n")
     (tmp_path / "single.csv").write_text(",".join(["0.1"] * 208))
+    (tmp_path / "both.csv").write_text(",".join(["0.1"] * 416))
     done = subprocess.run([program, *options], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 2
     assert told in done.stderr

@@ -208,9 +208,9 @@ def test_the_library_compiles_without_a_warning(tmp_path: Path, compiler: str) -
             pytest.skip("needs the newlib of arm-none-eabi-gcc")
     build("example_firmware.o", tmp_path, compiler)
     for source in ("tactomo_protocol.c", "tactomo_device.c"):
-        command = [compiler, "-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion"]
+        options = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror", "-Os"]
         done = subprocess.run(
-            [*command, "-Werror", "-Os", "-c", "-o", tmp_path / "out.o", C_FOLDER / source],
+            [compiler, *options, "-c", "-o", str(tmp_path / "out.o"), str(C_FOLDER / source)],
             capture_output=True,
             text=True,
         )
