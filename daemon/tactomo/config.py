@@ -7,7 +7,6 @@ Every key has a default but `ports`. Errors name the file, the key, its value an
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -19,6 +18,7 @@ from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM, MessageError
 from tactomo_client.messages import check_sensor_name
 from tactomo_models import METHODS
 from tactomo_models.errors import explain
+from tactomo_models.toml_file import read_toml
 
 from tactomo.endpoint import check_endpoint, is_local, needs_keys
 from tactomo.errors import ConfigError
@@ -175,12 +175,12 @@ def load_config(path: str | Path | None = None, **overrides: Any) -> DaemonConfi
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text("utf-8"))
+        return read_toml(path)
     except OSError as error:
         raise ConfigError(
             f"cannot read {path}: {error.strerror}", "give the path of a TOML file"
         ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise ConfigError(
             f"{path} is not valid TOML: {error}",
             "compare it with deploy/daemon.example.toml",

@@ -15,10 +15,12 @@ import struct
 from collections.abc import Iterator
 from typing import IO, Final, NamedTuple
 
-from mcap.records import Channel, Chunk, Message
+import zstandard
+from mcap.records import Channel, Chunk, McapRecord, Message
 from mcap.stream_reader import breakup_chunk
 
 MAX_RECORD_BYTES: Final = 64 << 20
+"""Of a record, and of what a chunk is unpacked to."""
 _MARK: Final = b"\x04\0\0\0zstd"
 _BEFORE_MARK: Final = 37
 _HEADER: Final = struct.Struct("<BQQQQI8sQ")
@@ -76,7 +78,7 @@ def _read_chunk(file: IO[bytes], start: int) -> IntactChunk | None:
     data = file.read(size)
     chunk = Chunk("zstd", data, end_ns, start_ns, crc, uncompressed)
     try:
-        records = breakup_chunk(chunk, validate_crc=True)
+        records = unpack_chunk(chunk)
     except Exception:  # damage can fail in any layer: zstd, memory, CRC, struct, utf-8
         return None
     end = start + len(header) + len(data)
@@ -88,3 +90,18 @@ def _read_chunk(file: IO[bytes], start: int) -> IntactChunk | None:
 def _index_bytes(messages: list[Message]) -> int:
     """Return the length of a chunk's message indexes."""
     return 15 * len({message.channel_id for message in messages}) + 16 * len(messages)
+
+
+def unpack_chunk(chunk: Chunk) -> list[McapRecord]:
+    """Return the records of a chunk; raises anything at all where it is damaged.
+
+    A few kilobytes may claim to be gigabytes: what unpacks to more than a record's bound is damage,
+    and so is a compression that our recordings do not use.
+    """
+    size = zstandard.frame_content_size(chunk.data) if chunk.compression == "zstd" else 0
+    if (
+        chunk.compression not in ("", "zstd")
+        or max(size, chunk.uncompressed_size) > MAX_RECORD_BYTES
+    ):
+        raise ValueError("not a chunk of ours")
+    return breakup_chunk(chunk, validate_crc=True)

@@ -38,7 +38,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import IO, Any, Final, NamedTuple
+from typing import IO, Annotated, Any, Final, NamedTuple
 from urllib.parse import quote
 
 import msgpack  # type: ignore[import-untyped]
@@ -47,13 +47,15 @@ from mcap.reader import make_reader
 from mcap.records import Channel as McapChannel
 from mcap.records import Chunk as McapChunk
 from mcap.records import Footer, Header, McapRecord, Message, Metadata
-from mcap.stream_reader import StreamReader, breakup_chunk
-from tactomo_client.messages import array_from_wire
+from mcap.stream_reader import StreamReader
+from pydantic import BaseModel, Strict, StrictBool, StrictInt, StrictStr
+from tactomo_client import MessageError
+from tactomo_client.messages import MAX_ENTRIES, array_from_wire
 from tactomo_models import Reference
 from tactomo_protocol import Channel, Decoder, Hello, Scan
 
 from tactomo.errors import RecordingError
-from tactomo.intact_chunks import MAX_RECORD_BYTES, intact_chunks
+from tactomo.intact_chunks import MAX_RECORD_BYTES, intact_chunks, unpack_chunk
 
 PROFILE: Final = "tactomo"
 RECOVERED: Final = "tactomo-recovered"
@@ -248,13 +250,14 @@ def _summarise(path: Path, origin: Origin) -> Summary:
         if isinstance(record, Footer):
             summary.is_complete = True
         elif isinstance(record, Metadata) and record.name == RECOVERED:
-            summary.recovered_gaps = int(record.metadata.get("gaps", "0"))
+            gaps = record.metadata.get("gaps", "")
+            summary.recovered_gaps = int(gaps) if gaps.isdecimal() and len(gaps) < 10 else 0
         elif isinstance(record, Message):
             kind, _, rest = topic.partition("/")
             summary.frames += kind == "frame"
             if kind == "reference":
                 references.add(read_reference_number(record.data))
-            if kind == "port":
+            if kind == "port" and topic in CHANNELS:
                 number, _, extra = rest.partition("/")
                 if not extra:
                     _count_bytes(summary, int(number), record)
@@ -349,11 +352,7 @@ def _records(
         while True:
             try:
                 record = next(records)
-                inside = (
-                    breakup_chunk(record, validate_crc=True)
-                    if isinstance(record, McapChunk)
-                    else [record]
-                )
+                inside = unpack_chunk(record) if isinstance(record, McapChunk) else [record]
             except StopIteration:
                 return
             except InvalidMagic as error:
@@ -390,38 +389,49 @@ def _not_a_recording(path: Path, reason: str) -> RecordingError:
 
 def _read_reference(data: bytes) -> Reference:
     fields = _fields(data, "scans", *REFERENCE_ARRAYS)
-    arrays = {
-        name: None if fields[name] is None else array_from_wire(fields[name])
-        for name in REFERENCE_ARRAYS
-    }
-    return Reference(scans=fields["scans"], **arrays)
+    try:
+        arrays = {
+            name: None if fields[name] is None else array_from_wire(fields[name])
+            for name in REFERENCE_ARRAYS
+        }
+    except MessageError as error:
+        raise _malformed() from error
+    return Reference(scans=_integer(fields["scans"]), **arrays)
 
 
 def read_reference_number(data: bytes) -> int | None:
     """Return which of its recording's references a message holds; None in old recordings."""
-    number: int | None = _fields(data).get("number")
-    return number
+    number = _fields(data).get("number")
+    return None if number is None else _integer(number)
 
 
 def read_mark(data: bytes) -> Mark:
     """Read a message of the topic ``frame``; raise RecordingError where it is none."""
-    fields = _fields(data, "scans", "tier", "budget_ms")
     try:
-        keys = [ScanKey(Channel(c), counter, device) for c, counter, device in fields["scans"]]
-    except (TypeError, ValueError) as error:
+        mark = _Mark.model_validate(_fields(data))
+        keys = [ScanKey(Channel(c), counter, device) for c, counter, device in mark.scans]
+    except ValueError as error:
         raise _malformed() from error
-    return Mark(
-        scans=tuple(keys),
-        tier=fields["tier"],
-        budget_ms=fields["budget_ms"],
-        reference_number=fields.get("reference"),
-        is_cold=fields.get("cold", False),
-    )
+    return Mark(tuple(keys), mark.tier, mark.budget_ms, None, mark.reference, mark.cold)
+
+
+class _Mark(BaseModel):
+    scans: list[tuple[StrictInt, StrictInt, StrictInt]]
+    tier: StrictStr
+    budget_ms: Annotated[float, Strict()] | None
+    reference: StrictInt | None = None
+    cold: StrictBool = False
+
+
+def _integer(value: object) -> int:
+    if not isinstance(value, int):
+        raise _malformed()
+    return value
 
 
 def _fields(data: bytes, *needed: str) -> dict[str, Any]:
     try:
-        fields = msgpack.unpackb(data)
+        fields = msgpack.unpackb(data, max_array_len=MAX_ENTRIES, max_map_len=MAX_ENTRIES)
     except Exception as error:  # msgpack raises of many kinds
         raise _malformed() from error
     if not isinstance(fields, dict) or not fields.keys() >= set(needed):

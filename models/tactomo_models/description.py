@@ -7,12 +7,11 @@ Nothing about a sensor is hard-coded elsewhere. The shipped descriptions lie in
 from __future__ import annotations
 
 import hashlib
-import tomllib
 from functools import cached_property
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +19,18 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from tactomo_models.errors import DescriptionError, explain
 from tactomo_models.pattern import Pairs, scan_pairs
+from tactomo_models.toml_file import parse_toml, read_toml
 
 Modality = Literal["magnitude", "structure"]
 FloatArray = NDArray[np.float64]
-Metres = Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)]
+# Below ten micrometres the mesh would be refined for ever.
+Metres = Annotated[float, Field(ge=1e-5, le=10, allow_inf_nan=False)]
 # TOML has lists where a frozen model has tuples; what is in them is as strict as the rest.
 Table = Annotated[tuple[float, ...], Field(min_length=2, max_length=64, strict=False)]
+
+
+MAX_TABLE_BYTES = 2_000_000_000
+"""Of a sensor's influence tables, which grow as the square of the map's nodes."""
 
 
 class _Section(BaseModel):
@@ -220,7 +225,19 @@ class SensorDescription(_Section):
                     f"pattern.{key} = {offset}: must be below the number of electrodes, "
                     f"{self.electrode_count}"
                 )
+        self._check_size()
         return self
+
+    def _check_size(self) -> None:
+        """Refuse what no computer has the memory for, before anything is built."""
+        nodes, measurements = self.map.nodes_x * self.map.nodes_y, self.electrode_count**2
+        needed = 8 * nodes * (nodes + 2 * measurements)
+        if needed > MAX_TABLE_BYTES:
+            raise ValueError(
+                f"map: {self.map.nodes_x} x {self.map.nodes_y} nodes with {self.electrode_count} "
+                f"electrodes need tables of {needed / 1e9:.1f} GB, more than "
+                f"{MAX_TABLE_BYTES / 1e9:g}: give fewer nodes"
+            )
 
     @property
     def width_m(self) -> float:
@@ -391,26 +408,30 @@ def load_description(source: str | Path) -> SensorDescription:
             or out of range; the message names the key, its value and what is allowed.
     """
     name = str(source)
-    if name in shipped_descriptions():
-        text = resources.files("tactomo_models.sensors").joinpath(f"{name}.toml").read_text("utf-8")
-    else:
-        text = _read(Path(source))
     try:
-        return SensorDescription.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise DescriptionError(f"{name} is not valid TOML: {error}") from error
+        return SensorDescription.model_validate(_read(name))
     except ValidationError as error:
         raise DescriptionError(
             "\n".join(f"{name}: {explain(item)}" for item in error.errors())
         ) from error
 
 
-def _read(path: Path) -> str:
+def _read(name: str) -> dict[str, Any]:
     try:
-        return path.read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise DescriptionError(
-            f"cannot read the sensor description {path}: {reason}; give the path of a TOML file "
-            f"or one of: {', '.join(shipped_descriptions())}"
-        ) from error
+        if name in shipped_descriptions():
+            folder = resources.files("tactomo_models.sensors")
+            return parse_toml(folder.joinpath(f"{name}.toml").read_text("utf-8"))
+        return read_toml(Path(name))
+    except OSError as error:
+        raise _cannot_read(name, error.strerror) from error
+    except UnicodeDecodeError as error:
+        raise _cannot_read(name, "not UTF-8 text") from error
+    except ValueError as error:
+        raise DescriptionError(f"{name} is not valid TOML: {error}") from error
+
+
+def _cannot_read(name: str, reason: str | None) -> DescriptionError:
+    return DescriptionError(
+        f"cannot read the sensor description {name}: {reason}; give the path of a TOML file "
+        f"or one of: {', '.join(shipped_descriptions())}"
+    )

@@ -61,7 +61,10 @@ def test_no_change_tells_no_pressure(paper: SensorDescription) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (("width_m = 0.06", "width_m = -1"), ["sheet.width_m", "-1", "greater than 0"]),
+        (
+            ("width_m = 0.06", "width_m = -1"),
+            ["sheet.width_m", "-1", "greater than or equal to 0.00001"],
+        ),
         (("width_m = 0.06", "width_m = nan"), ["sheet.width_m", "nan", "finite"]),
         (("width_m = 0.06", 'width_m = "wide"'), ["sheet.width_m", "wide", "number"]),
         (("width_m = 0.06", "width_m = inf"), ["sheet.width_m", "inf", "finite"]),

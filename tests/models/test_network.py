@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from base64 import b64decode
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,38 @@ def shipped(paper: SensorDescription) -> Path:
 def test_a_network_of_another_sensor_is_refused(shipped: Path, small: SensorDescription) -> None:
     with pytest.raises(ArtifactError, match=r"trained for sensor 'paper_square'.*not for 'small'"):
         Network(shipped, small, "network")
+
+
+@pytest.mark.parametrize(
+    ("model", "said"),
+    [  # y = x + w with w in a file named ../secret.bin, and y = Evil(x) of the domain my.ops
+        (
+            "CAk6dgoOCgF4CgF3EgF5IgNBZGQSAWcqPwgEEAFCAXdqGQoIbG9jYXRpb24SDS4uL3NlY3JldC5iaW5qCwoG"
+            "b2Zmc2V0EgEwagwKBmxlbmd0aBICMTZwAVoPCgF4EgoKCAgBEgQKAggEYg8KAXkSCgoICAESBAoCCARCBAoA"
+            "EBE=",
+            "[Ee]xternal",
+        ),
+        (
+            "CAk6OwoUCgF4EgF5IgRFdmlsOgZteS5vcHMSAWdaDwoBeBIKCggIARIECgIIBGIPCgF5EgoKCAgBEgQKAggE"
+            "QgQKABARQgoKBm15Lm9wcxAB",
+            "Evil",
+        ),
+    ],
+)
+def test_a_network_reads_no_other_file_and_runs_no_code_of_its_own(
+    paper: SensorDescription,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    model: str,
+    said: str,
+) -> None:
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    (tmp_path / "secret.bin").write_bytes(bytes(16))
+    (here / "hostile.onnx").write_bytes(b64decode(model))
+    with pytest.raises(ArtifactError, match=said):
+        load_network(paper, "network", here / "hostile.onnx")
 
 
 def test_a_network_of_another_kind_is_refused(shipped: Path, paper: SensorDescription) -> None:

@@ -36,6 +36,10 @@ EVENT: Final = "event"
 KINDS: Final = (MAP, CONTACTS, SCAN, STATUS, EVENT)
 
 MAX_MESSAGE_BYTES: Final = 16 * 1024 * 1024
+MAX_ENTRIES: Final = 4096
+"""Of one list or map."""
+MAX_DEPTH: Final = 16
+"""Of lists and maps in each other."""
 MAX_ARRAY_VALUES: Final = 1024 * 1024
 MAX_ARRAY_DIMENSIONS: Final = 4
 ARRAY_DTYPES: Final = ("<f4", "<f8", "<i2", "<i4", "<i8", "<u2", "<u4", "<u8", "|i1", "|u1")
@@ -240,9 +244,12 @@ def _unpack_map(data: bytes) -> dict[str, Any]:
     if len(data) > MAX_MESSAGE_BYTES:
         raise MessageError(f"a message of {len(data)} bytes is over {MAX_MESSAGE_BYTES}")
     try:
-        fields = msgpack.unpackb(data)
+        fields = msgpack.unpackb(data, max_array_len=MAX_ENTRIES, max_map_len=MAX_ENTRIES)
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         raise MessageError(f"the body is not MessagePack: {error}") from error
+    except MemoryError as error:
+        raise MessageError("the body is larger than this computer's memory") from error
+    _check_depth(fields, MAX_DEPTH)
     if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):
         raise MessageError("the body is not a map with string keys")
     if type(fields.get("schema")) is not int or fields["schema"] != SCHEMA:
@@ -251,6 +258,15 @@ def _unpack_map(data: bytes) -> dict[str, Any]:
             "install the tactomo-client of the daemon's version",
         )
     return fields
+
+
+def _check_depth(value: object, left: int) -> None:
+    if not isinstance(value, dict | list):
+        return
+    if not left:
+        raise MessageError(f"the body is nested more than {MAX_DEPTH} deep")
+    for item in value.values() if isinstance(value, dict) else value:
+        _check_depth(item, left - 1)
 
 
 def _check_header(fields: Mapping[str, Any]) -> None:

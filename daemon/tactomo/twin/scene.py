@@ -21,7 +21,6 @@ same device times on every run.
 from __future__ import annotations
 
 import math
-import tomllib
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -29,6 +28,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from tactomo_models import Press
 from tactomo_models.errors import explain
+from tactomo_models.toml_file import read_toml
 
 from tactomo.errors import ConfigError
 
@@ -178,16 +178,16 @@ def load_scene(path: str | Path) -> Scene:
 
     """
     try:
-        return Scene.model_validate(tomllib.loads(Path(path).read_text("utf-8")))
+        return Scene.model_validate(read_toml(Path(path)))
     except OSError as error:
         raise ConfigError(
             f"cannot read the scene {path}: {error.strerror}",
             "give the path of a TOML file, such as those in deploy/scenes",
         ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is not valid TOML: {error}", "correct the file") from error
     except ValidationError as error:
         raise ConfigError(f"{path}: {complaints(error)}", "correct the file") from error
+    except ValueError as error:
+        raise ConfigError(f"{path} is not valid TOML: {error}", "correct the file") from error
 
 
 def complaints(error: ValidationError) -> str:

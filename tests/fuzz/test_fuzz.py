@@ -1,0 +1,134 @@
+"""Whatever bytes come, a parser says what it documents and nothing else; `make fuzz` goes on."""
+
+from __future__ import annotations
+
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import msgpack  # type: ignore[import-untyped]
+import pytest
+from fuzz_targets import HEADER, TARGETS
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from tactomo_client import MessageError
+from tactomo_client.messages import MAX_DEPTH, MAX_ENTRIES, decode_message, encode_message
+from tactomo_models import load_description
+from tactomo_models.errors import DescriptionError
+from tactomo_models.sensors import __path__ as sensors_path
+
+QUICK = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+POSITION = st.integers(0, 2**16)
+
+
+@st.composite
+def mutations(draw: st.DrawFn, examples: list[bytes]) -> bytes:
+    """Valid input, then flipped, cut, repeated, and joined with another at any place."""
+    data = bytearray(draw(st.sampled_from(examples)))
+    for _ in range(draw(st.integers(0, 6))):
+        at = draw(POSITION) % (len(data) + 1)
+        match draw(st.sampled_from(["flip", "set", "cut", "insert", "splice", "repeat"])):
+            case "flip" if at < len(data):
+                data[at] ^= 1 << draw(st.integers(0, 7))
+            case "set" if at < len(data):
+                data[at] = draw(st.sampled_from([0, 1, 0x7F, 0x80, 0xC1, 0xDD, 0xDF, 0xFF]))
+            case "cut":
+                del data[at : at + draw(st.integers(1, 64))]
+            case "insert":
+                data[at:at] = draw(st.binary(max_size=16))
+            case "splice":
+                other = draw(st.sampled_from(examples))
+                data[at:] = other[draw(POSITION) % (len(other) + 1) :]
+            case "repeat":
+                data[at:at] = data[at : at + 32] * draw(st.integers(1, 8))
+    return bytes(data)
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_what_is_valid_is_taken(name: str) -> None:
+    for example in TARGETS[name].examples():
+        TARGETS[name].parse(example)
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_no_mutation_breaks_a_parser(name: str) -> None:
+    target = TARGETS[name]
+    examples = target.examples()
+
+    @QUICK
+    @given(data=st.one_of(mutations(examples), st.binary(max_size=200)))
+    def try_it(data: bytes) -> None:
+        target.parse(data)
+
+    try_it()
+
+
+def hostile_bodies() -> dict[str, bytes]:
+    def of(value: Any) -> bytes:
+        fields = {"schema": 1, "sensor": "left", "kind": "map", **HEADER, "extra": value}
+        return bytes(msgpack.packb(fields))
+
+    deep: Any = []
+    for _ in range(300):
+        deep = [deep]
+    huge_list, huge_map = b"\xdd\x00\xff\xff\xff", b"\xdf\x00\xff\xff\xff"
+    return {
+        "deep": of(deep),
+        "deeper": b"\x91" * 100_000,
+        "deep maps": b"\x81\xa1a" * 30_000,
+        "a list that claims 16 million": huge_list + b"\xc0" * 100,
+        "such lists in each other": huge_list * 1000 + b"\xc0" * 100,
+        "such maps in each other": (huge_map + b"\xa1a") * 1000,
+        "more entries than allowed": of([0] * (MAX_ENTRIES + 1)),
+        "a binary that claims 4 GB": b"\x81\xa1a\xc6\xff\xff\xff\xff",
+        "a text that claims 4 GB": b"\x81\xa1a\xdb\xff\xff\xff\xff",
+        "an extension type": b"\x81\xa1a\xc9\xff\xff\xff\xff\x01",
+        "a list as a key": b"\x81\x90\x01",
+        "millions of empty lists": of([[[] for _ in range(4000)] for _ in range(50)])[:-9],
+    }
+
+
+@pytest.mark.parametrize("name", hostile_bodies())
+def test_a_hostile_body_is_refused_in_little_memory(name: str) -> None:
+    data = b"left/map\0" + hostile_bodies()[name]
+    tracemalloc.start()
+    try:
+        with pytest.raises(MessageError):
+            decode_message(data)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 64e6
+
+
+def test_what_is_sent_is_within_the_bounds() -> None:
+    value: Any = 1
+    for _ in range(MAX_DEPTH - 1):
+        value = {"a": value}
+    data = encode_message("left", "map", {**HEADER, "extra": value})
+    assert decode_message(data).fields["extra"] == value
+    deeper = encode_message("left", "map", {**HEADER, "extra": [value]})
+    with pytest.raises(MessageError, match="nested"):
+        decode_message(deeper)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("[pattern]", "[map]\nnodes_x = 401\nnodes_y = 401\n[pattern]"), "tables of"),
+        (("[pattern]", "[map]\nnodes_x = 10000\n[pattern]"), "less than or equal to 401"),
+        (("per_side = 4", "per_side = 4000"), "less than or equal to 16"),
+        (("length_m = 0.006", "length_m = 1e-300"), "greater than or equal to 0.00001"),
+        (("schema = 1", "schema = " + "[" * 3000), "nested too deeply"),
+        (("schema = 1", "schema = 1\n#" + "x" * (1 << 20)), "more than 1048576 bytes"),
+    ],
+)
+def test_a_description_cannot_eat_the_machine(
+    tmp_path: Path, change: tuple[str, str], said: str
+) -> None:
+    text = (Path(sensors_path[0]) / "paper_square.toml").read_text("utf-8")
+    assert change[0] in text
+    path = tmp_path / "mine.toml"
+    path.write_text(text.replace(*change))
+    with pytest.raises(DescriptionError, match=said):
+        load_description(path)

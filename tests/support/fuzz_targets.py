@@ -1,0 +1,226 @@
+"""What is fuzzed: every parser of ours that reads what others wrote, with examples to start from.
+
+A target takes any bytes and raises nothing: what its parser documents, it takes in itself. The
+default suite mutates the examples for a moment (`test_fuzz`); `make fuzz` has libFuzzer do so for
+long, led by the coverage of our code (`run`).
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+from tactomo.control import COMMANDS
+from tactomo.errors import RecordingError
+from tactomo.recording import Mark, Origin, ScanKey, open_recording
+from tactomo.recording_writer import (
+    RecordingWriter,
+    hello_entry,
+    mark_entry,
+    port_entry,
+    reference_entry,
+)
+from tactomo.twin import control as twin_control
+from tactomo_client import ClientError
+from tactomo_client.frame import frame_from_message
+from tactomo_client.messages import (
+    CONTACTS,
+    MAP,
+    decode_message,
+    decode_reply,
+    decode_request,
+    encode_error,
+    encode_message,
+    encode_reply,
+    encode_request,
+)
+from tactomo_models import Reference, load_description, shipped_descriptions
+from tactomo_models.errors import DescriptionError
+from tactomo_models.sensors import __path__ as sensors_path
+from tactomo_protocol import (
+    Acknowledge,
+    AckStatus,
+    Channel,
+    Command,
+    CommandCode,
+    Decoder,
+    Hello,
+    Packet,
+    SampleFormat,
+    Scan,
+    ScanFlag,
+    encode,
+)
+
+BOTH = (Channel.MAGNITUDE, Channel.STRUCTURE)
+HELLO = Hello("fuzz-1", "1.0", BOTH, 16, 1, 1, 208, SampleFormat.INT32, 1e-6, 20.0)
+SCAN = Scan(Channel.STRUCTURE, 7, 350_000, ScanFlag(0), np.arange(208, dtype=np.int32))
+PACKETS: tuple[Packet, ...] = (
+    HELLO,
+    SCAN,
+    Scan(Channel.MAGNITUDE, 2**32 - 1, 2**64 - 1, ScanFlag(1), np.zeros(3, np.float32)),
+    Acknowledge(1, CommandCode.START, AckStatus.OK),
+    Command(CommandCode.SET_RATE, request=1, rate_hz=20.0),
+)
+HEADER: Mapping[str, Any] = {
+    "session": "0123456789abcdef",
+    "sequence": 7,
+    "acquired_realtime_ns": 1_700_000_000_000_000_000,
+    "acquired_monotonic_ns": 123_456_789,
+    "device_us": 42,
+    "age_ns": 1_000_000,
+    "tier": "levelset",
+    "tier_reason": "two contacts",
+    "flags": ["misfit_high"],
+    "misfit": 1.25,
+    "scan_counter": 3,
+}
+CONTACT = {"id": 1, "x_mm": 1.0, "y_mm": -2.0, "area_mm2": 700.0, "magnitude": None}
+
+
+@dataclass(frozen=True)
+class Target:
+    """One parser: valid input, and what to do with any other."""
+
+    examples: Callable[[], list[bytes]] = field(repr=False)
+    parse: Callable[[bytes], None]
+
+
+def _wire_examples() -> list[bytes]:
+    packets = [encode(packet) for packet in PACKETS]
+    return [*packets, b"".join(packets)]
+
+
+def _parse_wire(data: bytes) -> None:
+    """Cut into reads of several lengths, the outcome is the same, and little is kept."""
+    whole, pieces = Decoder(), Decoder()
+    expected = [encode(packet) for packet in whole.feed(data) if _has_form(packet)]
+    step = 1 + len(data) % 7
+    found = []
+    for start in range(0, len(data), step):
+        found += [encode(p) for p in pieces.feed(data[start : start + step]) if _has_form(p)]
+    assert found == expected
+    assert whole.counts == pieces.counts
+
+
+def _has_form(packet: object) -> bool:
+    return isinstance(packet, Hello | Scan | Acknowledge | Command)
+
+
+def _message_examples() -> list[bytes]:
+    image = np.linspace(0, 1, 12, dtype=np.float32).reshape(3, 4)
+    images = {"map": image, "pressure_kpa": None, "structure": image}
+    extent = {"x_mm": [-75.0, 75.0], "y_mm": [-75.0, 75.0]}
+    contacts = {**HEADER, "contacts": [CONTACT]}
+    return [
+        encode_message("left", MAP, {**contacts, **images, **extent}),
+        encode_message("left", CONTACTS, contacts),
+        encode_reply({"scans": 20}),
+        encode_error("tare_refused", "somebody presses", "let go"),
+    ]
+
+
+def _parse_message(data: bytes) -> None:
+    with suppress(ClientError):
+        frame_from_message(decode_message(data), time.monotonic_ns(), 0.5)
+    with suppress(ClientError):
+        decode_reply(data)
+
+
+def _request_examples() -> list[bytes]:
+    return [
+        encode_request("set_tier", {"tier": "fit"}),
+        encode_request("set_budget", {"budget_ms": 20.0}),
+        encode_request("record_start", {"path": "/tmp/a.mcap"}),
+        encode_request("press", {"x_mm": 1.0, "y_mm": 2.0, "shape": "ring"}),
+        encode_request("play", {"scene": {"press": [{"from_s": 0.0, "duration_s": 1.0}]}}),
+    ]
+
+
+def _parse_request(data: bytes) -> None:
+    """As far as the handlers, of the daemon and of the twin."""
+    with suppress(ClientError, ValidationError):
+        command, arguments = decode_request(data)
+        for commands in (COMMANDS, twin_control.COMMANDS):
+            if command in commands:
+                commands[command].model_validate(arguments)
+
+
+def _description_examples() -> list[bytes]:
+    folder = Path(sensors_path[0])
+    return [(folder / f"{name}.toml").read_bytes() for name in shipped_descriptions()]
+
+
+def _parse_description(data: bytes) -> None:
+    """Including what is worked out from it at once."""
+    path = _scratch("description.toml")
+    path.write_bytes(data)
+    with suppress(DescriptionError):
+        description = load_description(path)
+        assert description.electrode_ends_m.shape == (description.electrode_count, 2, 2)
+        assert np.isfinite(description.electrode_ends_m).all()
+        assert 0 < description.measurements <= description.electrode_count**2
+        assert len(description.map_x_m) * len(description.map_y_m) < 20_000
+        assert description.sha256
+
+
+def _recording_examples() -> list[bytes]:
+    path = _scratch("example.mcap")
+    path.unlink(missing_ok=True)
+    writer = RecordingWriter(path, Origin("left", "paper_square", "0" * 64, ("a", "b"), "0.1"))
+    volts = np.linspace(0.05, 0.2, 6)
+    reference = Reference(volts, volts, volts * 1e-4, None, scans=3)
+    writer.add(hello_entry(0, HELLO, 1, 1))
+    writer.add(reference_entry(reference, 1, 2, 2))
+    writer.add(port_entry(0, encode(SCAN), 3, 3))
+    writer.add(port_entry(1, b"\0\1\2", 4, 4))
+    key = ScanKey(Channel.STRUCTURE, 7, 350_000)
+    writer.add(mark_entry(Mark((key,), "fit", 4.0, reference_number=1), 5, 5))
+    writer.flush()
+    cut = path.read_bytes()
+    writer.close()
+    return [path.read_bytes(), cut]
+
+
+def _parse_recording(data: bytes) -> None:
+    path = _scratch("fuzzed.mcap")
+    path.write_bytes(data)
+    with suppress(RecordingError):
+        recording = open_recording(path)
+        for read in (
+            lambda: recording.summary.ending,
+            lambda: recording.span,
+            lambda: recording.start_ns,
+            lambda: list(recording.chunks(0)),
+            recording.marks,
+            recording.first_reference,
+            recording.replay_urls,
+        ):
+            with suppress(RecordingError):
+                read()
+
+
+@cache
+def _folder() -> tempfile.TemporaryDirectory[str]:
+    return tempfile.TemporaryDirectory(prefix="tactomo-fuzz-")
+
+
+def _scratch(name: str) -> Path:
+    return Path(_folder().name) / name
+
+
+TARGETS: Mapping[str, Target] = {
+    "wire": Target(_wire_examples, _parse_wire),
+    "message": Target(_message_examples, _parse_message),
+    "request": Target(_request_examples, _parse_request),
+    "description": Target(_description_examples, _parse_description),
+    "recording": Target(_recording_examples, _parse_recording),
+}
