@@ -125,7 +125,8 @@ class Connection:
 
     def _tell_closed(self, next_step: str) -> None:
         self._told = self.problem
-        self._on_event("port_lost", "error", f"{self.url}: {self.problem}", next_step)
+        detail = self.problem if self.url in self.problem else f"{self.url}: {self.problem}"
+        self._on_event("port_lost", "error", detail, next_step)
 
     def _tell_slow_adapter(self) -> None:
         timer_ms, name = self.latency_timer_ms, os.path.basename(os.path.realpath(self.url))

@@ -95,8 +95,8 @@ def how_to_grant(path: str) -> str:
     with contextlib.suppress(OSError, KeyError):
         about = os.stat(path)
         if about.st_mode & stat.S_IWGRP and about.st_gid != 0:
-            return f"`sudo usermod -aG {Path(path).group()} $USER`"
-    return "let root make it accessible (its group may not write to it)"
+            return f"`sudo usermod -aG {Path(path).group()} $USER`, then log in again"
+    return "have root let its group read and write it, by a udev rule"
 
 
 def _claim(port: serial.Serial, path: str, baud: int) -> None:
@@ -127,9 +127,7 @@ def _explain(url: str, baud: int, error: Exception) -> PortError:
             "connect the device; `tactomo ports` shows those that are there",
         )
     if number in (errno.EACCES, errno.EPERM):
-        return PortError(
-            f"{url} may not be opened by this user", f"{how_to_grant(url)}, then log in again"
-        )
+        return PortError(f"{url} may not be opened by this user", how_to_grant(url))
     if not is_path(url) or number is not None or _is_device(url):
         return PortError(f"cannot open {url} at {baud} baud: {error}", "check port and baud rate")
     return PortError(f"{url} is not a serial device", "give a path such as /dev/ttyACM0")

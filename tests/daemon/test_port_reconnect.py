@@ -198,6 +198,18 @@ def test_what_stands_in_the_way_is_told_and_waited_out(
     assert b.ask("status")["ports"][0]["problem"] is None
 
 
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may open everything")
+def test_a_permission_that_udev_gives_later_is_waited_for(
+    line: Any, connect: Connect, told: list[tuple[str, str]]
+) -> None:
+    line.path.chmod(0)
+    connection = connect(line.path)
+    assert not connection.try_open()
+    assert "may not be opened by this user; " in told[0][1]
+    line.path.chmod(0o620)
+    assert connection.try_open()
+
+
 def test_scans_of_a_newcomer_wait_for_its_hello(bench: Start, until: Until) -> None:
     b = bench()
     b.tare()

@@ -158,7 +158,7 @@ def _access(path: str) -> list[str]:
 
     if not os.path.exists(path) or os.access(path, os.R_OK | os.W_OK):
         return []
-    return [f"you may not open it; {how_to_grant(path)}, then log in again"]
+    return [f"you may not open it; {how_to_grant(path)}"]
 
 
 def _remarks(
