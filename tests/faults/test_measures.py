@@ -80,7 +80,7 @@ def test_latency(
         "two moving contacts": moving(scenes.two),
     }[scene]
     playing = play(volts, rate)
-    time.sleep(SETTLE_S)
+    wait_until(daemon.knows_the_clocks, "the device's clock to be known", step_s=0.5)
     first, wanted = len(ears.heard), max(200, round(frames * scale))
     wait_until(lambda: len(ears.heard) >= first + wanted, "the frames", 800.0, 0.1)
     playing.stop()

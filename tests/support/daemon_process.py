@@ -134,6 +134,10 @@ class DaemonProcess:
         fields = self._proc("stat").rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / TICKS_PER_S
 
+    def knows_the_clocks(self) -> bool:
+        """Whether it has fitted each device's clock: scans are dated by it from then on."""
+        return all(port["clock"]["state"] == "settled" for port in self.status()["ports"])
+
     def signal(self, number: int) -> None:
         """Send a signal."""
         self.popen.send_signal(number)

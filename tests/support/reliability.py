@@ -30,8 +30,9 @@ Machine: {machine}.{failures}
 
 ## Measures
 
-Latency is the age of the data: from the moment at which the daemon had read the last byte of a dual
-scan to its publication (*published*), and to its arrival in another process (*arrived*).
+Latency is the age of the data: from the moment at which a dual scan's last byte would have come with
+the least delay ([STREAM.md](../clients/STREAM.md#when-a-scan-was-acquired)) to publication
+(*published*), and to the arrival in another process (*arrived*).
 
 {measures}
 """
