@@ -25,14 +25,14 @@ OVERLOAD_S = 15.0
 
 
 def at_rest(daemon: DaemonProcess) -> dict[str, Any]:
-    """Return the status once nothing comes any more."""
-    seen: list[tuple[int, int]] = []
+    """Return the status once nothing has come, and nothing was published, for 2 s."""
+    seen: list[tuple[int, int, int]] = []
 
     def is_at_rest() -> bool:
         status = daemon.status()
         packets = sum(port["packets"] for port in status["ports"])
-        seen.append((packets, status["dropped_scans"]))
-        return len(seen) > 3 and len(set(seen[-3:])) == 1
+        seen.append((packets, status["dropped_scans"], status["acquired_monotonic_ns"]))
+        return len(seen) > 20 and len(set(seen[-20:])) == 1
 
     wait_until(is_at_rest, "the daemon to come to rest", step_s=0.1)
     return daemon.status()

@@ -30,8 +30,8 @@ Machine: {machine}.{failures}
 
 ## Measures
 
-Latency is the age of the data: from the moment at which a dual scan's last byte would have come with
-the least delay ([STREAM.md](../clients/STREAM.md#when-a-scan-was-acquired)) to publication
+Latency is the age of the data: from the moment at which a dual scan's last byte would have come
+with the least delay ([STREAM.md](../clients/STREAM.md#when-a-scan-was-acquired)) to publication
 (*published*), and to the arrival in another process (*arrived*).
 
 {measures}
