@@ -20,7 +20,7 @@ from tactomo_models import METHODS
 from tactomo_models.errors import explain
 from tactomo_models.toml_file import read_toml
 
-from tactomo.endpoint import check_endpoint, is_local, needs_keys
+from tactomo.endpoint import check_endpoint, check_metrics_address, is_local, needs_keys
 from tactomo.errors import ConfigError
 from tactomo.log import LogFormat, LogLevel
 
@@ -46,6 +46,7 @@ def _method(name: str) -> str:
 Endpoint = Annotated[str, AfterValidator(check_endpoint)]
 TierName = Annotated[str, AfterValidator(_method)]
 DeviceId = Annotated[str, Field(min_length=1, max_length=64)]
+MetricsAddress = Annotated[str, AfterValidator(check_metrics_address)]
 BudgetMs = Annotated[float, Field(gt=0, le=10_000)]
 
 
@@ -130,6 +131,8 @@ class DaemonConfig(BaseModel):
     lossless: bool = False
     """Reconstruct every dual scan, however late, instead of the newest one."""
     recording: RecordingConfig = RecordingConfig()
+    metrics: MetricsAddress | None = None
+    """``HOST:PORT`` of this computer where Prometheus may scrape."""
     exit_at_end: bool = False
     """Stop once every replayed port has reached the end of its recording."""
     log_level: LogLevel = "info"

@@ -9,6 +9,7 @@ port-0, -1    a serial port, a decoder    scans to the pipeline, bytes to the re
 pipeline      sync, the reconstructor     messages to the publisher, marks to the recorder
 control       the control socket          commands to the pipeline and to the recorder
 publisher     the stream's socket         what it sent to the recorder, if that is asked for
+metrics       the scrapers' socket        nothing; only if it is asked for
 doorkeeper    the list of clients         nothing; runs where there are keys (Doorkeeper)
 recorder      the files of recordings     nothing
 ============  ==========================  =========================================================
@@ -30,7 +31,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import structlog
 import zmq
@@ -53,7 +54,7 @@ from tactomo.config import DaemonConfig
 from tactomo.control import Control, RecordStart, SetBudget, SetTier
 from tactomo.doorkeeper import Doorkeeper, load_server_keys
 from tactomo.errors import CommandError, ConfigError
-from tactomo.events import Severity
+from tactomo.events import EventBook, Severity
 from tactomo.imaging import Imaging
 from tactomo.pipeline import Pipeline, Replay
 from tactomo.port import PortReader
@@ -64,6 +65,9 @@ from tactomo.recording import REPLAY_SCHEME, Origin, Recording
 from tactomo.recording_writer import message_entry
 from tactomo.status import Status
 from tactomo.supervision import Supervision, notify
+
+if TYPE_CHECKING:
+    from tactomo.metrics import MetricsServer
 
 WATCH_S: Final = 0.1
 
@@ -102,6 +106,8 @@ class Daemon:
         self.session = uuid.uuid4().hex
         self._undo = contextlib.ExitStack()
         self._stop_asked = threading.Event()
+        self._why_stopped = "asked to"
+        self._events = EventBook()
         curve = config.curve
         self._keys = None if curve is None else load_server_keys(curve.secret, curve.clients)
         description = load_description(config.description)
@@ -155,10 +161,11 @@ class Daemon:
             on_idle=self._check,
         )
         self._status = Status(
-            description, self._ports, self._pipeline, self._imaging, self._recorder
+            description, self._ports, self._pipeline, self._imaging, self._recorder, self._events
         )
 
         self._doorkeeper: Doorkeeper | None = None
+        self._metrics = None if config.metrics is None else self._make_metrics()
         self._threads: list[Publisher | Control | Pipeline | PortReader] = [
             self._publisher,
             self._control,
@@ -170,6 +177,11 @@ class Daemon:
     def stream_address(self) -> str:
         """Where the stream is bound, once started."""
         return self._publisher.address
+
+    @property
+    def metrics_address(self) -> str:
+        """Where Prometheus may scrape, once started; empty if it may not."""
+        return "" if self._metrics is None else self._metrics.address
 
     @property
     def control_address(self) -> str:
@@ -207,8 +219,10 @@ class Daemon:
         supervision = Supervision(self._turns, self._summary)
         while not self._stop_asked.wait(WATCH_S):
             if self.config.exit_at_end and self._pipeline.finished.is_set():
+                self._why_stopped = "every replayed port is at its end"
                 break
-            if not self._all_alive():  # its traceback is on standard error
+            if not self._all_alive():  # its traceback is in the log
+                self._why_stopped = "a thread died"
                 log.error("thread_died", next_step="please report the traceback above")
                 return 1
             supervision.turn()
@@ -220,7 +234,8 @@ class Daemon:
         For the main thread. Raises what `start` raises.
         """
         for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda *_: self._stop_asked.set())
+            signal.signal(number, self._on_signal)
+        threading.excepthook = _log_thread_failure
         self.start()
         # What is there now stays: never looked through again, which would take tenths of a second.
         gc.collect()
@@ -231,13 +246,26 @@ class Daemon:
         finally:
             notify("STOPPING=1", "STATUS=stopping")
             self.stop()
-            log.info("stopped")
+            log.info("stopped", why=self._why_stopped, **self._last_words())
 
     def status(self) -> dict[str, Any]:
         """Return the fields of a `status` message as of now, envelope included."""
         envelope = self._publisher.envelope(STATUS)
         topic = {"schema": SCHEMA, "sensor": self.config.name, "kind": STATUS}
         return {**topic, **envelope, **self._status_fields()}
+
+    def _on_signal(self, number: int, _: object) -> None:
+        self._why_stopped = signal.Signals(number).name
+        self._stop_asked.set()
+
+    def _last_words(self) -> dict[str, Any]:
+        """What one would want to know afterwards of a daemon that is no more."""
+        status = self._status_fields()
+        troubles = status["events"]["troubles"]
+        said = {key: round(status[key]) for key in ("uptime_s", "frames", "dropped_scans")}
+        if not troubles:
+            return said
+        return {**said, "last_trouble": f"{troubles[0]['name']}: {troubles[0]['detail']}"}
 
     def _open(self, undo: contextlib.ExitStack) -> None:
         """Open and start each part, what is downstream first; `undo` goes the other way."""
@@ -263,13 +291,24 @@ class Daemon:
             port.open(or_wait=config.wait_for_ports)
             undo.callback(port.stop)
         self._recorder.open()
+        if self._metrics is not None and config.metrics is not None:
+            self._metrics.open(config.metrics)
+            undo.callback(self._metrics.stop)
+            self._metrics.start()
         for part in self._threads:
             part.start()
+
+    def _make_metrics(self) -> MetricsServer:
+        # Imported where it is asked for: it needs an extra.
+        from tactomo.metrics import MetricsServer
+
+        return MetricsServer(self.status, self._publisher.latency, lambda: self._imaging.stages)
 
     def _all_alive(self) -> bool:
         doorkeeper = self._doorkeeper
         has_door = doorkeeper is None or doorkeeper.is_alive
-        return has_door and all(part.is_alive for part in self._threads)
+        has_metrics = self._metrics is None or self._metrics.is_alive
+        return has_door and has_metrics and all(part.is_alive for part in self._threads)
 
     def _check(self) -> None:
         """Look after what has no thread of its own; called by the control thread."""
@@ -316,10 +355,19 @@ class Daemon:
             active.add(message_entry(kind, data, time.monotonic_ns(), time.time_ns()))
 
     def _on_event(self, name: str, severity: Severity, detail: str, next_step: str = "") -> None:
-        extra = {"next_step": next_step} if next_step else {}
-        getattr(log, severity)(name, detail=detail, **extra)
+        spared = self._events.note(name, severity, detail, next_step)
+        if spared is not None:
+            extra: dict[str, Any] = {"next_step": next_step} if next_step else {}
+            if spared:
+                extra["not_logged"] = spared  # of this name since the last line
+            getattr(log, severity)(name, detail=detail, **extra)
         fields = {"name": name, "severity": severity, "detail": detail, "next_step": next_step}
         self._publisher.publish(EVENT, fields)
+
+
+def _log_thread_failure(failure: threading.ExceptHookArgs) -> None:
+    thread = failure.thread.name if failure.thread else "unknown"
+    log.error("thread_failed", thread=thread, exc_info=failure.exc_value)
 
 
 def read_replay(urls: Sequence[str], description: SensorDescription) -> Replay | None:

@@ -54,6 +54,21 @@ def is_local(endpoint: str) -> bool:
         return host == "localhost"
 
 
+def check_metrics_address(address: str) -> str:
+    """Return ``HOST:PORT`` of this computer; raise ValueError, saying what to use, otherwise."""
+    endpoint = f"tcp://{address}"
+    try:
+        check_endpoint(endpoint)
+    except ValueError:
+        raise ValueError("use 127.0.0.1:PORT, with port 0 for any free one") from None
+    if not is_local(endpoint):
+        raise ValueError(
+            f"{urlsplit(endpoint).hostname} can be reached from other computers, and nothing "
+            "guards the metrics; use 127.0.0.1:PORT and have an agent there pass them on"
+        )
+    return address
+
+
 def bind(
     socket: zmq.Socket[bytes],
     endpoint: str,

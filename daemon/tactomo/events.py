@@ -1,13 +1,23 @@
-"""Events: what happened, told at the same time to the log and to whoever subscribes."""
+"""Events: what happened, told at the same time to the log and to whoever subscribes.
+
+Who comes late finds in `status` how often each one happened, and the last troubles (`EventBook`).
+The log is told less often than the stream: a bad cable must not fill a robot's disk in a year.
+"""
 
 from __future__ import annotations
 
+import threading
 import time
-from typing import Final, Literal, Protocol
+from collections import Counter
+from typing import Any, Final, Literal, NamedTuple, Protocol
 
 Severity = Literal["info", "warning", "error"]
 
 EVENT_PERIOD_S: Final = 1.0
+LOGGED_AT_ONCE: Final = 5
+"""Lines of one event that the log takes in a row; then one in `LOG_PERIOD_S`."""
+LOG_PERIOD_S: Final = 300.0
+TROUBLES_KEPT: Final = 8
 
 
 class OnEvent(Protocol):
@@ -32,3 +42,86 @@ class RateLimit:
             return False
         self._passed_s = now_s
         return True
+
+
+class _Happened(NamedTuple):
+    severity: Severity
+    detail: str
+    next_step: str
+    realtime_ns: int
+    monotonic_s: float
+
+
+class EventBook:
+    """Counts events by name, keeps the last troubles, and says what the log is to be told.
+
+    For any thread. What it holds is bounded by the number of names.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._counts: Counter[str] = Counter()
+        self._troubles: dict[str, _Happened] = {}  # the last of each name, the newest at the end
+        self._allowance: dict[str, _Allowance] = {}
+
+    def note(self, name: str, severity: Severity, detail: str, next_step: str) -> int | None:
+        """Take note of an event.
+
+        Returns:
+            None where the log is to be spared this one; else how many it was spared before.
+
+        """
+        now_s = time.monotonic()
+        with self._lock:
+            self._counts[name] += 1
+            if severity != "info":
+                self._troubles.pop(name, None)
+                happened = _Happened(severity, detail, next_step, time.time_ns(), now_s)
+                self._troubles[name] = happened
+            return self._allowance.setdefault(name, _Allowance(now_s)).take(now_s)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How often each event happened, by name."""
+        with self._lock:
+            return dict(self._counts)
+
+    def fields(self) -> dict[str, Any]:
+        """Return what `status` says of events."""
+        now_s = time.monotonic()
+        with self._lock:
+            troubles = list(self._troubles.items())[-TROUBLES_KEPT:]
+            counts = dict(self._counts)
+        return {
+            "counts": counts,
+            "troubles": [
+                {
+                    "name": name,
+                    "severity": happened.severity,
+                    "detail": happened.detail,
+                    "next_step": happened.next_step,
+                    "realtime_ns": happened.realtime_ns,
+                    "age_s": now_s - happened.monotonic_s,
+                }
+                for name, happened in reversed(troubles)
+            ],
+        }
+
+
+class _Allowance:
+    """A few log lines of one event at once, then one a period."""
+
+    def __init__(self, now_s: float) -> None:
+        self._lines = float(LOGGED_AT_ONCE)
+        self._at_s = now_s
+        self._spared = 0
+
+    def take(self, now_s: float) -> int | None:
+        grown = self._lines + (now_s - self._at_s) / LOG_PERIOD_S
+        self._lines, self._at_s = min(grown, float(LOGGED_AT_ONCE)), now_s
+        if self._lines < 1:
+            self._spared += 1
+            return None
+        self._lines -= 1
+        spared, self._spared = self._spared, 0
+        return spared

@@ -1,19 +1,36 @@
-"""Structured logs: readable lines on a terminal, one JSON object a line for a journal.
+"""Structured logs: readable lines on a terminal, journald's own kind under systemd, JSON elsewhere.
 
 Every log line is an event name and key-value pairs. Everything goes to standard error, so that a
 program's own output stays clean.
+
+journald takes a line's priority from `<N>` in front of it (sd-daemon(3)), so that
+`journalctl -p err` shows what is wrong, and has times of its own. One event is one line there; of a
+traceback, each line has the priority.
 """
 
 from __future__ import annotations
 
 import logging
+import os
 import sys
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, Final, Literal
 
 import structlog
 
 LogLevel = Literal["debug", "info", "warning", "error"]
-LogFormat = Literal["auto", "text", "json"]
+LogFormat = Literal["auto", "text", "json", "journal"]
+
+PRIORITIES: Final[Mapping[str, int]] = {
+    "critical": 2,
+    "error": 3,
+    "warning": 4,
+    "info": 6,
+    "debug": 7,
+}
+"""Syslog's numbers."""
+
+_logfmt = structlog.processors.LogfmtRenderer()
 
 
 def configure_logging(level: LogLevel = "info", form: LogFormat = "auto") -> None:
@@ -21,13 +38,39 @@ def configure_logging(level: LogLevel = "info", form: LogFormat = "auto") -> Non
 
     Args:
         level: the least severe level shown.
-        form: ``text`` for people, ``json`` for journald and collectors; ``auto`` takes ``text``
-            where standard error is a terminal and ``json`` elsewhere.
+        form: ``text`` for people, ``journal`` for journald, ``json`` for collectors; ``auto`` takes
+            ``journal`` where standard error is journald's, ``text`` where it is a terminal, and
+            ``json`` elsewhere.
 
     """
-    as_text = form == "text" or (form == "auto" and sys.stderr.isatty())
-    render: list[structlog.typing.Processor] = (
-        [
+    structlog.configure(
+        processors=[structlog.processors.add_log_level, *_renderers(form)],
+        wrapper_class=structlog.make_filtering_bound_logger(logging.getLevelName(level.upper())),
+        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+        cache_logger_on_first_use=False,
+    )
+
+
+def is_journal() -> bool:
+    """Whether standard error goes to journald: systemd names the device and inode of its pipe."""
+    try:
+        status = os.fstat(2)
+    except OSError:
+        return False
+    return os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
+
+
+def with_priority(text: str, level: str) -> str:
+    """Return text with journald's mark of this level in front of each line."""
+    mark = f"<{PRIORITIES[level]}>"
+    return "\n".join(mark + line for line in text.splitlines())
+
+
+def _renderers(form: LogFormat) -> list[structlog.typing.Processor]:
+    if form == "journal" or (form == "auto" and is_journal()):
+        return [structlog.processors.format_exc_info, _journal_line]
+    if form == "text" or (form == "auto" and sys.stderr.isatty()):
+        return [
             structlog.processors.TimeStamper(fmt="%H:%M:%S", utc=False),
             structlog.dev.ConsoleRenderer(
                 colors=sys.stderr.isatty(),
@@ -36,16 +79,22 @@ def configure_logging(level: LogLevel = "info", form: LogFormat = "auto") -> Non
                 exception_formatter=structlog.dev.plain_traceback,
             ),
         ]
-        if as_text
-        else [
-            structlog.processors.TimeStamper(fmt="iso", utc=True),
-            structlog.processors.format_exc_info,
-            structlog.processors.JSONRenderer(),
-        ]
-    )
-    structlog.configure(
-        processors=[structlog.processors.add_log_level, *render],
-        wrapper_class=structlog.make_filtering_bound_logger(logging.getLevelName(level.upper())),
-        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
-        cache_logger_on_first_use=False,
-    )
+    return [
+        structlog.processors.TimeStamper(fmt="iso", utc=True),
+        structlog.processors.format_exc_info,
+        structlog.processors.JSONRenderer(),
+    ]
+
+
+def _journal_line(logger: Any, method: str, event: structlog.typing.EventDict) -> str:
+    """Return the event's name and its pairs as ``name key="value"``, then its traceback."""
+    level = event.pop("level")
+    traceback = event.pop("exception", "")
+    name = str(event.pop("event"))
+    pairs = {key: _one_line(value) for key, value in event.items()}
+    line = f"{name} {_logfmt(logger, method, pairs)}".rstrip()
+    return with_priority(f"{line}\n{traceback}" if traceback else line, level)
+
+
+def _one_line(value: Any) -> Any:
+    return value if isinstance(value, bool | int | float) else " ".join(str(value).split())

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import threading
 import time
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any, Final
 
 from tactomo_models import SensorDescription
 from tactomo_protocol import Channel
 
+from tactomo.events import EventBook
 from tactomo.frames import description_fields, port_fields
 from tactomo.imaging import Imaging
 from tactomo.pipeline import Pipeline
@@ -31,12 +35,14 @@ class Status:
         pipeline: Pipeline,
         imaging: Imaging,
         recorder: Recorder,
+        events: EventBook,
     ) -> None:
         self._description = description_fields(description)
         self._ports = ports
         self._pipeline = pipeline
         self._imaging = imaging
         self._recorder = recorder
+        self._events = events
         self._started_s = time.monotonic()
 
     def fields(self, latency: Durations, subscribers: int) -> dict[str, Any]:
@@ -53,6 +59,8 @@ class Status:
             "source": {"kind": source(self._ports)},
             "ports": [port_fields(port) for port in self._ports],
             "rates": self._rates(),
+            "scans": {c.name.lower(): rate.count for c, rate in pipeline.scan_rates.items()},
+            "frames": imaging.frame_rate.count,
             "dropped_scans": pipeline.dropped + pipeline.overflowed,
             "incomplete_scans": pipeline.incomplete,
             "late_scans": pipeline.late,
@@ -74,6 +82,8 @@ class Status:
             },
             "recorder": self._recorder_fields(),
             "subscribers": subscribers,
+            "events": self._events.fields(),
+            "process": process_fields(),
         }
 
     def state(self) -> str:
@@ -120,6 +130,24 @@ class Status:
             },
             "frames_hz": self._imaging.frame_rate.per_second(),
         }
+
+
+def process_fields() -> dict[str, Any]:
+    """Return what this process takes of the computer; its memory is None where nobody says."""
+    return {
+        "pid": os.getpid(),
+        "cpu_s": time.process_time(),
+        "memory_bytes": _resident_bytes(),
+        "threads": threading.active_count(),
+    }
+
+
+def _resident_bytes() -> int | None:
+    try:
+        pages = int(Path("/proc/self/statm").read_text("ascii").split()[1])
+    except (OSError, IndexError, ValueError):
+        return None
+    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def source(ports: list[PortReader]) -> str:

@@ -16,20 +16,28 @@ RATE_WINDOW_NS: Final = 3_000_000_000
 
 
 class Durations:
-    """The last 256 durations of one thing."""
+    """The last 256 durations of one thing.
+
+    Attributes:
+        count: how many there were in all.
+        total_s: and how long they took together.
+
+    """
 
     def __init__(self) -> None:
+        self.count = 0
+        self.total_s = 0.0
         self._seconds = np.full(RING, np.nan)
-        self._count = 0
 
     def add(self, seconds: float) -> None:
         """Take note of one."""
-        self._seconds[self._count % RING] = seconds
-        self._count += 1
+        self._seconds[self.count % RING] = seconds
+        self.total_s += seconds
+        self.count += 1
 
     def percentiles_ms(self) -> dict[str, float] | None:
         """Return p50 and p99 in milliseconds; None before the first one."""
-        known = self._seconds[: min(self._count, RING)]
+        known = self._seconds[: min(self.count, RING)]
         if not known.size:
             return None
         p50, p99 = np.percentile(known, (50, 99)) * 1e3
@@ -37,16 +45,21 @@ class Durations:
 
 
 class Rate:
-    """How often something comes, over the last seconds."""
+    """How often something comes, over the last seconds.
+
+    Attributes:
+        count: how often it came in all.
+
+    """
 
     def __init__(self) -> None:
+        self.count = 0
         self._times_ns = np.zeros(RING, dtype=np.int64)
-        self._count = 0
 
     def add(self, monotonic_ns: int) -> None:
         """Take note of one that came at that time."""
-        self._times_ns[self._count % RING] = monotonic_ns
-        self._count += 1
+        self._times_ns[self.count % RING] = monotonic_ns
+        self.count += 1
 
     def per_second(self) -> float:
         """Return the rate in Hz; 0 when nothing came for a while."""

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tactomo.cli.complaints import FLAG_ADVICE
+from tactomo_models import Flag
 
 Run = Callable[..., Any]
 
@@ -61,6 +63,34 @@ def test_status_shows_what_matters(tactomo: Run, control: Any) -> None:
         "12 ms: fit, 4.50 modelled ms; calibration: measured here",
     ):
         assert words in result.stdout
+
+
+def test_status_begins_with_what_is_wrong_and_what_to_do(tactomo: Run, control: Any) -> None:
+    closed = {"url": "/dev/ttyACM1", "connected": False, "state": "closed", "problem": "no device"}
+    trouble = {"name": "port_lost", "severity": "error", "detail": "gone", "age_s": 240.0}
+    control.answers["status"] = {
+        **STATUS,
+        **{"state": "stale", "ports": [STATUS["ports"][0], closed], "frames": 99},  # type: ignore[index]
+        "events": {"counts": {"port_lost": 2, "tared": 1}, "troubles": [trouble]},
+        "process": {"pid": 7, "cpu_s": 1.2, "memory_bytes": 90_000_000, "threads": 6},
+    }
+    result = tactomo("status", "--control", control.address)
+    lines = [line.strip() for line in result.stdout.splitlines()]
+    assert lines[:6] == [
+        "scans have stopped coming",
+        "check the ports below",
+        "/dev/ttyACM1 is closed: no device",
+        "plug it in, or check the cable; it is tried again until it is there",
+        "/dev/ttyACM0: 3 of 102 packets came damaged",
+        "check the cable, its shield and the baud rate",
+    ]
+    assert "port_lost, 4 min ago: gone" in result.stdout
+    assert "port_lost 2, tared 1" in result.stdout
+    assert "pid 7, 10.0 % of a core on average, 90 MB, 6 threads" in result.stdout
+
+
+def test_every_flag_has_its_advice() -> None:
+    assert set(FLAG_ADVICE) == {flag.name.lower() for flag in Flag if flag.name}
 
 
 def test_status_of_a_daemon_that_has_no_data_yet(tactomo: Run, control: Any) -> None:

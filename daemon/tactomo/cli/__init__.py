@@ -7,6 +7,7 @@ Everything heavy is imported inside the commands that need it, so that `tactomo 
 from __future__ import annotations
 
 import sys
+import traceback
 
 from tactomo.cli import (
     bench,
@@ -66,7 +67,13 @@ def main() -> None:
         app(prog_name="tactomo")
     except Exception as error:
         told = explain(error)
-        if told is None:  # a mistake of ours: the traceback belongs in a bug report
-            raise
-        print(f"tactomo: {told}", file=sys.stderr)
+        _tell(error if told is None else f"tactomo: {told}")
         sys.exit(1)
+
+
+def _tell(what: Exception | str) -> None:
+    """Print an error, or the traceback of a mistake of ours; as an error, where journald reads."""
+    from tactomo.log import is_journal, with_priority
+
+    text = what if isinstance(what, str) else "".join(traceback.format_exception(what)).rstrip()
+    print(with_priority(text, "error") if is_journal() else text, file=sys.stderr)

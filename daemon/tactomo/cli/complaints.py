@@ -58,6 +58,7 @@ FLAG_ADVICE: Mapping[str, tuple[str, str]] = {
     ),
 }
 STATES: Mapping[str, tuple[str, str]] = {
+    "waiting_for_port": ("a port is not there yet", "check the ports below"),
     "waiting_for_data": ("no scan has come yet", "check the ports below"),
     "stale": ("scans have stopped coming", "check the ports below"),
 }
@@ -78,6 +79,7 @@ def complaints(status: Mapping[str, Any]) -> list[Complaint]:
         *(each for port in status.get("ports") or [] for each in _of_port(port)),
         *_of_flags(status),
         *_of_losses(status),
+        *_of_recorder(status.get("recorder") or {}),
     ]
     return sorted(found, key=lambda complaint: complaint.severity != "error")
 
@@ -88,17 +90,20 @@ def _of_state(status: Mapping[str, Any]) -> Iterator[Complaint]:
         yield Complaint("error", *known)
 
 
+PORT_STATES: Mapping[str, str] = {
+    "closed": "plug it in, or check the cable; it is tried again until it is there",
+    "refused": "give the daemon the sensor's own device and description",
+    "garbage": "check the baud rate, and that the firmware speaks the protocol",
+    "silent": "check that the device has power and that this is its port",
+    "idle": "is the device waiting for a trigger, or was it reset?",
+}
+
+
 def _of_port(port: Mapping[str, Any]) -> Iterator[Complaint]:
     url = port.get("url")
-    if not port.get("connected"):
-        step = "plug it in, or check the cable; it is tried again until it is there"
-        yield Complaint("error", f"{url} is not open", step)
-    if port.get("refusal"):
-        step = "give the daemon the description of the sensor that is connected"
-        yield Complaint("error", f"{url}: its device is refused: {port['refusal']}", step)
-    if port.get("connected") and not port.get("device"):
-        step = "is it the right port and baud rate? does the firmware speak the protocol?"
-        yield Complaint("error", f"{url}: its device has not said hello", step)
+    step = PORT_STATES.get(str(port.get("state")))
+    if step is not None:
+        yield Complaint("error", f"{url} is {port['state']}: {port.get('problem') or '-'}", step)
     packets, corrupt = port.get("packets") or 0, port.get("corrupt") or 0
     if corrupt > CORRUPT_NOTED * (packets + corrupt):
         share = f"{corrupt} of {packets + corrupt} packets came damaged"
@@ -128,3 +133,9 @@ def _of_losses(status: Mapping[str, Any]) -> Iterator[Complaint]:
     if expected and incomplete > DROPPED_NOTED * expected:
         step = "check the cable of the channel that is missing; if it comes late, sync_wait_ms"
         yield Complaint("warning", f"{incomplete} dual scans lacked a channel", step)
+
+
+def _of_recorder(recorder: Mapping[str, Any]) -> Iterator[Complaint]:
+    if recorder.get("waits_for"):
+        step = "free some space or mend the disk; recording begins again by itself"
+        yield Complaint("error", f"nothing is recorded: {recorder['waits_for']}", step)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from tactomo.recording import Recording
 
 LogLevel = Literal["debug", "info", "warning", "error"]
-LogFormat = Literal["auto", "text", "json"]
+LogFormat = Literal["auto", "text", "json", "journal"]
 
 
 @app.command(
@@ -95,6 +95,10 @@ def daemon(
     record_maps: Annotated[
         bool, typer.Option("--record-maps", help="Put maps and contacts into recordings, too.")
     ] = False,
+    metrics: Annotated[
+        str | None,
+        typer.Option(help="Address of this computer for Prometheus, such as 127.0.0.1:9460."),
+    ] = None,
     exit_at_end: Annotated[
         bool, typer.Option("--exit-at-end", help="Stop when every replayed port has ended.")
     ] = False,
@@ -103,7 +107,7 @@ def daemon(
     ] = None,
     log_format: Annotated[
         LogFormat | None,
-        typer.Option(help="[auto: text on a terminal, one JSON object a line elsewhere]"),
+        typer.Option(help="[auto: text on a terminal, journal for journald, else JSON lines]"),
     ] = None,
 ) -> None:
     """Read a skin's ports, reconstruct, and publish maps and contacts until stopped.
@@ -130,6 +134,7 @@ def daemon(
         lossless=lossless or None,
         record=record,
         record_maps=record_maps or None,
+        metrics=metrics,
         exit_at_end=exit_at_end or None,
         log_level=log_level,
         log_format=log_format,

@@ -20,6 +20,7 @@ from tactomo.cli.app import (
     app,
     examples,
 )
+from tactomo.cli.complaints import complaints
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -36,7 +37,11 @@ def status(
     keys: KeysFolder = None,
     as_json: JsonOutput = False,
 ) -> None:
-    """Show how the daemon is: ports, rates, latency, the time of each stage, what was lost."""
+    """Show how the daemon is: first what is wrong and what to do about it, then all there is.
+
+    Ports, rates, latency, the time of each stage, what was lost, what happened since the start.
+    `tactomo doctor` looks deeper.
+    """
     from tactomo_client import request
 
     answer = request("status", control, keys=keys)
@@ -44,8 +49,13 @@ def status(
         typer.echo(json.dumps(answer, indent=2, default=str))
         return
     from rich.console import Console
+    from rich.markup import escape
 
-    Console().print(status_table(answer))
+    console = Console()
+    for complaint in complaints(answer):
+        colour = "bold red" if complaint.severity == "error" else "yellow"
+        console.print(f"[{colour}]{escape(complaint.what)}[/]\n    {escape(complaint.next_step)}")
+    console.print(status_table(answer))
 
 
 @app.command(
@@ -218,6 +228,9 @@ def _status_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
         ("reference", f"{reference['scans']} dual scans" if reference else "none yet"),
         ("recording", _recording(recording, status.get("recorder") or {})),
         ("subscribers", str(status.get("subscribers", "-"))),
+        ("events", _events(status.get("events") or {})),
+        *(("  last", _trouble(each)) for each in (status.get("events") or {}).get("troubles", [])),
+        ("process", _process(status.get("process") or {}, status.get("uptime_s") or 0.0)),
     ]
     return rows
 
@@ -227,6 +240,30 @@ def _recording(recording: dict[str, Any] | None, recorder: dict[str, Any]) -> st
         return f"{recording['path']} ({recording['bytes'] / 1e6:.1f} MB)"
     waits_for = recorder.get("waits_for")
     return f"[red]waits:[/] {waits_for}" if waits_for else "off"
+
+
+def _events(events: dict[str, Any]) -> str:
+    counts = events.get("counts") or {}
+    return ", ".join(f"{name} {count}" for name, count in sorted(counts.items())) or "none"
+
+
+def _trouble(trouble: dict[str, Any]) -> str:
+    from rich.markup import escape
+
+    age_s = trouble.get("age_s") or 0.0
+    colour = "red" if trouble.get("severity") == "error" else "yellow"
+    ago = f"{age_s:.0f} s" if age_s < 120 else f"{age_s / 60:.0f} min"
+    return f"[{colour}]{trouble.get('name')}[/], {ago} ago: {escape(str(trouble.get('detail')))}"
+
+
+def _process(process: dict[str, Any], uptime_s: float) -> str:
+    memory_bytes = process.get("memory_bytes")
+    memory = "-" if memory_bytes is None else f"{memory_bytes / 1e6:.0f} MB"
+    share = 1e2 * (process.get("cpu_s") or 0.0) / max(uptime_s, 1.0)
+    return (
+        f"pid {process.get('pid', '-')}, {share:.1f} % of a core on average, "
+        f"{memory}, {process.get('threads', '-')} threads"
+    )
 
 
 def _port_line(port: dict[str, Any]) -> str:

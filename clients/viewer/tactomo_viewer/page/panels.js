@@ -3,6 +3,7 @@
 import { explainFlag } from "./health.js";
 
 const EVENTS_SHOWN = 50;
+const TROUBLE_SHOWN_S = 3600;
 const SOURCES = { twin: "simulated skin", device: "device", replay: "replay" };
 const STATES = { waiting_for_port: "no port yet", waiting_for_data: "no data yet", taring: "taring", running: "running", stale: "stale" };
 
@@ -105,7 +106,7 @@ function showStages(stages) {
   });
 }
 
-function showChannels({ ports, rates, dropped_scans: dropped, incomplete_scans: incomplete }) {
+function showChannels({ ports, rates, events, dropped_scans: dropped, incomplete_scans: incomplete }) {
   const lines = [];
   for (const name of ["magnitude", "structure"]) {
     const hz = rates?.[`${name}_hz`];
@@ -117,6 +118,12 @@ function showChannels({ ports, rates, dropped_scans: dropped, incomplete_scans: 
   }
   if (incomplete) lines.push(["warn", "incomplete dual scans", String(incomplete)]);
   if (dropped) lines.push(["warn", "dropped dual scans", String(dropped)]);
+  // What happened before this page was opened is among them.
+  for (const { name, severity, age_s: age } of events?.troubles ?? []) {
+    if (age > TROUBLE_SHOWN_S) continue;
+    const kind = severity === "error" ? "bad" : "warn";
+    lines.push([kind, name.replaceAll("_", " "), `${events.counts[name]} ×, last ${fixed(age / 60, 0)} min ago`]);
+  }
   const list = byId("channels");
   fit(list, lines.length, () => {
     const item = element("li");
