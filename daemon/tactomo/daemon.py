@@ -134,6 +134,7 @@ class Daemon:
             round(config.sync_wait_ms * 1e6),
             config.lossless,
             replay,
+            self._zero_counters,
             self._on_event,
         )
         self._ports = [
@@ -345,6 +346,10 @@ class Daemon:
     def _set_budget(self, arguments: SetBudget) -> Mapping[str, Any]:
         self._pipeline.set_budget(arguments.budget_ms)
         return {"budget_ms": arguments.budget_ms}
+
+    def _zero_counters(self) -> None:
+        for port in self._ports:
+            port.zero_counters()
 
     def _status_fields(self) -> Mapping[str, Any]:
         return self._status.fields(self._publisher.latency, self._publisher.subscribers)

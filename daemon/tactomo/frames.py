@@ -8,15 +8,21 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 from tactomo_client.messages import array_to_wire
-from tactomo_models import Contact, Reconstruction, SensorDescription
+from tactomo_models import Contact, Flag, Reconstruction, SensorDescription
 from tactomo_protocol import Channel, Hello
 
-from tactomo.port import ChannelScan, PortReader
+from tactomo.clock import DeviceClock
+from tactomo.port import PortReader
+from tactomo.recording import Timing
+from tactomo.sync import DualScan
 
 NO_FRAME_YET: Final[dict[str, Any]] = {
     "acquired_realtime_ns": None,
     "acquired_monotonic_ns": None,
+    "delay_ns": None,
+    "dated_by": None,
     "device_us": None,
+    "skew_ms": None,
     "tier": None,
     "tier_reason": None,
     "flags": [],
@@ -25,23 +31,29 @@ NO_FRAME_YET: Final[dict[str, Any]] = {
 }
 
 
-def scan_header(last: ChannelScan) -> dict[str, Any]:
+def scan_header(dual: DualScan, timing: Timing) -> dict[str, Any]:
     """Return the envelope's part that says when a dual scan was acquired."""
+    last = dual.last
     return {
         **NO_FRAME_YET,
-        "acquired_realtime_ns": last.realtime_ns,
-        "acquired_monotonic_ns": last.monotonic_ns,
-        "device_us": last.device_us,
+        "acquired_realtime_ns": last.realtime_ns - timing.delay_ns,
+        "acquired_monotonic_ns": last.monotonic_ns - timing.delay_ns,
+        "delay_ns": timing.delay_ns,
+        "dated_by": "device" if timing.is_dated else "arrival",
+        "device_us": dual.scans[0].device_us,
+        "skew_ms": None if timing.skew_ns is None else timing.skew_ns * 1e-6,
+        "flags": Flag.CHANNELS_SKEWED.names() if timing.is_skewed else [],
     }
 
 
-def frame_header(last: ChannelScan, frame: Reconstruction) -> dict[str, Any]:
+def frame_header(dual: DualScan, timing: Timing, frame: Reconstruction) -> dict[str, Any]:
     """Return the same with what the reconstruction says about itself."""
+    flags = frame.flags | (Flag.CHANNELS_SKEWED if timing.is_skewed else Flag(0))
     return {
-        **scan_header(last),
+        **scan_header(dual, timing),
         "tier": str(frame.tier),
         "tier_reason": frame.reason,
-        "flags": sorted(frame.flags.names()),
+        "flags": sorted(flags.names()),
         "misfit": _finite(frame.misfit),
         "confidence": _finite(frame.confidence),
     }
@@ -116,6 +128,7 @@ def port_fields(port: PortReader) -> dict[str, Any]:
         "unused_scans": port.unused,
         "reopened": port.reopened,
         "latency_timer_ms": port.latency_timer_ms,
+        "clock": _clock(port.clock),
     }
 
 
@@ -136,6 +149,17 @@ def magnitude_max(description: SensorDescription) -> float | None:
     if description.magnitude is None:
         return None
     return max(abs(change) for change in description.magnitude.response.relative_change)
+
+
+def _clock(clock: DeviceClock) -> dict[str, Any]:
+    line = clock.line
+    return {
+        "state": str(clock.state),
+        "offset_ns": None if line is None else line.lag_ns,
+        "rate_ppm": None if line is None else line.rate * 1e6,
+        "delay_ms": clock.delays.percentiles_ms(),
+        "jumps": clock.jumps,
+    }
 
 
 def _contact(contact: Contact) -> dict[str, Any]:

@@ -32,7 +32,7 @@ from tactomo.events import OnEvent, RateLimit
 from tactomo.frames import contacts_fields, frame_header, map_fields, scan_fields, scan_header
 from tactomo.publisher import Publisher
 from tactomo.recorder import ActiveRecording, Recorder
-from tactomo.recording import Mark, ScanKey
+from tactomo.recording import Mark, ScanKey, Timing
 from tactomo.recording_writer import mark_entry, reference_entry
 from tactomo.sync import DualScan
 from tactomo.tare import Tare
@@ -66,7 +66,7 @@ class Imaging:
         reference_realtime_ns: when it was taken.
         stages: how long each stage takes.
         frame_rate: how often a frame is published.
-        last_monotonic_ns: arrival of the newest dual scan; 0 before the first.
+        acquired_monotonic_ns: when the newest dual scan was acquired; 0 before the first.
 
     """
 
@@ -86,7 +86,7 @@ class Imaging:
         self.reference_realtime_ns = 0
         self.stages: dict[str, Durations] = {}
         self.frame_rate = Rate()
-        self.last_monotonic_ns = 0
+        self.acquired_monotonic_ns = 0
         self._description = description
         self._channels = tuple(c for c in Channel if c.name.lower() in description.modalities)
         self._reconstructor = reconstructor
@@ -167,22 +167,22 @@ class Imaging:
                 ),
             )
 
-    def process(self, dual: DualScan, lost: set[Channel]) -> None:
+    def process(self, dual: DualScan, timing: Timing, lost: set[Channel]) -> None:
         """Turn one dual scan into a frame; `lost` are the channels that are not to be expected."""
         mark = dual.mark
         if mark is not None:
             self._obey(mark)
         self._follow_recording(dual)
         volts = {scan.channel: scan.volts for scan in dual.scans}
-        self._publish_scan(dual, volts)
+        self._publish_scan(dual, timing, volts)
         frame = self._reconstruct(volts, _saturated(dual))
         if frame is not None:
-            self._publish_frame(dual, frame)
+            self._publish_frame(dual, timing, frame)
         if self._marked is not None and dual.recording == self._marked.number:
             keys = tuple(ScanKey(s.channel, s.counter, s.device_us) for s in dual.scans)
             tier, budget_ms = self.given
             number = self._marked.references or None
-            done = Mark(keys, str(tier), budget_ms, reference_number=number)
+            done = Mark(keys, str(tier), budget_ms, timing=timing, reference_number=number)
             self._marked.add(mark_entry(done, time.monotonic_ns(), time.time_ns()))
         self._go_on_taring(volts, lost)
 
@@ -247,15 +247,15 @@ class Imaging:
             self._time(stage, seconds)
         return frame
 
-    def _publish_scan(self, dual: DualScan, volts: Volts) -> None:
-        header = scan_header(dual.last)
-        self.last_monotonic_ns = dual.last.monotonic_ns
+    def _publish_scan(self, dual: DualScan, timing: Timing, volts: Volts) -> None:
+        header = scan_header(dual, timing)
+        self.acquired_monotonic_ns = header["acquired_monotonic_ns"]
         if self._publisher.wants(SCAN):
             self._publisher.publish(SCAN, scan_fields(dual.counter, volts), header)
 
-    def _publish_frame(self, dual: DualScan, frame: Reconstruction) -> None:
+    def _publish_frame(self, dual: DualScan, timing: Timing, frame: Reconstruction) -> None:
         started_s = time.perf_counter()
-        header = frame_header(dual.last, frame)
+        header = frame_header(dual, timing, frame)
         self._publisher.header = header
         self._publisher.publish(CONTACTS, contacts_fields(dual.counter, frame), header)
         active = self._recorder.active

@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from tactomo_models import Reference, Tier
 from tactomo_protocol import Channel
@@ -27,11 +27,15 @@ from tactomo.events import OnEvent, RateLimit
 from tactomo.imaging import Imaging
 from tactomo.port import Delivery
 from tactomo.recording import Mark
+from tactomo.skew import Skew
 from tactomo.sync import DualScan, Joiner, MarkedSync, Sync
 from tactomo.timing import Rate
+from tactomo.wall_clock import WallClock
 
 IDLE_S: Final = 0.1
 QUEUED_DELIVERIES: Final = 256
+ZERO_PERIOD_S: Final = 10.0
+"""How often devices are asked to zero their counters, while that does not bring them in step."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +50,15 @@ class Replay:
     """Whether bytes come in their own time rather than as fast as they are taken."""
 
 
+class _SyncState(NamedTuple):
+    """What events are told about when it changes."""
+
+    lost: frozenset[Channel]
+    resets: int
+    zeroed: int
+    is_skewed: bool
+
+
 class Pipeline:
     """`start` it, `deliver` to it, `stop` it.
 
@@ -56,9 +69,13 @@ class Pipeline:
         sync_wait_ns: how long a scan waits for its partner.
         lossless: reconstruct every dual scan, however late.
         replay: what the recording says, where the ports replay one.
+        zero_counters: asks every device to count from 0 again.
         on_event: told what happens to scans and channels.
 
     Attributes:
+        sync: pairs the scans; it counts those that it drops.
+        skew: how far apart the channels are.
+        wall_clock: whether it was set.
         dropped: dual scans left out because newer ones had come.
         overflowed: deliveries lost because this thread did not come round to them for seconds;
             written by the port threads under a lock.
@@ -77,6 +94,7 @@ class Pipeline:
         sync_wait_ns: int,
         lossless: bool,
         replay: Replay | None,
+        zero_counters: Callable[[], None],
         on_event: OnEvent,
     ) -> None:
         self.dropped = 0
@@ -92,12 +110,18 @@ class Pipeline:
         self._is_exact = replay is not None and bool(replay.marks)
         is_unpaced = replay is not None and not replay.is_paced
         self._is_lossless = lossless or self._is_exact or is_unpaced
-        self._sync: Joiner = (
+        self.sync: Joiner = (
             MarkedSync(replay.marks)
             if replay is not None and replay.marks
             else Sync(channels, sync_wait_ns)
         )
+        self.skew = Skew()
+        self.wall_clock = WallClock(on_event)
+        self._zero_counters = zero_counters
+        self._zero_limit = RateLimit(ZERO_PERIOD_S)
         self._on_event = on_event
+        self._received = [0] * ports  # scans, each counted by its port's thread
+        self._used = self._left_out = self._discarded = 0  # scans, too
         self._drop_limit = RateLimit()
         self._dropped_told = 0
         self._is_excused = False  # the dual scans to be dropped next are not worth a warning
@@ -126,13 +150,21 @@ class Pipeline:
         """Whether the thread runs."""
         return self._thread.is_alive()
 
-    @property
-    def late(self) -> int:
-        """Scans dropped because their dual scan had gone on without them."""
-        return self._sync.late
+    def tally(self) -> dict[str, int]:
+        """Return what became of every scan that was delivered; for any thread."""
+        sync = self.sync
+        outcome = {
+            "used": self._used,
+            "late": sync.late,
+            "repeated": sync.repeated,
+            "dropped": self._left_out + self._discarded + sync.unmarked,
+        }
+        received = sum(self._received)
+        return {"received": received, **outcome, "waiting": received - sum(outcome.values())}
 
     def deliver(self, delivery: Delivery) -> None:
         """Take what a port read; called by port threads. Waits only if nothing may be lost."""
+        self._received[delivery.port] += len(delivery.scans)
         while not self._stopping.is_set():
             try:
                 self._deliveries.put(delivery, timeout=IDLE_S if self._is_lossless else 0)
@@ -170,15 +202,16 @@ class Pipeline:
         self._begin()
         while not self._stopping.is_set():
             self.turns += 1
-            lost, resets = set(self._sync.lost), self._sync.resets
+            self.wall_clock.check()
+            before = self._sync_state()
             ready = self._gather()
-            self._tell_changes(lost, resets)
+            self._tell_changes(before)
             for dual in ready if self._is_lossless else self._newest(ready):
                 if self._stopping.is_set():
                     break
                 self.turns += 1
                 reference = self._imaging.reference
-                self._imaging.process(dual, self._sync.lost)
+                self._process(dual)
                 if self._imaging.reference is not reference:
                     self._is_excused = True
             while not self._commands.empty():
@@ -186,6 +219,13 @@ class Pipeline:
             self._imaging.check_tare()
             if len(self._ended) == self._ports:
                 self.finished.set()
+
+    def _process(self, dual: DualScan) -> None:
+        recorded = dual.mark.timing if dual.mark is not None else None
+        timing = recorded or self.skew.timing(dual)
+        self.skew.note(timing)
+        self._imaging.process(dual, timing, self.sync.lost)
+        self._used += len(dual.scans)
 
     def _begin(self) -> None:
         reference = self._replay.reference if self._replay else None
@@ -208,12 +248,12 @@ class Pipeline:
         except queue.Empty:
             pass
         if self._replay is None:
-            ready += self._sync.advance(time.monotonic_ns())
+            ready += self.sync.advance(time.monotonic_ns())
         self.incomplete += sum(len(dual.scans) < len(self._channels) for dual in ready)
         return ready
 
     def _wait_s(self) -> float:
-        deadline_ns = self._sync.deadline_ns
+        deadline_ns = self.sync.deadline_ns
         if deadline_ns is None or self._replay is not None:
             return IDLE_S
         return min(IDLE_S, max(0.0, (deadline_ns - time.monotonic_ns()) * 1e-9))
@@ -223,7 +263,8 @@ class Pipeline:
         self._note_channels(delivery)
         for scan in delivery.scans:
             self.scan_rates[scan.channel].add(scan.monotonic_ns)
-            ready += self._sync.push(scan)
+            self.skew.take(scan)
+            ready += self.sync.push(scan)
         if self._replay is not None:
             ready += self._follow_clock(delivery, self._replay.is_paced)
         return ready
@@ -235,7 +276,7 @@ class Pipeline:
         self._announced[delivery.port] = delivery.channels
         if len(self._announced) == self._ports:
             announced = {c for channels in self._announced.values() for c in channels}
-            self._sync.lost.update(set(self._channels) - announced)
+            self.sync.lost.update(set(self._channels) - announced)
 
     def _follow_clock(self, delivery: Delivery, is_paced: bool) -> list[DualScan]:
         """Let waits end by the recording's clock."""
@@ -245,17 +286,18 @@ class Pipeline:
         else:
             self._clocks[delivery.port] = delivery.clock_ns
         if len(self._ended) == self._ports:
-            return self._sync.finish()
+            return self.sync.finish()
         # Ports that are read as fast as they are taken run ahead of one another: only what the
         # slowest one has passed is over. A port not heard yet is the slowest.
         if is_paced:
-            return self._sync.advance(max(self._clocks.values(), default=0))
+            return self.sync.advance(max(self._clocks.values(), default=0))
         if len(self._clocks) + len(self._ended) < self._ports:
             return []
-        return self._sync.advance(min(self._clocks.values()))
+        return self.sync.advance(min(self._clocks.values()))
 
     def _newest(self, ready: list[DualScan]) -> list[DualScan]:
         self.dropped += max(0, len(ready) - 1)
+        self._left_out += sum(len(dual.scans) for dual in ready[:-1])
         if ready and self._is_excused:  # a new reference takes a while to prepare for
             self._is_excused, self._dropped_told = False, self.dropped
         if self.dropped > self._dropped_told and self._drop_limit.allows():
@@ -269,34 +311,65 @@ class Pipeline:
             self._dropped_told = self.dropped
         return ready[-1:]
 
-    def _tell_changes(self, lost: set[Channel], resets: int) -> None:
-        for channel in sorted(self._sync.lost - lost):
-            name = channel.name.lower()
+    def _sync_state(self) -> _SyncState:
+        sync = self.sync
+        return _SyncState(frozenset(sync.lost), sync.resets, sync.zeroed, self.skew.is_skewed)
+
+    def _tell_changes(self, before: _SyncState) -> None:
+        now = self._sync_state()
+        self._tell_lost(before.lost, now.lost)
+        if now.resets > before.resets:
+            self._on_event(
+                "device_restarted",
+                "warning",
+                "a device was reset: its scan counter and its clock went back",
+                "check its supply; tare again if it lost its settings",
+            )
+        if now.zeroed > before.zeroed:
+            self._on_event("counters_zeroed", "info", "the scan counter went back, the clock on")
+        if now.is_skewed:
+            self._bring_in_step(is_news=not before.is_skewed)
+        elif before.is_skewed:
+            self._on_event("channels_in_step", "info", "the same counter is the same instant again")
+
+    def _tell_lost(self, before: frozenset[Channel], now: frozenset[Channel]) -> None:
+        for channel in sorted(now - before):
             self._on_event(
                 "channel_lost",
                 "warning",
-                f"no {name} scans in time; maps go on without them",
+                f"no {channel.name.lower()} scans in time; maps go on without them",
                 "check that channel's cable; if its scans come late, raise sync_wait_ms",
             )
-        for channel in sorted(lost - self._sync.lost):
+        for channel in sorted(before - now):
             self._on_event(
                 "channel_back",
                 "info",
                 f"{channel.name.lower()} scans come again",
                 "" if self._imaging.has_reference(channel) else "tare: it has no reference yet",
             )
-        if self._sync.resets > resets:
+
+    def _bring_in_step(self, is_news: bool) -> None:
+        """Have two boards count from 0 again; nothing helps a board that does so by itself."""
+        are_two = self._ports > 1 and self._replay is None
+        if is_news:
             self._on_event(
-                "device_restarted",
+                "channels_skewed",
                 "warning",
-                "the scan counter went back",
-                "tare again if the device lost its settings",
+                f"the channels' counters are {abs(self.skew.out_of_step_ns) * 1e-6:.0f} ms apart: "
+                "the same counter is not the same instant",
+                "the boards are asked to zero their counters; should it come again, check the "
+                "sync line between them"
+                if are_two
+                else "correct the firmware: both scans of one counter belong to one instant",
             )
+        if are_two and self._zero_limit.allows():
+            self._zero_counters()
 
     def _discard_oldest(self) -> None:
         with self._overflow_lock, contextlib.suppress(queue.Empty):
-            self._deliveries.get_nowait()
+            oldest = self._deliveries.get_nowait()
             self.overflowed += 1
+            self._discarded += 0 if oldest is None else len(oldest.scans)
 
     def _ask(self, command: Callable[[], None]) -> None:
         self._commands.put(command)

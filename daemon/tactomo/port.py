@@ -38,6 +38,7 @@ from tactomo_protocol import (
 )
 
 from tactomo.adapters import ROOT
+from tactomo.clock import MAX_RATE, ClockState, DeviceClock
 from tactomo.connection import Connection
 from tactomo.events import OnEvent, RateLimit
 from tactomo.liveness import PATIENCE_S, DeviceState, Liveness
@@ -52,6 +53,7 @@ ASK_AGAIN_S: Final = 1.5
 """How long a device may say no hello, or send no scan, before it is asked again."""
 TROUBLE_PERIOD_S: Final = 30.0
 """How often at most a device is said to be in trouble: some come and go for hours."""
+_INTRODUCTION: Final = (CommandCode.IDENTIFY, CommandCode.START)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,6 +72,15 @@ class ChannelScan:
     """The same on the clock that synchronisation goes by: in a replay, the recording's."""
     recording: int
     """Number of the recording that has the scan's bytes; 0 for none."""
+    port: int = 0
+    """Index of the port that it came by."""
+    delay_ns: int | None = None
+    """How long it was held up on its way; None while the device's clock cannot tell."""
+
+    @property
+    def acquired_ns(self) -> int:
+        """When it would have come without delay, or came if that is unknown, as `clock_ns`."""
+        return self.clock_ns - (self.delay_ns or 0)
 
 
 class Delivery(NamedTuple):
@@ -106,6 +117,7 @@ class PortReader:
         hello: the newest one; None before the first.
         refusal: why this device's scans are not used; empty when they are.
         reopened: how often the port was opened again because the device did not speak.
+        clock: the device's, by which its scans are dated.
         has_ended: whether the replay behind the port is at its end.
         turns: of the loop, device or no device; the watchdog goes by them.
 
@@ -130,6 +142,7 @@ class PortReader:
         self.hello: Hello | None = None
         self.refusal = ""
         self.reopened = 0
+        self.clock = DeviceClock()
         self.has_ended = False
         self.turns = 0
         self._baud = baud
@@ -151,6 +164,9 @@ class PortReader:
         self._corrupt_limit = RateLimit()
         self._trouble_told: DeviceState | None = None
         self._trouble_limit = RateLimit(TROUBLE_PERIOD_S)
+        self._clock_told = (self.clock.state, 0)
+        self._clock_limit = RateLimit()
+        self._is_zeroing = threading.Event()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"port-{index}")
 
@@ -214,6 +230,10 @@ class PortReader:
         """Whether the thread runs, or has come to the end that a replay has."""
         return self._thread.is_alive() or self.has_ended
 
+    def zero_counters(self) -> None:
+        """Ask the device to count from 0 again and to scan; for any thread."""
+        self._is_zeroing.set()
+
     def _run(self) -> None:
         if self._connection.is_open:
             self._greet_newcomer()
@@ -256,6 +276,9 @@ class PortReader:
         """See to a device that does not do as it should."""
         if now_s - self._asked_s > ASK_AGAIN_S:
             self._ask()
+        if self._is_zeroing.is_set():
+            self._is_zeroing.clear()
+            self._ask((CommandCode.ZERO_COUNTERS, CommandCode.START))
         self._tell_trouble(self._liveness.judge(now_s))
         if self._liveness.is_reopening_due(now_s):
             self._reopen()
@@ -288,6 +311,8 @@ class PortReader:
                         monotonic_ns,
                         clock_ns,
                         recording,
+                        self.index,
+                        self.clock.date(packet.channel, packet.device_us, clock_ns),
                     )
                 )
         now_s = monotonic_ns * 1e-9
@@ -297,6 +322,7 @@ class PortReader:
             channels = None if self.hello is None else self.hello.channels
             self._deliver(Delivery(self.index, clock_ns, tuple(scans), channels))
         self._tell_corrupt()
+        self._tell_clock()
 
     def _record(self, data: bytes, realtime_ns: int, monotonic_ns: int) -> int:
         """Give the bytes to the recording that runs, if any; returns its number or 0."""
@@ -329,7 +355,7 @@ class PortReader:
         """Take note of a packet; returns a scan's volts if they may be used."""
         if isinstance(packet, Hello):
             self._greet(packet)
-        elif isinstance(packet, Acknowledge) and packet.status != AckStatus.OK:
+        elif isinstance(packet, Acknowledge) and _is_refusal(packet):
             self._on_event(
                 "command_refused",
                 "warning",
@@ -386,10 +412,10 @@ class PortReader:
             else "give the daemon the description of the sensor that is connected",
         )
 
-    def _ask(self) -> None:
+    def _ask(self, codes: tuple[CommandCode, ...] = _INTRODUCTION) -> None:
         """Ask the device who it is and to start; harmless where it has started already."""
         self._asked_s = time.monotonic()
-        for code in (CommandCode.IDENTIFY, CommandCode.START):
+        for code in codes:
             self._request = (self._request + 1) % 256
             if not self._connection.write(encode(Command(code, self._request))):
                 return
@@ -450,6 +476,28 @@ class PortReader:
         self._deliver(Delivery(self.index, 0, (), has_ended=True))
         self._on_event("replay_ended", "info", f"{self.url}: {reason}")
 
+    def _tell_clock(self) -> None:
+        """Tell of a device's clock that jumped or is none; scans are dated by arrival then."""
+        clock, (state, jumps) = self.clock, self._clock_told
+        if clock.jumps > jumps and self._clock_limit.allows():
+            self._on_event(
+                "device_clock_jumped",
+                "warning",
+                f"{self.url}: the device's clock jumped, or the device was reset; "
+                f"{clock.jumps} times since the start",
+                "if it comes again and again, check the device's supply and its timer",
+            )
+            jumps = clock.jumps
+        if clock.state is not state and clock.state is ClockState.UNUSABLE:
+            self._on_event(
+                "device_clock_unusable",
+                "warning",
+                f"{self.url}: the device's clock stands still, or is off by more than "
+                f"{MAX_RATE * 1e6:g} ppm; what buffers hold up is not seen in the ages",
+                "correct the firmware's clock: microseconds, read as the scan begins",
+            )
+        self._clock_told = (clock.state, jumps)
+
     def _tell_corrupt(self) -> None:
         corrupt = self._decoder.counts.corrupt
         if corrupt > self._corrupt_told and self._corrupt_limit.allows():
@@ -460,6 +508,14 @@ class PortReader:
                 "check the cable, its shield and the baud rate",
             )
             self._corrupt_told = corrupt
+
+
+def _is_refusal(answer: Acknowledge) -> bool:
+    """Whether a device did not do what it should; a follower leaves the counters to its leader."""
+    is_leaders = answer.command == CommandCode.ZERO_COUNTERS
+    return answer.status != AckStatus.OK and not (
+        is_leaders and answer.status == AckStatus.UNKNOWN_COMMAND
+    )
 
 
 def contradiction(hello: Hello, description: SensorDescription) -> str:

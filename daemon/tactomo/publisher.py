@@ -202,7 +202,7 @@ class Publisher:
         data = encode_message(self._sensor, message.kind, {**envelope, **message.fields})
         self._socket.send(data, zmq.DONTWAIT)
         if message.kind == CONTACTS and envelope["age_ns"] is not None:
-            self.latency.add(envelope["age_ns"] * 1e-9)
+            self.latency.add((envelope["age_ns"] - envelope["delay_ns"]) * 1e-9)
         if message.kind not in (STATUS, EVENT):
             self._on_sent(message.kind, data)
         return data

@@ -12,7 +12,7 @@ reference      msgpack     the reference that holds from here on: its number in 
 frame          msgpack     a dual scan that the daemon reconstructed: channel, counter and device
                            time of each of its scans, the tier and the budget (ms of modelled
                            work, not of time) that it was reconstructed with, the number of the
-                           reference in force, and whether it started cold
+                           reference in force, whether it started cold, and its timing
 map, contacts  stream      messages exactly as published, if asked for; scan likewise, as long as
                            anybody subscribes to it
 =============  ==========  =======================================================================
@@ -84,6 +84,19 @@ class ScanKey(NamedTuple):
     device_us: int
 
 
+class Timing(NamedTuple):
+    """When a dual scan was acquired, and how far its two channels are apart."""
+
+    delay_ns: int
+    """From then to the arrival of its last byte."""
+    is_dated: bool
+    """Whether by the device's clock; otherwise it was acquired when its first scan arrived."""
+    skew_ns: int | None
+    """The magnitude scan's time less the structure scan's; None where that is not known."""
+    is_skewed: bool
+    """Whether that is so much that the two are not of one instant."""
+
+
 @dataclass(frozen=True, slots=True)
 class Mark:
     """One dual scan that the daemon reconstructed, and with what."""
@@ -97,6 +110,8 @@ class Mark:
     """Which of the recording's references was in force, from 1; None for none."""
     is_cold: bool = False
     """Whether what came before is unknown, so that the reconstruction starts anew with it."""
+    timing: Timing | None = None
+    """None where an older version recorded."""
 
 
 class Chunk(NamedTuple):
@@ -412,7 +427,8 @@ def read_mark(data: bytes) -> Mark:
         keys = [ScanKey(Channel(c), counter, device) for c, counter, device in mark.scans]
     except ValueError as error:
         raise _malformed() from error
-    return Mark(tuple(keys), mark.tier, mark.budget_ms, None, mark.reference, mark.cold)
+    timing = None if mark.timing is None else Timing(*mark.timing)
+    return Mark(tuple(keys), mark.tier, mark.budget_ms, None, mark.reference, mark.cold, timing)
 
 
 class _Mark(BaseModel):
@@ -421,6 +437,7 @@ class _Mark(BaseModel):
     budget_ms: Annotated[float, Strict()] | None
     reference: StrictInt | None = None
     cold: StrictBool = False
+    timing: tuple[StrictInt, StrictBool, StrictInt | None, StrictBool] | None = None
 
 
 def _integer(value: object) -> int:

@@ -71,6 +71,7 @@ def pack_mark(mark: Mark) -> bytes:
         "budget_ms": mark.budget_ms,
         "reference": mark.reference_number,
         "cold": mark.is_cold,
+        "timing": mark.timing,
     }
     packed: bytes = msgpack.packb(fields)
     return packed

@@ -63,7 +63,13 @@ class Status:
             "frames": imaging.frame_rate.count,
             "dropped_scans": pipeline.dropped + pipeline.overflowed,
             "incomplete_scans": pipeline.incomplete,
-            "late_scans": pipeline.late,
+            "late_scans": pipeline.sync.late,
+            "scans": pipeline.tally(),
+            "channel_skew_ms": pipeline.skew.sizes.percentiles_ms(),
+            "wall_clock": {
+                "jumps": pipeline.wall_clock.jumps,
+                "last_jump_s": pipeline.wall_clock.last_jump_s,
+            },
             "reference": reference
             and {
                 "scans": reference.scans,
@@ -88,7 +94,7 @@ class Status:
 
     def state(self) -> str:
         """Return the daemon's state in one word."""
-        last_ns = self._imaging.last_monotonic_ns
+        last_ns = self._imaging.acquired_monotonic_ns
         if not last_ns:
             is_waiting = any(port.state == "closed" for port in self._ports)
             return "waiting_for_port" if is_waiting else "waiting_for_data"

@@ -71,6 +71,7 @@ class Flag(IntFlag):
     CHANNELS_SWAPPED = 512  # the magnitude channel answers more than the structure channel
     SATURATED = 1024  # the converter clipped; what it clipped is left out
     LOW_CONFIDENCE = 2048  # the network expects its own map to be wrong
+    CHANNELS_SKEWED = 4096  # the two scans are not of one instant; set by who pairs them
 
     def names(self) -> list[str]:
         """Names of the flags that are set, in lower case, as the stream carries them."""

@@ -61,11 +61,15 @@ class Frame:
     """Counts the messages of this kind; a gap means that frames were missed."""
     scan_counter: int
     acquired_realtime_ns: int
-    """When the daemon's computer had read the scan's last byte, nanoseconds since 1970 (UTC)."""
+    """When the scan was acquired, nanoseconds since 1970 (UTC): see STREAM.md for what that is."""
     acquired_monotonic_ns: int
     """The same instant on that computer's monotonic clock."""
     device_us: int | None
     """The device's own clock, microseconds."""
+    delay_ns: int | None
+    """From then until the daemon had read the scan's last byte."""
+    skew_ms: float | None
+    """The magnitude scan's time less the structure scan's; None where that is not known."""
     tier: str | None
     """How much model the frame was given: quiet, tikhonov, fit, hybrid, ..."""
     tier_reason: str | None
@@ -90,7 +94,7 @@ class Frame:
 
     @property
     def age_s(self) -> float:
-        """Seconds from the arrival of the scan's last byte at the daemon until now."""
+        """Seconds since the scan was acquired, what buffers held it up by included."""
         since_receipt_ns = time.monotonic_ns() - self._received_ns
         return (self._age_at_receipt_ns + since_receipt_ns) * 1e-9
 
@@ -121,6 +125,8 @@ def frame_from_message(message: Message, received_ns: int, stale_after_s: float)
         acquired_realtime_ns=_integer(fields, "acquired_realtime_ns"),
         acquired_monotonic_ns=_integer(fields, "acquired_monotonic_ns"),
         device_us=fields["device_us"],
+        delay_ns=fields.get("delay_ns"),
+        skew_ms=fields.get("skew_ms"),
         tier=fields["tier"],
         tier_reason=fields["tier_reason"],
         flags=frozenset(fields["flags"]),

@@ -321,7 +321,7 @@ class _Stream:
         tiers: dict[str, int] = {}
         begin_s = time.monotonic()
         for frame in self._during(seconds):
-            ages_ms.append(frame.age_s * 1e3)
+            ages_ms.append(frame.age_s * 1e3 - (frame.delay_ns or 0) * 1e-6)
             tiers[str(frame.tier)] = tiers.get(str(frame.tier), 0) + 1
             if moves is not None:
                 moves(min(1.0, (time.monotonic() - begin_s) / seconds))

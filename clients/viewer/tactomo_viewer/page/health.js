@@ -17,6 +17,7 @@ const FLAGS = {
   noise_high: ["Noise high", "Voltages that should be equal differ widely. Look for interference, a loose ground or a broken device."],
   low_confidence: ["Low confidence", "The network expects this map to be wrong. Do not act on it; tare, and check the leads if it stays."],
   channels_swapped: ["Channels swapped?", "The magnitude channel answers more than the structure channel: exchange their plugs, then tare. Or is the structure channel dead?"],
+  channels_skewed: ["Channels of two instants", "The two channels' scans of one counter were taken at different times: do not act on this map. Check the sync line between the boards."],
 };
 
 /** A flag's name and meaning for people. */
