@@ -51,8 +51,8 @@ def test_every_scan_is_joined_sent_alone_or_counted_once(
         pushed.append(scan(channel, counters[channel], now_ns, device_us))
         sent += sync.push(pushed[-1])
         assert sync.deadline_ns is None or sync.deadline_ns <= now_ns + WAIT_NS
-        out = sum(len(dual.scans) for dual in sent)
-        assert out + sync.late + sync.repeated + sync.waiting == len(pushed)
+        told = sum(len(dual.scans) for dual in sent)
+        assert told + sync.late + sync.repeated + sync.waiting == len(pushed)
     sent += sync.finish()
 
     out = [id(single) for dual in sent for single in dual.scans]
@@ -113,8 +113,9 @@ def test_lags_skips_and_repeats_lose_no_pair_and_make_no_wrong_one(
     """Two ports that each keep their order; how far one lags changes all the time."""
     arriving: list[tuple[int, ChannelScan, int]] = []  # when, what, of which instant
     counter = start
-    for number in {0, zero_at} & set(range(len(taken))):  # both channels show that they began
-        taken[number] = Instant(taken[number][0] or 0.0, taken[number][1] or 0.0, False)
+    taken[:1] = [Instant(0.0, 0.0, False) for _ in taken[:1]]  # both channels are heard of
+    if zero_at is not None and zero_at < len(taken):  # and heard to begin anew
+        taken[zero_at] = Instant(taken[zero_at][0] or 0.0, taken[zero_at][1] or 0.0, False)
     for number, instant in enumerate(taken):
         counter = 0 if number == zero_at else (counter + 1) % 2**32
         for channel, share in zip(BOTH, instant[:2], strict=True):

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from tactomo.log import configure_logging
-from tactomo.recording_writer import write_recording
 from tactomo.recording import open_recording
+from tactomo.recording_writer import write_recording
 from tactomo_protocol import (
     Acknowledge,
     AckStatus,
