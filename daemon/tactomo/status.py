@@ -64,7 +64,7 @@ class Status:
             "dropped_scans": pipeline.dropped + pipeline.overflowed,
             "incomplete_scans": pipeline.incomplete,
             "late_scans": pipeline.sync.late,
-            "scans": pipeline.tally(),
+            "scan_tally": pipeline.tally(),
             "channel_skew_ms": pipeline.skew.sizes.percentiles_ms(),
             "wall_clock": {
                 "jumps": pipeline.wall_clock.jumps,

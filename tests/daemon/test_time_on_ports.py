@@ -250,7 +250,7 @@ def test_every_scan_is_accounted_for(bench: Start, lossless: bool) -> None:
         if number % 7 == 0:  # once more
             b.skin.scan(channels=(MAGNITUDE,), counter=b.skin.counter)
     sent = 2 * 3 + 6 + 2 * 24 + 5
-    tally = b.until(lambda: settled(b.ask("status")["scans"], sent))
+    tally = b.until(lambda: settled(b.ask("status")["scan_tally"], sent))
     assert tally["repeated"] == 5
     assert (tally["dropped"] == 0) == lossless
     assert tally["used"] > 0
