@@ -166,7 +166,7 @@ def test_resets_silence_and_unplugging_pass(rigs: list[Rig], program: Path, tmp_
     rig = Rig(program, tmp_path, "--ports", 2, "--away", 0.5, **QUICK)
     rigs.append(rig)
     rig.flow("the start")
-    for number in (signal.SIGHUP, signal.SIGUSR1):
+    for number in (signal.SIGHUP, signal.SIGUSR2, signal.SIGUSR1):
         since = len(rig.ears.heard)
         rig.emulator.reset(number)
         if number == signal.SIGUSR1:
