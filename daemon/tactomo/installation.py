@@ -45,6 +45,7 @@ PROGRAM: Final = "/usr/bin/tactomo"
 HIDDEN: Final = ("/home/", "/root/", "/tmp/", "/var/tmp/", "/run/user/")
 """What the service's sandbox does not see."""
 ADDRESS_STEP: Final = 10
+UDEV_RUNS: Final = Path("/run/udev/control")
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +73,10 @@ class File:
         if before is None:
             return "write"
         return "keep" if self.is_owners else "replace"
+
+    def is_to_do(self, root: Path) -> bool:
+        """Whether carrying it out would change anything."""
+        return self.effect(root) in ("write", "replace", "remove")
 
     def carry_out(self, root: Path) -> None:
         """Write or remove it, if that is to be done."""
@@ -124,9 +129,7 @@ def plan_install(name: str, ports: Sequence[str], rules: str, root: Path, progra
     if rules:
         files.append(File(_rules_file(name), rules))
     files.append(File(_configuration(name), _config(name, ports, root), is_owners=True))
-    effects = {file.effect(root) for file in files}
-    commands = _commands(root, bool(effects & {"write", "replace"}), name)
-    return Plan(root, tuple(files), tuple(commands))
+    return Plan(root, tuple(files), tuple(_commands(root, files, name)))
 
 
 def plan_uninstall(name: str | None, root: Path) -> Plan:
@@ -147,7 +150,7 @@ def plan_uninstall(name: str | None, root: Path) -> Plan:
         disable = [("systemctl", f"--root={root}", "disable", unit) for unit in units]
         return Plan(root, tuple(files), tuple(disable))
     disable = [("systemctl", "disable", "--now", unit) for unit in units]
-    reload = [("systemctl", "daemon-reload"), ("udevadm", "control", "--reload")]
+    reload = [("systemctl", "daemon-reload"), *_udev_commands(root, files)]
     return Plan(root, tuple(files), (*disable, *reload))
 
 
@@ -220,21 +223,28 @@ def _shared(root: Path, program: str) -> Iterator[tuple[Path, str]]:
         yield path, shipped(file).replace(f"ExecStart={PROGRAM} ", f"ExecStart={program} ")
 
 
-def _commands(root: Path, is_changed: bool, name: str) -> Iterator[tuple[str, ...]]:
+def _commands(root: Path, files: Sequence[File], name: str) -> Iterator[tuple[str, ...]]:
     unit = _unit(name)
     if root != Path("/"):
         yield ("systemd-sysusers", f"--root={root}", "tactomo.conf")
         yield ("systemctl", f"--root={root}", "enable", unit)
         return
-    if is_changed:
+    if any(file.is_to_do(root) for file in files):
         yield ("systemd-sysusers", "tactomo.conf")
         yield ("systemd-tmpfiles", "--create", "tactomo.conf")
         yield ("systemctl", "daemon-reload")
+        yield from _udev_commands(root, files)
+        yield ("systemctl", "try-restart", unit)
+    yield ("systemctl", "enable", "--now", unit)
+
+
+def _udev_commands(root: Path, files: Sequence[File]) -> Iterator[tuple[str, ...]]:
+    """Yield what makes changed rules count, where udev runs: in a container it does not."""
+    is_changed = any(RULES in file.path.parents and file.is_to_do(root) for file in files)
+    if is_changed and UDEV_RUNS.exists():
         yield ("udevadm", "control", "--reload")
         yield ("udevadm", "trigger", "--subsystem-match=tty", "--subsystem-match=usb")
         yield ("udevadm", "settle", "--timeout=10")
-        yield ("systemctl", "try-restart", unit)
-    yield ("systemctl", "enable", "--now", unit)
 
 
 def _config(name: str, ports: Sequence[str], root: Path) -> str:

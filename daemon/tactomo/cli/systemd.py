@@ -100,9 +100,14 @@ def status(
     """Show what systemd says of the skins' services, with the last lines of their logs."""
     import subprocess
 
-    from tactomo.installation import check_running_systemd
+    from tactomo.errors import ServiceError
+    from tactomo.installation import check_running_systemd, installed
 
     check_running_systemd()
+    if name is None and not installed(Path("/")):
+        raise ServiceError(
+            "no skin's service is installed", "tactomo service install NAME --port PORT"
+        )
     unit = f"tactomo@{name or '*'}.service"
     command = ["systemctl", "status", "--no-pager", "--lines=5", unit]
     raise typer.Exit(1 if subprocess.run(command, check=False).returncode else 0)
