@@ -44,7 +44,8 @@ PROGRAM: Final = "/usr/bin/tactomo"
 """As the units call it; another one is put in its place."""
 HIDDEN: Final = ("/home/", "/root/", "/tmp/", "/var/tmp/", "/run/user/")
 """What the service's sandbox does not see."""
-ADDRESS_STEP: Final = 10
+ADDRESS_STEP: Final = 20
+"""From one skin's ports to the next one's; the proxy's is between."""
 UDEV_RUNS: Final = Path("/run/udev/control")
 
 
