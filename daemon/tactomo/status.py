@@ -107,7 +107,7 @@ class Status:
         state = self.state().replace("_", " ")
         absent = [port.url for port in self._ports if not port.is_open and not port.has_ended]
         if absent:
-            return f"{state}, {' and '.join(absent)} not there"
+            return f"{state}, {' and '.join(absent)} not open"
         rate_hz = self._imaging.frame_rate.per_second()
         return f"{state}: {rate_hz:.0f} frames/s, {subscriptions} subscriptions"
 
