@@ -1,7 +1,7 @@
 """Print those entries of requirements.lock, hashes included, that a robot needs.
 
-The lock has the developers' tools, too. What is needed is what `tactomo` requires without extras,
-and what that requires in turn, as installed in the environment that runs this.
+The lock has the developers' tools, too. What is needed is what `tactomo` requires with a robot's
+extras, and what that requires in turn, as installed in the environment that runs this.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from pathlib import Path
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+EXTRAS = ("", "metrics")
 LOCK = Path(__file__).parents[2] / "requirements.lock"
 
 
@@ -22,7 +23,8 @@ def needed(name: str, found: set[str]) -> set[str]:
     for line in requires(name) or ():
         requirement = Requirement(line)
         other = canonicalize_name(requirement.name)
-        is_wanted = requirement.marker is None or requirement.marker.evaluate({"extra": ""})
+        marker = requirement.marker
+        is_wanted = marker is None or any(marker.evaluate({"extra": extra}) for extra in EXTRAS)
         if is_wanted and other not in found:
             found.add(other)
             needed(other, found)
