@@ -7,6 +7,7 @@ extras, and what that requires in turn, as installed in the environment that run
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Iterator
 from importlib.metadata import requires
 from pathlib import Path
@@ -14,20 +15,26 @@ from pathlib import Path
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-EXTRAS = ("", "metrics")
-LOCK = Path(__file__).parents[2] / "requirements.lock"
+ROOT = Path(__file__).parents[2]
+EXTRAS = ("metrics",)
 
 
-def needed(name: str, found: set[str]) -> set[str]:
-    """Return `found`, which is added to, with all that a distribution requires."""
-    for line in requires(name) or ():
+def wanted() -> list[str]:
+    """Return what a robot's tactomo requires."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    extras = [line for name in EXTRAS for line in project["optional-dependencies"][name]]
+    return [*project["dependencies"], *extras]
+
+
+def needed(lines: list[str], found: set[str]) -> set[str]:
+    """Return `found`, which is added to, with all that these requirements bring."""
+    for line in lines:
         requirement = Requirement(line)
-        other = canonicalize_name(requirement.name)
-        marker = requirement.marker
-        is_wanted = marker is None or any(marker.evaluate({"extra": extra}) for extra in EXTRAS)
-        if is_wanted and other not in found:
-            found.add(other)
-            needed(other, found)
+        name = canonicalize_name(requirement.name)
+        is_wanted = requirement.marker is None or requirement.marker.evaluate({"extra": ""})
+        if is_wanted and name not in found:
+            found.add(name)
+            needed(requires(name) or [], found)
     return found
 
 
@@ -37,5 +44,6 @@ def entries(lock: str) -> Iterator[tuple[str, str]]:
         yield canonicalize_name(entry.partition("==")[0].strip()), entry
 
 
-names = needed("tactomo", set())
-print("".join(entry for name, entry in entries(LOCK.read_text("utf-8")) if name in names))
+names = needed(wanted(), set())
+lock = (ROOT / "requirements.lock").read_text("utf-8")
+print("".join(entry for name, entry in entries(lock) if name in names))
