@@ -154,6 +154,13 @@ def test_one_scan_that_seems_early_moves_nothing() -> None:
     assert seen.within_ms(1.0) < 1.0
 
 
+def test_one_scan_that_seems_a_little_early_moves_nothing() -> None:
+    def jumpy(device_us: int) -> int:
+        return device_us + (4_000 if 200_000_000 <= device_us < 200_050_000 else 0)
+
+    assert arrivals(300, device_us=jumpy).within_ms(1.0) < 1.0
+
+
 def test_one_old_scan_moves_nothing() -> None:
     def jumpy(device_us: int) -> int:
         return device_us - (300_000 if 200_000_000 <= device_us < 200_050_000 else 0)

@@ -204,6 +204,23 @@ def test_boards_out_of_step_are_flagged_zeroed_and_forgiven(bench: Start) -> Non
     assert "command_refused" not in events(b)
 
 
+def test_an_exact_replay_knows_what_was_known_when_the_recording_began(
+    bench: Start, replay: Replay, tmp_path: Path
+) -> None:
+    path = tmp_path / "live.mcap"
+    b = bench(ports=2, sync_wait_ms=50)
+    b.tare()
+    boards = Boards(b, magnitude=5000, structure=40)
+    b.until(lambda: boards.scan() and "channels_skewed" in events(b))
+    b.ask("record_start", path=str(path))
+    counters = [boards.scan() for _ in range(3)]
+    b.listener.frame(counters[-1])
+    b.ask("record_stop")
+    again = replay(path).of("map")
+    assert again
+    assert all("channels_skewed" in frame["flags"] for frame in again)
+
+
 def test_a_board_that_is_reset_alone_is_never_paired_with_the_other(bench: Start) -> None:
     b = bench(ports=2, sync_wait_ms=50)
     b.tare()
