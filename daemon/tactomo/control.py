@@ -28,6 +28,7 @@ MAX_REQUEST_BYTES: Final = 64 * 1024
 POLL_MS: Final = 50
 POLL_WHILE_PENDING_MS: Final = 10
 MAX_PENDING: Final = 64
+QUEUED_PER_CLIENT: Final = 64
 LINGER_MS: Final = 100
 
 Result = Mapping[str, Any]
@@ -105,6 +106,8 @@ class Control:
         """Bind the control socket; raise AddressError where the address cannot be had."""
         self._socket = context.socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_REQUEST_BYTES)
+        self._socket.setsockopt(zmq.RCVHWM, QUEUED_PER_CLIENT)
+        self._socket.setsockopt(zmq.SNDHWM, QUEUED_PER_CLIENT)
         self.address = bind(self._socket, endpoint, CONTROL, secret=secret)
 
     def cut_connections(self) -> None:

@@ -53,6 +53,7 @@ from threadpoolctl import threadpool_limits
 from tactomo.config import DaemonConfig
 from tactomo.control import Control, RecordStart, SetBudget, SetTier
 from tactomo.doorkeeper import Doorkeeper, load_server_keys
+from tactomo.endpoint import allow_connections
 from tactomo.errors import CommandError, ConfigError
 from tactomo.events import EventBook, Severity
 from tactomo.imaging import Imaging
@@ -237,6 +238,7 @@ class Daemon:
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._on_signal)
         threading.excepthook = _log_thread_failure
+        allow_connections()
         self.start()
         # What is there now stays: never looked through again, which would take tenths of a second.
         gc.collect()

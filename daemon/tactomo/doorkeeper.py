@@ -10,6 +10,7 @@ It is read again when it changes. A client that was taken off it is cut off with
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable
@@ -79,8 +80,8 @@ class AllowList:
         return key in self._allowed.get(domain, ())
 
     def reload(self) -> None:
-        """Read the folder again if it has changed."""
-        with self._lock:
+        """Read the folder again if it has changed; one that cannot be looked at stays as it was."""
+        with self._lock, contextlib.suppress(OSError):  # such as too many open files
             files = _files(self._folder)
             signature = _signature([*files[STREAM], *files[CONTROL]])
             if signature != self._signature:

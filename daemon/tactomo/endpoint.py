@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ipaddress
 import os
+import resource
 import socket as posix_socket
 import stat
 import time
@@ -26,6 +27,20 @@ IPC: Final = "ipc://"
 HANDSHAKE_MS: Final = 3000
 """Who has not finished the handshake by then is cut off."""
 REBIND_S: Final = 2.0
+MAX_OPEN: Final = 8192
+"""Files and connections of a process; the systemd units say the same."""
+
+
+def allow_connections() -> None:
+    """Let this process have as many connections at once as the system allows, up to MAX_OPEN.
+
+    Who connects and says nothing takes a descriptor for HANDSHAKE_MS, and ports and recordings need
+    some, too.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = MAX_OPEN if hard == resource.RLIM_INFINITY else min(hard, MAX_OPEN)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 def check_endpoint(endpoint: str) -> str:

@@ -24,6 +24,7 @@ from tactomo_client.messages import STATUS
 from tactomo_client.subscription import connect_subscriber, reconnect
 
 from tactomo.doorkeeper import STREAM, Context, Doorkeeper, ServerKeys
+from tactomo.endpoint import allow_connections
 from tactomo.events import RateLimit, Severity
 from tactomo.subscriptions import SUBSCRIBERS_CUT, Subscribers
 
@@ -232,6 +233,7 @@ def serve(proxy: Proxy) -> None:
     """
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: proxy.stop())
+    allow_connections()
     try:
         proxy.open()
         log.info("ready", stream=proxy.address, sources=list(proxy.sources))

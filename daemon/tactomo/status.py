@@ -21,6 +21,7 @@ from tactomo.recorder import Recorder
 from tactomo.recording import REPLAY_SCHEME
 from tactomo.timing import Durations
 
+VERSION: Final = version("tactomo")  # read from a file, which may fail later
 STALE_S: Final = 1.0
 """How old the newest dual scan may be before the daemon says that there are no data any more."""
 
@@ -52,7 +53,7 @@ class Status:
         reference = imaging.reference
         stages = {stage: times.percentiles_ms() for stage, times in imaging.stages.items()}
         return {
-            "version": version("tactomo"),
+            "version": VERSION,
             "state": self.state(),
             "uptime_s": time.monotonic() - self._started_s,
             "description": self._description,

@@ -32,13 +32,13 @@ def notify(*lines: str) -> None:
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:
         return
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sender:
-        sender.setblocking(False)
-        try:
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sender:
+            sender.setblocking(False)
             # "@" stands for the NUL byte that a name outside the file system begins with.
             sender.sendto("\n".join(lines).encode(), address.replace("@", "\0", 1))
-        except OSError as error:  # the next message may get through
-            log.warning("service_manager_unreachable", detail=str(error))
+    except OSError as error:  # the next message may get through
+        log.warning("service_manager_unreachable", detail=str(error))
 
 
 class Supervision:

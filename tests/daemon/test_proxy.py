@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import pty
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -15,7 +18,7 @@ from typing import Any
 import pytest
 import zmq
 from tactomo import keys as key_files
-from tactomo_client import Keys, KeysError, subscribe
+from tactomo_client import ControlError, Keys, KeysError, request, subscribe
 from tactomo_client.fake import FakeSensor
 from tactomo_client.keys import secure
 from tactomo_client.messages import decode_message, topic
@@ -75,8 +78,8 @@ def reader() -> Iterator[Callable[..., zmq.Socket[bytes]]]:
         return socket
 
     yield make
-    for socket in sockets:
-        socket.close()
+    for each in sockets:
+        each.close()
 
 
 @pytest.fixture
@@ -272,3 +275,39 @@ def test_a_flood_of_subscriptions_is_cut_and_the_stream_goes_on(
         time.sleep(0.05)
     assert b.step(0.1)["map"] is not None
     b.until(lambda: b.ask("status")["subscribers"] == 5)
+
+
+@pytest.mark.slow
+def test_a_flood_of_connections_leaves_the_daemon_running(tmp_path: Path) -> None:
+    """With no descriptor left for anything else: 300 that say nothing, of 128 that there may be."""
+    device, host = pty.openpty()
+    stream, control = f"ipc://{tmp_path}/stream", f"ipc://{tmp_path}/control"
+    command = [sys.executable, "-m", "tactomo.cli", "daemon", "--port", os.ttyname(host)]
+    with subprocess.Popen(
+        ["prlimit", "--nofile=128:128", *command, "--stream", stream, "--control", control]
+    ) as process:
+        try:
+            wait_for_status(control)
+            silent = [socket.socket(socket.AF_UNIX) for _ in range(300)]
+            for each in silent:
+                each.settimeout(0.05)
+                with contextlib.suppress(OSError):
+                    each.connect(f"{tmp_path}/stream")
+            time.sleep(2.0)  # a status or two are due meanwhile
+            assert process.poll() is None
+            for each in silent:
+                each.close()
+            assert wait_for_status(control)["version"]
+        finally:
+            process.terminate()
+        assert process.wait(PATIENCE_S) == 0
+    os.close(device)
+    os.close(host)
+
+
+def wait_for_status(address: str) -> dict[str, Any]:
+    deadline = time.monotonic() + 3 * PATIENCE_S
+    while time.monotonic() < deadline:
+        with contextlib.suppress(ControlError):
+            return request("status", address, 2.0)
+    raise AssertionError("no answer")
