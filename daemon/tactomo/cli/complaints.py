@@ -56,6 +56,10 @@ FLAG_ADVICE: Mapping[str, tuple[str, str]] = {
         "the magnitude channel changes more than the structure channel",
         "exchange the two plugs, then run `tactomo tare`",
     ),
+    "channels_skewed": (
+        "the two channels' scans are not of one instant",
+        "check the sync line between the two boards",
+    ),
 }
 STATES: Mapping[str, tuple[str, str]] = {
     "waiting_for_port": ("a port is not there yet", "check the ports below"),

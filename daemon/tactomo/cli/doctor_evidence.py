@@ -47,7 +47,7 @@ class Heard(NamedTuple):
         packets: packets that came.
         corrupt: packets that failed their check.
         lost: dual scans that the device took and nobody received, by gaps in the counter.
-        delay_ms: (n,) what each scan arrived later than the promptest one, by the device's clock.
+        delay_ms: (n,) how much later than the promptest each scan came, by the device's clock.
         period_ms: from scan to scan on the device's clock; None where fewer than two came.
     """
 
@@ -249,13 +249,17 @@ def _heard_of_messages(
 
     dropped = after["dropped_scans"] - before["dropped_scans"]
     counters = [m["scan_counter"] for m in messages]
-    arrived_ms = np.array([m["acquired_monotonic_ns"] for m in messages]) * 1e-6
     device_ms = np.array([m["device_us"] for m in messages]) * 1e-3
+    if all(m.get("dated_by") == "device" for m in messages):
+        delays_ms = np.array([m["delay_ns"] for m in messages]) * 1e-6
+    else:  # the daemon does not know the device's clock yet: it is fitted here
+        arrived_ms = np.array([m["acquired_monotonic_ns"] for m in messages]) * 1e-6
+        delays_ms = _delays(arrived_ms, device_ms)
     return Heard(
         rise("packets"),
         rise("corrupt"),
         max(0, _gaps(counters) - dropped),
-        _delays(arrived_ms, device_ms),
+        delays_ms,
         _period(device_ms, counters),
     )
 

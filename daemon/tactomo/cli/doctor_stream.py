@@ -87,7 +87,8 @@ def _latency_found(evidence: Evidence) -> Finding:
     period_ms = heard.period_ms if heard is not None else None
     parts = {name: float(times["p50"]) for name, times in _stages(evidence).items()}
     if heard is not None and len(heard.delay_ms):
-        parts = {"transport jitter": float(np.median(heard.delay_ms)), **parts}
+        # Reading waits for the other channel's scan, too: the later one of the two counts.
+        parts = {"transport and sync": float(np.median(heard.delay_ms)), **parts}
     where = ", ".join(f"{name} {ms:.1f}" for name, ms in parts.items())
     detail = f"age when published p50 {p50:.1f} ms, p99 {p99:.1f} ms"
     if period_ms is not None:
@@ -109,7 +110,7 @@ def _latency_found(evidence: Evidence) -> Finding:
 def _stages(evidence: Evidence) -> dict[str, Any]:
     """The times of the daemon's stages that follow one another; others are parts of these."""
     stages = evidence.after.get("stage_ms") or {}
-    return {name: stages[name] for name in ("sync", "reconstruct", "publish") if name in stages}
+    return {name: stages[name] for name in ("reconstruct", "publish") if name in stages}
 
 
 def _pressed_found(evidence: Evidence) -> Finding:
