@@ -144,6 +144,7 @@ def test_a_pipeline_that_hangs_is_not_hidden_by_the_threads_that_do_not(
     assert "in reconstruct" in log, "where it hangs is in the log"
 
 
+@pytest.mark.slow
 def test_a_stopped_process_feeds_no_watchdog(
     supervised: tuple[subprocess.Popen[str], Any], manager: ServiceManager
 ) -> None:
