@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tactomo import recorder
 from tactomo.config import RecordingConfig
 from tactomo.recording import open_recording
 from tactomo.rotation import KeptRecording, list_recordings, to_delete
@@ -37,8 +38,9 @@ def counters(path: Path, channel: Channel) -> list[int]:
 
 @pytest.mark.parametrize("ports", [1, 2])
 def test_each_file_replays_alone_and_together_they_have_every_frame_once(
-    bench: Start, replay: Start, tmp_path: Path, ports: int
+    bench: Start, replay: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ports: int
 ) -> None:
+    monkeypatch.setattr(recorder, "LOOK_S", 0.3)
     folder = tmp_path / "set"
     b = bench(
         ports=ports, recording={"folder": folder, "at_start": True, "rotate_mb": 0.01, "maps": True}
@@ -54,13 +56,14 @@ def test_each_file_replays_alone_and_together_they_have_every_frame_once(
     b.daemon.stop()
     live = maps(b.listener.of("map"))
     files = sorted(folder.iterdir())
-    assert [path.name.split("-")[1] for path in files] == ["000001", "000002", "000003", "000004"]
+    numbers = [path.name.split("-")[1] for path in files]
+    assert numbers == [f"{number:06d}" for number in range(1, len(files) + 1)]
     again: list[int] = []
     for path in files:
         summary = open_recording(path).summary
         assert summary.is_complete
         assert summary.corrupt == 0
-        assert summary.hellos
+        assert summary.hellos or not summary.port_bytes  # begun just before the end
         replayed = maps(replay(path).of("map"))
         assert len(replayed) == summary.frames
         for counter, image in replayed.items():
@@ -70,25 +73,7 @@ def test_each_file_replays_alone_and_together_they_have_every_frame_once(
     for channel in Channel:
         assert {c for path in files for c in counters(path, channel)} == set(again)
     events = [event["name"] for event in b.listener.of("event")]
-    assert events.count("recording_rotated") == 3
-
-
-def test_contacts_keep_their_identity_where_a_recording_begins(
-    bench: Start, tmp_path: Path
-) -> None:
-    from tactomo_models import Press, SkinSimulator, load_description
-
-    skin = SkinSimulator(load_description("paper_square"), spacing_m=0.008)  # coarse, but quick
-    b = bench(ports=2, real=True)
-    b.skin.introduce()
-    for _ in range(b.daemon.config.tare_scans):
-        b.step(volts=skin.voltages(()))
-    b.listener.event("tared")
-    volts = skin.voltages((Press(0.0, 0.03, 180.0),))
-    before = b.step(volts=volts)
-    b.ask("record_start", path=str(tmp_path / "a.mcap"))
-    after = b.step(volts=volts)
-    assert [c["id"] for c in before["contacts"]] == [c["id"] for c in after["contacts"]] != []
+    assert events.count("recording_rotated") == len(files) - 1 >= 3
 
 
 def test_numbers_go_on_whatever_the_clock_and_strangers_do(bench: Start, tmp_path: Path) -> None:

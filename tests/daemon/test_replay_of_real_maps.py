@@ -30,9 +30,11 @@ def test_the_replay_of_a_pressed_skin_gives_the_same_maps(
     for _ in range(b.daemon.config.tare_scans):
         press()
     b.listener.event("tared")
-    press(Press(0.0, 0.03, 180.0))
+    before = press(Press(0.0, 0.03, 180.0))
     b.ask("record_start", path=str(path))
     first = b.skin.counter + 1
+    after = press(Press(0.0, 0.03, 180.0))  # a recording begins cold, but nobody need notice
+    assert [c["id"] for c in before["contacts"]] == [c["id"] for c in after["contacts"]] != []
     for step in range(4):
         press(Press(-0.03 + 0.004 * step, 0.02, 180.0))
     pressed = press(Press(-0.014, 0.02, 180.0), Press(0.04, -0.03, 190.0))
