@@ -34,7 +34,7 @@ ENTRY_BYTES: Final = 300
 """What an entry takes beside its data."""
 LOOK_S: Final = 1.0
 RETRY_S: Final = 10.0
-OVERLAP_S: Final = 2.0
+OVERLAP_S: Final = 10.0
 """How long, at most, a file goes on when the next one has begun."""
 STALL_S: Final = 5.0
 START_S: Final = 10.0
