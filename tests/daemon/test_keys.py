@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import os
 import re
@@ -25,6 +26,8 @@ from tactomo.endpoint import bind
 from tactomo.errors import AddressError, ConfigError
 from tactomo_client import Keys, KeysError, StreamTimeout, request, subscribe
 from tactomo_client.keys import read_public, read_secret
+from tactomo_viewer.feed import Feed, Status
+from tactomo_viewer.link import ControlLink
 
 Start = Callable[..., Any]
 SERVER = "left"
@@ -119,6 +122,25 @@ def test_another_process_gets_in_with_the_folder_alone(guarded: Any, robot: Robo
     assert said.returncode == 1
     assert "hangs up on a client without keys" in said.stderr
     assert "TACTOMO_KEYS" in said.stderr
+
+
+def test_the_viewer_gets_in(guarded: Any) -> None:
+    async def look() -> tuple[Status, dict[str, Any]]:
+        feed = Feed(SERVER, guarded.daemon.stream_address, guarded.keys, lambda: None)
+        link = ControlLink(guarded.daemon.control_address, guarded.keys)
+        reading = asyncio.create_task(feed.run())
+        try:
+            async with asyncio.timeout(PATIENCE_S):
+                while feed.status is None:
+                    await asyncio.sleep(0.01)
+            return feed.status, await link.request("status", {}, PATIENCE_S)
+        finally:
+            reading.cancel()
+            await asyncio.gather(reading, return_exceptions=True)
+            link.close()
+
+    status, answer = asyncio.run(look())
+    assert status.fields["session"] == answer["session"] == guarded.daemon.session
 
 
 def test_the_example_of_the_specification_gets_in(

@@ -252,7 +252,7 @@ def _unpack_map(data: bytes) -> dict[str, Any]:
         raise MessageError(f"the body is not MessagePack: {error}") from error
     except MemoryError as error:
         raise MessageError("the body is larger than this computer's memory") from error
-    _check_depth(fields, MAX_DEPTH)
+    _check_depth(fields)
     if not isinstance(fields, dict) or not all(isinstance(key, str) for key in fields):
         raise MessageError("the body is not a map with string keys")
     if type(fields.get("schema")) is not int or fields["schema"] != SCHEMA:
@@ -263,13 +263,14 @@ def _unpack_map(data: bytes) -> dict[str, Any]:
     return fields
 
 
-def _check_depth(value: object, left: int) -> None:
-    if not isinstance(value, dict | list):
-        return
-    if not left:
-        raise MessageError(f"the body is nested more than {MAX_DEPTH} deep")
-    for item in value.values() if isinstance(value, dict) else value:
-        _check_depth(item, left - 1)
+def _check_depth(fields: Any) -> None:
+    level = [fields] if type(fields) in (dict, list) else []
+    for _ in range(MAX_DEPTH):
+        inner = [v for each in level for v in (each.values() if type(each) is dict else each)]
+        level = [value for value in inner if type(value) is dict or type(value) is list]
+        if not level:
+            return
+    raise MessageError(f"the body is nested more than {MAX_DEPTH} deep")
 
 
 def _check_header(fields: Mapping[str, Any]) -> None:
