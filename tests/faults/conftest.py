@@ -44,7 +44,7 @@ def pytest_runtest_makereport(
 def pytest_sessionfinish(session: pytest.Session) -> None:
     path = session.config.getoption("reliability")
     if path and session.config.stash[ROWS]:
-        write_page(Path(path), session.config.stash[ROWS])
+        write_page(Path(path), session.config.stash[ROWS], session.config.getoption("scale"))
 
 
 @pytest.fixture

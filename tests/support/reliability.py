@@ -22,7 +22,7 @@ by `make faults`, which runs all of it again on the machine at hand ({minutes} m
 it. Every fault is done to a real `tactomo daemon` process on real pseudo-terminals and real ZeroMQ
 sockets. The tests are in `tests/faults`; a row is a test.
 
-Machine: {machine}.{failures}
+Machine: {machine}.{shortened}{failures}
 
 ## Faults
 
@@ -68,13 +68,14 @@ def row_of(item: pytest.Item, report: pytest.TestReport) -> Row | None:
     return Row(marker.name, fault, promise, tried, figure, report.outcome, report.duration)
 
 
-def write_page(path: Path, rows: list[Row]) -> None:
-    """Write the page whole."""
+def write_page(path: Path, rows: list[Row], scale: float) -> None:
+    """Write the page whole; `scale` is how much of the long measures was done."""
     failed = sum(row.outcome == "failed" for row in rows)
     path.write_text(
         _PAGE.format(
             minutes=max(1, round(sum(row.seconds for row in rows) / 60)),
             machine=_machine(),
+            shortened="" if scale == 1 else f" The long measures at {scale:g} of their length.",
             failures=f" **{failed} promises were not kept.**" if failed else "",
             faults=_table(("Fault", "Promise", "How it was tried", "Figure"), rows, "fault"),
             measures=_table(("Measure", "Aim", "How", "Figure"), rows, "measure"),
