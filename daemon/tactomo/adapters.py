@@ -12,7 +12,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -20,6 +20,7 @@ from typing import Final
 ROOT: Final = Path("/")
 LINK_FOLDERS: Final = ("tactomo", "serial/by-id", "serial/by-path")
 """Where udev puts lasting names below ``/dev``, the most telling one first."""
+PTY_MAJORS: Final = range(136, 144)
 LOW_LATENCY_MS: Final = 2
 """A latency timer of up to so much costs a scan nothing worth telling of."""
 
@@ -105,8 +106,12 @@ def latency_timer_ms(path: str, root: Path = ROOT) -> int | None:
 def holders(path: str, root: Path = ROOT) -> list[Holder]:
     """Return the processes that have a device open, as far as this user may see."""
     device = os.path.realpath(path)
-    opened = {folder: set(_open_files(folder)) for folder in (root / "proc").glob("[0-9]*")}
-    return [_holder(folder, files) for folder, files in opened.items() if device in files]
+    opened = {folder: dict(_open_files(folder)) for folder in (root / "proc").glob("[0-9]*")}
+    return [
+        _holder(folder, files)
+        for folder, files in opened.items()
+        if device in files and _is_same(files[device], device)
+    ]
 
 
 def modem_manager_runs(root: Path = ROOT) -> bool:
@@ -169,18 +174,33 @@ def _natural(path: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", path)]
 
 
-def _holder(process: Path, files: set[str]) -> Holder:
+def _is_same(descriptor: Path, device: str) -> bool:
+    """Whether an open file of a device's name is that device.
+
+    Containers have pseudo-terminals of their own, under the names and numbers that ours have.
+    """
+    try:
+        opened, ours = os.stat(descriptor), os.stat(device)
+    except OSError:  # closed by now, or not there: its name is all there is to go by
+        return True
+    is_pty = os.major(ours.st_rdev) in PTY_MAJORS
+    return opened.st_rdev == ours.st_rdev and (not is_pty or os.path.samestat(opened, ours))
+
+
+def _holder(process: Path, files: Mapping[str, Path]) -> Holder:
     arguments = _text(process / "cmdline").replace("\0", " ").strip()
     command = arguments or _text(process / "comm") or "?"
     shown = "".join(letter if letter.isprintable() else "?" for letter in command)
-    return Holder(int(process.name), shown[:_COMMAND_LENGTH], bool(files & _PTY_MASTERS))
+    return Holder(int(process.name), shown[:_COMMAND_LENGTH], bool(files.keys() & _PTY_MASTERS))
 
 
-def _open_files(process: Path) -> Iterator[str]:
+def _open_files(process: Path) -> Iterator[tuple[str, Path]]:
+    """Yield what a process has open, each with its descriptor in /proc."""
     with contextlib.suppress(OSError):  # the process is not ours to look at, or gone by now
         for descriptor in os.listdir(process / "fd"):
             with contextlib.suppress(OSError):  # closed by now
-                yield os.readlink(process / "fd" / descriptor)
+                path = process / "fd" / descriptor
+                yield os.readlink(path), path
 
 
 def _number(file: Path, base: int = 10) -> int | None:

@@ -20,7 +20,7 @@ from typing import Final
 
 import serial
 
-from tactomo.adapters import LOW_LATENCY_MS, ROOT, Holder, holders, latency_timer_ms
+from tactomo.adapters import LOW_LATENCY_MS, PTY_MAJORS, ROOT, Holder, holders, latency_timer_ms
 from tactomo.errors import PortAbsentError, PortBusyError, PortError, TactomoError
 from tactomo.protocol_replay import register
 
@@ -34,7 +34,6 @@ an OSError, the operating system's own one, termios.error while it is set up, an
 ValueError where its descriptor has become None or is closed."""
 
 _GLANCE_S: Final = 0.05
-_PTY_MAJORS: Final = range(136, 144)
 
 
 def open_serial(url: str, baud: int) -> serial.Serial:
@@ -103,7 +102,7 @@ def _claim(port: serial.Serial, path: str, baud: int) -> None:
     """Keep others out of an open port, or close it and raise PortBusyError naming them."""
     try:
         # A pseudo-terminal keeps the mark when its last user has gone, killed ones too.
-        if os.major(os.fstat(port.fileno()).st_rdev) not in _PTY_MAJORS:
+        if os.major(os.fstat(port.fileno()).st_rdev) not in PTY_MAJORS:
             fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
         if other_holders(path):
             time.sleep(_GLANCE_S)  # another daemon that was turned away needs a moment to close it

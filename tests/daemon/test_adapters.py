@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import pty
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -160,3 +163,43 @@ def test_a_latency_timer_that_stays_long_is_told(
 
 def test_a_port_says_its_latency_timer_in_status(bench: Callable[..., Any]) -> None:
     assert bench().ask("status")["ports"][0]["latency_timer_ms"] is None
+
+
+# Opens pseudo-terminals of its own until one has the wanted name, as in a container, and gives that
+# one to a program; says its process.
+NAMESAKE = """
+import os, pty, subprocess, sys
+name = ""
+while name != sys.argv[1]:
+    far_end, near_end = pty.openpty()
+    name = os.ttyname(near_end)
+with subprocess.Popen(["sleep", "60"], stdin=near_end) as program:
+    print(program.pid, flush=True)
+    sys.stdin.read()
+    program.kill()
+"""
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root may mount")
+def test_a_container_has_pseudo_terminals_of_the_same_names() -> None:
+    far_end, near_end = pty.openpty()
+    name = os.ttyname(near_end)
+    mount = (
+        "mount -t devpts -o newinstance,ptmxmode=0666 devpts /dev/pts"
+        ' && mount --bind /dev/pts/ptmx /dev/ptmx && exec "$@"'
+    )
+    command = ["unshare", "--mount", "sh", "-c", mount, "sh", sys.executable, "-c", NAMESAKE, name]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as container:
+        assert container.stdin is not None
+        assert container.stdout is not None
+        pid = container.stdout.readline()
+        if not pid:
+            pytest.skip("nothing may be mounted here")
+        found = [who.pid for who in holders(name)]
+        container.stdin.close()
+    assert os.readlink(f"/proc/self/fd/{near_end}") == name
+    assert found == [os.getpid()]
+    os.close(far_end)
+    os.close(near_end)
