@@ -17,7 +17,7 @@ run: $(READY)    ## twin, daemon and viewer: a skin to press in the browser
 	$(BIN)/tactomo demo $(ARGS)
 
 test: $(READY)   ## the default test suite
-	$(BIN)/pytest $(ARGS)
+	$(BIN)/pytest -n auto --dist loadfile $(ARGS)
 
 test-slow: $(READY)  ## the tests too long for every run
 	$(BIN)/pytest -m 'slow and not train' $(ARGS)

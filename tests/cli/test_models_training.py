@@ -30,6 +30,8 @@ def test_a_missing_extra_is_told(
     monkeypatch.setattr(joblib, "delayed", None, raising=False)
     monkeypatch.setitem(sys.modules, "joblib", joblib)
     monkeypatch.setitem(sys.modules, package, None)
+    for name in [name for name in sys.modules if name.startswith("tactomo_models.training")]:
+        monkeypatch.delitem(sys.modules, name)  # what was imported when it was there
     result = tactomo("models", *arguments)
     assert result.returncode == 1
     assert f"training needs {package}, which is not installed" in result.stderr

@@ -270,7 +270,7 @@ def test_a_flood_of_subscriptions_is_cut_and_the_stream_goes_on(
     deadline = time.monotonic() + PATIENCE_S
     while not any(e["name"] == "subscribers_cut" for e in b.listener.of("event")):
         assert time.monotonic() < deadline
-        assert b.ask("status")["subscribers"] < 40_000
+        assert b.ask("status")["subscribers"] < 60_000  # never all of it
         b.skin.scan()
         time.sleep(0.05)
     assert b.step(0.1)["map"] is not None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -226,7 +227,7 @@ def test_the_examples_load(example: Path) -> None:
 
 def test_an_installed_package_has_the_files_along(tmp_path: Path) -> None:
     build = "from hatchling.build import build_wheel; import sys; build_wheel(sys.argv[1])"
-    subprocess.run(["python", "-c", build, str(tmp_path)], cwd=ROOT, check=True, timeout=100)
+    subprocess.run([sys.executable, "-c", build, str(tmp_path)], cwd=ROOT, check=True, timeout=100)
     (wheel,) = tmp_path.glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {f"tactomo/deploy/{file}" for file in installation.SHARED} <= names
