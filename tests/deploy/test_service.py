@@ -150,6 +150,10 @@ def test_what_stands_in_the_way_is_said(tactomo: Run, monkeypatch: pytest.Monkey
         monkeypatch.setattr("sys.executable", place)
         with pytest.raises(ServiceError, match="does not see"):
             installation.this_program()
+    look = tactomo("service", "install", "palm", "--port", "/dev/ttyACM0", "--dry-run")
+    assert look.returncode == 0
+    assert "does not see" in look.stderr
+    assert "tactomo@palm.service" in look.stdout
     assert "is not plugged in" in tactomo("service", "udev", "palm", "-p", "/dev/ttyUSB99").stderr
 
 

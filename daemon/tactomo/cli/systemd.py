@@ -61,12 +61,12 @@ def install(
     """
     from tactomo import udev
     from tactomo.adapters import list_adapters
-    from tactomo.installation import plan_install, this_program
+    from tactomo.installation import plan_install
 
     _check_name(name)
     rules, names = udev.rules(name, port, list_adapters())
     root = root.absolute()
-    plan = plan_install(name, names, rules, root, program or this_program())
+    plan = plan_install(name, names, rules, root, program or _program(dry_run))
     _carry_out(plan, dry_run)
     if not dry_run:
         typer.echo(f"tactomo@{name} is installed; `tactomo service status {name}` shows how it is")
@@ -148,6 +148,20 @@ def _check_name(name: str) -> None:
         check_sensor_name(name)
     except MessageError as error:
         raise ServiceError(f"{name!r} is no name for a skin", error.next_step) from error
+
+
+def _program(dry_run: bool) -> str:
+    """Return the program that the service is to call; who only looks may do so from anywhere."""
+    from tactomo.errors import ServiceError
+    from tactomo.installation import PROGRAM, this_program
+
+    try:
+        return this_program()
+    except ServiceError as error:
+        if not dry_run:
+            raise
+        typer.echo(f"Not from here: {error}. From {PROGRAM}:\n", err=True)
+        return PROGRAM
 
 
 def _carry_out(plan: Plan, dry_run: bool) -> None:
