@@ -49,7 +49,9 @@ def intact_chunks(file: IO[bytes], start: int = 0) -> Iterator[IntactChunk]:
         found = _read_chunk(file, mark - _BEFORE_MARK)
         if found is not None:
             yield found
-        start = mark + 1 - _BEFORE_MARK if found is None else found.end
+        # Not from its end on: zstd does not mind more than its data, so a damaged length may reach
+        # into the next chunk.
+        start = mark + 1 - _BEFORE_MARK
 
 
 def _find_mark(file: IO[bytes], start: int) -> int | None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from tactomo.errors import RecordingError
@@ -180,6 +180,7 @@ def test_cut_at_every_byte(tmp_path: Path) -> None:
 
 @TAKES_FILES
 @given(st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 7)), min_size=1, max_size=12))
+@example([(6175, 0)])  # a chunk whose length reaches into the next one
 def test_bits_flipped_anywhere(tmp_path: Path, flips: list[tuple[int, int]]) -> None:
     data = bytearray(whole())
     for position, bit in flips:

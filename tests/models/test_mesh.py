@@ -97,6 +97,7 @@ def test_a_rectangle_of_any_geometry(
     width: float, aspect: float, per_side: int, spread: float, share: float, nodes: int
 ) -> None:
     spread *= 1 - 1e-12  # the sum that the description checks may round up
+    share = max(share, 20e-6 * per_side / (spread * width * min(aspect, 1)))  # none below 10 um
     description = rectangle(width, min(width * aspect, 10.0), per_side, spread, share, nodes)
     areas = triangle_areas(check(description))
     assert areas.sum() == pytest.approx(description.width_m * description.height_m, rel=ROUNDING)

@@ -30,6 +30,7 @@ from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
 
 from tactomo.config import Endpoint
+from tactomo.endpoint import is_local
 from tactomo.errors import CommandError, ConfigError
 from tactomo.twin.control import (
     ControlSocket,
@@ -120,6 +121,12 @@ class TwinConfig:
             TypeAdapter(Endpoint).validate_python(self.control)
         except ValidationError as error:
             raise ConfigError(f"control = {self.control!r}", complaints(error)) from error
+        if not is_local(self.control):
+            raise ConfigError(
+                f"control = {self.control!r} can be reached from other computers, and anybody "
+                "there could press the twin",
+                "use tcp://127.0.0.1:PORT or ipc://PATH",
+            )
         channels = len(self.description.modalities)
         if self.ports not in (1, 2) or self.ports > channels:
             raise ConfigError(
