@@ -7,7 +7,7 @@ Every key has a default but `ports`. Errors name the file, the key, its value an
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -145,6 +145,12 @@ class DaemonConfig(BaseModel):
         return self
 
     @model_validator(mode="after")
+    def _addresses_differ(self) -> Self:
+        if self.stream == self.control and not self.stream.endswith(":0"):
+            raise ValueError("stream and control have the same address")
+        return self
+
+    @model_validator(mode="after")
     def _addresses_are_guarded(self) -> Self:
         for key in ("stream", "control"):
             if self.curve is None and not is_local(getattr(self, key)):
@@ -171,9 +177,17 @@ def load_config(path: str | Path | None = None, **overrides: Any) -> DaemonConfi
         return DaemonConfig.model_validate(_override(values, given))
     except ValidationError as error:
         complaints = [f"{_source(item, path, given)}: {explain(item)}" for item in error.errors()]
-        raise ConfigError(
-            "\n".join(complaints), f"known keys: {', '.join(DaemonConfig.model_fields)}"
-        ) from error
+        raise ConfigError("\n".join(complaints), _known_keys(error.errors())) from error
+
+
+def _known_keys(items: Sequence[ErrorDetails]) -> str:
+    """Return the keys that there are where one is unknown or missing."""
+    tables: dict[str, type[BaseModel]] = {"recording": RecordingConfig, "curve": Curve}
+    for item in items:
+        if item["type"] in ("extra_forbidden", "missing"):
+            name = str(item["loc"][0]) if len(item["loc"]) > 1 else ""
+            return f"known keys: {', '.join(tables.get(name, DaemonConfig).model_fields)}"
+    return "deploy/daemon.example.toml shows every key"
 
 
 def _read_toml(path: Path) -> dict[str, Any]:

@@ -293,11 +293,11 @@ class Daemon:
         for port in self._ports:
             port.open(or_wait=config.wait_for_ports)
             undo.callback(port.stop)
-        self._recorder.open()
         if self._metrics is not None and config.metrics is not None:
             self._metrics.open(config.metrics)
             undo.callback(self._metrics.stop)
             self._metrics.start()
+        self._recorder.open()  # when nothing can fail any more: no file for each attempt
         for part in self._threads:
             part.start()
 

@@ -310,7 +310,7 @@ class Recorder:
         if self.active is not None:
             raise CommandError(
                 f"a recording runs already: {self.active.path}",
-                "stop it with record_stop first",
+                "stop it first: `tactomo record stop`",
                 "already_recording",
             )
         folder = self._rules.folder_path if path is None else None
@@ -480,6 +480,8 @@ class Recorder:
         while not folder.is_dir() and folder != folder.parent:
             folder = folder.parent
         disk = os.statvfs(folder)
+        if not disk.f_blocks:  # no disk: whatever stands in the way there will say so
+            return LEAST_ROOM, 0
         reserve = min(self._rules.reserve_mb * 1e6, MOST_RESERVED * disk.f_blocks * disk.f_frsize)
         return disk.f_bavail * disk.f_frsize, round(reserve)
 

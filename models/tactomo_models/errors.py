@@ -35,6 +35,8 @@ def explain(item: "ErrorDetails") -> str:
     message = item["msg"].removeprefix("Value error, ")
     if item["type"] == "extra_forbidden":
         return f"unknown key {key}"
+    if item["type"] == "tuple_type":
+        return f"{key} = {item['input']!r}: give a list, in brackets"
     if item["type"] == "missing":
         return f"{key} is missing"
     if not key:

@@ -27,7 +27,8 @@ def config_file(folder: Path, text: str) -> Path:
         ("ports = []", "ports = []"),
         ("ports = ['a', 'b', 'c']", "at most 2"),
         ("ports = ['a', 'a']", "the two ports are the same"),
-        ("ports = 'a'", "ports = 'a'"),
+        ("ports = 'a'", "ports = 'a': give a list, in brackets"),
+        ("ports = ['a']\nstream = 'ipc:///x'\ncontrol = 'ipc:///x'", "the same address"),
         ("ports = ['a']\ndevice_ids = ['']", "device_ids"),
         ("ports = ['a']\nwait_for_ports = 'yes please'", "wait_for_ports"),
         ("ports = ['a']\nbaud = 'fast'", "baud = 'fast'"),
@@ -57,6 +58,22 @@ def test_a_bad_file_is_refused_with_the_reason(tmp_path: Path, text: str, said: 
     assert str(path) in caught.value.cause
     assert said in caught.value.cause
     assert caught.value.next_step
+
+
+@pytest.mark.parametrize(
+    ("text", "next_step"),
+    [
+        ("prot = 1", "known keys: name, "),
+        ("[recording]\nrotat_mb = 1", "known keys: file, "),
+        ("tare_scans = 1", "deploy/daemon.example.toml"),
+    ],
+)
+def test_the_keys_that_there_are_are_told_where_one_is_not(
+    tmp_path: Path, text: str, next_step: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config(config_file(tmp_path, f"ports = ['a']\n{text}"))
+    assert next_step in caught.value.next_step
 
 
 def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:

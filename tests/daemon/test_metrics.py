@@ -96,12 +96,13 @@ def test_a_slow_scraper_disturbs_nobody_and_does_not_hold_up_the_stop(bench: Ben
         assert time.monotonic() - begin_s < 4.0, "less than the scraper's time"
 
 
-def test_a_port_in_use_is_named(bench: Bench) -> None:
+def test_a_port_in_use_is_named_and_nothing_recorded(bench: Bench, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         taken = f"127.0.0.1:{other.getsockname()[1]}"
         with pytest.raises(AddressError, match=f"cannot offer metrics at {taken}") as caught:
-            bench(ports=1, metrics=taken)
+            bench(ports=1, metrics=taken, record=tmp_path / "a.mcap")
     assert caught.value.next_step
+    assert not (tmp_path / "a.mcap").exists()
 
 
 @pytest.mark.parametrize(

@@ -395,7 +395,7 @@ def test_the_command_says_what_was_kept_and_lost(tactomo: Run, tmp_path: Path) -
     assert "intact data beyond; `tactomo recover`" in facts["ends"]
     rows = json.loads(tactomo("info", ".", "--json").stdout)
     assert [(row["recording"], row["sensor"], row["ends"]) for row in rows] == [
-        ("a-recovered.mcap", "left", "whole"),
+        ("a-recovered.mcap", "left", "closed"),
         ("a.mcap", "left", "not closed"),
     ]
     assert "a-recovered.mcap" in tactomo("info", ".").stdout

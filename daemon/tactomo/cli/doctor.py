@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from tactomo.cli.doctor_evidence import Evidence
 
 COLOURS = {"ok": "green", "unknown": "dim", "advice": "yellow", "fault": "red", "broken": "red"}
+MARKS = {"ok": "", "unknown": "? ", "advice": "! ", "fault": "✗ ", "broken": "✗ "}
 VERDICTS = {
     "ok": "healthy",
     "advice": "healthy",
@@ -238,7 +239,7 @@ def _print(
 def _why(verdict: Level) -> str:
     return {
         "advice": ", with some advice",
-        "fault": ": see what is marked, and what to do about it",
+        "fault": ": see what is marked ✗, and what to do about it",
         "broken": ": nothing that comes from this device can be trusted",
         "unknown": ": too little could be told",
     }[verdict]
@@ -255,6 +256,8 @@ def _table(title: str, findings: list[Finding]) -> Table:
         colour = COLOURS[finding.level]
         about = finding.about.replace("_", " ")
         table.add_row(
-            f"[{colour}]{about}[/]", f"[{colour}]{escape(finding.detail)}[/]", finding.next_step
+            f"[{colour}]{MARKS[finding.level]}{about}[/]",
+            f"[{colour}]{escape(finding.detail)}[/]",
+            finding.next_step,
         )
     return table

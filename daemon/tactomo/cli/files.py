@@ -77,8 +77,8 @@ def _show_folder(folder: Path, as_json: bool) -> None:
 
     table = Table(title=str(folder))
     for name in ("recording", "sensor", "began", "seconds", "MB", "ends"):
-        is_number = name in ("seconds", "MB")
-        table.add_column(name, justify="right" if is_number else "left", no_wrap=True)
+        justify: Literal["right", "left"] = "right" if name in ("seconds", "MB") else "left"
+        table.add_column(name, justify=justify, no_wrap=name != "recording", overflow="fold")
     for row in rows:
         table.add_row(*(str(value) for value in row.values()))
     Console().print(table)
@@ -100,12 +100,12 @@ def _recording_line(path: Path) -> dict[str, Any]:
         "sensor": recording.origin.sensor,
         "began": _date(span.start_ns),
         "seconds": round((span.end_ns - span.start_ns) * 1e-9, 1),
-        "ends": "whole" if span.is_complete else "not closed",
+        "ends": "closed" if span.is_complete else "not closed",
     }
 
 
 def _date(time_ns: int) -> str:
-    return datetime.fromtimestamp(time_ns * 1e-9).isoformat(" ", "seconds")
+    return datetime.fromtimestamp(time_ns * 1e-9).isoformat(" ", "seconds") if time_ns else ""
 
 
 def _facts(what: str) -> dict[str, Any]:
