@@ -11,6 +11,7 @@ It is read again when it changes. A client that was taken off it is cut off with
 from __future__ import annotations
 
 import contextlib
+import shlex
 import threading
 import time
 from collections.abc import Callable
@@ -24,10 +25,10 @@ from tactomo_client.keys import PUBLIC_SUFFIX, read_public, read_secret
 from zmq.auth.thread import ThreadAuthenticator
 
 from tactomo.events import OnEvent, RateLimit
+from tactomo.keys import MAY_COMMAND, how_to_allow
 
 STREAM: Final = "stream"
 CONTROL: Final = "control"
-MAY_COMMAND: Final = "may_command"
 MAX_CLIENTS: Final = 1000
 CHECK_S: Final = 1.0
 
@@ -53,7 +54,7 @@ def load_server_keys(secret: Path, clients: Path) -> ServerKeys:
     if not clients.is_dir():
         raise KeysError(
             f"there is no folder {clients} of clients that may come in",
-            "make it and let one in: `tactomo keys allow NAME.key --for SENSOR`",
+            f"make it: `mkdir -p {shlex.quote(str(clients))}`; then {how_to_allow(clients)}",
         )
     return ServerKeys(read_secret(secret)[1], clients)
 
@@ -142,6 +143,7 @@ class Doorkeeper:
         on_revoked: Callable[[], None],
     ) -> None:
         self._allowed = AllowList(keys.clients, on_event)
+        self._clients = keys.clients
         self._on_event = on_event
         self._on_revoked = on_revoked
         self._checked_s = 0.0  # of the one thread that calls `check`, as is _revocations
@@ -192,8 +194,8 @@ class Doorkeeper:
                 "warning",
                 f"{self._authenticator.address} may not use the {domain}: its public key {key} is "
                 f"not allowed ({self._refused} refused so far)",
-                "if it is yours, copy its NAME.key here: `tactomo keys allow NAME.key --for SENSOR`"
-                + (" --may-command" if domain == CONTROL else ""),
+                "if it is yours, copy its public key (CLIENT.key) to this computer, and "
+                + how_to_allow(self._clients, may_command=domain == CONTROL),
             )
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,9 +21,8 @@ from platformdirs import user_config_path
 from tactomo_client.errors import KeysError
 from tactomo_client.keys import PUBLIC_SUFFIX, SECRET_SUFFIX, read_public
 
-from tactomo.doorkeeper import MAY_COMMAND
-
 CLIENTS_SUFFIX: Final = ".clients"
+MAY_COMMAND: Final = "may_command"
 SYSTEM_FOLDER: Final = Path("/etc/tactomo/keys")
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
@@ -55,6 +55,18 @@ def public_path(folder: Path, name: str) -> Path:
 def clients_folder(folder: Path, server: str) -> Path:
     """Return where the clients of this server are listed."""
     return folder / f"{_checked(server)}{CLIENTS_SUFFIX}"
+
+
+def how_to_allow(clients: Path, *, may_command: bool = False) -> str:
+    """Return the command that lets CLIENT.key in by this list, to be copied as it is."""
+    folder = clients.absolute().parent
+    if clients.suffix != CLIENTS_SUFFIX:  # not a list that `allow` would find
+        place = clients.absolute() / MAY_COMMAND if may_command else clients.absolute()
+        return f"`install -D -m 644 -t {shlex.quote(str(place))} CLIENT.key`"
+    words = ["tactomo", "keys", "allow", "CLIENT.key", "--for", clients.stem]
+    words += ["--may-command"] if may_command else []
+    words += ["--keys", str(folder)] if folder != default_folder() else []
+    return f"`{shlex.join(words)}`"
 
 
 def make_pair(folder: Path, name: str, *, is_server: bool = False, force: bool = False) -> None:
@@ -97,8 +109,8 @@ def allow(
         force: replace another key of the same name.
 
     Raises:
-        KeysError: the file holds no public key, or a secret one; another key has this name; or the
-            list cannot be written.
+        KeysError: the file holds no public key, or a secret one; there is no such server; another
+            key has this name; or the list cannot be written.
 
     """
     if public.suffix == SECRET_SUFFIX:
@@ -109,6 +121,7 @@ def allow(
         )
     key = read_public(public).decode("ascii")
     client = Client(_checked(public.stem), key, may_command)
+    _check_server(folder, server)
     known = {other.name: other for other in list_clients(folder, server)}.get(client.name)
     if known is not None and known.public != key and not force:
         raise KeysError(
@@ -131,9 +144,10 @@ def revoke(folder: Path, name: str, server: str) -> None:
     """Take a client off a server's list.
 
     Raises:
-        KeysError: it is not on it, or the list cannot be written.
+        KeysError: it is not on it, there is no such server, or the list cannot be written.
 
     """
+    _check_server(folder, server)
     places = [path for path in _places(folder, server, name) if path.exists()]
     if not places:
         known = ", ".join(client.name for client in list_clients(folder, server)) or "nobody"
@@ -162,6 +176,18 @@ def list_pairs(folder: Path) -> list[str]:
 def list_servers(folder: Path) -> list[str]:
     """Return the names of the servers that have a list of clients in a folder."""
     return sorted(path.stem for path in folder.glob(f"*{CLIENTS_SUFFIX}") if path.is_dir())
+
+
+def _check_server(folder: Path, server: str) -> None:
+    """Refuse to begin a list that no daemon reads."""
+    if not clients_folder(folder, server).is_dir():
+        known = ", ".join(list_servers(folder)) or "none"
+        raise KeysError(
+            f"no server key {server!r} in {folder}; there are: {known}",
+            "run this on the server's computer, with its folder of keys (--keys) and the name that "
+            "was given to `tactomo keys make NAME --server`",
+            "no_such_server",
+        )
 
 
 def _clients(folder: Path, may_command: bool) -> list[Client]:

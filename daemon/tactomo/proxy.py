@@ -10,6 +10,7 @@ alone. One thread, the main one, touches everything but the doorkeeper's own.
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
 import time
@@ -35,6 +36,8 @@ POLL_MS: Final = 200
 LOOK_S: Final = 1.0
 REMEMBERED_S: Final = 3.0
 """A status that is older is not news to a newcomer: its daemon is gone."""
+SILENT_S: Final = 5.0
+"""A source that has not answered so long after the start is missed."""
 LINGER_MS: Final = 200
 MAX_SENSORS: Final = 64
 MAX_TOPIC_BYTES: Final = 128
@@ -198,6 +201,8 @@ class _Inlet:
         self._keys = keys
         self._handshakes = Handshakes(self.socket)
         self._told: str | None = None
+        self._missed_at_s = time.monotonic() + SILENT_S
+        self._is_missed = False
         try:
             connect_subscriber(self.socket, address, [], keys=keys)
         except ClientError:
@@ -219,6 +224,23 @@ class _Inlet:
                 _tell(refusal.name, "error", refusal.cause, refusal.next_step)
             reconnect(self.socket, self.address)
         self._told = None if refusal is None else refusal.name
+        if refusal is None:
+            self._tell_missed()
+
+    def _tell_missed(self) -> None:
+        """Say once that this source has never answered, and that it does now."""
+        answers = self._handshakes.have_succeeded
+        if self._is_missed and answers:
+            self._is_missed, self._missed_at_s = False, math.inf
+            _tell("source_came", "info", f"{self.address} is there now")
+        elif not answers and not self._is_missed and time.monotonic() > self._missed_at_s:
+            self._is_missed = True
+            _tell(
+                "source_silent",
+                "warning",
+                f"nothing from {self.address}",
+                "start its daemon, or give --from the address that its daemon logs as `stream`",
+            )
 
     def close(self) -> None:
         """Close the connection."""

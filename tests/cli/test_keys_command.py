@@ -42,6 +42,8 @@ def test_what_make_prints_leads_to_a_client_that_is_let_in(
     (tmp_path / "desk" / "left.key").write_bytes((folder / "left.key").read_bytes())
     loaded = Keys.load(tmp_path / "desk")
     assert loaded.public.decode() in allowed.stdout
+    assert str(folder) in allowed.stdout
+    assert f"`tactomo keys allow CLIENT.key --for left --keys {folder}`" in made.stdout
     assert loaded.server == read_public(folder / "left.key")
     listed = keys("list").stdout
     assert f"desk   {loaded.public.decode()}   may read the stream and command" in listed
@@ -104,7 +106,10 @@ def test_a_client_is_listed_once_and_taken_off(keys: Run, tactomo: Run, tmp_path
         (("allow", "desk.key", "--for", "../.."), "cannot be the name"),
         (("allow", "empty.key", "--for", "left"), "cannot read a key"),
         (("allow", "desk.key_secret", "--for", "left"), "must not leave its computer"),
-        (("revoke", "desk", "--for", "left"), "not on the list"),
+        (("allow", "desk.key", "--for", "left"), "no server key 'left' in"),
+        (("allow", "desk.key", "--for", "left"), "there are: arm"),
+        (("revoke", "desk", "--for", "left"), "no server key 'left' in"),
+        (("revoke", "desk", "--for", "arm"), "not on the list"),
     ],
 )
 def test_what_cannot_be_done_says_why(
@@ -112,7 +117,9 @@ def test_what_cannot_be_done_says_why(
 ) -> None:
     (tmp_path / "empty.key").touch()
     tactomo("keys", "make", "desk", "--keys", tmp_path)
+    keys("make", "arm", "--server")
     outcome = keys(*arguments)
+    assert not (tmp_path / "keys" / "left.clients").exists()
     assert outcome.returncode == 1
     assert said in outcome.stderr
     assert "Traceback" not in outcome.stderr

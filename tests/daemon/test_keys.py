@@ -170,7 +170,9 @@ def test_a_client_that_is_not_listed_is_refused_and_told_of(guarded: Any, robot:
         assert public in caught.value.cause
         assert public in event["detail"]
         assert own_address() in event["detail"] or "127.0.0.1" in event["detail"]
-        assert "tactomo keys allow" in event["next_step"]
+        command = f"`tactomo keys allow CLIENT.key --for {SERVER} --keys {robot.folder}`"
+        assert command in event["next_step"]
+        assert f"`tactomo keys allow stranger.key --for {SERVER}`" in caught.value.next_step
         with pytest.raises(KeysError) as refused:
             request("status", guarded.daemon.control_address, 5.0, keys=stranger)
         assert refused.value.name == "key_refused"
@@ -187,7 +189,9 @@ def test_a_reader_may_not_command(guarded: Any, robot: Robot) -> None:
     with pytest.raises(KeysError) as refused:
         request("tare", guarded.daemon.control_address, 5.0, keys=ros)
     assert refused.value.name == "key_refused"
-    assert "may not use the control" in guarded.listener.event("client_refused")["detail"]
+    event = guarded.listener.event("client_refused")
+    assert "may not use the control" in event["detail"]
+    assert f"--for {SERVER} --may-command --keys {robot.folder}`" in event["next_step"]
 
 
 def test_the_wrong_server_key_is_noticed(guarded: Any, robot: Robot) -> None:

@@ -177,6 +177,18 @@ def test_a_daemon_may_come_and_go(
             pass
 
 
+def test_a_source_that_never_answered_is_missed_once(
+    left: FakeSensor, proxy: Callable[..., Running]
+) -> None:
+    left.close()
+    running = proxy(left)
+    warning = running.said("source_silent")
+    assert f"nothing from {left.address}" in warning["detail"]
+    assert "start its daemon" in warning["next_step"]
+    with FakeSensor("left", left.address):
+        assert left.address in running.said("source_came")["detail"]
+
+
 def test_a_slow_subscriber_slows_nobody(
     left: FakeSensor, proxy: Callable[..., Running], reader: Any
 ) -> None:
@@ -245,6 +257,7 @@ def test_with_keys_it_lets_in_the_listed_alone(
     ("arguments", "status", "said"),
     [
         (["--bind", "tcp://0.0.0.0:5570"], 1, "can be reached from other computers"),
+        (["--bind", "ipc:///tmp/none"], 2, "is a --from, too"),
         (["--bind", "udp://x"], 2, "use tcp://127.0.0.1:PORT"),
         (["--secret", "none.key_secret"], 1, "none.clients"),
     ],

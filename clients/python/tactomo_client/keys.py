@@ -35,11 +35,16 @@ _HANDSHAKE_EVENTS: Final = (
 
 @dataclass(frozen=True)
 class Keys:
-    """A client's pair of keys and its server's public key, each 40 characters of Z85."""
+    """A client's pair of keys and its server's public key, each 40 characters of Z85.
+
+    The names are those of their files, for messages.
+    """
 
     public: bytes
     secret: bytes = field(repr=False)
     server: bytes
+    name: str = "CLIENT"
+    server_name: str = "SERVER"
 
     @classmethod
     def load(cls, folder: str | Path) -> Self:
@@ -56,7 +61,8 @@ class Keys:
         mine = _only(where, sorted(where.glob(f"*{SECRET_SUFFIX}")), "secret key of your own")
         public, secret = read_secret(mine)
         theirs = [p for p in sorted(where.glob(f"*{PUBLIC_SUFFIX}")) if p.stem != mine.stem]
-        return cls(public, secret, read_public(_only(where, theirs, "server's public key")))
+        server = _only(where, theirs, "server's public key")
+        return cls(public, secret, read_public(server), mine.stem, server.stem)
 
 
 def as_keys(keys: Keys | str | Path | None) -> Keys | None:
@@ -137,17 +143,23 @@ class Handshakes:
     """Watches what becomes of a socket's handshakes, to tell a closed door from nobody at home.
 
     Belongs to the socket's thread, and is to be closed before the socket.
+
+    Attributes:
+        have_succeeded: whether `refusal` has ever seen a server take this client in.
+
     """
 
     def __init__(self, socket: zmq.Socket[bytes]) -> None:
         self._socket = socket
         self._monitor = socket.get_monitor_socket(_HANDSHAKE_EVENTS)
         self._failures: list[int] = []  # since the last success
+        self.have_succeeded = False
 
     def refusal(self, address: str, keys: Keys | None) -> KeysError | None:
         """Return why the server lets nobody in by these keys; None as long as it may do so."""
         while self._monitor.poll(0):
             event = recv_monitor_message(self._monitor)["event"]
+            self.have_succeeded |= event == zmq.Event.HANDSHAKE_SUCCEEDED
             self._failures = (
                 [] if event == zmq.Event.HANDSHAKE_SUCCEEDED else [*self._failures[-1:], event]
             )
@@ -168,8 +180,9 @@ def _refusal(event: int, address: str, keys: Keys | None) -> KeysError:
     if event == zmq.Event.HANDSHAKE_FAILED_AUTH and keys is not None:
         return KeysError(
             f"{address} does not let this client in: its key {keys.public.decode()} is not allowed",
-            "on the server's computer: `tactomo keys allow NAME.key --for SENSOR` (with "
-            "--may-command for its control socket)",
+            f"copy {keys.name}{PUBLIC_SUFFIX} to the server's computer, and there run `tactomo "
+            f"keys allow {keys.name}{PUBLIC_SUFFIX} --for {keys.server_name}`, for its control "
+            "socket with `--may-command`, and with `--keys FOLDER` where they are elsewhere",
             "key_refused",
         )
     if keys is None:

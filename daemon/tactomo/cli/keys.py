@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
@@ -18,7 +19,8 @@ keys = typer.Typer(
         "Make and manage the keys that let clients on other computers connect (CURVE).\n\n"
         "Each side makes a pair with `make`. The server's *public* key is copied to its clients, "
         "and each client's *public* key is put on the server's list with `allow`. Secret keys "
-        "never leave their computer."
+        "never leave their computer.\n\n"
+        "A client's folder of keys holds one server's public key: keep a folder for each server."
     ),
     no_args_is_help=True,
     epilog=examples(
@@ -56,7 +58,7 @@ def make(
     force: Force = False,
 ) -> None:
     """Make a pair of keys and say what to do with it."""
-    from tactomo.keys import clients_folder, make_pair, public_path, secret_path
+    from tactomo.keys import clients_folder, how_to_allow, make_pair, public_path, secret_path
 
     where = (_folder(folder)).absolute()
     make_pair(where, name, is_server=server, force=force)
@@ -66,17 +68,23 @@ def make(
     if not server:
         typer.echo(f"1. Copy {public.name} to the server's computer, and there run:")
         typer.echo(f"     tactomo keys allow {public.name} --for SERVER      (to read its stream)")
-        typer.echo("   with --may-command where it may tare and record, too.")
-        typer.echo(f"2. Copy the server's NAME.key into {where}; then here, for example:")
-        typer.echo(f"     tactomo watch --stream tcp://ROBOT:5560 --keys {where}")
+        typer.echo(
+            "   with --may-command where it may tare and record, too. SERVER is the name given"
+        )
+        typer.echo("   to `tactomo keys make SERVER --server` there.")
+        typer.echo(f"2. Copy the server's SERVER.key into {where}, which is for")
+        typer.echo("   this one server: keep a folder for each. Then here, for example:")
+        typer.echo(f"     tactomo watch --stream tcp://ROBOT:5560 --keys {shlex.quote(str(where))}")
         return
     typer.echo("1. Put into the daemon's configuration, and start it again:")
     typer.echo(f'     [curve]\n     secret = "{secret}"')
     typer.echo(f'     clients = "{clients_folder(where, name)}"')
     if os.geteuid() == 0:
         typer.echo(f"   The daemon's user must own the secret key: chown USER {secret}")
-    typer.echo(f"2. Copy {public.name} into each client's folder of keys.")
-    typer.echo(f"3. Let each client in: tactomo keys allow CLIENT.key --for {name}")
+    typer.echo(
+        f"2. Copy {public.name} into each client's folder of keys, a folder for each server."
+    )
+    typer.echo(f"3. Let each client in: {how_to_allow(clients_folder(where, name))}")
 
 
 @keys.command(
@@ -100,8 +108,9 @@ def allow(
     """
     from tactomo.keys import allow as put_on_list
 
-    client = put_on_list(_folder(folder), public, server, may_command=may_command, force=force)
-    typer.echo(f"{client.name} ({client.public}) {_rights(client)} of {server}")
+    where = _folder(folder)
+    client = put_on_list(where, public, server, may_command=may_command, force=force)
+    typer.echo(f"{client.name} ({client.public}) {_rights(client)} of {server}, in {where}")
 
 
 @keys.command(epilog=examples("tactomo keys revoke desk --for left_forearm"))
@@ -116,8 +125,9 @@ def revoke(
     """
     from tactomo.keys import revoke as take_off_list
 
-    take_off_list(_folder(folder), name, server)
-    typer.echo(f"{name} is off the list of {server}")
+    where = _folder(folder)
+    take_off_list(where, name, server)
+    typer.echo(f"{name} is off the list of {server}, in {where}")
 
 
 @keys.command("list", epilog=examples("tactomo keys list"))

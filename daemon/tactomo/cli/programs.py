@@ -278,14 +278,25 @@ def proxy(
     keys: KeysFolder = None,
     log_level: Annotated[LogLevel, typer.Option(help="The least severe that is logged.")] = "info",
     log_format: Annotated[
-        LogFormat, typer.Option(help="text, json, or auto: text on a terminal.")
+        LogFormat,
+        typer.Option(
+            help="text, json, journal; auto: text on a terminal, journal for journald, else json."
+        ),
     ] = "auto",
 ) -> None:
     """Pass on the streams of several daemons at one address, until stopped.
 
     Each skin has a daemon of its own; this gives them one address, and one door to the outside. The
     daemons' control sockets stay where they are.
+
+    A folder of keys holds one server's public key, and --keys is used for all --from: daemons that
+    want keys of this proxy share one server key, or have a proxy each.
     """
+    if bind in sources:
+        raise typer.BadParameter(
+            f"{bind} is a --from, too; give another address of this computer",
+            param_hint="'--bind'",
+        )
     from tactomo_client.keys import as_keys
 
     from tactomo.doorkeeper import load_server_keys
