@@ -337,7 +337,8 @@ async def test_a_page_that_goes_away_lifts_its_presses_but_not_the_held_ones(
 async def test_the_page_hears_when_the_twin_comes_and_goes(sensor: FakeSensor) -> None:
     twin = FakeControl()
     async with viewer_of(sensor, twin=twin.address) as viewer, viewer.page() as page:
-        assert (await page.next("twin"))["answers"] is True
+        while not (await page.next("twin"))["answers"]:
+            pass  # a busy computer may take longer for the first answer than is waited for
         twin.close()
         assert (await page.next("twin"))["answers"] is False
         with FakeControl(address=twin.address):
