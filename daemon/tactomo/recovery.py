@@ -22,7 +22,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Header, Message, Metadata
 from mcap.stream_reader import StreamReader
-from tactomo_protocol import Channel, Decoder, Scan
+from tactomo_protocol import SCAN_COUNTERS, Channel, Decoder, Scan
 
 from tactomo.errors import RecordingError
 from tactomo.intact_chunks import intact_chunks
@@ -41,7 +41,6 @@ from tactomo.recording import (
 from tactomo.recording_writer import RecordingWriter, pack_mark
 
 _REMEMBERED_SCANS: Final = 1024
-_COUNTERS: Final = 1 << 32
 _NAME: Final = struct.pack("<I", len(PROFILE)) + PROFILE.encode()
 _BEGINNING_BYTES: Final = 1 << 16
 _RECORD_HEAD: Final = struct.Struct("<BQ")
@@ -214,7 +213,7 @@ class _Salvage:
         self._scans.append(ScanKey(scan.channel, scan.counter, scan.device_us))
         gap = self._open_gap_of.pop(scan.channel, None)
         if gap is not None:
-            missing = (scan.counter - self._counters[scan.channel] - 1) % _COUNTERS
+            missing = (scan.counter - self._counters[scan.channel] - 1) % SCAN_COUNTERS
             if missing < _MOST_MISSING:
                 gap.scans[scan.channel] = missing
         self._counters[scan.channel] = scan.counter

@@ -18,7 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol
 
-from tactomo_protocol import Channel
+from tactomo_protocol import SCAN_COUNTERS, Channel
 
 from tactomo.port import ChannelScan
 from tactomo.recording import Mark, ScanKey
@@ -30,7 +30,6 @@ START_GRACE_NS: Final = 3_000_000_000
 STALE_US: Final = 2_000_000
 """A counter and a clock that are back by no more than this belong to a scan sent once again."""
 
-_COUNTERS: Final = 1 << 32
 _ZEROED, _RESET = 1, 2  # epochs further; both boards of a pair, so the same for both
 
 
@@ -337,4 +336,4 @@ def _dual(*scans: ChannelScan | None, mark: Mark | None = None) -> DualScan:
 
 def counts_between(earlier: int, later: int) -> int:
     """Return how much further one counter is than another, across the wrap of 32 bits."""
-    return (later - earlier + _COUNTERS // 2) % _COUNTERS - _COUNTERS // 2
+    return (later - earlier + SCAN_COUNTERS // 2) % SCAN_COUNTERS - SCAN_COUNTERS // 2

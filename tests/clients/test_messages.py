@@ -8,6 +8,7 @@ from typing import Any
 import msgpack  # type: ignore[import-untyped]
 import numpy as np
 import pytest
+from fuzz_targets import ENVELOPE as HEADER
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -27,19 +28,6 @@ from tactomo_client.messages import (
     encode_request,
     topic,
 )
-
-HEADER: dict[str, Any] = {
-    "session": "0123456789abcdef",
-    "sequence": 7,
-    "acquired_realtime_ns": 1_700_000_000_000_000_000,
-    "acquired_monotonic_ns": 123_456_789,
-    "device_us": 42,
-    "age_ns": 1_000_000,
-    "tier": "levelset",
-    "tier_reason": "two contacts",
-    "flags": ["misfit_high"],
-    "misfit": 1.25,
-}
 
 RESERVED = {"schema", "sensor", "kind", "clock_id", *HEADER}
 

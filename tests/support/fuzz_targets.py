@@ -70,7 +70,7 @@ PACKETS: tuple[Packet, ...] = (
     Acknowledge(1, CommandCode.START, AckStatus.OK),
     Command(CommandCode.SET_RATE, request=1, rate_hz=20.0),
 )
-HEADER: Mapping[str, Any] = {
+ENVELOPE: dict[str, Any] = {
     "session": "0123456789abcdef",
     "sequence": 7,
     "acquired_realtime_ns": 1_700_000_000_000_000_000,
@@ -81,8 +81,8 @@ HEADER: Mapping[str, Any] = {
     "tier_reason": "two contacts",
     "flags": ["misfit_high"],
     "misfit": 1.25,
-    "scan_counter": 3,
 }
+HEADER = {**ENVELOPE, "scan_counter": 3}
 CONTACT = {"id": 1, "x_mm": 1.0, "y_mm": -2.0, "area_mm2": 700.0, "magnitude": None}
 
 

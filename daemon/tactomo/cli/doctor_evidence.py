@@ -19,7 +19,7 @@ from tactomo_models import DescriptionError, SensorDescription, load_description
 from tactomo_models.diagnosis import PatternLayout, pattern_of_zeros, without_zeros
 from tactomo_models.pattern import Pairs, scan_pairs
 from tactomo_models.plausibility import Layout
-from tactomo_protocol import Channel, Decoder, Hello, Scan, ScanFlag
+from tactomo_protocol import SCAN_COUNTERS, Channel, Decoder, Hello, Scan, ScanFlag
 
 from tactomo.cli.imported import load_arrays, read_scans, single_ended
 from tactomo.errors import TactomoError
@@ -31,7 +31,6 @@ STATUS_WAIT_S = 3.0  # a daemon sends its status every second
 AT_REST = ("baseline", "reference", "rest", "empty")  # names of arrays of scans at rest
 CHANGES = "dv"
 LOOKUP = "lookup"
-COUNTERS = 1 << 32
 
 
 class DoctorError(TactomoError):
@@ -266,8 +265,8 @@ def _heard_of_messages(
 
 def _gaps(counters: list[int]) -> int:
     """Scans missing between the first and the last; a counter that goes back starts anew."""
-    steps = np.mod(np.diff(np.array(counters, dtype=np.int64)), COUNTERS)
-    return int((steps[(steps > 0) & (steps < COUNTERS // 2)] - 1).sum())
+    steps = np.mod(np.diff(np.array(counters, dtype=np.int64)), SCAN_COUNTERS)
+    return int((steps[(steps > 0) & (steps < SCAN_COUNTERS // 2)] - 1).sum())
 
 
 def _delays(arrived_ms: FloatArray, device_ms: FloatArray) -> FloatArray:

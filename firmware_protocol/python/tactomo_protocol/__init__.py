@@ -21,6 +21,7 @@ from .codec import (
     encode,
 )
 from .packets import (
+    SCAN_COUNTERS,
     Acknowledge,
     AckStatus,
     Channel,
@@ -40,6 +41,7 @@ __all__ = [
     "MAX_SAMPLES",
     "MAX_STRING_BYTES",
     "PROTOCOL_VERSION",
+    "SCAN_COUNTERS",
     "AckStatus",
     "Acknowledge",
     "Channel",

@@ -70,6 +70,10 @@ class AckStatus(IntEnum):
     BUSY = 3
 
 
+SCAN_COUNTERS = 1 << 32
+"""How many values a scan's counter has before it begins again at 0."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
     """One channel's voltages of one scan.
