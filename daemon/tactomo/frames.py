@@ -174,6 +174,10 @@ def _contact(contact: Contact) -> dict[str, Any]:
         "x_sigma_mm": _finite(contact.x_sigma_m * 1e3),
         "y_sigma_mm": _finite(contact.y_sigma_m * 1e3),
         "area_sigma_mm2": _finite(contact.area_sigma_m2 * 1e6),
+        "pressure_sigma_kpa": _finite(contact.pressure_sigma_kpa),
+        "force_n": _finite(contact.force_n),
+        "force_sigma_n": _finite(contact.force_sigma_n),
+        "pressure_range": str(contact.pressure_range),
     }
 
 

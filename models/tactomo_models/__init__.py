@@ -26,6 +26,7 @@ from tactomo_models.description import (
 )
 from tactomo_models.errors import ArtifactError, DataError, DescriptionError, ModelError
 from tactomo_models.plausibility import Flag
+from tactomo_models.pressure import PressureCurve, PressureRange
 from tactomo_models.reconstruct import Reconstruction, Reconstructor
 from tactomo_models.reference import Reference
 from tactomo_models.scene import Press
@@ -43,6 +44,8 @@ __all__ = [
     "Modality",
     "ModelError",
     "Press",
+    "PressureCurve",
+    "PressureRange",
     "Reconstruction",
     "Reconstructor",
     "Reference",

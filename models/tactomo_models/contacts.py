@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
-from tactomo_models.description import SensorDescription
 from tactomo_models.forward import ForwardModel
+from tactomo_models.pressure import PressureRange
 from tactomo_models.shape_fit import Shape
 
 FloatArray = NDArray[np.float64]
@@ -42,9 +42,13 @@ class Contact:
         magnitude: relative conductivity change of the magnitude channel, without its sign;
             NaN if unknown.
         magnitude_sigma: standard uncertainty of the magnitude.
-        pressure_kpa: NaN if unknown, or below the magnitude channel's onset.
+        pressure_kpa: see `pressure_range`; NaN if unknown, the range's top if above.
         x_sigma_m, y_sigma_m: standard uncertainties of the centroid; NaN if unknown.
         area_sigma_m2: that of the area; NaN if unknown.
+        pressure_sigma_kpa: standard uncertainty of the pressure; NaN but within the range.
+        force_n: pressure times area; NaN if unknown.
+        force_sigma_n: standard uncertainty of the force; NaN if unknown.
+        pressure_range: where the pressure lies, seen from what the magnitude channel answers to.
     """
 
     id: int
@@ -57,6 +61,10 @@ class Contact:
     x_sigma_m: float = float("nan")
     y_sigma_m: float = float("nan")
     area_sigma_m2: float = float("nan")
+    pressure_sigma_kpa: float = float("nan")
+    force_n: float = float("nan")
+    force_sigma_n: float = float("nan")
+    pressure_range: PressureRange = PressureRange.UNKNOWN
 
 
 @dataclass(frozen=True)
@@ -427,13 +435,3 @@ class Tracker:
     def clear(self) -> None:
         """Forget all contacts; identities are not used again."""
         self._centres, self._ids, self._missed = np.zeros((0, 2)), [], []
-
-
-def pressure_of(
-    description: SensorDescription, magnitude: FloatArray, sigma: FloatArray
-) -> FloatArray:
-    """Pressure (K,) in kPa; NaN where the magnitude is not clearly above zero."""
-    if description.magnitude is None:
-        return np.full(len(magnitude), np.nan)
-    known = magnitude > 2 * sigma
-    return np.where(known, description.magnitude.response.pressure(magnitude), np.nan)

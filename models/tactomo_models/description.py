@@ -108,17 +108,6 @@ class MagnitudeResponse(_Section):
         """Relative conductivity change at a pressure, any shape."""
         return np.asarray(np.interp(pressure_kpa, self.pressure_kpa, self.relative_change))
 
-    def pressure(self, magnitude: FloatArray) -> FloatArray:
-        """Pressure in kPa at which |relative change| is `magnitude`, any shape.
-
-        NaN where the table does not answer: no change at all says only "below the onset".
-        Beyond the table's end the last pressure is returned.
-        """
-        size = np.abs(np.asarray(self.relative_change))
-        onset = int(np.flatnonzero(size > 0)[0]) - 1
-        kpa = np.interp(magnitude, size[onset:], np.asarray(self.pressure_kpa)[onset:])
-        return np.where(np.asarray(magnitude) > 0, kpa, np.nan)
-
 
 class StructureResponse(_Section):
     """Ratio of the pressed to the unpressed conductivity against pressure in kPa."""

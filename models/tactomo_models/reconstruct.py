@@ -13,7 +13,7 @@ counted in modelled work, so that a recording reconstructs exactly as the live s
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -33,7 +33,6 @@ from tactomo_models.contacts import (
     Tracker,
     bare_tangent,
     linear_magnitudes,
-    pressure_of,
     without_holes,
 )
 from tactomo_models.description import Modality, SensorDescription
@@ -44,6 +43,7 @@ from tactomo_models.objects import ObjectFollower
 from tactomo_models.outlines import Outlines, ellipses_of
 from tactomo_models.paper_level_set import PaperLevelSet
 from tactomo_models.plausibility import Flag, Wiring
+from tactomo_models.pressure import PressureCurve, pressures_of
 from tactomo_models.redrawing import Drawing, Redrawer, SecondOpinion
 from tactomo_models.reference import Reference
 from tactomo_models.shape_fit import Shape
@@ -59,6 +59,7 @@ MUCH_MORE = 5.0  # ratio of the channels' contrasts (logarithms) for that
 HOLLOW_MISFIT = 1.1  # of the magnitude channel: enough to ask whether a contact is a ring
 LINEAR_PART = 0.5  # of the misfit of nothing, that areas cut out of a linear image may leave
 MOST_HELD = 10  # frames without a structure scan that the last shape stands in for: half a second
+TOUCHED = 0.05  # share of a node that a contact covers, from which it is touched
 LOW_CONFIDENCE = 0.8  # expected correlation below which a map is better not trusted
 SURE_CONFIDENCE = 0.9  # ... from which one is, although the physics cannot explain the data
 SURE_SHARE = 0.85  # of the second opinion, from which contacts are its own: outlines know theirs
@@ -76,8 +77,8 @@ class Reconstruction:
     Attributes:
         map: (nodes_y, nodes_x) |relative conductivity change| of the magnitude channel; None
             where it cannot be computed.
-        pressure_kpa: (nodes_y, nodes_x); None where it cannot be computed. Nodes pressed below
-            the magnitude channel's onset are 0: see `structure`.
+        pressure_kpa: (nodes_y, nodes_x); None where it cannot be computed. 0 where nothing
+            touches, NaN in contacts whose pressure is not known.
         structure: (nodes_y, nodes_x) 0 bare to 1 pressed; None where it cannot be computed. For
             a sensor whose objects conduct `either_way`, -1 where one conducts worse.
         contacts: pressed areas.
@@ -123,6 +124,7 @@ class Reconstructor:
         budget_s: compute time a frame may take, on a machine of the 2.5 GHz class.
         redraw: whether the refining network has the last word on what the physics has found.
         regularisation: factor on what a rule chooses for the linear methods.
+        curve: turns magnitudes into pressures; the description's own table if None.
 
     Raises:
         ArtifactError: the artifact or the tier's network cannot be used.
@@ -139,8 +141,12 @@ class Reconstructor:
         budget_s: float | None = None,
         redraw: bool = True,
         regularisation: float = 1.0,
+        curve: PressureCurve | None = None,
     ) -> None:
         self.description = description
+        if curve is None and description.magnitude is not None:
+            curve = PressureCurve.of_response(description.magnitude.response)
+        self._curve = curve
         self._tier = tier
         self.budget_s = budget_s
         self._redraw = redraw
@@ -480,10 +486,9 @@ class Reconstructor:
             contacts = self._contacts_of(areas, known * size, known * sigma)
         if image.confidence < LOW_CONFIDENCE:
             flags |= Flag.LOW_CONFIDENCE
-        pressure = np.array([c.pressure_kpa for c in contacts])
         return Reconstruction(
             map=image.map if "magnitude" in data else None,
-            pressure_kpa=_fused(areas, pressure, image.map.shape) if "magnitude" in data else None,
+            pressure_kpa=_pressure_map(areas, contacts) if "magnitude" in data else None,
             structure=image.structure if "structure" in data else None,
             contacts=contacts,
             tier=tier,
@@ -518,8 +523,7 @@ class Reconstructor:
         magnitude, pressure = None, None
         if "magnitude" in data:
             magnitude = own.map(self.description.sign("magnitude"))
-            kpa = np.array([c.pressure_kpa for c in contacts])
-            pressure = _fused(shown.areas, kpa, own.pressed.shape)
+            pressure = _pressure_map(shown.areas, contacts)
         if second is not None and magnitude is not None:
             other = second.drawing.map(self.description.sign("magnitude"))
             magnitude += second.share * (other - magnitude)
@@ -590,15 +594,15 @@ class Reconstructor:
         if self._shown is None or self._frames_held > MOST_HELD:
             return None
         with self._timed("contacts"):
-            areas, pressed = self._shown.areas, self._shown.on_map
+            areas = self._shown.areas
             fitted = self._fit_magnitudes(areas, data, 1)
             if self._magnitude_unexplained(data, fitted, BAD_MISFIT):
                 return None
             contacts = self._contacts(areas, fitted)
         assert fitted is not None
         return Reconstruction(
-            map=_fused(areas, np.array([c.magnitude for c in contacts]), pressed.shape),
-            pressure_kpa=_fused(areas, np.array([c.pressure_kpa for c in contacts]), pressed.shape),
+            map=_fused(areas, np.array([c.magnitude for c in contacts])),
+            pressure_kpa=_pressure_map(areas, contacts),
             structure=None,
             contacts=contacts,
             tier=self._shown.tier,
@@ -720,7 +724,7 @@ class Reconstructor:
         self, areas: Areas, size: FloatArray, sigma: FloatArray
     ) -> tuple[Contact, ...]:
         ids = self._tracker.update(areas.centres_m)
-        pressure = pressure_of(self.description, size, sigma)
+        pressures = pressures_of(self._curve, size, sigma, areas.areas_m2, areas.sigmas[:, 2])
         return tuple(
             Contact(
                 id=ids[k],
@@ -729,10 +733,14 @@ class Reconstructor:
                 area_m2=float(areas.areas_m2[k]),
                 magnitude=float(size[k]),
                 magnitude_sigma=float(sigma[k]),
-                pressure_kpa=float(pressure[k]),
+                pressure_kpa=float(pressures.kpa[k]),
                 x_sigma_m=float(areas.sigmas[k, 0]),
                 y_sigma_m=float(areas.sigmas[k, 1]),
                 area_sigma_m2=float(areas.sigmas[k, 2]),
+                pressure_sigma_kpa=float(pressures.sigma_kpa[k]),
+                force_n=float(pressures.force_n[k]),
+                force_sigma_n=float(pressures.force_sigma_n[k]),
+                pressure_range=pressures.ranges[k],
             )
             for k in range(len(areas))
         )
@@ -758,9 +766,15 @@ def _named(name: Modality, electrodes: list[int]) -> str:
     return f"{name} {word} {', '.join(map(str, electrodes))} left out"
 
 
-def _fused(areas: Areas, values: FloatArray, shape: tuple[int, ...]) -> Image:
+def _fused(areas: Areas, values: FloatArray) -> Image:
     """Map on which each area carries its own value; areas of unknown value stay 0."""
-    if len(areas) == 0:
-        return np.zeros(shape, np.float32)
     fused = np.einsum("k,kyx->yx", np.nan_to_num(values), areas.on_map)
     return np.asarray(fused, dtype=np.float32)
+
+
+def _pressure_map(areas: Areas, contacts: Sequence[Contact]) -> Image:
+    """Each contact's pressure on its area; NaN, and not 0, where it is touched but unknown."""
+    values = np.array([contact.pressure_kpa for contact in contacts])
+    fused = _fused(areas, values)
+    fused[(areas.on_map[np.isnan(values)] > TOUCHED).any(axis=0)] = np.nan
+    return fused

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import pty
 import re
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tactomo.cli.watch import PRESSED_COLOUR, map_text
+from tactomo.cli.watch import PRESSED_COLOUR, frame_line, map_text
 from tactomo_client import Contact, subscribe
 from tactomo_client.fake import FakeSensor
 
@@ -119,6 +120,28 @@ def test_in_a_pipe_it_prints_a_line_a_frame(tactomo: Run, sensor: FakeSensor) ->
     assert result.returncode == 0
     assert "#7 (+12.5, -20.0) mm 171 kPa" in result.stdout
     assert result.stdout.count("\n") > 5
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        (
+            {"pressure_sigma_kpa": 4.2, "force_n": 119.7, "force_sigma_n": 6.0},
+            "171 ± 4 kPa, 120 ± 6 N",
+        ),
+        ({"pressure_kpa": None, "pressure_range": "below"}, "touched, pressure unknown"),
+        (
+            {"pressure_kpa": 300.0, "force_n": 210.0, "pressure_range": "above"},
+            "≥ 300 kPa, ≥ 210 N",
+        ),
+        ({"pressure_kpa": None}, "Δσ/σ₀ 0.100"),
+    ],
+)
+def test_it_says_how_well_a_pressure_is_known(fields: dict[str, Any], words: str) -> None:
+    with FakeSensor("skin") as fake, subscribe("skin", address=fake.address) as frames:
+        fake.wait_for_subscriber()
+        fake.publish([dataclasses.replace(CONTACT, **fields)])
+        assert frame_line(next(frames)).endswith(f"mm {words}")
 
 
 def test_in_a_pipe_it_says_that_nothing_comes(tactomo: Run) -> None:

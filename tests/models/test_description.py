@@ -5,12 +5,11 @@ from __future__ import annotations
 from importlib import resources
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tactomo_models import DescriptionError, SensorDescription, load_description
-from tactomo_models.description import MagnitudeResponse, shipped_descriptions
+from tactomo_models.description import shipped_descriptions
 from tactomo_models.pattern import scan_pairs
 
 
@@ -40,22 +39,6 @@ def test_a_scan_is_drive_major_without_touching_pairs() -> None:
 
 def test_opposite_drive_gives_192_voltages() -> None:
     assert len(scan_pairs(16, drive_offset=8).drive) == 192
-
-
-@given(st.floats(0.001, 0.999), st.sampled_from([1.0, -1.0]))
-def test_pressure_inverts_the_response(share: float, sign: float) -> None:
-    response = MagnitudeResponse(
-        pressure_kpa=(0, 130, 140, 200), relative_change=(0, 0, 0.03 * sign, 0.25 * sign)
-    )
-    pressure = 130 + 70 * share
-    change = response.change(np.array([pressure]))
-    assert response.pressure(np.abs(change)) == pytest.approx(pressure, rel=1e-9)
-    assert response.sign == sign
-
-
-def test_no_change_tells_no_pressure(paper: SensorDescription) -> None:
-    assert paper.magnitude is not None
-    assert np.isnan(paper.magnitude.response.pressure(np.zeros(1))).all()
 
 
 @pytest.mark.parametrize(

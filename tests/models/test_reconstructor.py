@@ -139,11 +139,15 @@ def test_a_press_below_the_onset_is_touched_with_unknown_pressure(
     frame = settle(reconstructor, skin, press_mm(20, 20, 110))
     (contact,) = frame.contacts
     assert error_mm(contact, press_mm(20, 20)) < 2
+    assert contact.pressure_range == "below"
     assert math.isnan(contact.pressure_kpa)
+    assert math.isnan(contact.force_n)
     assert frame.structure is not None
     assert frame.structure.max() > 0.9
     assert frame.pressure_kpa is not None
-    assert not frame.pressure_kpa.any()
+    pressed = frame.structure > 0.5
+    assert np.isnan(frame.pressure_kpa[pressed]).all(), "0 would say that nothing touches"
+    assert not frame.pressure_kpa[frame.structure == 0].any()
 
 
 def test_without_structure_the_linear_image_goes_on_flagged(

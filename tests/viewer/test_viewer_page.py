@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from types import TracebackType
 from typing import Any, Self
 
@@ -41,10 +42,6 @@ DESCRIPTION: dict[str, Any] = {
     "electrodes_mm": [[-54.0, -75.0], [75.0, -54.0]],
     "magnitude_max": 0.45,
     "pressure_max_kpa": 300.0,
-    "magnitude_response": {
-        "pressure_kpa": [0.0, 130.0, 140.0, 200.0, 300.0],
-        "relative_change": [0.0, 0.0, 0.03, 0.25, 0.45],
-    },
 }
 
 
@@ -297,17 +294,34 @@ def test_the_colours_are_the_well_known_ones(page: Page, name: str) -> None:
 @pytest.mark.usefixtures("quiet_console")
 def test_contacts_are_listed_with_value_and_uncertainty(page: Page) -> None:
     page.skin.press(36, -48, kpa=173.0, magnitude=0.151)
+    (contact,) = page.skin.contacts
+    known = replace(contact, pressure_sigma_kpa=2.7, force_n=78.2, force_sigma_n=3.4)
+    page.skin.contacts = [known]
     page.open()
     rows = "return [...document.querySelectorAll('#contacts tbody tr')].map(r => ({...r.dataset}))"
     wait_for(lambda: page.js(rows) == [{"id": "1", "xMm": "36", "yMm": "-48"}])
     row = page["contacts"].find_element(By.CSS_SELECTOR, "tbody tr")
-    # 0.01 of magnitude is 60 kPa / 0.22 * 0.01 = 2.7 kPa, by the sensor's response
-    assert row.text.split() == ["1", "36.0", "−48.0", "452", "173", "±", "3"]
+    assert row.text.split() == ["1", "36.0", "−48.0", "452", "173", "±", "3", "78", "±", "3"]
     page.browser.find_element(By.CSS_SELECTOR, "input[value=percent]").click()
-    wait_for(lambda: row.text.split() == ["1", "36.0", "−48.0", "452", "15.1", "±", "1.0"])
+    wait_for(lambda: row.text.split()[4:] == ["15.1", "±", "1.0", "78", "±", "3"])
+    page.browser.find_element(By.CSS_SELECTOR, "input[value=kpa]").click()
+    page.skin.contacts = [replace(known, pressure_range="above")]
+    wait_for(lambda: row.text.split()[4:] == ["≥", "173", "≥", "78"])
     page.skin.contacts = []
     wait_for(lambda: page.js(rows) == [])
     assert page["no-contacts"].text == "Nothing pressed."
+
+
+def test_what_is_touched_too_lightly_is_shown_and_has_no_number(page: Page) -> None:
+    page.skin.press(36, -48)
+    (contact,) = page.skin.contacts
+    unknown = np.where(blob(36, -48, 1.0) > 0, np.nan, 0).astype(np.float32)
+    page.skin.contacts = [replace(contact, pressure_kpa=None, pressure_range="below")]
+    page.skin.frame |= {"pressure_kpa": unknown}
+    page.open()
+    wait_for(lambda: page["contacts"].text.split()[-2:] == ["touched", "–"])
+    wait_for(lambda: page.colour(30, -48)[1] > 120)  # as where there is no map at all
+    assert sum(page.colour(-36, 48)) < 60
 
 
 def test_rate_latency_tier_and_quality_are_told(page: Page) -> None:

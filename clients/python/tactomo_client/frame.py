@@ -42,6 +42,15 @@ class Contact:
     """Standard uncertainty of `y_mm`."""
     area_sigma_mm2: float | None = None
     """Standard uncertainty of `area_mm2`."""
+    pressure_sigma_kpa: float | None = None
+    """Standard uncertainty of `pressure_kpa`, the sensor's calibration included."""
+    force_n: float | None = None
+    """Pressure times area."""
+    force_sigma_n: float | None = None
+    """Standard uncertainty of `force_n`."""
+    pressure_range: str = "unknown"
+    """``within``; ``below``: touched, too lightly to be measured, `pressure_kpa` is None;
+    ``above``: `pressure_kpa` is the least that it can be; ``unknown``."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,6 +180,10 @@ def _contact(value: object) -> Contact:
         x_sigma_mm=_number_or_none(value, "x_sigma_mm"),
         y_sigma_mm=_number_or_none(value, "y_sigma_mm"),
         area_sigma_mm2=_number_or_none(value, "area_sigma_mm2"),
+        pressure_sigma_kpa=_number_or_none(value, "pressure_sigma_kpa"),
+        force_n=_number_or_none(value, "force_n"),
+        force_sigma_n=_number_or_none(value, "force_sigma_n"),
+        pressure_range=_word(value, "pressure_range", "unknown"),
     )
 
 
@@ -189,6 +202,13 @@ def _extent(fields: dict[str, Any], name: str) -> tuple[float, float]:
         raise MessageError(f"field {name!r} is not [first, last]")
     ends = {"first": value[0], "last": value[1]}
     return _number(ends, "first"), _number(ends, "last")
+
+
+def _word(fields: Mapping[str, object], name: str, absent: str) -> str:
+    value = fields.get(name, absent)
+    if not isinstance(value, str):
+        raise MessageError(f"field {name!r} is not text")
+    return value
 
 
 def _integer(fields: Mapping[str, object], name: str) -> int:

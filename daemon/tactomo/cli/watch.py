@@ -22,7 +22,7 @@ from tactomo.cli.app import (
 if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.text import Text
-    from tactomo_client import Frame, Keys
+    from tactomo_client import Contact, Frame, Keys
 
 REFRESH_HZ = 12.0
 STALE_S = 0.5
@@ -162,7 +162,7 @@ def _print_lines(view: View, end_s: float) -> None:
 def frame_line(frame: Frame) -> str:
     """Return one frame as a line of text."""
     pressed = "; ".join(
-        f"#{c.id} ({c.x_mm:+.1f}, {c.y_mm:+.1f}) mm {_pressure(c.pressure_kpa, c.magnitude)}"
+        f"#{c.id} ({c.x_mm:+.1f}, {c.y_mm:+.1f}) mm {_pressure(c)}{_force(c, ', ')}"
         for c in frame.contacts
     )
     flags = f"  [{', '.join(sorted(frame.flags))}]" if frame.flags else ""
@@ -266,11 +266,11 @@ def _contact_table(frame: Frame) -> RenderableType:
     if not frame.contacts:
         return Text("nothing pressed", "dim")
     table = Table(box=None, pad_edge=False)
-    for name in ("#", "x mm", "y mm", "mm²", "pressure"):
+    for name in ("#", "x mm", "y mm", "mm²", "pressure", "force"):
         table.add_column(name, justify="right")
     for c in frame.contacts:
-        pressure = _pressure(c.pressure_kpa, c.magnitude)
-        table.add_row(str(c.id), f"{c.x_mm:+.1f}", f"{c.y_mm:+.1f}", f"{c.area_mm2:.0f}", pressure)
+        place = f"{c.x_mm:+.1f}", f"{c.y_mm:+.1f}", f"{c.area_mm2:.0f}"
+        table.add_row(str(c.id), *place, _pressure(c), _force(c))
     return table
 
 
@@ -295,7 +295,21 @@ def _health(view: View, frame: Frame) -> RenderableType:
     return table
 
 
-def _pressure(pressure_kpa: float | None, magnitude: float | None) -> str:
-    if pressure_kpa is not None:
-        return f"{pressure_kpa:.0f} kPa"
-    return "pressed" if magnitude is None else f"Δσ/σ₀ {magnitude:.3f}"
+def _pressure(contact: Contact) -> str:
+    if contact.pressure_kpa is not None:
+        return _measured(contact, contact.pressure_kpa, contact.pressure_sigma_kpa, "kPa")
+    if contact.pressure_range == "below":
+        return "touched, pressure unknown"
+    return "pressed" if contact.magnitude is None else f"Δσ/σ₀ {contact.magnitude:.3f}"
+
+
+def _force(contact: Contact, before: str = "") -> str:
+    if contact.force_n is None:
+        return ""
+    return before + _measured(contact, contact.force_n, contact.force_sigma_n, "N")
+
+
+def _measured(contact: Contact, value: float, sigma: float | None, unit: str) -> str:
+    if contact.pressure_range == "above":
+        return f"≥ {value:.0f} {unit}"
+    return f"{value:.0f}{'' if sigma is None else f' ± {sigma:.0f}'} {unit}"

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from tactomo_models.description import SensorDescription
 from tactomo_models.errors import DataError
 from tactomo_models.evaluation.scenes import CONTRAST, gap_m, outline_of, seed_of
+from tactomo_models.pressure import PressureCurve
 from tactomo_models.scene import Press, Profile, Shape
 
 FloatArray = NDArray[np.float64]
@@ -124,14 +125,14 @@ def paper_presses(
         DataError: there is no room for so many.
     """
     assert description.magnitude is not None
-    response = description.magnitude.response
+    curve = PressureCurve.of_response(description.magnitude.response)
     least, most = (scale_of(description) * half_axis for half_axis in PAPER_HALF_AXIS_M)
 
     def one() -> Press:
         long = rng.uniform(least, most)
         return Press(
             *_anywhere(description, rng),
-            pressure_kpa=float(response.pressure(np.array(rng.uniform(*PAPER_CHANGE)))),
+            pressure_kpa=float(curve.pressure(np.array(rng.uniform(*PAPER_CHANGE)))),
             radius_m=long,
             radius_y_m=rng.uniform(max(least, long / 2), long),
             angle_rad=rng.uniform(0, np.pi),

@@ -128,19 +128,27 @@ export class MapView {
     c.fillRect(this.plot.left, this.plot.top, this.plot.width, this.plot.height);
     const source = image ?? structure;
     if (!source) return;
+    const values = (pixels, at, value) => {
+      const level = 3 * Math.max(0, Math.min(SIZE - 1, Math.round((value / scale) * (SIZE - 1)))) || 0;
+      pixels[at] = table[level];
+      pixels[at + 1] = table[level + 1];
+      pixels[at + 2] = table[level + 2];
+      pixels[at + 3] = 255;
+    };
+    const touched = (pixels, at, value) => {
+      pixels.set(this.theme.pressed, at);
+      pixels[at + 3] = 200 * Math.max(0, Math.min(1, value)) || 0;
+    };
+    this.#paint(c, frame, source, smooth, image ? values : touched);
+    if (image && structure && image.values.some(Number.isNaN)) {
+      const unknown = structure.values.map((value, i) => (Number.isNaN(image.values[i]) ? value : 0));
+      this.#paint(c, frame, { ...structure, values: unknown }, smooth, touched);
+    }
+  }
+
+  /** Colour the nodes of an image: `paint(pixels, at, value)` sets one. */
+  #paint(c, frame, source, smooth, paint) {
     const nodes = smooth ? upsample(source, FINER) : source;
-    const paint = image
-      ? (pixels, at, value) => {
-          const level = 3 * Math.max(0, Math.min(SIZE - 1, Math.round((value / scale) * (SIZE - 1)))) || 0;
-          pixels[at] = table[level];
-          pixels[at + 1] = table[level + 1];
-          pixels[at + 2] = table[level + 2];
-          pixels[at + 3] = 255;
-        }
-      : (pixels, at, value) => {
-          pixels.set(this.theme.pressed, at);
-          pixels[at + 3] = 200 * Math.max(0, Math.min(1, value)) || 0;
-        };
     const pixels = c.createImageData(nodes.nx, nodes.ny);
     for (let iy = 0; iy < nodes.ny; iy++) {
       for (let ix = 0; ix < nodes.nx; ix++) {

@@ -23,7 +23,7 @@ export function showContacts(contacts, unit, value) {
   const body = byId("contacts").tBodies[0];
   fit(body, contacts.length, () => {
     const row = document.createElement("tr");
-    for (let i = 0; i < 5; i++) row.append(document.createElement(i ? "td" : "th"));
+    for (let i = 0; i < 6; i++) row.append(document.createElement(i ? "td" : "th"));
     row.cells[0].scope = "row";
     return row;
   });
@@ -32,10 +32,16 @@ export function showContacts(contacts, unit, value) {
     Object.assign(row.dataset, { id: contact.id, xMm: contact.x_mm, yMm: contact.y_mm });
     const texts = [
       String(contact.id), fixed(contact.x_mm, 1), fixed(contact.y_mm, 1),
-      fixed(contact.area_mm2, 0), value(contact),
+      fixed(contact.area_mm2, 0), value(contact), forceText(contact),
     ];
     texts.forEach((text, column) => setText(row.cells[column], text));
   });
+}
+
+function forceText({ force_n: force, force_sigma_n: sigma, pressure_range: range }) {
+  if (force === null) return "–";
+  if (range === "above") return `≥ ${fixed(force, 0)}`;
+  return `${fixed(force, 0)}${sigma === null ? "" : ` ± ${fixed(sigma, sigma < 1 ? 1 : 0)}`}`;
 }
 
 export function showState(name, text = STATES[name] ?? String(name)) {

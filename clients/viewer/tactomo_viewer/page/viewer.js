@@ -111,7 +111,7 @@ function draw() {
     image,
     scale: image ? scaleTop(image, unit) : 1,
     unit: unit === "kpa" ? "kPa" : "Δσ/σ₀ %",
-    label: (contact) => valueText(contact, unit) || "touched",
+    label: (contact) => valueText(contact, unit) || touchedText(contact, unit),
     notice: frame && !image ? noticeFor(frame, unit) : "",
     hint: touch.enabled && touch.count === 0 && !frame?.contacts.length ? "Press the skin" : "",
     colormap: byId("colormap").value,
@@ -164,29 +164,24 @@ function scaleTop(image, unit) {
 // Values
 
 function valueText(contact, unit) {
-  const { magnitude, magnitude_sigma: sigma, pressure_kpa: kpa } = contact;
+  const { magnitude, magnitude_sigma: sigma, pressure_kpa: kpa, pressure_sigma_kpa: spread } = contact;
   if (unit === "percent") {
     if (magnitude === null) return "";
     return `${fixed(100 * magnitude, 1)}${sigma === null ? "" : ` ± ${fixed(100 * sigma, 1)}`} %`;
   }
   if (kpa === null) return "";
-  const spread = pressureSpread(magnitude, sigma);
+  if (contact.pressure_range === "above") return `≥ ${fixed(kpa, 0)} kPa`;
   return `${fixed(kpa, 0)}${spread === null ? "" : ` ± ${fixed(spread, spread < 1 ? 1 : 0)}`} kPa`;
 }
 
-// The pressure's uncertainty: the magnitude's, through the sensor's response.
-function pressureSpread(magnitude, sigma) {
-  const response = state.status?.fields.description?.magnitude_response;
-  if (!response || magnitude === null || sigma === null) return null;
-  const changes = response.relative_change.map(Math.abs);
-  const at = (value) => {
-    const above = changes.findIndex((change) => change >= value);
-    if (above <= 0) return response.pressure_kpa[above < 0 ? changes.length - 1 : 0];
-    const t = (value - changes[above - 1]) / (changes[above] - changes[above - 1]);
-    return response.pressure_kpa[above - 1] +
-      t * (response.pressure_kpa[above] - response.pressure_kpa[above - 1]);
-  };
-  return (at(magnitude + sigma) - at(Math.max(0, magnitude - sigma))) / 2;
+// What stands where there is no number: how hard is not known, that it is touched is.
+function touchedText(contact, unit) {
+  return unit === "kpa" && contact.pressure_range === "below" ? "touched, pressure unknown" : "touched";
+}
+
+function cellText(contact, unit) {
+  const text = valueText(contact, unit).replace(/ (kPa|%)$/, "");
+  return text || (contact.pressure_range === "below" ? "touched" : "–");
 }
 
 function contactNear({ x, y, size }) {
@@ -261,7 +256,7 @@ function showNumbers(now, trusted) {
   const unit = chosen("unit");
   const known = trusted && !frame.flags.includes("no_reference");
   const contacts = known ? [...frame.contacts].sort((a, b) => a.id - b.id) : [];
-  showContacts(contacts, unit, (contact) => valueText(contact, unit).replace(/ (kPa|%)$/, "") || "–");
+  showContacts(contacts, unit, (contact) => cellText(contact, unit));
   setText(byId("no-contacts"), known ? "Nothing pressed." : "Not known.");
   showQuality(frame, trusted);
   byId("map").ariaLabel = known
