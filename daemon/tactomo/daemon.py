@@ -45,7 +45,7 @@ from tactomo_models import (
     load_description,
     load_or_build_artifact,
 )
-from tactomo_models.calibration import Calibration, calibration_for
+from tactomo_models.machine_speed import MachineSpeed, machine_speed_for
 from tactomo_models.tier import check_tier
 from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
@@ -82,7 +82,7 @@ class Daemon:
         config: what it serves.
         reconstructor: what makes maps of voltages; by default the description's own, with an
             artifact that is built if need be.
-        calibration: what turns a budget of time into one of work; by default what was measured on
+        machine_speed: what turns a budget of time into one of work; by default what was measured on
             this machine, if that was.
 
     Raises:
@@ -101,7 +101,7 @@ class Daemon:
         config: DaemonConfig,
         *,
         reconstructor: Reconstructor | None = None,
-        calibration: Calibration | None = None,
+        machine_speed: MachineSpeed | None = None,
     ) -> None:
         self.config = config
         self.session = uuid.uuid4().hex
@@ -122,7 +122,7 @@ class Daemon:
         self._imaging = Imaging(
             description,
             reconstructor or _make_reconstructor(config, description),
-            calibration or _find_calibration(description),
+            machine_speed or _find_machine_speed(description),
             config.tare_scans,
             self._recorder,
             self._publisher,
@@ -429,8 +429,10 @@ def _make_reconstructor(config: DaemonConfig, description: SensorDescription) ->
     return Reconstructor(description, artifact, tier=Tier(config.tier), budget_s=budget_s)
 
 
-def _find_calibration(description: SensorDescription) -> Calibration:
-    return calibration_for(description, lambda why: log.warning("calibration_unused", detail=why))
+def _find_machine_speed(description: SensorDescription) -> MachineSpeed:
+    return machine_speed_for(
+        description, lambda why: log.warning("machine_speed_unused", detail=why)
+    )
 
 
 def _origin(config: DaemonConfig, description: SensorDescription) -> Origin:

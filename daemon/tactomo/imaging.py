@@ -24,7 +24,7 @@ from tactomo_models import (
     SensorDescription,
     Tier,
 )
-from tactomo_models.calibration import Calibration
+from tactomo_models.machine_speed import MachineSpeed
 from tactomo_protocol import Channel, ScanFlag
 
 from tactomo.errors import CommandError
@@ -55,12 +55,12 @@ log = structlog.get_logger()
 class Imaging:
     """Reconstructs dual scans against a reference that it takes itself.
 
-    The tier and the time budget that are asked for become what the reconstructor is given by a
-    calibration, before they are recorded: marks hold what was given, so that a replay gives the
+    The tier and the time budget that are asked for become what the reconstructor is given by the
+    machine's speed, before they are recorded: marks hold what was given, so that a replay gives the
     same on any machine.
 
     Attributes:
-        calibration: what turns a budget of time into one of work.
+        machine_speed: what turns a budget of time into one of work.
         given: the tier that frames are given, and the milliseconds of modelled work.
         reference: what changes are measured against; None before the first tare.
         reference_realtime_ns: when it was taken.
@@ -74,13 +74,13 @@ class Imaging:
         self,
         description: SensorDescription,
         reconstructor: Reconstructor,
-        calibration: Calibration,
+        machine_speed: MachineSpeed,
         tare_scans: int,
         recorder: Recorder,
         publisher: Publisher,
         on_event: OnEvent,
     ) -> None:
-        self.calibration = calibration
+        self.machine_speed = machine_speed
         self.given: tuple[Tier, float | None]
         self.reference: Reference | None = None
         self.reference_realtime_ns = 0
@@ -131,7 +131,7 @@ class Imaging:
 
     def _ask(self, tier: Tier, budget_ms: float | None) -> None:
         self._asked = (tier, budget_ms)
-        plan = self.calibration.plan(tier, None if budget_ms is None else budget_ms * 1e-3)
+        plan = self.machine_speed.plan(tier, None if budget_ms is None else budget_ms * 1e-3)
         self._give(plan.tier, None if plan.budget_s is None else plan.budget_s * 1e3)
 
     def _give(self, tier: Tier, budget_ms: float | None) -> None:

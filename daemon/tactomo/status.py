@@ -80,7 +80,7 @@ class Status:
             "latency_ms": latency.percentiles_ms(),
             "tier_requested": str(imaging.tier),
             "budget_ms": imaging.budget_ms,
-            "calibration": self._calibration(),
+            "plan": self._plan(),
             "recording": active
             and {
                 "path": str(active.path),
@@ -121,9 +121,9 @@ class Status:
             "waits_for": recorder.waits_for or None,
         }
 
-    def _calibration(self) -> dict[str, Any]:
+    def _plan(self) -> dict[str, Any]:
         tier, modelled_ms = self._imaging.given
-        source = self._imaging.calibration.source
+        source = self._imaging.machine_speed.source
         return {"source": source, "tier": str(tier), "modelled_ms": modelled_ms}
 
     def _rates(self) -> dict[str, float | None]:

@@ -36,7 +36,7 @@ STATUS = {
     "tier": "levelset",
     "tier_requested": "auto",
     "budget_ms": 12.0,
-    "calibration": {"source": "measured here", "tier": "fit", "modelled_ms": 4.5},
+    "plan": {"source": "measured here", "tier": "fit", "modelled_ms": 4.5},
     "flags": ["structure_missing"],
     "misfit": 1.02,
     "dropped_scans": 2,
@@ -60,7 +60,7 @@ def test_status_shows_what_matters(tactomo: Run, control: Any) -> None:
         *("left_forearm: running", "/dev/ttyACM0 (open)", "3 corrupt", "(not open)"),
         *("p50 4.25 ms", "structure_missing", "19.96 frames/s", "2 dual scans dropped"),
         *("20 dual scans", "/tmp/a.mcap (2.5 MB)", "levelset (asked for: auto)"),
-        "12 ms: fit, 4.50 modelled ms; calibration: measured here",
+        "12 ms: fit, 4.50 modelled ms; machine speed: measured here",
     ):
         assert words in result.stdout
 

@@ -29,7 +29,7 @@ from tactomo_client import Keys, request
 from tactomo_client.keys import secure
 from tactomo_client.messages import KINDS, Message, decode_message, topic
 from tactomo_models import Contact, Flag, Modality, Reconstruction, Reference, Tier
-from tactomo_models.calibration import Calibration
+from tactomo_models.machine_speed import MachineSpeed
 from tactomo_protocol import (
     Channel,
     Command,
@@ -356,7 +356,7 @@ def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Cal
     """Start a daemon: ``bench(ports=1, **config)``; everything is stopped later.
 
     It has the reconstructor above, each frame of which takes `seconds`, or the `real` one; and a
-    `calibration`, or this machine's. What listens to it and asks it has `keys`.
+    `machine_speed`, or this machine's. What listens to it and asks it has `keys`.
     The cables are in, unless `is_plugged` says otherwise.
     """
     daemons: list[Daemon] = []
@@ -366,7 +366,7 @@ def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Cal
         ports: int = 1,
         seconds: float = 0.0,
         real: bool = False,
-        calibration: Calibration | None = None,
+        machine_speed: MachineSpeed | None = None,
         keys: Keys | None = None,
         is_plugged: bool = True,
         **config: Any,
@@ -387,7 +387,7 @@ def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Cal
         }
         memory: Any = None if real else Memory(seconds)
         daemon = Daemon(
-            load_config(None, **settings), reconstructor=memory, calibration=calibration
+            load_config(None, **settings), reconstructor=memory, machine_speed=machine_speed
         )
         daemon.start()
         daemons.append(daemon)
@@ -424,7 +424,7 @@ class Heard:
 def replay(tmp_path: Path) -> Callable[..., Any]:
     """Replay a recording to its end: ``replay(path, speed=0, **config)`` returns what was said.
 
-    With a `calibration`, or this machine's.
+    With a `machine_speed`, or this machine's.
     """
     count = itertools.count()
 
@@ -432,7 +432,7 @@ def replay(tmp_path: Path) -> Callable[..., Any]:
         path: Path,
         speed: float = 0,
         real: bool = False,
-        calibration: Calibration | None = None,
+        machine_speed: MachineSpeed | None = None,
         **config: Any,
     ) -> Heard:
         out = tmp_path / f"replayed-{next(count)}.mcap"
@@ -449,7 +449,7 @@ def replay(tmp_path: Path) -> Callable[..., Any]:
         }
         memory: Any = None if real else Memory()
         daemon = Daemon(
-            load_config(None, **settings), reconstructor=memory, calibration=calibration
+            load_config(None, **settings), reconstructor=memory, machine_speed=machine_speed
         )
         daemon.start()
         try:

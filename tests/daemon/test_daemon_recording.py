@@ -15,7 +15,7 @@ from tactomo.recording import open_recording
 from tactomo.recording_writer import write_recording
 from tactomo_client.messages import array_from_wire
 from tactomo_models import Reference
-from tactomo_models.calibration import Calibration, Row
+from tactomo_models.machine_speed import MachineSpeed, Row
 from tactomo_protocol import Channel, Scan, ScanFlag, encode
 
 Start = Callable[..., Any]
@@ -148,7 +148,7 @@ def test_what_a_time_bought_is_given_again_on_any_machine(
         Row(method="auto", budget_s=0.001, p50_s=0.003, p99_s=0.004, icc=0.9),
         Row(method="noser", budget_s=None, p50_s=0.001, p99_s=0.002, icc=0.6),
     )
-    here = Calibration(
+    here = MachineSpeed(
         tactomo="1",
         machine="of the test",
         taken="2026-01-31",
@@ -158,7 +158,7 @@ def test_what_a_time_bought_is_given_again_on_any_machine(
         speed=2.0,
         rows=rows,
     )
-    b = bench(record=path, calibration=here)
+    b = bench(record=path, machine_speed=here)
     b.tare()
     for budget_ms, tier, modelled_ms in (
         (12, "auto", 5.0),
@@ -167,7 +167,7 @@ def test_what_a_time_bought_is_given_again_on_any_machine(
     ):
         b.ask("set_budget", budget_ms=budget_ms)
         given = {"source": here.source, "tier": tier, "modelled_ms": modelled_ms}
-        b.until(lambda given=given: b.ask("status")["calibration"] == pytest.approx(given))
+        b.until(lambda given=given: b.ask("status")["plan"] == pytest.approx(given))
         status = b.ask("status")
         assert (status["tier_requested"], status["budget_ms"]) == ("auto", budget_ms)
         b.step(load=0.1)
@@ -176,7 +176,7 @@ def test_what_a_time_bought_is_given_again_on_any_machine(
     assert [tier for tier, _ in marks] == ["auto"] * 4 + ["noser", "auto"]
     assert [budget_ms for _, budget_ms in marks[3:]] == [pytest.approx(5), 1, None]
     elsewhere = here.model_copy(update={"overhead_s": 0.0, "speed": 0.1, "rows": rows[1:]})
-    again = replay(path, calibration=elsewhere)
+    again = replay(path, machine_speed=elsewhere)
     assert [(mark.tier, mark.budget_ms) for mark in open_recording(again.path).marks()] == marks
 
 

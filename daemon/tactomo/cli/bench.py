@@ -35,7 +35,7 @@ PAGE_WIDTH = 150
 SETTLE_S = 1.5
 STATUS_S = 13.0  # at 20 dual scans a second: as far back as the stage times in a status go
 START_S = 60.0
-LIVE, CHART, CALIBRATE = "Live and methods", "Speed against accuracy", "Calibration"
+LIVE, CHART, SPEED = "Live and methods", "Speed against accuracy", "Machine speed"
 
 
 @dataclass(frozen=True)
@@ -73,8 +73,8 @@ class Results:
         "tactomo bench --replay grasp.mcap",
         "tactomo bench --no-live --json > times.json",
         "tactomo bench --chart speed_accuracy.png --count 25",
-        "tactomo bench --calibrate",
-        "tactomo bench --calibrate --show",
+        "tactomo bench --machine-speed",
+        "tactomo bench --machine-speed --show",
     ),
 )
 def bench(
@@ -111,11 +111,11 @@ def bench(
         int,
         typer.Option(min=1, rich_help_panel=CHART, help="Still scenes each of 1 to 4 contacts."),
     ] = 10,
-    calibrate: Annotated[
+    machine_speed: Annotated[
         bool,
         typer.Option(
-            "--calibrate",
-            rich_help_panel=CALIBRATE,
+            "--machine-speed",
+            rich_help_panel=SPEED,
             help="Instead of all else, measure what a budget of time buys here, and keep it for "
             "daemons that start from now on.",
         ),
@@ -124,8 +124,8 @@ def bench(
         bool,
         typer.Option(
             "--show",
-            rich_help_panel=CALIBRATE,
-            help="With --calibrate: only show what such a daemon would go by.",
+            rich_help_panel=SPEED,
+            help="With --machine-speed: only show what such a daemon would go by.",
         ),
     ] = False,
     as_json: JsonOutput = False,
@@ -141,21 +141,22 @@ def bench(
     at 40, 20 and 10 dB, each from a cold start, and moving ones under a daemon's budgets. Takes
     about ten minutes, the first time some more to simulate them.
 
-    With `--calibrate`, methods follow one moving scene (tuning seeds) and what they took is kept in
-    the cache, beside the sensor's models: daemons then keep to a budget of time as this machine
-    does, and `auto` takes the method that is most accurate within it. Takes some three minutes;
-    leave the machine alone meanwhile. A service has a cache of its own: set CACHE_DIRECTORY to it.
+    With `--machine-speed`, methods follow one moving scene (tuning seeds) and what they took is
+    kept in the cache, beside the sensor's models: daemons then keep to a budget of time as this
+    machine does, and `auto` takes the method that is most accurate within it. Takes some three
+    minutes; leave the machine alone meanwhile. A service has a cache of its own: set
+    CACHE_DIRECTORY to it.
     """
-    if show and not calibrate:
-        raise typer.BadParameter("--show goes with --calibrate")
-    if calibrate and chart is not None:
-        raise typer.BadParameter("--calibrate and --chart are two runs")
+    if show and not machine_speed:
+        raise typer.BadParameter("--show goes with --machine-speed")
+    if machine_speed and chart is not None:
+        raise typer.BadParameter("--machine-speed and --chart are two runs")
     results = Results(machine(), description, "a twin" if replay is None else replay.name)
     if chart is not None:
         _chart(results, chart, count, as_json)
         return
-    if calibrate:
-        _calibrate(results, show, as_json)
+    if machine_speed:
+        _machine_speed(results, show, as_json)
         return
     from rich.console import Console
 
@@ -199,20 +200,20 @@ def _chart(results: Results, picture: Path, count: int, as_json: bool) -> None:
     typer.echo(f"wrote {picture} and {bench_chart.table_path(picture)}", err=True)
 
 
-def _calibrate(results: Results, show: bool, as_json: bool) -> None:
+def _machine_speed(results: Results, show: bool, as_json: bool) -> None:
     """Measure what a time buys on this machine, or show what was measured."""
-    from tactomo.cli import bench_calibrate
+    from tactomo.cli import bench_machine_speed
 
     name = results.description
-    made = bench_calibrate.in_force(name) if show else bench_calibrate.calibrate(name)
+    made = bench_machine_speed.in_force(name) if show else bench_machine_speed.measure(name)
     if as_json:
         typer.echo(made.model_dump_json(indent=2))
         return
     console = _console(results)
-    for table in bench_calibrate.tables_of(made):
+    for table in bench_machine_speed.tables_of(made):
         console.print(table)
     console.print(
-        f"Calibration: {made.source}. A frame takes {made.overhead_s * 1e3:.1f} ms and "
+        f"This machine's speed: {made.source}. A frame takes {made.overhead_s * 1e3:.1f} ms and "
         f"{made.speed:.2f} times its modelled budget (p99)."
     )
 
@@ -408,7 +409,7 @@ def _stage_table(phases: list[Phase]) -> Table:
 def machine() -> str:
     """Return the processor, its cores that we may use, and the versions that matter."""
     import numpy as np
-    from tactomo_models.calibration import processor
+    from tactomo_models.machine_speed import processor
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return (

@@ -217,7 +217,7 @@ def _status_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
             for stage, times in (status.get("stage_ms") or {}).items()
         ),
         ("tier", f"{status.get('tier') or '-'} (asked for: {status.get('tier_requested')})"),
-        ("budget", _budget(status.get("budget_ms"), status.get("calibration") or {})),
+        ("budget", _budget(status.get("budget_ms"), status.get("plan") or {})),
         ("flags", ", ".join(status.get("flags", [])) or "none"),
         ("misfit", _number(status.get("misfit"))),
         (
@@ -278,12 +278,12 @@ def _port_line(port: dict[str, Any]) -> str:
     )
 
 
-def _budget(budget_ms: float | None, calibration: dict[str, Any]) -> str:
+def _budget(budget_ms: float | None, plan: dict[str, Any]) -> str:
     """Say what time a frame may take, and what it is given for that."""
-    source = f"calibration: {calibration.get('source', '-')}"
+    source = f"machine speed: {plan.get('source', '-')}"
     if budget_ms is None:
         return f"the tier's own; {source}"
-    given = f"{calibration.get('tier')}, {_number(calibration.get('modelled_ms'))} modelled ms"
+    given = f"{plan.get('tier')}, {_number(plan.get('modelled_ms'))} modelled ms"
     return f"{budget_ms:g} ms: {given}; {source}"
 
 

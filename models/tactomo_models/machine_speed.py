@@ -1,12 +1,12 @@
 """What a budget of time buys on the machine at hand: how much work, and which method.
 
 A reconstructor's budget counts modelled work, so that a recording reconstructs exactly as the live
-stream did (`shape_fit.Budget`). A calibration turns time into such a budget, once, before the
-reconstructor is given it and before it is recorded: a replay needs no calibration, and takes the
+stream did (`shape_fit.Budget`). The machine's speed turns time into such a budget, once, before the
+reconstructor is given it and before it is recorded: a replay needs no such measure, and takes the
 same steps on any machine.
 
-It is measured by `tactomo bench --calibrate` and kept beside the sensor's artifact. Where there is
-none, one that comes with tactomo stands in.
+It is measured by `tactomo bench --machine-speed` and kept beside the sensor's artifact. Where
+there is none, one that comes with tactomo stands in.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from tactomo_models.description import SensorDescription
 from tactomo_models.errors import ArtifactError, explain
 from tactomo_models.tier import METHODS, Tier, check_tier
 
-SHIPPED: Final = "shipped_calibration.json"
-AGAIN: Final = "run: tactomo bench --calibrate"
+SHIPPED: Final = "shipped_machine_speed.json"
+AGAIN: Final = "run: tactomo bench --machine-speed"
 CLEARLY: Final = 0.02  # of ICC: by more than this another method must be better than auto's own
 LEAST_BUDGET_S: Final = 0.001  # a frame does one thing at least, whatever it may take
 
@@ -69,7 +69,7 @@ class Plan(NamedTuple):
     budget_s: float | None
 
 
-class Calibration(_Table):
+class MachineSpeed(_Table):
     """What was measured for one sensor on one machine.
 
     Attributes:
@@ -99,8 +99,8 @@ class Calibration(_Table):
     @classmethod
     def of_rows(
         cls, description: SensorDescription, taken: str, rows: Sequence[Row]
-    ) -> Calibration:
-        """Make a calibration of what was measured just now on this machine.
+    ) -> MachineSpeed:
+        """Make one of what was measured just now on this machine.
 
         Args:
             description: the sensor.
@@ -161,33 +161,33 @@ def _law(rows: Sequence[Row]) -> tuple[float, float]:
     return float(overhead_s), max(float(speed), 1e-3)
 
 
-def calibration_path(description: SensorDescription) -> Path:
-    """Where a sensor's calibration is kept: beside its artifact."""
-    return default_path(description).with_suffix(".calibration.json")
+def machine_speed_path(description: SensorDescription) -> Path:
+    """Where what was measured for a sensor is kept: beside its artifact."""
+    return default_path(description).with_suffix(".speed.json")
 
 
-def save_calibration(calibration: Calibration, path: Path) -> None:
-    """Write a calibration; a half-written one is never left under that name.
+def save_machine_speed(measured: MachineSpeed, path: Path) -> None:
+    """Write what was measured; a half-written one is never left under that name.
 
     Raises:
         ArtifactError: the file cannot be written.
     """
-    content = (calibration.model_dump_json(indent=1) + "\n").encode()
+    content = (measured.model_dump_json(indent=1) + "\n").encode()
     try:
         write_whole(path, lambda file: file.write(content))
     except OSError as error:
         raise ArtifactError(f"cannot write {path}: {error.strerror}; free some space") from error
 
 
-def load_calibration(path: Path, description: SensorDescription) -> Calibration:
-    """Read a calibration and make sure that it holds here.
+def load_machine_speed(path: Path, description: SensorDescription) -> MachineSpeed:
+    """Read what was measured and make sure that it holds here.
 
     Raises:
         ArtifactError: it is damaged, or of another machine, sensor or version of tactomo.
         FileNotFoundError: there is none.
     """
     try:
-        found = Calibration.model_validate_json(path.read_bytes())
+        found = MachineSpeed.model_validate_json(path.read_bytes())
     except FileNotFoundError:
         raise
     except OSError as error:
@@ -207,19 +207,19 @@ def load_calibration(path: Path, description: SensorDescription) -> Calibration:
     return found
 
 
-def calibration_for(description: SensorDescription, warn: Callable[[str], None]) -> Calibration:
-    """The calibration in force: what was measured here, or else what comes with tactomo.
+def machine_speed_for(description: SensorDescription, warn: Callable[[str], None]) -> MachineSpeed:
+    """What is in force: what was measured here, or else what comes with tactomo.
 
     Args:
         description: the sensor.
         warn: told in one line why what was measured here is not used.
     """
     try:
-        found = load_calibration(calibration_path(description), description)
+        found = load_machine_speed(machine_speed_path(description), description)
     except FileNotFoundError:
         found = _shipped()
     except ArtifactError as error:
-        warn(f"{error}; until then: the calibration that comes with tactomo")
+        warn(f"{error}; until then: the one that comes with tactomo")
         found = _shipped()
     # Which method is best is another sensor's, and a network may be gone that was there.
     of_this = found.sha256 == description.sha256
@@ -235,9 +235,9 @@ def _is_to_be_had(description: SensorDescription, method: str) -> bool:
     return True
 
 
-def _shipped() -> Calibration:
+def _shipped() -> MachineSpeed:
     text = files("tactomo_models").joinpath(SHIPPED).read_text("utf-8")
-    return Calibration.model_validate_json(text).model_copy(update={"shipped": True})
+    return MachineSpeed.model_validate_json(text).model_copy(update={"shipped": True})
 
 
 @cache

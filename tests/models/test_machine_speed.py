@@ -1,4 +1,4 @@
-"""Calibrations: what a budget of time buys, and that one which does not hold here is not used."""
+"""What a budget of time buys, and that what was measured elsewhere is not used here."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from tactomo_models import ArtifactError, SensorDescription, Tier, calibration
-from tactomo_models.calibration import (
+from tactomo_models import ArtifactError, SensorDescription, Tier, machine_speed
+from tactomo_models.machine_speed import (
     CLEARLY,
-    Calibration,
+    MachineSpeed,
     Row,
-    calibration_for,
-    calibration_path,
-    load_calibration,
-    save_calibration,
+    load_machine_speed,
+    machine_speed_for,
+    machine_speed_path,
+    save_machine_speed,
 )
 
 
@@ -30,11 +30,11 @@ OTHERS = [row("noser", None, 2.0, 0.6), row("tikhonov", None, 1.0, 0.5)]
 
 
 @pytest.fixture
-def measured(small: SensorDescription) -> Calibration:
-    return Calibration.of_rows(small, "2026-01-31", [*AUTO, *OTHERS])
+def measured(small: SensorDescription) -> MachineSpeed:
+    return MachineSpeed.of_rows(small, "2026-01-31", [*AUTO, *OTHERS])
 
 
-def test_a_time_buys_the_work_that_frames_took_so_long_for(measured: Calibration) -> None:
+def test_a_time_buys_the_work_that_frames_took_so_long_for(measured: MachineSpeed) -> None:
     assert measured.overhead_s == pytest.approx(4e-3)
     assert measured.speed == pytest.approx(2.0)
     for tier in (Tier.AUTO, Tier.LEVELSET):
@@ -48,19 +48,19 @@ def test_a_time_buys_the_work_that_frames_took_so_long_for(measured: Calibration
     [(100, "auto"), (14, "auto"), (13, "noser"), (1.5, "tikhonov"), (0.1, "tikhonov")],
 )
 def test_auto_takes_the_most_accurate_method_that_keeps_to_the_time(
-    measured: Calibration, time_ms: float, tier: str
+    measured: MachineSpeed, time_ms: float, tier: str
 ) -> None:
     assert measured.plan(Tier.AUTO, time_ms / 1e3).tier == tier
 
 
 def test_auto_yields_only_to_what_is_clearly_better(small: SensorDescription) -> None:
     for icc, tier in ((0.91, "auto"), (0.93, "noser")):
-        made = Calibration.of_rows(small, "2026-01-31", [AUTO[1], row("noser", None, 2.0, icc)])
+        made = MachineSpeed.of_rows(small, "2026-01-31", [AUTO[1], row("noser", None, 2.0, icc)])
         assert made.plan(Tier.AUTO, 1.0).tier == tier
 
 
 def test_what_was_asked_for_by_name_is_given_and_no_time_leaves_all_as_it_is(
-    measured: Calibration,
+    measured: MachineSpeed,
 ) -> None:
     plan = measured.plan(Tier.FIT, 1e-4)
     assert plan.tier is Tier.FIT
@@ -89,7 +89,7 @@ def test_more_time_never_buys_less(
     small: SensorDescription, rows: list[Row], time_s: float, more_s: float
 ) -> None:
     assume(any(r.method == "auto" for r in rows))
-    made = Calibration.of_rows(small, "2026-01-31", rows)
+    made = MachineSpeed.of_rows(small, "2026-01-31", rows)
     less, more = made.best_within(time_s), made.best_within(time_s + more_s)
     assert less is not None
     assert more is not None
@@ -100,16 +100,19 @@ def test_more_time_never_buys_less(
 
 
 def test_what_is_kept_is_found_again(
-    small: SensorDescription, measured: Calibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    small: SensorDescription,
+    measured: MachineSpeed,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("CACHE_DIRECTORY", str(tmp_path / "cache"))
     told: list[str] = []
-    before = calibration_for(small, told.append)
+    before = machine_speed_for(small, told.append)
     assert (before.rows, told) == ((), [])  # no measurement of another sensor tells what is best
-    assert "tactomo bench --calibrate" in before.source
+    assert "tactomo bench --machine-speed" in before.source
     assert before.plan(Tier.AUTO, 0.05).tier is Tier.AUTO
-    save_calibration(measured, calibration_path(small))
-    after = calibration_for(small, told.append)
+    save_machine_speed(measured, machine_speed_path(small))
+    after = machine_speed_for(small, told.append)
     assert (after, told) == (measured, [])
     assert after.source == "measured here on 2026-01-31"
 
@@ -118,7 +121,7 @@ def test_the_shipped_one_is_of_the_shipped_sensor(
     paper: SensorDescription, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CACHE_DIRECTORY", str(tmp_path))
-    shipped = calibration_for(paper, pytest.fail)
+    shipped = machine_speed_for(paper, pytest.fail)
     assert {"auto", "tikhonov"} <= {row.method for row in shipped.rows}
     assert "shipped" in shipped.source
     assert shipped.plan(Tier.AUTO, 0.05).tier is Tier.AUTO
@@ -139,35 +142,35 @@ def test_the_shipped_one_is_of_the_shipped_sensor(
 )
 def test_one_that_does_not_hold_here_is_refused_in_one_line(
     small: SensorDescription,
-    measured: Calibration,
+    measured: MachineSpeed,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     change: dict[str, object] | None,
     why: str,
 ) -> None:
     monkeypatch.setenv("CACHE_DIRECTORY", str(tmp_path))
-    path, text = calibration_path(small), measured.model_dump_json()
+    path, text = machine_speed_path(small), measured.model_dump_json()
     path.write_text(text[:99] if change is None else json.dumps({**json.loads(text), **change}))
     with pytest.raises(ArtifactError) as refusal:
-        load_calibration(path, small)
+        load_machine_speed(path, small)
     assert why in str(refusal.value)
-    assert "run: tactomo bench --calibrate" in str(refusal.value)
+    assert "run: tactomo bench --machine-speed" in str(refusal.value)
     told: list[str] = []
-    assert calibration_for(small, told.append).rows == ()
+    assert machine_speed_for(small, told.append).rows == ()
     assert len(told) == 1
     assert why in told[0]
     assert "\n" not in told[0]
 
 
 def test_what_cannot_be_read_or_written_is_said(
-    small: SensorDescription, measured: Calibration, tmp_path: Path
+    small: SensorDescription, measured: MachineSpeed, tmp_path: Path
 ) -> None:
     with pytest.raises(ArtifactError, match="cannot read"):
-        load_calibration(tmp_path, small)
+        load_machine_speed(tmp_path, small)
     (tmp_path / "file").write_text("")
     with pytest.raises(ArtifactError, match="cannot write"):
-        save_calibration(measured, tmp_path / "file" / "calibration.json")
+        save_machine_speed(measured, tmp_path / "file" / "speed.json")
 
 
 def test_the_processor_has_a_name() -> None:
-    assert calibration.processor()
+    assert machine_speed.processor()

@@ -1,4 +1,4 @@
-"""`tactomo bench --calibrate`: what it keeps is what it then shows."""
+"""`tactomo bench --machine-speed`: what it keeps is what it then shows."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from tactomo_models import load_description
-from tactomo_models.calibration import Calibration, Row, calibration_path, save_calibration
+from tactomo_models.machine_speed import MachineSpeed, Row, machine_speed_path, save_machine_speed
 
 Run = Callable[..., Any]
 
@@ -19,7 +19,7 @@ def test_what_is_in_force_is_shown(
     tactomo: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CACHE_DIRECTORY", str(tmp_path))
-    shipped = tactomo("bench", "--calibrate", "--show")
+    shipped = tactomo("bench", "--machine-speed", "--show")
     assert shipped.returncode == 0
     assert "shipped, of" in shipped.stdout
     sensor = load_description("paper_square")
@@ -28,31 +28,31 @@ def test_what_is_in_force_is_shown(
         for budget_s in (0.005, 0.02)
     ]
     rows.append(Row(method="noser", budget_s=None, p50_s=0.001, p99_s=0.002, icc=0.6))
-    measured = Calibration.of_rows(sensor, "2026-01-31", rows)
-    save_calibration(measured, calibration_path(sensor))
-    words = tactomo("bench", "--calibrate", "--show")
+    measured = MachineSpeed.of_rows(sensor, "2026-01-31", rows)
+    save_machine_speed(measured, machine_speed_path(sensor))
+    words = tactomo("bench", "--machine-speed", "--show")
     assert "measured here on 2026-01-31" in words.stdout
     assert "A frame takes 7.0 ms and 2.00 times its modelled budget" in words.stdout
     bought = [line.split() for line in words.stdout.partition("within")[2].splitlines()]
     cells = [[word for word in line if word not in "│┃"] for line in bought]
     assert ["10", "noser"] in cells
     assert ["50", "auto", "21.5"] in cells
-    numbers = tactomo("bench", "--calibrate", "--show", "--json")
-    assert Calibration.model_validate_json(numbers.stdout) == measured
-    calibration_path(sensor).write_text("{}")
-    damaged = tactomo("bench", "--calibrate", "--show")
+    numbers = tactomo("bench", "--machine-speed", "--show", "--json")
+    assert MachineSpeed.model_validate_json(numbers.stdout) == measured
+    machine_speed_path(sensor).write_text("{}")
+    damaged = tactomo("bench", "--machine-speed", "--show")
     assert damaged.returncode == 0
     assert "is damaged" in damaged.stderr
     assert "shipped, of" in damaged.stdout
 
 
-@pytest.mark.parametrize("options", [["--show"], ["--calibrate", "--chart", "chart.png"]])
+@pytest.mark.parametrize("options", [["--show"], ["--machine-speed", "--chart", "chart.png"]])
 def test_options_that_do_not_go_together(tactomo: Run, options: list[str]) -> None:
     assert tactomo("bench", *options).returncode == 2
 
 
-def test_a_sensor_without_scenes_cannot_be_calibrated(tactomo: Run) -> None:
-    result = tactomo("bench", "--calibrate", "-d", "tank_disc")
+def test_a_sensor_without_scenes_cannot_be_measured(tactomo: Run) -> None:
+    result = tactomo("bench", "--machine-speed", "-d", "tank_disc")
     assert result.returncode == 1
     assert "has one channel" in result.stderr
 
@@ -67,10 +67,10 @@ def test_a_machine_is_measured(
     shipped = resources.files("tactomo_models.sensors").joinpath("paper_square.toml")
     sensor = tmp_path / "coarse.toml"
     sensor.write_text(shipped.read_text("utf-8") + "[map]\nnodes_x = 21\nnodes_y = 21\n")
-    result = tactomo("bench", "--calibrate", "--json", "-d", sensor)
+    result = tactomo("bench", "--machine-speed", "--json", "-d", sensor)
     assert result.returncode == 0, result.stderr
     told = json.loads(result.stdout)
     assert {"auto", "tikhonov", "noser"} <= {row["method"] for row in told["rows"]}
     assert all(0 < row["p50_s"] <= row["p99_s"] for row in told["rows"])
-    shown = tactomo("bench", "--calibrate", "--show", "--json", "-d", sensor)
+    shown = tactomo("bench", "--machine-speed", "--show", "--json", "-d", sensor)
     assert json.loads(shown.stdout) == told

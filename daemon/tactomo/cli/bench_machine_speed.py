@@ -1,4 +1,4 @@
-"""`tactomo bench --calibrate`: how much work, and which method, a time buys on this machine.
+"""`tactomo bench --machine-speed`: how much work, and which method, a time buys on this machine.
 
 Measured on moving scenes of tuning seeds, as a daemon has them: what is chosen by accuracy must
 not be chosen on the scenes that report it.
@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, Final
 from rich.console import Console
 from rich.progress import Progress
 from tactomo_models import METHODS, Tier, load_description
-from tactomo_models.calibration import (
-    Calibration,
-    Row,
-    calibration_for,
-    calibration_path,
-    save_calibration,
-)
 from tactomo_models.evaluation.moving import draw_sequence
 from tactomo_models.evaluation.trade_off import BUDGETED, BUDGETS_S, Point, variants
+from tactomo_models.machine_speed import (
+    MachineSpeed,
+    Row,
+    machine_speed_for,
+    machine_speed_path,
+    save_machine_speed,
+)
 
 from tactomo.cli.bench_chart import follow, to_be_had, told_if_busy
 
@@ -35,7 +35,7 @@ LEAST_S: Final = 0.002
 TIMES_MS: Final = (1, 2, 5, 10, 20, 50, 100)  # of which the table tells what they buy
 
 
-def calibrate(name: str) -> Calibration:
+def measure(name: str) -> MachineSpeed:
     """Measure a sensor's methods on this machine and keep what came out, with a progress bar.
 
     Raises:
@@ -49,9 +49,9 @@ def calibrate(name: str) -> Calibration:
         with told_if_busy():
             points = follow(moving, variants(methods, (LEAST_S, *BUDGETS_S)), progress)
     today = datetime.now(UTC).date().isoformat()
-    calibration = Calibration.of_rows(sensor, today, [_row(point) for point in points])
-    save_calibration(calibration, calibration_path(sensor))
-    return calibration
+    speed = MachineSpeed.of_rows(sensor, today, [_row(point) for point in points])
+    save_machine_speed(speed, machine_speed_path(sensor))
+    return speed
 
 
 def _row(point: Point) -> Row:
@@ -64,20 +64,20 @@ def _row(point: Point) -> Row:
     )
 
 
-def in_force(name: str) -> Calibration:
-    """Return the calibration that a daemon would use, and say on standard error why, if need be."""
+def in_force(name: str) -> MachineSpeed:
+    """Return what a daemon would use, and say on standard error why, if need be."""
     console = Console(stderr=True)
-    return calibration_for(load_description(name), lambda why: console.print(why, soft_wrap=True))
+    return machine_speed_for(load_description(name), lambda why: console.print(why, soft_wrap=True))
 
 
-def tables_of(calibration: Calibration) -> Sequence[Table]:
+def tables_of(speed: MachineSpeed) -> Sequence[Table]:
     """Lay out what was measured, and what each time buys."""
     from rich.table import Table
 
     measured = Table(title="one frame of moving scenes (simulated, tuning seeds)")
     for heading in ("method", "modelled budget ms", "p50 ms", "p99 ms", "ICC"):
         measured.add_column(heading, justify="left" if heading == "method" else "right")
-    for row in calibration.rows:
+    for row in speed.rows:
         measured.add_row(
             row.method,
             "" if row.budget_s is None else f"{row.budget_s * 1e3:g}",
@@ -89,7 +89,7 @@ def tables_of(calibration: Calibration) -> Sequence[Table]:
     for heading in ("within ms", "method", "modelled budget ms"):
         bought.add_column(heading, justify="left" if heading == "method" else "right")
     for time_ms in TIMES_MS:
-        plan = calibration.plan(Tier.AUTO, time_ms * 1e-3)
+        plan = speed.plan(Tier.AUTO, time_ms * 1e-3)
         budget = f"{plan.budget_s * 1e3:.1f}" if plan.tier in BUDGETED and plan.budget_s else ""
         bought.add_row(str(time_ms), str(plan.tier), budget)
-    return [measured, bought] if calibration.rows else [bought]
+    return [measured, bought] if speed.rows else [bought]
