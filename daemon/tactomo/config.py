@@ -23,6 +23,7 @@ from tactomo_models.toml_file import read_toml
 from tactomo.endpoint import check_endpoint, check_metrics_address, is_local, needs_keys
 from tactomo.errors import ConfigError
 from tactomo.log import LogFormat, LogLevel
+from tactomo.protocols import OURS, PROTOCOLS
 
 MAX_PORTS = 2
 
@@ -43,8 +44,15 @@ def _method(name: str) -> str:
     return name
 
 
+def _protocol(name: str) -> str:
+    if name not in PROTOCOLS:
+        raise ValueError(f"use one of: {', '.join(PROTOCOLS)}")
+    return name
+
+
 Endpoint = Annotated[str, AfterValidator(check_endpoint)]
 TierName = Annotated[str, AfterValidator(_method)]
+ProtocolName = Annotated[str, AfterValidator(_protocol)]
 DeviceId = Annotated[str, Field(min_length=1, max_length=64)]
 MetricsAddress = Annotated[str, AfterValidator(check_metrics_address)]
 BudgetMs = Annotated[float, Field(gt=0, le=10_000)]
@@ -116,7 +124,10 @@ class DaemonConfig(BaseModel):
     """The devices that make up this sensor, as their hello says; empty accepts any."""
     wait_for_ports: bool = False
     """Start without a port that cannot be opened yet, and wait for it."""
-    baud: Annotated[int, Field(ge=1200, le=12_000_000)] = 921_600
+    protocol: ProtocolName = OURS
+    """What the device speaks: ours, or that of other people's hardware."""
+    baud: Annotated[int, Field(ge=1200, le=12_000_000)] | None = None
+    """Of a real UART; None for what is usual with the protocol."""
     stream: Endpoint = DEFAULT_STREAM
     control: Endpoint = DEFAULT_CONTROL
     curve: Curve | None = None
@@ -142,6 +153,8 @@ class DaemonConfig(BaseModel):
     def _ports_differ(self) -> Self:
         if len(set(self.ports)) != len(self.ports):
             raise ValueError("ports: the two ports are the same one")
+        if self.protocol != OURS and len(self.ports) > 1:
+            raise ValueError(f"ports: a device of protocol {self.protocol} has one port; give one")
         return self
 
     @model_validator(mode="after")

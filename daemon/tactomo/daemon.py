@@ -5,7 +5,7 @@ Threads, each with what it alone touches, and what it hands on:
 ============  ==========================  =========================================================
 thread        owns                        hands on
 ============  ==========================  =========================================================
-port-0, -1    a serial port, a decoder    scans to the pipeline, bytes to the recorder
+port-0, -1    a serial port               scans to the pipeline, bytes to the recorder
 pipeline      sync, the reconstructor     messages to the publisher, marks to the recorder
 control       the control socket          commands to the pipeline and to the recorder
 publisher     the stream's socket         what it sent to the recorder, if that is asked for
@@ -60,6 +60,7 @@ from tactomo.imaging import Imaging
 from tactomo.pipeline import Pipeline, Replay
 from tactomo.port import PortReader
 from tactomo.protocol_replay import parse_replay_url
+from tactomo.protocols import default_baud, protocol_named
 from tactomo.publisher import Publisher
 from tactomo.recorder import Recorder
 from tactomo.recording import REPLAY_SCHEME, Origin, Recording
@@ -114,8 +115,10 @@ class Daemon:
         description = load_description(config.description)
         self._description = description
         replay = read_replay(config.ports, description)
+        protocol = _protocol(config)
         channels = tuple(c for c in Channel if c.name.lower() in description.modalities)
-        self._recorder = Recorder(_origin(config, description), config.recording, self._on_event)
+        origin = _origin(config, protocol, description)
+        self._recorder = Recorder(origin, config.recording, self._on_event)
         self._publisher = Publisher(
             config.name, self.session, self._status_fields, self._record_message, self._on_event
         )
@@ -142,7 +145,8 @@ class Daemon:
             PortReader(
                 index,
                 url,
-                config.baud,
+                config.baud or default_baud(protocol),
+                protocol_named(protocol, description),
                 description,
                 config.device_ids,
                 self._recorder,
@@ -435,11 +439,19 @@ def _find_machine_speed(description: SensorDescription) -> MachineSpeed:
     )
 
 
-def _origin(config: DaemonConfig, description: SensorDescription) -> Origin:
+def _protocol(config: DaemonConfig) -> str:
+    """Return what the ports speak: as configured or, where they are replayed, as recorded."""
+    if config.ports[0].startswith(f"{REPLAY_SCHEME}://"):
+        return parse_replay_url(config.ports[0])[0].origin.protocol
+    return config.protocol
+
+
+def _origin(config: DaemonConfig, protocol: str, description: SensorDescription) -> Origin:
     return Origin(
         sensor=config.name,
         description=config.description,
         description_sha256=description.sha256,
         ports=config.ports,
         version=version("tactomo"),
+        protocol=protocol,
     )

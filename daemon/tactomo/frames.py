@@ -117,6 +117,7 @@ def port_fields(port: PortReader) -> dict[str, Any]:
     """Return what `status` says about a port."""
     return {
         "url": port.url,
+        "protocol": port.protocol,
         "connected": port.is_open,
         "state": port.state,
         "problem": port.problem or None,
@@ -128,7 +129,7 @@ def port_fields(port: PortReader) -> dict[str, Any]:
         "unused_scans": port.unused,
         "reopened": port.reopened,
         "latency_timer_ms": port.latency_timer_ms,
-        "clock": _clock(port.clock),
+        "clock": _clock(port.clock, port.has_clock),
     }
 
 
@@ -151,10 +152,10 @@ def magnitude_max(description: SensorDescription) -> float | None:
     return max(abs(change) for change in description.magnitude.response.relative_change)
 
 
-def _clock(clock: DeviceClock) -> dict[str, Any]:
+def _clock(clock: DeviceClock, is_there: bool) -> dict[str, Any]:
     line = clock.line
     return {
-        "state": str(clock.state),
+        "state": str(clock.state) if is_there else "absent",
         "offset_ns": None if line is None else line.lag_ns,
         "rate_ppm": None if line is None else line.rate * 1e6,
         "delay_ms": clock.delays.percentiles_ms(),

@@ -22,19 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 from tactomo_models import SensorDescription
 from tactomo_protocol import (
-    MAX_FRAME_BYTES,
     Acknowledge,
     AckStatus,
     Channel,
-    Command,
     CommandCode,
-    Decoder,
     DecoderCounts,
     Hello,
     Packet,
     Scan,
     ScanFlag,
-    encode,
 )
 
 from tactomo.adapters import ROOT
@@ -44,16 +40,14 @@ from tactomo.events import OnEvent, RateLimit
 from tactomo.liveness import PATIENCE_S, DeviceState, Liveness
 from tactomo.open_serial import other_holders
 from tactomo.protocol_replay import ReplayEnded
+from tactomo.protocols import PortProtocol, Trouble
 from tactomo.recorder import ActiveRecording, Recorder
 from tactomo.recording import REPLAY_SCHEME
-from tactomo.recording_writer import hello_entry, port_entry
+from tactomo.recording_writer import port_entry, preamble_entry
 
 RETRY_S: Final = 0.25
-ASK_AGAIN_S: Final = 1.5
-"""How long a device may say no hello, or send no scan, before it is asked again."""
 TROUBLE_PERIOD_S: Final = 30.0
 """How often at most a device is said to be in trouble: some come and go for hours."""
-_INTRODUCTION: Final = (CommandCode.IDENTIFY, CommandCode.START)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,6 +96,7 @@ class PortReader:
         index: its number among the sensor's ports.
         url: a device's path or a pyserial URL.
         baud: of a real UART.
+        protocol: what its device speaks; it belongs to the thread from `start` on.
         description: the sensor that the device must fit.
         device_ids: those that may speak here; any where it is empty.
         recorder: gets every byte while it records.
@@ -128,6 +123,7 @@ class PortReader:
         index: int,
         url: str,
         baud: int,
+        protocol: PortProtocol,
         description: SensorDescription,
         device_ids: Collection[str],
         recorder: Recorder,
@@ -154,12 +150,11 @@ class PortReader:
         self._connection = Connection(url, baud, on_event, root)
         self._is_replay = url.startswith(f"{REPLAY_SCHEME}://")
         self._liveness = Liveness()
-        self._decoder = Decoder()
-        self._tail = b""  # bytes from the last delimiter on, where a recording may begin
+        self._protocol = protocol
         self._recording = 0  # number of the recording that has the last chunk
         self._is_known = False  # the device that is plugged in has said hello
         self._asked_s = 0.0  # when the device was last asked, or last sent a scan
-        self._request = 0
+        self._trouble_of_protocol: Trouble | None = None
         self._corrupt_told = 0
         self._corrupt_limit = RateLimit()
         self._trouble_told: DeviceState | None = None
@@ -172,8 +167,18 @@ class PortReader:
 
     @property
     def counts(self) -> DecoderCounts:
-        """What the decoder has met so far."""
-        return self._decoder.counts
+        """What the protocol has understood so far, and what not."""
+        return self._protocol.counts
+
+    @property
+    def has_clock(self) -> bool:
+        """Whether the device says when its scans were taken."""
+        return self._protocol.has_clock
+
+    @property
+    def protocol(self) -> str:
+        """What its device speaks."""
+        return self._protocol.name
 
     @property
     def is_open(self) -> bool:
@@ -244,6 +249,7 @@ class PortReader:
                     self._read_once()
                 else:
                     self._wait_for_device()
+            self._send(self._protocol.stop())
         except ReplayEnded as end:
             self._end(str(end))
 
@@ -260,7 +266,6 @@ class PortReader:
 
     def _wait_for_device(self) -> None:
         """Try the port once more, after a while."""
-        self._tail = b""
         self._trouble_told = None
         if not self._stopping.wait(RETRY_S) and self._connection.try_open():
             self._on_event("port_back", "info", self.url)
@@ -269,16 +274,17 @@ class PortReader:
     def _greet_newcomer(self) -> None:
         """Make a new start with whichever device is at the port now."""
         self._is_known = False
+        self._protocol.restart()
         self._liveness.opened(time.monotonic())
         self._ask()
 
     def _attend(self, now_s: float) -> None:
         """See to a device that does not do as it should."""
-        if now_s - self._asked_s > ASK_AGAIN_S:
+        if now_s - self._asked_s > self._protocol.patience_s:
             self._ask()
         if self._is_zeroing.is_set():
             self._is_zeroing.clear()
-            self._ask((CommandCode.ZERO_COUNTERS, CommandCode.START))
+            self._send(self._protocol.zero_counters())
         self._tell_trouble(self._liveness.judge(now_s))
         if self._liveness.is_reopening_due(now_s):
             self._reopen()
@@ -286,7 +292,7 @@ class PortReader:
     def _reopen(self) -> None:
         """Close and open the port: what a USB bridge that hangs often needs."""
         self._connection.close()
-        self._tail = b""
+        self._protocol.restart()
         if self._connection.try_open():
             self.reopened += 1
             self._liveness.reopened(time.monotonic())
@@ -296,7 +302,8 @@ class PortReader:
         self.bytes_read += len(data)
         recording = self._record(data, realtime_ns, monotonic_ns)
         scans = []
-        packets = self._decoder.feed(data)
+        understood = self.counts.packets
+        packets = self._protocol.feed(data)
         for packet in packets:
             volts = self._handle(packet)
             if volts is not None and isinstance(packet, Scan):
@@ -312,17 +319,22 @@ class PortReader:
                         clock_ns,
                         recording,
                         self.index,
-                        self.clock.date(packet.channel, packet.device_us, clock_ns),
+                        self.clock.date(packet.channel, packet.device_us, clock_ns)
+                        if self.has_clock
+                        else None,
                     )
                 )
         now_s = monotonic_ns * 1e-9
         found = sum(isinstance(packet, Scan) for packet in packets)
-        self._liveness.heard(now_s, len(packets), found)
+        self._liveness.heard(now_s, self.counts.packets - understood, found)
         if packets:
             channels = None if self.hello is None else self.hello.channels
             self._deliver(Delivery(self.index, clock_ns, tuple(scans), channels))
+        if not self._is_replay:
+            self._send(self._protocol.replies())
         self._tell_corrupt()
         self._tell_clock()
+        self._tell_protocols_trouble()
 
     def _record(self, data: bytes, realtime_ns: int, monotonic_ns: int) -> int:
         """Give the bytes to the recording that runs, if any; returns its number or 0."""
@@ -333,19 +345,15 @@ class PortReader:
             active = self._recorder.active
             is_taken = active is not None and self._record_to(active, data, times)
         self._recording = active.number if active is not None and is_taken else 0
-        delimiter = data.rfind(0)
-        self._tail = (self._tail + data)[-MAX_FRAME_BYTES:] if delimiter < 0 else data[delimiter:]
         return self._recording
 
     def _record_to(self, active: ActiveRecording, data: bytes, times: tuple[int, int]) -> bool:
         entries = [port_entry(self.index, data, *times)]
         if active.number != self._recording:
-            # A recording begins with the hello in force and at a delimiter, so that its first
-            # packet is whole and what it means is known.
-            if self._tail:
-                entries.insert(0, port_entry(self.index, self._tail, *times))
-            if self.hello is not None:
-                entries.insert(0, hello_entry(self.index, self.hello, *times))
+            # So that its first scan is whole and what it means is known.
+            preamble = self._protocol.preamble()
+            if preamble:
+                entries.insert(0, preamble_entry(self.index, preamble, *times))
         previous = active.previous
         if previous is not None and self._recording in (previous.number, active.number):
             previous.add(entries[-1])
@@ -381,14 +389,9 @@ class PortReader:
         if hello == before:
             return
         self.hello = hello
-        is_foreign = bool(self._device_ids) and hello.device_id not in self._device_ids
-        self.refusal = (
-            f"{hello.device_id} is not one of this sensor's devices, {', '.join(self._device_ids)}"
-            if is_foreign
-            else contradiction(hello, self._description)
-        )
+        self.refusal = self._why_refused(hello)
         if self.refusal:
-            self._tell_refusal(hello, is_foreign)
+            self._tell_refusal(hello, self._is_foreign(hello))
         elif before is not None and before.device_id != hello.device_id:
             self._on_event(
                 "device_changed",
@@ -396,6 +399,15 @@ class PortReader:
                 f"{self.url}: {hello.device_id} is where {before.device_id} was",
                 "tare, if another skin was plugged in; `device_ids` keeps foreign ones out",
             )
+
+    def _why_refused(self, hello: Hello) -> str:
+        if self._is_foreign(hello):
+            ours = ", ".join(self._device_ids)
+            return f"{hello.device_id} is not one of this sensor's devices, {ours}"
+        return contradiction(hello, self._description)
+
+    def _is_foreign(self, hello: Hello) -> bool:
+        return bool(self._device_ids) and hello.device_id not in self._device_ids
 
     def _tell_refusal(self, hello: Hello, is_foreign: bool) -> None:
         name = self._description.name
@@ -412,12 +424,16 @@ class PortReader:
             else "give the daemon the description of the sensor that is connected",
         )
 
-    def _ask(self, codes: tuple[CommandCode, ...] = _INTRODUCTION) -> None:
-        """Ask the device who it is and to start; harmless where it has started already."""
+    def _ask(self) -> None:
+        """Ask the device who it is and to start."""
         self._asked_s = time.monotonic()
-        for code in codes:
-            self._request = (self._request + 1) % 256
-            if not self._connection.write(encode(Command(code, self._request))):
+        self._send(self._protocol.introduction())
+
+    def _send(self, messages: list[bytes]) -> None:
+        """Write to the device what it takes; while it is talked to, it is not asked anew."""
+        for message in messages:
+            self._asked_s = time.monotonic()
+            if not self._connection.is_open or not self._connection.write(message):
                 return
 
     def _trouble(self, state: DeviceState) -> str:
@@ -426,7 +442,7 @@ class PortReader:
         if state is DeviceState.SILENT:
             return f"nothing came for {PATIENCE_S:g} s"
         if state is DeviceState.GARBAGE:
-            return f"bytes come, but no packet at {self._baud} baud"
+            return f"bytes come, but no packet of protocol {self.protocol} at {self._baud} baud"
         if state is DeviceState.IDLE and (hello is None or hello.scan_rate_hz > 0):
             return "the device speaks, but sends no scans"
         return ""
@@ -454,8 +470,8 @@ class PortReader:
                     "device_garbled",
                     "warning",
                     detail,
-                    "wrong baud rate, or no skin: set `baud` to the firmware's; "
-                    "`tactomo ports` shows what is where",
+                    "wrong baud rate, or another device: set `baud` or `protocol` to the device's; "
+                    "`tactomo ports --ask` tells what is where",
                 )
             else:
                 self._on_event(
@@ -498,8 +514,24 @@ class PortReader:
             )
         self._clock_told = (clock.state, jumps)
 
+    def _tell_protocols_trouble(self) -> None:
+        """Tell why nothing can be made of what comes, and when it can again."""
+        trouble = self._protocol.trouble
+        if trouble == self._trouble_of_protocol:
+            return
+        if trouble is not None:
+            self.refusal = trouble.cause
+            detail = f"{self.url}: {trouble.cause}"
+            self._on_event("device_refused", "error", detail, trouble.next_step)
+        elif self.hello is not None:
+            self.refusal = self._why_refused(self.hello)
+            self._on_event("device_speaks", "info", self.url)
+        else:
+            self.refusal = ""
+        self._trouble_of_protocol = trouble
+
     def _tell_corrupt(self) -> None:
-        corrupt = self._decoder.counts.corrupt
+        corrupt = self.counts.corrupt
         if corrupt > self._corrupt_told and self._corrupt_limit.allows():
             self._on_event(
                 "corrupt_packets",

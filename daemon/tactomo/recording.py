@@ -5,8 +5,10 @@ Messages are in the order in which they were written, and that order is what cou
 =============  ==========  =======================================================================
 topic          encoding    message
 =============  ==========  =======================================================================
-port/N         raw         bytes of port N exactly as read; the first ones start at a delimiter
-port/N/hello   raw         one whole frame: the hello in force when the recording began
+port/N         raw         bytes of port N exactly as read, in the protocol of its device
+port/N/hello   raw         what a replay must be told before those: the hello in force when the
+                           recording began, and the packet that had begun to come; for a foreign
+                           protocol also where in its scans the port was (`protocols.interface`)
 reference      msgpack     the reference that holds from here on: its number in this recording,
                            volts and noise of each channel; repeated every minute
 frame          msgpack     a dual scan that the daemon reconstructed: channel, counter and device
@@ -23,7 +25,7 @@ one, so every dual scan lies whole in the file that has its mark.
 
 `log_time` is a steady clock: the wall clock when the recording began plus the monotonic time
 since. `publish_time` is the wall clock itself. The metadata record ``tactomo`` says which sensor
-it was.
+it was, and which protocol its ports spoke.
 
 The file of a daemon that was killed ends somewhere in its last chunk. Everything here reads with
 MCAP's streaming reader, so such a file opens like any other, up to its last complete chunk. What
@@ -51,11 +53,13 @@ from mcap.stream_reader import StreamReader
 from pydantic import BaseModel, Strict, StrictBool, StrictInt, StrictStr
 from tactomo_client import MessageError
 from tactomo_client.messages import MAX_ENTRIES, array_from_wire
-from tactomo_models import Reference
-from tactomo_protocol import Channel, Decoder, Hello, Scan
+from tactomo_models import Reference, load_description
+from tactomo_models.errors import DescriptionError
+from tactomo_protocol import Channel, Hello, Scan
 
-from tactomo.errors import RecordingError
+from tactomo.errors import ConfigError, RecordingError
 from tactomo.intact_chunks import MAX_RECORD_BYTES, intact_chunks, unpack_chunk
+from tactomo.protocols import OURS, PortProtocol, protocol_named
 
 PROFILE: Final = "tactomo"
 RECOVERED: Final = "tactomo-recovered"
@@ -131,6 +135,24 @@ class Origin:
     description_sha256: str
     ports: tuple[str, ...]
     version: str
+    protocol: str = OURS
+    """What the ports speak."""
+
+    def new_protocol(self) -> PortProtocol:
+        """Return what turns a port's bytes into packets.
+
+        Raises:
+            RecordingError: it is not known here, or needs a description that is not here.
+
+        """
+        try:
+            known = None if self.protocol == OURS else load_description(self.description)
+            return protocol_named(self.protocol, known)
+        except (ConfigError, DescriptionError) as error:
+            raise RecordingError(
+                f"the recording is of protocol {self.protocol} and cannot be understood: {error}",
+                "put its sensor description where the recording names it",
+            ) from error
 
 
 @dataclass(slots=True)
@@ -205,7 +227,7 @@ class Recording:
         return next(times, 0)
 
     def chunks(self, port: int) -> Iterator[Chunk]:
-        """Yield what port `port` said; before all else the hello in force, if it was known."""
+        """Yield what port `port` said; before all else its preamble, if there is one."""
         topics = (f"port/{port}", f"port/{port}/hello")
         for topic, message in _messages(self.path):
             if topic in topics:
@@ -258,7 +280,7 @@ def open_recording(path: str | Path) -> Recording:
 def _summarise(path: Path, origin: Origin) -> Summary:
     """Read a whole recording; its decoders are the daemon's own."""
     summary = Summary(origin, path.stat().st_size)
-    decoders: defaultdict[int, Decoder] = defaultdict(Decoder)
+    decoders: defaultdict[int, PortProtocol] = defaultdict(origin.new_protocol)
     references: set[int | None] = set()
     stops: list[int] = []
     for topic, record in _records(path, stops.append):
@@ -295,7 +317,7 @@ def _count_bytes(summary: Summary, port: int, message: Message) -> None:
     summary.end_ns = max(summary.end_ns, message.log_time)
 
 
-def _count_packets(summary: Summary, decoder: Decoder, data: bytes) -> None:
+def _count_packets(summary: Summary, decoder: PortProtocol, data: bytes) -> None:
     for packet in decoder.feed(data):
         if isinstance(packet, Scan):
             summary.scans[packet.channel] = summary.scans.get(packet.channel, 0) + 1
@@ -341,6 +363,7 @@ def to_origin(metadata: Mapping[str, str]) -> Origin:
         description_sha256=metadata.get("description_sha256", ""),
         ports=ports,
         version=metadata.get("version", ""),
+        protocol=metadata.get("protocol", OURS),
     )
 
 

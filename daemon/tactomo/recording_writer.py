@@ -42,9 +42,9 @@ def port_entry(port: int, data: bytes, monotonic_ns: int, realtime_ns: int) -> E
     return Entry(f"port/{port}", data, monotonic_ns, realtime_ns)
 
 
-def hello_entry(port: int, hello: Hello, monotonic_ns: int, realtime_ns: int) -> Entry:
-    """The hello in force on a port, as the frame it would come in."""
-    return Entry(f"port/{port}/hello", encode(hello), monotonic_ns, realtime_ns)
+def preamble_entry(port: int, data: bytes, monotonic_ns: int, realtime_ns: int) -> Entry:
+    """What a port's protocol needs to know of what came before the recording."""
+    return Entry(f"port/{port}/hello", data, monotonic_ns, realtime_ns)
 
 
 def reference_entry(
@@ -155,6 +155,7 @@ class RecordingWriter:
             "description_sha256": origin.description_sha256,
             "ports": "\n".join(origin.ports),
             "version": origin.version,
+            "protocol": origin.protocol,
         }
         self._writer.add_metadata(PROFILE, metadata)
         # Always the same ones in the same order: should the chunk that names them be lost, what

@@ -22,10 +22,11 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Header, Message, Metadata
 from mcap.stream_reader import StreamReader
-from tactomo_protocol import SCAN_COUNTERS, Channel, Decoder, Scan
+from tactomo_protocol import SCAN_COUNTERS, Channel, Scan
 
 from tactomo.errors import RecordingError
 from tactomo.intact_chunks import intact_chunks
+from tactomo.protocols import PortProtocol
 from tactomo.recording import (
     CHANNELS,
     PROFILE,
@@ -134,7 +135,7 @@ class _Salvage:
         self._progress = progress
         self._writer = RecordingWriter(part, origin)
         self._topics = dict(enumerate(CHANNELS, 1))
-        self._decoders: defaultdict[int, Decoder] = defaultdict(Decoder)
+        self._decoders: defaultdict[int, PortProtocol] = defaultdict(origin.new_protocol)
         self._scans: deque[ScanKey] = deque(maxlen=_REMEMBERED_SCANS)
         self._counters: dict[Channel, int] = {}
         self._time_ns: int | None = None  # of the newest bytes of a port

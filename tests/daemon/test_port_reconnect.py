@@ -345,7 +345,7 @@ def test_a_device_that_only_babbles_may_have_another_baud_rate(bench: Start, unt
 
     until(babble)
     event = b.listener.event("device_garbled")
-    assert "no packet at 921600 baud" in event["detail"]
+    assert "no packet of protocol tactomo at 921600 baud" in event["detail"]
     assert "baud" in event["next_step"]
 
 

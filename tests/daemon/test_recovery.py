@@ -19,9 +19,9 @@ from tactomo.intact_chunks import intact_chunks
 from tactomo.recording import Mark, Origin, ScanKey, open_recording
 from tactomo.recording_writer import (
     RecordingWriter,
-    hello_entry,
     mark_entry,
     port_entry,
+    preamble_entry,
     reference_entry,
 )
 from tactomo.recovery import Recovery, recover
@@ -52,7 +52,7 @@ def write(path: Path) -> None:
     rest = np.linspace(0.05, 0.2, 208)
     reference = Reference.from_scans(np.stack([rest, rest * 1.0001]), None)
     writer = RecordingWriter(path, ORIGIN)
-    writer.add(hello_entry(0, HELLO, 0, 0))
+    writer.add(preamble_entry(0, encode(HELLO), 0, 0))
     references = 0
     for counter in range(SCANS):
         time_ns = counter * PERIOD_NS

@@ -23,9 +23,9 @@ from tactomo.errors import RecordingError
 from tactomo.recording import Mark, Origin, ScanKey, open_recording
 from tactomo.recording_writer import (
     RecordingWriter,
-    hello_entry,
     mark_entry,
     port_entry,
+    preamble_entry,
     reference_entry,
 )
 from tactomo.twin import control as twin_control
@@ -178,7 +178,7 @@ def _recording_examples() -> list[bytes]:
     writer = RecordingWriter(path, Origin("left", "paper_square", "0" * 64, ("a", "b"), "0.1"))
     volts = np.linspace(0.05, 0.2, 6)
     reference = Reference(volts, volts, volts * 1e-4, None, scans=3)
-    writer.add(hello_entry(0, HELLO, 1, 1))
+    writer.add(preamble_entry(0, encode(HELLO), 1, 1))
     writer.add(reference_entry(reference, 1, 2, 2))
     writer.add(port_entry(0, encode(SCAN), 3, 3))
     writer.add(port_entry(1, b"\0\1\2", 4, 4))

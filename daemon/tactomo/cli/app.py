@@ -68,6 +68,8 @@ Method: TypeAlias = Literal[
     "cnn-single",
     "cnn-multimodal",
 ]
+# The daemon's PROTOCOLS, likewise.
+Protocol: TypeAlias = Literal["tactomo"]
 SensorName: TypeAlias = Annotated[
     str, typer.Option("--sensor", "-s", help="The sensor's name in the stream.")
 ]

@@ -19,7 +19,7 @@ from tactomo_models import DescriptionError, SensorDescription, load_description
 from tactomo_models.diagnosis import PatternLayout, pattern_of_zeros, without_zeros
 from tactomo_models.pattern import Pairs, scan_pairs
 from tactomo_models.plausibility import Layout
-from tactomo_protocol import SCAN_COUNTERS, Channel, Decoder, Hello, Scan, ScanFlag
+from tactomo_protocol import SCAN_COUNTERS, Channel, Hello, Scan, ScanFlag
 
 from tactomo.cli.imported import load_arrays, read_scans, single_ended
 from tactomo.errors import TactomoError
@@ -331,7 +331,7 @@ class _PortScans:
     """All scans that one port of a recording brought."""
 
     def __init__(self, recording: Recording, port: int) -> None:
-        decoder = Decoder()
+        decoder = recording.origin.new_protocol()
         hello: Hello | None = None
         self.scans: list[_Taken] = []
         for chunk in recording.chunks(port):

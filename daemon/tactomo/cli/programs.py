@@ -22,6 +22,7 @@ from tactomo.cli.app import (
     Description,
     KeysFolder,
     Method,
+    Protocol,
     RecordingFile,
     SensorName,
     StreamAddress,
@@ -69,8 +70,11 @@ def daemon(
     wait_for_ports: Annotated[
         bool, typer.Option("--wait-for-ports", help="Start even where a port is not there yet.")
     ] = False,
+    protocol: Annotated[
+        Protocol | None, typer.Option(help="What the device speaks. [tactomo]")
+    ] = None,
     baud: Annotated[
-        int | None, typer.Option(help="Of a real UART; USB takes any. [921600]")
+        int | None, typer.Option(help="Of a real UART; USB takes any. [the protocol's usual]")
     ] = None,
     stream: Annotated[
         str | None, typer.Option(help=f"Where to publish. [{DEFAULT_STREAM}]")
@@ -124,6 +128,7 @@ def daemon(
         ports=tuple(port) if port else None,
         device_ids=tuple(device_id) if device_id else None,
         wait_for_ports=wait_for_ports or None,
+        protocol=protocol,
         baud=baud,
         stream=stream,
         control=control,

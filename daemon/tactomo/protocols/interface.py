@@ -1,0 +1,256 @@
+"""What a port must know of the language that its device speaks.
+
+There is one object for each port. The port's thread owns it; `counts`, `trouble` and the class's
+constants may be read by others. Whatever a device says becomes packets of our own protocol, so that
+nothing behind the port knows of another one.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar, Final, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from tactomo_models import SensorDescription
+from tactomo_protocol import (
+    SCAN_COUNTERS,
+    Channel,
+    Decoder,
+    DecoderCounts,
+    Hello,
+    Packet,
+    SampleFormat,
+    Scan,
+    ScanFlag,
+    UnknownPacket,
+    encode,
+)
+
+from tactomo.errors import ConfigError
+
+
+class Trouble(NamedTuple):
+    """Why nothing can be made of what a device says."""
+
+    cause: str
+    next_step: str
+
+
+class PortProtocol(Protocol):
+    """A language of devices, as one port speaks it."""
+
+    @property
+    def name(self) -> str:
+        """As in the configuration."""
+
+    @property
+    def baud(self) -> int:
+        """Of a real UART, where the configuration names none."""
+
+    @property
+    def patience_s(self) -> float:
+        """How long a device may send no scan before it is introduced to us again."""
+
+    @property
+    def has_clock(self) -> bool:
+        """Whether its scans say by the device's own clock when they were taken."""
+
+    @property
+    def counts(self) -> DecoderCounts:
+        """What was understood and what was not, over all connections."""
+
+    @property
+    def trouble(self) -> Trouble | None:
+        """Why its scans cannot be used at present; None where they can, or none came yet."""
+
+    def feed(self, data: bytes) -> list[Packet]:
+        """Return the packets completed by `data`; any bytes in any chunking, never raises."""
+
+    def replies(self) -> list[bytes]:
+        """Return what is to be written now, after what was fed; each message is returned once."""
+
+    def introduction(self) -> list[bytes]:
+        """Return what is written to a newcomer, or one that is silent: who are you, and start."""
+
+    def zero_counters(self) -> list[bytes]:
+        """Return what has a device count from 0 again; nothing where there is no such thing."""
+
+    def stop(self) -> list[bytes]:
+        """Return what keeps a device from going on sending to nobody; nothing for ours."""
+
+    def restart(self) -> None:
+        """Take note that the port was opened anew: what had begun to come is not finished."""
+
+    def preamble(self) -> bytes:
+        """Return what a recording begins with if it begins now.
+
+        Fed to a new object before the bytes to come, it makes the same scans of them.
+        """
+
+
+class Reading(NamedTuple):
+    """One scan of a foreign device."""
+
+    volts: NDArray[np.float64]
+    """(M,) in the description's order."""
+    device_us: int = 0
+    """By its clock; 0 where it has none."""
+
+
+_POSITION: Final = struct.Struct("<IQB")
+_POSITION_TYPE: Final = 0x70  # PROTOCOL.md leaves it to experiments; no device of ours sends it
+
+
+@dataclass(frozen=True, slots=True)
+class _Position:
+    """Where in its scans a foreign port is: what its bytes do not say."""
+
+    counter: int
+    device_us: int
+    clock_format: int
+
+
+class ForeignProtocol:
+    """What the protocols of other people's devices have in common; a subclass parses.
+
+    It makes up what such a device does not say: the hello, from the sensor's description, before
+    the first scan, and the scans' counter, which goes on over all connections. The device carries
+    the description's only channel.
+
+    Args:
+        description: the sensor; its scans are float32 volts in the description's order.
+        rate_hz: scans a second, 0 where only the device knows.
+
+    Raises:
+        ConfigError: the description has two channels.
+
+    Attributes:
+        device_us: the newest reading's time, to go on from.
+        clock_format: of several that a device's clock may have, a number that `parse` understands.
+
+    """
+
+    name: ClassVar[str]
+    baud: ClassVar[int]
+    device_id: ClassVar[str]
+    patience_s: float = 4.0
+    has_clock: bool = False
+
+    def __init__(self, description: SensorDescription, rate_hz: float = 0.0) -> None:
+        if len(description.modalities) != 1:
+            raise ConfigError(
+                f"{description.name} has two channels, and a device of protocol {self.name} "
+                "carries one",
+                "give the description of a sensor with one channel, such as tank_disc",
+            )
+        self.description = description
+        self.counts = DecoderCounts()
+        self.trouble: Trouble | None = None
+        self.device_us = 0
+        self.clock_format = 0
+        self._channel = Channel[description.modalities[0].upper()]
+        self._rate_hz = rate_hz
+        self._counter = 0
+        self._has_begun = self._has_greeted = False
+
+    def feed(self, data: bytes) -> list[Packet]:
+        """See `PortProtocol`."""
+        packets: list[Packet] = []
+        if not self._has_begun and data:
+            self._has_begun = True
+            data = self._resume(data, packets)
+        for reading in self.parse(data):
+            if not self._has_greeted:
+                packets.append(self.hello())
+                self._has_greeted = True
+            packets.append(self._scan(reading))
+        return packets
+
+    def parse(self, data: bytes) -> Iterator[Reading]:
+        """Yield the readings that `data` completes; counts, and never raises."""
+        raise NotImplementedError
+
+    @classmethod
+    def recognises(cls, data: bytes) -> bool:
+        """Tell whether these bytes, from anywhere in a stream, are of this protocol, likely."""
+        raise NotImplementedError
+
+    def begun(self) -> bytes:
+        """Return the bytes of what has begun to come and is not complete, a few scans' at most."""
+        raise NotImplementedError
+
+    def restart(self) -> None:
+        """See `PortProtocol`; a subclass forgets what `begun` returns."""
+        raise NotImplementedError
+
+    def replies(self) -> list[bytes]:
+        """See `PortProtocol`."""
+        return []
+
+    def introduction(self) -> list[bytes]:
+        """See `PortProtocol`."""
+        return []
+
+    def zero_counters(self) -> list[bytes]:
+        """See `PortProtocol`."""
+        return []
+
+    def stop(self) -> list[bytes]:
+        """See `PortProtocol`."""
+        return []
+
+    def preamble(self) -> bytes:
+        """See `PortProtocol`: the hello, where in its scans this port is, and what has begun."""
+        if not self._has_greeted:
+            return b""
+        body = _POSITION.pack(self._counter, self.device_us, self.clock_format)
+        position = UnknownPacket(_POSITION_TYPE, body)
+        return encode(self.hello()) + encode(position) + self.begun()
+
+    def hello(self) -> Hello:
+        """Return what the device would say of itself if it spoke our protocol."""
+        pattern = self.description.pattern
+        return Hello(
+            device_id=self.device_id,
+            firmware=f"protocol {self.name}",
+            channels=(self._channel,),
+            electrodes=self.description.electrode_count,
+            drive_offset=pattern.drive_offset,
+            measure_offset=pattern.measure_offset,
+            samples_per_scan=self.description.measurements,
+            sample_format=SampleFormat.FLOAT32,
+            volts_per_count=1.0,
+            scan_rate_hz=self._rate_hz,
+        )
+
+    def _scan(self, reading: Reading) -> Scan:
+        self.device_us = reading.device_us
+        counter, self._counter = self._counter, (self._counter + 1) % SCAN_COUNTERS
+        samples = reading.volts.astype(np.float32)
+        return Scan(self._channel, counter, reading.device_us, ScanFlag(0), samples)
+
+    def _resume(self, data: bytes, packets: list[Packet]) -> bytes:
+        """Take a recording's preamble, if `data` begins with one; return what comes after it."""
+        parts = data.split(b"\0", 4)  # two frames, each with both delimiters, and the rest
+        if parts[0] or len(parts) < 5:
+            return data
+        rest = parts[4]
+        said = Decoder().feed(data[: len(data) - len(rest)])
+        position = _position(said)
+        if position is None:
+            return data
+        self._counter, self.device_us = position.counter, position.device_us
+        self.clock_format = position.clock_format
+        self._has_greeted = True
+        packets.append(said[0])
+        return rest
+
+
+def _position(said: list[Packet]) -> _Position | None:
+    match said:
+        case [Hello(), UnknownPacket(type=0x70, body=body)] if len(body) == _POSITION.size:
+            return _Position(*_POSITION.unpack(body))
+    return None
