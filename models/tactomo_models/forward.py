@@ -30,12 +30,12 @@ from threadpoolctl import threadpool_limits
 
 from tactomo_models.condensation import Condensation
 from tactomo_models.description import SensorDescription
+from tactomo_models.greens import GreensFunction
 from tactomo_models.mesh import SheetMesh, mesh_sheet
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 _STRIP = 128  # triangles that are differentiated at once: what that takes stays in the cache
-_BLOCK = 256  # right-hand sides solved at once: bounds the memory of a build
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,8 @@ class BareSheet:
         triangles: (3, T) nodes of each triangle.
         pressable: (P,) mesh nodes whose conductivity may change.
         support: (S,) nodes of all triangles that touch a pressable node.
-        green: (S, S) potential at a support node for a unit current into another.
+        green: (S, S) potential at a support node for a unit current into another; as a
+            `GreensFunction` where few presses are solved and a quick start is worth more.
         potentials: (S, L - 1) potential at the support nodes for a unit current into electrode
             l and out of the last one.
         transfer: (L, L) electrode potentials for the same currents; the last row and column are 0.
@@ -59,7 +60,7 @@ class BareSheet:
     triangles: IntArray
     pressable: IntArray
     support: IntArray
-    green: FloatArray
+    green: FloatArray | GreensFunction
     potentials: FloatArray
     transfer: FloatArray
     map_weights: sp.csr_matrix
@@ -71,6 +72,8 @@ def solve_bare_sheet(
     sheet: SheetMesh,
     conductivity: FloatArray | None = None,
     impedance: FloatArray | None = None,
+    *,
+    quick: bool = False,
 ) -> BareSheet:
     """Assemble and solve the complete electrode model of an unpressed sheet.
 
@@ -79,23 +82,27 @@ def solve_bare_sheet(
         sheet: its mesh of N nodes.
         conductivity: (N,) of an uneven sheet, relative to the description's; 1 if None.
         impedance: (L,) contact impedances, relative to the description's; 1 if None.
+        quick: leave the Green's function in pieces: a tenth of the time and memory, but a newly
+            pressed area then costs a millisecond more, and there are no `ForwardModel.probes`.
     """
     mesh = sheet.mesh
     # The integral of a linear conductivity over a triangle is that of its corners' mean.
     nodal = np.ones(mesh.p.shape[1]) if conductivity is None else conductivity
-    factor, fields = _factorise(description, sheet, nodal[mesh.t].mean(axis=0), impedance)
+    system = assemble_sheet(description, sheet, nodal[mesh.t].mean(axis=0), impedance)
     inside = description.on_sheet(mesh.p[0], mesh.p[1], description.sheet.frame_width_m)
     pressable = np.flatnonzero(inside)
     touched = np.isin(mesh.t, pressable).any(axis=0)
     support = np.unique(mesh.t[:, touched])
+    fields = _fields(description, system)
     with threadpool_limits(1):
-        green = _greens_function(factor, support, len(fields))
+        green = GreensFunction(system, support, mesh.p[:, support])
+        whole = green if quick else green.whole()
     return BareSheet(
         points=mesh.p,
         triangles=mesh.t.astype(np.intp),
         pressable=pressable,
         support=support,
-        green=green,
+        green=whole,
         potentials=fields[support],
         transfer=_transfer(description, fields),
         map_weights=_map_weights(description, mesh)[:, pressable].tocsr(),
@@ -121,7 +128,8 @@ def transfer_resistances(
         (L, L) electrode potentials for a unit current into each electrode and out of the last;
         see `scan_voltages`.
     """
-    return _transfer(description, _factorise(description, sheet, conductivity, impedance)[1])
+    system = assemble_sheet(description, sheet, conductivity, impedance)
+    return _transfer(description, _fields(description, system))
 
 
 def scan_voltages(description: SensorDescription, transfer: FloatArray) -> FloatArray:
@@ -149,23 +157,17 @@ def volts_per_unit(description: SensorDescription) -> float:
     return description.pattern.current_a / description.sheet_conductance_s
 
 
-def _factorise(
-    description: SensorDescription,
-    sheet: SheetMesh,
-    conductivity: FloatArray,
-    impedance: FloatArray | None,
-) -> tuple[spla.SuperLU, FloatArray]:
-    """Factor of the system, and its solutions (unknowns, L - 1) for a current into each electrode.
+def _fields(description: SensorDescription, system: sp.csc_matrix) -> FloatArray:
+    """Solutions (unknowns, L - 1) of a sheet's system for a current into each electrode.
 
     The last electrode is what the currents leave by: its potential is 0 and no unknown.
     """
-    system = assemble_sheet(description, sheet, conductivity, impedance)
     unknown = description.electrode_count - 1
     injected = np.zeros((system.shape[0], unknown))
     injected[-unknown:] = np.eye(unknown)
     with threadpool_limits(1):  # SuperLU's panels are too small to share: more threads only spin
         factor = spla.splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-        return factor, factor.solve(injected)
+        return np.asarray(factor.solve(injected))
 
 
 def _transfer(description: SensorDescription, fields: FloatArray) -> FloatArray:
@@ -234,23 +236,16 @@ def assemble_sheet(
     return (stiffness + sp.csr_matrix(terms, (size, size)))[:-1, :-1].tocsc()
 
 
-def _greens_function(factor: spla.SuperLU, support: IntArray, size: int) -> FloatArray:
-    green = np.empty((len(support), len(support)))
-    for start in range(0, len(support), _BLOCK):
-        block = support[start : start + _BLOCK]
-        unit = np.zeros((size, len(block)))
-        unit[block, np.arange(len(block))] = 1.0
-        green[:, start : start + len(block)] = factor.solve(unit)[support]
-    return (green + green.T) / 2
-
-
 def _map_weights(description: SensorDescription, mesh: skfem.MeshTri) -> sp.csr_matrix:
     """Linear interpolation from mesh nodes to map nodes; rows off the sheet are empty."""
     x, y = np.meshgrid(description.map_x_m, description.map_y_m)
     # A hair inside, so that points on the rim are not lost to rounding or to the disc's facets.
     points = np.stack([x.ravel(), y.ravel()]) * (1 - 1e-9)
     on = np.flatnonzero(_inside_mesh(mesh, points))
-    weights = skfem.Basis(mesh, skfem.ElementTriP1()).probes(points[:, on]).tocsr()
+    basis = skfem.Basis(mesh, skfem.ElementTriP1())
+    # It looks for each point in the triangles near any of them: row by row these are few.
+    rows = np.split(points[:, on], np.flatnonzero(np.diff(points[1, on])) + 1, axis=1)
+    weights = sp.vstack([basis.probes(row) for row in rows]).tocsr()
     weights.data[weights.data < 1e-7] = 0  # a trace of other corners; rounding puts some below 0
     weights.eliminate_zeros()
     rows = sp.csr_matrix((np.ones(len(on)), (on, np.arange(len(on)))), (x.size, len(on)))
@@ -484,6 +479,8 @@ class ForwardModel:
     def _green(self, rows: IntArray, columns: IntArray) -> FloatArray:
         """Block of the bare sheet's Green's function; `take` is twice as fast as `np.ix_`."""
         green = self.bare.green
+        if isinstance(green, GreensFunction):
+            return green.between(rows, columns)
         return np.asarray(green.ravel().take(rows[:, None] * len(green) + columns))
 
     def _around(self, nodes: IntArray) -> IntArray:

@@ -46,7 +46,7 @@ class SkinSimulator:
         x, y = sheet.mesh.p
         self._background = 1 + unevenness * smooth_noise(x, y, description.width_m / 4, rng)
         impedance = np.exp(impedance_spread * rng.standard_normal(description.electrode_count))
-        bare = solve_bare_sheet(description, sheet, self._background, impedance)
+        bare = solve_bare_sheet(description, sheet, self._background, impedance, quick=True)
         self._forward = ForwardModel(description, bare)
         self._background = self._background[bare.pressable]
         self._x, self._y = bare.points[:, bare.pressable]

@@ -397,3 +397,22 @@ def test_small_electrodes_agree_with_pyeits_point_electrodes(small: SensorDescri
     larger, smaller = np.array(differences)
     assert smaller.max() < 1e-3
     assert np.log2(larger / smaller) == pytest.approx(2, abs=0.3)
+
+
+@pytest.mark.parametrize("name", ["paper_square", "skin_round"])
+def test_a_greens_function_in_pieces_gives_the_same_voltages(name: str) -> None:
+    """Over many boxes, presses of one and of several, at the rim and in the middle."""
+    sensor = load_description(name)
+    sheet = mesh_sheet(sensor, refinements=1)
+    conductivity = 1 + 0.2 * np.sin(90 * sheet.mesh.p[0])
+    whole, pieces = (
+        ForwardModel(sensor, solve_bare_sheet(sensor, sheet, conductivity, quick=quick))
+        for quick in (False, True)
+    )
+    x, y = whole.bare.points[:, whole.bare.pressable] / sensor.width_m
+    for centre_x, centre_y, radius in ((0.0, 0.0, 0.3), (0.35, -0.3, 0.1), (-0.1, 0.2, 0.04)):
+        pressed = np.hypot(x - centre_x, y - centre_y) < radius
+        change = 5.0 * pressed
+        np.testing.assert_allclose(
+            pieces.solve(change).voltages, whole.solve(change).voltages, rtol=1e-9, atol=1e-12
+        )

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tactomo_models import SensorDescription, SkinSimulator
 from tactomo_models.forward import ForwardModel, exchanged
+from tactomo_models.greens import GreensFunction
 
 FloatArray = NDArray[np.float64]
 
@@ -23,6 +24,7 @@ def shorted(simulator: SkinSimulator, first: int, second: int) -> SkinSimulator:
     """The same skin with two electrodes connected: a rank-one change of the bare sheet."""
     forward = simulator._forward
     bare = forward.bare
+    assert isinstance(bare.green, GreensFunction)
     between = np.zeros(len(bare.transfer))
     between[first], between[second] = 1, -1
     electrodes = bare.transfer @ between
@@ -36,7 +38,7 @@ def shorted(simulator: SkinSimulator, first: int, second: int) -> SkinSimulator:
             bare,
             transfer=bare.transfer - np.outer(electrodes, electrodes) / resistance,
             potentials=bare.potentials - np.outer(nodes, electrodes[:-1]) / resistance,
-            green=bare.green - np.outer(nodes, nodes) / resistance,
+            green=bare.green.whole() - np.outer(nodes, nodes) / resistance,
         ),
     )
     return made
