@@ -46,9 +46,10 @@ class Nothing(Arguments):
 
 
 class RecordStart(Arguments):
-    """Where to record to; a name is chosen where none is given."""
+    """Where to record to, and whether with maps; what is not given is as configured."""
 
     path: Annotated[str, Field(min_length=1, max_length=4096)] | None = None
+    maps: bool | None = None
 
 
 class SetTier(Arguments):

@@ -338,7 +338,8 @@ class Daemon:
         return self._status.summary(self._publisher.subscribers)
 
     def _record_start(self, arguments: RecordStart) -> Future[Mapping[str, Any]]:
-        return self._recorder.start(Path(arguments.path) if arguments.path else None)
+        path = Path(arguments.path) if arguments.path else None
+        return self._recorder.start(path, arguments.maps)
 
     def _set_tier(self, arguments: SetTier) -> Mapping[str, Any]:
         tier = Tier(arguments.tier)

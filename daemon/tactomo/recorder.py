@@ -181,6 +181,7 @@ class Recorder:
         self._rules = rules
         self._on_event = on_event
         self._folder: Path | None = None  # where a set of files is recorded, or is to be
+        self._with_maps = rules.maps  # as was asked for, for all files of a set
         self._ending: ActiveRecording | None = None  # the file before, while that goes on
         self._last = (Path(), 0)  # the newest file that was closed
         self._next_try_s = self._next_look_s = 0.0
@@ -208,13 +209,15 @@ class Recorder:
         elif self._rules.at_start:
             _wait_for(self._ask(self._keep_recording))
 
-    def start(self, path: Path | None) -> Future[Mapping[str, Any]]:
+    def start(self, path: Path | None, maps: bool | None = None) -> Future[Mapping[str, Any]]:
         """Ask for a recording: to a file, or with None to the folder, cut into files.
 
-        The future gets its absolute `path`, or CommandError where one runs already, or
-        RecordingError where the file exists or cannot be created, or the disk has no room.
+        With or without `maps` and contacts; None leaves that to the rules. The future gets its
+        absolute `path`, or CommandError where one runs already, or RecordingError where the file
+        exists or cannot be created, or the disk has no room.
         """
-        return self._ask(lambda: self._start(None if path is None else path.absolute()))
+        with_maps = self._rules.maps if maps is None else maps
+        return self._ask(lambda: self._start(None if path is None else path.absolute(), with_maps))
 
     def stop(self) -> Future[Mapping[str, Any]]:
         """Ask for the recording's end.
@@ -306,7 +309,7 @@ class Recorder:
         except Exception as error:  # of any kind: a recording may fail, but never without a word
             self._give_up(_reason(error))
 
-    def _start(self, path: Path | None) -> Mapping[str, Any]:
+    def _start(self, path: Path | None, with_maps: bool) -> Mapping[str, Any]:
         if self.active is not None:
             raise CommandError(
                 f"a recording runs already: {self.active.path}",
@@ -314,6 +317,7 @@ class Recorder:
                 "already_recording",
             )
         folder = self._rules.folder_path if path is None else None
+        self._with_maps = with_maps
         self.active = self._create(path)
         self._folder, self.waits_for = folder, ""
         self._on_event("recording_started", "info", str(self.active.path))
@@ -323,7 +327,7 @@ class Recorder:
     def _keep_recording(self) -> None:
         """Record to the folder, now or as soon as that can be done."""
         try:
-            self._start(None)
+            self._start(None, self._rules.maps)
         except (OSError, RecordingError) as error:
             self._folder = self._rules.folder_path
             self.failures += 1
@@ -347,7 +351,7 @@ class Recorder:
             path = next_path(folder, self._origin.sensor, time.time())
         writer = create(path, self._origin)
         self.files += 1
-        return ActiveRecording(self.files, path, writer, self._rules.maps, previous)
+        return ActiveRecording(self.files, path, writer, self._with_maps, previous)
 
     def _stop(self) -> Mapping[str, Any]:
         active, is_wanted = self.active, self._folder is not None

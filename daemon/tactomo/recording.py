@@ -36,7 +36,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -44,40 +44,22 @@ from typing import IO, Annotated, Any, Final, NamedTuple
 from urllib.parse import quote
 
 import msgpack  # type: ignore[import-untyped]
-from mcap.exceptions import InvalidMagic
-from mcap.reader import make_reader
-from mcap.records import Channel as McapChannel
-from mcap.records import Chunk as McapChunk
-from mcap.records import Footer, Header, McapRecord, Message, Metadata
-from mcap.stream_reader import StreamReader
+from mcap.records import Footer, McapRecord, Message, Metadata
 from pydantic import BaseModel, Strict, StrictBool, StrictInt, StrictStr
-from tactomo_client import MessageError
+from tactomo_client import MessageError, recording_file
+from tactomo_client.errors import RecordingError as ClientRecordingError
+from tactomo_client.intact_chunks import intact_chunks
 from tactomo_client.messages import MAX_ENTRIES, array_from_wire
 from tactomo_models import Reference, load_description
 from tactomo_models.errors import DescriptionError
 from tactomo_protocol import Channel, Hello, Scan
 
 from tactomo.errors import ConfigError, RecordingError
-from tactomo.intact_chunks import MAX_RECORD_BYTES, intact_chunks, unpack_chunk
 from tactomo.protocols import OURS, PortProtocol, protocol_named
 
-PROFILE: Final = "tactomo"
 RECOVERED: Final = "tactomo-recovered"
 REFERENCE_ARRAYS: Final = ("magnitude", "structure", "magnitude_noise", "structure_noise")
 REPLAY_SCHEME: Final = "replay"
-CHANNELS: Final[Mapping[str, str]] = {
-    "reference": "msgpack",
-    "frame": "msgpack",
-    "map": "tactomo-stream",
-    "contacts": "tactomo-stream",
-    "scan": "tactomo-stream",
-    **{
-        f"port/{port}{hello}": "application/octet-stream"
-        for port in (0, 1)
-        for hello in ("", "/hello")
-    },
-}
-"""Encoding of each topic, in the order of their MCAP channel numbers from 1."""
 
 
 class ScanKey(NamedTuple):
@@ -195,20 +177,13 @@ class Summary:
         return "cut off; `tactomo recover` makes it whole for other tools"
 
 
-class Span(NamedTuple):
-    """When a recording began and ended, on the steady clock; 0 where nothing is in it."""
-
-    start_ns: int
-    end_ns: int
-    is_complete: bool
-
-
 class Recording:
     """A recording opened for reading; every call reads the file anew, from its start."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.origin = _read_origin(path)
+        with _our_errors():
+            self.origin = to_origin(recording_file.read_metadata(path))
 
     @cached_property
     def summary(self) -> Summary:
@@ -216,9 +191,10 @@ class Recording:
         return _summarise(self.path, self.origin)
 
     @cached_property
-    def span(self) -> Span:
+    def span(self) -> recording_file.Span:
         """When it began and ended, without reading what is in it."""
-        return _read_span(self.path)
+        with _our_errors():
+            return recording_file.read_span(self.path)
 
     @cached_property
     def start_ns(self) -> int:
@@ -294,7 +270,7 @@ def _summarise(path: Path, origin: Origin) -> Summary:
             summary.frames += kind == "frame"
             if kind == "reference":
                 references.add(read_reference_number(record.data))
-            if kind == "port" and topic in CHANNELS:
+            if kind == "port" and topic in recording_file.CHANNELS:
                 number, _, extra = rest.partition("/")
                 if not extra:
                     _count_bytes(summary, int(number), record)
@@ -325,35 +301,6 @@ def _count_packets(summary: Summary, decoder: PortProtocol, data: bytes) -> None
             summary.hellos.append(packet)
 
 
-def _read_span(path: Path) -> Span:
-    with open_file(path) as file:
-        with suppress(Exception):  # cut or damaged: then its chunks tell
-            summary = make_reader(file).get_summary()
-            if summary is not None and summary.statistics is not None:
-                known = summary.statistics
-                return Span(known.message_start_time, known.message_end_time, True)
-        file.seek(0)
-        times: list[tuple[int, int]] = []
-        with suppress(Exception):  # up to the damage
-            for record in StreamReader(file, emit_chunks=True).records:
-                if isinstance(record, McapChunk):
-                    times.append((record.message_start_time, record.message_end_time))
-        return Span(times[0][0] if times else 0, times[-1][1] if times else 0, False)
-
-
-def _read_origin(path: Path) -> Origin:
-    header = metadata = None
-    for _, record in _records(path):
-        if isinstance(record, Header):
-            header = record
-        elif isinstance(record, Metadata) and record.name == PROFILE:
-            metadata = record.metadata
-            break
-    if header is None or header.profile != PROFILE or metadata is None:
-        raise _not_a_recording(path, "was not made by tactomo")
-    return to_origin(metadata)
-
-
 def to_origin(metadata: Mapping[str, str]) -> Origin:
     """Return what a recording's metadata record says that it is of."""
     ports = tuple(metadata.get("ports", "").split("\n"))
@@ -376,53 +323,23 @@ def _messages(path: Path) -> Iterator[tuple[str, Message]]:
 def _records(
     path: Path, on_damage: Callable[[int], None] = lambda _: None
 ) -> Iterator[tuple[str, McapRecord]]:
-    """Yield the file's records up to its end or to the first damage; messages with their topic.
-
-    `on_damage` is told where the last thing that could be read ends.
-    """
-    topics: dict[int, str] = {}
-    with open_file(path) as file:
-        reader = StreamReader(
-            file, emit_chunks=True, validate_crcs=True, record_size_limit=MAX_RECORD_BYTES
-        )
-        records = iter(reader.records)
-        end = 0
-        while True:
-            try:
-                record = next(records)
-                inside = unpack_chunk(record) if isinstance(record, McapChunk) else [record]
-            except StopIteration:
-                return
-            except InvalidMagic as error:
-                if not end:
-                    raise _not_a_recording(path, "is not an MCAP file") from error
-                on_damage(end)  # it is the closing one that is cut off
-                return
-            except Exception:  # damage can fail in any layer: disk, struct, zstd, utf-8, CRC
-                on_damage(end)
-                return
-            end = file.tell()
-            for each in inside:
-                if isinstance(each, McapChannel):
-                    topics[each.id] = each.topic
-                yield topics.get(getattr(each, "channel_id", 0), ""), each
+    with _our_errors():
+        yield from recording_file.records(path, on_damage)
 
 
 def open_file(path: Path) -> IO[bytes]:
     """Open a recording's file as it is; raise RecordingError where that cannot be done."""
+    with _our_errors():
+        return recording_file.open_file(path)
+
+
+@contextmanager
+def _our_errors() -> Iterator[None]:
+    """Turn the client's error into ours, which is also an answer to a command."""
     try:
-        return path.open("rb")
-    except OSError as error:
-        raise RecordingError(
-            f"cannot open the recording {path}: {error.strerror}", "give the path of a .mcap file"
-        ) from error
-
-
-def _not_a_recording(path: Path, reason: str) -> RecordingError:
-    return RecordingError(
-        f"{path} {reason}",
-        "record one with `tactomo record`, or make one of .npz scans with `tactomo import`",
-    )
+        yield
+    except ClientRecordingError as error:
+        raise RecordingError(error.cause, error.next_step) from error
 
 
 def _read_reference(data: bytes) -> Reference:

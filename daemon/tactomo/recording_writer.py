@@ -17,11 +17,12 @@ from typing import Any, Final, NamedTuple
 import msgpack  # type: ignore[import-untyped]
 from mcap.writer import Writer
 from tactomo_client.messages import array_to_wire
+from tactomo_client.recording_file import CHANNELS, PROFILE
 from tactomo_models import Reference
 from tactomo_protocol import Hello, Scan, encode
 
 from tactomo.errors import RecordingError
-from tactomo.recording import CHANNELS, PROFILE, REFERENCE_ARRAYS, Mark, Origin
+from tactomo.recording import REFERENCE_ARRAYS, Mark, Origin
 
 CHUNK_BYTES: Final = 1 << 20
 MAX_PENDING_BYTES: Final = 4 << 20

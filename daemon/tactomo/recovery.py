@@ -22,14 +22,13 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Header, Message, Metadata
 from mcap.stream_reader import StreamReader
+from tactomo_client.intact_chunks import intact_chunks
+from tactomo_client.recording_file import CHANNELS, PROFILE
 from tactomo_protocol import SCAN_COUNTERS, Channel, Scan
 
 from tactomo.errors import RecordingError
-from tactomo.intact_chunks import intact_chunks
 from tactomo.protocols import PortProtocol
 from tactomo.recording import (
-    CHANNELS,
-    PROFILE,
     RECOVERED,
     Origin,
     ScanKey,

@@ -14,6 +14,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from tactomo_client.recording_file import ROTATED_NAME
+
 from tactomo.config import RecordingConfig
 from tactomo.errors import RecordingError
 from tactomo.recording import open_recording
@@ -59,19 +61,18 @@ def list_recordings(folder: Path, sensor: str) -> list[KeptRecording]:
 
 
 def _recordings(folder: Path, sensor: str) -> Iterator[KeptRecording]:
-    pattern = re.compile(rf"{re.escape(sensor)}-(\d{{6,}})-(\d{{8}}T\d{{6}}Z)\.mcap", re.ASCII)
     for path in folder.iterdir():
-        name = pattern.fullmatch(path.name)
-        if name is None:
+        name = re.fullmatch(ROTATED_NAME, path.name, re.ASCII)
+        if name is None or name["sensor"] != sensor:
             continue
         try:
-            begin = datetime.strptime(name[2], _STAMP).replace(tzinfo=UTC)
+            begin = datetime.strptime(name["begin"], _STAMP).replace(tzinfo=UTC)
             facts = path.lstat()
         except (ValueError, FileNotFoundError):  # no such date; deleted by somebody meanwhile
             continue
         if stat.S_ISREG(facts.st_mode):
             size, end_s = facts.st_size, facts.st_mtime
-            yield KeptRecording(int(name[1]), path, size, begin.timestamp(), end_s)
+            yield KeptRecording(int(name["number"]), path, size, begin.timestamp(), end_s)
 
 
 def to_delete(recordings: list[KeptRecording], rules: RecordingConfig) -> list[Deletion]:

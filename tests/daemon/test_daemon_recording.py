@@ -13,7 +13,9 @@ from tactomo.daemon import Daemon
 from tactomo.errors import ConfigError, PortError, RecordingError
 from tactomo.recording import open_recording
 from tactomo.recording_writer import write_recording
+from tactomo_client.frame import frame_from_message
 from tactomo_client.messages import array_from_wire
+from tactomo_client.recording import open_recording as open_frames
 from tactomo_models import Reference
 from tactomo_models.machine_speed import MachineSpeed, Row
 from tactomo_protocol import Channel, Scan, ScanFlag, encode
@@ -213,6 +215,29 @@ def test_maps_and_contacts_lie_beside_the_bytes_if_asked_for(bench: Start, tmp_p
     assert topics.count("frame") == 4
     assert topics.count("map") == 4
     assert topics.count("contacts") == 4
+
+
+def test_a_recording_has_the_frames_that_were_published(bench: Start, tmp_path: Path) -> None:
+    path = tmp_path / "frames.mcap"
+    b = bench()
+    b.tare()
+    b.ask("record_start", path=str(path), maps=True)
+    first = b.skin.counter + 1
+    for load in (0.1, 0.2):
+        b.step(load=load)
+    b.ask("record_stop")
+    live = [m for m in b.listener.messages if m.kind == "map" and m.fields["scan_counter"] >= first]
+    recording = open_frames(path)
+    assert (recording.sensor, recording.description) == ("left", "paper_square")
+    for message, frame in zip(live, recording, strict=True):
+        alive = frame_from_message(message, None, 0.5)
+        assert (frame.sequence, frame.contacts) == (alive.sequence, alive.contacts)
+        np.testing.assert_array_equal(frame.map, alive.map)
+        assert frame.age_s == alive.age_s
+    b.ask("record_start", path=str(tmp_path / "bytes.mcap"))
+    b.step(load=0.3)
+    b.ask("record_stop")
+    assert not open_frames(tmp_path / "bytes.mcap").has_frames
 
 
 def test_a_truncated_recording_opens_up_to_where_it_ends(

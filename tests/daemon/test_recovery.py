@@ -15,7 +15,6 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from tactomo.errors import RecordingError
-from tactomo.intact_chunks import intact_chunks
 from tactomo.recording import Mark, Origin, ScanKey, open_recording
 from tactomo.recording_writer import (
     RecordingWriter,
@@ -25,6 +24,7 @@ from tactomo.recording_writer import (
     reference_entry,
 )
 from tactomo.recovery import Recovery, recover
+from tactomo_client.intact_chunks import intact_chunks
 from tactomo_client.messages import array_from_wire
 from tactomo_models import Reference
 from tactomo_protocol import Channel, Decoder, Hello, SampleFormat, Scan, ScanFlag, encode

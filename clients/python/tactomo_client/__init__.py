@@ -18,6 +18,7 @@ from tactomo_client.errors import (
     ControlError,
     KeysError,
     MessageError,
+    RecordingError,
     StreamTimeout,
 )
 from tactomo_client.frame import Contact, Frame
@@ -40,6 +41,7 @@ __all__ = [
     "Keys",
     "KeysError",
     "MessageError",
+    "RecordingError",
     "StreamTimeout",
     "Subscription",
     "request",

@@ -6,8 +6,10 @@ ClientError
 ├── ControlError    a command was refused, or nothing answered it: `tactomo tare` while
 │                   somebody presses the skin, the daemon is not running
 ├── StreamTimeout   no frame came within `timeout_s`: the cable is out, the name is misspelt
-└── KeysError       keys cannot be used (the file is missing, others may read it), or the server
-                    does not let them in: the client is not on its list, it is another server
+├── KeysError       keys cannot be used (the file is missing, others may read it), or the server
+│                   does not let them in: the client is not on its list, it is another server
+└── RecordingError  a recording cannot be read: there is no such file, it is another program's, or
+                    there are no maps and contacts in it
 """
 
 from __future__ import annotations
@@ -52,4 +54,11 @@ class KeysError(ClientError):
     """Keys that cannot be used, or that a server does not let in; `name` says which."""
 
     def __init__(self, cause: str, next_step: str = "", name: str = "bad_keys") -> None:
+        super().__init__(cause, next_step, name)
+
+
+class RecordingError(ClientError):
+    """A recording that cannot be read; `name` is ``no_frames`` where it holds no frames."""
+
+    def __init__(self, cause: str, next_step: str = "", name: str = "bad_recording") -> None:
         super().__init__(cause, next_step, name)

@@ -98,13 +98,18 @@ class Frame:
     x_mm: tuple[float, float] | None
     y_mm: tuple[float, float] | None
     _age_at_receipt_ns: int
-    _received_ns: int
+    _received_ns: int | None
     _stale_after_s: float
 
     @property
     def age_s(self) -> float:
-        """Seconds since the scan was acquired, what buffers held it up by included."""
-        since_receipt_ns = time.monotonic_ns() - self._received_ns
+        """Seconds since the scan was acquired, what buffers held it up by included.
+
+        Of a recorded frame: until it was published; it grows no older.
+        """
+        since_receipt_ns = 0
+        if self._received_ns is not None:
+            since_receipt_ns = time.monotonic_ns() - self._received_ns
         return (self._age_at_receipt_ns + since_receipt_ns) * 1e-9
 
     @property
@@ -113,8 +118,13 @@ class Frame:
         return self.age_s > self._stale_after_s
 
 
-def frame_from_message(message: Message, received_ns: int, stale_after_s: float) -> Frame:
-    """Return the frame in a `map` or `contacts` message that came at `received_ns` (monotonic).
+def frame_from_message(message: Message, received_ns: int | None, stale_after_s: float) -> Frame:
+    """Return the frame in a `map` or `contacts` message.
+
+    Args:
+        message: the message.
+        received_ns: when it came, by the monotonic clock; None for one that was recorded.
+        stale_after_s: the age in seconds from which the frame is stale.
 
     Raises:
         MessageError: a field is missing or of the wrong type.
@@ -153,17 +163,22 @@ def frame_from_message(message: Message, received_ns: int, stale_after_s: float)
     )
 
 
-def age_at_receipt_ns(fields: dict[str, Any], received_ns: int) -> int:
-    """Return the age in ns of a message that came at `received_ns` (monotonic).
+def age_at_receipt_ns(fields: dict[str, Any], received_ns: int | None) -> int:
+    """Return the age in ns of a message that came at `received_ns` (monotonic; None: recorded).
 
     Exact where publisher and subscriber read the same clock; otherwise the age at publication,
     which leaves out the time that the message was on its way.
     """
     acquired_ns: int | None = fields["acquired_monotonic_ns"]
     age_at_publication_ns: int | None = fields["age_ns"]
-    if acquired_ns is not None and clock_id() and fields.get("clock_id") == clock_id():
+    if received_ns is not None and acquired_ns is not None and is_our_clock(fields):
         return max(0, received_ns - acquired_ns)
     return max(0, age_at_publication_ns or 0)
+
+
+def is_our_clock(fields: Mapping[str, Any]) -> bool:
+    """Whether a message was stamped by this computer's monotonic clock."""
+    return bool(clock_id()) and fields.get("clock_id") == clock_id()
 
 
 def _contact(value: object) -> Contact:

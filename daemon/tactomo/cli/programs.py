@@ -321,7 +321,7 @@ def proxy(
     epilog=examples(
         "tactomo replay grasp.mcap --viewer",
         "tactomo replay grasp.mcap --speed 0.25",
-        "tactomo replay grasp.mcap --speed max",
+        "tactomo replay grasp.mcap --speed max --record frames.mcap",
     ),
 )
 def replay(
@@ -347,6 +347,9 @@ def replay(
     stay: Annotated[
         bool, typer.Option("--stay", help="Keep running after the recording's end.")
     ] = False,
+    record: Annotated[
+        Path | None, typer.Option(help="Record the replay to this file, with maps and contacts.")
+    ] = None,
 ) -> None:
     """Play a recording through the daemon, which cannot tell it from a device.
 
@@ -359,6 +362,8 @@ def replay(
     opened = open_recording(recording)
     origin = opened.summary.origin
     if with_viewer:
+        if record is not None:
+            raise typer.BadParameter("--record goes without --viewer")
         from tactomo.cli.demo import show_replay
 
         show_replay(recording, speed, sensor, description, stream, control, viewer_port)
@@ -374,6 +379,8 @@ def replay(
         control=control,
         lossless=True if factor == 0 else None,
         exit_at_end=not stay,
+        record=record,
+        record_maps=record is not None or None,
     )
     warn_of_damage(opened)
     raise typer.Exit(_run_daemon(settings))

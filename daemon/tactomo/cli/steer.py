@@ -78,6 +78,7 @@ def tare(control: ControlAddress = DEFAULT_CONTROL, keys: KeysFolder = None) -> 
     rich_help_panel=STEER,
     epilog=examples(
         "tactomo record grasp.mcap --seconds 10",
+        "tactomo record grasp.mcap --maps",
         "tactomo record start grasp.mcap",
         "tactomo record start        (into the daemon's folder)",
         "tactomo record stop",
@@ -96,6 +97,9 @@ def record(
         float | None,
         typer.Option(min=0.1, help="For FILE: how long; until Ctrl-C when left out."),
     ] = None,
+    maps: Annotated[
+        bool, typer.Option("--maps", help="With maps and contacts. [as the daemon is configured]")
+    ] = False,
     control: ControlAddress = DEFAULT_CONTROL,
     keys: KeysFolder = None,
 ) -> None:
@@ -111,17 +115,16 @@ def record(
     if what not in ("start", "stop"):
         if path is not None:
             raise typer.BadParameter("give one file, or `start FILE`")
-        _record_for(Path(what), seconds, control, keys)
+        _record_for(Path(what), seconds, maps, control, keys)
         return
     if seconds is not None:
         raise typer.BadParameter("--seconds goes with FILE, not with start or stop")
     if what == "stop":
-        if path is not None:
-            raise typer.BadParameter("stop takes no file")
+        if path is not None or maps:
+            raise typer.BadParameter("stop takes no file, and no --maps")
         _tell_recorded(request("record_stop", control, 10.0, keys=keys))
         return
-    arguments = {} if path is None else {"path": str(path.absolute())}
-    answer = request("record_start", control, 10.0, keys=keys, **arguments)
+    answer = request("record_start", control, 10.0, keys=keys, **_record_arguments(path, maps))
     typer.echo(f"recording to {answer['path']}")
 
 
@@ -295,11 +298,19 @@ def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-def _record_for(path: Path, seconds: float | None, control: str, keys: Path | None) -> None:
+def _record_arguments(path: Path | None, maps: bool) -> dict[str, Any]:
+    where = {} if path is None else {"path": str(path.absolute())}
+    return {**where, "maps": True} if maps else where
+
+
+def _record_for(
+    path: Path, seconds: float | None, maps: bool, control: str, keys: Path | None
+) -> None:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
     from tactomo_client import request
 
-    started = request("record_start", control, 10.0, keys=keys, path=str(path.absolute()))
+    arguments = _record_arguments(path, maps)
+    started = request("record_start", control, 10.0, keys=keys, **arguments)
     size = TextColumn("{task.fields[size]}")
     columns = (TextColumn("recording"), BarColumn(), TimeElapsedColumn(), size)
     begin_s = time.monotonic()

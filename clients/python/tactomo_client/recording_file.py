@@ -1,0 +1,191 @@
+"""A recording's file: what is in it by name, and reading it record by record, damaged or not.
+
+The layout is that of the daemon, which writes and replays recordings through the names here; its
+module `tactomo.recording` says what each topic holds. For frames, see `tactomo_client.recording`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import IO, Final, NamedTuple
+
+try:
+    from mcap.exceptions import InvalidMagic
+    from mcap.reader import make_reader
+    from mcap.records import Channel, Chunk, Header, McapRecord, Message, Metadata
+    from mcap.stream_reader import StreamReader
+    from mcap.summary import Summary
+except ImportError as error:
+    raise ImportError(
+        "reading recordings needs mcap and zstandard: pip install 'tactomo-client[recording]'"
+    ) from error
+
+from tactomo_client.errors import RecordingError
+from tactomo_client.intact_chunks import MAX_RECORD_BYTES, intact_chunks, unpack_chunk
+
+PROFILE: Final = "tactomo"
+CHANNELS: Final[Mapping[str, str]] = {
+    "reference": "msgpack",
+    "frame": "msgpack",
+    "map": "tactomo-stream",
+    "contacts": "tactomo-stream",
+    "scan": "tactomo-stream",
+    **{
+        f"port/{port}{hello}": "application/octet-stream"
+        for port in (0, 1)
+        for hello in ("", "/hello")
+    },
+}
+"""Encoding of each topic, in the order of their MCAP channel numbers from 1."""
+ROTATED_NAME: Final = r"(?P<sensor>.+)-(?P<number>\d{6,})-(?P<begin>\d{8}T\d{6}Z)\.mcap"
+"""What the files of a folder are called; the number rises by one with each."""
+ENDLESS_NS: Final = 2**63
+
+
+class Span(NamedTuple):
+    """When a recording began and ended, on its steady clock; 0 where nothing is in it."""
+
+    start_ns: int
+    end_ns: int
+    is_complete: bool
+
+
+def open_file(path: Path) -> IO[bytes]:
+    """Open a recording's file as it is; raise RecordingError where that cannot be done."""
+    try:
+        return path.open("rb")
+    except OSError as error:
+        raise RecordingError(
+            f"cannot open the recording {path}: {error.strerror}", "give the path of a .mcap file"
+        ) from error
+
+
+def records(
+    path: Path,
+    on_damage: Callable[[int], None] = lambda _: None,
+    wants: Callable[[Chunk], bool] = lambda _: True,
+) -> Iterator[tuple[str, McapRecord]]:
+    """Yield the file's records up to its end or to the first damage; messages with their topic.
+
+    Args:
+        path: the file.
+        on_damage: told where the last thing that could be read ends.
+        wants: whether a chunk is to be unpacked; the first one is in any case, for it names topics.
+
+    Raises:
+        RecordingError: the file cannot be opened, or is no MCAP file.
+
+    """
+    topics: dict[int, str] = {}
+    with open_file(path) as file:
+        reader = StreamReader(
+            file, emit_chunks=True, validate_crcs=True, record_size_limit=MAX_RECORD_BYTES
+        )
+        found = iter(reader.records)
+        end = 0
+        while True:
+            try:
+                inside = _inside(next(found), lambda chunk: not topics or wants(chunk))
+            except StopIteration:
+                return
+            except InvalidMagic as error:
+                if not end:
+                    raise _not_a_recording(path, "is not an MCAP file") from error
+                on_damage(end)  # it is the closing one that is cut off
+                return
+            except Exception:  # damage can fail in any layer: disk, struct, zstd, utf-8, CRC
+                on_damage(end)
+                return
+            end = file.tell()
+            for each in inside:
+                if isinstance(each, Channel):
+                    topics[each.id] = each.topic
+                yield topics.get(getattr(each, "channel_id", 0), ""), each
+
+
+def _inside(record: McapRecord, wants: Callable[[Chunk], bool]) -> list[McapRecord]:
+    if not isinstance(record, Chunk):
+        return [record]
+    return unpack_chunk(record) if wants(record) else []
+
+
+def messages(
+    path: Path,
+    kind: str,
+    start_ns: int = 0,
+    end_ns: int = ENDLESS_NS,
+    tell: Callable[[str], None] = lambda _: None,
+) -> Iterator[Message]:
+    """Yield a file's messages of a kind and a time, those beyond damage, too."""
+
+    def overlaps(chunk: Chunk) -> bool:
+        return chunk.message_start_time < end_ns and chunk.message_end_time >= start_ns
+
+    damaged_at: list[int] = []
+    for topic, record in records(path, damaged_at.append, overlaps):
+        if topic == kind and isinstance(record, Message) and start_ns <= record.log_time < end_ns:
+            yield record
+    if damaged_at:
+        tell(f"{path} is cut off or damaged; `tactomo recover` makes it whole for other tools")
+        for topic, record in messages_beyond(path, damaged_at[0]):
+            if topic == kind and start_ns <= record.log_time < end_ns:
+                yield record
+
+
+def messages_beyond(path: Path, start: int) -> Iterator[tuple[str, Message]]:
+    """Yield what intact chunks hold from a place in the file on, each with its topic."""
+    topics = dict(enumerate(CHANNELS, 1))
+    with open_file(path) as file:
+        for chunk in intact_chunks(file, start):
+            topics |= {channel.id: channel.topic for channel in chunk.channels}
+            for message in chunk.messages:
+                yield topics.get(message.channel_id, ""), message
+
+
+def read_metadata(path: Path) -> Mapping[str, str]:
+    """Return what the recording in a file says of itself.
+
+    Raises:
+        RecordingError: the file cannot be opened, or is no recording of tactomo's.
+
+    """
+    header = None
+    for _, record in records(path):
+        if isinstance(record, Header):
+            header = record
+        elif isinstance(record, Metadata) and record.name == PROFILE:
+            if header is not None and header.profile == PROFILE:
+                return record.metadata
+            break
+    raise _not_a_recording(path, "was not made by tactomo")
+
+
+def read_span(path: Path) -> Span:
+    """Return when the recording in a file began and ended, without reading what is in it."""
+    index = read_index(path)
+    if index is not None and index.statistics is not None:
+        known = index.statistics
+        return Span(known.message_start_time, known.message_end_time, True)
+    times: list[tuple[int, int]] = []
+    with open_file(path) as file, suppress(Exception):  # up to the damage
+        for record in StreamReader(file, emit_chunks=True).records:
+            if isinstance(record, Chunk):
+                times.append((record.message_start_time, record.message_end_time))
+    return Span(times[0][0] if times else 0, times[-1][1] if times else 0, False)
+
+
+def read_index(path: Path) -> Summary | None:
+    """Return the index at the end of a file, with its statistics; None where it was cut off."""
+    with open_file(path) as file, suppress(Exception):  # damage can fail in any layer
+        index = make_reader(file).get_summary()
+        return index if index is not None and index.statistics is not None else None
+    return None
+
+
+def _not_a_recording(path: Path, reason: str) -> RecordingError:
+    return RecordingError(
+        f"{path} {reason}",
+        "record one with `tactomo record`, or make one of .npz scans with `tactomo import`",
+    )
