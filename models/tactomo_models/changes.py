@@ -33,6 +33,7 @@ from tactomo_models.plausibility import (
     examine_reference,
 )
 from tactomo_models.reference import noise_of_reciprocity
+from tactomo_models.signs import Signs
 from tactomo_models.tier import Tier
 from tactomo_models.tikhonov import (
     EVEN,
@@ -138,7 +139,12 @@ class MeasuredChannel:
         if noise is None:
             noise = nominal_noise_v(volts)
         predicted, contrast = forward.bare_voltages, description.contrast(name)
-        verdict = examine_reference(wiring, volts, predicted, noise / np.sqrt(scans), contrast)
+        self._signs = Signs(description, wiring, predicted)
+        volts, sought = self._signs.give(volts), self._signs.certain
+        self._least_valid = (1 - MOST_INVALID) * float(np.count_nonzero(sought))
+        verdict = examine_reference(
+            wiring, volts, predicted, noise / np.sqrt(scans), contrast, sought
+        )
         self._flags, self._electrodes = verdict.flags, verdict.electrodes
         valid = verdict.usable
         reference = np.where(valid, volts, 0.0)
@@ -167,11 +173,12 @@ class MeasuredChannel:
             DataError: another number of voltages than the sensor has.
         """
         self._check_length(scan, f"a {self._name} scan")
+        scan = self._signs.give(scan)
         verdict = self._check.examine(scan, saturated=saturated)
         valid, flags = verdict.usable, self._flags | verdict.flags
         electrodes = sorted({*self._electrodes, *verdict.electrodes})
         count = int(np.count_nonzero(valid))
-        if count < (1 - MOST_INVALID) * len(scan) or not scan[valid].any():
+        if count < self._least_valid or not scan[valid].any():
             return Taken(None, flags | missing(self._name) | Flag.INVALID_VOLTAGE, electrodes)
         change = np.where(valid, scan - self._reference, 0.0) * self._per_volt
         square = change * change

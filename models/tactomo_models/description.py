@@ -18,15 +18,21 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from tactomo_models.errors import DescriptionError, explain
-from tactomo_models.pattern import Pairs, scan_pairs
+from tactomo_models.pattern import Pairs, combined, ring_pairs
 from tactomo_models.toml_file import parse_toml, read_toml
 
 Modality = Literal["magnitude", "structure"]
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
 # Below ten micrometres the mesh would be refined for ever.
 Metres = Annotated[float, Field(ge=1e-5, le=10, allow_inf_nan=False)]
 # TOML has lists where a frozen model has tuples; what is in them is as strict as the rest.
 Table = Annotated[tuple[float, ...], Field(min_length=2, max_length=64, strict=False)]
+Electrode = Annotated[int, Field(ge=0, le=63)]
+PairList = Annotated[
+    tuple[Annotated[tuple[Electrode, Electrode], Field(strict=False)], ...],
+    Field(min_length=1, max_length=256, strict=False),
+]
 
 
 MAX_TABLE_BYTES = 2_000_000_000
@@ -76,11 +82,55 @@ class Electrodes(_Section):
 
 
 class Pattern(_Section):
-    """Drive pair k is (k, k + drive_offset), measuring pair m is (m, m + measure_offset)."""
+    """Drive pair k is (k, k + drive_offset), measuring pair m is (m, m + measure_offset).
+
+    Or as listed by `drive`, `measure`: each pair once, source and sink, plus and minus.
+    """
 
     drive_offset: Annotated[int, Field(ge=1, le=32)] = 1
     measure_offset: Annotated[int, Field(ge=1, le=32)] = 1
+    drive: PairList | None = None
+    measure: PairList | None = None
     current_a: Annotated[float, Field(gt=0, le=1)]
+
+    @model_validator(mode="after")
+    def _pairs_are_pairs(self) -> Self:
+        for key in ("drive", "measure"):
+            listed = getattr(self, key)
+            if listed is None:
+                continue
+            if getattr(self, f"{key}_offset") != 1:
+                raise ValueError(f"{key} and {key}_offset: give one of the two")
+            for number, pair in enumerate(listed):
+                if pair[0] == pair[1] or pair in listed[:number]:
+                    raise ValueError(
+                        f"{key}[{number}] = {list(pair)}: must be two electrodes, and no pair twice"
+                    )
+        return self
+
+    def __str__(self) -> str:
+        """The pattern in words."""
+        drive, measure = (
+            f"{len(listed)} listed pairs" if listed else f"({k}, {k}+{offset})"
+            for k, offset, listed in (
+                ("k", self.drive_offset, self.drive),
+                ("m", self.measure_offset, self.measure),
+            )
+        )
+        return f"drive {drive}, measure {measure}"
+
+
+class Instrument(_Section):
+    """What the device that reads the electrodes makes of their voltages.
+
+    `unsigned` ones are sizes, as of a peak or RMS detector: see `signs`. `single_ended` readings,
+    of each electrode against the one that the current leaves by, are the `matrix` protocol's.
+    """
+
+    voltages: Literal["signed", "unsigned"] = "signed"
+    referenced: Literal["pairs", "single_ended"] = "pairs"
+    volts_per_unit: Annotated[float, Field(gt=0, le=1e6)] = 1.0
+    start: Annotated[str, Field(max_length=16, pattern=r"^[ -~\r\n]*$")] = ""
 
 
 class MagnitudeResponse(_Section):
@@ -196,6 +246,7 @@ class SensorDescription(_Section):
     sheet: Sheet
     electrodes: Electrodes
     pattern: Pattern
+    instrument: Instrument = Instrument()
     map: MapGrid = MapGrid()
     magnitude: MagnitudeChannel | None = None
     structure: StructureChannel | None = None
@@ -214,8 +265,23 @@ class SensorDescription(_Section):
                     f"pattern.{key} = {offset}: must be below the number of electrodes, "
                     f"{self.electrode_count}"
                 )
+        self._check_listed_pairs()
         self._check_size()
         return self
+
+    def _check_listed_pairs(self) -> None:
+        count = self.electrode_count
+        for key in ("drive", "measure"):
+            for pair in getattr(self.pattern, key) or ():
+                if max(pair) >= count:
+                    raise ValueError(
+                        f"pattern.{key} holds {list(pair)}: the electrodes are 0 to {count - 1}"
+                    )
+        if not 0 < self.measurements <= count**2:
+            raise ValueError(
+                f"pattern: {self.measurements} voltages by pairs that share no electrode; must be "
+                f"1 to {count**2}, the number of electrodes squared"
+            )
 
     def _check_size(self) -> None:
         """Refuse what no computer has the memory for, before anything is built."""
@@ -279,9 +345,29 @@ class SensorDescription(_Section):
     @cached_property
     def pairs(self) -> Pairs:
         """Drive and measuring pairs of every voltage, in the order of a scan."""
-        return scan_pairs(
-            self.electrode_count, self.pattern.drive_offset, self.pattern.measure_offset
-        )
+        return combined(self.drive_pairs, self.measure_pairs)
+
+    @property
+    def drive_pairs(self) -> IntArray:
+        """Source and sink of every drive, in order, (D, 2)."""
+        return self._pairs_of(self.pattern.drive, self.pattern.drive_offset)
+
+    @property
+    def measure_pairs(self) -> IntArray:
+        """Plus and minus of every measuring pair, in order, (K, 2)."""
+        return self._pairs_of(self.pattern.measure, self.pattern.measure_offset)
+
+    def _pairs_of(self, listed: PairList | None, offset: int) -> IntArray:
+        if listed is None:
+            return ring_pairs(self.electrode_count, offset)
+        return np.array(listed, dtype=np.intp)
+
+    @property
+    def offsets(self) -> tuple[int, int]:
+        """Of the first drive pair and the first measuring pair: what a hello says of a pattern."""
+        steps = (int(pairs[0, 1] - pairs[0, 0]) for pairs in (self.drive_pairs, self.measure_pairs))
+        drive, measure = (step % self.electrode_count for step in steps)
+        return drive, measure
 
     @property
     def measurements(self) -> int:
@@ -330,8 +416,10 @@ class SensorDescription(_Section):
     @cached_property
     def sha256(self) -> str:
         """Hash of what the physics depends on; calibration tables may change without a rebuild."""
+        unlisted = {key for key in ("drive", "measure") if getattr(self.pattern, key) is None}
         physics = self.model_dump_json(
-            include={"schema_version", "sheet", "electrodes", "pattern", "map"}
+            include={"schema_version", "sheet", "electrodes", "pattern", "map"},
+            exclude={"pattern": unlisted},  # hashes are older than these keys
         )
         return hashlib.sha256(physics.encode()).hexdigest()
 

@@ -379,13 +379,15 @@ def find_order(
     Args:
         description: the sensor.
         transfer: (L, L) the model's transfer resistances.
-        volts: (M,) measured, on any scale.
+        volts: (M,) measured, on any scale; where none is negative, sizes alone are compared.
         noise: (M,) their standard deviation.
     """
     count = description.electrode_count
+    is_unsigned = bool((volts >= 0).all())
 
     def trial(order: Sequence[int]) -> tuple[float, FloatArray]:
         moved = scan_voltages(description, exchanged(transfer, order))
+        moved = np.abs(moved) if is_unsigned else moved
         return _deviation(volts, moved, noise), moved
 
     straight = list(range(count))

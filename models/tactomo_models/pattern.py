@@ -25,11 +25,25 @@ def scan_pairs(electrodes: int, drive_offset: int = 1, measure_offset: int = 1) 
     With both offsets at 1 and 16 electrodes these are the 208 voltages of adjacent drive and
     adjacent measurement, in the order that EIDORS and pyEIT use.
     """
-    k, m = np.divmod(np.arange(electrodes * electrodes), electrodes)
-    drive = np.stack([k, (k + drive_offset) % electrodes], axis=1)
-    measure = np.stack([m, (m + measure_offset) % electrodes], axis=1)
-    apart = ~(drive[:, :, None] == measure[:, None, :]).any(axis=(1, 2))
+    return combined(ring_pairs(electrodes, drive_offset), ring_pairs(electrodes, measure_offset))
+
+
+def ring_pairs(electrodes: int, offset: int) -> NDArray[np.intp]:
+    """Every electrode with the one `offset` further round, (electrodes, 2)."""
+    first = np.arange(electrodes)
+    return np.stack([first, (first + offset) % electrodes], axis=1)
+
+
+def combined(drive: NDArray[np.intp], measure: NDArray[np.intp]) -> Pairs:
+    """Every drive pair (D, 2) with every measuring pair (K, 2) that does not touch it."""
+    drive, measure = np.repeat(drive, len(measure), axis=0), np.tile(measure, (len(drive), 1))
+    apart = ~touching(drive, measure)
     return Pairs(drive[apart], measure[apart])
+
+
+def touching(drive: NDArray[np.intp], measure: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Tell which of the pairs (n, 2) and (n, 2) share an electrode, (n,)."""
+    return np.asarray((drive[:, :, None] == measure[:, None, :]).any(axis=(1, 2)))
 
 
 def reciprocal_pairs(pairs: Pairs) -> NDArray[np.intp]:

@@ -281,6 +281,7 @@ def examine_reference(
     predicted: FloatArray,
     noise: FloatArray,
     contrast: float,
+    sought: BoolArray | bool = True,
 ) -> Verdict:
     """Say what is wrong with a reference (M,): hold it against the model of the unloaded sheet.
 
@@ -293,6 +294,7 @@ def examine_reference(
         predicted: (M,) by the model.
         noise: (M,) standard deviation of the reference, volts.
         contrast: factor by which pressing changes conductivity at most, up or down.
+        sought: (M,) voltages that are to be used; the others are nobody's fault.
     """
     finite = np.isfinite(volts) & np.isfinite(noise) & (noise >= 0)
     nothing = Verdict(np.zeros_like(finite), Flag.INVALID_VOLTAGE)
@@ -305,14 +307,16 @@ def examine_reference(
         noise = np.where(finite, noise, 0.0) / abs(scale)
     usable = finite & (size > SMALLEST) & (size < LARGEST)
     usable &= noise < LARGEST * np.abs(predicted).max()
+    lost = sought & ~usable
+    usable &= sought
     if not usable.any():
         return nothing
     volts, noise = np.where(usable, volts, 0.0) / scale, np.where(usable, noise, 0.0)
     check = ScanCheck(wiring, predicted, noise, usable, contrast)
     # A lead that picks up interference at rest: by itself noisy, and maybe right on average.
     noisy = usable & (noise > OUTLIER * np.median(noise[usable]))
-    verdict = check.examine(volts, suspect=noisy | ~usable)
-    flags = verdict.flags if usable.all() else verdict.flags | Flag.INVALID_VOLTAGE
+    verdict = check.examine(volts, suspect=noisy | lost)
+    flags = verdict.flags | Flag.INVALID_VOLTAGE if lost.any() else verdict.flags
     is_rewired = _rewired(wiring, volts * np.sign(predicted), noise)
     if is_rewired or deviation(volts, predicted, noise, verdict.usable) > MOST_DEVIATION:
         flags |= Flag.REFERENCE_MISMATCH

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from tactomo_models import DescriptionError, SensorDescription, load_description
 from tactomo_models.description import shipped_descriptions
 from tactomo_models.pattern import scan_pairs
+from variants import variant
 
 
 @pytest.mark.parametrize("name", shipped_descriptions())
@@ -79,6 +80,22 @@ def test_opposite_drive_gives_192_voltages() -> None:
         (("pitch_m = 0.02", "pitch_m = 0.09"), ["pitch_m", "0.05"]),
         (('"rectangle"\nwidth_m = 0.06\nheight_m = 0.05', '"disc"\nwidth_m = 0.06'), ["count"]),
         (("[pattern]", "[pattern]\ndrive_offset = 8"), ["pattern.drive_offset = 8", "below"]),
+        (("[pattern]", "[pattern]\ndrive = [[0, 8]]"), ["pattern.drive holds [0, 8]", "0 to 7"]),
+        (("[pattern]", "[pattern]\ndrive = [[0, 4], [0, 4]]"), ["drive[1] = [0, 4]", "twice"]),
+        (("[pattern]", "[pattern]\nmeasure = [[3, 3]]"), ["measure[0] = [3, 3]", "two electr"]),
+        (("[pattern]", "[pattern]\ndrive = []"), ["pattern.drive", "at least 1"]),
+        (
+            ("[pattern]", "[pattern]\ndrive = [[0, 1]]\ndrive_offset = 3"),
+            ["drive and drive_offset", "one of the two"],
+        ),
+        (
+            ("[pattern]", "[pattern]\ndrive = [[0, 1]]\nmeasure = [[1, 2]]"),
+            ["0 voltages", "1 to 64"],
+        ),
+        (
+            ("[pattern]", '[instrument]\nvoltages = "rms"\n[pattern]'),
+            ["instrument.voltages", "unsigned"],
+        ),
         (("0.0, 0.0, 0.25]", "0.0, 0.3, 0.25]"), ["relative_change", "only rise or only fall"]),
         (("0.0, 0.0, 0.25]", "0.0, 0.25]"), ["as many entries"]),
         (("conductivity_ratio = 100.0", "conductivity_ratio = 1.0"), ["differ from 1"]),
@@ -183,6 +200,8 @@ def test_a_scan_holds_every_pair_but_those_that_touch(
         (("width_m = 0.06", "width_m = 0.061"), True),
         (("thickness_m", "frame_width_m = 0.001\nthickness_m"), True),
         (("[pattern]", "[pattern]\nmeasure_offset = 2"), True),
+        (("[pattern]", "[pattern]\ndrive = [[0, 4], [1, 5]]"), True),
+        (("[map]", '[instrument]\nvoltages = "unsigned"\n[map]'), False),
         (("nodes_x = 21", "nodes_x = 23"), True),
         (("width_m = 0.06", "width_m = 0.060"), False),
         (("0.0, 0.0, 0.25]", "0.0, 0.1, 0.25]"), False),
@@ -202,6 +221,36 @@ def test_the_hash_follows_the_physics_alone(
 
     changed = hash_of(small_text.replace(*change))
     assert (changed != hash_of(small_text)) == rebuild
+
+
+@pytest.mark.parametrize(
+    ("name", "digits"),
+    [
+        ("paper_square", "41544fbeee0e"),
+        ("skin_round", "31d6be1fdd7e"),
+        ("tank_disc", "9556eb0ce76d"),
+        ("tank_uef2017", "e344dae4f17b"),
+    ],
+)
+def test_what_shipped_keeps_its_hash(name: str, digits: str) -> None:
+    """Networks and artifacts are bound to it: a new key must not change it where it is not used."""
+    assert load_description(name).sha256.startswith(digits)
+
+
+def test_listed_pairs_are_the_offsets_spelt_out(small: SensorDescription) -> None:
+    opposite = variant(small, pattern={"drive_offset": 4})
+    listed = variant(
+        small,
+        pattern={
+            "drive": [[k, (k + 4) % 8] for k in range(8)],
+            "measure": [[m, (m + 1) % 8] for m in range(8)],
+        },
+    )
+    np.testing.assert_array_equal(listed.pairs.drive, opposite.pairs.drive)
+    np.testing.assert_array_equal(listed.pairs.measure, opposite.pairs.measure)
+    assert listed.offsets == opposite.offsets == (4, 1)
+    assert str(opposite.pattern) == "drive (k, k+4), measure (m, m+1)"
+    assert str(listed.pattern) == "drive 8 listed pairs, measure 8 listed pairs"
 
 
 def test_descriptions_are_equal_by_what_they_say() -> None:

@@ -170,8 +170,8 @@ def _description_facts(description: SensorDescription) -> dict[str, Any]:
         "sheet": f"{sheet.shape}, {sheet.width_m * 1e3:g} x {description.height_m * 1e3:g} mm",
         "electrodes": description.electrode_count,
         "voltages a scan": description.measurements,
-        "pattern": f"drive (k, k+{description.pattern.drive_offset}), "
-        f"measure (m, m+{description.pattern.measure_offset})",
+        "pattern": str(description.pattern),
+        "instrument": f"{description.instrument.voltages} voltages",
         "channels": ", ".join(description.modalities),
         "map": f"{description.map.nodes_x} x {description.map.nodes_y} nodes",
         "answers to": "no pressure calibration"

@@ -120,13 +120,14 @@ class Scans:
 
     def hello(self, description: SensorDescription, rate_hz: float) -> Hello:
         """Return what the device that took these scans would have said of itself."""
+        drive_offset, measure_offset = description.offsets
         return Hello(
             device_id="import",
             firmware="tactomo import",
             channels=tuple(sorted(self.volts)),
             electrodes=description.electrode_count,
-            drive_offset=description.pattern.drive_offset,
-            measure_offset=description.pattern.measure_offset,
+            drive_offset=drive_offset,
+            measure_offset=measure_offset,
             samples_per_scan=description.measurements,
             sample_format=SampleFormat.FLOAT32,
             volts_per_count=1.0,

@@ -376,12 +376,13 @@ class Twin:
 
 
 def _identity(description: SensorDescription) -> Identity:
+    drive_offset, measure_offset = description.offsets
     return Identity(
         device_id=f"twin-{description.name}"[:64],
         firmware=f"tactomo-twin {version('tactomo')}",
         electrodes=description.electrode_count,
-        drive_offset=description.pattern.drive_offset,
-        measure_offset=description.pattern.measure_offset,
+        drive_offset=drive_offset,
+        measure_offset=measure_offset,
         measurements=description.measurements,
     )
 

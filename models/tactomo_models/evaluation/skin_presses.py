@@ -122,9 +122,8 @@ def scan_order(lookup: IntArray, description: SensorDescription) -> tuple[IntArr
         sign.append(-1.0 if turned else 1.0)
     if sorted(order) != list(range(len(place))):
         raise DataError(
-            f"the lookup is not the pattern of {description.name!r} (drive k, k + "
-            f"{description.pattern.drive_offset}; measure m, m + "
-            f"{description.pattern.measure_offset}): give another --sensor"
+            f"the lookup is not the pattern of {description.name!r} ({description.pattern}): give "
+            "another --sensor"
         )
     return np.array(order), np.array(sign)
 

@@ -1,0 +1,147 @@
+"""Other patterns, other numbers of electrodes, and devices that tell sizes alone."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from noisy_skin import Skin
+from numpy.typing import NDArray
+from tactomo_models import (
+    Artifact,
+    Flag,
+    Press,
+    Reconstruction,
+    Reconstructor,
+    Reference,
+    SensorDescription,
+    SkinSimulator,
+    build_artifact,
+    load_description,
+)
+from tactomo_models.forward import ForwardModel
+from tactomo_models.plausibility import Wiring
+from tactomo_models.signs import Signs
+from variants import variant
+
+PRESS = Press(x_m=0.012, y_m=-0.009, pressure_kpa=100.0, radius_m=0.008)
+UNSIGNED = {"voltages": "unsigned"}
+
+
+def disc(electrodes: int, **pattern: Any) -> SensorDescription:
+    """The round skin with so many electrodes, on a coarse map."""
+    return variant(
+        load_description("skin_round"),
+        electrodes={"count": electrodes},
+        pattern={"drive_offset": 1, **pattern},
+        map={"nodes_x": 25, "nodes_y": 25},
+        structure={"conductivity_ratio": 20.0},
+    )
+
+
+def skipping(electrodes: int) -> list[list[int]]:
+    """Drives of every second electrode across two, and back: no offset says that."""
+    return [[k, (k + 3) % electrodes] for k in range(0, electrodes, 2)] + [
+        [(k + 3) % electrodes, k] for k in range(0, electrodes, 2)
+    ]
+
+
+SENSORS = {
+    "8, adjacent": disc(8),
+    "8, opposite": disc(8, drive_offset=4),
+    "16, opposite": disc(16, drive_offset=8),
+    "16, skip 3": disc(16, drive_offset=4, measure_offset=3),
+    "16, listed": disc(16, drive=skipping(16)),
+    "32, adjacent": disc(32),
+    "32, opposite": disc(32, drive_offset=16),
+}
+
+
+@cache
+def simulator(sensor: SensorDescription) -> SkinSimulator:
+    return SkinSimulator(sensor, unevenness=0.03, impedance_spread=0.1, seed=4)
+
+
+class Built(dict[str, Artifact]):
+    """Artifacts by the hash that they belong to: the same with and without signs."""
+
+    def of(self, sensor: SensorDescription) -> Artifact:
+        if sensor.sha256 not in self:
+            self[sensor.sha256] = build_artifact(sensor)
+        return self[sensor.sha256]
+
+
+BUILT = Built()
+
+
+def pressed(
+    sensor: SensorDescription, *, unsigned: bool = False, press: Press = PRESS
+) -> Reconstruction:
+    """One press, as a device of either kind would have it reconstructed."""
+    skin = Skin(simulator(sensor))
+    read = np.abs if unsigned else np.asarray
+    rest = np.array([read(skin.scan()["structure"]) for _ in range(20)])
+    sensor = variant(sensor, instrument=UNSIGNED) if unsigned else sensor
+    made = Reconstructor(sensor, BUILT.of(sensor), budget_s=1.0)
+    made.set_reference(Reference.from_scans(None, rest))
+    return made.reconstruct(None, read(skin.scan(press)["structure"]))
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_a_press_is_found_by_any_pattern(name: str) -> None:
+    frame = pressed(SENSORS[name])
+    assert not frame.flags & ~Flag.MISFIT_HIGH
+    [contact] = frame.contacts
+    off_mm = 1e3 * np.hypot(contact.x_m - PRESS.x_m, contact.y_m - PRESS.y_m)
+    assert off_mm < (4.0 if name.startswith("8") else 1.5)
+
+
+@pytest.mark.parametrize("name", ["16, opposite", "16, listed", "32, adjacent"])
+def test_sizes_alone_show_the_same(name: str) -> None:
+    """Same scenes, same noise: between neighbours no sign is lost with the sign."""
+    signed, unsigned = pressed(SENSORS[name]), pressed(SENSORS[name], unsigned=True)
+    assert [c.x_m for c in unsigned.contacts] == pytest.approx([c.x_m for c in signed.contacts])
+    assert unsigned.misfit == pytest.approx(signed.misfit)
+    assert unsigned.flags == signed.flags
+
+
+def signs_of(sensor: SensorDescription) -> tuple[Signs, NDArray[np.float64], NDArray[np.bool_]]:
+    model = ForwardModel(sensor, BUILT.of(sensor).bare)
+    wiring = Wiring(sensor)
+    return Signs(sensor, wiring, model.bare_voltages), model.bare_voltages, wiring.ordered
+
+
+def test_a_small_voltage_of_crossing_pairs_has_no_certain_sign() -> None:
+    """Such a one is left out, and that is nobody's fault: no flag."""
+    sensor = variant(disc(16, drive_offset=8, measure_offset=8), instrument=UNSIGNED)
+    signs, predicted, ordered = signs_of(sensor)
+    assert not ordered.any()
+    uncertain = np.abs(predicted[~signs.certain])
+    assert 0 < len(uncertain) < len(predicted) / 3
+    assert uncertain.max() < np.abs(predicted[signs.certain]).min()
+    frame = pressed(sensor, unsigned=True)
+    assert not frame.flags & Flag.INVALID_VOLTAGE
+    assert np.isfinite(frame.misfit)
+
+
+def test_a_device_that_tells_signs_is_believed() -> None:
+    signs, predicted, _ = signs_of(disc(16, drive_offset=8, measure_offset=8))
+    assert signs.certain.all()
+    np.testing.assert_array_equal(signs.give(-predicted), -predicted)
+
+
+@pytest.mark.parametrize("name", ["16, opposite", "16, listed"])
+def test_no_press_turns_a_voltage_whose_pairs_do_not_cross(name: str) -> None:
+    """What the signs rest on; it is a theorem, held here against the forward model."""
+    sensor = SENSORS[name]
+    _, predicted, ordered = signs_of(sensor)
+    assert ordered.all()
+    skin = SkinSimulator(sensor, unevenness=0.05, impedance_spread=0.2, seed=1)
+    rng = np.random.default_rng(2)
+    for _ in range(10):
+        x_m, y_m = rng.uniform(-0.02, 0.02, 2)
+        press = Press(x_m=x_m, y_m=y_m, pressure_kpa=100.0, radius_m=rng.uniform(0.004, 0.015))
+        volts = skin.voltages([press])["structure"]
+        np.testing.assert_array_equal(np.sign(volts), np.sign(predicted))
