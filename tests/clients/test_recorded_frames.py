@@ -72,6 +72,13 @@ def record(
     return path
 
 
+def spoil_a_chunk(path: Path, in_file: float) -> None:
+    """Flip a byte in the first chunk that begins so far into the file, a share of it."""
+    data = bytearray(path.read_bytes())
+    data[data.index(b"zstd", int(len(data) * in_file)) + 100] ^= 0xFF
+    path.write_bytes(data)
+
+
 def numbers_of(frames: Any) -> list[int]:
     return [frame.sequence for frame in frames]
 
@@ -145,9 +152,7 @@ def test_a_time_range_reads_no_more_than_it_needs(
 
 
 def test_reading_is_lazy(whole: Path) -> None:
-    data = bytearray(whole.read_bytes())
-    data[len(data) // 2] ^= 0xFF
-    whole.write_bytes(data)
+    spoil_a_chunk(whole, in_file=0.5)
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # it never comes to the damage
         frames = open_recording(whole).frames()
@@ -182,9 +187,7 @@ def test_a_cut_recording_gives_what_there_is_and_says_so(tmp_path: Path) -> None
 
 
 def test_what_lies_beyond_damage_is_read_too(whole: Path) -> None:
-    data = bytearray(whole.read_bytes())
-    data[len(data) // 2] ^= 0xFF
-    whole.write_bytes(data)
+    spoil_a_chunk(whole, in_file=0.5)
     recording = open_recording(whole)
     assert recording.damage == "whole.mcap is damaged, with intact data beyond"
     with pytest.warns(RecordingWarning):
@@ -196,9 +199,7 @@ def test_what_lies_beyond_damage_is_read_too(whole: Path) -> None:
 
 def test_frames_are_found_where_the_names_of_the_topics_are_lost(tmp_path: Path) -> None:
     path = record(tmp_path / "headless.mcap", finish=False)
-    data = bytearray(path.read_bytes())
-    data[data.index(b"zstd") + 100] ^= 0xFF
-    path.write_bytes(data)
+    spoil_a_chunk(path, in_file=0.0)
     with pytest.warns(RecordingWarning):
         assert numbers_of(open_recording(path)) == list(range(3, 41))
 

@@ -210,8 +210,9 @@ def _damage(path: Path) -> str:
         pass
     if not damaged_at:
         return ""
-    beyond = any(True for _ in messages_beyond(path, damaged_at[0]))
-    return f"{path.name} is " + ("damaged, with intact data beyond" if beyond else "cut off")
+    if any(True for _ in messages_beyond(path, damaged_at[0])):
+        return f"{path.name} is damaged, with intact data beyond"
+    return f"{path.name} is " + ("cut off" if read_index(path) is None else "damaged")
 
 
 def _nanoseconds(seconds: float) -> int:
