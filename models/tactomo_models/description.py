@@ -11,11 +11,19 @@ from functools import cached_property
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    model_validator,
+)
 
 from tactomo_models.errors import DescriptionError, explain
 from tactomo_models.pattern import Pairs, combined, ring_pairs
@@ -70,15 +78,50 @@ class Sheet(_Section):
         return self
 
 
+def _one_or_two(given: object) -> str:
+    return "two" if isinstance(given, list | tuple) else "one"
+
+
+# One value for all four sides, or two: of bottom and top, of right and left.
+Count = Annotated[int, Field(ge=1, le=16)]
+OfSides = Discriminator(_one_or_two)
+PerSide = Annotated[
+    Annotated[Count, Tag("one")] | Annotated[tuple[Count, Count], Field(strict=False), Tag("two")],
+    OfSides,
+]
+Pitch = Annotated[
+    Annotated[Metres, Tag("one")]
+    | Annotated[tuple[Metres, Metres], Field(strict=False), Tag("two")],
+    OfSides,
+]
+
+
 class Electrodes(_Section):
     """Electrodes on the rim: `per_side` and `pitch_m` on a rectangle, `count` on a disc."""
 
     length_m: Metres
     contact_impedance_ohm_m: Annotated[float, Field(gt=0, le=1e9)]
-    per_side: Annotated[int, Field(ge=1, le=16)] | None = None
-    pitch_m: Metres | None = None
+    per_side: PerSide | None = None
+    pitch_m: Pitch | None = None
     count: Annotated[int, Field(ge=6, le=64)] | None = None
     first_angle_deg: Annotated[float, Field(ge=-360, le=360)] = -90.0
+
+    @property
+    def each_side(self) -> tuple[int, int]:
+        """How many are on the bottom and on the top of a rectangle, and on its right and left."""
+        return _both(self.per_side or 0)
+
+    @property
+    def pitches_m(self) -> tuple[float, float]:
+        """Their distance, centre to centre, on those sides."""
+        return _both(self.pitch_m or 0.0)
+
+
+_Number = TypeVar("_Number", int, float)
+
+
+def _both(given: _Number | tuple[_Number, _Number]) -> tuple[_Number, _Number]:
+    return given if isinstance(given, tuple) else (given, given)
 
 
 class Pattern(_Section):
@@ -334,7 +377,7 @@ class SensorDescription(_Section):
     @property
     def electrode_count(self) -> int:
         """Number of electrodes of one sheet."""
-        return self.electrodes.count or 4 * (self.electrodes.per_side or 0)
+        return self.electrodes.count or 2 * sum(self.electrodes.each_side)
 
     def __eq__(self, other: object) -> bool:
         """Descriptions are equal by what they say, whatever has been worked out from them."""
@@ -432,31 +475,40 @@ def _check_electrodes(sheet: Sheet, electrodes: Electrodes) -> None:
     else:
         if electrodes.per_side is None or electrodes.pitch_m is None or electrodes.count:
             raise ValueError("electrodes: a rectangle takes per_side and pitch_m, and no count")
-        room = electrodes.pitch_m
-        side = min(sheet.width_m, sheet.height_m or sheet.width_m)
-        needed = electrodes.pitch_m * (electrodes.per_side - 1) + electrodes.length_m
-        if needed > side:
-            raise ValueError(
-                f"electrodes: {electrodes.per_side} of them at pitch_m = {electrodes.pitch_m} "
-                f"need {needed:.4g} m, but the shorter side has {side:.4g} m"
-            )
+        for side, name in ((0, "width_m"), (1, "height_m")):
+            _check_side(electrodes, side, name, getattr(sheet, name))
+        room = min(electrodes.pitches_m)
     if electrodes.length_m >= room:
         raise ValueError(
             f"electrodes.length_m = {electrodes.length_m}: must be below their distance, {room:.4g}"
         )
 
 
+def _check_side(electrodes: Electrodes, side: int, name: str, length_m: float) -> None:
+    count, pitch_m = electrodes.each_side[side], electrodes.pitches_m[side]
+    needed = pitch_m * (count - 1) + electrodes.length_m
+    if needed > length_m:
+        raise ValueError(
+            f"electrodes: {count} of them at pitch_m = {pitch_m} need {needed:.4g} m, but the "
+            f"sheet's {name} is {length_m:.4g} m; give a smaller pitch_m, or two in brackets: of "
+            "bottom and top, of right and left (so for per_side, too)"
+        )
+
+
 def _rectangle_electrodes(description: SensorDescription) -> FloatArray:
-    n = description.electrodes.per_side or 0
-    along = (np.arange(n) - (n - 1) / 2) * (description.electrodes.pitch_m or 0)
     half = description.electrodes.length_m / 2
+    across, upright = (
+        ((np.arange(n) - (n - 1) / 2) * pitch_m)[:, None] + [-half, half]  # (n, 2), as one travels
+        for n, pitch_m in zip(
+            description.electrodes.each_side, description.electrodes.pitches_m, strict=True
+        )
+    )
     w, h = description.width_m / 2, description.height_m / 2
-    ends = np.stack([along - half, along + half], axis=1)  # (n, 2), in the direction of travel
     sides = [
-        (ends, np.full_like(ends, -h)),
-        (np.full_like(ends, w), ends),
-        (-ends, np.full_like(ends, h)),
-        (np.full_like(ends, -w), -ends),
+        (across, np.full_like(across, -h)),
+        (np.full_like(upright, w), upright),
+        (-across, np.full_like(across, h)),
+        (np.full_like(upright, -w), -upright),
     ]
     return np.concatenate([np.stack(side, axis=-1) for side in sides])
 

@@ -31,7 +31,7 @@ class DataError(ModelError):
 
 def explain(item: "ErrorDetails") -> str:
     """Turn one of pydantic's complaints about a file into "key = value: what is allowed"."""
-    key = ".".join(str(part) for part in item["loc"])
+    key = ".".join(str(part) for part in item["loc"] if part not in ("one", "two"))  # no keys
     message = item["msg"].removeprefix("Value error, ")
     if item["type"] == "extra_forbidden":
         return f"unknown key {key}"

@@ -78,7 +78,11 @@ def test_opposite_drive_gives_192_voltages() -> None:
         (('"rectangle"', '"hexagon"'), ["sheet.shape", "hexagon", "'rectangle' or 'disc'"]),
         (("height_m = 0.05", ""), ["height_m is required"]),
         (("length_m = 0.006", "length_m = 0.03"), ["length_m", "0.03", "below"]),
-        (("pitch_m = 0.02", "pitch_m = 0.09"), ["pitch_m", "0.05"]),
+        (("pitch_m = 0.02", "pitch_m = 0.09"), ["pitch_m", "0.06", "two in brackets"]),
+        (("pitch_m = 0.02", "pitch_m = 0.05"), ["pitch_m", "height_m is 0.05"]),
+        (("per_side = 2", "per_side = [2, 17]"), ["electrodes.per_side.1 = 17", "equal to 16"]),
+        (("per_side = 2", "per_side = [2]"), ["electrodes.per_side.1 is missing"]),
+        (("per_side = 2", "per_side = [2, 3, 2]"), ["electrodes.per_side", "at most 2"]),
         (('"rectangle"\nwidth_m = 0.06\nheight_m = 0.05', '"disc"\nwidth_m = 0.06'), ["count"]),
         (("[pattern]", "[pattern]\ndrive_offset = 8"), ["pattern.drive_offset = 8", "below"]),
         (("[pattern]", "[pattern]\ndrive = [[0, 8]]"), ["pattern.drive holds [0, 8]", "0 to 7"]),
@@ -176,6 +180,24 @@ def test_electrodes_of_a_disc_go_counter_clockwise_from_the_bottom() -> None:
     assert centres_mm[8] == pytest.approx([0, 100], abs=0.2)
 
 
+def test_the_hashes_that_shipped_networks_are_bound_to_stay() -> None:
+    shipped = {name: load_description(name).sha256[:12] for name in shipped_descriptions()}
+    assert shipped["paper_square"] == "41544fbeee0e"
+    assert shipped["tank_uef2017"] == "e344dae4f17b"
+
+
+def test_sides_may_have_electrodes_of_their_own(tmp_path: Path, small_text: str) -> None:
+    file = tmp_path / "sensor.toml"
+    unequal = small_text.replace("per_side = 2", "per_side = [3, 1]")
+    file.write_text(unequal.replace("pitch_m = 0.02", "pitch_m = [0.018, 0.01]"))
+    sensor = load_description(file)
+    assert sensor.electrode_count == 8
+    assert (sensor.electrode_centres_m * 1e3).round(6).tolist() == [
+        *([-18, -25], [0, -25], [18, -25], [30, 0]),
+        *([18, 25], [0, 25], [-18, 25], [-30, 0]),
+    ]
+
+
 @given(st.integers(6, 32), st.integers(1, 31), st.integers(1, 31))
 def test_a_scan_holds_every_pair_but_those_that_touch(
     electrodes: int, drive_offset: int, measure_offset: int
@@ -205,6 +227,7 @@ def test_a_scan_holds_every_pair_but_those_that_touch(
         (("[map]", '[instrument]\nvoltages = "unsigned"\n[map]'), False),
         (("nodes_x = 21", "nodes_x = 23"), True),
         (("width_m = 0.06", "width_m = 0.060"), False),
+        (("per_side = 2", "per_side = [3, 2]"), True),
         (("0.0, 0.0, 0.25]", "0.0, 0.1, 0.25]"), False),
         (("conductivity_ratio = 100.0", "conductivity_ratio = 50.0"), False),
         (('name = "small"', 'name = "other"'), False),

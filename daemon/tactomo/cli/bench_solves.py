@@ -165,7 +165,7 @@ def _pressable_in_the_middle(sensor: SensorDescription, larger: float = 1.0) -> 
         if key in raw["sheet"]:
             raw["sheet"][key] *= larger
     if "pitch_m" in raw["electrodes"]:
-        raw["electrodes"]["pitch_m"] *= larger
+        raw["electrodes"]["pitch_m"] = [larger * pitch for pitch in sensor.electrodes.pitches_m]
     raw["sheet"]["frame_width_m"] = 0.249 * larger * min(sensor.width_m, sensor.height_m)
     return SensorDescription.model_validate(raw)
 
