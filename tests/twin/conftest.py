@@ -108,9 +108,14 @@ def bench() -> Iterator[Callable[..., Bench]]:
     """Start twins of the paper's sensor on a flat skin; stops them afterwards."""
     running: list[Bench] = []
 
-    def start(skin: SkinModel | None = None, solve_s: float = 0.0, **config: Any) -> Bench:
+    def start(
+        skin: SkinModel | None = None,
+        solve_s: float = 0.0,
+        sensor: str = "paper_square",
+        **config: Any,
+    ) -> Bench:
         config = {"control": "tcp://127.0.0.1:0", "noise_v": 0.0, "rate_hz": 100.0, **config}
-        description = load_description("paper_square")
+        description = load_description(sensor)
         started = Bench(Twin(TwinConfig(description, **config), skin or FlatSkin(solve_s)))
         running.append(started)
         started.twin.start()

@@ -21,8 +21,8 @@ from tactomo_models.pattern import Pairs, scan_pairs
 from tactomo_models.plausibility import Layout
 from tactomo_protocol import SCAN_COUNTERS, Channel, Hello, Scan, ScanFlag
 
-from tactomo.cli.imported import load_arrays, read_scans, single_ended
 from tactomo.errors import TactomoError
+from tactomo.imported import load_arrays, read_scans, single_ended
 from tactomo.recording import Recording
 
 FloatArray = NDArray[np.float64]

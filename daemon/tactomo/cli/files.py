@@ -150,7 +150,7 @@ def _recording_facts(recording: Recording) -> dict[str, Any]:
 
 def _array_facts(path: Path) -> dict[str, Any]:
     """Describe a built artifact, or any other file of arrays, by what is in it."""
-    from tactomo.cli.imported import load_arrays
+    from tactomo.imported import load_arrays
 
     arrays = load_arrays(path)
     facts = {name: array.item() for name, array in arrays.items() if array.ndim == 0}
@@ -227,7 +227,7 @@ def import_scans(
     from tactomo_models import load_description
     from tactomo_protocol import Channel
 
-    from tactomo.cli.imported import read_scans
+    from tactomo.imported import read_scans
     from tactomo.recording_writer import write_recording
 
     reference = frame_slice(reference_frames)

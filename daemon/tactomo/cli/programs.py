@@ -153,14 +153,30 @@ def daemon(
         "tactomo twin --link /tmp/skin",
         "tactomo twin --ports 1 --scene deploy/scenes/sliding_finger.toml",
         "tactomo poke press x_mm=10 y_mm=-20",
+        "tactomo twin --description tank_disc --play tank.npz",
     ),
 )
 def twin(
     description: Description = DEFAULT_DESCRIPTION,
     ports: Annotated[
-        int, typer.Option(min=1, max=2, help="One line for both channels, or a line for each.")
-    ] = 2,
-    rate: Annotated[float, typer.Option(help="Dual scans a second.")] = 20.0,
+        int | None,
+        typer.Option(min=1, max=2, help="One line for both channels, or a line for each. [each]"),
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option(help="Dual scans a second. [20, or as in the file that plays]")
+    ] = None,
+    protocol: Annotated[
+        Protocol, typer.Option(help="What it speaks: ours, or as another instrument does.")
+    ] = "tactomo",
+    play: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.npz", help="Say measured frames, as `tactomo import` reads them, instead."
+        ),
+    ] = None,
+    once: Annotated[
+        bool, typer.Option("--once", help="Stop after the last played frame; else again.")
+    ] = False,
     scene: Annotated[
         Path | None,
         typer.Option(help="A scripted scene (TOML); starts with the first scan that is received."),
@@ -201,15 +217,20 @@ def twin(
     from tactomo.twin import Drift, Twin, TwinConfig, load_scene
 
     interrupt_on_sigterm()
+    sensor = load_description(description)
+    lines = len(sensor.modalities) if protocol == "tactomo" else 1
     config = TwinConfig(
-        load_description(description),
-        ports=ports,
+        sensor,
+        ports=lines if ports is None else ports,
         rate_hz=rate,
         noise_v=None if noise_uv is None else noise_uv * 1e-6,
         drift=Drift(walk=drift, creep=creep),
         unevenness=unevenness,
         seed=seed,
         scene=None if scene is None else load_scene(scene),
+        protocol=protocol,
+        play=play,
+        play_once=once,
         control=control,
         link_folder=link,
     )

@@ -32,6 +32,7 @@ from threadpoolctl import threadpool_limits
 from tactomo.config import Endpoint
 from tactomo.endpoint import is_local
 from tactomo.errors import CommandError, ConfigError
+from tactomo.protocols import OURS
 from tactomo.twin.control import (
     ControlSocket,
     DriftArguments,
@@ -54,12 +55,18 @@ from tactomo.twin.firmware import (
     Port,
     Voltages,
 )
+from tactomo.twin.foreign import ForeignFirmware
 from tactomo.twin.line import SerialLine
+from tactomo.twin.playing import Player
 from tactomo.twin.scene import Scene, complaints
+from tactomo.twin.speakers import SPEAKERS
 from tactomo.twin.surface import Surface
 
 # How often a line that nobody has open is looked at; its hang-up cannot be waited on.
 HANGUP_CHECK_S = 0.02
+RATE_HZ = 20.0
+# How long the line stays after the last frame of a file: the host must have read it.
+LINGER_S = 1.0
 # Room above the largest unloaded voltage before the converter clips.
 HEADROOM = 8.0
 # Noise of the converter where none is given, as a share of the largest unloaded voltage: 60 dB
@@ -74,7 +81,7 @@ IMPEDANCE_SPREAD = 0.1
 class SkinModel(Protocol):
     """What the twin needs of a forward model; `tactomo_models.SkinSimulator` is one."""
 
-    def voltages(self, presses: Sequence[Press]) -> Voltages:
+    def voltages(self, presses: Sequence[Press], /) -> Voltages:
         """Return the noise-free volts, (M,), of each channel of the sensor under these presses."""
 
 
@@ -94,12 +101,16 @@ class TwinConfig:
     Attributes:
         description: the sensor that it simulates.
         ports: 1 for one line that carries every channel, 2 for a line for each.
-        rate_hz: scans a second, at first; the host may change it.
+        rate_hz: scans a second, at first; the host may change it. None for those of the file that
+            is played, or 20.
         noise_v: noise in volts rms; None for a usual converter's.
         drift: how the gains drift.
         unevenness: standard deviation of the sheet's conductivity, a ratio.
         seed: equal seeds give equal noise, drift and unevenness.
         scene: a scripted scene; it starts with the first scan that a host can receive.
+        protocol: what the device speaks; foreign ones have one port and one channel.
+        play: an .npz file of measured frames, said in the place of simulated ones.
+        play_once: stop after the file's last frame instead of beginning again.
         control: address of the control socket; port 0 takes a free one.
         link_folder: where to keep links with stable names to the lines.
 
@@ -107,12 +118,15 @@ class TwinConfig:
 
     description: SensorDescription
     ports: int = 1
-    rate_hz: float = 20.0
+    rate_hz: float | None = None
     noise_v: float | None = None
     drift: Drift = field(default_factory=Drift)
     unevenness: float = UNEVENNESS
     seed: int = 0
     scene: Scene | None = None
+    protocol: str = OURS
+    play: Path | None = None
+    play_once: bool = False
     control: str = DEFAULT_TWIN_CONTROL
     link_folder: Path | None = None
 
@@ -133,7 +147,18 @@ class TwinConfig:
                 f"{self.description.name} has {channels} channel(s), so not {self.ports} ports",
                 "give 1 port, or 2 for a sensor of two channels",
             )
-        if not RATE_HZ_MIN <= self.rate_hz <= RATE_HZ_MAX:
+        if self.protocol != OURS and self.protocol not in SPEAKERS:
+            raise ConfigError(
+                f"the twin does not speak the protocol {self.protocol!r}",
+                f"use one of: {', '.join((OURS, *SPEAKERS))}",
+            )
+        if self.protocol != OURS and channels > 1:
+            raise ConfigError(
+                f"{self.description.name} has two channels, and a device of protocol "
+                f"{self.protocol} carries one",
+                "give the description of a sensor with one channel, such as tank_disc",
+            )
+        if self.rate_hz is not None and not RATE_HZ_MIN <= self.rate_hz <= RATE_HZ_MAX:
             raise ConfigError(
                 f"a rate of {self.rate_hz:g} Hz is out of range",
                 f"give {RATE_HZ_MIN:g} to {RATE_HZ_MAX:g} scans a second",
@@ -169,18 +194,16 @@ class Twin:
             for line, channels in _wiring(config).items():
                 ports.append(Port(SerialLine(line, config.link_folder), channels))
                 undo.callback(ports[-1].line.close)
+            self._player: Player | None = None
+            if config.play is not None:
+                self._player = Player(config.play, config.description, config.play_once)
+                skin = self._player
             self._skin = skin or make_skin(config.description, config.unevenness, config.seed)
             undo.pop_all()
         self._converter = self._make_converter()
         self._powered_s = time.monotonic()
-        self._firmware = Firmware(
-            identity=_identity(config.description),
-            ports=ports,
-            sample=self._sample,
-            converter=self._converter,
-            rate_hz=config.rate_hz,
-            clock=self._clock,
-        )
+        self._over_s: float | None = None  # when the last frame of a file was said
+        self._firmware = self._make_firmware(ports)
         self._wake_receiver, self._wake_sender = socket.socketpair()
         self._wake_receiver.setblocking(False)
         self._solver = ThreadPoolExecutor(max_workers=1, thread_name_prefix="twin-skin")
@@ -228,6 +251,7 @@ class Twin:
                     self._rest()
                     self._control.answer()
                     self._firmware.step()
+                    self._stop_at_end()
         except BaseException as error:  # handed to whoever waits for this thread
             self._failure = error
         finally:
@@ -254,6 +278,14 @@ class Twin:
         with contextlib.suppress(BlockingIOError):
             self._wake_receiver.recv(4096)
 
+    def _stop_at_end(self) -> None:
+        """Stop a while after the last frame of a file that is played once."""
+        if self._player is None or not self._player.is_over:
+            return
+        self._over_s = self._over_s or time.monotonic()
+        if time.monotonic() - self._over_s > LINGER_S:
+            self._stopping.set()
+
     def _wake(self) -> None:
         with contextlib.suppress(OSError):  # closed: the thread has ended
             self._wake_sender.send(b"\0")
@@ -263,6 +295,8 @@ class Twin:
 
     def _sample(self, time_s: float) -> Future[Voltages]:
         """Start computing the voltages of the skin as it is at device time `time_s`."""
+        if self._player is not None and self._player.is_over:
+            return Future()  # never done: nothing follows
         if not self._surface.is_playing and any(p.line.is_open for p in self._firmware.ports):
             self._surface.play(time_s)
         presses = [indenter.press() for indenter in self._surface.presses_at(time_s).values()]
@@ -270,7 +304,21 @@ class Twin:
         future.add_done_callback(lambda _: self._wake())
         return future
 
+    def _make_firmware(self, ports: list[Port]) -> Firmware:
+        config = self.config
+        identity = _identity(config.description, config.protocol)
+        own_rate_hz = None if self._player is None else self._player.rate_hz
+        rate_hz = config.rate_hz or own_rate_hz or RATE_HZ
+        if config.protocol != OURS:
+            speaker = SPEAKERS[config.protocol](config.description, rate_hz)
+            return ForeignFirmware(
+                speaker, identity, ports[0], self._sample, self._converter, self._clock
+            )
+        return Firmware(identity, ports, self._sample, self._converter, rate_hz, self._clock)
+
     def _make_converter(self) -> Converter:
+        if self._player is not None:  # noise and drift are in what was measured
+            return Converter(HEADROOM * self._player.largest_v, 0.0, Drift(0.0, 0.0))
         unloaded = self._skin.voltages([])
         largest_v = max(float(np.max(np.abs(volts))) for volts in unloaded.values())
         noise_v = self.config.noise_v
@@ -375,10 +423,11 @@ class Twin:
         return [ports[number]]
 
 
-def _identity(description: SensorDescription) -> Identity:
+def _identity(description: SensorDescription, protocol: str) -> Identity:
     drive_offset, measure_offset = description.offsets
+    device = description.name if protocol == OURS else f"{protocol}-{description.name}"
     return Identity(
-        device_id=f"twin-{description.name}"[:64],
+        device_id=f"twin-{device}"[:64],
         firmware=f"tactomo-twin {version('tactomo')}",
         electrodes=description.electrode_count,
         drive_offset=drive_offset,

@@ -121,13 +121,8 @@ class Firmware:
 
     def step(self) -> None:
         """Do what is due: answer commands, say hello, sample, send."""
-        for port in self.ports:
-            for packet in port.decoder.feed(port.line.receive()):
-                if isinstance(packet, Command):
-                    self._obey(port, packet)
-        if self._clock() >= self._next_hello_s:
-            self._next_hello_s = self._clock() + HELLO_PERIOD_S
-            self._greet(self.ports)
+        self._listen()
+        self._greet_when_due()
         self._begin_scan()
         self._finish_scan()
 
@@ -142,6 +137,17 @@ class Firmware:
     @property
     def _is_streaming(self) -> bool:
         return any(port.is_streaming for port in self.ports)
+
+    def _listen(self) -> None:
+        for port in self.ports:
+            for packet in port.decoder.feed(port.line.receive()):
+                if isinstance(packet, Command):
+                    self._obey(port, packet)
+
+    def _greet_when_due(self) -> None:
+        if self._clock() >= self._next_hello_s:
+            self._next_hello_s = self._clock() + HELLO_PERIOD_S
+            self._greet(self.ports)
 
     def _begin_scan(self) -> None:
         if self._pending is not None or not self._is_streaming:
@@ -165,8 +171,13 @@ class Firmware:
         for port in self.ports:
             for channel in port.channels:
                 if port.is_streaming and self._mute_until_s.get(channel, 0.0) <= self._clock():
-                    port.line.send(encode(self._scan(channel, time_s, flags, voltages)))
+                    self._say(port, channel, time_s, flags, voltages)
         self.counter = (self.counter + 1) % 2**32
+
+    def _say(
+        self, port: Port, channel: Channel, time_s: float, flags: ScanFlag, voltages: Voltages
+    ) -> None:
+        port.line.send(encode(self._scan(channel, time_s, flags, voltages)))
 
     def _scan(self, channel: Channel, time_s: float, flags: ScanFlag, voltages: Voltages) -> Scan:
         counts, saturated = self._converter.convert(

@@ -105,6 +105,11 @@ class SerialLine:
         self._rest = rest
         self.sent += 1
 
+    def push(self, data: bytes) -> bytes:
+        """Put on the line what fits, and return the rest; for a device that can wait."""
+        self._rest = self._write(self._rest)
+        return data if self._rest else self._write(data)
+
     def receive(self) -> bytes:
         """Return what the host has sent, possibly nothing; never waits."""
         if self._descriptor is None:

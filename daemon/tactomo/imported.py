@@ -224,14 +224,7 @@ def single_ended(
         ImportFileError: they do not fit the sensor, or are out of phase with the current.
 
     """
-    injection = _checked(path, "injection", arrays["injection"], (-1, 2)).astype(int)
-    electrodes = layout.electrode_count
-    raw = arrays["volts"]
-    if raw.shape[1:] != (len(injection), electrodes) or raw.dtype.kind not in "fciu":
-        raise ImportFileError(
-            f"{path}: volts is {raw.dtype} {raw.shape}",
-            f"it must be numbers (T, {len(injection)}, {electrodes})",
-        )
+    injection, raw = _single_ended_arrays(path, arrays, layout)
     rows, signs = _injection_rows(path, injection - injection.min(), layout)
     plus, minus = layout.pairs.measure.T
     differences = signs * (raw[:, rows, plus] - raw[:, rows, minus])
@@ -244,6 +237,36 @@ def single_ended(
         )
     volts = np.asarray(differences.real, dtype=np.float64)
     return volts, _times(path, arrays, len(raw)), notes
+
+
+def electrode_potentials(
+    path: Path, arrays: dict[str, NDArray[Any]], layout: Layout
+) -> NDArray[np.complexfloating]:
+    """Return single-ended readings as (T, injections, electrodes), in the layout's order of drives.
+
+    Raises:
+        ImportFileError: they do not fit the sensor.
+
+    """
+    injection, raw = _single_ended_arrays(path, arrays, layout)
+    rows, signs = _injection_rows(path, injection - injection.min(), layout)
+    _, first = np.unique(rows, return_index=True)
+    order = np.sort(first)  # of each drive the first voltage
+    potentials = signs[order][None, :, None] * raw[:, rows[order]]
+    return np.asarray(potentials, dtype=np.complex64)
+
+
+def _single_ended_arrays(
+    path: Path, arrays: dict[str, NDArray[Any]], layout: Layout
+) -> tuple[NDArray[np.int_], NDArray[Any]]:
+    injection = _checked(path, "injection", arrays["injection"], (-1, 2)).astype(int)
+    raw, electrodes = arrays["volts"], layout.electrode_count
+    if raw.shape[1:] != (len(injection), electrodes) or raw.dtype.kind not in "fciu":
+        raise ImportFileError(
+            f"{path}: volts is {raw.dtype} {raw.shape}",
+            f"it must be numbers (T, {len(injection)}, {electrodes})",
+        )
+    return injection, raw
 
 
 def _injection_rows(

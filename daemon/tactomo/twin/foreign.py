@@ -1,0 +1,162 @@
+"""Other people's instruments, emulated: the twin's skin behind another language than ours.
+
+`ForeignFirmware` does what they have in common: sampling, a line that may be slow, faults. Each
+language is a `Speaker`, which turns frames into bytes and obeys the host.
+"""
+
+from __future__ import annotations
+
+import random
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from tactomo_models import SensorDescription
+from tactomo_protocol import Channel, ScanFlag
+
+from tactomo.twin.converter import Converter
+from tactomo.twin.firmware import MODALITIES, Firmware, Identity, Port, Voltages
+from tactomo.twin.playing import PlayedFrame
+
+MAX_WAITING_BYTES = 1 << 17
+"""What an instrument keeps for a host that is slow to take it; then frames are lost."""
+PUMP_S = 0.001
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """What an instrument has measured in one go round the electrodes."""
+
+    volts: NDArray[np.float64]
+    """(M,) in the description's order."""
+    potentials: NDArray[np.complexfloating] | None
+    """(injections, electrodes) volts against ground, where measured ones are played."""
+    time_s: float
+    """When it began, by the instrument's clock."""
+
+
+class Speaker(Protocol):
+    """One instrument's side of its language. For use by one thread.
+
+    Attributes:
+        rate_hz: frames a second; the host may have changed it.
+        is_streaming: whether it sends frames at present.
+
+    """
+
+    rate_hz: float
+    is_streaming: bool
+
+    def greeting(self) -> list[bytes]:
+        """Return what it says when it is switched on, or plugged in."""
+
+    def hear(self, data: bytes) -> list[bytes]:
+        """Obey what the host says, in any chunking, and return the answers."""
+
+    def frame(self, frame: Frame) -> list[bytes]:
+        """Return what it sends of a frame, message by message."""
+
+    def held_up(self) -> list[bytes]:
+        """Return what it says when the host did not take a frame; often nothing."""
+
+
+MakeSpeaker = Callable[[SensorDescription, float], Speaker]
+"""Of the sensor and the frames a second that it starts with."""
+
+
+class ForeignFirmware(Firmware):
+    """An instrument behind its one line. For use by one thread.
+
+    Args:
+        speaker: its language.
+        identity: what the twin's status says of it.
+        port: its line.
+        sample: starts computing the skin's voltages at a device time in seconds.
+        converter: its noise; unused for frames that are played.
+        clock: seconds since power-up.
+
+    """
+
+    def __init__(
+        self,
+        speaker: Speaker,
+        identity: Identity,
+        port: Port,
+        sample: Callable[[float], Future[Voltages]],
+        converter: Converter,
+        clock: Callable[[], float],
+    ) -> None:
+        super().__init__(identity, [port], sample, converter, speaker.rate_hz, clock)
+        self._speaker = speaker
+        self._port = port
+        self._waiting: deque[bytes] = deque()
+        self._waiting_bytes = 0
+        self._was_open = False
+
+    def due_in_s(self) -> float:
+        """See `Firmware`; while bytes wait for the line, soon."""
+        due_s = super().due_in_s()
+        return min(due_s, PUMP_S) if self._waiting else due_s
+
+    def step(self) -> None:
+        """See `Firmware`."""
+        super().step()
+        self._pump()
+
+    def babble(self, port: Port, count: int) -> None:
+        """See `Firmware`."""
+        self._put([random.randbytes(count)])
+
+    def _listen(self) -> None:
+        is_open = self._port.line.is_open
+        if is_open and not self._was_open:
+            self._put(self._speaker.greeting())
+        self._was_open = is_open
+        data = self._port.line.receive()
+        if data:
+            self._put(self._speaker.hear(data))
+        if self._speaker.is_streaming and not self._port.is_streaming:
+            self._next_sample_s = self._clock()
+        self._port.is_streaming = self._speaker.is_streaming
+        self.rate_hz = self._speaker.rate_hz
+
+    def _greet_when_due(self) -> None:
+        self._next_hello_s = self._clock() + 1.0  # it says no hello
+
+    def _say(
+        self, port: Port, channel: Channel, time_s: float, flags: ScanFlag, voltages: Voltages
+    ) -> None:
+        if isinstance(voltages, PlayedFrame):
+            frame = Frame(voltages[MODALITIES[channel]], voltages.potentials, time_s)
+        else:
+            scan = self._scan(channel, time_s, flags, voltages)
+            frame = Frame(scan.volts(self._converter.volts_per_count), None, time_s)
+        if not port.line.is_open:
+            port.line.unheard += 1
+        elif self._waiting_bytes > MAX_WAITING_BYTES:
+            port.line.dropped += 1
+            self._put(self._speaker.held_up())
+        else:
+            port.line.sent += 1
+            self._put(self._speaker.frame(frame))
+
+    def _put(self, messages: list[bytes]) -> None:
+        self._waiting.extend(messages)
+        self._waiting_bytes += sum(map(len, messages))
+
+    def _pump(self) -> None:
+        """Hand the line what it takes; what nobody listens to is lost."""
+        if not self._port.line.is_open:
+            self._waiting.clear()
+            self._waiting_bytes = 0
+        while self._waiting:
+            message = self._waiting.popleft()
+            rest = self._port.line.push(message)
+            self._waiting_bytes -= len(message) - len(rest)
+            if rest:
+                self._waiting.appendleft(rest)
+                return

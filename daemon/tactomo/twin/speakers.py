@@ -1,0 +1,10 @@
+"""The languages that the twin speaks beside ours, by the name of their protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+from tactomo.twin.foreign import MakeSpeaker
+
+SPEAKERS: Final[Mapping[str, MakeSpeaker]] = {}
