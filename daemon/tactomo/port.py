@@ -552,11 +552,11 @@ def _is_refusal(answer: Acknowledge) -> bool:
 
 def contradiction(hello: Hello, description: SensorDescription) -> str:
     """Return in what a device differs from the sensor's description; empty when in nothing."""
-    pattern = description.pattern
+    drive_offset, measure_offset = description.offsets
     pairs = {
         "electrodes": (hello.electrodes, description.electrode_count),
-        "drive_offset": (hello.drive_offset, pattern.drive_offset),
-        "measure_offset": (hello.measure_offset, pattern.measure_offset),
+        "drive_offset": (hello.drive_offset, drive_offset),
+        "measure_offset": (hello.measure_offset, measure_offset),
         "samples_per_scan": (hello.samples_per_scan, description.measurements),
     }
     differ = [f"{key} {has}, not {want}" for key, (has, want) in pairs.items() if has != want]

@@ -212,14 +212,14 @@ class ForeignProtocol:
 
     def hello(self) -> Hello:
         """Return what the device would say of itself if it spoke our protocol."""
-        pattern = self.description.pattern
+        drive_offset, measure_offset = self.description.offsets
         return Hello(
             device_id=self.device_id,
             firmware=f"protocol {self.name}",
             channels=(self._channel,),
             electrodes=self.description.electrode_count,
-            drive_offset=pattern.drive_offset,
-            measure_offset=pattern.measure_offset,
+            drive_offset=drive_offset,
+            measure_offset=measure_offset,
             samples_per_scan=self.description.measurements,
             sample_format=SampleFormat.FLOAT32,
             volts_per_count=1.0,
