@@ -175,6 +175,15 @@ class Instrument(_Section):
     volts_per_unit: Annotated[float, Field(gt=0, le=1e6)] = 1.0
     start: Annotated[str, Field(max_length=16, pattern=r"^[ -~\r\n]*$")] = ""
 
+    @model_validator(mode="after")
+    def _single_ended_readings_have_their_sign(self) -> Self:
+        if self.referenced == "single_ended" and self.voltages == "unsigned":
+            raise ValueError(
+                "voltages = 'unsigned': single_ended readings, against the electrode that the "
+                "current leaves by, are positive by themselves; leave it out"
+            )
+        return self
+
 
 class MagnitudeResponse(_Section):
     """Relative conductivity change (sigma - sigma_0) / sigma_0 against pressure in kPa."""

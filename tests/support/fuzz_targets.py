@@ -20,6 +20,7 @@ import numpy as np
 from pydantic import ValidationError
 from tactomo.control import COMMANDS
 from tactomo.errors import RecordingError
+from tactomo.protocols import protocol_named
 from tactomo.recording import Mark, Origin, ScanKey, open_recording
 from tactomo.recording_writer import (
     RecordingWriter,
@@ -42,7 +43,7 @@ from tactomo_client.messages import (
     encode_reply,
     encode_request,
 )
-from tactomo_models import Reference, load_description, shipped_descriptions
+from tactomo_models import Reference, SensorDescription, load_description, shipped_descriptions
 from tactomo_models.errors import DescriptionError
 from tactomo_models.sensors import __path__ as sensors_path
 from tactomo_protocol import (
@@ -113,6 +114,32 @@ def _parse_wire(data: bytes) -> None:
 
 def _has_form(packet: object) -> bool:
     return isinstance(packet, Hello | Scan | Acknowledge | Command)
+
+
+def _line_examples() -> list[bytes]:
+    values = [f"{n / 16:.4f}" for n in range(256)]
+    fields = "".join(f"{value:>13}," for value in values[:192])
+    frame = f"OpenEIT\nmagnitudes: {fields}\r\n".encode()
+    table = ("\n" + ", ".join(values) + ", \n").encode()
+    rows = "".join(",".join(values[n : n + 16]) + "\r\n" for n in range(0, 256, 16))
+    return [b"\n" + frame * 2, table * 2, b"\nA\n" + rows.encode() * 2]
+
+
+def _parse_lines(data: bytes) -> None:
+    """Cut into reads of several lengths, the outcome is the same, also told to a new object."""
+    for name in ("openeit", "matrix"):
+        whole, pieces = (protocol_named(name, _described(name)) for _ in range(2))
+        expected = whole.feed(data)
+        step = 1 + len(data) % 7
+        found = [p for n in range(0, len(data), step) for p in pieces.feed(data[n : n + step])]
+        assert found == expected
+        assert whole.counts == pieces.counts
+        protocol_named(name, _described(name)).feed(pieces.preamble())
+
+
+@cache
+def _described(protocol: str) -> SensorDescription:
+    return load_description(f"{protocol}_disc")
 
 
 def _message_examples() -> list[bytes]:
@@ -219,6 +246,7 @@ def _scratch(name: str) -> Path:
 
 TARGETS: Mapping[str, Target] = {
     "wire": Target(_wire_examples, _parse_wire),
+    "lines": Target(_line_examples, _parse_lines),
     "message": Target(_message_examples, _parse_message),
     "request": Target(_request_examples, _parse_request),
     "description": Target(_description_examples, _parse_description),

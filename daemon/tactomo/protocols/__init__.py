@@ -12,6 +12,8 @@ from tactomo_models import SensorDescription
 
 from tactomo.errors import ConfigError
 from tactomo.protocols.interface import ForeignProtocol, PortProtocol, Reading, Trouble
+from tactomo.protocols.matrix import Matrix
+from tactomo.protocols.openeit import OpenEit
 from tactomo.protocols.ours import Ours
 
 __all__ = [
@@ -28,7 +30,9 @@ __all__ = [
 ]
 
 OURS: Final = Ours.name
-FOREIGN: Final[Mapping[str, type[ForeignProtocol]]] = {}
+FOREIGN: Final[Mapping[str, type[ForeignProtocol]]] = {
+    kind.name: kind for kind in (OpenEit, Matrix)
+}
 PROTOCOLS: Final = (OURS, *FOREIGN)
 
 
