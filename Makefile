@@ -37,7 +37,7 @@ firmware:        ## the C firmware library's emulator of a skin: firmware_protoc
 FUZZ_SECONDS ?= 60
 fuzz: $(READY)   ## a minute of each parser, ours (x86_64) and the C one (clang): FUZZ_SECONDS=3600
 	$(BIN)/python -m pip install --quiet 'atheris==3.0.0'
-	set -e; for target in wire message request description recording; do \
+	set -e; for target in wire lines message request description recording; do \
 	  $(BIN)/python tests/fuzz/run.py $$target -max_total_time=$(FUZZ_SECONDS); done
 	$(MAKE) -C firmware_protocol/c fuzz FUZZ_SECONDS=$(FUZZ_SECONDS)
 
