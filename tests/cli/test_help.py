@@ -28,7 +28,7 @@ TABLES = {"curve", "recording"}
     "command",
     [
         *ORDER,
-        *("models build", "models list"),
+        *("models build", "models draw", "models list"),
         *("evaluate scenes", "evaluate moving", "evaluate tanks", "evaluate skin"),
         "evaluate stability",
     ],
