@@ -52,8 +52,8 @@ def see(description: SensorDescription, artifact: Artifact) -> Visibility:
     margin_m = description.sheet.frame_width_m + radius_m
     fits = description.on_sheet(x, y, margin_m)
     images = signals.reshape(-1, *x.shape)
-    along_x = np.gradient(images, description.map_x_m, axis=2).reshape(signals.shape)
-    along_y = np.gradient(images, description.map_y_m, axis=1).reshape(signals.shape)
+    along_x = np.asarray(np.gradient(images, description.map_x_m, axis=2)).reshape(signals.shape)
+    along_y = np.asarray(np.gradient(images, description.map_y_m, axis=1)).reshape(signals.shape)
     slopes = np.stack([signals / CHANGE, along_x, along_y])
     information = np.einsum("imp,jmp->pij", slopes, slopes)
     covariance = np.linalg.pinv(information, hermitian=True)
