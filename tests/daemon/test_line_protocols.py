@@ -242,10 +242,14 @@ def test_a_new_cable_does_not_finish_the_old_line(kind: type[ForeignProtocol]) -
     sensor = OPENEIT if kind is OpenEit else MATRIX
     line = (openeit_line if kind is OpenEit else teensy_line)(VALUES[: sensor.measurements])
     protocol = begun(kind(sensor))
-    protocol.feed(line[:500])
+    protocol.feed(line + line[:500])
     protocol.restart()
     assert protocol.begun() == b""
-    assert scans(protocol.feed(line[500:] + line)) == [VALUES[: sensor.measurements].tolist()]
+    hello, scan = protocol.feed(line[500:] + line)
+    assert hello == protocol.hello()  # for the port: who is there now is the same
+    assert scans([scan]) == [VALUES[: sensor.measurements].tolist()]
+    assert isinstance(scan, Scan)
+    assert scan.counter == 1
     assert protocol.counts.corrupt == 0
 
 

@@ -69,7 +69,7 @@ Method: TypeAlias = Literal[
     "cnn-multimodal",
 ]
 # The daemon's PROTOCOLS, likewise.
-Protocol: TypeAlias = Literal["tactomo"]
+Protocol: TypeAlias = Literal["tactomo", "openeit", "matrix"]
 SensorName: TypeAlias = Annotated[
     str, typer.Option("--sensor", "-s", help="The sensor's name in the stream.")
 ]

@@ -155,6 +155,7 @@ class ForeignProtocol:
         self._rate_hz = rate_hz
         self._counter = 0
         self._has_begun = self._has_greeted = False
+        self._is_hello_due = True
 
     def feed(self, data: bytes) -> list[Packet]:
         """See `PortProtocol`."""
@@ -163,9 +164,9 @@ class ForeignProtocol:
             self._has_begun = True
             data = self._resume(data, packets)
         for reading in self.parse(data):
-            if not self._has_greeted:
+            if self._is_hello_due:
                 packets.append(self.hello())
-                self._has_greeted = True
+                self._has_greeted, self._is_hello_due = True, False
             packets.append(self._scan(reading))
         return packets
 
@@ -183,8 +184,8 @@ class ForeignProtocol:
         raise NotImplementedError
 
     def restart(self) -> None:
-        """See `PortProtocol`; a subclass forgets what `begun` returns."""
-        raise NotImplementedError
+        """See `PortProtocol`: a hello is due again; a subclass forgets what has begun."""
+        self._is_hello_due = True
 
     def replies(self) -> list[bytes]:
         """See `PortProtocol`."""
@@ -244,7 +245,7 @@ class ForeignProtocol:
             return data
         self._counter, self.device_us = position.counter, position.device_us
         self.clock_format = position.clock_format
-        self._has_greeted = True
+        self._has_greeted, self._is_hello_due = True, False
         packets.append(said[0])
         return rest
 

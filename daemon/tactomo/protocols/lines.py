@@ -79,8 +79,8 @@ class LineProtocol(ForeignProtocol):
 
     def restart(self) -> None:
         """See `PortProtocol`."""
-        self._line.clear()
-        self._is_dropping = True
+        super().restart()
+        self._drop()
 
     def understood(self, volts: NDArray[np.float64]) -> Reading:
         """Return a reading of what fits."""
@@ -110,7 +110,12 @@ class LineProtocol(ForeignProtocol):
         self._line += data
         if len(self._line) > MAX_LINE_BYTES:
             self.counts.oversize += 1
-            self.restart()
+            self._drop()
+
+    def _drop(self) -> None:
+        """Forget the line that has begun, and what is still to come of it."""
+        self._line.clear()
+        self._is_dropping = True
 
 
 def numbers(line: bytes) -> NDArray[np.float64] | None:

@@ -6,5 +6,6 @@ from collections.abc import Mapping
 from typing import Final
 
 from tactomo.twin.foreign import MakeSpeaker
+from tactomo.twin.printing import MatrixBoard, OpenEitBoard
 
-SPEAKERS: Final[Mapping[str, MakeSpeaker]] = {}
+SPEAKERS: Final[Mapping[str, MakeSpeaker]] = {"openeit": OpenEitBoard, "matrix": MatrixBoard}

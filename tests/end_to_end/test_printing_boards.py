@@ -1,0 +1,130 @@
+"""Boards that print their readings, from the emulator's pty through a daemon to a controller."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from daemon_process import SENSOR, DaemonProcess, wait_until
+from tactomo.twin import Twin, TwinConfig
+from tactomo_client import Frame, request, subscribe
+from tactomo_models import load_description
+from tactomo_models.sensors import __path__ as sensors_path
+
+COARSE = "[map]\nnodes_x = 25\nnodes_y = 25\n\n[structure]"
+SINGLE_ENDED = (('"unsigned"', '"signed"'), ('= "pairs"', '= "single_ended"'))
+WAITING = (('# start = "y"', 'start = "y"'),)
+SIXTEENTHS = (("volts_per_unit = 1.0", "volts_per_unit = 0.0625"),)
+
+Start = Callable[..., tuple[Twin, DaemonProcess]]
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Start]:
+    """Start an emulated board and a daemon on it."""
+    running: list[Any] = []
+
+    def start(
+        protocol: str, board: str, sensor: str = "", as_if: str = "", **config: Any
+    ) -> tuple[Twin, DaemonProcess]:
+        twin = Twin(
+            TwinConfig(
+                load_description(board), protocol=protocol, control="tcp://127.0.0.1:0", **config
+            )
+        )
+        running.append(twin.stop)
+        twin.start()
+        daemon = DaemonProcess(
+            tmp_path,
+            twin.ports,
+            protocol=as_if or protocol,
+            description=sensor or board,
+            ready=False,
+        )
+        running.append(daemon.kill)
+        daemon.wait_ready()
+        return twin, daemon
+
+    yield start
+    for stop in reversed(running):
+        stop()
+
+
+def changed(tmp_path: Path, name: str, *changes: tuple[str, str]) -> str:
+    """A shipped description with a coarse map and other changes, as a user would edit it."""
+    text = (Path(sensors_path[0]) / f"{name}.toml").read_text("utf-8")
+    for old, new in (("[structure]", COARSE), *changes):
+        assert old in text
+        text = text.replace(old, new)
+    path = tmp_path / f"{name}.toml"
+    path.write_text(text)
+    return str(path)
+
+
+def tared(daemon: DaemonProcess) -> None:
+    wait_until(lambda: daemon.told("tared"), "a reference")
+
+
+def frame_where(daemon: DaemonProcess, condition: Callable[[Frame], bool]) -> Frame:
+    """The first frame of which something holds, as a controller gets it."""
+    with closing(subscribe(SENSOR, address=daemon.stream, timeout_s=60.0)) as frames:
+        return next(frame for frame in frames if condition(frame))
+
+
+def press(twin: Twin, x_mm: float, y_mm: float, radius_mm: float = 9.0) -> None:
+    request("press", twin.control, x_mm=x_mm, y_mm=y_mm, radius_mm=radius_mm)
+
+
+@pytest.mark.parametrize(
+    ("protocol", "board", "changes"),
+    [
+        ("openeit", "openeit_disc", ()),
+        ("matrix", "matrix_disc", (*WAITING, *SIXTEENTHS)),
+        pytest.param("matrix", "matrix_disc", SINGLE_ENDED, marks=pytest.mark.slow),
+        pytest.param("matrix", "matrix_square", (), marks=pytest.mark.slow),
+    ],
+    ids=["openeit", "matrix", "single-ended", "32 electrodes"],
+)
+def test_a_press_on_an_emulated_board_is_where_it_is(
+    start: Start, tmp_path: Path, protocol: str, board: str, changes: tuple[tuple[str, str], ...]
+) -> None:
+    twin, daemon = start(protocol, changed(tmp_path, board, *changes))
+    tared(daemon)
+    press(twin, 18.0, -14.0)
+    frame = frame_where(daemon, lambda frame: len(frame.contacts) == 1)
+    frame = frame_where(daemon, lambda later: later.sequence > frame.sequence + 5)
+    [contact] = frame.contacts
+    assert math.hypot(contact.x_mm - 18.0, contact.y_mm + 14.0) < 2.0
+    assert not frame.flags
+    [port] = daemon.status()["ports"]
+    assert port["corrupt"] == 0
+
+
+def test_a_board_of_another_kind_is_refused_by_name(start: Start, tmp_path: Path) -> None:
+    board, sensor = changed(tmp_path, "openeit_disc"), changed(tmp_path, "matrix_disc")
+    _, daemon = start("openeit", board, sensor, as_if="matrix")
+    [refusal] = wait_until(lambda: daemon.told("device_refused"), "a refusal")
+    said = "192 numbers a line, as of 16 electrodes (opposite drive)"
+    assert said in refusal["detail"]
+    assert "description" in refusal["next_step"]
+    [port] = daemon.status()["ports"]
+    assert port["state"] == "refused"
+    assert said in port["problem"]
+
+
+def test_it_stands_what_happens_to_a_cable(start: Start, tmp_path: Path) -> None:
+    board = changed(tmp_path, "openeit_disc")
+    twin, daemon = start("openeit", board, link_folder=tmp_path / "links")
+    tared(daemon)
+    request("garbage", twin.control, count=3000)
+    wait_until(lambda: daemon.status()["ports"][0]["corrupt"] > 0, "damage that is counted")
+    request("unplug", twin.control)
+    wait_until(lambda: daemon.told("port_lost"), "a lost port")
+    request("replug", twin.control)
+    wait_until(lambda: daemon.told("port_back"), "the port again")
+    press(twin, -20.0, 10.0)
+    frame_where(daemon, lambda frame: len(frame.contacts) == 1)
