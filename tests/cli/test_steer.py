@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from tactomo.cli.complaints import FLAG_ADVICE
+from tactomo_client.fake import FakeSensor
 from tactomo_models import Flag
 
 Run = Callable[..., Any]
@@ -104,6 +106,26 @@ def test_status_as_json(tactomo: Run, control: Any) -> None:
     control.answers["status"] = STATUS
     result = tactomo("status", "--control", control.address, "--json")
     assert json.loads(result.stdout) == STATUS
+
+
+def test_status_of_one_sensor_is_what_its_stream_tells(tactomo: Run) -> None:
+    stop = threading.Event()
+    with FakeSensor("left_forearm") as fake:
+
+        def publish() -> None:
+            while not stop.wait(0.05):
+                fake.publish_message("status", STATUS)
+
+        thread = threading.Thread(target=publish)
+        thread.start()
+        result = tactomo("status", "-s", "left_forearm", "--stream", fake.address)
+        other = tactomo("status", "-s", "right", "--stream", fake.address)
+        stop.set()
+        thread.join()
+    assert result.returncode == 0, result.stderr
+    assert "left_forearm: running" in result.stdout
+    assert other.returncode == 1
+    assert f"nothing is heard of sensor 'right' at {fake.address}" in other.stderr
 
 
 def test_tare_says_what_the_reference_is_made_of(tactomo: Run, control: Any) -> None:

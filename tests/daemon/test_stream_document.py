@@ -12,6 +12,7 @@ import tactomo
 import tactomo.control
 import tactomo.twin.control
 from tactomo_models import METHODS, Flag, Tier
+from tactomo_models.reconstruct import BAD_MISFIT, UNSURE_MISFIT
 
 DOCUMENT = (Path(__file__).parents[2] / "clients" / "STREAM.md").read_text("utf-8")
 
@@ -59,6 +60,13 @@ def test_every_method_can_be_asked_for_by_its_name() -> None:
     assert made
     assert re.findall(r"`(\S+)`", asked[1]) == list(METHODS)
     assert re.findall(r"`(\S+)`", made[1]) == [tier for tier in Tier if tier is not Tier.AUTO]
+
+
+def test_it_says_from_what_misfit_on_a_frame_is_flagged() -> None:
+    row = re.search(r"^\| `misfit` .*", DOCUMENT, re.M)
+    assert row
+    assert f"above {BAD_MISFIT:g} the frame" in row[0]
+    assert f"above {UNSURE_MISFIT:g} over both" in row[0]
 
 
 def test_every_event_is_listed() -> None:

@@ -65,6 +65,25 @@ def test_one_port_carries_both_channels_of_the_same_instant(bench: Start) -> Non
     assert host.decoders[0].counts.corrupt == 0
 
 
+def test_a_follower_states_no_rate_of_its_own(bench: Start) -> None:
+    """PROTOCOL.md: its pulses come from the leader."""
+    host = bench(ports=2).host()
+    host.wait_for(lambda: host.kind(Hello, 0) and host.kind(Hello, 1))
+    assert host.kind(Hello, 0)[-1].scan_rate_hz > 0
+    assert host.kind(Hello, 1)[-1].scan_rate_hz == 0
+
+
+def test_a_press_off_the_sheet_is_refused_with_its_size(bench: Start) -> None:
+    twin = bench()
+    for x_mm, y_mm in ((100, 0), (0, -1000)):
+        with pytest.raises(ControlError, match=f"x_mm = {x_mm}, y_mm = {y_mm} is off") as caught:
+            twin.ask("press", x_mm=x_mm, y_mm=y_mm)
+        assert caught.value.name == "bad_argument"
+        assert "150 x 150 mm" in str(caught.value)
+    assert twin.ask("scene") == {"presses": []}
+    twin.ask("press", x_mm=85, y_mm=0)  # its rim is still on it
+
+
 def test_two_ports_share_counter_and_stamp(bench: Start) -> None:
     host = bench(ports=2).host()
     host.start()

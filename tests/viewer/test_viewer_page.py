@@ -363,6 +363,15 @@ def test_status_is_shown_part_by_part(page: Page) -> None:
     assert page["reference"].text.startswith("Reference of 20 scans")
     assert page["record"].text == "Stop · 1.5 MB"
     assert page["source"].text == "simulated skin"
+    assert page["recorder-waits"].text == ""
+
+
+def test_a_recording_that_waits_says_why(page: Page) -> None:
+    page.skin.status |= {"recording": None, "recorder": {"waits_for": "the disk is full"}}
+    page.open()
+    wait_for(lambda: page["recorder-waits"].text == "Recording waits: the disk is full.")
+    page.skin.status |= {"recorder": {"waits_for": None}}
+    wait_for(lambda: page["recorder-waits"].text == "")
 
 
 def test_foreign_text_stays_text(page: Page) -> None:

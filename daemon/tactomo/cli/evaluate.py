@@ -76,6 +76,9 @@ def scenes(
     that the reconstruction is not told, and noise of equal size in volts on every voltage. They
     are simulated on another, finer mesh than the one that reconstructs. The first run simulates
     (half a second a scene) and keeps the voltages in the cache.
+
+    A frame whose *misfit*, in units of the scans' noise, is above 2 (1.5 over both channels, for
+    *hybrid*) is flagged misfit_high; about 1 is good.
     """
     from tactomo_models import load_description
     from tactomo_models.evaluation import scenes as draw_scenes

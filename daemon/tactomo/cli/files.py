@@ -304,6 +304,9 @@ def reconstruct(
     Frames follow one another, as in a stream: each one starts from what the last one found. Give
     scenes that have nothing to do with each other in files of their own.
 
+    `misfit` is what the model left unexplained, in units of the scans' noise: about 1 is good, and
+    above 2 (1.5 over both channels, for *hybrid*) the frame is flagged.
+
     `flags` adds up what stands in the way of trusting a frame: 1 structure missing, 2 magnitude
     missing, 4 invalid voltage, 8 no reference, 16 misfit high, 32 not converged, 64 reference
     mismatch, 128 electrode fault, 256 noise high, 512 channels swapped, 1024 saturated,

@@ -11,16 +11,19 @@ import typer
 
 from tactomo.cli.app import (
     DEFAULT_CONTROL,
+    DEFAULT_STREAM,
     DEFAULT_TWIN_CONTROL,
     STEER,
     ControlAddress,
     JsonOutput,
     KeysFolder,
     Method,
+    StreamAddress,
     app,
     examples,
 )
 from tactomo.cli.complaints import complaints
+from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -30,9 +33,23 @@ TARE_TIMEOUT_S = 30.0
 
 @app.command(
     rich_help_panel=STEER,
-    epilog=examples("tactomo status", "tactomo status --json | jq .latency_ms"),
+    epilog=examples(
+        "tactomo status",
+        "tactomo status -s left_forearm",
+        "tactomo status -s left_forearm --stream tcp://127.0.0.1:5570",
+        "tactomo status --json | jq .latency_ms",
+    ),
 )
 def status(
+    sensor: Annotated[
+        str | None,
+        typer.Option(
+            "--sensor",
+            "-s",
+            help="Of this sensor, by its stream; so through a proxy, too. [by the control socket]",
+        ),
+    ] = None,
+    stream: StreamAddress = DEFAULT_STREAM,
     control: ControlAddress = DEFAULT_CONTROL,
     keys: KeysFolder = None,
     as_json: JsonOutput = False,
@@ -44,7 +61,9 @@ def status(
     """
     from tactomo_client import request
 
-    answer = request("status", control, keys=keys)
+    answer = request("status", control, keys=keys) if sensor is None else None
+    if answer is None:
+        answer = _heard_status(str(sensor), stream, keys)
     if as_json:
         typer.echo(json.dumps(answer, indent=2, default=str))
         return
@@ -187,6 +206,28 @@ def poke(
         typer.echo(json.dumps(answer, indent=2))
 
 
+def _heard_status(sensor: str, stream: str, keys: Path | None) -> dict[str, Any]:
+    """Return the status that a sensor's stream tells, every second and to each newcomer."""
+    from tactomo_client.keys import as_keys
+
+    from tactomo.cli.watch import GONE_S, View
+
+    view = View(sensor, stream, as_keys(keys))
+    try:
+        end_s = time.monotonic() + GONE_S
+        while not view.status and time.monotonic() < end_s:
+            view.update(0.1)
+        if view.status:
+            return view.status
+    finally:
+        view.close()
+    raise TactomoError(
+        f"nothing is heard of sensor {sensor!r} at {stream}",
+        "is its daemon running under this name? `tactomo status` without -s asks the one whose "
+        "control socket is at --control",
+    )
+
+
 def status_table(status: dict[str, Any]) -> Table:
     """Return a status message as a table for people; what it does not know shows as "-"."""
     from rich.table import Table
@@ -222,7 +263,10 @@ def _status_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
         ("tier", f"{status.get('tier') or '-'} (asked for: {status.get('tier_requested')})"),
         ("budget", _budget(status.get("budget_ms"), status.get("plan") or {})),
         ("flags", ", ".join(status.get("flags", [])) or "none"),
-        ("misfit", _number(status.get("misfit"))),
+        (
+            "misfit",
+            f"{_number(status.get('misfit'))} (1: explained to the noise; above 2: flagged)",
+        ),
         (
             "lost",
             f"{status.get('dropped_scans', 0)} dual scans dropped, "

@@ -369,8 +369,22 @@ class Twin:
         }
 
     def _press(self, arguments: PressArguments) -> dict[str, Any]:
+        self._check_touches(arguments)
         self._surface.press(arguments.id, arguments)
         return {}
+
+    def _check_touches(self, arguments: PressArguments) -> None:
+        """Refuse a press that lies off the sheet altogether: a slip, and nothing would tell."""
+        press, sensor = arguments.press(), self.config.description
+        reach_m = max(press.radius_m, press.radius_y_m or 0.0)
+        if not sensor.on_sheet(np.array(press.x_m), np.array(press.y_m), -reach_m):
+            round_ = sensor.sheet.shape == "disc"
+            raise CommandError(
+                f"x_mm = {arguments.x_mm:g}, y_mm = {arguments.y_mm:g} is off the sheet",
+                f"{sensor.name} is {'round, ' if round_ else ''}{1e3 * sensor.width_m:g} x "
+                f"{1e3 * sensor.height_m:g} mm, and 0, 0 is its middle",
+                name="bad_argument",
+            )
 
     def _release(self, arguments: ReleaseArguments) -> dict[str, Any]:
         return {"released": self._surface.release(arguments.id)}

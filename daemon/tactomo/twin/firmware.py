@@ -232,5 +232,6 @@ class Firmware:
             samples_per_scan=self.identity.measurements,
             sample_format=SampleFormat.INT32,
             volts_per_count=self._converter.volts_per_count,
-            scan_rate_hz=self.rate_hz,
+            # A follower's pulses come from the leader.
+            scan_rate_hz=self.rate_hz if port is self.ports[0] else 0.0,
         )

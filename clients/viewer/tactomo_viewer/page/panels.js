@@ -79,7 +79,7 @@ export function showStatus(status) {
   setText(byId("source"), SOURCES[source?.kind] ?? "");
   showStages(status.stage_ms ?? {});
   showChannels(status);
-  const { reference, recording } = status;
+  const { reference, recording, recorder } = status;
   setText(byId("reference"), reference
     ? `Reference of ${reference.scans} scans, taken ${clock(reference.taken_realtime_ns)}.`
     : "No reference yet.");
@@ -87,6 +87,9 @@ export function showStatus(status) {
   record.setAttribute("aria-pressed", String(Boolean(recording)));
   setText(record, recording ? `Stop · ${bytes(recording.bytes)}` : "Record");
   record.title = recording ? recording.path : "Record what the ports say to a file";
+  const waits = byId("recorder-waits");
+  waits.hidden = !recorder?.waits_for;
+  setText(waits, waits.hidden ? "" : `Recording waits: ${recorder.waits_for}.`);
   const choice = byId("tier-choice");
   if (document.activeElement !== choice && status.tier_requested) choice.value = status.tier_requested;
 }
