@@ -1,0 +1,491 @@
+// From the bytes of a `map` or `contacts` message to a Frame, by clients/STREAM.md.
+//
+// msgpack's parser runs over the bytes once and lays the values out on a tape; the fields are then
+// read from the tape by name. Tape, buffer and frame keep their storage from message to message, so
+// that nothing is allocated once they are large enough. Whatever the bytes, the outcome is a frame
+// or the reason why it is none.
+#pragma once
+
+// Recent headers of msgpack want Boost, unless they are told to do without.
+#if !defined(MSGPACK_NO_BOOST) && !defined(MSGPACK_USE_BOOST) && \
+    !__has_include(<boost/predef/other/endian.h>)
+#define MSGPACK_NO_BOOST
+#endif
+#include <msgpack.hpp>
+
+#include <algorithm>
+#include <array>
+#include <chrono>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <fstream>
+#include <limits>
+#include <optional>
+#include <string>
+#include <string_view>
+#include <vector>
+
+#include "error.hpp"
+#include "frame.hpp"
+
+namespace tactomo {
+
+inline constexpr int schema = 1;
+
+enum class Kind {
+    contacts,  ///< some hundred bytes a frame
+    map,       ///< images, too: some 30 kB
+};
+
+/// What to subscribe to; the closing NUL belongs to it.
+inline std::string topic(std::string_view sensor, Kind kind) {
+    return std::string(sensor) + (kind == Kind::map ? "/map" : "/contacts") + '\0';
+}
+
+namespace detail {
+
+/// Checks what STREAM.md allows for a sensor's name, and returns it.
+inline std::string sensor_name(std::string name) {
+    const auto is_alphanumeric = [](char c) {
+        return (c >= '0' && c <= '9') || (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z');
+    };
+    const bool fits = !name.empty() && name.size() <= 64 && is_alphanumeric(name.front()) &&
+                      std::all_of(name.begin(), name.end(), [&](char c) {
+                          return is_alphanumeric(c) || c == '_' || c == '.' || c == '-';
+                      });
+    if (fits) return name;
+    throw MessageError("'" + name + "' is not a sensor name",
+                       "use 1 to 64 letters, digits, '_', '-' or '.', starting with a letter or digit");
+}
+
+inline constexpr std::size_t max_message_bytes = 16 * 1024 * 1024;
+inline constexpr std::uint32_t max_entries = 4096;
+inline constexpr std::size_t max_depth = 16;
+inline constexpr std::uint64_t max_array_values = 1024 * 1024;
+inline constexpr std::size_t max_tokens = 256 * 1024;
+
+struct Token {
+    enum Type : std::uint8_t { nil, boolean, negative, positive, number, text, binary, list, map, other };
+
+    Type type = nil;
+    std::uint32_t size = 0;  // bytes of text and binary, entries of list and map
+    std::uint32_t next = 0;  // the token after this one and all that is in it
+    union {
+        std::int64_t signed_value = 0;
+        std::uint64_t unsigned_value;
+        double real;
+        const char* bytes;  // in the parser's buffer
+    };
+
+    bool is_text(std::string_view expected) const noexcept {
+        return type == text && view() == expected;
+    }
+    std::string_view view() const noexcept { return {bytes, size}; }
+};
+
+inline bool is_utf8(const char* text, std::size_t size) noexcept {
+    const auto* at = reinterpret_cast<const unsigned char*>(text);
+    const auto* const end = at + size;
+    while (at != end) {
+        const unsigned char first = *at++;
+        if (first < 0x80) continue;
+        const int more = first >= 0xF0 ? 3 : first >= 0xE0 ? 2 : 1;
+        if (first < 0xC2 || first > 0xF4 || end - at < more) return false;
+        // Overlong forms, surrogates, and what is beyond U+10FFFF.
+        const unsigned char low = first == 0xE0 ? 0xA0 : first == 0xF0 ? 0x90 : 0x80;
+        const unsigned char high = first == 0xED ? 0x9F : first == 0xF4 ? 0x8F : 0xBF;
+        if (*at < low || *at > high) return false;
+        for (int i = 1; i < more; ++i) {
+            if ((at[i] & 0xC0) != 0x80) return false;
+        }
+        at += more;
+    }
+    return true;
+}
+
+/// The values of one message in the order in which they stand there, as msgpack's parser visits them.
+class Tape : public msgpack::null_visitor {
+public:
+    const Token& operator[](std::size_t index) const noexcept { return tokens_[index]; }
+    void reserve(std::size_t tokens) { tokens_.reserve(tokens); }
+
+    // From here on: what the parser calls. False ends the parsing.
+    void init() noexcept {
+        tokens_.clear();
+        depth_ = 0;
+        expects_key_ = false;
+    }
+    bool visit_nil() { return put({}); }
+    bool visit_boolean(bool) { return put(token(Token::boolean)); }
+    bool visit_positive_integer(std::uint64_t value) {
+        Token made = token(Token::positive);
+        made.unsigned_value = value;
+        return put(made);
+    }
+    bool visit_negative_integer(std::int64_t value) {
+        // The signed encodings come here whatever their sign.
+        if (value >= 0) return visit_positive_integer(static_cast<std::uint64_t>(value));
+        Token made = token(Token::negative);
+        made.signed_value = value;
+        return put(made);
+    }
+    bool visit_float32(float value) { return visit_float64(static_cast<double>(value)); }
+    bool visit_float64(double value) {
+        Token made = token(Token::number);
+        made.real = value;
+        return put(made);
+    }
+    bool visit_str(const char* bytes, std::uint32_t size) {
+        expects_key_ = false;
+        return is_utf8(bytes, size) && put(bytes_token(Token::text, bytes, size));
+    }
+    bool visit_bin(const char* bytes, std::uint32_t size) {
+        return put(bytes_token(Token::binary, bytes, size));
+    }
+    bool visit_ext(const char*, std::uint32_t) { return put(token(Token::other)); }
+    bool start_array(std::uint32_t entries) { return open(Token::list, entries); }
+    bool start_map(std::uint32_t entries) { return open(Token::map, entries); }
+    bool end_array() noexcept { return close(); }
+    bool end_map() noexcept { return close(); }
+    bool start_map_key() noexcept { return expects_key_ = true; }
+
+private:
+    static Token token(Token::Type type) noexcept {
+        Token made;
+        made.type = type;
+        return made;
+    }
+    static Token bytes_token(Token::Type type, const char* bytes, std::uint32_t size) noexcept {
+        Token made = token(type);
+        made.size = size;
+        made.bytes = bytes;
+        return made;
+    }
+    bool put(Token made) {
+        if (expects_key_ || tokens_.size() >= max_tokens) return false;
+        made.next = static_cast<std::uint32_t>(tokens_.size() + 1);
+        tokens_.push_back(made);
+        return true;
+    }
+    bool open(Token::Type type, std::uint32_t entries) {
+        if (entries > max_entries || depth_ == max_depth) return false;
+        open_[depth_++] = tokens_.size();
+        Token made = token(type);
+        made.size = entries;
+        return put(made);
+    }
+    bool close() noexcept {
+        tokens_[open_[--depth_]].next = static_cast<std::uint32_t>(tokens_.size());
+        return true;
+    }
+
+    std::vector<Token> tokens_;
+    std::array<std::size_t, max_depth> open_{};
+    std::size_t depth_ = 0;
+    bool expects_key_ = false;
+};
+
+/// msgpack's parser would tell this that it hands out a buffer; ours never gives one away.
+struct KeepBuffer {
+    void operator()(char*) const noexcept {}
+};
+inline KeepBuffer keep_buffer;
+
+class Parser : public msgpack::parser<Parser, KeepBuffer> {
+public:
+    Parser() : msgpack::parser<Parser, KeepBuffer>(keep_buffer) {}
+
+    /// The body's values, or nullptr where it is not one whole MessagePack value within the limits.
+    const Tape* parse(std::string_view body) {
+        skip_nonparsed_buffer(nonparsed_size());
+        reset();
+        reserve_buffer(body.size());
+        std::memcpy(buffer(), body.data(), body.size());
+        buffer_consumed(body.size());
+        return next() && nonparsed_size() == 0 ? &tape_ : nullptr;
+    }
+
+    Tape& visitor() noexcept { return tape_; }
+    bool referenced() const noexcept { return false; }
+    void set_referenced(bool) noexcept {}
+
+private:
+    Tape tape_;
+};
+
+/// What may stand in a field's place.
+enum class Allow { value, nil, absence };
+
+/// Reads a map's fields by name. The first one that is wrong is noted, and reading goes on.
+class Fields {
+public:
+    /// `problem` gets the name of the first field that is wrong.
+    Fields(const Tape& tape, std::size_t index, std::string_view& problem) noexcept
+        : tape_(tape), index_(index), problem_(problem) {
+        if (tape_[index].type != Token::map) fail("not a map");
+    }
+
+    std::int64_t integer(std::string_view name) noexcept {
+        return integer(name, Allow::value).value_or(0);
+    }
+    std::optional<std::int64_t> integer(std::string_view name, Allow allow) noexcept {
+        const Token* const token = value(name, allow);
+        if (token == nullptr) return {};
+        if (token->type == Token::negative) return token->signed_value;
+        constexpr auto top = static_cast<std::uint64_t>(std::numeric_limits<std::int64_t>::max());
+        if (token->type == Token::positive && token->unsigned_value <= top) {
+            return static_cast<std::int64_t>(token->unsigned_value);
+        }
+        fail(name);
+        return {};
+    }
+    std::uint64_t counter(std::string_view name) noexcept {
+        const Token* const token = value(name, Token::positive);
+        return token == nullptr ? 0 : token->unsigned_value;
+    }
+    double number(std::string_view name) noexcept { return number(name, Allow::value).value_or(0); }
+    std::optional<double> number(std::string_view name, Allow allow) noexcept {
+        const Token* const token = value(name, allow);
+        if (token == nullptr) return {};
+        const std::optional<double> read = as_number(*token);
+        if (!read) fail(name);
+        return read;
+    }
+    std::string_view text(std::string_view name, Allow allow = Allow::value) noexcept {
+        const Token* const token = value(name, allow);
+        if (token == nullptr) return {};
+        if (token->type != Token::text) fail(name);
+        return token->type == Token::text ? token->view() : std::string_view();
+    }
+    /// Calls `each` with the index of every entry of a list.
+    template <typename Each>
+    void list(std::string_view name, const Each& each) {
+        const Token* const token = value(name, Token::list);
+        if (token == nullptr) return;
+        std::size_t at = *find(name) + 1;
+        for (std::uint32_t entry = 0; entry < token->size; ++entry, at = tape_[at].next) each(at);
+    }
+    /// Two positions, [first, last].
+    std::array<double, 2> extent(std::string_view name) noexcept {
+        std::array<double, 2> ends{};
+        const Token* const token = value(name, Token::list);
+        if (token == nullptr || token->size != 2) {
+            fail(name);
+            return ends;
+        }
+        for (std::size_t end = 0; end < 2; ++end) {
+            const std::optional<double> read = as_number(token[1 + end]);
+            if (!read) fail(name);
+            ends[end] = read.value_or(0);
+        }
+        return ends;
+    }
+    /// A two-dimensional array of float32; cleared where there is none.
+    void image(std::string_view name, Image& into) {
+        into.clear();
+        if (value(name, Allow::absence) == nullptr) return;
+        Fields array(tape_, *find(name), problem_);
+        const Token* const shape = array.value("shape", Token::list);
+        const Token* const data = array.value("data", Token::binary);
+        if (array.text("dtype") != "<f4") fail(name);
+        if (shape == nullptr || data == nullptr || shape->size != 2) return fail(name);
+        const std::uint64_t rows = length(shape[1]);
+        const std::uint64_t columns = length(shape[2]);
+        if (rows > max_array_values || columns > max_array_values) return fail(name);
+        const std::uint64_t values = rows * columns;
+        if (values > max_array_values || data->size != values * sizeof(float)) return fail(name);
+        copy_floats(*data, into.reshape(rows, columns));
+    }
+
+    void fail(std::string_view problem) noexcept {
+        if (problem_.empty()) problem_ = problem;
+    }
+
+private:
+    /// The field's value; nullptr where it is nil or absent, which is a failure unless allowed.
+    const Token* value(std::string_view name, Allow allow) noexcept {
+        const std::optional<std::size_t> found = find(name);
+        const bool is_nil = found && tape_[*found].type == Token::nil;
+        if (found && !is_nil) return &tape_[*found];
+        if (allow == Allow::value || (allow == Allow::nil && !is_nil)) fail(name);
+        return nullptr;
+    }
+    /// The field's value, which has to be of this type; nullptr where it is not.
+    const Token* value(std::string_view name, Token::Type type) noexcept {
+        const Token* const token = value(name, Allow::value);
+        if (token != nullptr && token->type == type) return token;
+        fail(name);
+        return nullptr;
+    }
+    /// Index of a field's value. Of two of a name, the last one counts.
+    std::optional<std::size_t> find(std::string_view name) const noexcept {
+        std::optional<std::size_t> found;
+        if (tape_[index_].type != Token::map) return found;
+        std::size_t at = index_ + 1;
+        for (std::uint32_t entry = 0; entry < tape_[index_].size; ++entry) {
+            if (tape_[at].view() == name) found = at + 1;
+            at = tape_[at + 1].next;
+        }
+        return found;
+    }
+    static std::optional<double> as_number(const Token& token) noexcept {
+        if (token.type == Token::positive) return static_cast<double>(token.unsigned_value);
+        if (token.type == Token::negative) return static_cast<double>(token.signed_value);
+        if (token.type == Token::number && std::isfinite(token.real)) return token.real;
+        return {};
+    }
+    static std::uint64_t length(const Token& token) noexcept {
+        return token.type == Token::positive ? token.unsigned_value : max_array_values + 1;
+    }
+    /// Little-endian, and at any address, into floats of this computer's.
+    static void copy_floats(const Token& data, float* into) noexcept {
+        const auto* bytes = reinterpret_cast<const unsigned char*>(data.bytes);
+        for (std::uint32_t at = 0; at < data.size; at += 4, ++into) {
+            const std::uint32_t bits = std::uint32_t{bytes[at]} | std::uint32_t{bytes[at + 1]} << 8 |
+                                       std::uint32_t{bytes[at + 2]} << 16 |
+                                       std::uint32_t{bytes[at + 3]} << 24;
+            std::memcpy(into, &bits, sizeof bits);
+        }
+    }
+
+    const Tape& tape_;
+    std::size_t index_;
+    std::string_view& problem_;
+};
+
+/// Identity of this computer's monotonic clock, empty where it has none.
+inline std::string clock_id() {
+    std::ifstream file("/proc/sys/kernel/random/boot_id");
+    std::string id;
+    file >> id;
+    return id;
+}
+
+inline PressureRange pressure_range(std::string_view name) noexcept {
+    if (name == "within") return PressureRange::within;
+    if (name == "below") return PressureRange::below;
+    if (name == "above") return PressureRange::above;
+    return PressureRange::unknown;
+}
+
+inline Contact contact(Fields& fields) noexcept {
+    Contact read;
+    read.id = fields.integer("id");
+    read.x_mm = fields.number("x_mm");
+    read.y_mm = fields.number("y_mm");
+    read.area_mm2 = fields.number("area_mm2");
+    read.magnitude = fields.number("magnitude", Allow::absence);
+    read.magnitude_sigma = fields.number("magnitude_sigma", Allow::absence);
+    read.pressure_kpa = fields.number("pressure_kpa", Allow::absence);
+    read.pressure_sigma_kpa = fields.number("pressure_sigma_kpa", Allow::absence);
+    read.force_n = fields.number("force_n", Allow::absence);
+    read.force_sigma_n = fields.number("force_sigma_n", Allow::absence);
+    read.x_sigma_mm = fields.number("x_sigma_mm", Allow::absence);
+    read.y_sigma_mm = fields.number("y_sigma_mm", Allow::absence);
+    read.area_sigma_mm2 = fields.number("area_sigma_mm2", Allow::absence);
+    read.pressure_range = pressure_range(fields.text("pressure_range", Allow::absence));
+    return read;
+}
+
+/// Decodes the messages of one topic.
+class Decoder {
+public:
+    Decoder(std::string_view sensor, Kind kind, std::size_t max_contacts)
+        : topic_(topic(sensor, kind)), kind_(kind), clock_id_(clock_id()) {
+        constexpr std::size_t envelope_tokens = 256;
+        constexpr std::size_t contact_tokens = 64;
+        parser_.visitor().reserve(envelope_tokens + contact_tokens * max_contacts);
+        parser_.reserve_buffer(64 * 1024);
+    }
+
+    /// Reads a message that came at `received` into `frame`. Empty if that went well; otherwise the
+    /// field that is missing or wrong, or the rule that was broken, and the frame is of no use.
+    std::string_view decode(std::string_view message, std::chrono::steady_clock::time_point received,
+                            Frame& frame) {
+        if (message.size() > max_message_bytes) return "larger than 16 MiB";
+        if (message.substr(0, topic_.size()) != topic_) return "topic";
+        const Tape* const tape = parser_.parse(message.substr(topic_.size()));
+        if (tape == nullptr) return "not MessagePack, or beyond the limits";
+        std::string_view problem;
+        Fields fields(*tape, 0, problem);
+        if (fields.counter("schema") != schema) return "schema";
+        read_envelope(fields, received, frame);
+        read_flags(*tape, fields, frame);
+        read_contacts(*tape, fields, problem, frame);
+        if (kind_ == Kind::map) read_images(fields, frame);
+        return problem;
+    }
+
+private:
+    void read_envelope(Fields& fields, std::chrono::steady_clock::time_point received,
+                       Frame& frame) const noexcept {
+        frame.sensor = fields.text("sensor");
+        if (topic_.compare(0, topic_.find('/'), fields.text("sensor")) != 0) fields.fail("sensor");
+        if (fields.text("kind") != (kind_ == Kind::map ? "map" : "contacts")) fields.fail("kind");
+        frame.session = fields.text("session");
+        frame.sequence = fields.counter("sequence");
+        frame.scan_counter = fields.integer("scan_counter");
+        frame.acquired_realtime_ns = fields.integer("acquired_realtime_ns");
+        frame.acquired_monotonic_ns = fields.integer("acquired_monotonic_ns");
+        frame.device_us = fields.integer("device_us", Allow::nil);
+        frame.delay_ns = fields.integer("delay_ns", Allow::absence);
+        frame.dated_by = fields.text("dated_by", Allow::absence);
+        frame.skew_ms = fields.number("skew_ms", Allow::absence);
+        frame.tier = fields.text("tier", Allow::nil);
+        frame.tier_reason = fields.text("tier_reason", Allow::nil);
+        frame.misfit = fields.number("misfit", Allow::nil);
+        frame.confidence = fields.number("confidence", Allow::absence);
+        frame.received = received;
+        frame.age_at_receipt = age(fields, frame.acquired_monotonic_ns, received);
+    }
+    /// Exact where publisher and subscriber read the same clock; otherwise the age at publication,
+    /// which leaves out the time that the message was on its way.
+    std::chrono::nanoseconds age(Fields& fields, std::int64_t acquired_ns,
+                                 std::chrono::steady_clock::time_point received) const noexcept {
+        const std::int64_t at_publication_ns = fields.integer("age_ns", Allow::nil).value_or(0);
+        const bool same_clock =
+            !clock_id_.empty() && fields.text("clock_id", Allow::absence) == clock_id_;
+        // On Linux, which alone has such an identity, steady_clock is CLOCK_MONOTONIC.
+        const std::int64_t received_ns =
+            std::chrono::duration_cast<std::chrono::nanoseconds>(received.time_since_epoch()).count();
+        const bool is_past = acquired_ns <= received_ns;
+        // Halved, so that no clock can be so wrong that ages overflow.
+        constexpr std::int64_t limit_ns = std::numeric_limits<std::int64_t>::max() / 2;
+        const std::int64_t oldest_ns = received_ns - limit_ns;
+        const std::int64_t exact_ns =
+            is_past ? received_ns - std::max(acquired_ns, oldest_ns) : std::int64_t{0};
+        const std::int64_t ns = same_clock ? exact_ns : std::max<std::int64_t>(0, at_publication_ns);
+        return std::chrono::nanoseconds(std::min(ns, limit_ns));
+    }
+    static void read_flags(const Tape& tape, Fields& fields, Frame& frame) {
+        frame.flags.clear();
+        fields.list("flags", [&](std::size_t at) {
+            if (tape[at].type != Token::text) return fields.fail("flags");
+            frame.flags.emplace_back() = tape[at].view();
+        });
+    }
+    static void read_contacts(const Tape& tape, Fields& fields, std::string_view& problem,
+                              Frame& frame) {
+        frame.contacts.clear();
+        fields.list("contacts", [&](std::size_t at) {
+            Fields entry(tape, at, problem);
+            frame.contacts.push_back(contact(entry));
+        });
+    }
+    static void read_images(Fields& fields, Frame& frame) {
+        fields.image("map", frame.map);
+        fields.image("pressure_kpa", frame.pressure_kpa);
+        fields.image("structure", frame.structure);
+        frame.x_mm = fields.extent("x_mm");
+        frame.y_mm = fields.extent("y_mm");
+    }
+
+    std::string topic_;
+    Kind kind_;
+    std::string clock_id_;
+    Parser parser_;
+};
+
+}  // namespace detail
+}  // namespace tactomo
