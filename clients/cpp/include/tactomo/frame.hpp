@@ -113,7 +113,7 @@ struct Frame {
     std::optional<std::int64_t> delay_ns;    ///< from then until the daemon had read its last byte
     Text<16> dated_by;  ///< "device": what buffers held up is in its age; "arrival": it is not
     std::optional<double> skew_ms;           ///< the magnitude scan's time less the structure scan's
-    Text<32> tier;                           ///< how much model it was given; empty: none
+    Text<48> tier;                           ///< how much model it was given; empty: none
     Text<255> tier_reason;
     std::vector<Text<48>> flags;  ///< what to be wary of; empty when all is well
     std::optional<double> misfit;  ///< what the model left unexplained, in units of the noise

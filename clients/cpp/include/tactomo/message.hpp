@@ -214,8 +214,8 @@ private:
     Tape tape_;
 };
 
-/// What may stand in a field's place.
-enum class Allow { value, nil, absence };
+/// What may stand in place of a field's value.
+enum class Allow : unsigned { nothing = 0, nil = 1, absence = 2, both = 3 };
 
 /// Reads a map's fields by name. The first one that is wrong is noted, and reading goes on.
 class Fields {
@@ -227,7 +227,7 @@ public:
     }
 
     std::int64_t integer(std::string_view name) noexcept {
-        return integer(name, Allow::value).value_or(0);
+        return integer(name, Allow::nothing).value_or(0);
     }
     std::optional<std::int64_t> integer(std::string_view name, Allow allow) noexcept {
         const Token* const token = value(name, allow);
@@ -244,7 +244,7 @@ public:
         const Token* const token = value(name, Token::positive);
         return token == nullptr ? 0 : token->unsigned_value;
     }
-    double number(std::string_view name) noexcept { return number(name, Allow::value).value_or(0); }
+    double number(std::string_view name) noexcept { return number(name, Allow::nothing).value_or(0); }
     std::optional<double> number(std::string_view name, Allow allow) noexcept {
         const Token* const token = value(name, allow);
         if (token == nullptr) return {};
@@ -252,7 +252,7 @@ public:
         if (!read) fail(name);
         return read;
     }
-    std::string_view text(std::string_view name, Allow allow = Allow::value) noexcept {
+    std::string_view text(std::string_view name, Allow allow = Allow::nothing) noexcept {
         const Token* const token = value(name, allow);
         if (token == nullptr) return {};
         if (token->type != Token::text) fail(name);
@@ -284,7 +284,7 @@ public:
     /// A two-dimensional array of float32; cleared where there is none.
     void image(std::string_view name, Image& into) {
         into.clear();
-        if (value(name, Allow::absence) == nullptr) return;
+        if (value(name, Allow::both) == nullptr) return;
         Fields array(tape_, *find(name), problem_);
         const Token* const shape = array.value("shape", Token::list);
         const Token* const data = array.value("data", Token::binary);
@@ -308,12 +308,13 @@ private:
         const std::optional<std::size_t> found = find(name);
         const bool is_nil = found && tape_[*found].type == Token::nil;
         if (found && !is_nil) return &tape_[*found];
-        if (allow == Allow::value || (allow == Allow::nil && !is_nil)) fail(name);
+        const Allow needed = is_nil ? Allow::nil : Allow::absence;
+        if ((static_cast<unsigned>(allow) & static_cast<unsigned>(needed)) == 0) fail(name);
         return nullptr;
     }
     /// The field's value, which has to be of this type; nullptr where it is not.
     const Token* value(std::string_view name, Token::Type type) noexcept {
-        const Token* const token = value(name, Allow::value);
+        const Token* const token = value(name, Allow::nothing);
         if (token != nullptr && token->type == type) return token;
         fail(name);
         return nullptr;
@@ -375,15 +376,15 @@ inline Contact contact(Fields& fields) noexcept {
     read.x_mm = fields.number("x_mm");
     read.y_mm = fields.number("y_mm");
     read.area_mm2 = fields.number("area_mm2");
-    read.magnitude = fields.number("magnitude", Allow::absence);
-    read.magnitude_sigma = fields.number("magnitude_sigma", Allow::absence);
-    read.pressure_kpa = fields.number("pressure_kpa", Allow::absence);
-    read.pressure_sigma_kpa = fields.number("pressure_sigma_kpa", Allow::absence);
-    read.force_n = fields.number("force_n", Allow::absence);
-    read.force_sigma_n = fields.number("force_sigma_n", Allow::absence);
-    read.x_sigma_mm = fields.number("x_sigma_mm", Allow::absence);
-    read.y_sigma_mm = fields.number("y_sigma_mm", Allow::absence);
-    read.area_sigma_mm2 = fields.number("area_sigma_mm2", Allow::absence);
+    read.magnitude = fields.number("magnitude", Allow::both);
+    read.magnitude_sigma = fields.number("magnitude_sigma", Allow::both);
+    read.pressure_kpa = fields.number("pressure_kpa", Allow::both);
+    read.pressure_sigma_kpa = fields.number("pressure_sigma_kpa", Allow::both);
+    read.force_n = fields.number("force_n", Allow::both);
+    read.force_sigma_n = fields.number("force_sigma_n", Allow::both);
+    read.x_sigma_mm = fields.number("x_sigma_mm", Allow::both);
+    read.y_sigma_mm = fields.number("y_sigma_mm", Allow::both);
+    read.area_sigma_mm2 = fields.number("area_sigma_mm2", Allow::both);
     read.pressure_range = pressure_range(fields.text("pressure_range", Allow::absence));
     return read;
 }
@@ -429,13 +430,13 @@ private:
         frame.acquired_realtime_ns = fields.integer("acquired_realtime_ns");
         frame.acquired_monotonic_ns = fields.integer("acquired_monotonic_ns");
         frame.device_us = fields.integer("device_us", Allow::nil);
-        frame.delay_ns = fields.integer("delay_ns", Allow::absence);
-        frame.dated_by = fields.text("dated_by", Allow::absence);
-        frame.skew_ms = fields.number("skew_ms", Allow::absence);
+        frame.delay_ns = fields.integer("delay_ns", Allow::both);
+        frame.dated_by = fields.text("dated_by", Allow::both);
+        frame.skew_ms = fields.number("skew_ms", Allow::both);
         frame.tier = fields.text("tier", Allow::nil);
         frame.tier_reason = fields.text("tier_reason", Allow::nil);
         frame.misfit = fields.number("misfit", Allow::nil);
-        frame.confidence = fields.number("confidence", Allow::absence);
+        frame.confidence = fields.number("confidence", Allow::both);
         frame.received = received;
         frame.age_at_receipt = age(fields, frame.acquired_monotonic_ns, received);
     }

@@ -1,0 +1,484 @@
+"""The C++ client, built as its users build it, beside the Python one on the same messages."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import random
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import msgpack  # type: ignore[import-untyped]
+import numpy as np
+import pytest
+from cpp_client import (
+    SANITIZED,
+    Watch,
+    can_sanitize,
+    compile_probe,
+    decode,
+    need_headers,
+    run,
+)
+from daemon_process import SENSOR, DaemonProcess, wait_until
+from fuzz_targets import CONTACT, HEADER
+from tactomo import keys as key_files
+from tactomo_client import ClientError, Contact, Frame, request, subscribe
+from tactomo_client.fake import FakeSensor
+from tactomo_client.frame import frame_from_message
+from tactomo_client.messages import CONTACTS, MAP, decode_message, encode_message
+
+PATIENCE_S = 60.0
+
+pytestmark = pytest.mark.timeout(400)  # compilers are slow where others work, too
+IMAGES = ("map", "pressure_kpa", "structure")
+ANYWHERE = "tcp://127.0.0.1:0"
+
+
+@pytest.fixture(scope="session")
+def programs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """`probe` as it is, and `checked` with sanitizers where there are some; built side by side."""
+    need_headers()
+    folder = tmp_path_factory.mktemp("cpp")
+    clang = "clang++" if shutil.which("clang++") else "c++"
+    flags = SANITIZED if can_sanitize(folder, clang) else "-O1"
+    with ThreadPoolExecutor() as both:
+        checked = both.submit(compile_probe, folder, clang, f"{flags} -DMSGPACK_NO_BOOST")
+        plain = folder / "plain"
+        plain.mkdir()
+        probe = both.submit(compile_probe, plain, "c++", "-O1")
+        return {"probe": probe.result(), "checked": checked.result()}
+
+
+@pytest.fixture
+def probe(programs: dict[str, Path]) -> Path:
+    return programs["probe"]
+
+
+@pytest.fixture
+def checked(programs: dict[str, Path]) -> Path:
+    return programs["checked"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Twin:
+    """A running `tactomo twin`."""
+
+    ports: list[str]
+    control: str
+
+
+@pytest.fixture(scope="module")
+def twin() -> Iterator[Twin]:
+    command = ["-m", "tactomo.cli", "twin", "--announce", "--control", ANYWHERE]
+    with subprocess.Popen([sys.executable, *command], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        said = json.loads(next(line for line in process.stdout if line.startswith("{")))
+        yield Twin(said["ports"], said["control"])
+        process.terminate()
+        process.stdout.read()
+
+
+@pytest.fixture(scope="module")
+def start(
+    tmp_path_factory: pytest.TempPathFactory, twin: Twin
+) -> Iterator[Callable[..., DaemonProcess]]:
+    """Start a daemon on the twin's skin in place of the one that runs, and wait for its reference.
+
+    The same one again, if it still runs and is to be configured in the same way.
+    """
+    folder = tmp_path_factory.mktemp("daemons")
+    running: list[tuple[dict[str, Any], DaemonProcess]] = []
+
+    def begin(**config: Any) -> DaemonProcess:
+        request("clear", twin.control)
+        if running and running[-1][0] == config and running[-1][1].is_running:
+            return running[-1][1]
+        for _, old in running:
+            old.kill()
+        daemon = DaemonProcess(folder, twin.ports, tier="fit", **config)
+        running.append((config, daemon))
+        wait_until(lambda: daemon.told("tared"), "its reference")
+        return daemon
+
+    yield begin
+    for _, daemon in running:
+        daemon.kill()
+
+
+def python_view(frame: Frame) -> dict[str, Any]:
+    """The frame as the probe prints it, but for its age and, of contacts alone, the extent."""
+    view: dict[str, Any] = {
+        field.name: getattr(frame, field.name)
+        for field in dataclasses.fields(frame)
+        if not field.name.startswith("_") and field.name not in ("x_mm", "y_mm")
+    }
+    view["flags"] = sorted(frame.flags)
+    view["contacts"] = [dataclasses.asdict(contact) for contact in frame.contacts]
+    for name in IMAGES:
+        image = getattr(frame, name)
+        if image is not None:
+            view[name] = {"shape": list(image.shape), "hex": image.astype("<f4").tobytes().hex()}
+    for name in ("x_mm", "y_mm"):
+        view[name] = list(getattr(frame, name) or (0.0, 0.0))
+    return view
+
+
+def cpp_view(said: dict[str, Any]) -> dict[str, Any]:
+    """The frame that the probe printed, in the words of `python_view`."""
+    view = {**said, "flags": sorted(set(said["flags"]))}
+    del view["age_ns"]
+    for name in ("tier", "tier_reason"):
+        view[name] = said[name] or None
+    return view
+
+
+@pytest.mark.parametrize("kind", [CONTACTS, MAP])
+def test_both_clients_see_the_same_contact_at_the_same_sequence_number(
+    probe: Path, start: Callable[..., DaemonProcess], twin: Twin, kind: Any
+) -> None:
+    daemon = start()
+    with (
+        Watch(probe, SENSOR, daemon.stream, kind) as cpp,
+        subscribe(SENSOR, address=daemon.stream, kind=kind, timeout_s=PATIENCE_S) as python,
+    ):
+        cpp.frames(1)
+        next(python)
+        request("press", twin.control, x_mm=20.0, y_mm=-10.0, pressure_kpa=180.0)
+        pressed = next(frame for frame in python if frame.contacts)
+        ours = {frame.sequence: frame for frame in (pressed, *(next(python) for _ in range(10)))}
+        found = cpp.wait(lambda said: said["frame"] and said["frame"]["contacts"], "the contact")
+        theirs = {frame["sequence"]: frame for frame in (found["frame"], *cpp.frames(10))}
+    shared = ours.keys() & theirs.keys()
+    assert len(shared) == 11
+    for sequence in shared:
+        assert cpp_view(theirs[sequence]) == python_view(ours[sequence])
+        assert 0 < theirs[sequence]["age_ns"] < PATIENCE_S * 1e9
+    contact = theirs[pressed.sequence]["contacts"][0]
+    assert abs(contact["x_mm"] - 20) < 5
+    assert abs(contact["y_mm"] + 10) < 5
+    if kind == MAP:
+        assert theirs[pressed.sequence]["map"]["shape"] == [51, 51]
+
+
+def test_stale_while_the_daemon_is_gone_and_fresh_after_its_restart(
+    probe: Path, start: Callable[..., DaemonProcess]
+) -> None:
+    first = start()
+    with Watch(probe, SENSOR, first.stream, "contacts") as skin:
+        before = skin.wait(lambda said: said["frame"] and not said["stale"], "a fresh frame")
+        assert before["restarts"] == 0
+        first.kill()
+        skin.wait(lambda said: said["frame"] is None and said["stale"], "silence")
+        second = start(stream=first.stream, control=first.control)
+        after = skin.wait(lambda said: said["frame"] and not said["stale"], "a fresh frame")
+    assert second.stream == first.stream
+    assert after["restarts"] == 1
+    assert after["frame"]["session"] != before["frame"]["session"]
+
+
+def test_a_loop_of_1_khz_allocates_nothing_once_frames_come(
+    probe: Path, start: Callable[..., DaemonProcess], twin: Twin
+) -> None:
+    daemon = start()
+    request("press", twin.control, x_mm=0.0, y_mm=0.0)
+    for kind in (CONTACTS, MAP):
+        did = json.loads(run(probe, "loop", SENSOR, daemon.stream, kind, 1500))
+        assert did["counts"]
+        assert did["frames"] > 5
+        assert did["before_first"] > 0
+        assert did["after_first"] == 0
+
+
+def test_commands(probe: Path, start: Callable[..., DaemonProcess], tmp_path: Path) -> None:
+    daemon = start()
+
+    def ask(command: str, argument: object = "") -> Any:
+        return json.loads(run(probe, "control", daemon.control, command, argument))
+
+    assert ask("tare") == daemon.status()["reference"]["scans"]
+    status, told = ask("status"), daemon.status()
+    for name in ("sensor", "session", "version", "state", "tier"):
+        assert status[name] == told[name]
+    assert status["ports"] == len(told["ports"]) == 2
+    assert status["url"] == told["ports"][0]["url"]
+    path = str(tmp_path / "from-cpp.mcap")
+    assert ask("record_start", path) == path
+    stopped = ask("record_stop")
+    assert stopped == {"path": path, "bytes": Path(path).stat().st_size}
+    assert ask("set_tier", "noser") == "noser"
+    wait_until(lambda: daemon.status()["tier_requested"] == "noser", "the tier")
+    assert ask("set_tier", "fit") == "fit"
+    assert ask("set_budget", 25) == 25
+    wait_until(lambda: daemon.status()["budget_ms"] == 25, "the budget")
+    assert ask("set_budget") is None
+    wait_until(lambda: daemon.status()["budget_ms"] is None, "no budget")
+    refused = subprocess.run(
+        [probe, "control", daemon.control, "set_tier", "best"], capture_output=True, text=True
+    )
+    assert refused.returncode == 1
+    assert refused.stderr.startswith("bad_argument: ")
+    assert "use one of: auto" in refused.stderr
+
+
+def test_commands_to_the_twin(probe: Path, twin: Twin) -> None:
+    run(probe, "control", twin.control, "press")
+    presses = request("scene", twin.control)["presses"]
+    assert [(p["id"], p["x_mm"], p["y_mm"]) for p in presses] == [("probe", 20.0, -10.0)]
+    run(probe, "control", twin.control, "clear")
+
+
+def test_nothing_answers(probe: Path) -> None:
+    with FakeSensor("left") as silent:
+        free = silent.address
+    did = subprocess.run([probe, "control", free, "status"], capture_output=True, text=True)
+    assert did.returncode == 1
+    assert did.stderr.startswith("no_answer: ")
+    assert "tactomo daemon" in did.stderr
+    bad = subprocess.run([probe, "control", "nowhere", "status"], capture_output=True, text=True)
+    assert bad.stderr.startswith("bad_address: ")
+    name = subprocess.run([probe, "watch", "a b", free, "map"], capture_output=True, text=True)
+    assert name.stderr.startswith("malformed_message: 'a b' is not a sensor name")
+
+
+def test_with_keys(probe: Path, start: Callable[..., DaemonProcess], tmp_path: Path) -> None:
+    robot = tmp_path / "robot"
+    key_files.make_pair(robot, SENSOR, is_server=True)
+    folders = {name: tmp_path / name for name in ("desk", "stranger")}
+    for name, folder in folders.items():
+        key_files.make_pair(folder, name)
+        shutil.copy(key_files.public_path(robot, SENSOR), folder)
+    desk = folders["desk"]
+    key_files.allow(robot, key_files.public_path(desk, "desk"), SENSOR, may_command=True)
+    curve = {
+        "secret": str(key_files.secret_path(robot, SENSOR)),
+        "clients": str(key_files.clients_folder(robot, SENSOR)),
+    }
+    daemon = start(curve=curve)
+    with Watch(probe, SENSOR, daemon.stream, "contacts", desk) as skin:
+        skin.frames(2)
+    assert json.loads(run(probe, "control", daemon.control, "status", "", desk))["sensor"] == SENSOR
+    with Watch(probe, SENSOR, daemon.stream, "contacts", folders["stranger"]) as skin:
+        skin.wait(lambda said: said["door"] == "key_refused", "the refusal")
+        stranger = key_files.public_path(folders["stranger"], "stranger")
+        key_files.allow(robot, stranger, SENSOR)
+        skin.frames(1)
+    with Watch(probe, SENSOR, daemon.stream, "contacts") as skin:
+        skin.wait(lambda said: said["door"] == "keys_needed", "the refusal")
+    key_files.secret_path(desk, "desk").chmod(0o644)
+    told = subprocess.run(
+        [probe, "control", daemon.control, "status", "", desk], capture_output=True, text=True
+    )
+    assert told.stderr.startswith("bad_keys: others than its owner may read")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "complaint"),
+    [
+        ("other.key", 'public-key = "abc"', "should hold one server's public key, and holds 2"),
+        ("server.key", 'public-key = "abc"', "holds no public-key of 40 characters"),
+        ("desk.key_secret", "", "holds no public-key of 40 characters"),
+    ],
+)
+def test_a_folder_of_keys_that_cannot_be_used(
+    probe: Path, tmp_path: Path, name: str, text: str, complaint: str
+) -> None:
+    for owner in ("desk", "server"):
+        key_files.make_pair(tmp_path, owner)
+    key_files.secret_path(tmp_path, "server").unlink()
+    (tmp_path / name).write_text(text)
+    told = subprocess.run(
+        [probe, "watch", "left", ANYWHERE, "map", tmp_path], capture_output=True, text=True
+    )
+    assert told.returncode == 1
+    assert complaint in told.stderr
+
+
+def test_gaps_malformed_messages_and_a_flag_of_tomorrow(sensor: FakeSensor, probe: Path) -> None:
+    with Watch(probe, "left", sensor.address, "contacts") as skin:
+        assert sensor.wait_for_subscriber() == b"left/contacts\0"
+        for sequence in (1, 2, 5):
+            sensor.publish(sequence=sequence)
+        seen = skin.wait(lambda said: said["missed"] == 2, "the gap")
+        assert seen["frame"]["sequence"] == 5
+        sensor.send(b"left/contacts\0\x93")
+        sensor.send(b"left/contacts\0" + msgpack.packb({"schema": 2}))
+        sensor.publish(flags=["of_tomorrow", "misfit_high"], brand_new={"a": [1]}, sequence=6)
+        seen = skin.wait(lambda said: said["frame"], "the next frame")
+    assert seen["frame"]["flags"] == ["of_tomorrow", "misfit_high"]
+    assert (seen["malformed"], seen["malformed_by"], seen["missed"]) == (2, "schema", 2)
+
+
+def test_an_old_frame_is_stale_and_silence_makes_one_stale(sensor: FakeSensor, probe: Path) -> None:
+    old_ns = time.monotonic_ns() - 2_000_000_000
+    with Watch(probe, "left", sensor.address, "contacts") as skin:
+        sensor.wait_for_subscriber()
+        sensor.publish(acquired_monotonic_ns=old_ns)
+        assert skin.wait(lambda said: said["frame"], "the old frame")["stale"]
+        # Another computer's clock says nothing: its age at publication counts.
+        sensor.publish(acquired_monotonic_ns=old_ns, clock_id="another", age_ns=2_000_000)
+        assert not skin.wait(lambda said: said["frame"], "the fresh frame")["stale"]
+        skin.wait(lambda said: said["stale"], "silence to make it stale")
+
+
+def test_no_allocation_however_frames_differ(sensor: FakeSensor, probe: Path) -> None:
+    """From none to as many contacts as there is room for, long reasons, flags, malformed ones."""
+    stop = threading.Event()
+    dice = random.Random(1)
+
+    def publish() -> None:
+        sensor.wait_for_subscriber(PATIENCE_S)
+        for count in range(10**6):
+            contacts = [Contact(i, 1.0, 2.0, 3.0, 0.1, None, 150.0) for i in range(count % 65)]
+            reason = "in words " * (count % 100)
+            flags = [f"flag_number_{i}" for i in range(count % 17)]
+            sensor.publish(contacts, tier_reason=reason, flags=flags)
+            stop.wait(0.002)
+            sensor.send(b"left/contacts\0" + dice.randbytes(count % 300))
+            if stop.wait(0.002):
+                return
+
+    publisher = threading.Thread(target=publish)
+    publisher.start()
+    try:
+        did = json.loads(run(probe, "loop", "left", sensor.address, "contacts", 2000))
+    finally:
+        stop.set()
+        publisher.join()
+    assert did["frames"] > 20
+    assert did["malformed"] > 20
+    assert did["after_first"] == 0
+
+
+def examples() -> dict[str, dict[str, Any]]:
+    """Fields of a `map` and of a `contacts` message."""
+    image = np.linspace(0, 1, 12, dtype=np.float32).reshape(3, 4)
+    contact = {**CONTACT, "magnitude_sigma": 0.5, "force_n": 2, "pressure_range": "below"}
+    fields = {**HEADER, "contacts": [contact, dict(CONTACT)], "clock_id": "a", "dated_by": "device"}
+    array = {"shape": [3, 4], "dtype": "<f4", "data": image.tobytes()}
+    images = {"map": array, "pressure_kpa": None, "structure": dict(array)}
+    extent = {"x_mm": [-75.0, 75.0], "y_mm": [-75, 75]}
+    return {MAP: {**fields, **images, **extent}, CONTACTS: fields}
+
+
+def any_value(dice: random.Random) -> Any:
+    """A value of some type, often of a right one."""
+    return dice.choice(
+        [
+            *(None, True, 0, 1, -1, 255, 2**32, -(2**31), 2**62, 1.5, -0.0, "", "within", "ä€😀"),
+            *(b"", b"\0" * 48, [], {}, [1, 2], [3.5, -4], [[]], {"a": 1}, ["misfit_high"]),
+            *(
+                "left",
+                "map",
+                "contacts",
+                "<f4",
+                "<f8",
+                [3, 4],
+                [4, 3],
+                [0, 0],
+                [12],
+                [2**20, 2**20],
+            ),
+        ]
+    )
+
+
+def mutated(fields: dict[str, Any], dice: random.Random) -> dict[str, Any]:
+    """The fields with some values replaced, left out or added, at any depth."""
+    changed: dict[str, Any] = msgpack.unpackb(msgpack.packb(fields))
+    for _ in range(dice.choice((0, 1, 1, 2, 3))):
+        place: Any = changed
+        while True:
+            key = dice.choice(list(place) if isinstance(place, dict) else range(len(place)))
+            inner = place[key]
+            if not isinstance(inner, dict | list) or not inner or dice.random() < 0.3:
+                break
+            place = inner
+        action = dice.random()
+        if action < 0.2:
+            del place[key]
+        elif action < 0.3 and isinstance(place, dict):
+            place[f"new_{key}"] = any_value(dice)
+        else:
+            place[key] = any_value(dice)
+        if not place:
+            break
+    return changed
+
+
+def corrupted(message: bytes, dice: random.Random) -> bytes:
+    """The message with bytes flipped, cut out or put in."""
+    data = bytearray(message)
+    for _ in range(dice.choice((1, 1, 2, 8))):
+        at = dice.randrange(len(data))
+        action = dice.random()
+        if action < 0.6:
+            data[at] = dice.choice((dice.randrange(256), 0xC0, 0xDF, 0xC6, 0xFF, 0xDD))
+        elif action < 0.8:
+            del data[at : at + dice.randrange(1, 20)]
+        else:
+            data[at:at] = dice.randbytes(dice.randrange(1, 20))
+        if not data:
+            break
+    return bytes(data)
+
+
+def expected(message: bytes) -> dict[str, Any] | None:
+    """What the Python client makes of it; None where it is no frame."""
+    with contextlib.suppress(ClientError):
+        return python_view(frame_from_message(decode_message(message), time.monotonic_ns(), 0.5))
+    return None
+
+
+@pytest.mark.parametrize("kind", [CONTACTS, MAP])
+def test_both_clients_agree_on_what_is_a_frame(checked: Path, kind: str) -> None:
+    dice = random.Random(f"agree on {kind}")
+    head = f"left/{kind}\0".encode()
+    whole = {"schema": 1, "sensor": "left", "kind": kind, **examples()[kind]}
+    messages = [head + msgpack.packb(mutated(whole, dice)) for _ in range(3000)]
+    outcomes = decode(checked, "left", kind, messages)
+    assert len(outcomes) == len(messages)
+    accepted = 0
+    for message, outcome in zip(messages, outcomes, strict=True):
+        wanted = expected(message)
+        got = None if "problem" in outcome else cpp_view(outcome)
+        if wanted is not None:
+            accepted += 1
+            for contact in wanted["contacts"]:
+                known = contact["pressure_range"] in ("within", "below", "above")
+                contact["pressure_range"] = contact["pressure_range"] if known else "unknown"
+            wanted = {**wanted, **{k: wanted[k] or None for k in ("tier", "tier_reason")}}
+        assert got == wanted, (outcome.get("problem"), msgpack.unpackb(message[len(head) :]))
+    assert 300 < accepted < 2700
+
+
+@pytest.mark.parametrize("kind", [CONTACTS, MAP])
+def test_no_bytes_crash_it(checked: Path, kind: str) -> None:
+    dice = random.Random(f"crash {kind}")
+    whole = encode_message("left", kind, examples()[kind])
+    messages = [corrupted(whole, dice) for _ in range(4000)] + [whole]
+    deep = b"left/%b\0" % kind.encode() + b"\x81\xa1a" + b"\x91" * 100_000
+    wide = b"left/%b\0" % kind.encode() + b"\xdf\xff\xff\xff\xff"
+    outcomes = decode(checked, "left", kind, [b"", deep, wide, *messages])
+    assert len(outcomes) == len(messages) + 3
+    assert "problem" not in outcomes[-1]
+
+
+def test_garbage_over_a_socket_is_skipped(sensor: FakeSensor, checked: Path) -> None:
+    dice = random.Random(5)
+    whole = encode_message("left", MAP, examples()[MAP])
+    with Watch(checked, "left", sensor.address, "map") as skin:
+        assert sensor.wait_for_subscriber(PATIENCE_S) == b"left/map\0"
+        for _ in range(500):
+            sensor.send(b"left/map\0" + corrupted(whole[9:], dice))
+        sensor.publish(sequence=9_999)
+        seen = skin.wait(lambda s: s["frame"] and s["frame"]["sequence"] == 9_999, "the whole one")
+    assert seen["malformed"] > 100

@@ -1,0 +1,146 @@
+"""The C++ client's README, followed to the letter by a newcomer with an empty home."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from cpp_client import CPP_FOLDER, need_headers
+from tactomo_client import Contact
+from tactomo_client.fake import FakeSensor
+
+README = (CPP_FOLDER / "README.md").read_text("utf-8")
+ROOT = Path(__file__).parents[2]
+CONTACT = Contact(7, 10.0, -5.0, 700.0, 0.2, 0.01, 183.0)
+STRICT = "-Wall -Wextra -Wpedantic -Wconversion -Wshadow -Werror"
+BUILD_S = 110.0
+
+pytestmark = pytest.mark.timeout(400)  # compilers are slow where others work, too
+
+
+def commands() -> list[str]:
+    """All commands of the README, in order."""
+    blocks: list[str] = re.findall(r"```sh\n(.*?)```", README, re.S)
+    return [line for block in blocks for line in block.splitlines()]
+
+
+def file_in_readme(name: str) -> str:
+    found = re.search(rf"`{re.escape(name)}`:\n\n```\w+\n(.*?)```", README, re.S)
+    assert found
+    return found[1]
+
+
+@pytest.fixture(scope="module")
+def pressed() -> Iterator[str]:
+    """Where a sensor of the README's name is pressed all the time."""
+    stop = threading.Event()
+
+    def publish() -> None:
+        while not stop.wait(0.02):
+            sensor.publish([CONTACT])
+
+    with FakeSensor("skin") as sensor:
+        thread = threading.Thread(target=publish)
+        thread.start()
+        yield sensor.address
+        stop.set()
+        thread.join()
+
+
+class Newcomer:
+    """Somebody in a checkout, with a home."""
+
+    def __init__(self, folder: Path) -> None:
+        self.checkout = folder / "tactomo"
+        (self.checkout / "clients").mkdir(parents=True)
+        shutil.copytree(CPP_FOLDER, self.checkout / "clients" / "cpp")
+        self._environment = {
+            **os.environ,
+            "HOME": str(folder),
+            "CXXFLAGS": STRICT,
+            "CMAKE_BUILD_PARALLEL_LEVEL": "2",
+        }
+
+    def run(self, command: str) -> str:
+        """Run a command of the README in the checkout, with which all is well."""
+        done = subprocess.run(
+            ["bash", "-ec", command],
+            cwd=self.checkout,
+            env=self._environment,
+            capture_output=True,
+            text=True,
+            timeout=BUILD_S,
+        )
+        assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
+        return done.stdout
+
+
+@pytest.fixture(scope="module")
+def newcomer(tmp_path_factory: pytest.TempPathFactory) -> Newcomer:
+    need_headers()
+    if shutil.which("cmake") is None or shutil.which("pkg-config") is None:
+        pytest.skip("needs cmake and pkg-config")
+    return Newcomer(tmp_path_factory.mktemp("home"))
+
+
+def test_from_nothing_to_a_running_controller(newcomer: Newcomer, pressed: str) -> None:
+    """Every command but `apt`, in order; only the address is another one."""
+    (newcomer.checkout / "robot").mkdir()
+    for name in ("robot/CMakeLists.txt", "robot/robot.cpp"):
+        (newcomer.checkout / name).write_text(file_in_readme(name))
+    said = {}
+    exported = ""
+    for command in commands():
+        if command.startswith("sudo apt "):
+            continue
+        if command.startswith("export "):
+            exported = f"{command}\n"
+        elif command.startswith("build/controller"):
+            said["controller"] = newcomer.run(f"{command} --stream {pressed}")
+        elif command == "robot/build/robot":
+            said["robot"] = newcomer.run(f"{command} {pressed}")
+        else:
+            newcomer.run(exported + command)
+    assert "retreat: pressed hard\n" in said["controller"]
+    assert "5000 turns" in said["controller"]
+    assert re.search(
+        r"latest\(\): p50 [\d.]+ us, p99 [\d.]+ us, worst [\d.]+ us\n", said["controller"]
+    )
+    assert "7 at (10.0, -5.0) mm, 183 kPa\n" in said["robot"]
+    by_pkg_config = newcomer.run(f"robot/robot {pressed}")
+    assert "7 at (10.0, -5.0) mm, 183 kPa\n" in by_pkg_config
+
+
+def test_what_it_installs_is_what_the_suite_installs() -> None:
+    told = next(command for command in commands() if command.startswith("sudo apt install "))
+    packages = told.removeprefix("sudo apt install ")
+    assert f"install {packages}\n" in (ROOT / ".ci" / "run").read_text()
+
+
+def test_its_version_is_the_python_clients() -> None:
+    python = (ROOT / "clients" / "python" / "pyproject.toml").read_text()
+    version = re.search(r'^version = "(.*)"', python, re.M)
+    assert version
+    assert f"project(tactomo VERSION {version[1]} " in (CPP_FOLDER / "CMakeLists.txt").read_text()
+
+
+def test_the_other_examples_compile(tmp_path: Path) -> None:
+    """Commands, and keys: not run, for they would be sent to whoever listens."""
+    need_headers()
+    blocks = [
+        block for block in re.findall(r"```cpp\n(.*?)```", README, re.S) if "main(" not in block
+    ]
+    assert len(blocks) == 2
+    functions = [f"void example_{i}() {{\n{block}}}\n" for i, block in enumerate(blocks)]
+    source = tmp_path / "examples.cpp"
+    source.write_text("#include <tactomo/client.hpp>\n#include <cstdio>\n" + "".join(functions))
+    command = ["c++", "-std=c++17", "-fsyntax-only", *STRICT.split(), "-Wno-unused-variable"]
+    command += [f"-I{CPP_FOLDER / 'include'}", str(source)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=BUILD_S)
+    assert done.returncode == 0, done.stderr
