@@ -24,9 +24,9 @@ BUILD = "Models and measures"
 SERVICE = "On a robot"
 
 ORDER = (
-    *("demo", "daemon", "ports", "proxy", "twin", "viewer"),
+    *("demo", "daemon", "ports", "proxy", "twin", "viewer", "foxglove"),
     *("status", "doctor", "watch", "tare", "record", "tier", "poke", "keys"),
-    *("info", "import", "replay", "recover", "reconstruct", "plot"),
+    *("info", "import", "replay", "recover", "reconstruct", "plot", "export"),
     "service",
     *("models", "bench", "bench-solves", "evaluate"),
 )

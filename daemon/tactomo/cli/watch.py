@@ -22,15 +22,11 @@ from tactomo.cli.app import (
 if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.text import Text
-    from tactomo_client import Contact, Frame, Keys
+    from tactomo_client import Frame, Keys
 
 REFRESH_HZ = 12.0
 STALE_S = 0.5
 GONE_S = 3.0
-# Dark to bright, as perceived brightness: black, violet, red, orange, yellow, white.
-COLOURS = ((0, 0, 4), (87, 16, 110), (188, 55, 84), (249, 142, 9), (252, 255, 164))
-PRESSED_COLOUR = (40, 60, 90)
-UNKNOWN_COLOUR = (30, 30, 30)
 
 
 @app.command(
@@ -161,8 +157,10 @@ def _print_lines(view: View, end_s: float) -> None:
 
 def frame_line(frame: Frame) -> str:
     """Return one frame as a line of text."""
+    from tactomo_client.appearance import force_words, pressure_words
+
     pressed = "; ".join(
-        f"#{c.id} ({c.x_mm:+.1f}, {c.y_mm:+.1f}) mm {_pressure(c)}{_force(c, ', ')}"
+        f"#{c.id} ({c.x_mm:+.1f}, {c.y_mm:+.1f}) mm {pressure_words(c)}{force_words(c, ', ')}"
         for c in frame.contacts
     )
     flags = f"  [{', '.join(sorted(frame.flags))}]" if frame.flags else ""
@@ -219,8 +217,9 @@ def map_text(frame: Frame, status: dict[str, Any], columns: int) -> Text:
     from rich.color import Color
     from rich.style import Style
     from rich.text import Text
+    from tactomo_client.appearance import map_pixels
 
-    pixels = _pixels(frame, status)
+    pixels = map_pixels(frame, status.get("description") or {})
     if pixels is None:
         return Text("no image: " + ", ".join(sorted(frame.flags)))
     step = -(-pixels.shape[1] // columns)
@@ -236,32 +235,10 @@ def map_text(frame: Frame, status: dict[str, Any], columns: int) -> Text:
     return text
 
 
-def _pixels(frame: Frame, status: dict[str, Any]) -> Any:
-    """Return the colours of the map's nodes, (ny, nx, 3), or None where there is no image."""
-    import numpy as np
-
-    description = status.get("description") or {}
-    image, top = frame.pressure_kpa, description.get("pressure_max_kpa") or 300.0
-    if image is None:
-        image, top = frame.map, description.get("magnitude_max") or 0.25
-    if image is None:
-        image, top = frame.structure, 1.0
-    if image is None:
-        return None
-    level = np.clip(np.nan_to_num(image) / top, 0.0, 1.0) * (len(COLOURS) - 1)
-    knots, palette = np.arange(len(COLOURS)), np.array(COLOURS, dtype=float)
-    pixels = np.stack([np.interp(level, knots, palette[:, c]) for c in range(3)], axis=-1)
-    if frame.structure is not None:
-        pressed = (np.nan_to_num(frame.structure) > 0.5) & (level < 0.05)
-        pixels[pressed] = PRESSED_COLOUR
-    known = frame.structure if frame.structure is not None else image
-    pixels[np.isnan(known)] = UNKNOWN_COLOUR
-    return pixels.astype(int)
-
-
 def _contact_table(frame: Frame) -> RenderableType:
     from rich.table import Table
     from rich.text import Text
+    from tactomo_client.appearance import force_words, pressure_words
 
     if not frame.contacts:
         return Text("nothing pressed", "dim")
@@ -270,7 +247,7 @@ def _contact_table(frame: Frame) -> RenderableType:
         table.add_column(name, justify="right")
     for c in frame.contacts:
         place = f"{c.x_mm:+.1f}", f"{c.y_mm:+.1f}", f"{c.area_mm2:.0f}"
-        table.add_row(str(c.id), *place, _pressure(c), _force(c))
+        table.add_row(str(c.id), *place, pressure_words(c), force_words(c))
     return table
 
 
@@ -293,23 +270,3 @@ def _health(view: View, frame: Frame) -> RenderableType:
     for name, value in rows.items():
         table.add_row(f"[dim]{name}[/]", value)
     return table
-
-
-def _pressure(contact: Contact) -> str:
-    if contact.pressure_kpa is not None:
-        return _measured(contact, contact.pressure_kpa, contact.pressure_sigma_kpa, "kPa")
-    if contact.pressure_range == "below":
-        return "touched, pressure unknown"
-    return "pressed" if contact.magnitude is None else f"Δσ/σ₀ {contact.magnitude:.3f}"
-
-
-def _force(contact: Contact, before: str = "") -> str:
-    if contact.force_n is None:
-        return ""
-    return before + _measured(contact, contact.force_n, contact.force_sigma_n, "N")
-
-
-def _measured(contact: Contact, value: float, sigma: float | None, unit: str) -> str:
-    if contact.pressure_range == "above":
-        return f"≥ {value:.0f} {unit}"
-    return f"{value:.0f}{'' if sigma is None else f' ± {sigma:.0f}'} {unit}"

@@ -1,0 +1,19 @@
+"""tactomo in Foxglove: a running sensor over its WebSocket protocol, and recordings that open there.
+
+`Bridge` serves what a daemon publishes, `write_mcap` writes recorded frames to a file; both say the
+same things on the same topics, which `topics` lists. Needs foxglove-sdk, the extra `foxglove`.
+"""
+
+from tactomo_foxglove.bridge import Bridge, BridgeError
+from tactomo_foxglove.layout import layout_for, shipped_layout
+from tactomo_foxglove.placement import Placement
+from tactomo_foxglove.recorded import write_mcap
+
+__all__ = [
+    "Bridge",
+    "BridgeError",
+    "Placement",
+    "layout_for",
+    "shipped_layout",
+    "write_mcap",
+]

@@ -1,0 +1,240 @@
+"""The bridge: what a daemon publishes, served over Foxglove's WebSocket protocol.
+
+One thread, `run`'s caller, reads the stream and draws; foxglove-sdk's own threads send to whoever
+looks. Each of those has a queue of a second or so, of which the oldest is dropped: who is slow sees
+the newest, and nobody waits. Nothing that a client sends reaches the daemon.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, Self
+
+import foxglove
+import zmq
+from foxglove.channels import FrameTransformsChannel
+from foxglove.websocket import StatusLevel
+from tactomo_client import ClientError, Frame, Keys, MessageError
+from tactomo_client.frame import frame_from_message
+from tactomo_client.keys import Handshakes
+from tactomo_client.messages import EVENT, MAP, STATUS, Message, decode_message, topic
+from tactomo_client.subscription import connect_subscriber, reconnect
+
+from tactomo_foxglove.messages import known
+from tactomo_foxglove.placement import Placement
+from tactomo_foxglove.topics import SensorTopics
+
+DEFAULT_HOST: Final = "127.0.0.1"
+DEFAULT_PORT: Final = 8765
+STALE_AFTER_S: Final = 0.5
+GONE_AFTER_S: Final = 3.0
+HEALTH_PERIOD_S: Final = 0.2
+REMIND_PERIOD_S: Final = 1.0
+SILENCE_S: Final = 5.0
+"""After such a silence (a status comes every second) the connection is made anew."""
+BACKLOG: Final = 128
+
+
+class BridgeError(ClientError):
+    """The bridge cannot be served as asked."""
+
+
+class Bridge:
+    """Serves one or several sensors of one stream. Use it in a `with` block.
+
+    Args:
+        sensors: their names in the stream.
+        stream: the daemon's stream, or a proxy's.
+        host: the address to listen on.
+        port: the port to listen on; 0 takes a free one.
+        keys: for a daemon beyond this computer.
+        placement: where the sensor hangs; of several, all hang there.
+
+    Raises:
+        BridgeError: the address cannot be listened on.
+        ClientError: a name is no sensor's, or `stream` no address.
+
+    """
+
+    def __init__(
+        self,
+        sensors: Sequence[str],
+        stream: str,
+        host: str = DEFAULT_HOST,
+        port: int = DEFAULT_PORT,
+        keys: Keys | None = None,
+        placement: Placement | None = None,
+    ) -> None:
+        self._stream, self._keys = stream, keys
+        topics = [topic(sensor, kind) for sensor in sensors for kind in (MAP, STATUS, EVENT)]
+        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
+        self._handshakes = Handshakes(self._socket)
+        try:
+            connect_subscriber(self._socket, stream, topics, keys=keys)
+            context = foxglove.Context()
+            self._server = _serve(sensors, host, port, context)
+        except ClientError:
+            self._close_stream()
+            raise
+        self.host = host
+        placed = placement or Placement()
+        transforms = FrameTransformsChannel("/tf", context=context)
+        self._sensors = {
+            sensor: _Sensor(SensorTopics(sensor, context, transforms, placed), stream)
+            for sensor in sensors
+        }
+
+    @property
+    def url(self) -> str:
+        """Where Foxglove finds it."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"ws://{host}:{self._server.port}"
+
+    @property
+    def app_url(self) -> str | None:
+        """The page of Foxglove's web app that opens it."""
+        return self._server.app_url()
+
+    def run(self, stop: threading.Event) -> None:
+        """Serve until `stop` is set.
+
+        Raises:
+            KeysError: the daemon does not let us in.
+
+        """
+        next_health_s = heard_s = time.monotonic()
+        while not stop.is_set():
+            wait_s = max(0.0, next_health_s - time.monotonic())
+            if self._socket.poll(round(wait_s * 1e3) + 1):
+                self._take(self._socket.recv())
+                heard_s = time.monotonic()
+            now_s = time.monotonic()
+            if now_s >= next_health_s:
+                next_health_s = now_s + HEALTH_PERIOD_S
+                for sensor in self._sensors.values():
+                    sensor.look_around(self._server)
+                if refusal := self._handshakes.refusal(self._stream, self._keys):
+                    raise refusal
+            if now_s - heard_s > SILENCE_S:
+                heard_s = now_s
+                reconnect(self._socket, self._stream)
+
+    def close(self) -> None:
+        """Stop serving; clients are told goodbye."""
+        self._server.stop()
+        self._close_stream()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _take(self, data: bytes) -> None:
+        try:
+            message = decode_message(data)
+            if sensor := self._sensors.get(message.sensor):
+                sensor.take(message)
+        except MessageError:
+            return  # another program publishes there; ours will show, or its silence will
+
+    def _close_stream(self) -> None:
+        self._handshakes.close()
+        self._socket.close(0)
+
+
+class _Sensor:
+    """The newest that is known of one sensor, and what has been said about its age."""
+
+    def __init__(self, topics: SensorTopics, stream: str) -> None:
+        self._topics = topics
+        self._stream = stream
+        self._frame: Frame | None = None
+        self._status: Mapping[str, Any] = {}
+        self._status_s = time.monotonic()
+        self._complained_s: float | None = None
+
+    def take(self, message: Message) -> None:
+        now_ns = time.time_ns()
+        if message.kind == MAP:
+            self._frame = frame_from_message(message, time.monotonic_ns(), STALE_AFTER_S)
+            if not self._frame.is_stale:
+                self._topics.frame(self._frame, now_ns)
+        elif message.kind == STATUS:
+            self._status, self._status_s = message.fields, time.monotonic()
+            self._topics.sheet(message.fields["description"], now_ns)
+        else:
+            self._topics.event(message.fields, now_ns)
+
+    def look_around(self, server: foxglove.WebSocketServer) -> None:
+        """Say how the daemon is, and complain about old data as long as they are old."""
+        self._topics.health(self._health(), time.time_ns())
+        trouble = self._trouble()
+        identity = f"{self._topics.sensor} stale"
+        if not trouble and self._complained_s is not None:
+            server.remove_status([identity])
+            self._complained_s = None
+        elif trouble and _is_due(self._complained_s):
+            self._complained_s = time.monotonic()
+            server.publish_status(trouble, StatusLevel.Warning, identity)
+            if self._frame is not None:
+                self._topics.stale(self._frame, trouble, time.time_ns())
+
+    def _trouble(self) -> str:
+        """Return in words why what is shown is not what is now; empty while it is."""
+        name = self._topics.sensor
+        if self._is_gone:
+            return f"STALE: no daemon answers at {self._stream} for {name!r}: is it running?"
+        if not self._status:
+            return ""
+        state = f"the daemon says: {self._status['state']}"
+        if self._frame is None:
+            return f"{name!r}: no frame yet; {state}"
+        if self._frame.is_stale:
+            return f"STALE: {name!r} was felt {self._frame.age_s:.1f} s ago; {state}"
+        return ""
+
+    @property
+    def _is_gone(self) -> bool:
+        return time.monotonic() - self._status_s > GONE_AFTER_S
+
+    def _health(self) -> dict[str, Any]:
+        status, frame = self._status, self._frame
+        recording = status.get("recording") or {}
+        kept = ("uptime_s", "tier_requested", "frames", "dropped_scans", "incomplete_scans")
+        return known(
+            {
+                "state": "gone" if self._is_gone else status.get("state"),
+                "is_stale": self._is_gone or frame is None or frame.is_stale,
+                "age_s": None if frame is None else frame.age_s,
+                "recording": recording.get("path"),
+                "rates": known((status.get("rates") or {}).items()),
+                "latency_ms": known((status.get("latency_ms") or {}).items()),
+                **{name: status.get(name) for name in (*kept, "late_scans")},
+            }.items()
+        )
+
+
+def _is_due(last_s: float | None) -> bool:
+    return last_s is None or time.monotonic() - last_s >= REMIND_PERIOD_S
+
+
+def _serve(
+    sensors: Sequence[str], host: str, port: int, context: foxglove.Context
+) -> foxglove.WebSocketServer:
+    try:
+        return foxglove.start_server(
+            name=f"tactomo: {', '.join(sensors)}",
+            host=host,
+            port=port,
+            context=context,
+            message_backlog_size=BACKLOG,
+        )
+    except RuntimeError as error:
+        raise BridgeError(
+            f"cannot listen on {host} port {port}: {str(error).rpartition(': ')[2]}",
+            "stop the program that uses it, or choose another with --port (0: any free one)",
+            name="cannot_listen",
+        ) from error

@@ -1,0 +1,86 @@
+"""How a frame looks where there is no page to draw it (a terminal, Foxglove): colours and words.
+
+`map_pixels` colours the map, `pressure_words` and `force_words` say how hard a contact is pressed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactomo_client.frame import Contact, Frame
+
+# Dark to bright, as perceived brightness: black, violet, red, orange, yellow, white.
+COLOURS: Final = ((0, 0, 4), (87, 16, 110), (188, 55, 84), (249, 142, 9), (252, 255, 164))
+PRESSED_COLOUR: Final = (40, 60, 90)
+UNKNOWN_COLOUR: Final = (30, 30, 30)
+
+DEFAULT_PRESSURE_MAX_KPA: Final = 300.0
+DEFAULT_MAGNITUDE_MAX: Final = 0.25
+
+
+def map_pixels(frame: Frame, description: Mapping[str, Any]) -> NDArray[np.uint8] | None:
+    """Return the colours of the map's nodes (ny, nx, 3), row 0 at the bottom; None without a map.
+
+    Colour is pressure, or the relative change where the sensor has no pressure calibration, or how
+    surely a node is pressed. What is pressed without a value is blue-grey.
+
+    Args:
+        frame: a frame with images.
+        description: the sensor, as `status` has it; may be empty.
+
+    """
+    shown = shown_image(frame, description)
+    if shown is None:
+        return None
+    image, top = shown
+    level = np.clip(np.nan_to_num(image) / top, 0.0, 1.0) * (len(COLOURS) - 1)
+    knots, palette = np.arange(len(COLOURS)), np.array(COLOURS, dtype=float)
+    pixels = np.stack([np.interp(level, knots, palette[:, c]) for c in range(3)], axis=-1)
+    if frame.structure is not None:
+        pressed = (np.nan_to_num(frame.structure) > 0.5) & (level < 0.05)
+        pixels[pressed] = PRESSED_COLOUR
+    pixels[~known_nodes(frame, image)] = UNKNOWN_COLOUR
+    return pixels.astype(np.uint8)
+
+
+def shown_image(
+    frame: Frame, description: Mapping[str, Any]
+) -> tuple[NDArray[np.float32], float] | None:
+    """Return the image that says most about how hard is pressed, and the top of its scale."""
+    if frame.pressure_kpa is not None:
+        top = description.get("pressure_max_kpa") or DEFAULT_PRESSURE_MAX_KPA
+        return frame.pressure_kpa, top
+    if frame.map is not None:
+        return frame.map, description.get("magnitude_max") or DEFAULT_MAGNITUDE_MAX
+    return None if frame.structure is None else (frame.structure, 1.0)
+
+
+def known_nodes(frame: Frame, image: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return which nodes are on the sheet at all: those outside a round one are not."""
+    return ~np.isnan(image if frame.structure is None else frame.structure)
+
+
+def pressure_words(contact: Contact) -> str:
+    """Return the contact's pressure, as far as it is known."""
+    if contact.pressure_kpa is not None:
+        return _measured(contact, contact.pressure_kpa, contact.pressure_sigma_kpa, "kPa")
+    if contact.pressure_range == "below":
+        return "touched, pressure unknown"
+    return "pressed" if contact.magnitude is None else f"Δσ/σ₀ {contact.magnitude:.3f}"
+
+
+def force_words(contact: Contact, before: str = "") -> str:
+    """Return the contact's force, with `before` before it; empty where it is not known."""
+    if contact.force_n is None:
+        return ""
+    return before + _measured(contact, contact.force_n, contact.force_sigma_n, "N")
+
+
+def _measured(contact: Contact, value: float, sigma: float | None, unit: str) -> str:
+    if contact.pressure_range == "above":
+        return f"≥ {value:.0f} {unit}"
+    return f"{value:.0f}{'' if sigma is None else f' ± {sigma:.0f}'} {unit}"
