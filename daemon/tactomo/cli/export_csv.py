@@ -1,0 +1,110 @@
+"""Contacts as a table: a row for each contact in each frame, units in the columns' names."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from tactomo_client import Contact
+from tactomo_models import Flag
+from tactomo_models.archive import read_arrays
+from tactomo_models.errors import DataError
+
+from tactomo.cli.recorded import Moment
+
+FRAME_COLUMNS: Final = (
+    "time_s",
+    "acquired_realtime_ns",
+    "session",
+    "sequence",
+    "scan_counter",
+    "age_s",
+    "tier",
+    "misfit",
+    "confidence",
+    "flags",
+)
+CONTACT_COLUMNS: Final = (
+    "id",
+    "x_mm",
+    "y_mm",
+    "area_mm2",
+    "magnitude",
+    "magnitude_sigma",
+    "pressure_kpa",
+    "pressure_sigma_kpa",
+    "pressure_range",
+    "force_n",
+    "force_sigma_n",
+    "x_sigma_mm",
+    "y_sigma_mm",
+    "area_sigma_mm2",
+)
+ARRAY_COLUMNS: Final = {"magnitude_sigma": "contact_sigma"}
+"""Columns whose array in the .npz of `tactomo reconstruct` is not named `contact_` and theirs."""
+
+
+def write_contacts(moments: Iterable[Moment], output: Path) -> int:
+    """Write the contacts of frames; return how many frames there were."""
+    count = 0
+    with output.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow([*FRAME_COLUMNS, *CONTACT_COLUMNS])
+        for count, (time_s, frame) in enumerate(moments, 1):
+            start = [
+                f"{time_s:.9f}",
+                *(getattr(frame, name) for name in FRAME_COLUMNS[1:-1]),
+                " ".join(sorted(frame.flags)),
+            ]
+            for contact in frame.contacts or (None,):
+                writer.writerow([*start, *_cells(contact)])
+    return count
+
+
+def _cells(contact: Contact | None) -> list[Any]:
+    return ["" if contact is None else getattr(contact, name) for name in CONTACT_COLUMNS]
+
+
+def write_contacts_of_arrays(source: Path, output: Path) -> int:
+    """Write the contacts in the .npz file of `tactomo reconstruct`; return how many frames it has.
+
+    Raises:
+        DataError: it cannot be read, or is not such a file.
+
+    """
+    try:
+        arrays = read_arrays(source)
+    except OSError as error:
+        raise DataError(f"cannot read {source}: {error.strerror}") from error
+    missing = {"contact_frame", "contact_x_mm", "contact_y_mm", "flags"} - arrays.keys()
+    if missing:
+        raise DataError(
+            f"{source} holds no contacts ({', '.join(sorted(missing))} missing); give the OUT.npz "
+            "of `tactomo reconstruct`"
+        )
+    columns = {name: arrays.get(ARRAY_COLUMNS.get(name, f"contact_{name}")) for name in _KEPT}
+    of_frames = {name: arrays[name] for name in ("misfit", "confidence") if name in arrays}
+    contact_frames, flags = arrays["contact_frame"], arrays["flags"]
+    with output.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["frame", *of_frames, "flags", *columns])
+        for frame, bits in enumerate(flags):
+            words = " ".join(sorted(Flag(int(bits)).names()))
+            start = [frame, *(_cell(values, frame) for values in of_frames.values()), words]
+            for row in np.flatnonzero(contact_frames == frame).tolist() or (None,):
+                writer.writerow([*start, *(_cell(values, row) for values in columns.values())])
+    return len(flags)
+
+
+_KEPT: Final = tuple(name for name in CONTACT_COLUMNS if name != "id")
+
+
+def _cell(values: Any, row: int | None) -> Any:
+    """Return what goes into the table: nothing for what is not there, or is not known."""
+    if values is None or row is None:
+        return ""
+    value = values[row].item()
+    return "" if isinstance(value, float) and np.isnan(value) else value

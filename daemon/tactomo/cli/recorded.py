@@ -1,0 +1,252 @@
+"""The frames of a recording, for commands that draw or write them; made first where it has none."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+
+import typer
+
+from tactomo.errors import TactomoError
+
+if TYPE_CHECKING:
+    from tactomo_client import Frame
+    from tactomo_client.recording import Recording
+    from tactomo_models import SensorDescription
+
+MARGIN_S = 30.0
+"""How much earlier or later than it was acquired a frame may have been published."""
+PROGRESS_PERIOD_S = 0.5
+
+Tell = Callable[[float, float], None]
+"""Told how much is done, and of how much."""
+
+FromOption = Annotated[
+    float, typer.Option("--from", min=0.0, metavar="SECONDS", help="Leave out what was before.")
+]
+ToOption = Annotated[
+    float | None,
+    typer.Option("--to", min=0.0, metavar="SECONDS", help="Leave out what was after. [the end]"),
+]
+DescriptionOption = Annotated[
+    str | None,
+    typer.Option(
+        "--sensor",
+        "--description",
+        "-d",
+        help="What the sensor is made of: a shipped name or a TOML file. [the recorded one]",
+        show_default=False,
+    ),
+]
+
+
+class Moment(NamedTuple):
+    """A frame, and how many seconds after the recording's beginning it was acquired."""
+
+    time_s: float
+    frame: Frame
+
+
+@dataclass(frozen=True)
+class RecordedFrames:
+    """The frames of a recording between two times.
+
+    Attributes:
+        path: the recording that was asked for.
+        sensor: the sensor's name.
+        description: what the sensor is made of; None where that is not known on this computer.
+        start_ns: when the recording begins, nanoseconds since 1970.
+        start_s: the first frames that are wanted, seconds from there.
+        end_s: where the frames end that are wanted.
+
+    """
+
+    path: Path
+    sensor: str
+    description: SensorDescription | None
+    start_ns: int
+    start_s: float
+    end_s: float
+    _source: Recording
+    _is_remade: bool
+
+    def moments(self, kind: Literal["map", "contacts"] = "map") -> Iterator[Moment]:
+        """Yield the frames in the order of their times, one at a time."""
+        # What was made of a replay was published at the replay's times.
+        window = (0.0, float("inf"))
+        if not self._is_remade:
+            window = (max(0.0, self.start_s - MARGIN_S), self.end_s + MARGIN_S)
+        clock = _Clock(self.start_ns)
+        for frame in self._source.frames(kind, start_s=window[0], end_s=window[1]):
+            time_s = clock.time_s(frame)
+            if self.start_s <= time_s < self.end_s:
+                yield Moment(time_s, frame)
+
+    def shown(self, moments: Iterator[Moment], doing: str) -> Iterator[Moment]:
+        """Yield the moments, with a bar on standard error that shows how far this has come."""
+        length_s = min(self.end_s, self._source.duration_s) - self.start_s
+        with progress_bar(doing) as tell:
+            for moment in moments:
+                tell(moment.time_s - self.start_s, max(length_s, 1e-9))
+                yield moment
+
+
+class _Clock:
+    """Seconds since the recording's beginning, by the monotonic clock: the wall clock jumps."""
+
+    def __init__(self, start_ns: int) -> None:
+        self._start_ns = start_ns
+        self._session = ""
+        self._zero_ns = 0
+
+    def time_s(self, frame: Frame) -> float:
+        if frame.session != self._session:  # another run of the daemon, maybe after a reboot
+            self._session = frame.session
+            since_start_ns = frame.acquired_realtime_ns - self._start_ns
+            self._zero_ns = frame.acquired_monotonic_ns - since_start_ns
+        return (frame.acquired_monotonic_ns - self._zero_ns) * 1e-9
+
+
+@contextlib.contextmanager
+def recorded_frames(
+    path: Path,
+    description: str | None,
+    start_s: float = 0.0,
+    end_s: float | None = None,
+    scratch: Path | None = None,
+) -> Iterator[RecordedFrames]:
+    """Open a recording's frames; where it has none, reconstruct it first, by the code of live.
+
+    Args:
+        path: a recording, or the folder of one that was cut into files.
+        description: what the sensor is made of; None for what the recording says.
+        start_s: leave out what was acquired before, seconds from the recording's beginning.
+        end_s: leave out what was acquired from there on.
+        scratch: a folder with room for the frames, if they have to be made.
+
+    Raises:
+        TactomoError: the recording cannot be read or reconstructed, or the times are no times.
+
+    """
+    from tactomo_client.recording import open_recording
+    from tactomo_models import ModelError, load_description
+
+    if end_s is not None and end_s <= start_s:
+        raise typer.BadParameter(f"--to {end_s:g} is not after --from {start_s:g}")
+    given = open_recording(path)
+    known = None
+    try:
+        known = load_description(description or given.description)
+    except ModelError:
+        if description or not given.has_frames:
+            raise
+    with _told_warnings(), contextlib.ExitStack() as undo:
+        source = given
+        if not given.has_frames or description:
+            folder = undo.enter_context(
+                tempfile.TemporaryDirectory(prefix=".tactomo-", dir=scratch)
+            )
+            source = _reconstructed(given, description or given.description, Path(folder))
+        yield RecordedFrames(
+            path,
+            given.sensor,
+            known,
+            given.start_ns,
+            start_s,
+            float("inf") if end_s is None else end_s,
+            source,
+            source is not given,
+        )
+
+
+@contextlib.contextmanager
+def _told_warnings() -> Iterator[None]:
+    """Tell on standard error what a recording lacks, each thing once."""
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_, **__: typer.echo(str(message), err=True)
+        yield
+
+
+@contextlib.contextmanager
+def progress_bar(doing: str) -> Iterator[Tell]:
+    """Show a bar on standard error while this lasts, if that is a terminal."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(doing, total=None)
+
+        def tell(done: float, total: float) -> None:
+            progress.update(task, completed=done, total=total)
+
+        yield tell
+
+
+def _reconstructed(given: Recording, description: str, folder: Path) -> Recording:
+    """Replay a recording through a daemon of our own, into one that has frames."""
+    from tactomo_client.recording import open_recording
+
+    for file in given.files:
+        _reconstruct_file(file, given.sensor, description, folder / file.name)
+    made = open_recording(folder if given.path.is_dir() else folder / given.files[0].name)
+    if not made.has_frames:
+        raise TactomoError(
+            f"{given.path} cannot be reconstructed: no dual scan of {description} is in it",
+            "look at it with `tactomo info`; it may need another --sensor",
+        )
+    return made
+
+
+def _reconstruct_file(path: Path, sensor: str, description: str, target: Path) -> None:
+    from tactomo.config import load_config
+    from tactomo.daemon import Daemon
+    from tactomo.log import configure_logging
+    from tactomo.recording import open_recording
+
+    configure_logging("error")
+    recording = open_recording(path)
+    with tempfile.TemporaryDirectory(prefix="tactomo-") as sockets:  # their paths must be short
+        config = load_config(
+            name=sensor or None,
+            description=description,
+            ports=recording.replay_urls(speed=0),
+            stream=f"ipc://{sockets}/stream",
+            control=f"ipc://{sockets}/control",
+            lossless=True,
+            exit_at_end=True,
+            record=target,
+            record_maps=True,
+        )
+        total = max(recording.summary.scans.values(), default=0)
+        with _watched(config.control, total, f"reconstructing {path.name}"):
+            status = Daemon(config).run()
+    if status != 0:
+        raise TactomoError(f"{path} could not be replayed", "`tactomo replay` tells more")
+
+
+@contextlib.contextmanager
+def _watched(control: str, total: int, doing: str) -> Iterator[None]:
+    """Show how many frames a daemon has made, asking it from a thread."""
+    from tactomo_client import ClientError, request
+
+    done = threading.Event()
+
+    def watch(tell: Tell) -> None:
+        while not done.wait(PROGRESS_PERIOD_S):
+            with contextlib.suppress(ClientError):  # it has not begun, or has ended
+                tell(request("status", control, PROGRESS_PERIOD_S)["frames"], total)
+
+    with progress_bar(doing) as tell:
+        thread = threading.Thread(target=watch, args=(tell,), name="progress")
+        thread.start()
+        try:
+            yield
+        finally:
+            done.set()
+            thread.join()
