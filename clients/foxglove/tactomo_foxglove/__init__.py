@@ -1,4 +1,4 @@
-"""tactomo in Foxglove: a running sensor over its WebSocket protocol, and recordings that open there.
+"""tactomo in Foxglove: a running sensor over WebSocket, and recordings that open there.
 
 `Bridge` serves what a daemon publishes, `write_mcap` writes recorded frames to a file; both say the
 same things on the same topics, which `topics` lists. Needs foxglove-sdk, the extra `foxglove`.

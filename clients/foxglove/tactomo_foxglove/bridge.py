@@ -73,16 +73,16 @@ class Bridge:
         self._handshakes = Handshakes(self._socket)
         try:
             connect_subscriber(self._socket, stream, topics, keys=keys)
-            context = foxglove.Context()
-            self._server = _serve(sensors, host, port, context)
+            self._context = foxglove.Context()  # its channels close when it is gone
+            self._server = _serve(sensors, host, port, self._context)
         except ClientError:
             self._close_stream()
             raise
         self.host = host
         placed = placement or Placement()
-        transforms = FrameTransformsChannel("/tf", context=context)
+        transforms = FrameTransformsChannel("/tf", context=self._context)
         self._sensors = {
-            sensor: _Sensor(SensorTopics(sensor, context, transforms, placed), stream)
+            sensor: _Sensor(SensorTopics(sensor, self._context, transforms, placed), stream)
             for sensor in sensors
         }
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import fields
 from typing import Any, Final
 
 import numpy as np
@@ -222,9 +223,7 @@ def contacts_scene(
     return SceneUpdate(deletions=[everything], entities=entities)
 
 
-def _warning(
-    sensor: str, description: Mapping[str, Any], text: str, at: Timestamp
-) -> SceneEntity:
+def _warning(sensor: str, description: Mapping[str, Any], text: str, at: Timestamp) -> SceneEntity:
     above = Vector3(x=0.0, y=0.6 * _height_mm(description) * 1e-3, z=0.02)
     return SceneEntity(
         timestamp=at,
@@ -249,9 +248,7 @@ def _disc(contact: Contact, description: Mapping[str, Any], stale: bool) -> Cyli
     )
 
 
-def _floating_label(
-    contact: Contact, description: Mapping[str, Any], stale: bool
-) -> TextPrimitive:
+def _floating_label(contact: Contact, description: Mapping[str, Any], stale: bool) -> TextPrimitive:
     top = disc_height_m(contact, description) + 0.006
     position = Vector3(x=contact.x_mm * 1e-3, y=contact.y_mm * 1e-3, z=top)
     return _text(label(contact), position, GREY if stale else WHITE, 14.0)
@@ -296,8 +293,9 @@ def _disc_colour(contact: Contact, description: Mapping[str, Any], stale: bool) 
     if level is None:
         return LIGHT_TOUCH
     at = min(max(level, 0.0), 1.0) * (len(COLOURS) - 1)
-    rgb = [np.interp(at, range(len(COLOURS)), channel) / 255 for channel in zip(*COLOURS)]
-    return Color(r=rgb[0], g=rgb[1], b=rgb[2], a=0.9)
+    channels = zip(*COLOURS, strict=True)
+    red, green, blue = (np.interp(at, range(len(COLOURS)), c) / 255 for c in channels)
+    return Color(r=float(red), g=float(green), b=float(blue), a=0.6)
 
 
 def sheet_scene(sensor: str, description: Mapping[str, Any], time_ns: int) -> SceneUpdate:
@@ -380,28 +378,9 @@ def _metadata(contact: Contact) -> list[KeyValuePair]:
     ]
 
 
-CONTACT_FIELDS: Final = (
-    "id",
-    "x_mm",
-    "y_mm",
-    "area_mm2",
-    "magnitude",
-    "magnitude_sigma",
-    "pressure_kpa",
-    "pressure_sigma_kpa",
-    "pressure_range",
-    "force_n",
-    "force_sigma_n",
-    "x_sigma_mm",
-    "y_sigma_mm",
-    "area_sigma_mm2",
-)
-
-
 def contact_numbers(contact: Contact) -> dict[str, Any]:
     """Return what is known of a contact; what is unknown is left out."""
-    values = {name: getattr(contact, name) for name in CONTACT_FIELDS}
-    return {name: value for name, value in values.items() if value is not None}
+    return known((field.name, getattr(contact, field.name)) for field in fields(Contact))
 
 
 def _on_sheet(frame: Frame, description: Mapping[str, Any]) -> NDArray[np.bool_]:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import foxglove
 from foxglove.channels import FrameTransformsChannel
@@ -18,19 +17,17 @@ PROFILE = "tactomo-foxglove"
 
 
 def write_mcap(
-    frames: Iterable[Frame],
-    path: Path,
+    frames: Iterable[tuple[int, Frame]],
+    file: IO[bytes],
     sensor: str,
     description: Mapping[str, Any],
     placement: Placement | None = None,
 ) -> int:
-    """Write frames to an MCAP file, and return how many there were.
-
-    Each is at the time at which it was acquired. Of the frames only one is in memory at a time.
+    """Write frames as an MCAP file, and return how many there were; one at a time is in memory.
 
     Args:
-        frames: in the order of their times.
-        path: the file; it is written over.
+        frames: each with when it was acquired, nanoseconds since 1970; in that order.
+        file: a file opened for writing, which stays open.
         sensor: the sensor's name.
         description: the sensor, as `status` has it; empty where it is not known.
         placement: where the sensor hangs.
@@ -41,9 +38,9 @@ def write_mcap(
     topics = SensorTopics(sensor, context, transforms, placement or Placement())
     options = MCAPWriteOptions(profile=PROFILE, compression_threads=0)
     count = 0
-    with foxglove.open_mcap(path, allow_overwrite=True, context=context, writer_options=options):
-        for count, frame in enumerate(frames, 1):
+    with foxglove.open_mcap(file, context=context, writer_options=options):
+        for count, (time_ns, frame) in enumerate(frames, 1):
             if count == 1 and description:
-                topics.sheet(description, frame.acquired_realtime_ns)
-            topics.frame(frame, frame.acquired_realtime_ns)
+                topics.sheet(description, time_ns)
+            topics.frame(frame, time_ns)
     return count

@@ -20,6 +20,7 @@ What is unknown is left out of the JSON messages.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any, Final
 
 import foxglove
@@ -31,7 +32,7 @@ from foxglove.channels import (
     RawImageChannel,
     SceneUpdateChannel,
 )
-from tactomo_client import Frame
+from tactomo_client import Contact, Frame
 
 from tactomo_foxglove import messages
 from tactomo_foxglove.messages import contact_numbers, known
@@ -57,9 +58,10 @@ def _numbers(*names: str) -> dict[str, Any]:
 
 
 CONTACT_SCHEMA: Final = _object(
-    id=_INTEGER,
-    pressure_range=_TEXT,
-    **_numbers(*(n for n in messages.CONTACT_FIELDS if n not in ("id", "pressure_range"))),
+    **{
+        field.name: {"int": _INTEGER, "str": _TEXT}.get(str(field.type), _NUMBER)
+        for field in fields(Contact)
+    }
 )
 FRAME_SCHEMA: Final = _object(
     "tactomo.Frame",
@@ -101,7 +103,10 @@ class SensorTopics:
     """
 
     def __init__(
-        self, sensor: str, context: foxglove.Context, transforms: FrameTransformsChannel,
+        self,
+        sensor: str,
+        context: foxglove.Context,
+        transforms: FrameTransformsChannel,
         placement: Placement,
     ) -> None:
         self.sensor = sensor
@@ -125,9 +130,7 @@ class SensorTopics:
     def sheet(self, description: Mapping[str, Any], time_ns: int) -> None:
         """Say what the sensor is and where it hangs."""
         self.description = description
-        self._sheet.log(
-            messages.sheet_scene(self.sensor, description, time_ns), log_time=time_ns
-        )
+        self._sheet.log(messages.sheet_scene(self.sensor, description, time_ns), log_time=time_ns)
         self._hang(time_ns)
 
     def frame(self, frame: Frame, time_ns: int) -> None:
@@ -161,9 +164,7 @@ class SensorTopics:
         if self._contacts.has_sinks():
             scene = messages.contacts_scene(frame, about, time_ns, stale)
             self._contacts.log(scene, log_time=time_ns)
-        if self._grid.has_sinks() and (
-            grid := messages.grid(frame, about, time_ns, bool(stale))
-        ):
+        if self._grid.has_sinks() and (grid := messages.grid(frame, about, time_ns, bool(stale))):
             self._grid.log(grid, log_time=time_ns)
         if self._image.has_sinks() and (
             image := messages.image(frame, about, time_ns, bool(stale))

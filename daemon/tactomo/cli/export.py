@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import IO, TYPE_CHECKING, Annotated
 
 import typer
 
@@ -24,6 +22,7 @@ from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
     from tactomo_client import Frame
+    from tactomo_foxglove import Placement
 
 KINDS = {".mcap": "frames for Foxglove", ".csv": "contacts", ".npz": "maps and contacts"}
 
@@ -83,30 +82,17 @@ def export(
     from the recording's beginning. The size of a recording does not matter: memory stays small.
     """
     kind = _kind(output)
-    if recording.suffix.lower() == ".npz":
-        _export_arrays(recording, output)
-        return
-    if kind == ".mcap":
-        need_foxglove()
-        placed = placement_of(parent, pose)
     if output.exists() and recording.exists() and output.samefile(recording):
         raise typer.BadParameter(f"{output} is the recording itself; name another file")
     prepare_file(output)
-    with recorded_frames(recording, description, start_s, end_s, output.parent) as frames:
-        with _written_whole(output) as part:
-            if kind == ".mcap":
-                count = _write_mcap(frames, part, placed)
-            elif kind == ".csv":
-                count = _write_csv(frames, part)
-            else:
-                count = _write_npz(frames, part)
-            if not count:
-                raise TactomoError(
-                    f"there are no frames of {recording} between these times",
-                    "`tactomo info` tells how long it is",
-                )
-    if layout is not None:
-        write_layout(layout, frames.sensor)
+    if recording.suffix.lower() == ".npz":
+        count = _export_arrays(recording, output)
+    else:
+        write = _writer(kind, parent, pose, output.parent)
+        with recorded_frames(recording, description, start_s, end_s, output.parent) as frames:
+            count = _write(output, lambda file: write(frames, file))
+            if layout is not None:
+                write_layout(layout, frames.sensor)
     typer.echo(f"wrote {output}: {KINDS[kind]}, {count} frames")
 
 
@@ -117,55 +103,73 @@ def _kind(output: Path) -> str:
     return kind
 
 
-@contextlib.contextmanager
-def _written_whole(output: Path) -> Iterator[Path]:
-    """Yield where to write, beside `output`, which is replaced by it if all goes well."""
-    part = output.with_name(f".{output.name}.part")
+def _writer(
+    kind: str, parent: str, pose: str, scratch: Path
+) -> Callable[[RecordedFrames, IO[bytes]], int]:
+    if kind == ".mcap":
+        need_foxglove()
+        placement = placement_of(parent, pose)
+        return lambda frames, file: _write_mcap(frames, file, placement)
+    if kind == ".csv":
+        return _write_csv
+    return lambda frames, file: _write_npz(frames, file, scratch)
+
+
+def _write(output: Path, write: Callable[[IO[bytes]], int]) -> int:
+    """Write a file as a whole; return how many frames went into it.
+
+    Raises:
+        TactomoError: it cannot be written, or there is no frame to be written.
+    """
+    from tactomo_models.archive import write_whole
+
+    def write_some(file: IO[bytes]) -> None:
+        nonlocal count
+        if not (count := write(file)):
+            raise TactomoError(
+                "there are no frames between these times", "`tactomo info` tells how long it is"
+            )
+
+    count = 0
     try:
-        yield part
-        os.replace(part, output)
+        write_whole(output, write_some)
     except OSError as error:
         raise TactomoError(
             f"cannot write {output}: {error.strerror or error}",
             "make room, or name a file that you may write",
         ) from error
-    finally:
-        part.unlink(missing_ok=True)
+    return count
 
 
-def _write_mcap(frames: RecordedFrames, output: Path, placed: object) -> int:
-    from tactomo_foxglove import Placement, write_mcap
+def _write_mcap(frames: RecordedFrames, file: IO[bytes], placement: Placement) -> int:
+    from tactomo_foxglove import write_mcap
 
     from tactomo.frames import description_fields
 
-    assert isinstance(placed, Placement)
     about = {} if frames.description is None else description_fields(frames.description)
 
     def timed() -> Iterator[tuple[int, Frame]]:
         for time_s, frame in frames.shown(frames.moments(), "exporting"):
             yield frames.start_ns + round(time_s * 1e9), frame
 
-    return write_mcap(timed(), output, frames.sensor, about, placed)
+    return write_mcap(timed(), file, frames.sensor, about, placement)
 
 
-def _write_csv(frames: RecordedFrames, output: Path) -> int:
+def _write_csv(frames: RecordedFrames, file: IO[bytes]) -> int:
     from tactomo.cli.export_csv import write_contacts
 
-    return write_contacts(frames.shown(frames.moments("contacts"), "exporting"), output)
+    return write_contacts(frames.shown(frames.moments("contacts"), "exporting"), file)
 
 
-def _write_npz(frames: RecordedFrames, output: Path) -> int:
+def _write_npz(frames: RecordedFrames, file: IO[bytes], scratch: Path) -> int:
     from tactomo.cli.export_npz import write_maps
 
-    return write_maps(frames.shown(frames.moments(), "exporting"), output)
+    return write_maps(frames.shown(frames.moments(), "exporting"), file, scratch)
 
 
-def _export_arrays(arrays: Path, output: Path) -> None:
+def _export_arrays(arrays: Path, output: Path) -> int:
     from tactomo.cli.export_csv import write_contacts_of_arrays
 
     if output.suffix.lower() != ".csv":
         raise typer.BadParameter(f"{output}: of an .npz file only a .csv can be made")
-    prepare_file(output)
-    with _written_whole(output) as part:
-        count = write_contacts_of_arrays(arrays, part)
-    typer.echo(f"wrote {output}: contacts, {count} frames")
+    return _write(output, lambda file: write_contacts_of_arrays(arrays, file))

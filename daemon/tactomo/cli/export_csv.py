@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
-from collections.abc import Iterable
+import io
+from collections.abc import Iterable, Iterator
+from dataclasses import fields
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
 
 import numpy as np
 from tactomo_client import Contact
@@ -27,33 +30,18 @@ FRAME_COLUMNS: Final = (
     "confidence",
     "flags",
 )
-CONTACT_COLUMNS: Final = (
-    "id",
-    "x_mm",
-    "y_mm",
-    "area_mm2",
-    "magnitude",
-    "magnitude_sigma",
-    "pressure_kpa",
-    "pressure_sigma_kpa",
-    "pressure_range",
-    "force_n",
-    "force_sigma_n",
-    "x_sigma_mm",
-    "y_sigma_mm",
-    "area_sigma_mm2",
-)
+CONTACT_COLUMNS: Final = tuple(field.name for field in fields(Contact))
 ARRAY_COLUMNS: Final = {"magnitude_sigma": "contact_sigma"}
 """Columns whose array in the .npz of `tactomo reconstruct` is not named `contact_` and theirs."""
 
 
-def write_contacts(moments: Iterable[Moment], output: Path) -> int:
+def write_contacts(moments: Iterable[Moment], output: IO[bytes]) -> int:
     """Write the contacts of frames; return how many frames there were."""
     count = 0
-    with output.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
+    with _table(output) as writer:
         writer.writerow([*FRAME_COLUMNS, *CONTACT_COLUMNS])
-        for count, (time_s, frame) in enumerate(moments, 1):
+        for time_s, frame in moments:
+            count += 1
             start = [
                 f"{time_s:.9f}",
                 *(getattr(frame, name) for name in FRAME_COLUMNS[1:-1]),
@@ -64,11 +52,19 @@ def write_contacts(moments: Iterable[Moment], output: Path) -> int:
     return count
 
 
+@contextlib.contextmanager
+def _table(output: IO[bytes]) -> Iterator[Any]:
+    """Yield a CSV writer onto a file, which stays open."""
+    text = io.TextIOWrapper(output, encoding="utf-8", newline="")
+    yield csv.writer(text)
+    text.detach()  # flushes it
+
+
 def _cells(contact: Contact | None) -> list[Any]:
     return ["" if contact is None else getattr(contact, name) for name in CONTACT_COLUMNS]
 
 
-def write_contacts_of_arrays(source: Path, output: Path) -> int:
+def write_contacts_of_arrays(source: Path, output: IO[bytes]) -> int:
     """Write the contacts in the .npz file of `tactomo reconstruct`; return how many frames it has.
 
     Raises:
@@ -88,13 +84,13 @@ def write_contacts_of_arrays(source: Path, output: Path) -> int:
     columns = {name: arrays.get(ARRAY_COLUMNS.get(name, f"contact_{name}")) for name in _KEPT}
     of_frames = {name: arrays[name] for name in ("misfit", "confidence") if name in arrays}
     contact_frames, flags = arrays["contact_frame"], arrays["flags"]
-    with output.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
+    with _table(output) as writer:
         writer.writerow(["frame", *of_frames, "flags", *columns])
         for frame, bits in enumerate(flags):
             words = " ".join(sorted(Flag(int(bits)).names()))
             start = [frame, *(_cell(values, frame) for values in of_frames.values()), words]
-            for row in np.flatnonzero(contact_frames == frame).tolist() or (None,):
+            first, end = np.searchsorted(contact_frames, (frame, frame + 1)).tolist()
+            for row in range(first, end) or (None,):
                 writer.writerow([*start, *(_cell(values, row) for values in columns.values())])
     return len(flags)
 

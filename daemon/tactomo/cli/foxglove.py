@@ -68,8 +68,8 @@ def foxglove(
     WebSocket*, ws://127.0.0.1:8765; then *Import from file* under *Layouts*, with the file that
     `--layout` writes. It only shows: nothing that is done there reaches the sensor.
 
-    Needs foxglove-sdk: `pip install 'tactomo[foxglove]'`. Recordings open there, too, after `tactomo
-    export RECORDING OUT.mcap`.
+    Needs foxglove-sdk: `pip install 'tactomo[foxglove]'`. Recordings open there, too, after
+    `tactomo export RECORDING OUT.mcap`.
     """
     need_foxglove()
     from tactomo_client.keys import as_keys

@@ -1,87 +1,89 @@
-"""`tactomo plot`: a recording's contacts as a picture, where they went and when."""
+"""`tactomo plot`: a recording on a page: its maps, its contacts over sheet and time, its health."""
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tactomo.cli.app import FILES, RecordingFile, app, examples
-from tactomo.cli.programs import warn_of_damage
+from tactomo.cli.app import FILES, app, examples
+from tactomo.cli.recorded import DescriptionOption, FromOption, ToOption, recorded_frames
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from tactomo_models import SensorDescription
 
-    from tactomo.recording import Recording
+PANELS = ("maps", "path", "pressure", "force", "position", "misfit", "flags", "timing")
+DEFAULT_PANELS = tuple(panel for panel in PANELS if panel != "position")
 
 
 @app.command(
     rich_help_panel=FILES,
     epilog=examples(
         "tactomo plot grasp.mcap -o grasp.png",
-        "tactomo plot tank.mcap -o cup.png --smallest-mm2 200",
+        "tactomo plot grasp.mcap -o push.pdf --from 2 --to 8 --what maps,pressure,force",
+        "tactomo plot tank.mcap -o cup.png --what path,position --smallest-mm2 200",
     ),
 )
 def plot(
-    recording: RecordingFile,
+    recording: Annotated[
+        Path, typer.Argument(help="A recording (.mcap), or the folder of one in several files.")
+    ],
     output: Annotated[
         Path, typer.Option("--output", "-o", help="The picture: .png, .svg or .pdf.")
-    ] = Path("contacts.png"),
-    description: Annotated[
-        str | None, typer.Option("--sensor", "--description", "-d", help="[the recorded one]")
-    ] = None,
+    ] = Path("recording.png"),
+    what: Annotated[
+        str, typer.Option(metavar="PANELS", help=f"Some of {', '.join(PANELS)}.")
+    ] = ",".join(DEFAULT_PANELS),
+    start_s: FromOption = 0.0,
+    end_s: ToOption = None,
+    description: DescriptionOption = None,
     smallest_mm2: Annotated[
         float, typer.Option("--smallest-mm2", min=0.0, help="Leave out smaller contacts.")
     ] = 0.0,
     title: Annotated[str | None, typer.Option(help="Above the picture.")] = None,
 ) -> None:
-    """Draw the contacts of a recording: their path over the sheet, and their course in time.
+    """Draw a recording on one page.
 
-    Uses the contacts in the recording if it has some (`tactomo daemon --record-maps`); otherwise
-    the recording is reconstructed first, by the same code as live. Needs matplotlib:
-    `pip install 'tactomo[plot]'`.
+    *maps*: at telling moments, lettered; each stretch with the same contacts is shown, the longest
+    ones first. *path*: where the contacts went. *pressure*, *force*, *position*: over time, with a
+    band of two standard uncertainties (95 %) where they are known. *misfit*: what the model left
+    unexplained; about 1 is good. *flags*: the tier of each frame, and what to be wary of. *timing*:
+    how old frames were when they were published, the time between them, and which were lost.
+
+    Uses the recorded maps (`--record-maps`, `tactomo record --maps`); without any the recording is
+    reconstructed first, by the same code as live. Needs matplotlib: `pip install 'tactomo[plot]'`.
     """
+    panels = _panels(what)
     prepare_picture(output)
-    from rich.console import Console
-    from tactomo_models import load_description
+    from tactomo.cli.plot_course import Course, read_course, read_maps
+    from tactomo.cli.plot_page import draw_page
 
-    from tactomo.recording import open_recording
+    with recorded_frames(recording, description, start_s, end_s, output.parent) as frames:
+        course: Course = read_course(frames, smallest_mm2)
+        if not course.times_s:
+            raise TactomoError(
+                f"there are no frames of {recording} between these times",
+                "`tactomo info` tells how long it is",
+            )
+        maps = read_maps(frames, course) if "maps" in panels else []
+        figure = draw_page(course, maps, frames.description, panels, title or recording.name)
+    save_figure(figure, output)
+    typer.echo(
+        f"wrote {output}: {len(course.tracks)} contact(s) in {len(course.times_s)} frames, "
+        f"{course.times_s[-1] - course.times_s[0]:.1f} s"
+    )
 
-    opened = open_recording(recording)
-    warn_of_damage(opened)
-    sensor = description or opened.summary.origin.description
-    points = _read_contacts(recording) if opened.summary.is_complete else []
-    if not points:
-        with Console(stderr=True).status("reconstructing the recording"):
-            points = _reconstruct(opened, sensor)
-    points = [point for point in points if point.area_mm2 >= smallest_mm2]
-    if not points:
-        raise TactomoError(
-            f"there are no contacts in {recording}",
-            "look at it with `tactomo replay --viewer`; it may need another --sensor",
+
+def _panels(what: str) -> tuple[str, ...]:
+    asked = [panel.strip() for panel in what.split(",") if panel.strip()]
+    unknown = [panel for panel in asked if panel not in PANELS]
+    if unknown or not asked:
+        raise typer.BadParameter(
+            f"--what {what}: choose from {', '.join(PANELS)}, separated by commas"
         )
-    _draw(points, load_description(sensor), title or recording.name, output)
-    contacts = len({point.id for point in points})
-    typer.echo(f"wrote {output}: {contacts} contact(s), {len(points)} positions")
-
-
-@dataclass(frozen=True, slots=True)
-class Point:
-    """One contact in one frame."""
-
-    time_s: float
-    id: int
-    x_mm: float
-    y_mm: float
-    area_mm2: float
-    magnitude: float | None
-    pressure_kpa: float | None
+    return tuple(panel for panel in PANELS if panel in asked)
 
 
 def prepare_picture(output: Path) -> None:
@@ -149,133 +151,3 @@ def save_figure(figure: Figure, output: Path) -> None:
         raise TactomoError(
             f"cannot write {output}: {error}", "give a .png, .svg or .pdf that you may write"
         ) from error
-
-
-def _read_contacts(path: Path) -> list[Point]:
-    """Return the contacts in a complete recording; none where it was made without them."""
-    from mcap.reader import make_reader
-    from tactomo_client.messages import CONTACTS, decode_message
-
-    points: list[Point] = []
-    first_us: int | None = None
-    with path.open("rb") as file:
-        for _, _, message in make_reader(file).iter_messages(
-            topics=[CONTACTS], log_time_order=False
-        ):
-            fields = decode_message(message.data).fields
-            first_us = fields["device_us"] if first_us is None else first_us
-            time_s = (fields["device_us"] - first_us) * 1e-6
-            for contact in fields["contacts"]:
-                kept = {name: contact[name] for name in Point.__slots__ if name != "time_s"}
-                points.append(Point(time_s, **kept))
-    return points
-
-
-def _reconstruct(recording: Recording, description: str) -> list[Point]:
-    """Replay a recording through a daemon of our own, into one that has contacts."""
-    from tactomo.config import load_config
-    from tactomo.daemon import Daemon
-    from tactomo.log import configure_logging
-
-    configure_logging("error")
-    with tempfile.TemporaryDirectory(prefix="tactomo-") as folder:
-        path = Path(folder) / "contacts.mcap"
-        config = load_config(
-            name="plot",
-            description=description,
-            ports=recording.replay_urls(speed=0),
-            stream=f"ipc://{folder}/stream",
-            control=f"ipc://{folder}/control",
-            lossless=True,
-            exit_at_end=True,
-            record=path,
-            record_maps=True,
-        )
-        if Daemon(config).run() != 0:
-            raise TactomoError(
-                f"{recording.path} could not be replayed", "`tactomo replay` tells more"
-            )
-        return _read_contacts(path)
-
-
-def _draw(points: list[Point], description: SensorDescription, title: str, output: Path) -> None:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 5.2), layout="constrained")
-    figure.suptitle(title)
-    halves: Any = figure.subfigures(1, 2, width_ratios=(1.1, 1.0))
-    left, right = halves
-    _draw_sheet(left, points, description)
-    _draw_traces(right, points)
-    save_figure(figure, output)
-
-
-def _draw_sheet(figure: Any, points: list[Point], description: SensorDescription) -> None:
-    from matplotlib.patches import Circle, Rectangle
-
-    axes = figure.subplots()
-    width, height = description.width_m * 1e3, description.height_m * 1e3
-    style: dict[str, Any] = {"fill": False, "edgecolor": "0.4", "linewidth": 1.5}
-    if description.sheet.shape == "disc":
-        axes.add_patch(Circle((0, 0), width / 2, **style))
-    else:
-        axes.add_patch(Rectangle((-width / 2, -height / 2), width, height, **style))
-    for number, (begin, end) in enumerate(description.electrode_ends_m * 1e3):
-        axes.plot(*zip(begin, end, strict=True), color="black", linewidth=4, solid_capstyle="butt")
-        x, y = (begin + end) / 2 * 1.08
-        axes.text(x, y, str(number), ha="center", va="center", fontsize=7, color="0.4")
-    for track in _by_contact(points):
-        x, y = [point.x_mm for point in track], [point.y_mm for point in track]
-        axes.plot(x, y, color="0.8", linewidth=0.8, zorder=1)
-    dots = axes.scatter(
-        [point.x_mm for point in points],
-        [point.y_mm for point in points],
-        c=[point.time_s for point in points],
-        s=[max(4.0, point.area_mm2 / 40) for point in points],
-        cmap="viridis",
-        alpha=0.8,
-        linewidths=0,
-        zorder=2,
-    )
-    figure.colorbar(dots, ax=axes, label="time (s)", shrink=0.8)
-    axes.set(
-        xlim=(-0.57 * width, 0.57 * width),
-        ylim=(-0.57 * height, 0.57 * height),
-        aspect="equal",
-        xlabel="x (mm)",
-        ylabel="y (mm)",
-        title="path, dots by area",
-    )
-
-
-def _draw_traces(figure: Any, points: list[Point]) -> None:
-    rows = figure.subplots(3, 1, sharex=True)
-    what, unit = _strength(points)
-    for track in _by_contact(points):
-        times = [point.time_s for point in track]
-        rows[0].plot(times, [point.x_mm for point in track], ".-", markersize=2, linewidth=0.8)
-        rows[1].plot(times, [point.y_mm for point in track], ".-", markersize=2, linewidth=0.8)
-        strength = [getattr(point, what) for point in track]
-        rows[2].plot(times, strength, ".-", markersize=2, linewidth=0.8)
-    for axes, label in zip(rows, ("x (mm)", "y (mm)", unit), strict=True):
-        axes.set_ylabel(label)
-        axes.grid(visible=True, alpha=0.3)
-    rows[2].set_xlabel("time (s)")
-
-
-def _strength(points: Iterable[Point]) -> tuple[str, str]:
-    """Return the attribute that best tells how hard is pressed, and its axis label."""
-    known = list(points)
-    if any(point.pressure_kpa is not None for point in known):
-        return "pressure_kpa", "pressure (kPa)"
-    if any(point.magnitude is not None for point in known):
-        return "magnitude", "|Δσ|/σ₀"
-    return "area_mm2", "area (mm²)"
-
-
-def _by_contact(points: list[Point]) -> list[list[Point]]:
-    """Return the points of each contact, in time."""
-    tracks: dict[int, list[Point]] = {}
-    for point in points:
-        tracks.setdefault(point.id, []).append(point)
-    return list(tracks.values())

@@ -1,0 +1,191 @@
+"""`tactomo export`: what other programs read of a recording is what was recorded."""
+
+from __future__ import annotations
+
+import csv
+import json
+import resource
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+from recorded_grasp import (
+    FIRST_PRESSED,
+    FRAMES,
+    LAST_PRESSED,
+    LIGHT_FROM,
+    PERIOD_NS,
+    SENSOR,
+    START_NS,
+    contacts_of,
+    images_of,
+    write_grasp,
+)
+
+Run = Callable[..., Any]
+
+
+@pytest.fixture
+def grasp(tmp_path: Path) -> Path:
+    return write_grasp(tmp_path / "grasp.mcap")
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def decoded(path: Path, topic: str) -> list[tuple[int, Any]]:
+    """Read a topic by the MCAP and protobuf libraries, and the schemas in the file itself."""
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        if topic.endswith(("/frame", "/health")):
+            found = reader.iter_messages(topics=[topic])
+            return [(message.log_time, json.loads(message.data)) for _, _, message in found]
+        found = reader.iter_decoded_messages(topics=[topic])
+        return [(message.log_time, content) for _, _, message, content in found]
+
+
+def test_contacts_as_a_table(tactomo: Run, grasp: Path) -> None:
+    result = tactomo("export", grasp, "contacts.csv")
+    assert result.returncode == 0, result.stderr
+    assert result.stdout == f"wrote contacts.csv: contacts, {FRAMES} frames\n"
+    rows = rows_of(grasp.with_name("contacts.csv"))
+    for number in range(FRAMES):
+        at_s = number * PERIOD_NS * 1e-9
+        of_frame = [row for row in rows if float(row["time_s"]) == pytest.approx(at_s)]
+        expected = contacts_of(number)
+        if not expected:
+            assert [row["id"] for row in of_frame] == [""]  # nothing pressed, and that is known
+            continue
+        assert len(of_frame) == len(expected)
+        for row, contact in zip(of_frame, expected, strict=True):
+            assert int(row["acquired_realtime_ns"]) == START_NS + number * PERIOD_NS
+            assert float(row["x_mm"]) == contact.x_mm  # to the last bit
+            pressure = row["pressure_kpa"]
+            assert (float(pressure) if pressure else None) == contact.pressure_kpa
+            assert row["pressure_range"] == contact.pressure_range
+            assert row["flags"] == ("misfit_high" if number in (33, 34) else "")
+
+
+def test_maps_as_arrays(tactomo: Run, grasp: Path) -> None:
+    assert tactomo("export", grasp, "maps.npz").returncode == 0
+    with np.load(grasp.with_name("maps.npz")) as arrays:
+        assert arrays["map"].shape == (FRAMES, 51, 51)
+        assert np.isnan(arrays["pressure_kpa"][:5]).all()  # before the tare there are none
+        for name in ("map", "pressure_kpa", "structure"):
+            assert arrays[name].dtype == np.float32
+            np.testing.assert_array_equal(arrays[name][50], images_of(50)[name])
+        np.testing.assert_allclose(arrays["time_s"], np.arange(FRAMES) * PERIOD_NS * 1e-9)
+        np.testing.assert_allclose(arrays["x_mm"], np.linspace(-75, 75, 51))
+        np.testing.assert_array_equal(np.flatnonzero(arrays["flags"]), [33, 34])
+        assert arrays["flags"][33] == 16  # as `tactomo reconstruct` counts them
+        frames = arrays["contact_frame"]
+        assert (frames[0], frames[-1]) == (FIRST_PRESSED, LAST_PRESSED - 1)
+        light = arrays["contact_id"] == 2
+        assert set(frames[light]) == set(range(LIGHT_FROM, LAST_PRESSED))
+        assert np.isnan(arrays["contact_pressure_kpa"][light]).all()
+        assert set(arrays["contact_pressure_range"][light]) == {"below"}
+        assert (arrays["contact_sigma"][~light] == 0.005).all()
+
+
+def test_a_file_for_foxglove(tactomo: Run, grasp: Path) -> None:
+    result = tactomo("export", grasp, "fox.mcap", "--layout", "left.json", "--pose", "0,0,1")
+    assert result.returncode == 0, result.stderr
+    fox = grasp.with_name("fox.mcap")
+    numbers = decoded(fox, f"/{SENSOR}/frame")
+    assert [time for time, _ in numbers] == [START_NS + n * PERIOD_NS for n in range(FRAMES)]
+    assert [m["contact_count"] for _, m in numbers] == [len(contacts_of(n)) for n in range(FRAMES)]
+    assert {round(m["age_ms"], 6) for _, m in numbers} == {7.0}
+    scenes = decoded(fox, f"/{SENSOR}/contacts")
+    assert [len(scene.entities) for _, scene in scenes] == [m["contact_count"] for _, m in numbers]
+    assert len(decoded(fox, f"/{SENSOR}/grid")) == FRAMES - 5
+    assert len(decoded(fox, f"/{SENSOR}/image")) == FRAMES - 5
+    assert len(decoded(fox, f"/{SENSOR}/sheet")) == 1
+    assert decoded(fox, "/tf")[0][1].transforms[0].translation.z == 1.0
+    assert f"/{SENSOR}/grid" in grasp.with_name("left.json").read_text()
+
+
+def test_some_seconds_of_it(tactomo: Run, grasp: Path) -> None:
+    assert tactomo("export", grasp, "some.csv", "--from", 1, "--to", 1.5).returncode == 0
+    times = [float(row["time_s"]) for row in rows_of(grasp.with_name("some.csv"))]
+    assert (min(times), max(times)) == (1.0, 1.45)
+
+
+def test_a_recording_in_several_files(tactomo: Run, tmp_path: Path) -> None:
+    folder = tmp_path / "recordings"
+    folder.mkdir()
+    for number, part in enumerate((range(30), range(30, 60), range(60, FRAMES))):
+        write_grasp(folder / f"{SENSOR}-00000{number}-20231114T221320Z.mcap", part)
+    result = tactomo("export", folder, tmp_path / "all.csv")
+    assert result.returncode == 0, result.stderr
+    times = sorted({float(row["time_s"]) for row in rows_of(tmp_path / "all.csv")})
+    np.testing.assert_allclose(times, np.arange(FRAMES) * PERIOD_NS * 1e-9)
+
+
+def test_a_cut_recording_gives_what_is_there_and_says_so(tactomo: Run, grasp: Path) -> None:
+    data = grasp.read_bytes()
+    grasp.write_bytes(data[: len(data) * 2 // 3])
+    result = tactomo("export", grasp, "contacts.csv")
+    if result.returncode:  # all of it was in one chunk, and that is cut
+        assert "there are no maps" in result.stderr
+    else:
+        assert "cut" in result.stderr
+
+
+def test_contacts_of_reconstructed_arrays(tactomo: Run, grasp: Path) -> None:
+    assert tactomo("export", grasp, "maps.npz").returncode == 0
+    result = tactomo("export", "maps.npz", "again.csv")
+    assert result.returncode == 0, result.stderr
+    rows = rows_of(grasp.with_name("again.csv"))
+    assert [int(row["frame"]) for row in rows[:3]] == [0, 1, 2]
+    pressed = [row for row in rows if row["x_mm"]]
+    expected = [contact for n in range(FRAMES) for contact in contacts_of(n)]
+    assert [float(row["x_mm"]) for row in pressed] == [contact.x_mm for contact in expected]
+    assert {row["flags"] for row in rows if row["frame"] == "33"} == {"misfit_high"}
+    assert [row["pressure_kpa"] == "" for row in pressed] == [
+        contact.pressure_kpa is None for contact in expected
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "says"),
+    [
+        (["grasp.mcap", "out.txt"], 2, ".mcap, .csv, .npz"),
+        (["grasp.mcap", "grasp.mcap"], 2, "is the recording itself"),
+        (["grasp.mcap", "out.csv", "--from", "3", "--to", "2"], 2, "is not after --from"),
+        (["grasp.mcap", "out.csv", "--from", "99"], 1, "no frames"),
+        (["grasp.mcap", "nowhere/out.csv"], 1, "cannot write nowhere/out.csv"),
+        (["none.mcap", "out.csv"], 1, "none.mcap"),
+        (["grasp.mcap", "out.mcap", "--pose", "1"], 2, "X,Y,Z"),
+        (["none.npz", "out.csv"], 1, "cannot read none.npz"),
+        (["maps.npz", "out.mcap"], 2, "only a .csv"),
+    ],
+)
+@pytest.mark.usefixtures("grasp")
+def test_what_goes_wrong_is_told(
+    tactomo: Run, tmp_path: Path, arguments: list[str], status: int, says: str
+) -> None:
+    result = tactomo("export", *arguments)
+    assert result.returncode == status
+    assert says in result.stderr.replace("\n", " ")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["grasp.mcap"]
+
+
+def test_what_was_there_stays_where_writing_fails(tactomo: Run, grasp: Path) -> None:
+    for name in ("contacts.csv", "maps.npz", "fox.mcap"):
+        grasp.with_name(name).write_text("precious")
+        before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
+        try:
+            result = tactomo("export", grasp, name)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        assert result.returncode == 1, name
+        assert f"cannot write {name}" in result.stderr
+        assert grasp.with_name(name).read_text() == "precious"
+    assert len(list(grasp.parent.iterdir())) == 4

@@ -1,0 +1,115 @@
+"""`tactomo plot`: a page of a recording, and what is told about it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import matplotlib.image as mpl_image
+import numpy as np
+import pytest
+from recorded_grasp import FIRST_PRESSED, FRAMES, LAST_PRESSED, LIGHT_FROM, PERIOD_NS, write_grasp
+from tactomo.cli.plot_course import read_course, read_maps, telling_moments
+from tactomo.cli.plot_page import draw_page
+from tactomo.cli.recorded import recorded_frames
+
+Run = Callable[..., Any]
+
+
+@pytest.fixture
+def grasp(tmp_path: Path) -> Path:
+    return write_grasp(tmp_path / "grasp.mcap", [n for n in range(FRAMES) if n not in (55, 56)])
+
+
+def axes_labels(figure: Any) -> list[str]:
+    return [axes.get_ylabel() for axes in figure.axes]
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [("page.png", ()), ("page.svg", ("--what", "force")), ("page.pdf", ("--what", "flags"))],
+)
+def test_a_page_of_each_kind(
+    tactomo: Run, grasp: Path, name: str, options: tuple[str, ...]
+) -> None:
+    result = tactomo("plot", grasp, "-o", name, *options)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout == f"wrote {name}: 2 contact(s) in 78 frames, 4.0 s\n"
+    data = grasp.with_name(name).read_bytes()
+    assert data.startswith({"png": b"\x89PNG", "svg": b"<?xml", "pdf": b"%PDF"}[name[-3:]])
+    if name.endswith("png"):
+        pixels = mpl_image.imread(grasp.with_name(name))
+        assert pixels.shape[1] == 1800
+        assert np.ptp(pixels[..., :3]) > 0.9
+
+
+def test_what_the_page_is_drawn_from(grasp: Path) -> None:
+    with recorded_frames(grasp, None) as frames:
+        course = read_course(frames, 0.0)
+        maps = read_maps(frames, course)
+        assert frames.description is not None
+        panels = ("maps", "path", "pressure", "force", "misfit", "flags", "timing")
+        figure = draw_page(course, maps, frames.description, panels, "a grasp")
+    assert list(course.tracks) == ["1", "2"]
+    assert len(course.tracks["1"].times_s) == LAST_PRESSED - FIRST_PRESSED - 2
+    assert course.tracks["2"].times_s[0] == pytest.approx(LIGHT_FROM * PERIOD_NS * 1e-9)
+    assert sum(course.lost) == 2
+    assert course.ages_s[0] == pytest.approx(0.007)
+    assert len(maps) == 6
+    assert all(moment.frame.map is not None for moment in maps)
+    labels = axes_labels(figure)
+    assert {"pressure (kPa)", "force (N)", "misfit", "ms", "y (mm)"} <= set(labels)
+
+
+def test_some_panels_of_some_seconds(tactomo: Run, grasp: Path) -> None:
+    result = tactomo(
+        *("plot", grasp, "-o", "some.png", "--what", "position, pressure"),
+        *("--from", 1, "--to", 2, "--smallest-mm2", 500, "--title", "Some"),
+    )
+    assert result.returncode == 0, result.stderr
+    assert "1 contact(s) in 20 frames" in result.stdout
+
+
+def test_nothing_pressed_is_a_page_too(tactomo: Run, tmp_path: Path) -> None:
+    path = write_grasp(tmp_path / "idle.mcap", range(10, 18))
+    result = tactomo("plot", path, "-o", "idle.png")
+    assert result.returncode == 0, result.stderr
+    assert "0 contact(s) in 8 frames" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "says"),
+    [
+        (["grasp.mcap", "--what", "maps,music"], 2, "choose from maps"),
+        (["grasp.mcap", "-o", "page.gif"], 1, "not a kind of picture"),
+        (["grasp.mcap", "--from", "100"], 1, "no frames"),
+        (["none.mcap"], 1, "none.mcap"),
+    ],
+)
+@pytest.mark.usefixtures("grasp")
+def test_what_goes_wrong_is_told(
+    tactomo: Run, arguments: list[str], status: int, says: str
+) -> None:
+    result = tactomo("plot", *arguments)
+    assert result.returncode == status
+    assert says in result.stderr.replace("\n", " ")
+
+
+def moments_of(*stretches: tuple[int, str]) -> list[str]:
+    """Return what is pressed at the telling moments of stretches of (frames, contacts)."""
+    pressed = [frozenset(names) for frames, names in stretches for _ in range(frames)]
+    times = [0.1 * i for i in range(len(pressed))]
+    return ["".join(sorted(pressed[i])) for i in telling_moments(times, pressed, 4)]
+
+
+def test_every_long_stretch_with_the_same_contacts_gets_a_map() -> None:
+    assert moments_of((20, ""), (10, "a"), (10, "ab"), (10, "b")) in (
+        ["a", "a", "ab", "b"],
+        ["a", "ab", "ab", "b"],
+        ["a", "ab", "b", "b"],
+    )
+    assert moments_of((40, "a"), (9, "b"), (8, "c"), (7, "d"), (6, "e")) == ["a", "b", "c", "d"]
+    assert moments_of((50, ""), (1, "a")) == ["a"]
+    assert moments_of((50, "")) == [""]
+    assert moments_of((2, "a"), (1, "")) == ["a", "a"]

@@ -1,0 +1,310 @@
+"""The live bridge: a sensor on a real socket on one side, Foxglove's protocol on the other."""
+
+from __future__ import annotations
+
+import json
+import queue
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+from foxglove_client import FoxgloveClient
+from recorded_grasp import contacts_of, images_of
+from tactomo.frames import description_fields
+from tactomo_client import MessageError
+from tactomo_client.fake import FakeSensor
+from tactomo_client.messages import encode_message
+from tactomo_foxglove import Bridge, BridgeError, Placement
+from tactomo_models import load_description
+
+PRESSED = 50
+DESCRIPTION = description_fields(load_description("paper_square"))
+ALL = {"sheet", "contacts", "grid", "image", "annotations", "frame", "health", "events"}
+STATUS: Mapping[str, Any] = {
+    "state": "running",
+    "description": DESCRIPTION,
+    "rates": {"frames_hz": 20.0, "magnitude_hz": 20.0, "structure_hz": None},
+    "latency_ms": {"p50": 1.5, "p99": 3.0},
+    "recording": None,
+    "uptime_s": 12.0,
+    "frames": 7,
+}
+HEADER: Mapping[str, Any] = {
+    "session": "another",
+    "sequence": 1,
+    "acquired_realtime_ns": None,
+    "acquired_monotonic_ns": None,
+    "device_us": None,
+    "age_ns": None,
+    "tier": None,
+    "tier_reason": None,
+    "flags": [],
+    "misfit": None,
+}
+
+
+class Publishing:
+    """A sensor that publishes the same frame again and again until it is told to pause."""
+
+    def __init__(self, sensor: FakeSensor, number: int = PRESSED) -> None:
+        self.sensor = sensor
+        self.number = number
+        self.paused = False
+        self.also: queue.SimpleQueue[bytes] = queue.SimpleQueue()  # the socket is this thread's
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stop.wait(0.01):
+            self.sensor.publish_message("status", STATUS)
+            while not self.also.empty():
+                self.sensor.send(self.also.get())
+            if not self.paused:
+                self.sensor.publish(contacts_of(self.number), **images_of(self.number))
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+@contextmanager
+def publishing(sensor: FakeSensor, number: int = PRESSED) -> Iterator[Publishing]:
+    running = Publishing(sensor, number)
+    try:
+        yield running
+    finally:
+        running.stop()
+
+
+@contextmanager
+def bridged(stream: str, **options: Any) -> Iterator[Bridge]:
+    stop = threading.Event()
+    with Bridge(["left"], stream, port=0, **options) as bridge:
+        thread = threading.Thread(target=bridge.run, args=(stop,))
+        thread.start()
+        try:
+            yield bridge
+        finally:
+            stop.set()
+            thread.join()
+
+
+@pytest.fixture
+def sensor() -> Iterator[FakeSensor]:
+    with FakeSensor("left") as sensor:
+        yield sensor
+
+
+@pytest.fixture
+def source(sensor: FakeSensor) -> Iterator[Publishing]:
+    with publishing(sensor) as source:
+        yield source
+
+
+@pytest.fixture
+def client(source: Publishing) -> Iterator[FoxgloveClient]:
+    with bridged(source.sensor.address) as bridge, FoxgloveClient(bridge.url) as client:
+        yield client
+
+
+def words_of(scene: Any) -> str:
+    return " ".join(text.text for entity in scene.entities for text in entity.texts)
+
+
+def test_it_advertises_its_topics_with_their_schemas(client: FoxgloveClient) -> None:
+    assert set(client.channels) == {"/tf", *(f"/left/{name}" for name in ALL)}
+    assert all(channel["schema"] for channel in client.channels.values())
+    kinds = {topic: channel["schemaName"] for topic, channel in client.channels.items()}
+    assert kinds["/left/contacts"] == "foxglove.SceneUpdate"
+    assert kinds["/left/grid"] == "foxglove.Grid"
+    assert kinds["/left/events"] == "foxglove.Log"
+
+
+def test_contacts_are_discs_as_high_as_the_pressure(client: FoxgloveClient) -> None:
+    firm, _ = contacts_of(PRESSED)
+    assert firm.pressure_kpa is not None
+    scene = client.wait("/left/contacts", lambda scene: len(scene.entities) == 2)
+    one, other = (entity.cylinders[0] for entity in scene.entities)
+    assert one.pose.position.x == pytest.approx(firm.x_mm * 1e-3)
+    assert one.pose.position.y == pytest.approx(firm.y_mm * 1e-3)
+    assert np.pi / 4 * one.size.x**2 == pytest.approx(firm.area_mm2 * 1e-6)
+    assert one.size.z == pytest.approx(firm.pressure_kpa / 300.0 * 0.25 * 0.15)
+    assert other.size.z == pytest.approx(0.001)
+    assert f"1: {firm.pressure_kpa:.0f} ± 2 kPa" in words_of(scene)
+    assert "touched, pressure unknown" in words_of(scene)
+    assert scene.deletions[0].type == 1  # all that were there before
+    assert {e.frame_id for e in scene.entities} == {"left"}
+
+
+def test_the_grid_has_the_numbers_and_lies_where_the_map_is(client: FoxgloveClient) -> None:
+    grid = client.wait("/left/grid")
+    names = [field.name for field in grid.fields]
+    assert names == ["red", "green", "blue", "alpha", "pressure_kpa", "magnitude", "structure"]
+    types = {1: "u1", 7: "<f4"}
+    cells = np.frombuffer(
+        grid.data, np.dtype([(field.name, types[field.type]) for field in grid.fields])
+    ).reshape(51, 51)
+    np.testing.assert_array_equal(cells["pressure_kpa"], images_of(PRESSED)["pressure_kpa"])
+    np.testing.assert_array_equal(cells["structure"], images_of(PRESSED)["structure"])
+    assert grid.row_stride == 51 * grid.cell_stride == 51 * cells.itemsize
+    assert grid.pose.position.x + grid.cell_size.x / 2 == pytest.approx(-0.075)
+    assert grid.cell_size.y == pytest.approx(0.003)
+    assert (cells["alpha"] == 255).all()
+
+
+def test_the_image_has_y_up_and_its_labels_lie_on_it(client: FoxgloveClient) -> None:
+    firm = contacts_of(PRESSED)[0]
+    image = client.wait("/left/image")
+    pixels = np.frombuffer(image.data, np.uint8).reshape(image.height, image.width, 3)
+    brightest = np.argwhere(pixels.sum(axis=-1) == pixels.sum(axis=-1).max()).mean(axis=0)
+    marks = client.wait("/left/annotations")
+    circle = marks.circles[0]
+    assert (circle.position.y - 0.5, circle.position.x - 0.5) == pytest.approx(brightest, abs=1.0)
+    assert circle.position.y > image.height / 2  # below the middle, as it was pressed
+    assert circle.position.x == pytest.approx((firm.x_mm + 75) / 3 + 0.5)
+    assert "kPa" in marks.texts[0].text
+
+
+def test_numbers_to_plot(client: FoxgloveClient) -> None:
+    firm, _ = contacts_of(PRESSED)
+    numbers = client.wait("/left/frame", lambda m: "period_ms" in m)
+    assert numbers["contact_count"] == 2
+    assert numbers["contacts"][0]["pressure_kpa"] == firm.pressure_kpa
+    assert numbers["contacts"][1]["pressure_range"] == "below"
+    assert "pressure_kpa" not in numbers["contacts"][1]  # unknown, so it is left out
+    assert numbers["force_n"] == firm.force_n
+    assert numbers["misfit"] == 1.0
+    assert 0 <= numbers["age_ms"] < 500
+    health = client.wait("/left/health", lambda m: m["rates"])
+    assert health["rates"] == {"frames_hz": 20.0, "magnitude_hz": 20.0}
+    assert health["is_stale"] is False
+
+
+def test_the_sheet_hangs_where_it_is_said(sensor: FakeSensor) -> None:
+    placed = Placement("forearm", x_m=0.1, yaw_deg=90.0)
+    with (
+        bridged(sensor.address, placement=placed) as bridge,
+        publishing(sensor),
+        FoxgloveClient(bridge.url) as client,
+    ):
+        transform = client.wait("/tf").transforms[0]
+        sheet = client.wait("/left/sheet").entities[0]
+    assert (transform.parent_frame_id, transform.child_frame_id) == ("forearm", "left")
+    assert transform.translation.x == 0.1
+    assert transform.rotation.z == pytest.approx(np.sin(np.pi / 4))
+    assert len(sheet.cubes) == 16
+    assert max(point.x for point in sheet.lines[0].points) == pytest.approx(0.075)
+
+
+def test_events_are_lines_of_the_log(source: Publishing, client: FoxgloveClient) -> None:
+    event = {"name": "port_lost", "severity": "error", "detail": "unplugged", "next_step": "plug"}
+    source.also.put(encode_message("left", "event", {**HEADER, **event}))
+    line = client.wait("/left/events")
+    assert (line.level, line.name, line.file) == (4, "left", "port_lost")
+    assert line.message == "port_lost: unplugged -> plug"
+
+
+def test_old_data_are_shown_as_old_until_new_ones_come(
+    source: Publishing, client: FoxgloveClient
+) -> None:
+    client.wait("/left/grid")
+    source.paused = True
+    scene = client.wait("/left/contacts", lambda scene: "STALE" in words_of(scene))
+    assert len(scene.entities) == 3  # the contacts are still there, and grey
+    colour = scene.entities[0].cylinders[0].color
+    assert colour.r == colour.g == colour.b
+    assert client.wait("/left/health", lambda m: m["is_stale"] and "age_s" in m)["age_s"] > 0.5
+    warning = client.wait_said(lambda said: said["op"] == "status" and "STALE" in said["message"])
+    assert "the daemon says: running" in warning["message"]
+    source.paused = False
+    client.wait_said(lambda said: said["op"] == "removeStatus")
+    scene = client.wait("/left/contacts", lambda s: len(s.entities) == 2, anew=True)
+    assert "STALE" not in words_of(scene)
+
+
+def test_it_says_when_no_daemon_answers() -> None:
+    with bridged("tcp://127.0.0.1:9") as bridge, FoxgloveClient(bridge.url) as client:
+        warning = client.wait_said(lambda said: said["op"] == "status")
+        assert "no daemon answers" in warning["message"]
+        assert client.wait("/left/health", lambda m: m.get("state") == "gone")["is_stale"]
+
+
+def test_the_daemon_may_be_restarted(sensor: FakeSensor) -> None:
+    with bridged(sensor.address) as bridge, FoxgloveClient(bridge.url) as client:
+        with publishing(sensor):
+            first = client.wait("/left/frame")["session"]
+        sensor.close()
+        with FakeSensor("left", sensor.address) as again, publishing(again):
+            later = client.wait("/left/frame", lambda m: m["session"] != first)
+    assert later["missed_frames"] == 0
+
+
+def test_who_does_not_read_holds_up_nobody(sensor: FakeSensor) -> None:
+    with (
+        bridged(sensor.address) as bridge,
+        publishing(sensor),
+        FoxgloveClient(bridge.url, reads=False),
+        FoxgloveClient(bridge.url) as client,
+        FoxgloveClient(bridge.url) as other,
+    ):
+        for _ in range(100):  # some 5 MB
+            client.wait("/left/grid", anew=True)
+        assert client.wait("/left/frame", anew=True)["age_ms"] < 500
+        other.wait("/left/frame", anew=True)
+
+
+def test_what_breaks_the_rules_is_skipped(source: Publishing, client: FoxgloveClient) -> None:
+    source.also.put(b"left/map\0nonsense")
+    source.also.put(encode_message("left", "map", {**HEADER, "contacts": "none"}))
+    client.wait("/left/frame", anew=True)
+
+
+def test_an_address_that_is_taken(sensor: FakeSensor) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with pytest.raises(BridgeError, match=r"Address already in use.*--port"):
+            Bridge(["left"], sensor.address, port=taken.getsockname()[1])
+    with pytest.raises(BridgeError, match="cannot listen on nowhere"):
+        Bridge(["left"], sensor.address, host="nowhere.invalid", port=0)
+    with pytest.raises(MessageError):
+        Bridge(["no sensor"], sensor.address, port=0)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_command_serves_until_it_is_stopped(
+    sensor: FakeSensor, tmp_path: Any, number: int
+) -> None:
+    layout = tmp_path / "left.json"
+    command = [
+        *(sys.executable, "-m", "tactomo.cli", "foxglove", "left", "--stream", sensor.address),
+        *("--port", "0", "--layout", str(layout), "--announce"),
+    ]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        said = next(line for line in process.stdout if line.startswith("{"))
+        with publishing(sensor), FoxgloveClient(json.loads(said)["url"]) as client:
+            client.wait("/left/frame")
+            process.send_signal(number)
+            assert process.wait(10) == 0
+    assert "/left/contacts" in layout.read_text()
+
+
+def test_wrong_usage(tactomo: Callable[..., Any]) -> None:
+    result = tactomo("foxglove", "--pose", "1,2")
+    assert result.returncode == 2
+    assert "X,Y,Z" in result.stderr
+    began = time.monotonic()
+    result = tactomo("foxglove", "--layout", "nowhere/skin.json")
+    assert result.returncode == 1
+    assert "cannot write nowhere/skin.json" in result.stderr
+    assert time.monotonic() - began < 10

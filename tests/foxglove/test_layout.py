@@ -1,0 +1,69 @@
+"""The shipped layout shows what is published, under its names."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from tactomo_foxglove import layout_for, shipped_layout
+from tactomo_foxglove.topics import FRAME_SCHEMA, HEALTH_SCHEMA
+
+TOPICS = {"sheet", "contacts", "grid", "image", "annotations", "frame", "health", "events"}
+SCHEMAS = {"frame": FRAME_SCHEMA, "health": HEALTH_SCHEMA}
+
+
+def texts(value: Any) -> Iterator[str]:
+    """Yield every string in it, keys included."""
+    if isinstance(value, dict):
+        for key, each in value.items():
+            yield key
+            yield from texts(each)
+    elif isinstance(value, list):
+        for each in value:
+            yield from texts(each)
+    elif isinstance(value, str):
+        yield value
+
+
+def panels(layout: Any) -> Iterator[str]:
+    if isinstance(layout, str):
+        yield layout
+    else:
+        yield from panels(layout["first"])
+        yield from panels(layout["second"])
+
+
+def test_every_panel_has_a_configuration() -> None:
+    layout = json.loads(shipped_layout())
+    assert sorted(panels(layout["layout"])) == sorted(layout["configById"])
+    kinds = {name.partition("!")[0] for name in layout["configById"]}
+    assert {"3D", "Image", "Plot", "RosOut"} <= kinds
+
+
+def test_it_names_no_topic_and_no_field_that_there_is_not() -> None:
+    paths = [text for text in texts(json.loads(shipped_layout())) if text.startswith("/skin/")]
+    assert {path.split("/")[2].partition(".")[0] for path in paths} >= TOPICS - {"health"}
+    for path in paths:
+        topic, _, rest = path.removeprefix("/skin/").partition(".")
+        assert topic in TOPICS, path
+        schema: Any = SCHEMAS.get(topic)
+        for step in filter(None, rest.split(".")):
+            name, index = re.fullmatch(r"(\w+)(\[\d+\])?", step).groups()  # type: ignore[union-attr]
+            assert name in schema["properties"], path
+            schema = schema["properties"][name]
+            schema = schema["items"] if index else schema
+
+
+@pytest.mark.parametrize("sensor", ["left_forearm", "left.arm-2"])
+def test_for_a_sensor_of_another_name(sensor: str) -> None:
+    layout = json.loads(layout_for(sensor))
+    assert not [text for text in texts(layout) if "skin" in text]
+    config = layout["configById"]
+    assert config["3D!map"]["followTf"] == sensor
+    assert f"/{sensor}/grid" in config["3D!map"]["topics"]
+    value = config["Plot!force"]["paths"][0]["value"]
+    quote = '"' if "-" in sensor else ""
+    assert value == f"{quote}/{sensor}/frame{quote}.force_n"
