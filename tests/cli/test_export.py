@@ -44,10 +44,10 @@ def decoded(path: Path, topic: str) -> list[tuple[int, Any]]:
     with path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         if topic.endswith(("/frame", "/health")):
-            found = reader.iter_messages(topics=[topic])
-            return [(message.log_time, json.loads(message.data)) for _, _, message in found]
+            plain = reader.iter_messages(topics=[topic])
+            return [(message.log_time, json.loads(message.data)) for _, _, message in plain]
         found = reader.iter_decoded_messages(topics=[topic])
-        return [(message.log_time, content) for _, _, message, content in found]
+        return [(each.message.log_time, each.decoded_message) for each in found]
 
 
 def test_contacts_as_a_table(tactomo: Run, grasp: Path) -> None:

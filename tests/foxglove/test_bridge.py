@@ -69,7 +69,8 @@ class Publishing:
             while not self.also.empty():
                 self.sensor.send(self.also.get())
             if not self.paused:
-                self.sensor.publish(contacts_of(self.number), **images_of(self.number))
+                images: Mapping[str, Any] = images_of(self.number)
+                self.sensor.publish(contacts_of(self.number), **images)
 
     def stop(self) -> None:
         self._stop.set()

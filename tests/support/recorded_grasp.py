@@ -66,7 +66,7 @@ def images_of(number: int) -> dict[str, NDArray[np.float32] | None]:
         structure[inside] = 1.0
         pressure[inside] = np.nan if contact.pressure_kpa is None else contact.pressure_kpa
     return {
-        "map": np.nan_to_num(pressure) / 1000,
+        "map": np.nan_to_num(pressure) * np.float32(1e-3),
         "pressure_kpa": pressure,
         "structure": structure,
     }

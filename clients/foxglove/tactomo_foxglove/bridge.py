@@ -15,7 +15,7 @@ from typing import Any, Final, Self
 import foxglove
 import zmq
 from foxglove.channels import FrameTransformsChannel
-from foxglove.websocket import StatusLevel
+from foxglove.websocket import StatusLevel, WebSocketServer
 from tactomo_client import ClientError, Frame, Keys, MessageError
 from tactomo_client.frame import frame_from_message
 from tactomo_client.keys import Handshakes
@@ -95,7 +95,8 @@ class Bridge:
     @property
     def app_url(self) -> str | None:
         """The page of Foxglove's web app that opens it."""
-        return self._server.app_url()
+        url: str | None = self._server.app_url()
+        return url
 
     def run(self, stop: threading.Event) -> None:
         """Serve until `stop` is set.
@@ -168,7 +169,7 @@ class _Sensor:
         else:
             self._topics.event(message.fields, now_ns)
 
-    def look_around(self, server: foxglove.WebSocketServer) -> None:
+    def look_around(self, server: WebSocketServer) -> None:
         """Say how the daemon is, and complain about old data as long as they are old."""
         self._topics.health(self._health(), time.time_ns())
         trouble = self._trouble()
@@ -223,7 +224,7 @@ def _is_due(last_s: float | None) -> bool:
 
 def _serve(
     sensors: Sequence[str], host: str, port: int, context: foxglove.Context
-) -> foxglove.WebSocketServer:
+) -> WebSocketServer:
     try:
         return foxglove.start_server(
             name=f"tactomo: {', '.join(sensors)}",

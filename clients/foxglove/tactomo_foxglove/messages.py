@@ -160,7 +160,7 @@ def image(frame: Frame, description: Mapping[str, Any], time_ns: int, stale: boo
     )
 
 
-def annotations(
+def image_annotations(
     frame: Frame, description: Mapping[str, Any], time_ns: int, stale: bool
 ) -> ImageAnnotations | None:
     """Return the contacts as circles and labels on that picture."""

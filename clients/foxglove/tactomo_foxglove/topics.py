@@ -44,9 +44,8 @@ _TEXT: Final = {"type": "string"}
 _TRUTH: Final = {"type": "boolean"}
 
 
-def _object(title: str = "", **properties: Any) -> dict[str, Any]:
-    named = {"title": title} if title else {}
-    return {**named, "type": "object", "properties": properties}
+def _object(**properties: Any) -> dict[str, Any]:
+    return {"type": "object", "properties": properties}
 
 
 def _list(of: dict[str, Any]) -> dict[str, Any]:
@@ -63,33 +62,37 @@ CONTACT_SCHEMA: Final = _object(
         for field in fields(Contact)
     }
 )
-FRAME_SCHEMA: Final = _object(
-    "tactomo.Frame",
-    sequence=_INTEGER,
-    scan_counter=_INTEGER,
-    session=_TEXT,
-    tier=_TEXT,
-    tier_reason=_TEXT,
-    flags=_list(_TEXT),
-    flag_count=_INTEGER,
-    contact_count=_INTEGER,
-    contacts=_list(CONTACT_SCHEMA),
-    **_numbers("misfit", "confidence", "age_ms", "delay_ms", "skew_ms", "period_ms"),
-    **_numbers("force_n", "pressure_max_kpa"),
-    missed_frames=_INTEGER,
-)
+FRAME_SCHEMA: Final = {
+    "title": "tactomo.Frame",
+    **_object(
+        sequence=_INTEGER,
+        scan_counter=_INTEGER,
+        session=_TEXT,
+        tier=_TEXT,
+        tier_reason=_TEXT,
+        flags=_list(_TEXT),
+        flag_count=_INTEGER,
+        contact_count=_INTEGER,
+        contacts=_list(CONTACT_SCHEMA),
+        **_numbers("misfit", "confidence", "age_ms", "delay_ms", "skew_ms", "period_ms"),
+        **_numbers("force_n", "pressure_max_kpa"),
+        missed_frames=_INTEGER,
+    ),
+}
 _PERCENTILES: Final = _object(**_numbers("p50", "p99"))
-HEALTH_SCHEMA: Final = _object(
-    "tactomo.Health",
-    state=_TEXT,
-    is_stale=_TRUTH,
-    tier_requested=_TEXT,
-    recording=_TEXT,
-    rates=_object(**_numbers("frames_hz", "magnitude_hz", "structure_hz")),
-    latency_ms=_PERCENTILES,
-    **_numbers("age_s", "uptime_s"),
-    **dict.fromkeys(("frames", "dropped_scans", "incomplete_scans", "late_scans"), _INTEGER),
-)
+HEALTH_SCHEMA: Final = {
+    "title": "tactomo.Health",
+    **_object(
+        state=_TEXT,
+        is_stale=_TRUTH,
+        tier_requested=_TEXT,
+        recording=_TEXT,
+        rates=_object(**_numbers("frames_hz", "magnitude_hz", "structure_hz")),
+        latency_ms=_PERCENTILES,
+        **_numbers("age_s", "uptime_s"),
+        **dict.fromkeys(("frames", "dropped_scans", "incomplete_scans", "late_scans"), _INTEGER),
+    ),
+}
 
 
 class SensorTopics:
@@ -171,7 +174,7 @@ class SensorTopics:
         ):
             self._image.log(image, log_time=time_ns)
         if self._annotations.has_sinks() and (
-            marks := messages.annotations(frame, about, time_ns, bool(stale))
+            marks := messages.image_annotations(frame, about, time_ns, bool(stale))
         ):
             self._annotations.log(marks, log_time=time_ns)
 

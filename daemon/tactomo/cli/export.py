@@ -123,6 +123,8 @@ def _write(output: Path, write: Callable[[IO[bytes]], int]) -> int:
     """
     from tactomo_models.archive import write_whole
 
+    count = 0
+
     def write_some(file: IO[bytes]) -> None:
         nonlocal count
         if not (count := write(file)):
@@ -130,7 +132,6 @@ def _write(output: Path, write: Callable[[IO[bytes]], int]) -> int:
                 "there are no frames between these times", "`tactomo info` tells how long it is"
             )
 
-    count = 0
     try:
         write_whole(output, write_some)
     except OSError as error:

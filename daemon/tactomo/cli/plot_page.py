@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, Final
 
@@ -56,8 +56,8 @@ def draw_page(
     figure.text(0.01, 1 - 0.42 / figure.get_figheight(), _subtitle(course), color="0.4")
     parts = [part for part, height in (("strip", strip_in), ("body", body_in)) if height]
     heights = [height for height in (strip_in, body_in) if height]
-    subfigures = np.atleast_1d(figure.subfigures(len(parts), 1, height_ratios=heights))
-    areas = dict(zip(parts, subfigures, strict=True))
+    column: Any = figure.subfigures(len(parts), 1, height_ratios=heights, squeeze=False)
+    areas = dict(zip(parts, column[:, 0], strict=True))
     colours = _contact_colours(course)
     if maps:
         _draw_strip(areas["strip"], maps, about)
@@ -348,7 +348,7 @@ def _pairs(track: Track) -> list[tuple[float, Contact]]:
     return list(zip(track.times_s, track.contacts, strict=True))
 
 
-def _broken(times: Sequence[float], values: Sequence[Any]) -> tuple[Any, Any]:
+def _broken(times: Sequence[float], values: Iterable[Any]) -> tuple[Any, Any]:
     """Return the two as arrays, with a gap wherever nothing came for a while."""
     xs = np.asarray(times, dtype=float)
     ys = np.asarray([math.nan if value is None else value for value in values], dtype=float)
