@@ -34,6 +34,7 @@ Image = NDArray[np.float32]
 NetworkKind = Literal["network", "refiner", "cnn-single", "cnn-multimodal"]
 
 FORMAT = 1
+SHIPPED = Path(str(files("tactomo_models"))) / "networks"
 NONE_TRAINED = "none is trained for this sensor"
 NEWEST_OPSET = 21  # that the oldest ONNX Runtime we support runs
 FAINT = 0.05  # share pressed below which nothing is: a solve goes by the area that is not 0
@@ -250,8 +251,12 @@ class SensorNetworks:
         """Why the physics has to do without networks; empty where it need not."""
         if len(self._description.modalities) < 2:
             return f"{NONE_TRAINED}: it has a single channel"
-        if not all(find_network(self._description, kind) for kind in ("network", "refiner")):
-            return NONE_TRAINED
+        kinds: tuple[NetworkKind, ...] = ("network", "refiner")
+        absent = [kind for kind in kinds if find_network(self._description, kind) is None]
+        if len(absent) == 1:
+            return f"the {absent[0]} is not trained yet; see `tactomo models train`"
+        if absent:
+            return outgrown(self._description, "network") or NONE_TRAINED
         try:
             _ = self.fusion, self.refiner
         except ArtifactError as error:
@@ -282,8 +287,21 @@ def preprocessed(
 def find_network(description: SensorDescription, kind: NetworkKind) -> Path | None:
     """File of a sensor's network: the user's own, or the one that ships; None if there is none."""
     own = own_path(description, kind)
-    shipped = Path(str(files("tactomo_models"))) / "networks" / own.name
+    shipped = SHIPPED / own.name
     return next((path for path in (own, shipped) if path.exists()), None)
+
+
+def outgrown(description: SensorDescription, kind: NetworkKind) -> str:
+    """Tell that there are networks, of what the description said before; empty where none are."""
+    pattern = f"{description.name}-{'?' * 12}-{kind}.onnx"
+    old = [path for folder in (cache_folder(), SHIPPED) for path in folder.glob(pattern)]
+    if not old:
+        return ""
+    return (
+        f"{old[0].name} was trained before the sheet, electrodes, pattern or map of "
+        f"{description.name!r} changed (now {description.sha256[:12]}): train anew, or change them "
+        "back"
+    )
 
 
 def own_path(description: SensorDescription, kind: NetworkKind) -> Path:
@@ -312,7 +330,8 @@ def load_network(
         )
     if found is None:
         raise ArtifactError(
-            f"there is no {kind} for sensor {description.name!r} ({description.sha256[:12]}); "
+            outgrown(description, kind)
+            or f"there is no {kind} for sensor {description.name!r} ({description.sha256[:12]}); "
             "train one: tactomo models simulate, then tactomo models train"
         )
     return Network(found, description, kind)

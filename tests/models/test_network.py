@@ -23,13 +23,16 @@ from tactomo_models import (
     Tier,
 )
 from tactomo_models.network import (
+    NONE_TRAINED,
     FusionNetwork,
     Network,
+    SensorNetworks,
     find_network,
     load_network,
     own_path,
     preprocessed,
 )
+from variants import variant
 
 ONE = Press(0.02, -0.03, 180.0)
 THREE = (Press(-0.04, 0.03, 180.0), Press(0.03, 0.035, 160.0), ONE)
@@ -101,6 +104,21 @@ def test_other_files_are_refused(paper: SensorDescription, tmp_path: Path, conte
     path.write_bytes(content)
     with pytest.raises(ArtifactError, match=r"other\.onnx"):
         Network(path, paper, "network")
+
+
+def test_networks_of_a_description_as_it_was_are_said_to_be(
+    paper: SensorDescription, shipped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moved = variant(paper, electrodes={"pitch_m": 0.035})
+    with pytest.raises(ArtifactError, match=r"trained before .* changed .*: train anew"):
+        load_network(moved, "network")
+    assert "was trained before" in SensorNetworks(moved).missing
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    own_path(moved, "network").parent.mkdir(parents=True)
+    own_path(moved, "network").write_bytes(b"")
+    assert "the refiner is not trained yet" in SensorNetworks(moved).missing
+    renamed = moved.model_copy(update={"name": "other"})
+    assert SensorNetworks(renamed).missing == NONE_TRAINED
 
 
 def test_missing_networks_are_said_to_be_missing(
