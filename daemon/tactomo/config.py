@@ -6,17 +6,16 @@ Every key has a default but `ports`. Errors name the file, the key, its value an
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from platformdirs import user_data_path
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM, MessageError
 from tactomo_client.messages import check_sensor_name
 from tactomo_models import METHODS
+from tactomo_models.calibration_file import data_folder
 from tactomo_models.errors import explain
 from tactomo_models.toml_file import read_toml
 
@@ -104,9 +103,7 @@ class RecordingConfig(BaseModel):
     @property
     def folder_path(self) -> Path:
         """The folder; by default the service's own or the user's."""
-        state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
-        default = Path(state) if state else user_data_path("tactomo")
-        return (self.folder or default / "recordings").absolute()
+        return (self.folder or data_folder() / "recordings").absolute()
 
 
 class DaemonConfig(BaseModel):
@@ -118,6 +115,8 @@ class DaemonConfig(BaseModel):
     """This sensor's name in every topic, such as ``left_forearm``."""
     description: str = "paper_square"
     """A shipped sensor description's name, or the path of a TOML file."""
+    calibration: Path | None = None
+    """Of pressure, by `tactomo calibrate`; None for the sensor's own, where there is one."""
     ports: Annotated[tuple[str, ...], Field(min_length=1, max_length=MAX_PORTS)]
     """Device paths or pyserial URLs: one that carries both channels, or one for each."""
     device_ids: tuple[DeviceId, ...] = ()

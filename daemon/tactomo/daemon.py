@@ -38,12 +38,19 @@ import zmq
 from tactomo_client.messages import EVENT, SCHEMA, STATUS
 from tactomo_models import (
     ArtifactError,
+    CalibrationError,
     Reconstructor,
     Reference,
     SensorDescription,
     Tier,
     load_description,
     load_or_build_artifact,
+)
+from tactomo_models.calibration_file import (
+    PressureCalibration,
+    calibration_for,
+    load_calibration,
+    parse_calibration,
 )
 from tactomo_models.machine_speed import MachineSpeed, machine_speed_for
 from tactomo_models.tier import check_tier
@@ -117,7 +124,8 @@ class Daemon:
         replay = read_replay(config.ports, description)
         protocol = _protocol(config)
         channels = tuple(c for c in Channel if c.name.lower() in description.modalities)
-        origin = _origin(config, protocol, description)
+        calibration, self._unused = _find_calibration(config, description, replay)
+        origin = _origin(config, protocol, description, calibration)
         self._recorder = Recorder(origin, config.recording, self._on_event)
         self._publisher = Publisher(
             config.name, self.session, self._status_fields, self._record_message, self._on_event
@@ -126,6 +134,7 @@ class Daemon:
             description,
             reconstructor or _make_reconstructor(config, description),
             machine_speed or _find_machine_speed(description),
+            calibration,
             config.tare_scans,
             self._recorder,
             self._publisher,
@@ -214,6 +223,10 @@ class Daemon:
             control=self.control_address,
             ports=list(self.config.ports),
         )
+        for why in self._unused:
+            self._on_event(
+                "calibration_refused", "warning", why, "until then pressures are the description's"
+            )
 
     def stop(self) -> None:
         """Stop all threads and close everything; may be called twice."""
@@ -411,7 +424,23 @@ def read_replay(urls: Sequence[str], description: SensorDescription) -> Replay |
         marks=recording.marks() if is_whole else [],
         reference=reference,
         is_paced=speed > 0,
+        calibration=_recorded_calibration(recording, description),
     )
+
+
+def _recorded_calibration(
+    recording: Recording, description: SensorDescription
+) -> PressureCalibration | None:
+    """Return the one that the daemon had that recorded; None where it does not fit here."""
+    text = recording.origin.calibration
+    if not text:
+        return None
+    try:
+        found = parse_calibration(text, f"the calibration in {recording.path}")
+    except CalibrationError as error:
+        log.warning("calibration_unused", detail=str(error))
+        return None
+    return None if found.subject.mismatch(found.subject.sensor, description) else found
 
 
 def _check_reference(
@@ -447,7 +476,38 @@ def _protocol(config: DaemonConfig) -> str:
     return config.protocol
 
 
-def _origin(config: DaemonConfig, protocol: str, description: SensorDescription) -> Origin:
+def _find_calibration(
+    config: DaemonConfig, description: SensorDescription, replay: Replay | None
+) -> tuple[PressureCalibration | None, list[str]]:
+    """Return the pressure calibration to be used, and why others are not.
+
+    Raises:
+        CalibrationError: the configured one cannot be used.
+
+    """
+    unused: list[str] = []
+    if description.magnitude is None:
+        return None, unused
+    if config.calibration is not None:
+        try:
+            return load_calibration(config.calibration, config.name, description), unused
+        except FileNotFoundError as error:
+            raise CalibrationError(
+                f"there is no calibration {config.calibration}; run: tactomo calibrate "
+                f"{config.name}, or leave the key out"
+            ) from error
+    if replay is not None and replay.calibration is not None:
+        return replay.calibration, unused
+    found = calibration_for(config.name, description, config.description, unused.append)
+    return found, unused
+
+
+def _origin(
+    config: DaemonConfig,
+    protocol: str,
+    description: SensorDescription,
+    calibration: PressureCalibration | None,
+) -> Origin:
     return Origin(
         sensor=config.name,
         description=config.description,
@@ -455,4 +515,5 @@ def _origin(config: DaemonConfig, protocol: str, description: SensorDescription)
         ports=config.ports,
         version=version("tactomo"),
         protocol=protocol,
+        calibration="" if calibration is None else calibration.model_dump_json(),
     )

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tactomo_client.messages import array_to_wire
 from tactomo_models import Contact, Flag, Reconstruction, SensorDescription
+from tactomo_models.calibration_file import PressureCalibration
 from tactomo_protocol import Channel, Hello
 
 from tactomo.clock import DeviceClock
@@ -92,7 +93,6 @@ def description_fields(description: SensorDescription) -> dict[str, Any]:
     """Return what `status` says about the sensor."""
     width_m, height_m = description.width_m, description.height_m
     frame_m = 2 * description.sheet.frame_width_m
-    response = description.magnitude.response if description.magnitude else None
     return {
         "model": description.name,
         "sha256": description.sha256,
@@ -104,12 +104,39 @@ def description_fields(description: SensorDescription) -> dict[str, Any]:
         "electrodes_mm": (description.electrode_centres_m * 1e3).tolist(),
         "modalities": list(description.modalities),
         "magnitude_max": magnitude_max(description),
-        "pressure_max_kpa": max(response.pressure_kpa) if response else None,
-        "magnitude_response": response
-        and {
-            "pressure_kpa": list(response.pressure_kpa),
-            "relative_change": list(response.relative_change),
-        },
+    }
+
+
+def pressure_fields(
+    description: SensorDescription, calibration: PressureCalibration | None
+) -> dict[str, Any]:
+    """Return what `status` says about how a change becomes a pressure."""
+    response = description.magnitude.response if description.magnitude else None
+    if response is None:
+        return dict.fromkeys(("pressure_max_kpa", "magnitude_response", "calibration"))
+    if calibration is None:
+        kpa, change = response.pressure_kpa, response.relative_change
+    else:
+        kpa = calibration.pressure_kpa
+        change = tuple(response.sign * magnitude for magnitude in calibration.magnitude)
+    return {
+        "pressure_max_kpa": max(kpa),
+        "magnitude_response": {"pressure_kpa": list(kpa), "relative_change": list(change)},
+        "calibration": calibration and calibration_fields(calibration),
+    }
+
+
+def calibration_fields(calibration: PressureCalibration) -> dict[str, Any]:
+    """Return what `status` says about the pressure calibration in force."""
+    low, high = calibration.curve.range_kpa
+    return {
+        "taken": calibration.taken,
+        "readings": len(calibration.readings),
+        "range_kpa": [low, high],
+        "sigma_kpa": float(np.median(calibration.sigma_kpa)),
+        "onset_kpa": calibration.onset_kpa,
+        "hysteresis_kpa": calibration.hysteresis_kpa,
+        "device_ids": list(calibration.subject.device_ids),
     }
 
 

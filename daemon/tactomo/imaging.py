@@ -7,7 +7,7 @@ For use by the pipeline thread; nothing in here waits. What others may read (`re
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from concurrent.futures import Future
 from typing import Any, Final
 
@@ -24,7 +24,9 @@ from tactomo_models import (
     SensorDescription,
     Tier,
 )
+from tactomo_models.calibration_file import PressureCalibration
 from tactomo_models.machine_speed import MachineSpeed
+from tactomo_models.pressure import described_curve
 from tactomo_protocol import Channel, ScanFlag
 
 from tactomo.errors import CommandError
@@ -61,6 +63,7 @@ class Imaging:
 
     Attributes:
         machine_speed: what turns a budget of time into one of work.
+        calibration: of pressure, that is in force; None for the description's own curve.
         given: the tier that frames are given, and the milliseconds of modelled work.
         reference: what changes are measured against; None before the first tare.
         reference_realtime_ns: when it was taken.
@@ -75,12 +78,14 @@ class Imaging:
         description: SensorDescription,
         reconstructor: Reconstructor,
         machine_speed: MachineSpeed,
+        calibration: PressureCalibration | None,
         tare_scans: int,
         recorder: Recorder,
         publisher: Publisher,
         on_event: OnEvent,
     ) -> None:
         self.machine_speed = machine_speed
+        self.calibration: PressureCalibration | None = None
         self.given: tuple[Tier, float | None]
         self.reference: Reference | None = None
         self.reference_realtime_ns = 0
@@ -99,6 +104,9 @@ class Imaging:
         self._marked: ActiveRecording | None = None  # the recording that gets marks
         self._repeat_reference_s = 0.0
         self._failure_limit = RateLimit()
+        self._own_calibration = calibration
+        self._foreign = ""  # why it is not in force
+        self._use_calibration(calibration)
         budget_s = reconstructor.budget_s
         self._ask(reconstructor.tier, None if budget_s is None else budget_s * 1e3)
 
@@ -106,6 +114,28 @@ class Imaging:
     def is_taring(self) -> bool:
         """Whether a reference is being taken."""
         return self._tare is not None
+
+    def meet(self, device_ids: Collection[str]) -> None:
+        """Take note of who speaks: a calibration holds for the devices that it was made with."""
+        own = self._own_calibration
+        foreign = "" if own is None else own.subject.foreign(device_ids)
+        if own is None or foreign == self._foreign:
+            return
+        self._foreign = foreign
+        self._use_calibration(None if foreign else own)
+        if foreign:
+            self._on_event(
+                "calibration_refused",
+                "warning",
+                f"the pressure calibration of {own.subject.sensor} {foreign}",
+                f"until you run `tactomo calibrate {own.subject.sensor}`, pressures are the "
+                "description's",
+            )
+
+    def _use_calibration(self, calibration: PressureCalibration | None) -> None:
+        self.calibration = calibration
+        curve = described_curve(self._description) if calibration is None else calibration.curve
+        self._reconstructor.curve = curve
 
     def has_reference(self, channel: Channel) -> bool:
         """Whether there is something to measure this channel's changes against."""

@@ -20,7 +20,8 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from tactomo_models import Reference, Tier
-from tactomo_protocol import Channel
+from tactomo_models.calibration_file import PressureCalibration
+from tactomo_protocol import Channel, Hello
 
 from tactomo.errors import CommandError
 from tactomo.events import OnEvent, RateLimit
@@ -48,6 +49,8 @@ class Replay:
     """The one in force at its beginning."""
     is_paced: bool
     """Whether bytes come in their own time rather than as fast as they are taken."""
+    calibration: PressureCalibration | None = None
+    """Of pressure, that the daemon had that recorded."""
 
 
 class _SyncState(NamedTuple):
@@ -125,7 +128,7 @@ class Pipeline:
         self._drop_limit = RateLimit()
         self._dropped_told = 0
         self._is_excused = False  # the dual scans to be dropped next are not worth a warning
-        self._announced: dict[int, tuple[Channel, ...]] = {}  # what each port's device sends
+        self._announced: dict[int, Hello] = {}  # what each port's device says of itself
         self._clocks: dict[int, int] = {}  # the newest time on each replayed port that goes on
         self._ended: set[int] = set()
         self._deliveries: queue.Queue[Delivery | None] = queue.Queue(QUEUED_DELIVERIES)
@@ -260,7 +263,7 @@ class Pipeline:
 
     def _join(self, delivery: Delivery) -> list[DualScan]:
         ready: list[DualScan] = []
-        self._note_channels(delivery)
+        self._note_device(delivery)
         for scan in delivery.scans:
             self.scan_rates[scan.channel].add(scan.monotonic_ns)
             self.skew.take(scan)
@@ -269,13 +272,15 @@ class Pipeline:
             ready += self._follow_clock(delivery, self._replay.is_paced)
         return ready
 
-    def _note_channels(self, delivery: Delivery) -> None:
-        """Do not wait for a channel that no device says it sends."""
-        if delivery.channels is None or self._announced.get(delivery.port) == delivery.channels:
+    def _note_device(self, delivery: Delivery) -> None:
+        """Do not wait for a channel that no device says it sends; a calibration is of a device."""
+        if delivery.hello is None or self._announced.get(delivery.port) == delivery.hello:
             return
-        self._announced[delivery.port] = delivery.channels
+        self._announced[delivery.port] = delivery.hello
+        hellos = self._announced.values()
+        self._imaging.meet({hello.device_id for hello in hellos})
         if len(self._announced) == self._ports:
-            announced = {c for channels in self._announced.values() for c in channels}
+            announced = {channel for hello in hellos for channel in hello.channels}
             self.sync.lost.update(set(self._channels) - announced)
 
     def _follow_clock(self, delivery: Delivery, is_paced: bool) -> list[DualScan]:

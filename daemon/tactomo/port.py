@@ -83,8 +83,8 @@ class Delivery(NamedTuple):
     port: int
     clock_ns: int
     scans: tuple[ChannelScan, ...]
-    channels: tuple[Channel, ...] | None = None
-    """Those that the device says it sends here; None before its first hello."""
+    hello: Hello | None = None
+    """What the device says of itself; None before it has."""
     has_ended: bool = False
     """The replay behind the port is at its end: nothing more will come."""
 
@@ -328,8 +328,7 @@ class PortReader:
         found = sum(isinstance(packet, Scan) for packet in packets)
         self._liveness.heard(now_s, self.counts.packets - understood, found)
         if packets:
-            channels = None if self.hello is None else self.hello.channels
-            self._deliver(Delivery(self.index, clock_ns, tuple(scans), channels))
+            self._deliver(Delivery(self.index, clock_ns, tuple(scans), self.hello))
         if not self._is_replay:
             self._send(self._protocol.replies())
         self._tell_corrupt()

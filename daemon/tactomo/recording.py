@@ -119,6 +119,8 @@ class Origin:
     version: str
     protocol: str = OURS
     """What the ports speak."""
+    calibration: str = ""
+    """The pressure calibration that the daemon had, as the text of its file; empty for none."""
 
     def new_protocol(self) -> PortProtocol:
         """Return what turns a port's bytes into packets.
@@ -311,6 +313,7 @@ def to_origin(metadata: Mapping[str, str]) -> Origin:
         ports=ports,
         version=metadata.get("version", ""),
         protocol=metadata.get("protocol", OURS),
+        calibration=metadata.get("calibration", ""),
     )
 
 

@@ -157,6 +157,7 @@ class RecordingWriter:
             "ports": "\n".join(origin.ports),
             "version": origin.version,
             "protocol": origin.protocol,
+            "calibration": origin.calibration,
         }
         self._writer.add_metadata(PROFILE, metadata)
         # Always the same ones in the same order: should the chunk that names them be lost, what

@@ -13,7 +13,7 @@ from tactomo_models import SensorDescription
 from tactomo_protocol import Channel
 
 from tactomo.events import EventBook
-from tactomo.frames import description_fields, port_fields
+from tactomo.frames import description_fields, port_fields, pressure_fields
 from tactomo.imaging import Imaging
 from tactomo.pipeline import Pipeline
 from tactomo.port import PortReader
@@ -38,6 +38,7 @@ class Status:
         recorder: Recorder,
         events: EventBook,
     ) -> None:
+        self._sensor = description
         self._description = description_fields(description)
         self._ports = ports
         self._pipeline = pipeline
@@ -56,7 +57,10 @@ class Status:
             "version": VERSION,
             "state": self.state(),
             "uptime_s": time.monotonic() - self._started_s,
-            "description": self._description,
+            "description": {
+                **self._description,
+                **pressure_fields(self._sensor, imaging.calibration),
+            },
             "source": {"kind": source(self._ports)},
             "ports": [port_fields(port) for port in self._ports],
             "rates": self._rates(),

@@ -24,7 +24,13 @@ from tactomo_models.description import (
     load_description,
     shipped_descriptions,
 )
-from tactomo_models.errors import ArtifactError, DataError, DescriptionError, ModelError
+from tactomo_models.errors import (
+    ArtifactError,
+    CalibrationError,
+    DataError,
+    DescriptionError,
+    ModelError,
+)
 from tactomo_models.plausibility import Flag
 from tactomo_models.pressure import PressureCurve, PressureRange
 from tactomo_models.reconstruct import Reconstruction, Reconstructor
@@ -37,6 +43,7 @@ __all__ = [
     "METHODS",
     "Artifact",
     "ArtifactError",
+    "CalibrationError",
     "Contact",
     "DataError",
     "DescriptionError",

@@ -4,6 +4,7 @@ ModelError
  ├── DescriptionError   a sensor description that cannot be read or makes no sense
  │                      ("paper.toml: electrodes.length_m = 0.08: must be below the pitch, 0.036")
  ├── ArtifactError      a built artifact that is missing, damaged or made for another sensor
+ ├── CalibrationError   load-cell readings that make no curve, or a calibration of another sensor
  └── DataError          voltages of the wrong shape or kind
 """
 
@@ -23,6 +24,10 @@ class DescriptionError(ModelError):
 
 class ArtifactError(ModelError):
     """A built artifact that is missing, damaged or made for another sensor."""
+
+
+class CalibrationError(ModelError):
+    """Load-cell readings that make no curve, or a calibration of another sensor."""
 
 
 class DataError(ModelError):

@@ -13,7 +13,7 @@ from enum import StrEnum, auto
 import numpy as np
 from numpy.typing import NDArray
 
-from tactomo_models.description import MagnitudeResponse
+from tactomo_models.description import MagnitudeResponse, SensorDescription
 
 FloatArray = NDArray[np.float64]
 
@@ -106,6 +106,12 @@ class PressureCurve:
         first, last = np.diff(kpa)[[0, -1]] / np.diff(m)[[0, -1]]
         outside = first * np.minimum(magnitude - m[0], 0) + last * np.maximum(magnitude - m[-1], 0)
         return np.asarray(self.pressure(magnitude) + outside)
+
+
+def described_curve(description: SensorDescription) -> PressureCurve | None:
+    """The curve until there is a calibration; None where there is no magnitude channel."""
+    channel = description.magnitude
+    return None if channel is None else PressureCurve.of_response(channel.response)
 
 
 def pressures_of(

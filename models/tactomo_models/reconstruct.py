@@ -43,7 +43,7 @@ from tactomo_models.objects import ObjectFollower
 from tactomo_models.outlines import Outlines, ellipses_of
 from tactomo_models.paper_level_set import PaperLevelSet
 from tactomo_models.plausibility import Flag, Wiring
-from tactomo_models.pressure import PressureCurve, pressures_of
+from tactomo_models.pressure import PressureCurve, described_curve, pressures_of
 from tactomo_models.redrawing import Drawing, Redrawer, SecondOpinion
 from tactomo_models.reference import Reference
 from tactomo_models.shape_fit import Shape
@@ -129,6 +129,9 @@ class Reconstructor:
     Raises:
         ArtifactError: the artifact or the tier's network cannot be used.
 
+    Attributes:
+        curve: the one in force; it may be set at any time.
+
     Not thread-safe: one thread owns it.
     """
 
@@ -144,9 +147,7 @@ class Reconstructor:
         curve: PressureCurve | None = None,
     ) -> None:
         self.description = description
-        if curve is None and description.magnitude is not None:
-            curve = PressureCurve.of_response(description.magnitude.response)
-        self._curve = curve
+        self.curve = curve or described_curve(description)
         self._tier = tier
         self.budget_s = budget_s
         self._redraw = redraw
@@ -724,7 +725,7 @@ class Reconstructor:
         self, areas: Areas, size: FloatArray, sigma: FloatArray
     ) -> tuple[Contact, ...]:
         ids = self._tracker.update(areas.centres_m)
-        pressures = pressures_of(self._curve, size, sigma, areas.areas_m2, areas.sigmas[:, 2])
+        pressures = pressures_of(self.curve, size, sigma, areas.areas_m2, areas.sigmas[:, 2])
         return tuple(
             Contact(
                 id=ids[k],

@@ -125,6 +125,7 @@ def show_replay(
     speed: str = "1.0",
     sensor: str | None = None,
     description: str | None = None,
+    calibration: Path | None = None,
     stream: str = DEFAULT_STREAM,
     control: str = DEFAULT_CONTROL,
     viewer_port: int = DEFAULT_VIEWER_PORT,
@@ -141,6 +142,7 @@ def show_replay(
             *("replay", "replay", str(recording), "--speed", speed, "--sensor", name),
             *("--stream", stream, "--control", control, "--stay"),
             *_optional("--description", description),
+            *_optional("--calibration", calibration),
         )
         _show(family, _served(daemon.wait_ready()), viewer_port, browser, announce)
 

@@ -59,6 +59,10 @@ def daemon(
             "--description", "-d", help="A shipped sensor's name or a TOML file. [paper_square]"
         ),
     ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(help="Of pressure, by `tactomo calibrate`. [the sensor's own, if any]"),
+    ] = None,
     port: Annotated[
         list[str] | None,
         typer.Option("--port", "-p", help="Serial device or pyserial URL; twice for two boards."),
@@ -125,6 +129,7 @@ def daemon(
         config,
         name=sensor,
         description=description,
+        calibration=calibration,
         ports=tuple(port) if port else None,
         device_ids=tuple(device_id) if device_id else None,
         wait_for_ports=wait_for_ports or None,
@@ -359,6 +364,10 @@ def replay(
     description: Annotated[
         str | None, typer.Option("--description", "-d", help="[the recorded one]")
     ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(help="Of pressure, by `tactomo calibrate`. [the recorded one]"),
+    ] = None,
     tier: Annotated[Method, typer.Option(help="How much model a frame gets.")] = "auto",
     stream: StreamAddress = DEFAULT_STREAM,
     control: ControlAddress = DEFAULT_CONTROL,
@@ -387,13 +396,16 @@ def replay(
             raise typer.BadParameter("--record goes without --viewer")
         from tactomo.cli.demo import show_replay
 
-        show_replay(recording, speed, sensor, description, stream, control, viewer_port)
+        show_replay(
+            recording, speed, sensor, description, calibration, stream, control, viewer_port
+        )
         return
     from tactomo.config import load_config
 
     settings = load_config(
         name=sensor or origin.sensor or None,
         description=description or origin.description or None,
+        calibration=calibration,
         ports=opened.replay_urls(factor),
         tier=tier,
         stream=stream,
