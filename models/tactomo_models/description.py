@@ -174,6 +174,8 @@ class Instrument(_Section):
     referenced: Literal["pairs", "single_ended"] = "pairs"
     volts_per_unit: Annotated[float, Field(gt=0, le=1e6)] = 1.0
     start: Annotated[str, Field(max_length=16, pattern=r"^[ -~\r\n]*$")] = ""
+    scan_rate_hz: Annotated[float, Field(ge=0.1, le=1000)] = 20.0
+    frequency_hz: Annotated[float, Field(ge=100, le=1e7)] = 10_000.0
 
     @model_validator(mode="after")
     def _single_ended_readings_have_their_sign(self) -> Self:

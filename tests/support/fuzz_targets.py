@@ -17,10 +17,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import sciospec_stream
 from pydantic import ValidationError
 from tactomo.control import COMMANDS
 from tactomo.errors import RecordingError
 from tactomo.protocols import protocol_named
+from tactomo.protocols.sciospec import Sciospec
 from tactomo.recording import Mark, Origin, ScanKey, open_recording
 from tactomo.recording_writer import (
     RecordingWriter,
@@ -235,6 +237,28 @@ def _parse_recording(data: bytes) -> None:
                 read()
 
 
+TANK = load_description("tank_disc")
+
+
+def _sciospec_examples() -> list[bytes]:
+    said = sciospec_stream.frames(TANK, [np.full(TANK.measurements, 0.1)] * 3)
+    return [
+        b"".join(b"".join(frame) for frame in said),
+        b"".join(said[0][:9]) + b"\x18\x01\x83\x18",
+    ]
+
+
+def _parse_sciospec(data: bytes) -> None:
+    """Cut into reads of several lengths, the outcome is the same, and little is kept."""
+    whole, pieces = Sciospec(TANK), Sciospec(TANK)
+    expected = whole.feed(data)
+    step = 1 + len(data) % 701
+    found = [p for at in range(0, len(data), step) for p in pieces.feed(data[at : at + step])]
+    assert found == expected
+    assert whole.counts == pieces.counts
+    assert len(whole.begun()) < 9000
+
+
 @cache
 def _folder() -> tempfile.TemporaryDirectory[str]:
     return tempfile.TemporaryDirectory(prefix="tactomo-fuzz-")
@@ -247,6 +271,7 @@ def _scratch(name: str) -> Path:
 TARGETS: Mapping[str, Target] = {
     "wire": Target(_wire_examples, _parse_wire),
     "lines": Target(_line_examples, _parse_lines),
+    "sciospec": Target(_sciospec_examples, _parse_sciospec),
     "message": Target(_message_examples, _parse_message),
     "request": Target(_request_examples, _parse_request),
     "description": Target(_description_examples, _parse_description),

@@ -69,7 +69,7 @@ Method: TypeAlias = Literal[
     "cnn-multimodal",
 ]
 # The daemon's PROTOCOLS, likewise.
-Protocol: TypeAlias = Literal["tactomo", "openeit", "matrix"]
+Protocol: TypeAlias = Literal["tactomo", "sciospec", "openeit", "matrix"]
 SensorName: TypeAlias = Annotated[
     str, typer.Option("--sensor", "-s", help="The sensor's name in the stream.")
 ]

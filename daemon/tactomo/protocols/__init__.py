@@ -15,6 +15,7 @@ from tactomo.protocols.interface import ForeignProtocol, PortProtocol, Reading, 
 from tactomo.protocols.matrix import Matrix
 from tactomo.protocols.openeit import OpenEit
 from tactomo.protocols.ours import Ours
+from tactomo.protocols.sciospec import Sciospec
 
 __all__ = [
     "FOREIGN",
@@ -31,7 +32,7 @@ __all__ = [
 
 OURS: Final = Ours.name
 FOREIGN: Final[Mapping[str, type[ForeignProtocol]]] = {
-    kind.name: kind for kind in (OpenEit, Matrix)
+    kind.name: kind for kind in (Sciospec, OpenEit, Matrix)
 }
 PROTOCOLS: Final = (OURS, *FOREIGN)
 

@@ -7,5 +7,10 @@ from typing import Final
 
 from tactomo.twin.foreign import MakeSpeaker
 from tactomo.twin.printing import MatrixBoard, OpenEitBoard
+from tactomo.twin.sciospec import SciospecSpeaker
 
-SPEAKERS: Final[Mapping[str, MakeSpeaker]] = {"openeit": OpenEitBoard, "matrix": MatrixBoard}
+SPEAKERS: Final[Mapping[str, MakeSpeaker]] = {
+    "sciospec": SciospecSpeaker,
+    "openeit": OpenEitBoard,
+    "matrix": MatrixBoard,
+}
