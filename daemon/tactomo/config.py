@@ -15,6 +15,7 @@ from pydantic_core import ErrorDetails
 from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM, MessageError
 from tactomo_client.messages import check_sensor_name
 from tactomo_models import METHODS
+from tactomo_models.baseline import TIME_CONSTANT_S
 from tactomo_models.calibration_file import data_folder
 from tactomo_models.errors import explain
 from tactomo_models.toml_file import read_toml
@@ -106,6 +107,16 @@ class RecordingConfig(BaseModel):
         return (self.folder or data_folder() / "recordings").absolute()
 
 
+class BaselineConfig(BaseModel):
+    """Whether and how fast the reference follows a skin's drift while nothing presses."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    track: bool = True
+    """Off: changes are measured against the last tare as it was."""
+    time_constant_s: Annotated[float, Field(ge=5, le=3600)] = TIME_CONSTANT_S
+
+
 class DaemonConfig(BaseModel):
     """What one daemon serves: one sensor, read over one port or two."""
 
@@ -140,6 +151,7 @@ class DaemonConfig(BaseModel):
     """How long a scan waits for the other channel's scan of the same instant."""
     lossless: bool = False
     """Reconstruct every dual scan, however late, instead of the newest one."""
+    baseline: BaselineConfig = BaselineConfig()
     recording: RecordingConfig = RecordingConfig()
     metrics: MetricsAddress | None = None
     """``HOST:PORT`` of this computer where Prometheus may scrape."""
@@ -194,7 +206,11 @@ def load_config(path: str | Path | None = None, **overrides: Any) -> DaemonConfi
 
 def _known_keys(items: Sequence[ErrorDetails]) -> str:
     """Return the keys that there are where one is unknown or missing."""
-    tables: dict[str, type[BaseModel]] = {"recording": RecordingConfig, "curve": Curve}
+    tables: dict[str, type[BaseModel]] = {
+        "baseline": BaselineConfig,
+        "recording": RecordingConfig,
+        "curve": Curve,
+    }
     for item in items:
         if item["type"] in ("extra_forbidden", "missing"):
             name = str(item["loc"][0]) if len(item["loc"]) > 1 else ""

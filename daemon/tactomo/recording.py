@@ -10,7 +10,8 @@ port/N/hello   raw         what a replay must be told before those: the hello in
                            recording began, and the packet that had begun to come; for a foreign
                            protocol also where in its scans the port was (`protocols.interface`)
 reference      msgpack     the reference that holds from here on: its number in this recording,
-                           volts and noise of each channel; repeated every minute
+                           volts and noise of each channel, and how far they have drifted since;
+                           repeated every minute
 frame          msgpack     a dual scan that the daemon reconstructed: channel, counter and device
                            time of each of its scans, the tier and the budget (ms of modelled
                            work, not of time) that it was reconstructed with, the number of the
@@ -59,6 +60,8 @@ from tactomo.protocols import OURS, PortProtocol, protocol_named
 
 RECOVERED: Final = "tactomo-recovered"
 REFERENCE_ARRAYS: Final = ("magnitude", "structure", "magnitude_noise", "structure_noise")
+DRIFT_ARRAYS: Final = ("magnitude_drift", "structure_drift")
+"""Missing in recordings of daemons that did not follow drift."""
 REPLAY_SCHEME: Final = "replay"
 
 
@@ -349,8 +352,8 @@ def _read_reference(data: bytes) -> Reference:
     fields = _fields(data, "scans", *REFERENCE_ARRAYS)
     try:
         arrays = {
-            name: None if fields[name] is None else array_from_wire(fields[name])
-            for name in REFERENCE_ARRAYS
+            name: None if fields.get(name) is None else array_from_wire(fields[name])
+            for name in REFERENCE_ARRAYS + DRIFT_ARRAYS
         }
     except MessageError as error:
         raise _malformed() from error

@@ -22,7 +22,7 @@ from tactomo_models import Reference
 from tactomo_protocol import Hello, Scan, encode
 
 from tactomo.errors import RecordingError
-from tactomo.recording import REFERENCE_ARRAYS, Mark, Origin
+from tactomo.recording import DRIFT_ARRAYS, REFERENCE_ARRAYS, Mark, Origin
 
 CHUNK_BYTES: Final = 1 << 20
 MAX_PENDING_BYTES: Final = 4 << 20
@@ -53,7 +53,7 @@ def reference_entry(
 ) -> Entry:
     """The reference that holds, the `number`-th of its recording; repeated, it changes nothing."""
     fields: dict[str, Any] = {"number": number, "scans": reference.scans}
-    for name in REFERENCE_ARRAYS:
+    for name in REFERENCE_ARRAYS + DRIFT_ARRAYS:
         array = getattr(reference, name)
         fields[name] = None if array is None else array_to_wire(array)
     return Entry("reference", msgpack.packb(fields), monotonic_ns, realtime_ns)

@@ -17,6 +17,7 @@ from tactomo_models.artifact import (
     load_or_build_artifact,
     save_artifact,
 )
+from tactomo_models.baseline import BaselineTracker
 from tactomo_models.contacts import Contact
 from tactomo_models.description import (
     Modality,
@@ -43,6 +44,7 @@ __all__ = [
     "METHODS",
     "Artifact",
     "ArtifactError",
+    "BaselineTracker",
     "CalibrationError",
     "Contact",
     "DataError",

@@ -149,8 +149,10 @@ class MeasuredChannel:
         valid = verdict.usable
         reference = np.where(valid, volts, 0.0)
         noise = np.where(valid, noise, 0.0)
-        self._reference = reference
-        self._per_volt = np.divide(1, np.abs(reference), out=np.zeros_like(reference), where=valid)
+        self._tare = self._reference = reference
+        self._tare_per_volt = self._per_volt = np.divide(
+            1, np.abs(reference), out=np.zeros_like(reference), where=valid
+        )
         relative = np.hypot(noise * self._per_volt * np.sqrt(1 + 1 / scans), MODEL_ERROR)
         self._relative = np.where(valid, relative, UNUSABLE)
         self._noise = np.maximum(self._relative**2 - MODEL_ERROR**2, TRACE**2)
@@ -165,6 +167,15 @@ class MeasuredChannel:
         direction = 0.0 if description.either_way(name) else description.sign(name)
         self._total = direction * artifact.tikhonov.sum(axis=0)
         self._matrices: dict[Tier, Image] = {}
+
+    def follow(self, drift: FloatArray | None) -> None:
+        """Measure changes against the tare as it has drifted since: (M,) logarithms of factors.
+
+        What is known of noise, wiring and faults stays that of the tare.
+        """
+        factor = 1.0 if drift is None else np.exp(drift)
+        self._reference = self._tare * factor
+        self._per_volt = self._tare_per_volt / factor
 
     def take(self, scan: FloatArray, *, saturated: bool = False) -> Taken:
         """Relative changes of a scan (M,), volts; `saturated` where its converter clipped.
@@ -188,7 +199,7 @@ class MeasuredChannel:
         typical = float(np.median(square[valid])) / MEDIAN_SQUARE
         noise, error = self._noise * grown, self._error_share**2 * (square + typical)
         statistic = float((square / variance).sum())
-        quiet = statistic < _noise_limit(count)
+        quiet = statistic < noise_limit(count)
         total = self._total
         if not (quiet or electrodes) and _fell(total * change, total**2 * variance):
             flags |= Flag.REFERENCE_MISMATCH
@@ -248,7 +259,7 @@ def missing(name: Modality) -> Flag:
 
 
 @cache
-def _noise_limit(count: int) -> float:
+def noise_limit(count: int) -> float:
     """Sum of squares that noise alone in so many voltages stays below, but for false alarms."""
     return float(chi2.isf(FALSE_ALARM, count))
 

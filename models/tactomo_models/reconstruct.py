@@ -104,6 +104,24 @@ class Reconstruction:
 
 
 @dataclass(frozen=True)
+class Look:
+    """What a frame's scans say against the reference, before anything is made of it.
+
+    Attributes:
+        data: the changes of each channel that has any.
+        flags: what stands in the way of trusting them.
+    """
+
+    data: dict[Modality, Changes]
+    flags: Flag
+
+    @property
+    def is_quiet(self) -> bool:
+        """Whether there is something to see, and nothing presses."""
+        return bool(self.data) and all(taken.quiet for taken in self.data.values())
+
+
+@dataclass(frozen=True)
 class _Shown:
     """What was made of a shape: it serves again while the shape stays as it is."""
 
@@ -166,6 +184,7 @@ class Reconstructor:
                 self._follower = ObjectFollower(self._forward, ratio, self._object_image)
             else:
                 self._follower = ShapeFollower(self._forward, ratio)
+        self._reference: Reference | None = None
         self._channels: dict[Modality, MeasuredChannel] = {}
         self._tracker = Tracker()
         self._magnitudes = MagnitudeFollower(self._forward)
@@ -181,11 +200,21 @@ class Reconstructor:
         self._make_ready()
 
     def set_reference(self, reference: Reference) -> None:
-        """Measure changes against this unpressed scan from now on; forgets the warm start.
+        """Measure changes against this unpressed scan from now on.
+
+        Forgets the warm start, unless it is the last reference, drifted.
 
         Raises:
             DataError: a channel has another number of voltages than the sensor.
         """
+        drift = {"magnitude": reference.magnitude_drift, "structure": reference.structure_drift}
+        if self._reference is None or not reference.is_followed_from(self._reference):
+            self._tare(reference)
+        self._reference = reference
+        for name, channel in self._channels.items():
+            channel.follow(drift[name])
+
+    def _tare(self, reference: Reference) -> None:
         volts = {"magnitude": reference.magnitude, "structure": reference.structure}
         noise = {"magnitude": reference.magnitude_noise, "structure": reference.structure_noise}
         self._channels = {
@@ -205,6 +234,11 @@ class Reconstructor:
         }
         self._make_ready()
         self.reset()
+
+    @property
+    def artifact(self) -> Artifact:
+        """What is precomputed for the sensor."""
+        return self._artifact
 
     @property
     def tier(self) -> Tier:
@@ -261,6 +295,16 @@ class Reconstructor:
         Raises:
             DataError: a scan has another number of voltages than the sensor.
         """
+        return self.image(self.look(magnitude, structure, saturated=saturated))
+
+    def look(
+        self,
+        magnitude: FloatArray | None,
+        structure: FloatArray | None,
+        *,
+        saturated: Collection[Modality] = (),
+    ) -> Look:
+        """The first half of `reconstruct`, which costs little: what has changed."""
         self._stage_s = {}
         self._left_out = [self._unusable_network] if self._unusable_network else []
         flags = Flag(0)
@@ -271,7 +315,11 @@ class Reconstructor:
                     flags |= self._take(name, scan, data, saturated=name in saturated)
             if self._swapped(data):
                 flags |= Flag.CHANNELS_SWAPPED
-        made = self._by_tier(data, flags)
+        return Look(data, flags)
+
+    def image(self, look: Look) -> Reconstruction:
+        """The second half of `reconstruct`: what follows from the last `look`."""
+        made = self._by_tier(look.data, look.flags)
         reason = "; ".join([made.reason, *self._left_out])
         return replace(made, reason=reason, stage_s=self._stage_s)
 

@@ -27,6 +27,9 @@ class Reference:
         magnitude_noise: (M,) standard deviation of one scan, volts; None where unknown.
         structure_noise: (M,) likewise.
         scans: how many were averaged.
+        magnitude_drift: (M,) logarithm of the factor by which each voltage has drifted since; None
+            where nothing has been followed.
+        structure_drift: (M,) likewise.
     """
 
     magnitude: FloatArray | None
@@ -34,6 +37,15 @@ class Reference:
     magnitude_noise: FloatArray | None = None
     structure_noise: FloatArray | None = None
     scans: int = 1
+    magnitude_drift: FloatArray | None = None
+    structure_drift: FloatArray | None = None
+
+    def is_followed_from(self, other: Reference) -> bool:
+        """Whether this is another one's tare, drifted."""
+        has_drift = self.magnitude_drift is not None or self.structure_drift is not None
+        return has_drift and all(
+            _same(getattr(self, name), getattr(other, name)) for name in _TAKEN
+        )
 
     @classmethod
     def from_scans(cls, magnitude: FloatArray | None, structure: FloatArray | None) -> Reference:
@@ -54,6 +66,15 @@ class Reference:
             structure_noise=None if structure is None else noise_of_scans(structure),
             scans=min(len(scans) for scans in present),
         )
+
+
+_TAKEN = ("magnitude", "structure", "magnitude_noise", "structure_noise")
+
+
+def _same(one: FloatArray | None, other: FloatArray | None) -> bool:
+    if one is None or other is None:
+        return one is other
+    return one is other or np.array_equal(one, other)
 
 
 def noise_of_scans(scans: FloatArray) -> FloatArray | None:
