@@ -136,6 +136,7 @@ class Daemon:
             machine_speed or _find_machine_speed(description),
             calibration,
             config.tare_scans,
+            config.baseline,
             self._recorder,
             self._publisher,
             self._on_event,

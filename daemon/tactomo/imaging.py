@@ -16,6 +16,7 @@ import structlog
 from numpy.typing import NDArray
 from tactomo_client.messages import CONTACTS, MAP, SCAN
 from tactomo_models import (
+    BaselineTracker,
     Modality,
     ModelError,
     Reconstruction,
@@ -29,6 +30,7 @@ from tactomo_models.machine_speed import MachineSpeed
 from tactomo_models.pressure import described_curve
 from tactomo_protocol import Channel, ScanFlag
 
+from tactomo.config import BaselineConfig
 from tactomo.errors import CommandError
 from tactomo.events import OnEvent, RateLimit
 from tactomo.frames import contacts_fields, frame_header, map_fields, scan_fields, scan_header
@@ -41,6 +43,7 @@ from tactomo.tare import Tare
 from tactomo.timing import Durations, Rate
 
 REPEAT_REFERENCE_S: Final = 60.0
+REFUSAL_PERIOD_S: Final = 600.0
 NO_DATA_S: Final = 3.0
 """How long a tare on command waits for usable dual scans before it gives up."""
 
@@ -80,6 +83,7 @@ class Imaging:
         machine_speed: MachineSpeed,
         calibration: PressureCalibration | None,
         tare_scans: int,
+        baseline: BaselineConfig,
         recorder: Recorder,
         publisher: Publisher,
         on_event: OnEvent,
@@ -95,6 +99,9 @@ class Imaging:
         self._description = description
         self._channels = tuple(c for c in Channel if c.name.lower() in description.modalities)
         self._reconstructor = reconstructor
+        self._tracker = (
+            BaselineTracker(reconstructor, baseline.time_constant_s) if baseline.track else None
+        )
         self._tare_scans = tare_scans
         self._recorder = recorder
         self._publisher = publisher
@@ -107,8 +114,21 @@ class Imaging:
         self._own_calibration = calibration
         self._foreign = ""  # why it is not in force
         self._use_calibration(calibration)
+        self._refusal_limit = RateLimit(REFUSAL_PERIOD_S)
         budget_s = reconstructor.budget_s
         self._ask(reconstructor.tier, None if budget_s is None else budget_s * 1e3)
+
+    @property
+    def baseline(self) -> dict[str, Any]:
+        """What `status` says of how the reference follows the skin; for any thread."""
+        tracker = self._tracker
+        if tracker is None:
+            return {"state": "off", "moves": 0, "refusal": None, "drift": {}}
+        drift = {
+            name: {"gain": each.gain, "uneven": each.uneven} for name, each in tracker.drift.items()
+        }
+        refusal = tracker.refusal or None
+        return {"state": tracker.state, "moves": tracker.moves, "refusal": refusal, "drift": drift}
 
     @property
     def is_taring(self) -> bool:
@@ -171,9 +191,17 @@ class Imaging:
         self._reconstructor.budget_s = None if budget_ms is None else budget_ms * 1e-3
 
     def use_reference(self, reference: Reference, realtime_ns: int) -> None:
-        """Measure changes against `reference` from the next dual scan on."""
-        self._reconstructor.set_reference(reference)
-        self.reference, self.reference_realtime_ns = reference, realtime_ns
+        """Measure changes against `reference` from the next dual scan on, and follow from it."""
+        self.reference_realtime_ns = realtime_ns
+        if self._tracker is None:
+            self._reconstructor.set_reference(reference)
+            self._note_reference(reference)
+        else:
+            self._note_reference(self._tracker.begin(reference))
+
+    def _note_reference(self, reference: Reference) -> None:
+        """Say, and record, that this reference is in force."""
+        self.reference = reference
         if self._marked is not None:
             self._marked.references += 1
             self._record_reference()
@@ -205,7 +233,7 @@ class Imaging:
         self._follow_recording(dual)
         volts = {scan.channel: scan.volts for scan in dual.scans}
         self._publish_scan(dual, timing, volts)
-        frame = self._reconstruct(volts, _saturated(dual))
+        frame = self._reconstruct(volts, _saturated(dual), is_exact=mark is not None)
         if frame is not None:
             self._publish_frame(dual, timing, frame)
         if self._marked is not None and dual.recording == self._marked.number:
@@ -224,7 +252,9 @@ class Imaging:
         if mark.is_cold:
             self._reconstructor.reset()
         if mark.reference is not None:
-            self.use_reference(mark.reference, time.time_ns())
+            self.reference_realtime_ns = time.time_ns()
+            self._reconstructor.set_reference(mark.reference)
+            self._note_reference(mark.reference)
 
     def _follow_recording(self, dual: DualScan) -> None:
         """Begin to mark frames with the first dual scan that a recording holds whole.
@@ -255,12 +285,19 @@ class Imaging:
             times = (time.monotonic_ns(), self.reference_realtime_ns)
             self._marked.add(reference_entry(self.reference, number, *times))
 
-    def _reconstruct(self, volts: Volts, saturated: list[Modality]) -> Reconstruction | None:
+    def _reconstruct(
+        self, volts: Volts, saturated: list[Modality], *, is_exact: bool
+    ) -> Reconstruction | None:
+        """Make a frame; where it is exact, against the reference that the recording had then."""
         started_s = time.perf_counter()
+        scans = (volts.get(Channel.MAGNITUDE), volts.get(Channel.STRUCTURE))
         try:
-            frame = self._reconstructor.reconstruct(
-                volts.get(Channel.MAGNITUDE), volts.get(Channel.STRUCTURE), saturated=saturated
-            )
+            if self._tracker is None or is_exact:
+                frame = self._reconstructor.reconstruct(*scans, saturated=saturated)
+            else:
+                acquired_s = self.acquired_monotonic_ns * 1e-9
+                frame = self._tracker.reconstruct(acquired_s, *scans, saturated=saturated)
+                self._follow(self._tracker)
         except Exception as error:  # a robot is better off with the next frame than with none
             self._reconstructor.reset()
             if self._failure_limit.allows():
@@ -276,6 +313,18 @@ class Imaging:
         for stage, seconds in frame.stage_s.items():
             self._time(stage, seconds)
         return frame
+
+    def _follow(self, tracker: BaselineTracker) -> None:
+        """Take over the reference that the tracker has put in force, and tell where it refuses."""
+        if tracker.reference is not None and tracker.reference is not self.reference:
+            self._note_reference(tracker.reference)
+        if tracker.refusal and self._refusal_limit.allows():
+            self._on_event(
+                "baseline_refused",
+                "warning",
+                tracker.refusal,
+                "tare with nothing on the skin: `tactomo tare`",
+            )
 
     def _publish_scan(self, dual: DualScan, timing: Timing, volts: Volts) -> None:
         header = scan_header(dual, timing)

@@ -213,9 +213,9 @@ class Pipeline:
                 if self._stopping.is_set():
                     break
                 self.turns += 1
-                reference = self._imaging.reference
+                taken_ns = self._imaging.reference_realtime_ns
                 self._process(dual)
-                if self._imaging.reference is not reference:
+                if self._imaging.reference_realtime_ns != taken_ns:
                     self._is_excused = True
             while not self._commands.empty():
                 self._commands.get()()

@@ -55,7 +55,8 @@ def reference_entry(
     fields: dict[str, Any] = {"number": number, "scans": reference.scans}
     for name in REFERENCE_ARRAYS + DRIFT_ARRAYS:
         array = getattr(reference, name)
-        fields[name] = None if array is None else array_to_wire(array)
+        if array is not None or name in REFERENCE_ARRAYS:
+            fields[name] = None if array is None else array_to_wire(array)
     return Entry("reference", msgpack.packb(fields), monotonic_ns, realtime_ns)
 
 

@@ -80,6 +80,7 @@ class Status:
                 "scans": reference.scans,
                 "taken_realtime_ns": imaging.reference_realtime_ns,
             },
+            "baseline": imaging.baseline,
             "stage_ms": {stage: times for stage, times in stages.items() if times},
             "latency_ms": latency.percentiles_ms(),
             "tier_requested": str(imaging.tier),

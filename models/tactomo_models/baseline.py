@@ -94,6 +94,7 @@ class BaselineTracker:
 
     Attributes:
         reference: the one in force; None before the first tare.
+        moves: how often the reference has moved since the tare.
         refusal: why what is seen is not followed; empty while it is, or may be a contact.
 
     Not thread-safe: one thread owns it.
@@ -103,6 +104,7 @@ class BaselineTracker:
         self, reconstructor: Reconstructor, time_constant_s: float = TIME_CONSTANT_S
     ) -> None:
         self.reference: Reference | None = None
+        self.moves = 0
         self.refusal = ""
         self._reconstructor = reconstructor
         self._time_constant_s = time_constant_s
@@ -114,9 +116,12 @@ class BaselineTracker:
         self._moved_s = self._last_s = 0.0
         self._distrusted_s: float | None = None
 
-    def begin(self, reference: Reference) -> None:
-        """Measure against this reference, which has just been taken, and follow from there."""
-        self.reference = reference
+    def begin(self, reference: Reference) -> Reference:
+        """Measure against a reference, and follow from there; returns it as it is in force.
+
+        Where it had drifted itself, that is as good as a tare.
+        """
+        self.reference = reference = reference.taken_as_it_is()
         self._reconstructor.set_reference(reference)
         self._channels = {
             name: _Channel(self._subspace, tare)
@@ -126,7 +131,8 @@ class BaselineTracker:
         self._memory.clear()
         self._release = _Release()
         self._is_ready = self._is_held = False
-        self.refusal, self._distrusted_s = "", None
+        self.refusal, self._distrusted_s, self.moves = "", None, 0
+        return reference
 
     @property
     def state(self) -> State:
@@ -184,6 +190,7 @@ class BaselineTracker:
         )
         self._reconstructor.set_reference(self.reference)
         self._moved_s = time_s
+        self.moves += 1
 
     def _settles(self, time_s: float, look: Look, scans: Scans) -> bool:
         """Whether what is seen is nothing but drift; if so, the baseline is there now."""
@@ -354,7 +361,7 @@ class _Channel:
         self._amounts = np.zeros(subspace.modes.shape[1])
         self._rest = np.zeros(len(tare))
         self._certainty = np.zeros(len(tare))
-        self._seen_s = self._gain_seen_s = 0.0
+        self._seen_s = self._gain_seen_s = self._jumped_s = 0.0
         self._begun_s: float | None = None
         self.drop_block()
 
@@ -453,7 +460,7 @@ class _Channel:
         """The baseline is where a scan was explained to be."""
         self._amounts = self._kept() + found.amounts
         self._now = self._subspace.modes @ self._amounts + self._rest
-        self._seen_s = self._gain_seen_s = time_s
+        self._seen_s = self._gain_seen_s = self._jumped_s = time_s
 
     def _since(self, over_tare: FloatArray) -> FloatArray:
         """Logarithms (M,) of voltages over the baseline; 0 where there is none."""
@@ -472,8 +479,12 @@ class _Channel:
         return self._subspace.explain(change + crept, certainty, sigma)
 
     def _prior(self, time_s: float, creep: FloatArray, lag_s: float) -> FloatArray:
-        """Standard deviations (K,) of the modes; the reference may lag behind what it saw last."""
+        """Standard deviations (K,) of the modes.
+
+        The reference may lag behind what it saw last; a jump makes up for all of that.
+        """
         sigma = creep.copy()
+        lag_s = min(lag_s, max(0.0, time_s - self._jumped_s))
         sigma[0] = min(GAIN_PER_S * (max(0.0, time_s - self._gain_seen_s) + lag_s), GAIN_AT_ONCE)
         smooth = SMOOTH_PER_S * (max(0.0, time_s - self._seen_s) + lag_s)
         sigma[self._subspace.smooth] = min(smooth, SMOOTH_AT_ONCE)

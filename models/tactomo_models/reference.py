@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,16 @@ class Reference:
             _same(getattr(self, name), getattr(other, name)) for name in _TAKEN
         )
 
+    def taken_as_it_is(self) -> Reference:
+        """The same voltages as a tare of its own, drift included."""
+        return replace(
+            self,
+            magnitude=_drifted(self.magnitude, self.magnitude_drift),
+            structure=_drifted(self.structure, self.structure_drift),
+            magnitude_drift=None,
+            structure_drift=None,
+        )
+
     @classmethod
     def from_scans(cls, magnitude: FloatArray | None, structure: FloatArray | None) -> Reference:
         """Average scans (n, M) of an unpressed skin and estimate their noise.
@@ -69,6 +79,10 @@ class Reference:
 
 
 _TAKEN = ("magnitude", "structure", "magnitude_noise", "structure_noise")
+
+
+def _drifted(volts: FloatArray | None, drift: FloatArray | None) -> FloatArray | None:
+    return volts if volts is None or drift is None else volts * np.exp(drift)
 
 
 def _same(one: FloatArray | None, other: FloatArray | None) -> bool:

@@ -383,6 +383,7 @@ def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Cal
             "control": "tcp://127.0.0.1:0",
             "tare_scans": 3,
             "sync_wait_ms": 500,  # a busy computer must not lose a channel
+            "baseline": {"track": real},  # that takes a real one
             **config,
         }
         memory: Any = None if real else Memory(seconds)
@@ -445,6 +446,7 @@ def replay(tmp_path: Path) -> Callable[..., Any]:
             "exit_at_end": True,
             "record": out,
             "record_maps": True,
+            "baseline": {"track": real},
             **config,
         }
         memory: Any = None if real else Memory()

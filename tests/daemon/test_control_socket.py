@@ -196,7 +196,9 @@ def test_an_address_in_use_is_refused_and_nothing_is_left_open(
     other = f"ipc://{tmp_path}/socket" if transport == "ipc" else "tcp://127.0.0.1:0"
     b = bench(**{purpose: other})
     taken = getattr(b.daemon, f"{purpose}_address")
-    settings = {"stream": "tcp://127.0.0.1:0", "control": "tcp://127.0.0.1:0", purpose: taken}
+    free = "tcp://127.0.0.1:0"
+    settings: dict[str, Any] = {"stream": free, "control": free, purpose: taken}
+    settings["baseline"] = {"track": False}
     memory: Any = SimpleNamespace(tier=Tier.AUTO, budget_s=None)
     second = Daemon(load_config(ports=["/dev/null"], **settings), reconstructor=memory)
     before = threading.active_count()

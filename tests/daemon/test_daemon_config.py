@@ -6,7 +6,8 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from tactomo.config import DaemonConfig, RecordingConfig, load_config
+from pydantic import BaseModel
+from tactomo.config import BaselineConfig, DaemonConfig, RecordingConfig, load_config
 from tactomo.errors import ConfigError
 
 EXAMPLE = Path(__file__).parents[2] / "deploy" / "daemon.example.toml"
@@ -115,7 +116,7 @@ def test_the_example_shows_every_key_and_loads() -> None:
     # Keys without a value in the example are there as comments.
     commented = [line.removeprefix("# ") for line in text.splitlines() if " = " in line]
     shown = {line.partition(" = ")[0] for line in commented}
-    tables = {"recording": RecordingConfig}
+    tables: dict[str, type[BaseModel]] = {"baseline": BaselineConfig, "recording": RecordingConfig}
     assert set(DaemonConfig.model_fields) - tables.keys() <= shown
     assert all(f"[{name}]" in text for name in tables)
     assert all(set(table.model_fields) <= shown for table in tables.values())

@@ -60,6 +60,7 @@ class Process:
             "stream": "tcp://127.0.0.1:0",
             "control": "tcp://127.0.0.1:0",
             "tare_scans": 3,
+            "baseline": {"track": False},
             **config,
         }
         path = folder / "daemon.toml"
@@ -118,6 +119,7 @@ def test_nothing_is_left_after_a_start_that_failed(bench: Start, tmp_path: Path)
     threads = set(threading.enumerate())
     before = len(os.listdir("/proc/self/fd"))
     memory: Any = SimpleNamespace(tier=Tier.AUTO, budget_s=None)
+    off = {"track": False}
     local = {"stream": "tcp://127.0.0.1:0", "control": "tcp://127.0.0.1:0"}
     for settings in (
         {"ports": [good, bad], **local},
@@ -125,7 +127,7 @@ def test_nothing_is_left_after_a_start_that_failed(bench: Start, tmp_path: Path)
         {"ports": [good], "record": Path("/proc/none/skin.mcap"), **local},
     ):
         with pytest.raises(TactomoError):
-            Daemon(load_config(**settings), reconstructor=memory).start()
+            Daemon(load_config(baseline=off, **settings), reconstructor=memory).start()
     b.until(lambda: len(os.listdir("/proc/self/fd")) <= before)
     assert set(threading.enumerate()) <= threads
     for descriptor in free:

@@ -26,7 +26,9 @@ def refusal(port: str | Path) -> PortError:
     """Return the error with which a daemon refuses to start on a port."""
     memory: Any = SimpleNamespace(tier=Tier.AUTO, budget_s=None)
     local = "tcp://127.0.0.1:0"
-    config = load_config(None, ports=[str(port)], stream=local, control=local)
+    config = load_config(
+        None, ports=[str(port)], stream=local, control=local, baseline={"track": False}
+    )
     daemon = Daemon(config, reconstructor=memory)
     try:
         with pytest.raises(PortError) as caught:

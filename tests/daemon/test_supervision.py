@@ -90,7 +90,8 @@ def supervised(
     settings = {"ports": [str(skin.lines[0].path)], "tare_scans": 3, "stream": free}
     config = tmp_path / "skin.toml"
     lines = {**settings, "control": free, "log_format": "json"}.items()
-    config.write_text("".join(f"{key} = {json.dumps(value)}\n" for key, value in lines))
+    keys = "".join(f"{key} = {json.dumps(value)}\n" for key, value in lines)
+    config.write_text(keys + "[baseline]\ntrack = false\n")
     process = subprocess.Popen(
         [sys.executable, "-c", PROGRAM, str(config)],
         stderr=subprocess.PIPE,

@@ -39,7 +39,7 @@ from tactomo.log import configure_logging
 from tactomo_models import Reconstructor, load_description, load_or_build_artifact
 
 class Injected(Reconstructor):
-    def reconstruct(self, *arguments, **options):
+    def look(self, *arguments, **options):
         trigger = Path(sys.argv[1]).with_name("raise")
         if trigger.exists():
             if trigger.is_file():
@@ -47,7 +47,7 @@ class Injected(Reconstructor):
             raise ZeroDivisionError("made to fail")
         while Path(sys.argv[1]).with_name("hang").exists():
             time.sleep(0.01)
-        return super().reconstruct(*arguments, **options)
+        return super().look(*arguments, **options)
 
 configure_logging("info", "json")
 description = load_description("paper_square")

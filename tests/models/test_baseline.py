@@ -1,0 +1,187 @@
+"""Baseline tracking: drift leaves no ghost, and nothing that presses is taken for drift."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from tactomo_models import (
+    Artifact,
+    BaselineTracker,
+    Press,
+    Reconstruction,
+    Reconstructor,
+    Reference,
+    SensorDescription,
+    SkinSimulator,
+)
+from tactomo_models.baseline import CREEP
+from tactomo_models.tier import Tier
+
+FloatArray = NDArray[np.float64]
+Presses = tuple[Press, ...]
+
+PRESS = Press(0.01, -0.02, 180.0)
+TOUCH = replace(PRESS, pressure_kpa=2.0)  # far too light for the magnitude channel
+NOISE_SHARE = 2.5e-4  # of the largest voltage at rest, as the twin has it
+
+
+class Life:
+    """A skin in time: what presses on it, how its gain drifts, and what the tracker makes of it."""
+
+    def __init__(self, simulator: SkinSimulator, reconstructor: Reconstructor) -> None:
+        self.now_s = 1000.0
+        self.gain = 1.0
+        self._simulator = simulator
+        self._rest = simulator.voltages(())
+        self._rng = np.random.default_rng(5)
+        self.reconstructor = reconstructor
+        self.tracker = BaselineTracker(reconstructor)
+        self.tare()
+
+    def tare(self) -> None:
+        scans = [self.scan() for _ in range(20)]
+        stacks = (np.array([scan[name] for scan in scans]) for name in ("magnitude", "structure"))
+        self.tracker.begin(Reference.from_scans(*stacks))
+
+    def scan(self, *presses: Press) -> dict[str, FloatArray]:
+        return {
+            name: self.gain * volts
+            + NOISE_SHARE * np.abs(self._rest[name]).max() * self._rng.standard_normal(len(volts))
+            for name, volts in self._simulator.voltages(presses).items()
+        }
+
+    def lives(
+        self,
+        seconds: float,
+        *presses: Press,
+        step_s: float = 2.0,
+        gain: float = 1.0,
+        presses_at: Callable[[float], Presses] | None = None,
+    ) -> list[Reconstruction]:
+        """Go on for so long, while the gain changes by a factor; returns the frames."""
+        steps = round(seconds / step_s)
+        frames = []
+        for step in range(1, steps + 1):
+            self.now_s += step_s
+            self.gain *= gain ** (1 / steps)
+            now = presses if presses_at is None else presses_at(step / steps)
+            frames.append(self.tracker.reconstruct(self.now_s, **self.scan(*now)))
+        return frames
+
+
+@pytest.fixture
+def life(simulator: SkinSimulator, paper: SensorDescription, artifact: Artifact) -> Life:
+    made = Life(simulator, Reconstructor(paper, artifact))
+    made.lives(20)
+    return made
+
+
+def count(frames: list[Reconstruction]) -> list[int]:
+    return [len(frame.contacts) for frame in frames]
+
+
+def test_a_sheet_that_warms_leaves_no_ghost_and_untracked_it_does(life: Life) -> None:
+    tare = life.tracker.reference
+    frames = life.lives(1200, gain=0.95)
+    frames += life.lives(300)
+    assert {frame.tier for frame in frames} == {Tier.QUIET}
+    assert life.tracker.drift["structure"].gain == pytest.approx(-0.05, abs=2e-3)
+    assert life.tracker.state == "following"
+    assert tare is not None
+    life.reconstructor.set_reference(replace(tare, magnitude_drift=None, structure_drift=None))
+    assert life.reconstructor.reconstruct(**life.scan()).tier is not Tier.QUIET
+
+
+def test_a_contact_of_an_hour_stays_while_the_sheet_cools_and_leaves_no_ghost(life: Life) -> None:
+    life.lives(10, PRESS, step_s=1.0)
+    frames = life.lives(3600, PRESS, step_s=30.0, gain=1.03)
+    assert set(count(frames)) == {1}
+    magnitudes = [frame.contacts[0].magnitude for frame in frames]
+    assert np.ptp(magnitudes) < 0.2 * np.mean(magnitudes)
+    assert life.tracker.drift["structure"].gain == pytest.approx(0.03, abs=3e-3)
+    assert life.tracker.state == "held"
+    assert set(count(life.lives(20))) == {0}
+
+
+@pytest.mark.parametrize("kpa", [1.5, 180.0])
+def test_a_contact_that_lasts_is_never_erased(life: Life, kpa: float) -> None:
+    frames = life.lives(12 * 3600, replace(PRESS, pressure_kpa=kpa), step_s=600.0)
+    assert set(count(frames)) == {1}
+    assert life.tracker.drift["structure"].uneven < 1e-3
+
+
+def test_a_touch_that_stays_when_a_press_is_eased_is_not_taken_for_creep(life: Life) -> None:
+    life.lives(600, PRESS, step_s=10.0)
+    assert set(count(life.lives(120, TOUCH))) == {1}
+
+
+def test_a_finger_that_comes_down_within_a_minute_is_reported(life: Life) -> None:
+    def presses_at(share: float) -> Presses:
+        return (replace(PRESS, pressure_kpa=100.0 * share),)
+
+    frames = life.lives(60, presses_at=presses_at, step_s=0.5)
+    assert count(frames[8:]) == [1] * len(frames[8:])  # from 7 kPa on
+    assert set(count(life.lives(20))) == {0}
+
+
+def test_what_creeps_back_after_a_long_press_is_no_ghost(life: Life) -> None:
+    life.lives(1800, PRESS, step_s=20.0)
+    # 3 per cent more conductive where it was pressed: 0.15 kPa, as a touch would have it.
+    left = replace(PRESS, pressure_kpa=5.0 * 3 * CREEP)
+    assert {f.tier for f in life.lives(60, left)} == {Tier.QUIET}
+    assert life.tracker.moves
+    life.tare()
+    assert life.tracker.state == "waiting"
+    life.lives(20)
+    assert life.tracker.drift["structure"].uneven < 1e-3
+
+
+def test_a_step_that_no_skin_makes_is_refused_and_said(life: Life) -> None:
+    frames = life.lives(60, gain=0.7)
+    assert frames[-1].flags
+    assert life.tracker.state == "refused"
+    assert life.tracker.refusal
+
+
+def test_flagged_frames_teach_nothing(life: Life) -> None:
+    before = life.tracker.drift
+    life.gain = 1.002
+    for _ in range(60):
+        life.now_s += 2.0
+        life.tracker.reconstruct(life.now_s, **life.scan(), saturated=["structure"])
+        life.tracker.reconstruct(life.now_s, life.scan()["magnitude"], None)
+    assert life.tracker.drift == before
+
+
+def test_equal_frames_lead_to_equal_references(
+    simulator: SkinSimulator, paper: SensorDescription, artifact: Artifact
+) -> None:
+    ends = []
+    for _ in range(2):
+        life = Life(simulator, Reconstructor(paper, artifact))
+        life.lives(300, gain=1.02)
+        life.lives(20, PRESS)
+        life.lives(20)
+        ends.append(life.tracker.reference)
+    assert ends[0] is not None
+    assert ends[1] is not None
+    np.testing.assert_array_equal(ends[0].structure_drift, ends[1].structure_drift)
+
+
+def test_a_drifted_reference_says_the_same_again_wherever_it_is_put_in_force(
+    life: Life, paper: SensorDescription, artifact: Artifact
+) -> None:
+    life.lives(300, gain=1.02)
+    reference = life.tracker.reference
+    assert reference is not None
+    other = Reconstructor(paper, artifact)
+    other.set_reference(reference)
+    scan = life.scan(PRESS)
+    life.reconstructor.reset()
+    ours, theirs = life.reconstructor.reconstruct(**scan), other.reconstruct(**scan)
+    np.testing.assert_array_equal(ours.map, theirs.map)
+    assert [(c.x_m, c.y_m) for c in ours.contacts] == [(c.x_m, c.y_m) for c in theirs.contacts]
