@@ -19,10 +19,9 @@ from typing import Final
 
 import structlog
 import zmq
-from tactomo_client import ClientError, Keys
-from tactomo_client.keys import Handshakes
+from tactomo_client import Keys
+from tactomo_client.connection import connect_subscriber
 from tactomo_client.messages import STATUS
-from tactomo_client.subscription import connect_subscriber, reconnect
 
 from tactomo.doorkeeper import STREAM, Context, Doorkeeper, ServerKeys
 from tactomo.endpoint import allow_connections
@@ -198,16 +197,10 @@ class _Inlet:
         self.address = address
         self.socket: zmq.Socket[bytes] = context.socket(zmq.SUB)
         self.socket.setsockopt(zmq.RCVHWM, QUEUED_PER_SUBSCRIBER)
-        self._keys = keys
-        self._handshakes = Handshakes(self.socket)
+        self._connection = connect_subscriber(self.socket, address, [], keys=keys)
         self._told: str | None = None
         self._missed_at_s = time.monotonic() + SILENT_S
         self._is_missed = False
-        try:
-            connect_subscriber(self.socket, address, [], keys=keys)
-        except ClientError:
-            self.close()
-            raise
 
     def ask(self, more: set[bytes], less: set[bytes]) -> None:
         """Subscribe to some prefixes, and no more to others."""
@@ -218,18 +211,16 @@ class _Inlet:
 
     def knock_again(self) -> None:
         """Connect anew where this proxy was not let in, and say so now and then."""
-        refusal = self._handshakes.refusal(self.address, self._keys)
-        if refusal is not None:
-            if refusal.name != self._told:
-                _tell(refusal.name, "error", refusal.cause, refusal.next_step)
-            reconnect(self.socket, self.address)
+        refusal = self._connection.knock_again()
+        if refusal is not None and refusal.name != self._told:
+            _tell(refusal.name, "error", refusal.cause, refusal.next_step)
         self._told = None if refusal is None else refusal.name
         if refusal is None:
             self._tell_missed()
 
     def _tell_missed(self) -> None:
         """Say once that this source has never answered, and that it does now."""
-        answers = self._handshakes.have_succeeded
+        answers = self._connection.has_been_let_in
         if self._is_missed and answers:
             self._is_missed, self._missed_at_s = False, math.inf
             _tell("source_came", "info", f"{self.address} is there now")
@@ -244,8 +235,7 @@ class _Inlet:
 
     def close(self) -> None:
         """Close the connection."""
-        self._handshakes.close()
-        self.socket.close(0)
+        self._connection.close()
 
 
 def serve(proxy: Proxy) -> None:

@@ -155,7 +155,7 @@ def test_the_picture_is_the_right_way_up() -> None:
     with FakeSensor("skin") as fake, subscribe("skin", address=fake.address) as frames:
         fake.wait_for_subscriber()
         fake.publish([CONTACT], **images())
-        text = map_text(next(frames), STATUS, 51)
+        text = map_text(next(frames), {"pressure_max_kpa": 200.0}, 51)
     lines = text.split("\n")
     assert [len(line) for line in lines][:26] == [51] * 26
     cells: dict[tuple[int, int], list[Any]] = {

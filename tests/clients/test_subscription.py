@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import weakref
 from collections.abc import Callable
 
 import numpy as np
@@ -42,7 +43,7 @@ def wait_for(condition: Callable[[], object], timeout_s: float = 10.0) -> None:
         time.sleep(0.005)
 
 
-def newest_sequence(frames: Subscription) -> int:
+def newest_sequence(frames: Subscription[Frame]) -> int:
     frame = frames.latest()
     return 0 if frame is None else frame.sequence
 
@@ -244,10 +245,12 @@ def test_an_abandoned_subscription_closes_itself(sensor: FakeSensor) -> None:
     for _ in range(2):
         frames = subscribe("left", address=sensor.address)
         sensor.wait_for_subscriber()
-        alive = frames._closed
+        connection = weakref.ref(frames._connection)
+        socket = frames._connection.owner
         del frames
         gc.collect()
-        assert not alive.alive
+        assert connection() is None
+        assert socket.closed
 
 
 def test_ctrl_c_interrupts_the_wait(sensor: FakeSensor) -> None:
@@ -276,7 +279,7 @@ def test_what_cannot_be_subscribed_to_is_named() -> None:
     with pytest.raises(MessageError, match="not a sensor name"):
         subscribe("left forearm")
     with pytest.raises(MessageError, match="kind='map' or 'contacts'"):
-        subscribe("left", kind="scan")  # type: ignore[arg-type]
+        subscribe("left", kind="scan")  # type: ignore[call-overload]
     with pytest.raises(ControlError, match="cannot connect to '5560'"):
         subscribe("left", address="5560")
 

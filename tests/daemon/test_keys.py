@@ -24,10 +24,9 @@ from tactomo.daemon import Daemon
 from tactomo.doorkeeper import Doorkeeper, ServerKeys
 from tactomo.endpoint import bind
 from tactomo.errors import AddressError, ConfigError
-from tactomo_client import Keys, KeysError, StreamTimeout, request, subscribe
+from tactomo_client import Keys, KeysError, Status, StreamTimeout, aio, request, subscribe
 from tactomo_client.keys import read_public, read_secret
-from tactomo_viewer.feed import Feed, Status
-from tactomo_viewer.link import ControlLink
+from tactomo_viewer.feed import Feed
 
 Start = Callable[..., Any]
 SERVER = "left"
@@ -127,13 +126,13 @@ def test_another_process_gets_in_with_the_folder_alone(guarded: Any, robot: Robo
 def test_the_viewer_gets_in(guarded: Any) -> None:
     async def look() -> tuple[Status, dict[str, Any]]:
         feed = Feed(SERVER, guarded.daemon.stream_address, guarded.keys, lambda: None)
-        link = ControlLink(guarded.daemon.control_address, guarded.keys)
+        link = aio.Control(guarded.daemon.control_address, keys=guarded.keys)
         reading = asyncio.create_task(feed.run())
         try:
             async with asyncio.timeout(PATIENCE_S):
                 while feed.status is None:
                     await asyncio.sleep(0.01)
-            return feed.status, await link.request("status", {}, PATIENCE_S)
+            return feed.status, await link.request("status", PATIENCE_S)
         finally:
             reading.cancel()
             await asyncio.gather(reading, return_exceptions=True)

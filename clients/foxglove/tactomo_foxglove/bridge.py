@@ -17,10 +17,9 @@ import zmq
 from foxglove.channels import FrameTransformsChannel
 from foxglove.websocket import StatusLevel, WebSocketServer
 from tactomo_client import ClientError, Frame, Keys, MessageError
+from tactomo_client.connection import connect_subscriber
 from tactomo_client.frame import frame_from_message
-from tactomo_client.keys import Handshakes
 from tactomo_client.messages import EVENT, MAP, STATUS, Message, decode_message, topic
-from tactomo_client.subscription import connect_subscriber, reconnect
 
 from tactomo_foxglove.messages import known
 from tactomo_foxglove.placement import Placement
@@ -32,8 +31,6 @@ STALE_AFTER_S: Final = 0.5
 GONE_AFTER_S: Final = 3.0
 HEALTH_PERIOD_S: Final = 0.2
 REMIND_PERIOD_S: Final = 1.0
-SILENCE_S: Final = 5.0
-"""After such a silence (a status comes every second) the connection is made anew."""
 BACKLOG: Final = 128
 
 
@@ -67,16 +64,14 @@ class Bridge:
         keys: Keys | None = None,
         placement: Placement | None = None,
     ) -> None:
-        self._stream, self._keys = stream, keys
         topics = [topic(sensor, kind) for sensor in sensors for kind in (MAP, STATUS, EVENT)]
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
-        self._handshakes = Handshakes(self._socket)
+        self._connection = connect_subscriber(self._socket, stream, topics, keys=keys)
         try:
-            connect_subscriber(self._socket, stream, topics, keys=keys)
             self._context = foxglove.Context()  # its channels close when it is gone
             self._server = _serve(sensors, host, port, self._context)
         except ClientError:
-            self._close_stream()
+            self._connection.close()
             raise
         self.host = host
         placed = placement or Placement()
@@ -105,27 +100,23 @@ class Bridge:
             KeysError: the daemon does not let us in.
 
         """
-        next_health_s = heard_s = time.monotonic()
+        next_health_s = time.monotonic()
         while not stop.is_set():
             wait_s = max(0.0, next_health_s - time.monotonic())
             if self._socket.poll(round(wait_s * 1e3) + 1):
                 self._take(self._socket.recv())
-                heard_s = time.monotonic()
             now_s = time.monotonic()
             if now_s >= next_health_s:
                 next_health_s = now_s + HEALTH_PERIOD_S
                 for sensor in self._sensors.values():
                     sensor.look_around(self._server)
-                if refusal := self._handshakes.refusal(self._stream, self._keys):
+                if refusal := self._connection.refusal():
                     raise refusal
-            if now_s - heard_s > SILENCE_S:
-                heard_s = now_s
-                reconnect(self._socket, self._stream)
 
     def close(self) -> None:
         """Stop serving; clients are told goodbye."""
         self._server.stop()
-        self._close_stream()
+        self._connection.close()
 
     def __enter__(self) -> Self:
         return self
@@ -140,10 +131,6 @@ class Bridge:
                 sensor.take(message)
         except MessageError:
             return  # another program publishes there; ours will show, or its silence will
-
-    def _close_stream(self) -> None:
-        self._handshakes.close()
-        self._socket.close(0)
 
 
 class _Sensor:

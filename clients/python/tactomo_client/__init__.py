@@ -8,19 +8,40 @@
         for contact in frame.contacts:
             print(contact.id, contact.x_mm, contact.y_mm, contact.pressure_kpa)
 
-The messages behind it are specified in STREAM.md; `tactomo_client.messages` encodes and decodes
-them. Needs pyzmq, msgpack and numpy, and nothing of the daemon.
+`tactomo_client.aio` is the same for asyncio, `tactomo_client.recording` reads recorded frames, and
+`tactomo_client.fake` tests a controller without a skin. The messages behind it are specified in
+STREAM.md; `tactomo_client.messages` encodes and decodes them. Needs pyzmq, msgpack and numpy, and
+nothing of the daemon.
 """
 
-from tactomo_client.control import request
+from tactomo_client.control import (
+    BudgetInForce,
+    Control,
+    Daemon,
+    RecordedFile,
+    RecordingStarted,
+    RunningRecording,
+    Tare,
+    TierInForce,
+    request,
+)
 from tactomo_client.errors import (
+    AlreadyRecording,
+    BadArgument,
+    CannotWrite,
     ClientError,
     ControlError,
     KeysError,
     MessageError,
+    NoAnswer,
+    NoData,
+    NoNetwork,
+    NotRecording,
     RecordingError,
     StreamTimeout,
+    TareRefused,
 )
+from tactomo_client.event import Event
 from tactomo_client.frame import Contact, Frame
 from tactomo_client.keys import Keys
 from tactomo_client.messages import (
@@ -28,22 +49,41 @@ from tactomo_client.messages import (
     DEFAULT_STREAM,
     DEFAULT_TWIN_CONTROL,
 )
+from tactomo_client.status import Status
 from tactomo_client.subscription import Subscription, subscribe
 
 __all__ = [
     "DEFAULT_CONTROL",
     "DEFAULT_STREAM",
     "DEFAULT_TWIN_CONTROL",
+    "AlreadyRecording",
+    "BadArgument",
+    "BudgetInForce",
+    "CannotWrite",
     "ClientError",
     "Contact",
+    "Control",
     "ControlError",
+    "Daemon",
+    "Event",
     "Frame",
     "Keys",
     "KeysError",
     "MessageError",
+    "NoAnswer",
+    "NoData",
+    "NoNetwork",
+    "NotRecording",
+    "RecordedFile",
     "RecordingError",
+    "RecordingStarted",
+    "RunningRecording",
+    "Status",
     "StreamTimeout",
     "Subscription",
+    "Tare",
+    "TareRefused",
+    "TierInForce",
     "request",
     "subscribe",
 ]

@@ -3,32 +3,39 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from types import TracebackType
+from typing import Any, Final, Self
 
 import zmq
 
-from tactomo_client.errors import ControlError
-from tactomo_client.keys import Handshakes, Keys, as_keys, secure
-from tactomo_client.messages import (
-    DEFAULT_CONTROL,
-    MAX_MESSAGE_BYTES,
-    decode_reply,
-    encode_request,
-)
+from tactomo_client.connection import Connection, Owner, Waiting, wait, whole_ms
+from tactomo_client.errors import ClientError, ControlError, control_error
+from tactomo_client.filled import filled
+from tactomo_client.keys import Keys, as_keys
+from tactomo_client.messages import DEFAULT_CONTROL, decode_reply, encode_request
+from tactomo_client.status import Status, status_from_fields
 
+TIMEOUT_S: Final = 2.0
+TARE_TIMEOUT_S: Final = 30.0
+"""For a tare: as long as its dual scans take to come."""
+RECORD_TIMEOUT_S: Final = 10.0
+"""For a recording: a disk may take its time."""
 LOOK_S: Final = 0.1
 
 
 def request(
     command: str,
     address: str = DEFAULT_CONTROL,
-    timeout_s: float = 2.0,
+    timeout_s: float = TIMEOUT_S,
     *,
     keys: Keys | str | Path | None = None,
     **arguments: Any,
 ) -> dict[str, Any]:
-    """Send one command and return its result.
+    """Send one command and return its result as it came; `Daemon` has the daemon's commands typed.
 
     Args:
         command: one of the control commands of STREAM.md, for example ``tare``.
@@ -38,54 +45,298 @@ def request(
         **arguments: the command's arguments, for example ``tier="quiet"``.
 
     Raises:
-        ControlError: the command was refused, or nothing answered (`name` is then ``no_answer``).
+        ControlError: the command was refused, or nothing answered (`NoAnswer`).
         KeysError: the keys cannot be used, or the server does not let them in.
         MessageError: what answered does not speak this protocol.
 
+    Example::
+
+        request("press", DEFAULT_TWIN_CONTROL, x_mm=10.0, y_mm=0.0)
+
     """
-    message = encode_request(command, arguments)
-    used = as_keys(keys)
-    # A socket per command: after an unanswered request a REQ socket cannot send another.
-    socket: zmq.Socket[bytes]
-    with zmq.Context.instance().socket(zmq.REQ) as socket:
-        socket.setsockopt(zmq.LINGER, 0)
-        socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
-        secure(socket, address, used)
-        handshakes = Handshakes(socket)
+    with Control(address, keys=keys) as control:
+        return control.request(command, timeout_s, **arguments)
+
+
+class ControlLine:
+    """Sends commands over one socket, one at a time, whether a thread or an event loop waits.
+
+    The socket is kept from command to command, and left for another after one that was not
+    answered: a REQ socket cannot send again then.
+    """
+
+    def __init__(self, owner: Callable[[], Owner], address: str, keys: Keys | None) -> None:
+        self.address = address
+        self._owner = owner
+        self._keys = keys
+        self._connection: Connection | None = None
+
+    def exchange(
+        self, command: str, arguments: Mapping[str, Any], timeout_s: float
+    ) -> Waiting[dict[str, Any]]:
+        """Send one command; the outcome is its result.
+
+        Raises:
+            ControlError, KeysError, MessageError: as `request`.
+
+        """
+        message = encode_request(command, arguments)
+        connection = self._connection or self._connect()
+        reply = None
         try:
-            socket.connect(address)
-            socket.send(message)
+            connection.socket.send(message)
             deadline_s = time.monotonic() + timeout_s
-            while not socket.poll(_wait_ms(deadline_s)):
-                if refusal := handshakes.refusal(address, used):
+            while reply is None:
+                left_s = deadline_s - time.monotonic()
+                if (yield connection.owner, whole_ms(min(LOOK_S, left_s))):
+                    reply = connection.receive()
+                elif refusal := connection.refusal():
                     raise refusal
-                if time.monotonic() >= deadline_s:
-                    raise no_answer(address, timeout_s)
-            return decode_reply(socket.recv())
-        except zmq.ZMQError as error:
-            raise bad_address(address, error) from error
+                elif left_s <= 0 or not connection.is_open:
+                    raise _no_answer(self.address, timeout_s)
         finally:
-            handshakes.close()
+            if reply is None:
+                self.close()
+        return decode_reply(reply)
+
+    def close(self) -> None:
+        """Close the socket; the next command opens another."""
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+
+    def _connect(self) -> Connection:
+        self._connection = Connection(self._owner(), self.address, self._keys)
+        self._connection.connect()
+        return self._connection
 
 
-def _wait_ms(deadline_s: float) -> int:
-    """Return how long to wait before a look at why there is no answer; rounded up."""
-    return int(min(LOOK_S, max(0.0, deadline_s - time.monotonic())) * 1000) + 1
+@dataclass(frozen=True, slots=True)
+class Tare:
+    """A new reference is in force."""
+
+    scans: int
+    """How many dual scans it is made of."""
 
 
-def no_answer(address: str, timeout_s: float) -> ControlError:
-    """Return the error for a request that nothing answered."""
-    return ControlError(
+@dataclass(frozen=True, slots=True)
+class RecordingStarted:
+    """A recording runs."""
+
+    path: str
+    """The file, on the daemon's computer."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedFile:
+    """A recording that was stopped."""
+
+    path: str
+    """The file, on the daemon's computer; the last one of several."""
+    bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class TierInForce:
+    """How much model frames are given from now on."""
+
+    tier: str
+
+
+@dataclass(frozen=True, slots=True)
+class BudgetInForce:
+    """How long a frame may take from now on."""
+
+    budget_ms: float | None
+    """None: the tier's own."""
+
+
+@dataclass(slots=True)
+class RunningRecording:
+    """A recording that runs as long as its `with` block."""
+
+    path: str
+    """The file, on the daemon's computer; the first one of several."""
+    file: RecordedFile | None = None
+    """What was recorded; None as long as it runs."""
+
+
+class Control:
+    """A control socket, the daemon's or the twin's. Close it, or use it in a `with` block.
+
+    Connects with the first command, and again by itself after the other side was restarted. Belongs
+    to the thread that uses it; `tactomo_client.aio` has the same for asyncio.
+
+    Args:
+        address: where it is.
+        keys: keys, or the folder that holds them, for a daemon beyond this computer.
+        timeout_s: how long to wait for replies, seconds, where nothing else is said.
+
+    Example::
+
+        with Control(DEFAULT_TWIN_CONTROL) as twin:
+            twin.request("press", x_mm=10.0, y_mm=0.0)
+
+    """
+
+    def __init__(
+        self,
+        address: str = DEFAULT_CONTROL,
+        *,
+        keys: Keys | str | Path | None = None,
+        timeout_s: float = TIMEOUT_S,
+    ) -> None:
+        self.address = address
+        self.timeout_s = timeout_s
+        self._line = ControlLine(_open, address, as_keys(keys))
+
+    def request(
+        self, command: str, timeout_s: float | None = None, /, **arguments: Any
+    ) -> dict[str, Any]:
+        """Send any command and return its result as it came; errors are those of `request`."""
+        patience_s = self.timeout_s if timeout_s is None else timeout_s
+        return wait(self._line.exchange(command, arguments, patience_s))
+
+    def close(self) -> None:
+        """Close the connection; closing twice is fine."""
+        self._line.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+class Daemon(Control):
+    """A running daemon, to be given commands: a `Control` that knows them.
+
+    Every command raises the `ControlError` that says why it was not carried out (NoAnswer, and
+    those named with it), KeysError where the server does not let this client in, and MessageError
+    where what answers does not speak this protocol.
+
+    Example::
+
+        with Daemon() as daemon:
+            daemon.tare()
+            with daemon.record("/data/grasp.mcap", maps=True):
+                grasp()
+
+    """
+
+    def status(self) -> Status:
+        """Return how it is: what `tactomo status` shows.
+
+        Example::
+
+            if daemon.status().state != "running":
+                ...
+        """
+        return to_status(self.request("status"))
+
+    def tare(self, timeout_s: float = TARE_TIMEOUT_S) -> Tare:
+        """Take a new reference: the next scans of the *unloaded* skin count as nothing pressed.
+
+        Raises:
+            TareRefused: somebody presses.
+            NoData: no scans come.
+
+        """
+        return filled(Tare, self.request("tare", timeout_s))
+
+    def record_start(
+        self, path: str | Path | None = None, *, maps: bool | None = None
+    ) -> RecordingStarted:
+        """Start a recording of what the ports say, which goes on until `record_stop`.
+
+        Args:
+            path: the file to write, on the daemon's computer; relative to the folder that this
+                program runs in. None: files in the daemon's own folder.
+            maps: whether maps and contacts are recorded, too; None: as the daemon is configured.
+
+        Raises:
+            AlreadyRecording: one runs.
+            CannotWrite: the file exists, or cannot be created, or the disk is full.
+
+        """
+        arguments = record_arguments(path, maps)
+        return filled(RecordingStarted, self.request("record_start", RECORD_TIMEOUT_S, **arguments))
+
+    def record_stop(self) -> RecordedFile:
+        """Stop the recording.
+
+        Raises:
+            NotRecording: none runs.
+            CannotWrite: it could not be written to its end.
+
+        """
+        return filled(RecordedFile, self.request("record_stop", RECORD_TIMEOUT_S))
+
+    @contextmanager
+    def record(
+        self, path: str | Path | None = None, *, maps: bool | None = None
+    ) -> Iterator[RunningRecording]:
+        """Record during a `with` block; arguments and errors are those of `record_start`.
+
+        Example::
+
+            with daemon.record("/data/grasp.mcap", maps=True) as recording:
+                grasp()
+            print(recording.file.bytes)
+
+        """
+        recording = RunningRecording(self.record_start(path, maps=maps).path)
+        try:
+            yield recording
+        except BaseException:
+            with suppress(ClientError):  # what happened in the block is what counts
+                self.record_stop()
+            raise
+        recording.file = self.record_stop()
+
+    def set_tier(self, tier: str) -> TierInForce:
+        """Choose how much model frames are given, such as ``auto`` or ``levelset``.
+
+        Raises:
+            BadArgument: there is no such tier.
+            NoNetwork: the sensor has no network for it.
+
+        """
+        return filled(TierInForce, self.request("set_tier", tier=tier))
+
+    def set_budget(self, budget_ms: float | None) -> BudgetInForce:
+        """Choose how long a frame may take, ms; None leaves it to the tier.
+
+        Raises:
+            BadArgument: not more than 0.
+
+        """
+        return filled(BudgetInForce, self.request("set_budget", budget_ms=budget_ms))
+
+
+def to_status(result: Mapping[str, Any]) -> Status:
+    """Return the status in the reply to the command of that name, which has just come."""
+    return status_from_fields(result, time.monotonic_ns())
+
+
+def record_arguments(path: str | Path | None, maps: bool | None) -> dict[str, Any]:
+    """Return the arguments of `record_start` that are given."""
+    where = {} if path is None else {"path": str(Path(path).expanduser().absolute())}
+    return where if maps is None else {**where, "maps": maps}
+
+
+def _open() -> Owner:
+    return zmq.Context.instance().socket(zmq.REQ)
+
+
+def _no_answer(address: str, timeout_s: float) -> ControlError:
+    return control_error(
         f"nothing answered at {address} within {timeout_s:g} s",
         "start the daemon with `tactomo daemon`, or give the address of the one that runs",
-        name="no_answer",
-    )
-
-
-def bad_address(address: str, error: zmq.ZMQError) -> ControlError:
-    """Return the error for an address that ZeroMQ cannot connect to."""
-    return ControlError(
-        f"cannot connect to {address!r}: {error.strerror}",
-        "an address looks like tcp://127.0.0.1:5561 or ipc:///run/tactomo/control",
-        name="bad_address",
+        "no_answer",
     )

@@ -3,8 +3,15 @@
 ClientError
 ├── MessageError    a message does not follow STREAM.md: another program publishes there,
 │                   or its version is another one
-├── ControlError    a command was refused, or nothing answered it: `tactomo tare` while
-│                   somebody presses the skin, the daemon is not running
+├── ControlError    a command was not carried out; `name` says why, and these have a class:
+│   ├── NoAnswer          nothing answers: the daemon is not running, the address is another's
+│   ├── BadArgument       an argument is missing, of the wrong type or out of range
+│   ├── TareRefused       somebody presses the skin during a tare
+│   ├── NoData            no scans came during a tare: the cable is out
+│   ├── AlreadyRecording  a recording runs already
+│   ├── NotRecording      none runs that could be stopped
+│   ├── CannotWrite       the recording's file exists, may not be written, or the disk is full
+│   └── NoNetwork         the sensor has no network for the tier that was asked for
 ├── StreamTimeout   no frame came within `timeout_s`: the cable is out, the name is misspelt
 ├── KeysError       keys cannot be used (the file is missing, others may read it), or the server
 │                   does not let them in: the client is not on its list, it is another server
@@ -40,7 +47,65 @@ class MessageError(ClientError, ValueError):
 
 
 class ControlError(ClientError):
-    """A command that was refused or not answered; `name` says which of the two and why."""
+    """A command that was refused or not answered; `name` says which of the two and why.
+
+    Example::
+
+        try:
+            scans = daemon.tare().scans
+        except TareRefused as error:
+            print(error.cause, error.next_step)
+
+    """
+
+
+class NoAnswer(ControlError):  # noqa: N818 - this and what follows: named for what happened
+    """``no_answer``: nothing answers at the address within the time."""
+
+
+class BadArgument(ControlError):  # noqa: N818
+    """``bad_argument``: missing, unknown, of the wrong type or out of range."""
+
+
+class TareRefused(ControlError):  # noqa: N818
+    """``tare_refused``: the scans were too uneven for a reference; somebody presses."""
+
+
+class NoData(ControlError):  # noqa: N818
+    """``no_data``: there were no scans to make a reference of."""
+
+
+class AlreadyRecording(ControlError):  # noqa: N818
+    """``already_recording``: a recording runs already; stop it first."""
+
+
+class NotRecording(ControlError):  # noqa: N818
+    """``not_recording``: no recording runs."""
+
+
+class CannotWrite(ControlError):  # noqa: N818
+    """``cannot_write``: the recording's file exists, or it or its folder cannot be written."""
+
+
+class NoNetwork(ControlError):  # noqa: N818
+    """``no_network``: the sensor has no network for the tier that was asked for."""
+
+
+_OF_NAME = {
+    "no_answer": NoAnswer,
+    "bad_argument": BadArgument,
+    "tare_refused": TareRefused,
+    "no_data": NoData,
+    "already_recording": AlreadyRecording,
+    "not_recording": NotRecording,
+    "cannot_write": CannotWrite,
+    "no_network": NoNetwork,
+}
+
+
+def control_error(cause: str, next_step: str, name: str) -> ControlError:
+    """Return the error of that name, of its own class where it has one."""
+    return _OF_NAME.get(name, ControlError)(cause, next_step, name)
 
 
 class StreamTimeout(ClientError, TimeoutError):  # noqa: N818 - named for what happened

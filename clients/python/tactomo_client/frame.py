@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -97,9 +97,9 @@ class Frame:
     """Pressed (1) or not (0), with everything between for in between."""
     x_mm: tuple[float, float] | None
     y_mm: tuple[float, float] | None
-    _age_at_receipt_ns: int
-    _received_ns: int | None
-    _stale_after_s: float
+    _age_at_receipt_ns: int = field(repr=False)
+    _received_ns: int | None = field(repr=False)
+    _stale_after_s: float = field(repr=False)
 
     @property
     def age_s(self) -> float:

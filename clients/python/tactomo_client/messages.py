@@ -21,7 +21,7 @@ import msgpack  # type: ignore[import-untyped]
 import numpy as np
 from numpy.typing import NDArray
 
-from tactomo_client.errors import ControlError, MessageError
+from tactomo_client.errors import MessageError, control_error
 
 SCHEMA: Final = 1
 DEFAULT_STREAM: Final = "tcp://127.0.0.1:5560"
@@ -219,7 +219,7 @@ def decode_reply(data: bytes) -> dict[str, Any]:
     if fields.get("ok") is False and isinstance(error, dict):
         name, cause, next_step = (error.get(key) for key in ("name", "cause", "next_step"))
         if isinstance(name, str) and isinstance(cause, str) and isinstance(next_step, str):
-            raise ControlError(cause, next_step, name)
+            raise control_error(cause, next_step, name)
     raise MessageError("a reply is {schema, ok: true, result} or {schema, ok: false, error}")
 
 

@@ -15,10 +15,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from aiohttp import WSMessage, WSMsgType, web
-from tactomo_client import ClientError, ControlError
+from tactomo_client import ClientError, ControlError, aio
 
 from tactomo_viewer.feed import Feed
-from tactomo_viewer.link import ControlLink
 from tactomo_viewer.wire import frame_message, json_text
 
 MAX_UNCONFIRMED = 2
@@ -42,8 +41,8 @@ class Browser:
         self,
         socket: web.WebSocketResponse,
         feed: Feed,
-        daemon: ControlLink | None,
-        twin: ControlLink | None,
+        daemon: aio.Control | None,
+        twin: aio.Control | None,
     ) -> None:
         self._socket = socket
         self._feed = feed
@@ -104,8 +103,8 @@ class Browser:
         status = self._feed.status
         if status is not None and self._is_new(status):
             await self._send("status", age_ms=status.age_s * 1e3, status=status.fields)
-        for event in [e for e in self._feed.events if e.number > self._last_event]:
-            self._last_event = event.number
+        for number, event in [e for e in self._feed.events if e[0] > self._last_event]:
+            self._last_event = number
             await self._send("event", event=event.fields)
 
     def _is_new(self, item: object) -> bool:
@@ -174,7 +173,7 @@ class Browser:
             )
         if self._daemon is None:
             raise _read_only()
-        return await self._daemon.request(command, arguments, timeout_s)
+        return await self._daemon.request(command, timeout_s, **arguments)
 
     async def _ask_twin(self, command: str, arguments: dict[str, Any]) -> dict[str, Any]:
         if self._daemon is None:
@@ -185,7 +184,7 @@ class Browser:
                 "give the viewer a twin's control socket with --twin",
                 name="no_twin",
             )
-        return await self._twin.request(command, arguments, PRESS_TIMEOUT_S)
+        return await self._twin.request(command, PRESS_TIMEOUT_S, **arguments)
 
     async def _leave(self) -> None:
         # Commands under way are finished first: a release must not overtake its press.

@@ -2,44 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
 
-import zmq
-import zmq.asyncio
-from tactomo_client import Frame, Keys, MessageError
-from tactomo_client.frame import frame_from_message
-from tactomo_client.messages import EVENT, MAP, STATUS, decode_message, topic
-from tactomo_client.subscription import connect_subscriber, reconnect
+from tactomo_client import Event, Frame, Keys, KeysError, Status, aio
 
-STALE_AFTER_S = 0.5
 EVENTS_KEPT = 100
-SILENCE_MS = 5000
-"""After such a silence (a status comes every second) the connection is made anew."""
-
-
-@dataclass(frozen=True)
-class Status:
-    """One `status` message; `age_s` counts from its arrival."""
-
-    fields: dict[str, Any]
-    received_ns: int
-
-    @property
-    def age_s(self) -> float:
-        """Seconds since it arrived."""
-        return (time.monotonic_ns() - self.received_ns) * 1e-9
-
-
-@dataclass(frozen=True)
-class Event:
-    """One `event` message, numbered as it came."""
-
-    number: int
-    fields: dict[str, Any]
 
 
 class Feed:
@@ -48,8 +16,7 @@ class Feed:
     Attributes:
         frame: the newest frame, or None before the first.
         status: the newest status, or None before the first.
-        events: the recent events, oldest first.
-        malformed: messages that were skipped because they broke the rules.
+        events: the recent events, oldest first, each with its number as it came, from 1.
 
     Raises:
         MessageError: `sensor` cannot be a sensor's name.
@@ -62,35 +29,33 @@ class Feed:
     ) -> None:
         self.frame: Frame | None = None
         self.status: Status | None = None
-        self.events: deque[Event] = deque(maxlen=EVENTS_KEPT)
-        self.malformed = 0
+        self.events: deque[tuple[int, Event]] = deque(maxlen=EVENTS_KEPT)
         self._events_seen = 0
         self._on_change = on_change
-        topics = [topic(sensor, kind) for kind in (MAP, STATUS, EVENT)]
-        self._socket = zmq.asyncio.Context.instance().socket(zmq.SUB)
-        self._address = address
-        connect_subscriber(self._socket, address, topics, keys=keys)
+        self._news = aio.subscribe(
+            sensor, address=address, kind=("map", "status", "event"), keys=keys
+        )
+
+    @property
+    def malformed(self) -> int:
+        """Messages that were skipped because they broke the rules."""
+        return self._news.malformed
 
     async def run(self) -> None:
-        """Read until cancelled, then close the socket."""
-        with self._socket:
+        """Read until cancelled, then close the subscription."""
+        async with self._news:
             while True:
-                if await self._socket.poll(SILENCE_MS):
-                    self._take(await self._socket.recv(), time.monotonic_ns())
-                else:  # ZeroMQ does not knock again where a key was refused
-                    reconnect(self._socket, self._address)
+                try:
+                    self._take(await anext(self._news))
+                except KeysError:  # it knocks again by itself; the page shows the silence
+                    continue
 
-    def _take(self, data: bytes, received_ns: int) -> None:
-        try:
-            message = decode_message(data)
-            if message.kind == MAP:
-                self.frame = frame_from_message(message, received_ns, STALE_AFTER_S)
-            elif message.kind == STATUS:
-                self.status = Status(message.fields, received_ns)
-            else:
-                self._events_seen += 1
-                self.events.append(Event(self._events_seen, message.fields))
-        except MessageError:
-            self.malformed += 1
-            return
+    def _take(self, item: Frame | Status | Event) -> None:
+        if isinstance(item, Frame):
+            self.frame = item
+        elif isinstance(item, Status):
+            self.status = item
+        else:
+            self._events_seen += 1
+            self.events.append((self._events_seen, item))
         self._on_change()

@@ -18,11 +18,10 @@ from urllib.parse import urlsplit
 
 from aiohttp import WSCloseCode, web
 from aiohttp.typedefs import Handler, Middleware
-from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM, ClientError, Keys
+from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM, ClientError, Keys, aio
 
 from tactomo_viewer.browser import Browser
 from tactomo_viewer.feed import Feed
-from tactomo_viewer.link import ControlLink
 from tactomo_viewer.wire import json_text
 
 DEFAULT_HOST = "127.0.0.1"
@@ -138,8 +137,8 @@ class _Viewer:
         self._about = {"sensor": sensor, "stream": stream, "read_only": not may_command}
         self._browsers: set[Browser] = set()
         self._sockets: set[web.WebSocketResponse] = set()
-        self._daemon = ControlLink(control, keys) if may_command else None
-        self._twin = ControlLink(twin) if may_command and twin else None
+        self._daemon = aio.Control(control, keys=keys) if may_command else None
+        self._twin = aio.Control(twin) if may_command and twin else None
         self._twin_answers = False
         self._sensor, self._stream, self._keys = sensor, stream, keys
         self._feed: Feed
@@ -183,7 +182,7 @@ class _Viewer:
     async def _watch_twin(self) -> None:
         while self._twin is not None:
             try:
-                await self._twin.request("scene", {}, timeout_s=2.0)
+                await self._twin.request("scene")
                 answers = True
             except ClientError:
                 answers = False

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from tactomo_client import ClientError, Keys
+from tactomo_client import Keys
 from tactomo_models import DescriptionError, SensorDescription, load_description
 from tactomo_models.diagnosis import PatternLayout, pattern_of_zeros, without_zeros
 from tactomo_models.pattern import Pairs, scan_pairs
@@ -151,22 +151,14 @@ class _Listener:
 
     def __init__(self, sensor: str, stream: str, keys: Keys | None) -> None:
         import zmq
-        from tactomo_client.keys import Handshakes
+        from tactomo_client.connection import connect_subscriber
         from tactomo_client.messages import MAP, SCAN, STATUS, topic
-        from tactomo_client.subscription import connect_subscriber
 
         self.said: dict[str, list[dict[str, Any]]] = {MAP: [], SCAN: [], STATUS: []}
         self._where = f"{stream} for a sensor {sensor!r}"
-        self._stream, self._keys = stream, keys
+        topics = [topic(sensor, kind) for kind in self.said]
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
-        self._handshakes = Handshakes(self._socket)
-        try:
-            connect_subscriber(
-                self._socket, stream, [topic(sensor, kind) for kind in self.said], keys=keys
-            )
-        except ClientError:
-            self.close()
-            raise
+        self._connection = connect_subscriber(self._socket, stream, topics, keys=keys)
 
     def first_status(self) -> dict[str, Any]:
         """Wait for a status and forget what came before it; DoctorError where there is none."""
@@ -194,13 +186,12 @@ class _Listener:
             except MessageError:
                 continue
             self.said[message.kind].append(message.fields)
-        if refusal := self._handshakes.refusal(self._stream, self._keys):
+        if refusal := self._connection.refusal():
             raise refusal
 
     def close(self) -> None:
         """Close the subscription."""
-        self._handshakes.close()
-        self._socket.close()
+        self._connection.close()
 
 
 def _layout_of_status(

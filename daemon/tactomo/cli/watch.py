@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -22,11 +24,9 @@ from tactomo.cli.app import (
 if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.text import Text
-    from tactomo_client import Frame, Keys
+    from tactomo_client import Event, Frame, Status
 
 REFRESH_HZ = 12.0
-STALE_S = 0.5
-GONE_S = 3.0
 
 
 @app.command(
@@ -46,9 +46,8 @@ def watch(
     Without a terminal (in a pipe) it prints one line a frame instead. Ctrl-C ends it.
     """
     from rich.console import Console
-    from tactomo_client.keys import as_keys
 
-    view = View(sensor, stream, as_keys(keys))
+    view = View(sensor, stream, keys)
     console = Console()
     end_s = float("inf") if seconds is None else time.monotonic() + seconds
     try:
@@ -65,28 +64,15 @@ def watch(
 class View:
     """The newest frame, status and event of one sensor."""
 
-    def __init__(self, sensor: str, stream: str, keys: Keys | None = None) -> None:
-        import zmq
-        from tactomo_client import ClientError
-        from tactomo_client.keys import Handshakes
-        from tactomo_client.messages import EVENT, MAP, STATUS, topic
-        from tactomo_client.subscription import connect_subscriber
+    def __init__(self, sensor: str, stream: str, keys: Path | None = None) -> None:
+        from tactomo_client import subscribe
 
         self.sensor = sensor
         self.stream = stream
         self.frame: Frame | None = None
-        self.status: dict[str, Any] = {}
-        self.status_s = 0.0
-        self.event: dict[str, Any] = {}
-        self._keys = keys
-        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
-        self._handshakes = Handshakes(self._socket)
-        topics = [topic(sensor, kind) for kind in (MAP, STATUS, EVENT)]
-        try:
-            connect_subscriber(self._socket, stream, topics, keys=keys)
-        except ClientError:
-            self.close()
-            raise
+        self.status: Status | None = None
+        self.event: Event | None = None
+        self._news = subscribe(sensor, address=stream, kind=("map", "status", "event"), keys=keys)
 
     def update(self, wait_s: float) -> bool:
         """Take in what has come, waiting for it at most `wait_s`; tell whether a frame came.
@@ -95,41 +81,30 @@ class View:
             KeysError: the server does not let us in.
 
         """
-        from tactomo_client import MessageError
-
-        new = False
-        while self._socket.poll(round(wait_s * 1e3)):
+        before = self.frame
+        while (item := self._news.wait(wait_s)) is not None:
             wait_s = 0.0
-            try:
-                new |= self._take(self._socket.recv())
-            except MessageError:
-                continue  # another program publishes there; ours will show, or its silence will
-        if refusal := self._handshakes.refusal(self.stream, self._keys):
-            raise refusal
-        return new
+            self._take(item)
+        return self.frame is not before
 
     def close(self) -> None:
         """Close the subscription."""
-        self._handshakes.close()
-        self._socket.close()
+        self._news.close()
 
     @property
     def is_gone(self) -> bool:
         """Whether no status has come for so long that the daemon cannot be there."""
-        return time.monotonic() - self.status_s > GONE_S
+        return self.status is None or self.status.is_stale
 
-    def _take(self, data: bytes) -> bool:
-        from tactomo_client.frame import frame_from_message
-        from tactomo_client.messages import MAP, STATUS, decode_message
+    def _take(self, item: Frame | Status | Event) -> None:
+        from tactomo_client import Frame, Status
 
-        message = decode_message(data)
-        if message.kind == MAP:
-            self.frame = frame_from_message(message, time.monotonic_ns(), STALE_S)
-        elif message.kind == STATUS:
-            self.status, self.status_s = message.fields, time.monotonic()
+        if isinstance(item, Frame):
+            self.frame = item
+        elif isinstance(item, Status):
+            self.status = item
         else:
-            self.event = message.fields
-        return message.kind == MAP
+            self.event = item
 
 
 def _show_live(view: View, console: Any, end_s: float) -> None:
@@ -176,7 +151,8 @@ def _screen(view: View, columns: int, rows: int) -> RenderableType:
     frame = view.frame
     if frame is None:
         return Panel(_state_line(view), title=f"tactomo watch {view.sensor}")
-    image = map_text(frame, view.status, max(10, min(columns - 44, 2 * (rows - 6))))
+    description = view.status.fields.get("description") or {} if view.status else {}
+    image = map_text(frame, description, max(10, min(columns - 44, 2 * (rows - 6))))
     body = Table.grid(padding=(0, 2))
     body.add_row(image, Group(_contact_table(frame), Text(), _health(view, frame)))
     panel = Panel(
@@ -191,23 +167,23 @@ def _screen(view: View, columns: int, rows: int) -> RenderableType:
 def _state_line(view: View) -> Text:
     from rich.text import Text
 
-    if view.is_gone:
+    if view.status is None or view.is_gone:
         return Text(
             f"no daemon answers at {view.stream} for a sensor {view.sensor!r}: is it running?",
             "bold red",
         )
-    state = str(view.status.get("state", "unknown"))
+    state = view.status.state
     if view.frame is not None and view.frame.is_stale:
         age = f"STALE: the newest frame is {view.frame.age_s:.1f} s old"
         return Text(f"{age} (the daemon says: {state}) {_event_words(view.event)}", "bold red")
     return Text(f"{state} {_event_words(view.event)}", "green" if state == "running" else "yellow")
 
 
-def _event_words(event: dict[str, Any]) -> str:
-    return f"| last event: {event['name']} {event.get('detail', '')}" if event else ""
+def _event_words(event: Event | None) -> str:
+    return f"| last event: {event.name} {event.detail}" if event else ""
 
 
-def map_text(frame: Frame, status: dict[str, Any], columns: int) -> Text:
+def map_text(frame: Frame, description: Mapping[str, Any], columns: int) -> Text:
     """Return the map as text of at most `columns` half-block characters in width.
 
     Each character is two nodes, one above the other. Colour is pressure, or the relative change
@@ -219,7 +195,7 @@ def map_text(frame: Frame, status: dict[str, Any], columns: int) -> Text:
     from rich.text import Text
     from tactomo_client.appearance import map_pixels
 
-    pixels = map_pixels(frame, status.get("description") or {})
+    pixels = map_pixels(frame, description)
     if pixels is None:
         return Text("no image: " + ", ".join(sorted(frame.flags)))
     step = -(-pixels.shape[1] // columns)
@@ -254,17 +230,17 @@ def _contact_table(frame: Frame) -> RenderableType:
 def _health(view: View, frame: Frame) -> RenderableType:
     from rich.table import Table
 
-    rates = view.status.get("rates") or {}
-    latency = view.status.get("latency_ms") or {}
+    status = view.status
+    latency = status and status.latency_ms
     rows = {
-        "rate": f"{rates.get('frames_hz') or 0.0:.1f} frames/s",
-        "latency": f"{latency.get('p50') or 0.0:.1f} ms (p99 {latency.get('p99') or 0.0:.1f})",
+        "rate": f"{status.rates.frames_hz:.1f} frames/s" if status else "-",
+        "latency": f"{latency.p50:.1f} ms (p99 {latency.p99:.1f})" if latency else "-",
         "age": f"{frame.age_s * 1e3:.0f} ms",
         "tier": frame.tier or "-",
         "because": frame.tier_reason or "-",
         "misfit": "-" if frame.misfit is None else f"{frame.misfit:.2f}",
         "flags": ", ".join(sorted(frame.flags)) or "none",
-        "source": str((view.status.get("source") or {}).get("kind", "-")),
+        "source": status.source.kind if status else "-",
     }
     table = Table(box=None, show_header=False, pad_edge=False)
     for name, value in rows.items():

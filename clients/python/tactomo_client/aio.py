@@ -1,0 +1,340 @@
+"""The client for asyncio: the same subscriptions and commands, awaited.
+
+::
+
+    import asyncio
+
+    from tactomo_client.aio import subscribe
+
+    async def main():
+        async with subscribe("left_forearm", kind="contacts") as skin:
+            async for frame in skin:
+                print(frame.contacts)
+
+    asyncio.run(main())
+
+Many subscriptions may run in one event loop. A task that waits may be cancelled at any time: no
+frame is lost by it, and what is open stays open until it is closed or goes out of use.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, closing, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self, TypeVar, Unpack, cast, overload
+
+import zmq
+import zmq.asyncio
+
+from tactomo_client.connection import Owner, Waiting
+from tactomo_client.control import (
+    RECORD_TIMEOUT_S,
+    TARE_TIMEOUT_S,
+    TIMEOUT_S,
+    BudgetInForce,
+    ControlLine,
+    RecordedFile,
+    RecordingStarted,
+    RunningRecording,
+    Tare,
+    TierInForce,
+    record_arguments,
+    to_status,
+)
+from tactomo_client.errors import ClientError
+from tactomo_client.event import Event
+from tactomo_client.filled import filled
+from tactomo_client.frame import Frame
+from tactomo_client.keys import Keys, as_keys
+from tactomo_client.messages import DEFAULT_CONTROL, DEFAULT_STREAM
+from tactomo_client.reception import Item, Kind, Options, Reception, T_co
+from tactomo_client.status import Status
+
+__all__ = ["Control", "Daemon", "Subscription", "request", "subscribe"]
+
+T = TypeVar("T")
+
+
+@overload
+def subscribe(
+    sensor: str, *, kind: Literal["map", "contacts"] = "map", **options: Unpack[Options]
+) -> Subscription[Frame]: ...
+@overload
+def subscribe(
+    sensor: str, *, kind: Literal["status"], **options: Unpack[Options]
+) -> Subscription[Status]: ...
+@overload
+def subscribe(
+    sensor: str, *, kind: Literal["event"], **options: Unpack[Options]
+) -> Subscription[Event]: ...
+@overload
+def subscribe(
+    sensor: str, *, kind: tuple[Kind, ...], **options: Unpack[Options]
+) -> Subscription[Item]: ...
+
+
+def subscribe(
+    sensor: str,
+    *,
+    kind: Kind | tuple[Kind, ...] = "map",
+    address: str = DEFAULT_STREAM,
+    latest_only: bool = False,
+    stale_after_s: float | None = None,
+    timeout_s: float | None = None,
+    keys: Keys | str | Path | None = None,
+) -> Subscription[Any]:
+    """Subscribe to one sensor's frames, as `tactomo_client.subscribe` does, within an event loop.
+
+    Arguments and errors are the same.
+
+    Example::
+
+        async with subscribe("left_forearm") as skin:
+            async for frame in skin:
+                ...
+    """
+    return Subscription(
+        _open_subscriber,
+        sensor,
+        address,
+        kind,
+        latest_only,
+        stale_after_s,
+        timeout_s,
+        as_keys(keys),
+    )
+
+
+class Subscription(Reception[T_co], AsyncIterator[T_co]):
+    """An open subscription of an event loop. Close it, or use it in an `async with` block.
+
+    Belongs to the event loop in which it is first awaited. `subscribe` makes one.
+
+    """
+
+    async def __anext__(self) -> T_co:
+        """Wait for the next frame, in an `async for` or with `anext`.
+
+        Raises:
+            StreamTimeout: it does not come within `timeout_s`.
+            KeysError: the server does not let this client in. The next call knocks once more.
+
+        """
+        item = await _wait(self._arrival(self.timeout_s))
+        if item is not None:
+            return item
+        raise self._end() or StopAsyncIteration
+
+    async def wait(self, timeout_s: float) -> T_co | None:
+        """Wait for the next frame, but no longer than `timeout_s`; None if it has not come then.
+
+        Raises:
+            KeysError: the server does not let this client in. The next call knocks once more.
+
+        """
+        return await _wait(self._arrival(timeout_s))
+
+    async def latest(self) -> T_co | None:
+        """Return the newest frame there is, without waiting for one; None before the first one.
+
+        The same frame comes again when no newer one has arrived: look at `Frame.is_stale`. Other
+        tasks have their turn meanwhile.
+        """
+        await asyncio.sleep(0)
+        return self._latest()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+async def request(
+    command: str,
+    address: str = DEFAULT_CONTROL,
+    timeout_s: float = TIMEOUT_S,
+    *,
+    keys: Keys | str | Path | None = None,
+    **arguments: Any,
+) -> dict[str, Any]:
+    """Send one command and return its result as it came, as `tactomo_client.request` does."""
+    async with Control(address, keys=keys) as control:
+        return await control.request(command, timeout_s, **arguments)
+
+
+class Control:
+    """A control socket, the daemon's or the twin's: `tactomo_client.Control` for asyncio.
+
+    Several tasks may use it at once; their commands are carried out in the order of the calls.
+
+    Args:
+        address: where it is.
+        keys: keys, or the folder that holds them, for a daemon beyond this computer.
+        timeout_s: how long to wait for replies, seconds, where nothing else is said.
+
+    """
+
+    def __init__(
+        self,
+        address: str = DEFAULT_CONTROL,
+        *,
+        keys: Keys | str | Path | None = None,
+        timeout_s: float = TIMEOUT_S,
+    ) -> None:
+        self.address = address
+        self.timeout_s = timeout_s
+        self._line = ControlLine(_open_requester, address, as_keys(keys))
+        self._turn = asyncio.Lock()
+
+    async def request(
+        self, command: str, timeout_s: float | None = None, /, **arguments: Any
+    ) -> dict[str, Any]:
+        """Send any command and return its result as it came; errors are those of `request`."""
+        patience_s = self.timeout_s if timeout_s is None else timeout_s
+        async with self._turn:
+            return await _wait(self._line.exchange(command, arguments, patience_s))
+
+    def close(self) -> None:
+        """Close the connection; the next command opens another. Closing twice is fine."""
+        self._line.close()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+class Daemon(Control):
+    """A running daemon, to be given commands: `tactomo_client.Daemon` for asyncio.
+
+    Commands, results and errors are the same.
+
+    Example::
+
+        async with Daemon() as daemon:
+            await daemon.tare()
+            async with daemon.record("/data/grasp.mcap", maps=True):
+                await grasp()
+
+    """
+
+    async def status(self) -> Status:
+        """Return how it is: what `tactomo status` shows."""
+        return to_status(await self.request("status"))
+
+    async def tare(self, timeout_s: float = TARE_TIMEOUT_S) -> Tare:
+        """Take a new reference: the next scans of the *unloaded* skin count as nothing pressed.
+
+        Raises:
+            TareRefused: somebody presses.
+            NoData: no scans come.
+
+        """
+        return filled(Tare, await self.request("tare", timeout_s))
+
+    async def record_start(
+        self, path: str | Path | None = None, *, maps: bool | None = None
+    ) -> RecordingStarted:
+        """Start a recording, as `tactomo_client.Daemon.record_start` does.
+
+        Raises:
+            AlreadyRecording: one runs.
+            CannotWrite: the file exists, or cannot be created, or the disk is full.
+
+        """
+        arguments = record_arguments(path, maps)
+        result = await self.request("record_start", RECORD_TIMEOUT_S, **arguments)
+        return filled(RecordingStarted, result)
+
+    async def record_stop(self) -> RecordedFile:
+        """Stop the recording.
+
+        Raises:
+            NotRecording: none runs.
+            CannotWrite: it could not be written to its end.
+
+        """
+        return filled(RecordedFile, await self.request("record_stop", RECORD_TIMEOUT_S))
+
+    @asynccontextmanager
+    async def record(
+        self, path: str | Path | None = None, *, maps: bool | None = None
+    ) -> AsyncIterator[RunningRecording]:
+        """Record during an `async with` block; as `tactomo_client.Daemon.record`."""
+        recording = RunningRecording((await self.record_start(path, maps=maps)).path)
+        try:
+            yield recording
+        except BaseException:
+            with suppress(ClientError):  # what happened in the block is what counts
+                await self.record_stop()
+            raise
+        recording.file = await self.record_stop()
+
+    async def set_tier(self, tier: str) -> TierInForce:
+        """Choose how much model frames are given, such as ``auto`` or ``levelset``.
+
+        Raises:
+            BadArgument: there is no such tier.
+            NoNetwork: the sensor has no network for it.
+
+        """
+        return filled(TierInForce, await self.request("set_tier", tier=tier))
+
+    async def set_budget(self, budget_ms: float | None) -> BudgetInForce:
+        """Choose how long a frame may take, ms; None leaves it to the tier.
+
+        Raises:
+            BadArgument: not more than 0.
+
+        """
+        return filled(BudgetInForce, await self.request("set_budget", budget_ms=budget_ms))
+
+
+async def _wait(steps: Waiting[T]) -> T:
+    """Run a generator to its end, letting other tasks run while it waits, and return its value."""
+    with closing(steps):
+        try:
+            socket, wait_ms = next(steps)
+            while True:
+                socket, wait_ms = steps.send(await _is_readable(socket, wait_ms))
+        except StopIteration as done:
+            result: T = done.value
+            return result
+
+
+async def _is_readable(socket: Owner, wait_ms: int) -> bool:
+    try:
+        return bool(await cast(zmq.asyncio.Socket, socket).poll(wait_ms))
+    except asyncio.CancelledError:
+        task = asyncio.current_task()
+        if socket.closed and task is not None and not task.cancelling():
+            return False  # it was closed under us; nobody cancelled this task
+        raise
+
+
+def _open_subscriber() -> Owner:
+    return _open(zmq.SUB)
+
+
+def _open_requester() -> Owner:
+    return _open(zmq.REQ)
+
+
+def _open(kind: int) -> Owner:
+    # Of the plain context, so that the socket's monitor is a plain socket, too.
+    return zmq.asyncio.Socket(zmq.Context.instance(), kind)

@@ -1,0 +1,173 @@
+"""A client's socket, as STREAM.md recommends it, and waiting for it in a thread or an event loop.
+
+What a client does is written once, as generators that yield what they wait for (`Waiting`). `wait`
+runs one in a thread, `tactomo_client.aio` runs the same one in an event loop; nothing else here or
+in the modules that use it ever waits.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+import weakref
+from collections.abc import Generator, Iterable
+from typing import Any, Final, TypeVar
+
+import zmq
+
+from tactomo_client.errors import ControlError, KeysError, control_error
+from tactomo_client.keys import Handshakes, Keys, secure
+from tactomo_client.messages import MAX_MESSAGE_BYTES
+
+KNOCK_PERIOD_S: Final = 1.0
+"""How often a client that was not let in tries again."""
+
+T = TypeVar("T")
+Owner = zmq.Socket[Any]
+Waiting = Generator[tuple[Owner, int], bool, T]
+"""Yields a socket and for how many milliseconds to wait for a message on it; is sent whether one is
+there."""
+
+
+def wait(steps: Waiting[T]) -> T:
+    """Run a generator to its end, blocking this thread while it waits, and return its value."""
+    with contextlib.closing(steps):
+        try:
+            socket, wait_ms = next(steps)
+            while True:
+                socket, wait_ms = steps.send(bool(socket.poll(wait_ms)))
+        except StopIteration as done:
+            result: T = done.value
+            return result
+
+
+def whole_ms(seconds: float) -> int:
+    """Return a time in ZeroMQ's whole milliseconds; up, or the last one is spent spinning."""
+    return int(max(0.0, seconds) * 1000) + 1
+
+
+class Connection:
+    """One socket connected to one address, watched for whether the server lets this client in.
+
+    Close it, or let it go out of use.
+
+    Args:
+        owner: a new socket, a plain one or an asyncio one; the connection closes it.
+        address: where to connect.
+        keys: for a server that wants some.
+
+    Attributes:
+        socket: what to send and receive by, without waiting.
+        owner: what to wait for.
+
+    Raises:
+        ControlError: `address` is not an address.
+
+    """
+
+    def __init__(self, owner: Owner, address: str, keys: Keys | None) -> None:
+        self.owner = owner
+        self.address = address
+        self.socket: zmq.Socket[bytes] = zmq.Socket.shadow(owner.underlying)
+        self._keys = keys
+        self._knock_at_s = 0.0
+        self._handshakes = Handshakes(owner)
+        self._closed = weakref.finalize(self, _close, self._handshakes, owner)
+        try:
+            secure(self.socket, address, keys)
+            self.socket.setsockopt(zmq.LINGER, 0)
+            self.socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
+        except BaseException:
+            self.close()
+            raise
+
+    def connect(self) -> None:
+        """Connect, when all options are set."""
+        try:
+            self.socket.connect(self.address)
+        except zmq.ZMQError as error:
+            self.close()
+            raise bad_address(self.address, error) from error
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it was not closed."""
+        return self._closed.alive
+
+    def close(self) -> None:
+        """Close it; closing twice is fine."""
+        self._closed()
+
+    @property
+    def has_been_let_in(self) -> bool:
+        """Whether the server has ever taken this client in, as far as `refusal` has looked."""
+        return self._handshakes.have_succeeded
+
+    def receive(self) -> bytes | None:
+        """Return the message that waits; None if there is none after all."""
+        try:
+            return self.socket.recv(zmq.NOBLOCK)
+        except zmq.Again:
+            return None
+
+    def refusal(self) -> KeysError | None:
+        """Return why the server lets nobody in by these keys; None as long as it may do so."""
+        return self._handshakes.refusal(self.address, self._keys)
+
+    def knock_again(self) -> KeysError | None:
+        """Return why the server does not let us in, if so, and try again from time to time.
+
+        ZeroMQ itself never tries again where a key was refused.
+        """
+        refusal = self.refusal()
+        if refusal and time.monotonic() >= self._knock_at_s:
+            self._knock_at_s = time.monotonic() + KNOCK_PERIOD_S
+            reconnect(self.socket, self.address)
+        return refusal
+
+
+def _close(handshakes: Handshakes, owner: Owner) -> None:
+    handshakes.close()
+    owner.close()
+
+
+def connect_subscriber(
+    owner: Owner,
+    address: str,
+    topics: Iterable[bytes],
+    *,
+    latest_only: bool = False,
+    keys: Keys | None = None,
+) -> Connection:
+    """Connect a new SUB socket for these topics.
+
+    Raises:
+        ControlError: `address` is not an address; the socket is closed then.
+
+    """
+    connection = Connection(owner, address, keys)
+    # A computer that lost power never closes its connections; heartbeats notice.
+    connection.socket.setsockopt(zmq.HEARTBEAT_IVL, 1000)
+    connection.socket.setsockopt(zmq.HEARTBEAT_TIMEOUT, 3000)
+    if latest_only:
+        connection.socket.setsockopt(zmq.CONFLATE, 1)
+    for prefix in topics:
+        connection.socket.setsockopt(zmq.SUBSCRIBE, prefix)
+    connection.connect()
+    return connection
+
+
+def reconnect(socket: zmq.Socket[Any], address: str) -> None:
+    """Drop a connection and make it anew; what is subscribed to stays so."""
+    with contextlib.suppress(zmq.ZMQError):  # it may be gone altogether
+        socket.disconnect(address)
+    socket.connect(address)
+
+
+def bad_address(address: str, error: zmq.ZMQError) -> ControlError:
+    """Return the error for an address that ZeroMQ cannot connect to."""
+    return control_error(
+        f"cannot connect to {address!r}: {error.strerror}",
+        "an address looks like tcp://127.0.0.1:5561 or ipc:///run/tactomo/control",
+        "bad_address",
+    )

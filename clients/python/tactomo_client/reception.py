@@ -1,0 +1,186 @@
+"""What a subscription does, whether a thread or an event loop waits for it."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Final, Generic, Literal, NamedTuple, TypedDict, TypeVar, cast
+
+from tactomo_client.connection import (
+    KNOCK_PERIOD_S,
+    Owner,
+    Waiting,
+    connect_subscriber,
+    whole_ms,
+)
+from tactomo_client.errors import MessageError, StreamTimeout
+from tactomo_client.event import Event, event_from_message
+from tactomo_client.frame import Frame, frame_from_message
+from tactomo_client.keys import Keys
+from tactomo_client.messages import CONTACTS, EVENT, MAP, STATUS, Message, decode_message, topic
+from tactomo_client.status import Status, status_from_message
+
+Kind = Literal["map", "contacts", "status", "event"]
+Item = Frame | Status | Event
+
+
+class Options(TypedDict, total=False):
+    """What any subscription may be given; `subscribe` says what each is for."""
+
+    address: str
+    latest_only: bool
+    stale_after_s: float | None
+    timeout_s: float | None
+    keys: Keys | str | Path | None
+
+
+class _KindOfItem(NamedTuple):
+    read: Callable[[Message, int, float], Item]
+    stale_after_s: float
+
+
+_KINDS: Final[Mapping[str, _KindOfItem]] = {
+    MAP: _KindOfItem(frame_from_message, 0.5),
+    CONTACTS: _KindOfItem(frame_from_message, 0.5),
+    STATUS: _KindOfItem(status_from_message, 3.0),
+    EVENT: _KindOfItem(event_from_message, math.inf),
+}
+
+T_co = TypeVar("T_co", bound=Frame | Status | Event, covariant=True)
+
+
+class Reception(Generic[T_co]):
+    """One sensor's messages of some kinds, as they come over one connection.
+
+    Attributes:
+        sensor: the sensor's name.
+        address: of the stream.
+        kinds: what is received.
+        timeout_s: how long the iteration waits before it raises StreamTimeout; None: for ever.
+        missed: how many messages were published but never seen here, by gaps in `sequence`.
+        malformed: how many messages were skipped because they broke the rules of STREAM.md.
+
+    """
+
+    def __init__(
+        self,
+        owner: Callable[[], Owner],
+        sensor: str,
+        address: str,
+        kind: Kind | tuple[Kind, ...],
+        latest_only: bool,
+        stale_after_s: float | None,
+        timeout_s: float | None,
+        keys: Keys | None,
+    ) -> None:
+        self.sensor = sensor
+        self.address = address
+        self.kinds = _checked(kind, latest_only)
+        self.timeout_s = timeout_s
+        self.missed = 0
+        self.malformed = 0
+        self._stale_after_s = stale_after_s
+        self._newest: T_co | None = None
+        self._last: dict[str, tuple[str, int]] = {}  # of each kind, session and sequence
+        topics = [topic(sensor, each) for each in self.kinds]
+        self._connection = connect_subscriber(
+            owner(), address, topics, latest_only=latest_only, keys=keys
+        )
+
+    @property
+    def is_stale(self) -> bool:
+        """Whether the newest frame received so far is too old, or there was none yet."""
+        return self._newest is None or self._newest.is_stale
+
+    def close(self) -> None:
+        """Close the subscription; iterations over it end. Closing twice is fine."""
+        self._connection.close()
+
+    def _arrival(self, timeout_s: float | None) -> Waiting[T_co | None]:
+        """Wait for the next item; the outcome is None after `timeout_s`, or when this is closed.
+
+        Raises:
+            KeysError: the server does not let this client in. The next call knocks once more.
+
+        """
+        connection = self._connection
+        deadline_s = math.inf if timeout_s is None else time.monotonic() + timeout_s
+        while connection.is_open:
+            wait_s = min(KNOCK_PERIOD_S, deadline_s - time.monotonic())
+            is_there = yield connection.owner, whole_ms(wait_s)
+            if not connection.is_open:
+                break
+            if is_there:
+                if (item := self._receive()) is not None:
+                    return item
+            elif refusal := connection.knock_again():
+                raise refusal
+            if time.monotonic() >= deadline_s:
+                break
+        return None
+
+    def _latest(self) -> T_co | None:
+        """Take in all that has come, and return the newest item there ever was."""
+        connection = self._connection
+        if not connection.is_open:
+            return self._newest
+        while connection.socket.poll(0):
+            self._receive()
+        if self.is_stale:
+            connection.knock_again()
+        return self._newest
+
+    def _end(self) -> StreamTimeout | None:
+        """Return the error for an item that has not come in time; None if this was closed."""
+        if not self._connection.is_open:
+            return None
+        last = "none came before" if self._newest is None else "the stream has stopped"
+        return StreamTimeout(
+            f"no {' or '.join(self.kinds)} of sensor {self.sensor!r} at {self.address} "
+            f"for {self.timeout_s:g} s ({last})",
+            "run `tactomo status` to see whether the daemon runs, under which sensor name, and "
+            "what its ports say",
+        )
+
+    def _receive(self) -> T_co | None:
+        """Return the item in the message that waits; None if there is none, or a malformed one."""
+        data = self._connection.receive()
+        if data is None:
+            return None
+        received_ns = time.monotonic_ns()
+        try:
+            message = decode_message(data)
+            item = self._read(message, received_ns)
+        except MessageError:
+            self.malformed += 1
+            return None
+        self._count(message.kind, item)
+        self._newest = cast(T_co, item)
+        return self._newest
+
+    def _read(self, message: Message, received_ns: int) -> Item:
+        kind = _KINDS[message.kind]
+        own = self._stale_after_s
+        return kind.read(message, received_ns, kind.stale_after_s if own is None else own)
+
+    def _count(self, kind: str, item: Item) -> None:
+        session, sequence = self._last.get(kind, ("", 0))
+        if session == item.session:
+            self.missed += max(0, item.sequence - sequence - 1)
+        self._last[kind] = item.session, item.sequence
+
+
+def _checked(kind: Kind | tuple[Kind, ...], latest_only: bool) -> tuple[Kind, ...]:
+    kinds = kind if isinstance(kind, tuple) else (kind,)
+    if not kinds or not all(each in _KINDS for each in kinds):
+        raise MessageError(
+            f"cannot subscribe to {kind!r}", "use kind='map' or 'contacts', 'status' or 'event'"
+        )
+    if latest_only and len(kinds) > 1:
+        raise MessageError(
+            "latest_only keeps the newest message of one kind",
+            "subscribe to each kind by itself, or without latest_only",
+        )
+    return kinds

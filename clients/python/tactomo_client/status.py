@@ -1,0 +1,321 @@
+"""How a daemon is, as it tells every second: a `Status`, with what STREAM.md has under that name.
+
+Names, units and meanings are those of STREAM.md. What a daemon of another version does not send has
+the default; what it sends beyond these names is in `Status.fields`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from tactomo_client.filled import filled
+from tactomo_client.messages import Message
+
+
+@dataclass(frozen=True, slots=True)
+class Percentiles:
+    """Of durations, ms."""
+
+    p50: float
+    p99: float
+
+
+@dataclass(frozen=True, slots=True)
+class MagnitudeResponse:
+    """The table by which a relative change of conductivity becomes a pressure."""
+
+    pressure_kpa: tuple[float, ...]
+    relative_change: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SensorDescription:
+    """The sensor: its sheet, its electrodes and what it answers to."""
+
+    model: str = ""
+    """The description's name, such as ``paper_square``."""
+    sha256: str = ""
+    shape: str = ""
+    """``rectangle`` or ``disc``."""
+    width_mm: float | None = None
+    height_mm: float | None = None
+    sensing_width_mm: float | None = None
+    """Of the area that can be pressed, centred."""
+    sensing_height_mm: float | None = None
+    electrodes_mm: tuple[tuple[float, float], ...] = ()
+    """Centre of each electrode, x and y, electrode 0 first."""
+    modalities: tuple[str, ...] = ()
+    """``magnitude``, ``structure``, or both."""
+    magnitude_max: float | None = None
+    """The top of a sensible colour scale for `Frame.map`."""
+    pressure_max_kpa: float | None = None
+    magnitude_response: MagnitudeResponse | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where scans come from: ``device``, ``twin``, ``replay`` or ``unknown``."""
+
+    kind: str = "unknown"
+
+
+@dataclass(frozen=True, slots=True)
+class Device:
+    """What a device says of itself."""
+
+    device_id: str
+    firmware: str
+    channels: tuple[str, ...]
+    electrodes: int
+    samples_per_scan: int
+    scan_rate_hz: float
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceClock:
+    """How the daemon knows a device's clock."""
+
+    state: str
+    """``settling``, ``settled``, ``unusable`` or ``absent``."""
+    offset_ns: int | None = None
+    """The daemon's monotonic clock less the device's."""
+    rate_ppm: float | None = None
+    """By how much the device's clock is slow."""
+    delay_ms: Percentiles | None = None
+    """How much later than need be scans come."""
+    jumps: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Port:
+    """One port that the daemon reads."""
+
+    url: str
+    protocol: str = "tactomo"
+    connected: bool = False
+    """Whether it is open at present."""
+    state: str = ""
+    """``closed``, ``starting``, ``running``, ``idle``, ``garbage``, ``silent``, ``refused`` or
+    ``ended``."""
+    problem: str | None = None
+    """Why it is closed or of no use, in words."""
+    device: Device | None = None
+    """None before the device's first hello."""
+    bytes: int = 0
+    packets: int = 0
+    corrupt: int = 0
+    """Packets that failed a check."""
+    refusal: str | None = None
+    """Why the device's scans are not used, if they are not."""
+    unused_scans: int = 0
+    reopened: int = 0
+    """How often it was closed and opened because the device did not speak."""
+    latency_timer_ms: int | None = None
+    """How long an FTDI adapter holds bytes back at most; None for any other port."""
+    clock: DeviceClock | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Rates:
+    """Per second; None for a channel that the sensor does not have."""
+
+    magnitude_hz: float | None = None
+    structure_hz: float | None = None
+    frames_hz: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class ScanTally:
+    """What became of every single scan since the start."""
+
+    received: int = 0
+    used: int = 0
+    late: int = 0
+    repeated: int = 0
+    dropped: int = 0
+    waiting: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class WallClock:
+    """Whether the computer's clock was set while the daemon ran."""
+
+    jumps: int = 0
+    last_jump_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """The unloaded scans that changes are measured against."""
+
+    scans: int
+    """Dual scans that it is made of."""
+    taken_realtime_ns: int
+    """When, nanoseconds since 1970 (UTC)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What frames are given for the tier and the budget that were asked for."""
+
+    tier: str = ""
+    modelled_ms: float | None = None
+    """Work, in milliseconds of a 2.5 GHz core."""
+    source: str = ""
+    """Where the measure between time and work comes from, in words."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingProgress:
+    """The recording that runs."""
+
+    path: str
+    """On the daemon's computer."""
+    bytes: int
+    queued_bytes: int = 0
+    """What waits for the disk."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recorder:
+    """Recordings since the daemon's start."""
+
+    files: int = 0
+    deleted: int = 0
+    """Files that were deleted to keep to the rules."""
+    failures: int = 0
+    waits_for: str | None = None
+    """Why a recording that is wanted does not run, until it begins again by itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """The last event of a name that was no ``info``."""
+
+    name: str
+    severity: str
+    detail: str
+    next_step: str = ""
+    realtime_ns: int | None = None
+    """When, nanoseconds since 1970 (UTC)."""
+    age_s: float | None = None
+    """How long before the status."""
+
+
+@dataclass(frozen=True, slots=True)
+class EventCounts:
+    """What happened since the daemon's start, for those who were not there."""
+
+    counts: Mapping[str, int] = field(default_factory=dict)
+    """How often, by the event's name."""
+    troubles: tuple[Trouble, ...] = ()
+    """Newest first."""
+
+
+@dataclass(frozen=True, slots=True)
+class Process:
+    """What the daemon takes of its computer."""
+
+    pid: int
+    cpu_s: float
+    memory_bytes: int | None
+    threads: int
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """How a daemon is; one comes every second, whether or not data do.
+
+    Example::
+
+        status = Daemon().status()
+        print(status.state, [port.problem for port in status.ports])
+
+    """
+
+    session: str
+    """Changes when the daemon restarts; `sequence` starts anew then."""
+    sequence: int
+    sensor: str = ""
+    version: str = ""
+    state: str = ""
+    """``waiting_for_port``, ``waiting_for_data``, ``taring``, ``running`` or ``stale``."""
+    uptime_s: float = 0.0
+    flags: frozenset[str] = frozenset()
+    """The newest frame's, as are `tier` and `misfit`."""
+    tier: str | None = None
+    misfit: float | None = None
+    description: SensorDescription | None = None
+    source: Source = field(default_factory=Source)
+    ports: tuple[Port, ...] = ()
+    rates: Rates = field(default_factory=Rates)
+    dropped_scans: int = 0
+    """Dual scans left out because newer ones had come."""
+    incomplete_scans: int = 0
+    """Dual scans of which one channel did not come."""
+    late_scans: int = 0
+    scan_tally: ScanTally = field(default_factory=ScanTally)
+    channel_skew_ms: Percentiles | None = None
+    wall_clock: WallClock = field(default_factory=WallClock)
+    reference: Reference | None = None
+    """None before the first tare."""
+    stage_ms: Mapping[str, Percentiles] = field(default_factory=dict)
+    """For each stage of the pipeline."""
+    latency_ms: Percentiles | None = None
+    """From the last byte read to publication."""
+    tier_requested: str = ""
+    """``auto``, or the tier that was asked for."""
+    budget_ms: float | None = None
+    """Time that a frame may take; None: the tier's own."""
+    plan: Plan = field(default_factory=Plan)
+    recording: RecordingProgress | None = None
+    recorder: Recorder = field(default_factory=Recorder)
+    subscribers: int = 0
+    """Subscriptions in force."""
+    scans: Mapping[str, int] = field(default_factory=dict)
+    """Scans that came since the start, by channel."""
+    frames: int = 0
+    """Frames published since the start."""
+    events: EventCounts = field(default_factory=EventCounts)
+    process: Process | None = None
+    fields: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
+    """The whole message, as in STREAM.md."""
+    _received_ns: int = field(default=0, repr=False, compare=False)
+    _stale_after_s: float = field(default=3.0, repr=False, compare=False)
+
+    @property
+    def age_s(self) -> float:
+        """Seconds since it came."""
+        return (time.monotonic_ns() - self._received_ns) * 1e-9
+
+    @property
+    def is_stale(self) -> bool:
+        """Whether it is too old to be true: the daemon is gone, hangs, or cannot be reached."""
+        return self.age_s > self._stale_after_s
+
+
+def status_from_message(message: Message, received_ns: int, stale_after_s: float) -> Status:
+    """Return the status in a message that came at `received_ns`, by the monotonic clock.
+
+    Raises:
+        MessageError: a field is missing or of the wrong type.
+
+    """
+    return status_from_fields(message.fields, received_ns, stale_after_s)
+
+
+def status_from_fields(
+    fields: Mapping[str, Any], received_ns: int, stale_after_s: float = 3.0
+) -> Status:
+    """Return the status in the fields of a message, or of the reply to the command `status`.
+
+    Raises:
+        MessageError: a field is missing or of the wrong type.
+
+    """
+    return filled(
+        Status, fields, fields=fields, _received_ns=received_ns, _stale_after_s=stale_after_s
+    )
