@@ -177,6 +177,7 @@ def test_record_a_file_for_some_seconds(tactomo: Run, control: Any) -> None:
 
 def test_tier_and_budget(tactomo: Run, control: Any) -> None:
     control.answers["set_tier"] = {"tier": "tikhonov"}
+    control.answers["set_budget"] = {"budget_ms": 20.0}
     result = tactomo("tier", "tikhonov", "--budget-ms", "20", "--control", control.address)
     assert result.returncode == 0
     assert control.requests == [

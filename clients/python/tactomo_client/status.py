@@ -66,19 +66,19 @@ class Source:
 class Device:
     """What a device says of itself."""
 
-    device_id: str
-    firmware: str
-    channels: tuple[str, ...]
-    electrodes: int
-    samples_per_scan: int
-    scan_rate_hz: float
+    device_id: str = ""
+    firmware: str = ""
+    channels: tuple[str, ...] = ()
+    electrodes: int | None = None
+    samples_per_scan: int | None = None
+    scan_rate_hz: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceClock:
     """How the daemon knows a device's clock."""
 
-    state: str
+    state: str = ""
     """``settling``, ``settled``, ``unusable`` or ``absent``."""
     offset_ns: int | None = None
     """The daemon's monotonic clock less the device's."""
@@ -236,9 +236,9 @@ class Status:
 
     """
 
-    session: str
+    session: str = ""
     """Changes when the daemon restarts; `sequence` starts anew then."""
-    sequence: int
+    sequence: int = 0
     sensor: str = ""
     version: str = ""
     state: str = ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -27,8 +28,10 @@ from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
     from rich.table import Table
+    from tactomo_client import Daemon, RecordedFile
 
-TARE_TIMEOUT_S = 30.0
+HEARD_WITHIN_S = 3.0
+"""A status comes every second."""
 
 
 @app.command(
@@ -87,10 +90,10 @@ def tare(control: ControlAddress = DEFAULT_CONTROL, keys: KeysFolder = None) -> 
     Leave the skin alone for a second, then run this. Needed after mounting the skin, after a
     change of temperature, and when contacts show up where nobody presses.
     """
-    from tactomo_client import request
+    from tactomo_client import Daemon
 
-    answer = request("tare", control, TARE_TIMEOUT_S, keys=keys)
-    typer.echo(f"new reference from {answer.get('scans', '?')} dual scans")
+    with Daemon(control, keys=keys) as daemon:
+        typer.echo(f"new reference from {daemon.tare().scans} dual scans")
 
 
 @app.command(
@@ -129,22 +132,22 @@ def record(
     the newest are kept, as its configuration says under [recording]. `tactomo replay` plays a file
     again; each of several replays by itself.
     """
-    from tactomo_client import request
+    from tactomo_client import Daemon
 
+    daemon = Daemon(control, keys=keys)
     if what not in ("start", "stop"):
         if path is not None:
             raise typer.BadParameter("give one file, or `start FILE`")
-        _record_for(Path(what), seconds, maps, control, keys)
+        _record_for(daemon, Path(what), seconds, maps or None)
         return
     if seconds is not None:
         raise typer.BadParameter("--seconds goes with FILE, not with start or stop")
     if what == "stop":
         if path is not None or maps:
             raise typer.BadParameter("stop takes no file, and no --maps")
-        _tell_recorded(request("record_stop", control, 10.0, keys=keys))
+        _tell_recorded(daemon.record_stop())
         return
-    answer = request("record_start", control, 10.0, keys=keys, **_record_arguments(path, maps))
-    typer.echo(f"recording to {answer['path']}")
+    typer.echo(f"recording to {daemon.record_start(path, maps=maps or None).path}")
 
 
 @app.command(
@@ -163,12 +166,13 @@ def tier(
     keys: KeysFolder = None,
 ) -> None:
     """Choose how much model a frame is given, while the daemon runs."""
-    from tactomo_client import request
+    from tactomo_client import Daemon
 
-    answer = request("set_tier", control, keys=keys, tier=name)
-    if budget_ms is not None:
-        request("set_budget", control, keys=keys, budget_ms=budget_ms)
-    typer.echo(f"tier {answer.get('tier', name)}")
+    with Daemon(control, keys=keys) as daemon:
+        in_force = daemon.set_tier(name).tier
+        if budget_ms is not None:
+            daemon.set_budget(budget_ms)
+    typer.echo(f"tier {in_force}")
 
 
 @app.command(
@@ -208,19 +212,12 @@ def poke(
 
 def _heard_status(sensor: str, stream: str, keys: Path | None) -> dict[str, Any]:
     """Return the status that a sensor's stream tells, every second and to each newcomer."""
-    from tactomo_client.keys import as_keys
+    from tactomo_client import subscribe
 
-    from tactomo.cli.watch import GONE_S, View
-
-    view = View(sensor, stream, as_keys(keys))
-    try:
-        end_s = time.monotonic() + GONE_S
-        while not view.status and time.monotonic() < end_s:
-            view.update(0.1)
-        if view.status:
-            return view.status
-    finally:
-        view.close()
+    with subscribe(sensor, kind="status", address=stream, keys=keys) as statuses:
+        status = statuses.wait(HEARD_WITHIN_S)
+    if status is not None:
+        return dict(status.fields)
     raise TactomoError(
         f"nothing is heard of sensor {sensor!r} at {stream}",
         "is its daemon running under this name? `tactomo status` without -s asks the one whose "
@@ -342,41 +339,31 @@ def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.2f}"
 
 
-def _record_arguments(path: Path | None, maps: bool) -> dict[str, Any]:
-    where = {} if path is None else {"path": str(path.absolute())}
-    return {**where, "maps": True} if maps else where
-
-
-def _record_for(
-    path: Path, seconds: float | None, maps: bool, control: str, keys: Path | None
-) -> None:
+def _record_for(daemon: Daemon, path: Path, seconds: float | None, maps: bool | None) -> None:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-    from tactomo_client import request
 
-    arguments = _record_arguments(path, maps)
-    started = request("record_start", control, 10.0, keys=keys, **arguments)
     size = TextColumn("{task.fields[size]}")
     columns = (TextColumn("recording"), BarColumn(), TimeElapsedColumn(), size)
     begin_s = time.monotonic()
-    try:
-        with Progress(*columns, transient=True) as progress:
-            task = progress.add_task(started["path"], total=seconds, size="")
-            while seconds is None or time.monotonic() - begin_s < seconds:
-                recorded = (request("status", control, keys=keys).get("recording") or {}).get(
-                    "bytes", 0
-                )
-                passed_s = time.monotonic() - begin_s
-                progress.update(task, completed=passed_s, size=f"{recorded / 1e6:.1f} MB")
-                left_s = 0.5 if seconds is None else seconds - passed_s
-                time.sleep(max(0.0, min(0.5, left_s)))
-    except KeyboardInterrupt:
-        pass  # the way to end a recording without --seconds
-    finally:
-        _tell_recorded(request("record_stop", control, 10.0, keys=keys))
+    with (
+        daemon.record(path, maps=maps) as recording,
+        suppress(KeyboardInterrupt),  # the way to end a recording without --seconds
+        Progress(*columns, transient=True) as progress,
+    ):
+        task = progress.add_task(recording.path, total=seconds, size="")
+        while seconds is None or time.monotonic() - begin_s < seconds:
+            now = daemon.status().recording
+            passed_s = time.monotonic() - begin_s
+            recorded = f"{now.bytes / 1e6:.1f} MB" if now else ""
+            progress.update(task, completed=passed_s, size=recorded)
+            left_s = 0.5 if seconds is None else seconds - passed_s
+            time.sleep(max(0.0, min(0.5, left_s)))
+    if recording.file is not None:
+        _tell_recorded(recording.file)
 
 
-def _tell_recorded(answer: dict[str, Any]) -> None:
-    typer.echo(f"recorded {answer['path']} ({answer['bytes'] / 1e6:.2f} MB)")
+def _tell_recorded(file: RecordedFile) -> None:
+    typer.echo(f"recorded {file.path} ({file.bytes / 1e6:.2f} MB)")
 
 
 def _named(argument: str) -> tuple[str, Any]:
