@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import resource
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,8 @@ from recorded_grasp import (
     images_of,
     write_grasp,
 )
+from small_sensor import SMALL
+from tactomo_models import Press, SkinSimulator, load_description
 
 Run = Callable[..., Any]
 
@@ -189,3 +193,55 @@ def test_what_was_there_stays_where_writing_fails(tactomo: Run, grasp: Path) -> 
         assert f"cannot write {name}" in result.stderr
         assert grasp.with_name(name).read_text() == "precious"
     assert len(list(grasp.parent.iterdir())) == 4
+
+
+def test_what_holds_no_frames_is_reconstructed_first(
+    tactomo: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The small sheet is pressed at rest, on the right, and not again; the scans are imported."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    (tmp_path / "small.toml").write_text(SMALL)
+    skin = SkinSimulator(load_description(str(tmp_path / "small.toml")), spacing_m=0.002)
+    rest, pressed = skin.voltages(()), skin.voltages([Press(0.01, 0.0, 180.0, 0.008)])
+    noise = np.random.default_rng(1)
+    scans = {
+        name: np.array([rest[name]] * 25 + [pressed[name]] * 10 + [rest[name]] * 5)
+        for name in ("magnitude", "structure")
+    }
+    scans = {n: v + noise.normal(0, 1e-5 * np.abs(v).max(), v.shape) for n, v in scans.items()}
+    references = {f"{name}_reference": volts[:20].mean(axis=0) for name, volts in scans.items()}
+    np.savez(tmp_path / "in.npz", **scans, **references)
+    arguments = ("import", "in.npz", "bare.mcap", "--sensor", "small.toml", "--rate", 20)
+    assert tactomo(*arguments, "--reference-frames", "0:20").returncode == 0
+    result = tactomo("export", "bare.mcap", "made.csv", "--from", 1)
+    assert result.returncode == 0, result.stderr
+    rows = rows_of(tmp_path / "made.csv")
+    assert {float(row["time_s"]) >= 1.0 for row in rows} == {True}
+    touched = [row for row in rows if row["id"]]
+    times = [float(row["time_s"]) for row in touched]
+    assert (min(times), max(times)) == pytest.approx((1.25, 1.7), abs=0.02)
+    assert float(touched[5]["x_mm"]) == pytest.approx(10.0, abs=2.0)
+    result = tactomo("plot", "bare.mcap", "-o", "made.png", "--what", "path")
+    assert result.returncode == 0, result.stderr
+    assert not list(tmp_path.glob(".tactomo*"))
+
+
+@pytest.mark.slow
+def test_memory_does_not_grow_with_the_recording(tmp_path: Path) -> None:
+    """Ten minutes of maps are 0.4 GB as arrays."""
+
+    def most_mb(source: Path, output: str) -> float:
+        program = (
+            "import resource, sys; from tactomo.cli import main\n"
+            f"sys.argv = ['tactomo', 'export', {str(source)!r}, {str(tmp_path / output)!r}]\n"
+            "try: main()\n"
+            "finally: print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3)"
+        )
+        command = [sys.executable, "-c", program]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        return float(done.stdout.splitlines()[-1])
+
+    short = write_grasp(tmp_path / "short.mcap", [n % FRAMES for n in range(1200)])
+    long = write_grasp(tmp_path / "long.mcap", [n % FRAMES for n in range(12_000)])
+    for output in ("out.csv", "out.npz", "out.mcap"):
+        assert most_mb(long, output) < most_mb(short, output) + 60, output

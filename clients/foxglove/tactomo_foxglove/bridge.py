@@ -149,7 +149,7 @@ class _Sensor:
         if message.kind == MAP:
             self._frame = frame_from_message(message, time.monotonic_ns(), STALE_AFTER_S)
             if not self._frame.is_stale:
-                self._topics.frame(self._frame, now_ns)
+                self._topics.frame(self._frame, now_ns, self._frame.age_s)
         elif message.kind == STATUS:
             self._status, self._status_s = message.fields, time.monotonic()
             self._topics.sheet(message.fields["description"], now_ns)

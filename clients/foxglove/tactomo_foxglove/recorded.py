@@ -17,7 +17,7 @@ PROFILE = "tactomo-foxglove"
 
 
 def write_mcap(
-    frames: Iterable[tuple[int, Frame]],
+    frames: Iterable[tuple[int, Frame, float | None]],
     file: IO[bytes],
     sensor: str,
     description: Mapping[str, Any],
@@ -26,7 +26,8 @@ def write_mcap(
     """Write frames as an MCAP file, and return how many there were; one at a time is in memory.
 
     Args:
-        frames: each with when it was acquired, nanoseconds since 1970; in that order.
+        frames: in the order of their times: when each was acquired, nanoseconds since 1970; the
+            frame; and how old it was when it was published, seconds, if that is known.
         file: a file opened for writing, which stays open.
         sensor: the sensor's name.
         description: the sensor, as `status` has it; empty where it is not known.
@@ -39,8 +40,8 @@ def write_mcap(
     options = MCAPWriteOptions(profile=PROFILE, compression_threads=0)
     count = 0
     with foxglove.open_mcap(file, context=context, writer_options=options):
-        for count, (time_ns, frame) in enumerate(frames, 1):
+        for count, (time_ns, frame, age_s) in enumerate(frames, 1):
             if count == 1 and description:
                 topics.sheet(description, time_ns)
-            topics.frame(frame, time_ns)
+            topics.frame(frame, time_ns, age_s)
     return count

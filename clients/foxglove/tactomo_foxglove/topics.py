@@ -136,11 +136,11 @@ class SensorTopics:
         self._sheet.log(messages.sheet_scene(self.sensor, description, time_ns), log_time=time_ns)
         self._hang(time_ns)
 
-    def frame(self, frame: Frame, time_ns: int) -> None:
-        """Say what a frame shows, and its numbers."""
+    def frame(self, frame: Frame, time_ns: int, age_s: float | None) -> None:
+        """Say what a frame shows, and its numbers; `age_s` is None where nobody knows it."""
         self._hang(time_ns)
         self._show(frame, time_ns, "")
-        self._frame.log(_frame_numbers(frame, self._last), log_time=time_ns)
+        self._frame.log(_frame_numbers(frame, self._last, age_s), log_time=time_ns)
         self._last = frame
 
     def stale(self, frame: Frame, words: str, time_ns: int) -> None:
@@ -179,7 +179,7 @@ class SensorTopics:
             self._annotations.log(marks, log_time=time_ns)
 
 
-def _frame_numbers(frame: Frame, last: Frame | None) -> dict[str, Any]:
+def _frame_numbers(frame: Frame, last: Frame | None, age_s: float | None) -> dict[str, Any]:
     follows = last is not None and last.session == frame.session
     forces = [c.force_n for c in frame.contacts if c.force_n is not None]
     pressures = [c.pressure_kpa for c in frame.contacts if c.pressure_kpa is not None]
@@ -196,7 +196,7 @@ def _frame_numbers(frame: Frame, last: Frame | None) -> dict[str, Any]:
             "contacts": [contact_numbers(c) for c in sorted(frame.contacts, key=lambda c: c.id)],
             "misfit": frame.misfit,
             "confidence": frame.confidence,
-            "age_ms": frame.age_s * 1e3,
+            "age_ms": None if age_s is None else age_s * 1e3,
             "delay_ms": None if frame.delay_ns is None else frame.delay_ns * 1e-6,
             "skew_ms": frame.skew_ms,
             "period_ms": None

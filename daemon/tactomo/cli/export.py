@@ -149,9 +149,9 @@ def _write_mcap(frames: RecordedFrames, file: IO[bytes], placement: Placement) -
 
     about = {} if frames.description is None else description_fields(frames.description)
 
-    def timed() -> Iterator[tuple[int, Frame]]:
-        for time_s, frame in frames.shown(frames.moments(), "exporting"):
-            yield frames.start_ns + round(time_s * 1e9), frame
+    def timed() -> Iterator[tuple[int, Frame, float | None]]:
+        for time_s, frame, age_s in frames.shown(frames.moments(), "exporting"):
+            yield frames.start_ns + round(time_s * 1e9), frame, age_s
 
     return write_mcap(timed(), file, frames.sensor, about, placement)
 

@@ -24,11 +24,11 @@ FRAME_COLUMNS: Final = (
     "session",
     "sequence",
     "scan_counter",
-    "age_s",
     "tier",
     "misfit",
     "confidence",
     "flags",
+    "age_s",
 )
 CONTACT_COLUMNS: Final = tuple(field.name for field in fields(Contact))
 ARRAY_COLUMNS: Final = {"magnitude_sigma": "contact_sigma"}
@@ -40,12 +40,13 @@ def write_contacts(moments: Iterable[Moment], output: IO[bytes]) -> int:
     count = 0
     with _table(output) as writer:
         writer.writerow([*FRAME_COLUMNS, *CONTACT_COLUMNS])
-        for time_s, frame in moments:
+        for time_s, frame, age_s in moments:
             count += 1
             start = [
                 f"{time_s:.9f}",
-                *(getattr(frame, name) for name in FRAME_COLUMNS[1:-1]),
+                *(getattr(frame, name) for name in FRAME_COLUMNS[1:-2]),
                 " ".join(sorted(frame.flags)),
+                age_s,
             ]
             for contact in frame.contacts or (None,):
                 writer.writerow([*start, *_cells(contact)])

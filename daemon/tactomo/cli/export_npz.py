@@ -139,10 +139,16 @@ def _append(columns: Mapping[str, _Column], values: Mapping[str, Any]) -> None:
 
 
 def _frame_values(moment: Moment) -> dict[str, Any]:
-    time_s, frame = moment
+    time_s, frame, age_s = moment
     known = {name: _known(getattr(frame, name, None)) for name in FRAME_TYPES}
     bits = sum(Flag[name] for flag in frame.flags if (name := flag.upper()) in Flag.__members__)
-    return {**known, "time_s": time_s, "tier": frame.tier or "", "flags": bits}
+    return {
+        **known,
+        "time_s": time_s,
+        "age_s": _known(age_s),
+        "tier": frame.tier or "",
+        "flags": bits,
+    }
 
 
 def _contact_values(row: int, contact: Contact) -> dict[str, Any]:

@@ -37,7 +37,8 @@ class Course:
     tiers: list[str] = field(default_factory=list)
     flags: list[frozenset[str]] = field(default_factory=list)
     misfits: list[float | None] = field(default_factory=list)
-    ages_s: list[float] = field(default_factory=list)
+    ages_s: list[float | None] = field(default_factory=list)
+    """How old each was when it was published; None for what was made of the recording just now."""
     lost: list[int] = field(default_factory=list)
     """How many frames were published since the one before, but are not in the recording."""
     tracks: dict[str, Track] = field(default_factory=dict)
@@ -58,7 +59,7 @@ def read_course(frames: RecordedFrames, smallest_mm2: float) -> Course:
         course.tiers.append(frame.tier or "none")
         course.flags.append(frame.flags)
         course.misfits.append(frame.misfit)
-        course.ages_s.append(frame.age_s)
+        course.ages_s.append(moment.age_s)
         course.lost.append(_lost(last, moment))
         for contact in contacts:
             track = course.tracks.setdefault(f"{contact.id}{run}", Track())

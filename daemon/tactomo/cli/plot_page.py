@@ -393,16 +393,20 @@ def _bars(times_s: Sequence[float], present: Sequence[bool]) -> list[tuple[float
 
 
 def _draw_timing(axes: Any, course: Course, _: dict[str, Any]) -> None:
-    ages_ms = np.asarray(course.ages_s) * 1e3
+    known_ms = [age_s * 1e3 for age_s in course.ages_s if age_s is not None]
     periods_ms = np.diff(course.times_s) * 1e3
     axes.plot(course.times_s[1:], periods_ms, ".", color="0.65", markersize=2, label="period")
-    axes.plot(*_broken(course.times_s, ages_ms), color=INK, linewidth=0.8, label="age")
+    if known_ms:
+        times_s, ages_s = _broken(course.times_s, course.ages_s)
+        axes.plot(times_s, ages_s * 1e3, color=INK, linewidth=0.8, label="age")
     lost_at = [t for t, lost in zip(course.times_s, course.lost, strict=True) if lost]
     for time_s in lost_at:
         axes.axvline(time_s, color="tab:red", linewidth=0.8, alpha=0.6)
     rate_hz = 1e3 / float(np.median(periods_ms)) if len(periods_ms) else math.nan
-    words = f"{rate_hz:.1f} frames/s; age {np.median(ages_ms):.1f} ms (99 %: "
-    words += f"{np.percentile(ages_ms, 99):.1f}); {sum(course.lost)} frames lost"
+    ages = "age unknown: made of the recording"
+    if known_ms:
+        ages = f"age {np.median(known_ms):.1f} ms (99 %: {np.percentile(known_ms, 99):.1f})"
+    words = f"{rate_hz:.1f} frames/s; {ages}; {sum(course.lost)} frames lost"
     axes.set_title(words, fontsize=8, loc="right", pad=2, color=INK)
     axes.set_yscale("log")
     axes.set_ylabel("ms")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import heapq
 import tempfile
 import threading
 import warnings
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
@@ -47,10 +48,13 @@ DescriptionOption = Annotated[
 
 
 class Moment(NamedTuple):
-    """A frame, and how many seconds after the recording's beginning it was acquired."""
+    """A frame and its time in the recording."""
 
     time_s: float
+    """When it was acquired, seconds from the recording's beginning."""
     frame: Frame
+    age_s: float | None
+    """How old it was when it was published; None where it was made of the recording just now."""
 
 
 @dataclass(frozen=True)
@@ -73,24 +77,40 @@ class RecordedFrames:
     start_ns: int
     start_s: float
     end_s: float
-    _source: Recording
-    _is_remade: bool
+    _given: Recording
+    _remade: Sequence[Recording]
+    """Of each file, if it had to be made; otherwise none."""
 
     def moments(self, kind: Literal["map", "contacts"] = "map") -> Iterator[Moment]:
         """Yield the frames in the order of their times, one at a time."""
-        # What was made of a replay was published at the replay's times.
-        window = (0.0, float("inf"))
-        if not self._is_remade:
-            window = (max(0.0, self.start_s - MARGIN_S), self.end_s + MARGIN_S)
+        every = self._made_moments(kind) if self._remade else self._kept_moments(kind)
+        return (moment for moment in every if self.start_s <= moment.time_s < self.end_s)
+
+    def _kept_moments(self, kind: Literal["map", "contacts"]) -> Iterator[Moment]:
         clock = _Clock(self.start_ns)
-        for frame in self._source.frames(kind, start_s=window[0], end_s=window[1]):
-            time_s = clock.time_s(frame)
-            if self.start_s <= time_s < self.end_s:
-                yield Moment(time_s, frame)
+        window = {"start_s": max(0.0, self.start_s - MARGIN_S), "end_s": self.end_s + MARGIN_S}
+        for frame in self._given.frames(kind, **window):
+            yield Moment(clock.time_s(frame), frame, frame.age_s)
+
+    def _made_moments(self, kind: Literal["map", "contacts"]) -> Iterator[Moment]:
+        """Yield frames that were made of a replay, which knows its own times only."""
+        for file, made in zip(self._given.files, self._remade, strict=True):
+            arrivals = _arrivals(file)
+            for frame in made.frames(kind) if made.has_frames else ():
+                found = (
+                    clock_ns for counter, clock_ns in arrivals if counter == frame.scan_counter
+                )
+                clock_ns = next(found, None)
+                if clock_ns is None:
+                    break  # cannot be: a frame is made of scans
+                at_that_time = replace(
+                    frame, acquired_realtime_ns=clock_ns, acquired_monotonic_ns=clock_ns
+                )
+                yield Moment((clock_ns - self.start_ns) * 1e-9, at_that_time, None)
 
     def shown(self, moments: Iterator[Moment], doing: str) -> Iterator[Moment]:
         """Yield the moments, with a bar on standard error that shows how far this has come."""
-        length_s = min(self.end_s, self._source.duration_s) - self.start_s
+        length_s = min(self.end_s, self._given.duration_s) - self.start_s
         with progress_bar(doing) as tell:
             for moment in moments:
                 tell(moment.time_s - self.start_s, max(length_s, 1e-9))
@@ -111,6 +131,25 @@ class _Clock:
             since_start_ns = frame.acquired_realtime_ns - self._start_ns
             self._zero_ns = frame.acquired_monotonic_ns - since_start_ns
         return (frame.acquired_monotonic_ns - self._zero_ns) * 1e-9
+
+
+def _arrivals(path: Path) -> Iterator[tuple[int, int]]:
+    """Yield the counter of every scan in a recording, and when it came, on its steady clock."""
+    from tactomo_protocol import Scan
+
+    from tactomo.recording import open_recording
+
+    recording = open_recording(path)
+
+    def of_port(port: int) -> Iterator[tuple[int, int]]:
+        protocol = recording.origin.new_protocol()
+        for clock_ns, data in recording.chunks(port):
+            for packet in protocol.feed(data):
+                if isinstance(packet, Scan):
+                    yield packet.counter, clock_ns
+
+    ports = [of_port(port) for port in range(len(recording.origin.ports))]
+    return heapq.merge(*ports, key=lambda arrival: arrival[1])
 
 
 @contextlib.contextmanager
@@ -147,12 +186,12 @@ def recorded_frames(
         if description or not given.has_frames:
             raise
     with _told_warnings(), contextlib.ExitStack() as undo:
-        source = given
+        remade: list[Recording] = []
         if not given.has_frames or description:
             folder = undo.enter_context(
                 tempfile.TemporaryDirectory(prefix=".tactomo-", dir=scratch)
             )
-            source = _reconstructed(given, description or given.description, Path(folder))
+            remade = _reconstructed(given, description or given.description, Path(folder))
         yield RecordedFrames(
             path,
             given.sensor,
@@ -160,8 +199,8 @@ def recorded_frames(
             given.start_ns,
             start_s,
             float("inf") if end_s is None else end_s,
-            source,
-            source is not given,
+            given,
+            remade,
         )
 
 
@@ -188,14 +227,15 @@ def progress_bar(doing: str) -> Iterator[Tell]:
         yield tell
 
 
-def _reconstructed(given: Recording, description: str, folder: Path) -> Recording:
-    """Replay a recording through a daemon of our own, into one that has frames."""
+def _reconstructed(given: Recording, description: str, folder: Path) -> list[Recording]:
+    """Replay each file of a recording through a daemon of our own, into one that has frames."""
     from tactomo_client.recording import open_recording
 
+    made: list[Recording] = []
     for file in given.files:
         _reconstruct_file(file, given.sensor, description, folder / file.name)
-    made = open_recording(folder if given.path.is_dir() else folder / given.files[0].name)
-    if not made.has_frames:
+        made.append(open_recording(folder / file.name))
+    if not any(recording.has_frames for recording in made):
         raise TactomoError(
             f"{given.path} cannot be reconstructed: no dual scan of {description} is in it",
             "look at it with `tactomo info`; it may need another --sensor",
