@@ -251,7 +251,7 @@ def _disc(contact: Contact, description: Mapping[str, Any], stale: bool) -> Cyli
 def _floating_label(contact: Contact, description: Mapping[str, Any], stale: bool) -> TextPrimitive:
     top = disc_height_m(contact, description) + 0.006
     position = Vector3(x=contact.x_mm * 1e-3, y=contact.y_mm * 1e-3, z=top)
-    return _text(label(contact), position, GREY if stale else WHITE, 14.0)
+    return _text(label(contact), position, GREY if stale else WHITE, 12.0)
 
 
 def _text(text: str, position: Vector3, colour: Color, pixels: float) -> TextPrimitive:
@@ -367,8 +367,9 @@ def log(sensor: str, event: Mapping[str, Any], time_ns: int) -> Log:
 
 def label(contact: Contact) -> str:
     """Return what a contact is, in a few words: identity, pressure, force, place."""
-    words = pressure_words(contact) + force_words(contact, ", ")
-    return f"{contact.id}: {words}\n({contact.x_mm:.0f}, {contact.y_mm:.0f}) mm"
+    place = f"({contact.x_mm:.0f}, {contact.y_mm:.0f}) mm"
+    force = f"{words} at " if (words := force_words(contact)) else ""
+    return f"{contact.id}: {pressure_words(contact)}\n{force}{place}"
 
 
 def _metadata(contact: Contact) -> list[KeyValuePair]:

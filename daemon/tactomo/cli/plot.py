@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PANELS = ("maps", "path", "pressure", "force", "position", "misfit", "flags", "timing")
+PAGE_DPI = 125
 DEFAULT_PANELS = tuple(panel for panel in PANELS if panel != "position")
 
 
@@ -69,7 +70,7 @@ def plot(
             )
         maps = read_maps(frames, course) if "maps" in panels else []
         figure = draw_page(course, maps, frames.description, panels, title or recording.name)
-    save_figure(figure, output)
+    save_figure(figure, output, PAGE_DPI)
     typer.echo(
         f"wrote {output}: {len(course.tracks)} contact(s) in {len(course.times_s)} frames, "
         f"{course.times_s[-1] - course.times_s[0]:.1f} s"
@@ -139,14 +140,14 @@ def prepare_file(output: Path) -> None:
         ) from error
 
 
-def save_figure(figure: Figure, output: Path) -> None:
+def save_figure(figure: Figure, output: Path, dpi: int = 150) -> None:
     """Write a picture.
 
     Raises:
         TactomoError: it cannot be written.
     """
     try:
-        figure.savefig(output, dpi=150)
+        figure.savefig(output, dpi=dpi)
     except (OSError, ValueError) as error:
         raise TactomoError(
             f"cannot write {output}: {error}", "give a .png, .svg or .pdf that you may write"

@@ -307,7 +307,7 @@ def _draw_out_of_range(axes: Any, course: Course, colours: dict[str, Any]) -> No
         if beyond:
             axes.plot(*zip(*beyond, strict=True), "^", color=colours[name], markersize=3)
     if lights:
-        axes.legend(fontsize=7, loc="upper right", handlelength=1.2)
+        axes.legend(fontsize=7, loc="center left", handlelength=1.2)
 
 
 def _draw_force(axes: Any, course: Course, colours: dict[str, Any]) -> None:
