@@ -210,7 +210,8 @@ def test_what_holds_no_frames_is_reconstructed_first(
     }
     scans = {n: v + noise.normal(0, 1e-5 * np.abs(v).max(), v.shape) for n, v in scans.items()}
     references = {f"{name}_reference": volts[:20].mean(axis=0) for name, volts in scans.items()}
-    np.savez(tmp_path / "in.npz", **scans, **references)
+    arrays: dict[str, Any] = {**scans, **references}
+    np.savez(tmp_path / "in.npz", **arrays)
     arguments = ("import", "in.npz", "bare.mcap", "--sensor", "small.toml", "--rate", 20)
     assert tactomo(*arguments, "--reference-frames", "0:20").returncode == 0
     result = tactomo("export", "bare.mcap", "made.csv", "--from", 1)
