@@ -166,23 +166,27 @@ class Pattern(_Section):
 class Instrument(_Section):
     """What the device that reads the electrodes makes of their voltages.
 
-    `unsigned` ones are sizes, as of a peak or RMS detector: see `signs`. `single_ended` readings,
-    of each electrode against the one that the current leaves by, are the `matrix` protocol's.
+    `unsigned` ones are sizes, as of a peak or RMS detector: see `signs`. A converter that reads
+    nothing of voltages below zero has `positive` ones, or `negative` ones where it is connected the
+    other way round. `single_ended` readings, of each electrode against the one that the current
+    leaves by, are the `matrix` protocol's. `regularisation` is a factor on what the linear methods
+    choose by the noise: above 1 where a device has larger errors than noise.
     """
 
-    voltages: Literal["signed", "unsigned"] = "signed"
+    voltages: Literal["signed", "unsigned", "positive", "negative"] = "signed"
     referenced: Literal["pairs", "single_ended"] = "pairs"
     volts_per_unit: Annotated[float, Field(gt=0, le=1e6)] = 1.0
+    regularisation: Annotated[float, Field(ge=1e-3, le=1e6)] = 1.0
     start: Annotated[str, Field(max_length=16, pattern=r"^[ -~\r\n]*$")] = ""
     scan_rate_hz: Annotated[float, Field(ge=0.1, le=1000)] = 20.0
     frequency_hz: Annotated[float, Field(ge=100, le=1e7)] = 10_000.0
 
     @model_validator(mode="after")
     def _single_ended_readings_have_their_sign(self) -> Self:
-        if self.referenced == "single_ended" and self.voltages == "unsigned":
+        if self.referenced == "single_ended" and self.voltages != "signed":
             raise ValueError(
-                "voltages = 'unsigned': single_ended readings, against the electrode that the "
-                "current leaves by, are positive by themselves; leave it out"
+                f"voltages = {self.voltages!r}: single_ended readings, against the electrode that "
+                "the current leaves by, are positive by themselves; leave it out"
             )
         return self
 

@@ -300,7 +300,8 @@ def examine_reference(
     nothing = Verdict(np.zeros_like(finite), Flag.INVALID_VOLTAGE)
     with np.errstate(over="ignore"):
         ratio = np.where(finite, volts, 0.0) / predicted
-        scale = float(np.median(ratio[finite])) if finite.any() else 0.0
+        known = finite & sought
+        scale = float(np.median(ratio[known])) if known.any() else 0.0
         if not 1 / FARTHEST_SCALE < abs(scale) < FARTHEST_SCALE:
             return nothing
         size = np.abs(ratio / scale)

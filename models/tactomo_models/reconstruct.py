@@ -169,7 +169,7 @@ class Reconstructor:
         self._tier = tier
         self.budget_s = budget_s
         self._redraw = redraw
-        self._regularisation = regularisation
+        self._regularisation = regularisation * description.instrument.regularisation
         if redraw:
             check_tier(description, tier)
         self._artifact = artifact or load_or_build_artifact(description)

@@ -29,16 +29,20 @@ class Signs:
         predicted: (M,) voltages of the bare sheet by the model, on any scale.
 
     Attributes:
-        certain: (M,) readings whose sign is known; all of them where the device tells it.
+        certain: (M,) readings whose sign is known; all of them where the device tells it, and the
+            half that it reads where it reads but one sign.
     """
 
     def __init__(
         self, description: SensorDescription, wiring: Wiring, predicted: FloatArray
     ) -> None:
         least = LEAST_CROSSING * float(np.sqrt(np.mean(predicted**2)))
-        self._are_told = description.instrument.voltages == "signed"
+        kind = description.instrument.voltages
+        self._are_told = kind == "signed"
         self._model = np.sign(predicted)
         self.certain = wiring.ordered | (np.abs(predicted) > least) | self._are_told
+        if kind in ("positive", "negative"):
+            self.certain &= self._model == (1.0 if kind == "positive" else -1.0)
 
     def give(self, readings: FloatArray) -> FloatArray:
         """Voltages (..., M) of a device's readings, by the model's signs where it tells none."""

@@ -126,6 +126,28 @@ def test_a_small_voltage_of_crossing_pairs_has_no_certain_sign() -> None:
     assert np.isfinite(frame.misfit)
 
 
+@pytest.mark.parametrize(("kind", "sign"), [("positive", 1.0), ("negative", -1.0)])
+def test_a_converter_of_one_sign_is_believed_in_its_half(kind: str, sign: float) -> None:
+    """What it reads of the other half is noise, and nobody's fault."""
+    sensor = variant(SENSORS["16, opposite"], instrument={"voltages": kind})
+    signs, predicted, _ = signs_of(sensor)
+    np.testing.assert_array_equal(signs.certain, np.sign(predicted) == sign)
+    skin = Skin(simulator(SENSORS["16, opposite"]))
+    rng = np.random.default_rng(3)
+
+    def read(volts: NDArray[np.float64]) -> NDArray[np.float64]:
+        noise = 1e-3 * np.abs(volts).max() * rng.standard_normal(len(volts))
+        return np.where(np.sign(predicted) == sign, np.abs(volts), np.abs(noise))
+
+    rest = np.array([read(skin.scan()["structure"]) for _ in range(20)])
+    made = Reconstructor(sensor, BUILT.of(sensor), budget_s=1.0)
+    made.set_reference(Reference.from_scans(None, rest))
+    frame = made.reconstruct(None, read(skin.scan(PRESS)["structure"]))
+    [contact] = frame.contacts
+    assert np.hypot(contact.x_m - PRESS.x_m, contact.y_m - PRESS.y_m) < 1.5e-3
+    assert not frame.flags & ~Flag.MISFIT_HIGH
+
+
 def test_a_device_that_tells_signs_is_believed() -> None:
     signs, predicted, _ = signs_of(disc(16, drive_offset=8, measure_offset=8))
     assert signs.certain.all()

@@ -55,7 +55,7 @@ class OpenEit(LineProtocol):
                 "OpenEIT board has 8, 16 or 32, drives opposite ones and measures adjacent pairs",
                 "give a description such as openeit_disc",
             )
-        if description.instrument.voltages != "unsigned":
+        if description.instrument.voltages == "signed":
             raise ConfigError(
                 f"{description.name} is of signed voltages, and an OpenEIT board tells sizes alone",
                 'put voltages = "unsigned" under [instrument] in the description',

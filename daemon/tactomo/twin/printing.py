@@ -49,7 +49,7 @@ class _Printer:
         if not self._gain:
             self._gain = self.largest / float(np.abs(volts).max())
         read = volts * self._gain
-        return np.abs(read) if self._description.instrument.voltages == "unsigned" else read
+        return read if self._description.instrument.voltages == "signed" else np.abs(read)
 
 
 class OpenEitBoard(_Printer):

@@ -1,0 +1,195 @@
+"""Measured sets, said by the emulators of the boards that they belong to, and seen by a controller.
+
+The sets hold changes of voltages alone, so what the boards say is the model's voltages of the bare
+sheet plus those changes, after scans at rest with the noise that the changes show.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from daemon_process import SENSOR, DaemonProcess
+from numpy.typing import NDArray
+from tactomo.twin import Twin, TwinConfig
+from tactomo_client import Frame, subscribe
+from tactomo_models import Artifact, SensorDescription, build_artifact, load_description
+from tactomo_models.evaluation.skin_presses import read_presses
+from tactomo_models.evaluation.tanks import (
+    TankImager,
+    correlation,
+    on_pixels,
+    read_tanks,
+)
+from tactomo_models.forward import ForwardModel
+from tactomo_models.reference import noise_of_reciprocity
+from tactomo_models.sensors import __path__ as sensors_path
+
+FloatArray = NDArray[np.float64]
+DATA = Path(__file__).parents[2].parent / "shared" / "data"
+REST = 100
+"""Scans at rest that come first: a daemon tares by twenty, and a controller subscribes."""
+SCALE = 0.5
+"""Of the tanks' changes, as a share of the largest possible: what `evaluate tanks` finds."""
+ONE_SIDED = '[instrument]\nvoltages = "positive"\nregularisation = 30.0\n'
+UNSIGNED = '[instrument]\nvoltages = "unsigned"\n'
+
+
+def measured(name: str) -> Path:
+    path = DATA / name
+    if not path.exists():
+        pytest.skip(f"{name} is not beside the project")
+    return path
+
+
+def described(tmp_path: Path, name: str, more: str = "") -> Path:
+    path = tmp_path / f"{name}.toml"
+    path.write_text(f"{(Path(sensors_path[0]) / f'{name}.toml').read_text('utf-8')}\n{more}")
+    return path
+
+
+def bare_volts(sensor: SensorDescription, artifact: Artifact) -> FloatArray:
+    model = ForwardModel(sensor, artifact.bare)
+    return np.asarray(model.bare_voltages * model.volts_per_unit)
+
+
+@contextmanager
+def playing(
+    tmp_path: Path,
+    scans: FloatArray,
+    sensor: Path,
+    protocol: str,
+    rate_hz: float,
+    once: bool = True,
+    **config: Any,
+) -> Iterator[DaemonProcess]:
+    """A board that says these scans, and a daemon on it."""
+    path = tmp_path / "scans.npz"
+    np.savez(path, structure=scans)
+    board = TwinConfig(
+        load_description(sensor),
+        protocol=protocol,
+        play=path,
+        play_once=once,
+        rate_hz=rate_hz,
+        control="tcp://127.0.0.1:0",
+    )
+    twin = Twin(board)
+    twin.start()
+    daemon = DaemonProcess(
+        tmp_path, twin.ports, protocol=protocol, description=str(sensor), ready=False, **config
+    )
+    try:
+        daemon.wait_ready()
+        yield daemon
+    finally:
+        daemon.kill()
+        twin.stop()
+
+
+def frames_of(daemon: DaemonProcess, last: int, missed: int = 0) -> dict[int, Frame]:
+    """Frames by the number of their scan, up to the last one.
+
+    A board without a greeting says one line, `missed`, before it is known where a line begins.
+    """
+    found: dict[int, Frame] = {}
+    with closing(subscribe(SENSOR, address=daemon.stream, timeout_s=60.0)) as frames:
+        for frame in frames:
+            found[frame.scan_counter + missed] = frame
+            if frame.scan_counter + missed >= last:
+                return found
+    raise AssertionError("the stream ended")
+
+
+@pytest.mark.slow
+def test_presses_on_a_round_skin_are_located_through_an_openeit_board(tmp_path: Path) -> None:
+    """As near as by `tactomo evaluate skin`, whose NOSER image comes to 5.7 mm."""
+    path = described(tmp_path, "skin_round", ONE_SIDED)
+    sensor = load_description(path)
+    presses = read_presses(measured("skin_round_presses.npz"), sensor)
+    bare = bare_volts(sensor, build_artifact(sensor))
+    # Of the half that the set's converter reads, all but 1 % change by less than 30 %.
+    bare *= np.quantile(np.abs(presses.changes / bare)[:, bare > 0], 0.99) / 0.3
+    # Noise as in the half that it does not read.
+    noise = np.median(np.abs(presses.changes[:, bare < 0])) / 0.6745
+    at_rest = bare + noise * np.random.default_rng(0).standard_normal((REST, len(bare)))
+    scans = np.vstack([at_rest, bare + presses.changes])
+    with playing(tmp_path, scans, path, "openeit", 60.0, tier="noser") as daemon:
+        frames = frames_of(daemon, len(scans) - 1)
+    found = [frames[n].contacts for n in range(REST, len(scans)) if n in frames]
+    positions = [presses.positions_m[n - REST] for n in range(REST, len(scans)) if n in frames]
+    assert len(found) > 0.99 * len(presses.positions_m)
+    touched = [n for n, contacts in enumerate(found) if contacts]
+    assert len(touched) > 0.98 * len(found)
+    largest = [max(found[n], key=lambda c: c.area_mm2) for n in touched]
+    seen = np.array([(c.x_mm, c.y_mm, 1.0) for c in largest])
+    true_mm = np.array([positions[n] for n in touched]) * 1e3
+    errors = np.concatenate(
+        [off(seen, true_mm, fold) for fold in np.arange(len(seen)) % 10 == np.arange(10)[:, None]]
+    )
+    assert np.median(errors) < 6.5
+
+
+def off(seen: FloatArray, true_mm: FloatArray, test: NDArray[np.bool_]) -> FloatArray:
+    """Errors of some presses, by an affine map into the robot's frame that is fitted to others."""
+    into = np.linalg.lstsq(seen[~test], true_mm[~test], rcond=None)[0]
+    return np.asarray(np.linalg.norm(seen[test] @ into - true_mm[test], axis=1))
+
+
+@pytest.mark.slow
+def test_tanks_come_as_well_through_a_board_that_prints_tables(tmp_path: Path) -> None:
+    """Near what `tactomo evaluate tanks` makes of the same set: 0.86 on average."""
+    path = described(tmp_path, "tank_uef2017", UNSIGNED)
+    sensor = load_description(path)
+    tanks = read_tanks(measured("tank_uef2017.npz"), sensor)
+    artifact = build_artifact(sensor)
+    size = np.abs(ForwardModel(sensor, artifact.bare).bare_voltages)
+    changes = tanks.changes * SCALE * TankImager(sensor, artifact).largest_scale(tanks.changes)
+    noise = noise_of_reciprocity(sensor, changes)
+    assert noise is not None
+    rng = np.random.default_rng(0)
+    rest = [size + noise * rng.standard_normal(len(size)) for _ in range(REST)]
+    scans, last = list(rest), []
+    for change in changes:
+        scans += [*rest[:5], *[size + change] * 20]
+        last.append(len(scans) - 1)
+    with playing(
+        tmp_path, np.array(scans), path, "matrix", 4.0, budget_ms=200.0, tare_scans=90
+    ) as daemon:
+        frames = frames_of(daemon, last[-1], missed=1)
+    found = []
+    for number, truth in zip(last, tanks.truth, strict=True):
+        image = frames[number].structure
+        assert image is not None
+        found.append(correlation(on_pixels(sensor, image, truth.shape), truth))
+    assert np.mean(found) > 0.82
+
+
+def test_a_broken_device_is_flagged_in_every_frame_and_called_broken(tmp_path: Path) -> None:
+    with np.load(measured("skin_bad_device_32el.npz")) as arrays:
+        baseline, changes = arrays["baseline"].astype(float), arrays["dv"].astype(float)
+    path = described(tmp_path, "matrix_square", "")
+    path.write_text(
+        path.read_text().replace("[structure]", "[map]\nnodes_x = 25\nnodes_y = 25\n\n[structure]")
+    )
+    sensor = load_description(path)
+    table = np.vstack([baseline, baseline, baseline.mean(axis=0) + changes])
+    k, m = sensor.pairs.drive[:, 0], sensor.pairs.measure[:, 0]
+    scans = table.reshape(-1, 32, 32)[:, k, m]
+    with playing(tmp_path, scans, path, "matrix", 10.0, once=False) as daemon:
+        frames = frames_of(daemon, len(scans) - 1, missed=1)
+        command = [*(sys.executable, "-m", "tactomo.cli", "doctor", "--json"), "--seconds", "3"]
+        command += ["--sensor", SENSOR, "--stream", daemon.stream, "--description", str(path)]
+        doctor = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    pressed = [frame for number, frame in frames.items() if number >= 2 * len(baseline)]
+    assert len(pressed) > 50
+    assert all({"noise_high", "reference_mismatch"} <= set(frame.flags) for frame in pressed)
+    assert doctor.returncode == 1
+    assert json.loads(doctor.stdout)["verdict"] == "broken"
