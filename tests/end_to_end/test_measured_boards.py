@@ -36,7 +36,7 @@ FloatArray = NDArray[np.float64]
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 REST = 100
 """Scans at rest that come first: a daemon tares by twenty, and a controller subscribes."""
-SCALE = 0.5
+SCALE = 0.62
 """Of the tanks' changes, as a share of the largest possible: what `evaluate tanks` finds."""
 ONE_SIDED = '[instrument]\nvoltages = "positive"\nregularisation = 30.0\n'
 UNSIGNED = '[instrument]\nvoltages = "unsigned"\n'
@@ -144,6 +144,7 @@ def off(seen: FloatArray, true_mm: FloatArray, test: NDArray[np.bool_]) -> Float
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
 def test_tanks_come_as_well_through_a_board_that_prints_tables(tmp_path: Path) -> None:
     """Near what `tactomo evaluate tanks` makes of the same set: 0.86 on average."""
     path = described(tmp_path, "tank_uef2017", UNSIGNED)
@@ -155,13 +156,13 @@ def test_tanks_come_as_well_through_a_board_that_prints_tables(tmp_path: Path) -
     noise = noise_of_reciprocity(sensor, changes)
     assert noise is not None
     rng = np.random.default_rng(0)
-    rest = [size + noise * rng.standard_normal(len(size)) for _ in range(REST)]
+    rest = [size + noise * rng.standard_normal(len(size)) for _ in range(50)]
     scans, last = list(rest), []
     for change in changes:
-        scans += [*rest[:5], *[size + change] * 20]
+        scans += [*rest[:3], *[size + change] * 8]
         last.append(len(scans) - 1)
     with playing(
-        tmp_path, np.array(scans), path, "matrix", 4.0, budget_ms=200.0, tare_scans=90
+        tmp_path, np.array(scans), path, "matrix", 4.0, budget_ms=200.0, tare_scans=30
     ) as daemon:
         frames = frames_of(daemon, last[-1], missed=1)
     found = []
@@ -169,6 +170,7 @@ def test_tanks_come_as_well_through_a_board_that_prints_tables(tmp_path: Path) -
         image = frames[number].structure
         assert image is not None
         found.append(correlation(on_pixels(sensor, image, truth.shape), truth))
+    print(np.round(found, 3), np.mean(found))
     assert np.mean(found) > 0.82
 
 
