@@ -1,6 +1,7 @@
-"""Scans from .npz files of other programs, as volts in the order of a sensor description.
+"""Scans from files of other programs, as volts in the order of a sensor description.
 
-Two layouts are read, told apart by their arrays:
+Two layouts of .npz files are read, told apart by their arrays; Sciospec's .eit files are of the
+second (see `eit_files`):
 
 batch
     what `tactomo reconstruct` takes: `magnitude` and/or `structure` (T, M) volts in the
@@ -21,18 +22,20 @@ does not pass unnoticed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 from tactomo_models import Reference, SensorDescription
+from tactomo_models.archive import read_arrays
+from tactomo_models.batch import scans_of
 from tactomo_models.plausibility import Layout
 from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag
 
+from tactomo.eit_files import SUFFIX, eit_files, read_eit_files
 from tactomo.errors import TactomoError
 
 FloatArray = NDArray[np.float64]
@@ -138,19 +141,23 @@ class Scans:
 _CHANNELS = {channel.name.lower(): channel for channel in Channel}
 
 
-def read_scans(path: Path, description: SensorDescription, channel: Channel | None) -> Scans:
-    """Read the scans in an .npz file.
+def read_scans(
+    path: Path | Sequence[Path], description: SensorDescription, channel: Channel | None
+) -> Scans:
+    """Read the scans of a measurement.
 
     Args:
-        path: the file.
+        path: as of `load_arrays`.
         description: the sensor, whose pattern the voltages follow.
         channel: which channel a file of one channel holds; None for the sensor's only one.
 
     Raises:
-        ImportFileError: the file is neither layout, or does not fit the sensor.
+        ImportFileError, EitFileError, DataError: it cannot be read, is neither layout, or does not
+            fit the sensor.
 
     """
     arrays = load_arrays(path)
+    path = path if isinstance(path, Path) else path[0]
     if "volts" in arrays and "injection" in arrays:
         channel = channel or _only_channel(description)
         volts, time_s, notes = single_ended(path, arrays, description)
@@ -164,22 +171,32 @@ def read_scans(path: Path, description: SensorDescription, channel: Channel | No
     )
 
 
-def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an .npz file by name.
+def load_arrays(path: Path | Sequence[Path]) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an .npz file by name, or those that .eit files amount to.
+
+    Args:
+        path: one file; a folder of .eit files; or a list of them.
 
     Raises:
-        ImportFileError: it cannot be read or is none.
+        ImportFileError, EitFileError: it cannot be read.
+        DataError: it is no .npz file of numbers.
 
     """
+    given = [path] if isinstance(path, Path) else path
+    files = [file for each in given for file in (eit_files(each) if each.is_dir() else [each])]
+    if all(file.suffix.lower() == SUFFIX for file in files):
+        return read_eit_files(files)
+    if len(files) > 1:
+        raise ImportFileError(
+            f"{len(files)} files were given, not all of them {SUFFIX}", "import one .npz at a time"
+        )
+    [one] = files
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
+        return read_arrays(one)
     except OSError as error:
         raise ImportFileError(
-            f"cannot read {path}: {error.strerror or error}", "give the path of an .npz file"
+            f"cannot read {one}: {error.strerror or error}", "give the path of an .npz file"
         ) from error
-    except (ValueError, BadZipFile, AttributeError) as error:  # text, .npy, pickled objects
-        raise ImportFileError(f"{path} is not an .npz file of numbers", "save it anew") from error
 
 
 def _only_channel(description: SensorDescription) -> Channel:
@@ -192,21 +209,15 @@ def _only_channel(description: SensorDescription) -> Channel:
 
 
 def _batch(path: Path, arrays: dict[str, NDArray[Any]], description: SensorDescription) -> Scans:
-    volts: dict[Channel, FloatArray] = {}
-    reference: dict[Channel, FloatArray] = {}
-    for name, channel in _CHANNELS.items():
-        if name in arrays and not np.all(np.isnan(arrays[name])):
-            volts[channel] = _checked(path, name, arrays[name], (-1, description.measurements))
-            key = f"{name}_reference"
-            if key in arrays:
-                reference[channel] = _checked(path, key, arrays[key], (description.measurements,))
-    if len({len(each) for each in volts.values()}) != 1:
-        raise ImportFileError(f"{path}: magnitude and structure differ in length", "cut the longer")
-    if any(name.lower() not in description.modalities for name in (c.name for c in volts)):
+    foreign = sorted(arrays.keys() & _CHANNELS.keys() - set(description.modalities))
+    if any(not np.isnan(arrays[name]).all() for name in foreign):
         raise ImportFileError(
-            f"{path} holds a channel that {description.name} does not have",
+            f"{path} holds a channel that {description.name} does not have: {', '.join(foreign)}",
             "give another description with --sensor",
         )
+    scans, references = scans_of(path, arrays, description)
+    volts = {_CHANNELS[name]: channel for name, channel in scans.items()}
+    reference = {_CHANNELS[name]: channel for name, channel in references.items()}
     return Scans(volts, _times(path, arrays, len(next(iter(volts.values())))), reference)
 
 

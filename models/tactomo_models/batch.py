@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -96,25 +96,14 @@ def read_scans(
         raise DataError(
             f"cannot read {source}: {error.strerror}; give an .npz file of scans"
         ) from error
-    scans: dict[str, FloatArray] = {}
-    references: dict[str, FloatArray] = {}
-    for name in description.modalities:
-        if name in arrays and not _all_nan(arrays[name]):
-            scans[name] = _checked(source, name, arrays[name], (None, description.measurements))
-            key = f"{name}_reference"
-            if key not in arrays:
-                raise DataError(f"{source} has {name} but no {key}: add the unpressed scan")
-            references[name] = _checked(source, key, arrays[key], (description.measurements,))
-            if not np.any(np.nan_to_num(references[name])):
-                raise DataError(f"{source}: {key} holds no voltage; take the unpressed scan again")
-    if not scans:
-        raise DataError(
-            f"{source} holds none of the channels of {description.name!r} "
-            f"({', '.join(description.modalities)}); it holds: {', '.join(arrays) or 'nothing'}"
-        )
-    lengths = {name: len(channel) for name, channel in scans.items()}
-    if len(set(lengths.values())) > 1:
-        raise DataError(f"{source}: channels differ in length: {lengths}")
+    scans, references = scans_of(source, arrays, description)
+    for name in scans:
+        if name not in references:
+            raise DataError(f"{source} has {name} but no {name}_reference: add the unpressed scan")
+        if not np.any(np.nan_to_num(references[name])):
+            raise DataError(
+                f"{source}: {name}_reference holds no voltage; take the unpressed scan again"
+            )
     # The file does not say how noisy the scans are, nor of how many the reference is the mean.
     noise = {name: noise_of_reciprocity(description, channel) for name, channel in scans.items()}
     rest = {name: noise_of_reciprocity(description, scan) for name, scan in references.items()}
@@ -125,6 +114,38 @@ def read_scans(
         structure_noise=noise.get("structure"),
         scans=min(_averaged(noise[name], rest[name]) for name in scans),
     )
+
+
+def scans_of(
+    source: Path, arrays: Mapping[str, Any], description: SensorDescription
+) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+    """Return the scans (T, M) of each channel that a file holds, and the references (M,) there are.
+
+    Args:
+        source: where they are from, for errors.
+        arrays: `magnitude`, `structure` and their references; a channel may be all NaN.
+        description: the sensor.
+
+    Raises:
+        DataError: they do not fit the sensor, or each other.
+    """
+    scans: dict[str, FloatArray] = {}
+    references: dict[str, FloatArray] = {}
+    for name in description.modalities:
+        if name in arrays and not _all_nan(arrays[name]):
+            scans[name] = _checked(source, name, arrays[name], (None, description.measurements))
+            key = f"{name}_reference"
+            if key in arrays:
+                references[name] = _checked(source, key, arrays[key], (description.measurements,))
+    if not scans:
+        raise DataError(
+            f"{source} holds none of the channels of {description.name!r} "
+            f"({', '.join(description.modalities)}); it holds: {', '.join(arrays) or 'nothing'}"
+        )
+    lengths = {name: len(channel) for name, channel in scans.items()}
+    if len(set(lengths.values())) > 1:
+        raise DataError(f"{source}: channels differ in length: {lengths}")
+    return scans, references
 
 
 def _averaged(noise: FloatArray | None, rest: FloatArray | None) -> int:

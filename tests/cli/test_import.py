@@ -114,7 +114,7 @@ def test_the_batch_layout_keeps_channels_reference_and_gaps(tactomo: Run, tmp_pa
     ("arrays", "options", "says"),
     [
         ({"x": np.zeros(3)}, [], "in.npz holds x; it must hold"),
-        ({"magnitude": np.zeros((4, 207))}, ["--rate", "1"], "real numbers (T, 208)"),
+        ({"magnitude": np.zeros((4, 207))}, ["--rate", "1"], "real numbers of shape T x 208"),
         ({"magnitude": np.zeros((4, 208))}, [], "give --rate"),
         (
             {"magnitude": np.zeros((4, 208)), "structure": np.zeros((3, 208))},
@@ -162,8 +162,82 @@ def test_what_cannot_be_imported_is_refused(
 
 def test_what_is_no_npz_is_refused(tactomo: Run, tmp_path: Path) -> None:
     (tmp_path / "in.npz").write_text("volts,volts")
-    assert "is not an .npz file" in tactomo("import", "in.npz", "out.mcap").stderr
+    assert "no .npz file of numbers" in tactomo("import", "in.npz", "out.mcap").stderr
     assert "cannot read none.npz" in tactomo("import", "none.npz", "out.mcap").stderr
+
+
+def eit_text(volts: NDArray[np.complex128], date: str, frequencies: int = 1) -> str:
+    """A frame as Sciospec's program saves it."""
+    header = [18, 2, "setup_00001", date, "10000.0", "10000.0", 0, frequencies, "0.001", "20.0"]
+    lines = [*map(str, header), *[""] * 7, "MeasurementChannels: 1,2,3"]
+    for pair, row in zip(INJECTION, volts, strict=True):
+        lines.append(f"{pair[0]} {pair[1]}")
+        lines.append("\t".join(f"{v.real:.9E}\t{v.imag:.9E}" for v in row))
+    return "\n".join(lines) + "\n"
+
+
+def save_eit(folder: Path, volts: NDArray[np.float64]) -> list[Path]:
+    """Frames a twentieth of a second apart, with names that are not in the order of time."""
+    folder.mkdir()
+    paths = [folder / f"frame_{len(volts) - number}.eit" for number in range(len(volts))]
+    for number, path in enumerate(paths):
+        date = f"2024.01.31. 12:30:05.{50 * number:03d}"
+        path.write_text(eit_text(volts[number] * (1 + 0.1j), date))
+    return paths
+
+
+@pytest.mark.parametrize("how", ["folder", "list"])
+def test_sciospecs_files_are_read_in_the_order_of_their_dates(
+    tactomo: Run, tmp_path: Path, how: str
+) -> None:
+    volts = potentials(4)
+    paths = save_eit(tmp_path / "scan", volts)
+    given = [tmp_path / "scan"] if how == "folder" else paths
+    result = tactomo("import", *given, "out.mcap", "--sensor", "tank_disc")
+    assert result.returncode == 0, result.stderr
+    read = scans(open_recording(tmp_path / "out.mcap"))
+    assert [time_s for time_s, _ in read] == pytest.approx([0, 0.05, 0.1, 0.15], abs=1e-6)
+    got = np.array([scan.samples for _, scan in read])
+    assert np.allclose(got, expected(volts), rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("line", "text", "says"),
+    [
+        (1, "12", "line 1: 12, not 9 or 11 or 18 header lines; is it a Sciospec file"),
+        (1, "eit", "line 1: the number of header lines is no number"),
+        (4, "yesterday", "line 4: it is no date such as"),
+        (8, "3", "line 8: 3 frequencies; save one"),
+        (19, "1 1", "line 19: 1 1 is no injection"),
+        (20, "0.1\t0.2\t0.3", "line 20: 3 numbers, not pairs"),
+        (22, "0.1\t0.2", "line 22: 2 numbers, not 32 numbers"),
+        (24, "0.1\tx", "line 24: it holds what is no number"),
+        (24, "nan\t1", "line 24: 2 numbers, not 32"),
+        (50, None, "line 50: the file ends before it; it was cut off"),
+        (19, None, "line 19: no injection; it was cut off"),
+    ],
+)
+def test_a_line_that_is_wrong_is_named(
+    tactomo: Run, tmp_path: Path, line: int, text: str | None, says: str
+) -> None:
+    [path] = save_eit(tmp_path / "scan", potentials(1))
+    lines = path.read_text().splitlines()
+    lines[line - 1 :] = [] if text is None else [text, *lines[line:]]
+    path.write_text("\n".join(lines))
+    result = tactomo("import", path, "out.mcap", "--sensor", "tank_disc")
+    assert result.returncode == 1
+    assert f"{path}, {says}" in result.stderr
+    assert not (tmp_path / "out.mcap").exists()
+
+
+def test_sciospecs_files_must_belong_together(tactomo: Run, tmp_path: Path) -> None:
+    first, second = save_eit(tmp_path / "scan", potentials(2))
+    second.write_text(second.read_text().replace("\n1 2\n", "\n1 3\n"))
+    result = tactomo("import", first, second, "out.mcap", "--sensor", "tank_disc")
+    assert "different injections" in result.stderr
+    (tmp_path / "empty").mkdir()
+    assert "holds no .eit file" in tactomo("import", "empty", "out.mcap").stderr
+    assert "cannot read none.eit" in tactomo("import", "none.eit", "out.mcap").stderr
 
 
 def test_an_existing_recording_is_not_overwritten(tactomo: Run, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tactomo.errors import TactomoError
 from tactomo.imported import ImportFileError
-from tactomo_models import load_description
+from tactomo_models import DataError, load_description
 from tactomo_protocol import CommandCode, Hello
 
 TANK = load_description("tank_disc")
@@ -62,7 +62,7 @@ def test_what_cannot_be_played_is_refused_at_once(
         bench(sensor="tank_disc", play=tmp_path / "none.npz")
     path = tmp_path / "in.npz"
     np.savez(path, structure=np.ones((3, 192)))
-    with pytest.raises(ImportFileError, match="192"):
+    with pytest.raises(DataError, match="192"):
         bench(sensor="tank_disc", play=path)
     with pytest.raises(TactomoError, match="does not speak"):
         bench(sensor="tank_disc", protocol="morse")

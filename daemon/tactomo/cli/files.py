@@ -197,10 +197,14 @@ def _words(value: Any) -> str:
     epilog=examples(
         "tactomo import tank.npz tank.mcap --sensor tank_disc --reference-frames 0:20",
         "tactomo import presses.npz presses.mcap --rate 20",
+        "tactomo import setup_00001/ tank.mcap --sensor sciospec_disc --reference-frames 0:20",
     ),
 )
 def import_scans(
-    scans: Annotated[Path, typer.Argument(metavar="IN.npz", help="Scans, see above.")],
+    scans: Annotated[
+        list[Path],
+        typer.Argument(metavar="IN", help="An .npz file; .eit files, or a folder of them."),
+    ],
     recording: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="The recording to write.")],
     sensor: DescriptionOption = DEFAULT_DESCRIPTION,
     channel: Annotated[
@@ -216,12 +220,13 @@ def import_scans(
     ] = None,
     name: Annotated[str, typer.Option("--name", help="The sensor's name in the stream.")] = "skin",
 ) -> None:
-    """Turn measured scans (.npz) into a recording that replays through the daemon.
+    """Turn measured scans (.npz, .eit) into a recording that replays through the daemon.
 
     Reads the layout of `tactomo reconstruct` (magnitude, structure and their references), and
     single-ended readings as EIT instruments save them: `volts` (T, injections, electrodes) with
     `injection` (injections, 2) and `t`. Those become differences of neighbouring electrodes in the
-    description's order; of complex volts the real part counts.
+    description's order; of complex volts the real part counts. So do the .eit files that Sciospec's
+    own program saves, one a frame, in the order of their dates.
     """
     from rich.progress import track
     from tactomo_models import load_description

@@ -1,0 +1,167 @@
+"""Frames that Sciospec's own program saved: one ``.eit`` file of text each.
+
+The first line says how many lines the header has (9, 11 or 18), and, but for the oldest, the
+second one the version. Then come a name, the date, the least and the greatest frequency, its scale,
+how many frequencies, the amplitude in A and the frames a second. After the header there are two
+lines for each injection: source and sink, numbered from 1, and the potential of every channel
+against ground in volts, real and imaginary part by turns, with tabs between them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactomo.errors import TactomoError
+
+SUFFIX: Final = ".eit"
+HEADERS: Final = (9, 11, 18)
+MAX_BYTES: Final = 1 << 24
+_DATE: Final = "%Y.%m.%d. %H:%M:%S"
+_ANOTHER: Final = "is it a Sciospec file? Other programs have a format of that name, too"
+
+
+class EitFileError(TactomoError):
+    """A .eit file that cannot be read."""
+
+    name = "cannot_import"
+
+
+class _Frame(NamedTuple):
+    injection: list[tuple[int, int]]
+    volts: list[list[complex]]
+    time_s: float
+
+
+def eit_files(folder: Path) -> list[Path]:
+    """Return the .eit files in a folder, by name.
+
+    Raises:
+        EitFileError: there is none.
+
+    """
+    found = sorted(path for path in folder.iterdir() if path.suffix.lower() == SUFFIX)
+    if not found:
+        raise EitFileError(f"{folder} holds no {SUFFIX} file", "give the folder that has them")
+    return found
+
+
+def read_eit_files(paths: Sequence[Path]) -> dict[str, NDArray[Any]]:
+    """Return the frames of .eit files in the order of their dates.
+
+    `volts` (T, injections, channels) complex, `injection` (injections, 2) from 1, `t` (T,) seconds
+    since 1970, as if the dates in the files were UTC.
+
+    Raises:
+        EitFileError: one of them cannot be read, is none, or is of another measurement; it says
+            which line is wrong.
+
+    """
+    frames = [_read(path) for path in paths]
+    for path, frame in zip(paths, frames, strict=True):
+        if frame.injection != frames[0].injection or len(frame.volts[0]) != len(frames[0].volts[0]):
+            raise EitFileError(
+                f"{path} and {paths[0]} have different injections or channels",
+                "import each measurement by itself",
+            )
+    frames.sort(key=lambda frame: frame.time_s)
+    return {
+        "volts": np.array([frame.volts for frame in frames], dtype=np.complex128),
+        "injection": np.array(frames[0].injection),
+        "t": np.array([frame.time_s for frame in frames]),
+    }
+
+
+def _read(path: Path) -> _Frame:
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise EitFileError(f"{path} has more than {MAX_BYTES >> 20} MB", _ANOTHER)
+        lines = path.read_text("ascii").splitlines()
+    except OSError as error:
+        raise EitFileError(
+            f"cannot read {path}: {error.strerror}", f"give the path of a {SUFFIX} file"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise EitFileError(f"{path} is not text", _ANOTHER) from error
+    return _Lines(path, lines).frame()
+
+
+class _Lines:
+    """The lines of one file, each with its number for whoever has to correct it."""
+
+    def __init__(self, path: Path, lines: list[str]) -> None:
+        self._path = path
+        self._lines = lines
+
+    def frame(self) -> _Frame:
+        header = self._number(1, "the number of header lines")
+        if header not in HEADERS:
+            said = f"{header:g}, not {' or '.join(map(str, HEADERS))} header lines"
+            raise self._wrong(1, said, _ANOTHER)
+        first = 2 if header == HEADERS[0] else 3  # the line of the name
+        frequencies = self._number(first + 5, "the number of frequencies")
+        if frequencies != 1:
+            raise self._wrong(
+                first + 5, f"{frequencies:g} frequencies", "save one frequency in a file"
+            )
+        time_s = self._date(first + 1)
+        injection: list[tuple[int, int]] = []
+        volts: list[list[complex]] = []
+        for number in range(int(header) + 1, len(self._lines) + 1, 2):
+            if not "".join(self._lines[number - 1 :]).strip():
+                break
+            injection.append(self._pair(number))
+            volts.append(self._potentials(number + 1, len(volts[0]) if volts else None))
+        if not injection:
+            raise self._wrong(int(header) + 1, "no injection", "it was cut off: save it anew")
+        return _Frame(injection, volts, time_s)
+
+    def _text(self, number: int) -> str:
+        if number > len(self._lines):
+            raise self._wrong(number, "the file ends before it", "it was cut off: save it anew")
+        return self._lines[number - 1].strip()
+
+    def _number(self, number: int, what: str) -> float:
+        try:
+            return float(self._text(number))
+        except ValueError:
+            raise self._wrong(number, f"{what} is no number", _ANOTHER) from None
+
+    def _date(self, number: int) -> float:
+        text, _, thousandths = self._text(number).rpartition(".")
+        if ":" in thousandths:  # no thousandths
+            text, thousandths = self._text(number), "0"
+        try:
+            moment = datetime.strptime(text, _DATE).replace(tzinfo=UTC)
+            return moment.timestamp() + float(f"0.{thousandths}")
+        except ValueError:
+            raise self._wrong(number, "it is no date such as 2024.01.31. 12:30:05.250") from None
+
+    def _pair(self, number: int) -> tuple[int, int]:
+        try:
+            source, sink = map(int, self._text(number).split())
+        except ValueError:
+            raise self._wrong(number, "it is no injection, such as 1 2") from None
+        if not min(source, sink) >= 1 or source == sink:
+            raise self._wrong(number, f"{source} {sink} is no injection")
+        return source, sink
+
+    def _potentials(self, number: int, count: int | None) -> list[complex]:
+        try:
+            values = [float(each) for each in self._text(number).split()]
+        except ValueError:
+            raise self._wrong(number, "it holds what is no number") from None
+        if len(values) % 2 or not values or (count is not None and len(values) != 2 * count):
+            wanted = "pairs of numbers" if count is None else f"{2 * count} numbers"
+            raise self._wrong(number, f"{len(values)} numbers, not {wanted}")
+        if not np.isfinite(values).all():
+            raise self._wrong(number, "it holds what is no finite number")
+        return [complex(*pair) for pair in zip(values[::2], values[1::2], strict=True)]
+
+    def _wrong(self, number: int, cause: str, next_step: str = "save it anew") -> EitFileError:
+        return EitFileError(f"{self._path}, line {number}: {cause}", next_step)

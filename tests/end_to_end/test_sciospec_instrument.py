@@ -1,0 +1,237 @@
+"""A Sciospec instrument, emulated on a pty, through a daemon to a controller."""
+
+from __future__ import annotations
+
+import math
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from daemon_process import SENSOR, DaemonProcess, wait_until
+from tactomo.recording import open_recording
+from tactomo.twin import Twin, TwinConfig
+from tactomo_client import Frame, request, subscribe
+from tactomo_client.recording import open_recording as open_frames
+from tactomo_models import load_description
+from tactomo_models.sensors import __path__ as sensors_path
+from tactomo_protocol import Scan
+from whole_system import repository
+
+DATA = repository().parent / "shared" / "data"
+measured = pytest.mark.skipif(not DATA.exists(), reason="measured data are no part of the project")
+COARSE = ("[structure]", "[map]\nnodes_x = 25\nnodes_y = 25\n\n[structure]")
+
+Start = Callable[..., tuple[Twin, DaemonProcess]]
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Start]:
+    """Start an emulated instrument and a daemon on it."""
+    running: list[Callable[[], object]] = []
+
+    def start(
+        sensor: str, daemon: dict[str, Any] | None = None, **config: Any
+    ) -> tuple[Twin, DaemonProcess]:
+        settings = {"protocol": "sciospec", "control": "tcp://127.0.0.1:0", **config}
+        twin = Twin(TwinConfig(load_description(sensor), **settings))
+        running.append(twin.stop)
+        twin.start()
+        served = DaemonProcess(
+            tmp_path,
+            twin.ports,
+            protocol="sciospec",
+            description=sensor,
+            ready=False,
+            **(daemon or {}),
+        )
+        running.append(served.kill)
+        served.wait_ready()
+        return twin, served
+
+    yield start
+    for stop in reversed(running):
+        stop()
+
+
+def sensor(folder: Path, *changes: tuple[str, str]) -> str:
+    """The shipped description with changes, as a user would edit it."""
+    text = (Path(sensors_path[0]) / "sciospec_disc.toml").read_text("utf-8")
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path = folder / "tank.toml"
+    path.write_text(text)
+    return str(path)
+
+
+def frame_where(daemon: DaemonProcess, condition: Callable[[Frame], bool]) -> Frame:
+    with closing(subscribe(SENSOR, address=daemon.stream, timeout_s=60.0)) as frames:
+        return next(frame for frame in frames if condition(frame))
+
+
+def is_streaming(twin: Twin) -> bool:
+    return bool(request("status", twin.control)["ports"][0]["streaming"])
+
+
+def tactomo(*arguments: object) -> str:
+    command = [sys.executable, "-m", "tactomo.cli", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_an_instrument_is_configured_believed_and_stopped(start: Start, tmp_path: Path) -> None:
+    links = tmp_path / "links"
+    record = {"recording": {"file": str(tmp_path / "a.mcap")}}
+    twin, daemon = start(sensor(tmp_path, COARSE), record, link_folder=links)
+    wait_until(lambda: daemon.told("tared"), "a reference")
+    for x_mm in (40.0, -40.0):
+        request("press", twin.control, x_mm=x_mm, y_mm=20.0, radius_mm=15.0)
+        found = frame_where(
+            daemon,
+            lambda f, x=x_mm: len(f.contacts) == 1 and f.contacts[0].x_mm * x > 0,  # type: ignore[misc]
+        )
+        frame = frame_where(daemon, lambda f, n=found.sequence: f.sequence > n + 3)  # type: ignore[misc]
+        [contact] = frame.contacts
+        assert math.hypot(contact.x_mm - x_mm, contact.y_mm - 20.0) < 3.0
+    request("clear", twin.control)
+    # Junk between messages, and a cable that is pulled in the middle of one.
+    request("garbage", twin.control, count=3000)
+    wait_until(lambda: daemon.status()["ports"][0]["corrupt"] > 0, "damage that is counted")
+    request("unplug", twin.control)
+    wait_until(lambda: daemon.told("port_lost"), "a lost port")
+    request("replug", twin.control)
+    wait_until(lambda: daemon.told("port_back"), "the port again")
+    request("press", twin.control, x_mm=0.0, y_mm=-50.0, radius_mm=15.0)
+    frame_where(daemon, lambda f: len(f.contacts) == 1 and f.contacts[0].y_mm < -40)
+    assert not daemon.told("device_refused")
+    assert daemon.status()["ports"][0]["device"]["device_id"] == "sciospec"
+    assert is_streaming(twin)
+    daemon.stop()
+    assert wait_until(lambda: not is_streaming(twin), "an instrument that was stopped")
+    summary = open_recording(tmp_path / "a.mcap").summary
+    assert summary.origin.protocol == "sciospec"
+    assert sum(summary.scans.values()) >= summary.frames > 20
+
+
+@pytest.mark.slow
+def test_a_daemon_that_was_killed_leaves_it_measuring_and_the_next_takes_over(
+    start: Start, tmp_path: Path
+) -> None:
+    twin, daemon = start(sensor(tmp_path, COARSE))
+    wait_until(lambda: daemon.told("tared"), "a reference")
+    daemon.signal(signal.SIGKILL)
+    daemon.popen.wait(30)
+    assert is_streaming(twin)
+    again = DaemonProcess(
+        tmp_path, twin.ports, protocol="sciospec", description=str(tmp_path / "tank.toml")
+    )
+    try:
+        wait_until(lambda: again.told("tared"), "a reference of the next daemon")
+        [port] = again.status()["ports"]
+        assert port["state"] == "running"
+        assert port["refusal"] is None
+    finally:
+        again.kill()
+
+
+def test_what_the_instrument_refuses_is_named(start: Start, tmp_path: Path) -> None:
+    _, daemon = start(sensor(tmp_path, COARSE, ("scan_rate_hz = 20.0", "scan_rate_hz = 500.0")))
+    [told] = wait_until(lambda: daemon.told("device_refused"), "a refusal")
+    assert "will not measure 500 frames a second (NACK 81)" in told["detail"]
+    assert "[instrument]" in told["next_step"]
+    assert daemon.status()["ports"][0]["state"] == "refused"
+
+
+@pytest.mark.slow
+def test_ports_tells_what_speaks_sciospec(tmp_path: Path) -> None:
+    config = TwinConfig(
+        load_description(sensor(tmp_path, COARSE)),
+        protocol="sciospec",
+        control="tcp://127.0.0.1:0",
+    )
+    twin = Twin(config)
+    twin.start()
+    try:
+        assert "looks like --protocol sciospec" in tactomo("ports", *twin.ports, "--ask")
+    finally:
+        twin.stop()
+
+
+@measured
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_played_stream_gives_what_its_import_gives(start: Start, tmp_path: Path) -> None:
+    """The measured cup, said by the emulator and read from its file: equal scans and contacts."""
+    path, live, imported = DATA / "tank_sciospec_20fps.npz", tmp_path / "live.mcap", "import.mcap"
+    tank = sensor(tmp_path, COARSE)
+    settings = {"lossless": True, "recording": {"file": str(live), "maps": True}}
+    twin, daemon = start(tank, settings, play=path, play_once=True)
+    assert twin.wait(60.0)
+    wait_until(lambda: daemon.status()["scan_tally"]["waiting"] == 0, "its frames", 300.0)
+    daemon.stop()
+    # The first frame goes for reading the instrument's clock, the next 20 for the reference.
+    said = scans(live)
+    tactomo(*("import", path, tmp_path / imported, "--sensor", tank, "--reference-frames", "1:21"))
+    read = scans(tmp_path / imported)
+    assert len(said) == 254
+    for scan, other in zip(said, read[1:], strict=True):
+        np.testing.assert_allclose(scan, other, rtol=1e-5, atol=2e-7)
+    again = tmp_path / "again.mcap"
+    tactomo(
+        *("daemon", "--description", tank, "--port", f"replay://{tmp_path / imported}?speed=0"),
+        *("--record", again, "--record-maps", "--exit-at-end"),
+        *("--stream", "tcp://127.0.0.1:0", "--control", "tcp://127.0.0.1:0"),
+    )
+    ours, theirs = list(open_frames(live)), list(open_frames(again))
+    assert len(theirs) == 255
+    ours, theirs = ours[-234:], theirs[-234:]
+    for live_frame, read_frame in zip(ours, theirs, strict=True):
+        places = [[(c.x_mm, c.y_mm) for c in frame.contacts] for frame in (live_frame, read_frame)]
+        np.testing.assert_allclose(places[0], places[1], atol=0.01)
+    moving = ours[-125:-55]
+    angle = np.unwrap([math.atan2(f.contacts[0].y_mm, f.contacts[0].x_mm) for f in moving])
+    assert angle[-1] - angle[0] > math.pi  # around the tank, counter-clockwise
+
+
+@measured
+@pytest.mark.slow
+def test_each_labelled_object_lies_beside_its_electrode(start: Start, tmp_path: Path) -> None:
+    """Metal and plastic that stood beside electrodes 1, 5, 9 and 13 of a tank."""
+    tank = sensor(
+        tmp_path,
+        COARSE,
+        ("conductivity_ratio = 0.01", "conductivity_ratio = 30\neither_way = true"),
+    )
+    with np.load(DATA / "tank_labelled.npz") as sets:
+        names, rest, there = sets["name"], sets["reference"], sets["target"]
+    number = next(n for n, name in enumerate(names) if "electrode13" in name and "60uA" in name)
+    turn = np.exp(-0.5j * np.angle(np.sum(rest[number] ** 2)))
+    turn *= np.sign((rest[number] * turn).real[0])
+    path = tmp_path / "played.npz"
+    still = np.repeat([(each[number] * turn).real for each in (rest, there)], 60, axis=0)
+    noise = np.random.default_rng(0).normal(scale=2e-4, size=still.shape)
+    np.savez(path, structure=still + noise * np.abs(still).max())
+    _, daemon = start(tank, play=path, rate_hz=20.0)
+    wait_until(lambda: daemon.told("tared"), "a reference")
+    first = frame_where(daemon, lambda frame: len(frame.contacts) > 3)
+    frame = frame_where(daemon, lambda f: f.sequence > first.sequence + 5 and len(f.contacts) > 3)
+    found = [
+        (math.degrees(math.atan2(c.y_mm, c.x_mm)) + 90) / 22.5 % 16 + 1 for c in frame.contacts
+    ]
+    for named in map(int, re.findall(r"electrode(\d+)", str(names[number]))):
+        assert min(abs((each - named + 8) % 16 - 8) for each in found) < 0.7, (named, found)
+
+
+def scans(path: Path) -> list[np.ndarray[Any, np.dtype[np.float32]]]:
+    recording = open_recording(path)
+    protocol = recording.origin.new_protocol()
+    packets = (packet for chunk in recording.chunks(0) for packet in protocol.feed(chunk.data))
+    return [np.asarray(packet.samples) for packet in packets if isinstance(packet, Scan)]
