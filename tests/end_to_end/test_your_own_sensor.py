@@ -1,0 +1,123 @@
+"""docs/your_own_sensor.md as a newcomer follows it: every command but those of training.
+
+Those are in tests/training.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from faulty_skin import rewired
+from newcomer import Newcomer, Page
+from tactomo_models import (
+    DescriptionError,
+    Flag,
+    Press,
+    Reconstruction,
+    Reconstructor,
+    Reference,
+    SensorDescription,
+    SkinSimulator,
+    Tier,
+    load_description,
+)
+
+pytestmark = pytest.mark.timeout(300)  # a dozen programs, one after another
+
+PAGE = Page("your_own_sensor.md")
+FILE = "my_sheet.toml"
+SMALLER = {"--count 5 --contacts 1-4": "--count 1 --contacts 1", "--seconds 3": "--seconds 1"}
+SHORTER = {"--seconds 5": "--seconds 1", "doctor ": "doctor --seconds 2 "}
+
+
+@pytest.fixture
+def newcomer(tmp_path: Path) -> Newcomer:
+    (tmp_path / FILE).write_text(PAGE.file(FILE))
+    return Newcomer(tmp_path, SMALLER | SHORTER)
+
+
+def test_a_description_is_drawn_built_pressed_and_judged(newcomer: Newcomer) -> None:
+    with newcomer:
+        drawn, built, info = newcomer.follow(PAGE.commands(2) + PAGE.commands(3))
+        assert "scale 1 : 1" in drawn
+        assert (newcomer.folder / "my_sheet.png").exists()
+        assert "is up to date" in built  # drawing has built them
+        assert "my_sheet" in info
+        demo, press, watch, status, release = PAGE.commands(4)
+        newcomer.run(demo)
+        newcomer.run(press)
+        seen = newcomer.wait_for(watch, " mm ")
+        x_mm, y_mm = re.findall(r"\(([+-][\d.]+), ([+-][\d.]+)\) mm", seen)[-1]
+        assert (float(x_mm), float(y_mm)) == pytest.approx((30, 20), abs=2)
+        assert " fit (asked for: auto)" in newcomer.wait_for(status, "fit (asked")
+        newcomer.run(release)
+        newcomer.stop()
+        (judged,) = newcomer.follow(PAGE.commands(5))
+        assert "Simulated, not measured: my_sheet" in judged
+        assert (newcomer.folder / "fit.png").exists()
+
+
+def test_a_device_is_found_examined_tared_and_recorded(newcomer: Newcomer) -> None:
+    with newcomer:
+        newcomer.follow(PAGE.commands(7))
+        assert (newcomer.folder / "first.mcap").exists()
+    (install,) = PAGE.commands(9)
+    assert "/etc/tactomo/palm.toml" in newcomer.run(install)
+
+
+def test_what_is_refused_is_refused_in_the_pages_words(tmp_path: Path) -> None:
+    right = PAGE.file(FILE)
+    for written, wrong in (
+        ("per_side = [5, 3] ", "per_side = 4\npitch_m = 0.03 "),
+        ("length_m = 0.005 ", "length_m = 0.024 "),
+        ("width_m = 0.120", "widht_m = 0.120"),
+    ):
+        assert written in right
+        text = right.replace(written, wrong)
+        if wrong.startswith("per_side"):
+            text = text.replace("pitch_m = 0.024 ", "")
+        (tmp_path / FILE).write_text(text)
+        with pytest.raises(DescriptionError) as caught:
+            load_description(tmp_path / FILE)
+        said = str(caught.value).removeprefix(f"{tmp_path / FILE}: ")
+        told = [cell for cell in PAGE.text.split("`") if cell and cell in said]
+        assert max(map(len, told)) > 20, said
+
+
+@pytest.mark.parametrize(
+    ("order", "flagged", "place_mm"),
+    [
+        ([(4 - lead) % 16 for lead in range(16)], False, (-30, 20)),  # clockwise, from electrode 4
+        ([(lead + 8) % 16 for lead in range(16)], False, (-30, -20)),  # turned by half a turn
+        ([-lead % 16 for lead in range(16)], True, None),  # clockwise, from electrode 0
+        ([(lead + 1) % 16 for lead in range(16)], True, None),
+    ],
+)
+def test_a_wrong_numbering_is_seen_as_the_page_says(
+    tmp_path: Path, order: list[int], flagged: bool, place_mm: tuple[float, float] | None
+) -> None:
+    (tmp_path / FILE).write_text(PAGE.file(FILE))
+    sensor = load_description(tmp_path / FILE)
+    skin = rewired(SkinSimulator(sensor, unevenness=0.03, impedance_spread=0.1), order)
+    frame = _pressed(sensor, skin)
+    assert bool(frame.flags & Flag.REFERENCE_MISMATCH) == flagged
+    if place_mm is not None:
+        (contact,) = frame.contacts
+        assert (1e3 * contact.x_m, 1e3 * contact.y_m) == pytest.approx(place_mm, abs=1)
+
+
+def _pressed(sensor: SensorDescription, skin: SkinSimulator) -> Reconstruction:
+    """A frame of a press at (30, 20) mm."""
+    rest, pressed = dict(skin.voltages([])), skin.voltages([Press(0.03, 0.02, 250.0, 0.01)])
+    noise_v = 2.5e-4 * max(float(np.abs(volts).max()) for volts in rest.values())
+    noise = np.full(sensor.measurements, noise_v)
+    reconstructor = Reconstructor(sensor, tier=Tier.FIT)
+    reconstructor.set_reference(Reference(rest["magnitude"], rest["structure"], noise, noise, 20))
+    rng = np.random.default_rng(0)
+    noisy = {
+        name: volts + noise * rng.standard_normal(len(volts)) for name, volts in pressed.items()
+    }
+    return reconstructor.reconstruct(noisy["magnitude"], noisy["structure"])
