@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,12 @@ import pytest
 import tactomo
 import tactomo.control
 import tactomo.twin.control
+from tables import table as cells_of
+from tactomo.errors import CommandError
 from tactomo_models import METHODS, Flag, Tier
 from tactomo_models.reconstruct import BAD_MISFIT, UNSURE_MISFIT
 
+UNITS = {"ns": "ns", "us": "µs", "ms": "ms", "s": "s", "mm": "mm", "mm2": "mm²", "kpa": "kPa"}
 DOCUMENT = (Path(__file__).parents[2] / "clients" / "STREAM.md").read_text("utf-8")
 
 
@@ -27,7 +31,15 @@ def table(heading: str, column: str = "Name") -> set[str]:
     return {name for first in firsts for name in re.findall(r"`(\w+)`", first)}
 
 
+def of_status(heading: str) -> dict[str, str]:
+    """Return the meaning of each row of a table of the document."""
+    rows = cells_of("clients/STREAM.md", heading)
+    return {name: row["Meaning"] for name, row in rows.items()}
+
+
 ENVELOPE = table("### Envelope")
+NAMED_BY_THEMSELVES = ("stage_ms", "scans")
+"""Maps whose keys are the names of stages, or of channels."""
 
 
 def test_every_field_is_in_a_table_and_every_row_is_sent(bench: Callable[..., Any]) -> None:
@@ -47,6 +59,11 @@ def test_every_field_is_in_a_table_and_every_row_is_sent(bench: Callable[..., An
     assert status["ports"][0].keys() == table("Each of `ports`:")
     assert messages["map"]["map"].keys() == table("### Arrays")
     assert daemon.ask("status").keys() == status.keys()
+    rows = of_status("### `status`") | of_status("Each of `ports`:")
+    for name, inside in [*status.items(), *status["ports"][0].items()]:
+        if isinstance(inside, dict) and name not in ("description", *NAMED_BY_THEMSELVES):
+            told = set(re.findall(r"`(\w+)`", rows[name]))
+            assert inside.keys() <= told, name
 
 
 def test_every_flag_is_explained() -> None:
@@ -54,7 +71,7 @@ def test_every_flag_is_explained() -> None:
 
 
 def test_every_method_can_be_asked_for_by_its_name() -> None:
-    asked = re.search(r"^\| `set_tier` \| `tier` \(str\): (.*?)\|", DOCUMENT, re.M)
+    asked = re.search(r"^\| `set_tier` \| 1 \| `tier` \(str\): (.*?)\|", DOCUMENT, re.M)
     made = re.search(r"^\| `tier` \|.*?How much model the frame was given: (.*)\|", DOCUMENT, re.M)
     assert asked
     assert made
@@ -76,6 +93,49 @@ def test_every_event_is_listed() -> None:
 
 
 @pytest.mark.parametrize(
+    "heading",
+    [
+        *("### Envelope", "### Arrays", "### `map`", "### `contacts`", "Each contact:"),
+        *("### `scan`", "### `status`", "`description`:", "`calibration`:", "Each of `ports`:"),
+        "### `event`",
+    ],
+)
+def test_every_field_has_type_unit_meaning_and_since_when(heading: str) -> None:
+    for name, row in cells_of("clients/STREAM.md", heading).items():
+        assert list(row)[1:] == ["Type", "Unit", "Since", "Meaning"]
+        assert row["Type"], name
+        assert row["Meaning"], name
+        assert row["Since"].isdecimal(), name
+        for ending, unit in UNITS.items():
+            if re.fullmatch(rf"\w+_{ending}(`, `\w+_{ending})*", name):
+                assert row["Unit"] == unit, name
+
+
+def test_every_error_of_a_command_is_listed() -> None:
+    folder = Path(tactomo.__path__[0])
+    sources = [*folder.glob("*.py"), *folder.glob("twin/*.py")]
+    raised = {name for path in sources for name in refusals(ast.parse(path.read_text("utf-8")))}
+    listed = cells_of("clients/STREAM.md", "### Errors")
+    assert listed.keys() == raised | {"malformed_message"}
+    commands = {*tactomo.control.COMMANDS, *tactomo.twin.control.COMMANDS}
+    for row in listed.values():
+        assert set(re.findall(r"`(\w+)`", row["Commands"])) <= commands
+
+
+def refusals(source: ast.AST) -> Iterator[str]:
+    """Yield the names of the errors that a module refuses commands with."""
+    for call in ast.walk(source):
+        if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name):
+            continue
+        given = [keyword.value for keyword in call.keywords if keyword.arg == "name"]
+        named = [each.value for each in [*call.args[2:3], *given] if isinstance(each, ast.Constant)]
+        if call.func.id == "CommandError":
+            yield str(named[0]) if named else CommandError.name
+        elif call.func.id == "RecordingError" and named == ["cannot_write"]:
+            yield "cannot_write"
+
+
+@pytest.mark.parametrize(
     ("heading", "commands"),
     [
         ("### Commands of the daemon", tactomo.control.COMMANDS),
@@ -84,3 +144,10 @@ def test_every_event_is_listed() -> None:
 )
 def test_every_command_is_listed(heading: str, commands: dict[str, Any]) -> None:
     assert table(heading, "Command") == set(commands)
+    rows = cells_of("clients/STREAM.md", heading)
+    for names, row in rows.items():
+        assert row["Since"] == "1"
+        for command in re.findall(r"\w+", names):
+            assert commands[command].model_fields.keys() <= set(
+                re.findall(r"`(\w+)`", row["Arguments"])
+            ), command

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import msgpack  # type: ignore[import-untyped]
 import numpy as np
@@ -28,8 +29,9 @@ def batch(tmp_path_factory: pytest.TempPathFactory) -> Path:
     skin = SkinSimulator(description)
     rest = skin.voltages([])
     pressed = skin.voltages([Press(0.005, 0.0, 150.0, 0.006)])
-    arrays = {name: np.stack([rest[name], pressed[name]]) for name in rest}
-    np.savez(folder / "in.npz", **arrays, **{f"{name}_reference": rest[name] for name in rest})
+    arrays: dict[str, Any] = {f"{name}_reference": volts for name, volts in rest.items()}
+    arrays |= {name: np.stack([rest[name], pressed[name]]) for name in rest}
+    np.savez(folder / "in.npz", **arrays)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
         reconstruct_file(folder / "in.npz", folder / "out.npz", description=description)
@@ -77,7 +79,6 @@ def test_every_field_of_a_frame_and_of_a_reference_has_its_row() -> None:
     frame = msgpack.unpackb(pack_mark(Mark((), "auto", None)))
     assert table(PAGE, "## A frame").keys() == frame.keys()
     scan = np.ones(3)
-    reference = msgpack.unpackb(
-        reference_entry(Reference(*[scan] * 4, 1, *[scan] * 2), 1, 0, 0).data
-    )
+    whole = Reference(scan, scan, scan, scan, 1, scan, scan)
+    reference = msgpack.unpackb(reference_entry(whole, 1, 0, 0).data)
     assert table(PAGE, "## A reference").keys() == reference.keys()
