@@ -544,6 +544,20 @@ def shipped_descriptions() -> list[str]:
     )
 
 
+def shipped_text(name: str) -> str:
+    """The TOML text of a shipped description, comments and all.
+
+    Raises:
+        DescriptionError: there is none of that name.
+    """
+    if name not in shipped_descriptions():
+        raise DescriptionError(
+            f"no description is shipped as {name!r}; choose one of: "
+            f"{', '.join(shipped_descriptions())}"
+        )
+    return resources.files("tactomo_models.sensors").joinpath(f"{name}.toml").read_text("utf-8")
+
+
 def load_description(source: str | Path) -> SensorDescription:
     """Read a sensor description by its shipped name or from a TOML file.
 
@@ -563,8 +577,7 @@ def load_description(source: str | Path) -> SensorDescription:
 def _read(name: str) -> dict[str, Any]:
     try:
         if name in shipped_descriptions():
-            folder = resources.files("tactomo_models.sensors")
-            return parse_toml(folder.joinpath(f"{name}.toml").read_text("utf-8"))
+            return parse_toml(shipped_text(name))
         return read_toml(Path(name))
     except OSError as error:
         raise _cannot_read(name, error.strerror) from error

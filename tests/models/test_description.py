@@ -137,7 +137,7 @@ def test_an_unreadable_file_is_named(tmp_path: Path, content: bytes | None) -> N
 def test_a_folder_and_an_unknown_name_are_named(tmp_path: Path) -> None:
     for source in (tmp_path, "paper_sqare"):
         with pytest.raises(
-            DescriptionError, match=f"{source}.*paper_square, skin_round, tank_disc"
+            DescriptionError, match=f"{source}.*paper_square.*skin_round.*tank_disc"
         ):
             load_description(source)
 

@@ -1,4 +1,4 @@
-"""`tactomo models`: build what a sensor's reconstruction needs, ahead of time."""
+"""`tactomo models`: descriptions, and what a sensor's reconstruction needs, built ahead of time."""
 
 from __future__ import annotations
 
@@ -55,6 +55,27 @@ def build(
         )
         save_artifact(artifact, path)
     typer.echo(f"wrote {path}")
+
+
+@models_app.command(epilog=examples("tactomo models copy sciospec_disc tank.toml"))
+def copy(
+    name: Annotated[str, typer.Argument(help="Of those that `tactomo models list` shows.")],
+    path: Annotated[Path, typer.Argument(metavar="FILE.toml", help="The file to write.")],
+) -> None:
+    """Copy a shipped sensor description to a file of your own, to be changed there."""
+    from tactomo_models.description import shipped_text
+
+    from tactomo.errors import TactomoError
+
+    text = shipped_text(name)
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except OSError as error:
+        raise TactomoError(
+            f"cannot write {path}: {error.strerror}", "give the path of a file that is not there"
+        ) from error
+    typer.echo(f"wrote {path}; give it to --description, or --sensor")
 
 
 @models_app.command(name="list")

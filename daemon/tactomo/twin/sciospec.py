@@ -113,8 +113,12 @@ class SciospecSpeaker:
         if frame.potentials is not None:
             return frame.potentials
         scale = self._amplitude_a / self._description.pattern.current_a
-        rows = [least @ frame.volts[voltages] for voltages, least in self._spread]
-        return np.asarray(scale * np.array(rows), dtype=np.complex128)
+        return scale * self.potentials_of(frame.volts)
+
+    def potentials_of(self, volts: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Return potentials (drives, electrodes) that have a scan's voltages (M,), the least."""
+        rows = [least @ volts[voltages] for voltages, least in self._spread]
+        return np.array(rows, dtype=np.complex128)
 
     def _answer(self, tag: int, content: bytes) -> list[bytes]:
         if tag == DATA_TAG and content in (b"\0", b"\1"):
