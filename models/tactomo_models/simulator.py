@@ -12,11 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactomo_models.description import Modality, SensorDescription
-from tactomo_models.forward import ForwardModel, solve_bare_sheet
+from tactomo_models.forward import (
+    ForwardModel,
+    scan_voltages,
+    solve_bare_sheet,
+    transfer_resistances,
+)
 from tactomo_models.mesh import mesh_sheet
 from tactomo_models.scene import Press, strongest
 
 FloatArray = NDArray[np.float64]
+
+PROBE = 0.01  # relative change by which sensitivities are measured
 
 
 class SkinSimulator:
@@ -41,14 +48,17 @@ class SkinSimulator:
     ) -> None:
         self.description = description
         self._spacing_m = spacing_m or description.width_m / (description.map.nodes_x - 1) * 2 / 3
-        sheet = mesh_sheet(description, self._spacing_m)
+        self._sheet = mesh_sheet(description, self._spacing_m)
         rng = np.random.default_rng(seed)
-        x, y = sheet.mesh.p
-        self._background = 1 + unevenness * smooth_noise(x, y, description.width_m / 4, rng)
-        impedance = np.exp(impedance_spread * rng.standard_normal(description.electrode_count))
-        bare = solve_bare_sheet(description, sheet, self._background, impedance, quick=True)
+        x, y = self._sheet.mesh.p
+        self._conductivity = 1 + unevenness * smooth_noise(x, y, description.width_m / 4, rng)
+        spread = impedance_spread * rng.standard_normal(description.electrode_count)
+        self._impedance = np.exp(spread)
+        bare = solve_bare_sheet(
+            description, self._sheet, self._conductivity, self._impedance, quick=True
+        )
         self._forward = ForwardModel(description, bare)
-        self._background = self._background[bare.pressable]
+        self._background = self._conductivity[bare.pressable]
         self._x, self._y = bare.points[:, bare.pressable]
         self._last: tuple[tuple[Press, ...], dict[Modality, FloatArray]] | None = None
 
@@ -68,12 +78,47 @@ class SkinSimulator:
         return self.description.modalities
 
     def _solve(self, modality: Modality, scene: tuple[Press, ...]) -> FloatArray:
-        pressure, coverage = strongest(scene, self._x, self._y, self._spacing_m)
-        ratio = conductivity_ratio(self.description, modality, pressure, coverage)
+        return self.solve(self.ratio(modality, scene))
+
+    def ratio(self, modality: Modality, presses: Sequence[Press]) -> FloatArray:
+        """Conductivity over the bare sheet's at the mesh's P nodes that can be pressed."""
+        pressure, coverage = strongest(presses, self._x, self._y, self._spacing_m)
+        return conductivity_ratio(self.description, modality, pressure, coverage)
+
+    def solve(self, ratio: FloatArray) -> FloatArray:
+        """Noise-free volts (M,) where those nodes conduct so many times better, (P,)."""
         change = self._background * (ratio - 1)
         # Across the edge of a good conductor resistivities mix; see `ForwardModel.solve`.
         solved = self._forward.solve(change, mix_resistivities=bool(np.all(ratio >= 1)))
         return solved.voltages * self._forward.volts_per_unit
+
+    def smooth_field(self, rng: np.random.Generator) -> FloatArray:
+        """A random field (N,) at all of the mesh's nodes, of unit standard deviation."""
+        x, y = self._sheet.mesh.p
+        return smooth_noise(x, y, self.description.width_m / 4, rng)
+
+    def sensitivity(
+        self, field: FloatArray | float = 0.0, impedance: FloatArray | float = 0.0
+    ) -> FloatArray:
+        """By how much the logarithms of the bare sheet's voltages (M,) change.
+
+        Args:
+            field: (N,) change of the logarithm of conductivity at the mesh's nodes.
+            impedance: (L,) that of the contact impedances.
+        """
+        up, down = (self._directly(side * PROBE, field, impedance) for side in (1, -1))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            change = np.log(up / down) / (2 * PROBE)
+        return np.nan_to_num(change, posinf=0.0, neginf=0.0)
+
+    def _directly(
+        self, step: float, field: FloatArray | float, impedance: FloatArray | float
+    ) -> FloatArray:
+        conductivity = self._conductivity * np.exp(step * np.asarray(field))
+        by_triangle = conductivity[self._sheet.mesh.t].mean(axis=0)
+        contacts = self._impedance * np.exp(step * np.asarray(impedance))
+        transfer = transfer_resistances(self.description, self._sheet, by_triangle, contacts)
+        return scan_voltages(self.description, transfer)
 
 
 def conductivity_ratio(

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 import serial
 from numpy.typing import NDArray
+from small_sensor import SMALL
 from tactomo.errors import AddressError, ConfigError, TactomoError
 from tactomo.twin import Drift, Scene, TwinConfig
 from tactomo_client import ControlError
-from tactomo_models import Modality, Press, load_description
+from tactomo_models import Modality, Press, SkinSimulator, load_description
 from tactomo_protocol import (
     Acknowledge,
     AckStatus,
@@ -281,6 +282,32 @@ def test_noise_can_be_changed_while_it_runs(bench: Start) -> None:
     assert np.ptp(host.scans()[0].samples) == 0
     started.ask("noise", noise_v=0.01)
     host.wait_for(lambda: np.ptp(host.scans()[-1].samples) > 0)
+
+
+def test_the_skin_drifts_as_it_is_told_live_and_by_a_scene(bench: Start, tmp_path: Path) -> None:
+    file = tmp_path / "small.toml"
+    file.write_text(SMALL)
+    sensor = load_description(file)
+    started = bench(skin=SkinSimulator(sensor), sensor=str(file), drift=Drift(0.0, 0.0))
+    host = started.host()
+    host.start()
+    host.wait_for(lambda: host.scans())
+    rest = host.scans()[0].samples
+    started.ask("drift", step_k=5.0, uneven=0.0)
+    host.wait_for(lambda: not np.array_equal(host.scans()[-1].samples, rest))
+    warm = host.scans()[-1].samples
+    large = np.abs(rest) > 0.1 * np.abs(rest).max()
+    np.testing.assert_allclose(warm[large] / rest[large], np.exp(-0.1), rtol=1e-3)
+    press = {"at_s": 3000, "duration_s": 1, "x_mm": 0, "y_mm": 0}
+    started.ask("play", scene={"press": [press], "drift": {"step_k": 0.0}})
+    host.wait_for(lambda: np.array_equal(host.scans()[-1].samples, rest))
+    with pytest.raises(ControlError, match="swing_k"):
+        started.ask("drift", swing_k=-1.0)
+
+
+def test_a_skin_that_is_not_simulated_does_not_drift(bench: Start) -> None:
+    with pytest.raises(ControlError, match="not simulated"):
+        bench().ask("drift", swing_k=10.0)
 
 
 def test_nobody_gets_old_scans_and_nobody_blocks_the_twin(bench: Start, wait_for: Start) -> None:

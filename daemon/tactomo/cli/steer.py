@@ -200,8 +200,8 @@ def poke(
 
     `press` (x_mm, y_mm, id, radius_mm, pressure_kpa, shape; the same id again moves it),
     `release` (id), `clear`, `scene` (what presses now), `play` (the scripted scene from its start),
-    `noise` (noise_v), `drift` (walk, creep), `mute` (channel, seconds), `garbage` (count, port),
-    `unplug` and `replug` (port), `status`.
+    `noise` (noise_v), `drift` (swing_k, period_s, step_k, press_creep, ...), `mute` (channel,
+    seconds), `garbage` (count, port), `unplug` and `replug` (port), `status`.
     """
     from tactomo_client import request
 

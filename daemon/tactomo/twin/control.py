@@ -23,7 +23,7 @@ from tactomo_client.messages import (
 
 from tactomo.endpoint import bind
 from tactomo.errors import AddressError, CommandError
-from tactomo.twin.scene import Indenter, Scene, complaints
+from tactomo.twin.scene import Indenter, Scene, SkinDriftSettings, complaints
 
 Handler = Callable[[Any], Mapping[str, Any]]
 PressId = Annotated[str, Field(min_length=1, max_length=64)]
@@ -68,8 +68,8 @@ class NoiseArguments(Arguments):
     noise_v: float = Field(ge=0.0, le=1e3, allow_inf_nan=False)
 
 
-class DriftArguments(Arguments):
-    """Change how the gain drifts; 0 stops it. Leaves out what is not given."""
+class DriftArguments(SkinDriftSettings):
+    """Change how the gains and the skin drift; 0 stops it. Leaves out what is not given."""
 
     walk: float | None = Field(default=None, ge=0.0, le=1.0, allow_inf_nan=False)
     creep: float | None = Field(default=None, ge=-0.5, le=0.5, allow_inf_nan=False)

@@ -26,6 +26,7 @@ import zmq
 from pydantic import TypeAdapter, ValidationError
 from tactomo_client.messages import DEFAULT_TWIN_CONTROL
 from tactomo_models import Press, SensorDescription, SkinSimulator
+from tactomo_models.skin_drift import DriftingSkin, SkinDrift
 from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
 
@@ -58,7 +59,7 @@ from tactomo.twin.firmware import (
 from tactomo.twin.foreign import ForeignFirmware
 from tactomo.twin.line import SerialLine
 from tactomo.twin.playing import Player
-from tactomo.twin.scene import Scene, complaints
+from tactomo.twin.scene import Scene, SkinDriftSettings, complaints
 from tactomo.twin.speakers import SPEAKERS
 from tactomo.twin.surface import Surface
 
@@ -105,6 +106,7 @@ class TwinConfig:
             is played, or 20.
         noise_v: noise in volts rms; None for a usual converter's.
         drift: how the gains drift.
+        skin_drift: how the skin itself drifts; the scene's if that says so.
         unevenness: standard deviation of the sheet's conductivity, a ratio.
         seed: equal seeds give equal noise, drift and unevenness.
         scene: a scripted scene; it starts with the first scan that a host can receive.
@@ -121,6 +123,7 @@ class TwinConfig:
     rate_hz: float | None = None
     noise_v: float | None = None
     drift: Drift = field(default_factory=Drift)
+    skin_drift: SkinDrift = field(default_factory=SkinDrift)
     unevenness: float = UNEVENNESS
     seed: int = 0
     scene: Scene | None = None
@@ -199,6 +202,11 @@ class Twin:
                 self._player = Player(config.play, config.description, config.play_once)
                 skin = self._player
             self._skin = skin or make_skin(config.description, config.unevenness, config.seed)
+            self._drifting = (
+                DriftingSkin(self._skin, config.skin_drift, config.seed)
+                if isinstance(self._skin, SkinSimulator)
+                else None
+            )
             undo.pop_all()
         self._converter = self._make_converter()
         self._powered_s = time.monotonic()
@@ -298,11 +306,22 @@ class Twin:
         if self._player is not None and self._player.is_over:
             return Future()  # never done: nothing follows
         if not self._surface.is_playing and any(p.line.is_open for p in self._firmware.ports):
-            self._surface.play(time_s)
+            self._play_at(time_s)
         presses = [indenter.press() for indenter in self._surface.presses_at(time_s).values()]
-        future: Future[Voltages] = self._solver.submit(self._skin.voltages, presses)
+        future: Future[Voltages]
+        if self._drifting is None:
+            future = self._solver.submit(self._skin.voltages, presses)
+        else:
+            future = self._solver.submit(self._drifting.voltages, presses, time_s)
         future.add_done_callback(lambda _: self._wake())
         return future
+
+    def _play_at(self, time_s: float) -> None:
+        """Start the scripted scene; it may say how the skin drifts."""
+        self._surface.play(time_s)
+        script = self._surface.script
+        if script is not None and script.drift is not None and self._drifting is not None:
+            self._drifting.drift = script.drift.skin_drift()
 
     def _make_firmware(self, ports: list[Port]) -> Firmware:
         config = self.config
@@ -397,7 +416,7 @@ class Twin:
         self._surface.script = arguments.scene or self._surface.script
         if self._surface.script is None:
             raise CommandError("the twin has no scripted scene", "give one as `scene`")
-        self._surface.play(self._clock())
+        self._play_at(self._clock())
         return {"length_s": self._surface.script.length_s}
 
     def _set_noise(self, arguments: NoiseArguments) -> dict[str, Any]:
@@ -405,8 +424,17 @@ class Twin:
         return {}
 
     def _set_drift(self, arguments: DriftArguments) -> dict[str, Any]:
-        given = arguments.model_dump(exclude_none=True)
-        self._converter.drift = dataclasses.replace(self._converter.drift, **given)
+        gain = arguments.model_dump(include={"walk", "creep"}, exclude_none=True)
+        skin = arguments.model_dump(exclude={"walk", "creep"}, exclude_none=True)
+        if skin and self._drifting is None:
+            raise CommandError(
+                "this twin's skin is not simulated: it does not drift", "leave those out"
+            )
+        self._converter.drift = dataclasses.replace(self._converter.drift, **gain)
+        if self._drifting is not None:
+            self._drifting.drift = SkinDriftSettings.model_validate(skin).skin_drift(
+                self._drifting.drift
+            )
         return {}
 
     def _mute(self, arguments: MuteArguments) -> dict[str, Any]:

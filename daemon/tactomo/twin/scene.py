@@ -21,6 +21,7 @@ same device times on every run.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -28,6 +29,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from tactomo_models import Press
 from tactomo_models.errors import explain
+from tactomo_models.skin_drift import SkinDrift
 from tactomo_models.toml_file import read_toml
 
 from tactomo.errors import ConfigError
@@ -135,11 +137,33 @@ class ScriptedPress(Indenter):
         return min(1.0, age_s / self.ramp_s, (self.duration_s - age_s) / self.ramp_s)
 
 
+class SkinDriftSettings(_Strict):
+    """How the skin itself drifts; what is not given stays as it is. `SkinDrift` explains them."""
+
+    swing_k: Annotated[float, Field(ge=0.0, le=100.0, allow_inf_nan=False)] | None = None
+    period_s: Annotated[float, Field(ge=1.0, le=1e6, allow_inf_nan=False)] | None = None
+    step_k: Annotated[float, Field(ge=-50.0, le=50.0, allow_inf_nan=False)] | None = None
+    per_kelvin: Annotated[float, Field(ge=-0.1, le=0.1, allow_inf_nan=False)] | None = None
+    uneven: Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)] | None = None
+    press_creep: Annotated[float, Field(ge=0.0, le=0.1, allow_inf_nan=False)] | None = None
+    impedance: Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)] | None = None
+
+    def skin_drift(self, before: SkinDrift | None = None) -> SkinDrift:
+        """Return `before` (none, if None) with what is given here in its place."""
+        keys = {"press_creep": "creep"}
+        given = self.model_dump(include=set(SkinDriftSettings.model_fields), exclude_none=True)
+        return replace(
+            before or SkinDrift(), **{keys.get(key, key): value for key, value in given.items()}
+        )
+
+
 class Scene(_Strict):
     """A time line of presses; with ``loop`` it starts over after ``duration_s``."""
 
     name: str = ""
     loop: bool = False
+    drift: SkinDriftSettings | None = None
+    """How the skin drifts from the scene's start on; as the twin was set up if None."""
     duration_s: Annotated[float, Field(gt=0.0, le=86_400.0, allow_inf_nan=False)] | None = None
     press: tuple[ScriptedPress, ...] = Field(min_length=1)
 
