@@ -32,7 +32,7 @@ from daemon_process import SENSOR, DaemonProcess, wait_until
 from fuzz_targets import CONTACT, HEADER
 from tactomo import keys as key_files
 from tactomo_client import ClientError, Contact, Frame, request, subscribe
-from tactomo_client.fake import FakeSensor
+from tactomo_client.fake import FakeControl, FakeSensor
 from tactomo_client.frame import frame_from_message
 from tactomo_client.messages import CONTACTS, MAP, decode_message, encode_message
 
@@ -273,6 +273,10 @@ def test_with_keys(probe: Path, start: Callable[..., DaemonProcess], tmp_path: P
         skin.frames(1)
     with Watch(probe, SENSOR, daemon.stream, "contacts") as skin:
         skin.wait(lambda said: said["door"] == "keys_needed", "the refusal")
+    key_files.make_pair(tmp_path, "impostor")
+    shutil.copy(key_files.public_path(tmp_path, "impostor"), folders["stranger"] / f"{SENSOR}.key")
+    with Watch(probe, SENSOR, daemon.stream, "contacts", folders["stranger"]) as skin:
+        skin.wait(lambda said: said["door"] == "wrong_server", "the refusal")
     key_files.secret_path(desk, "desk").chmod(0o644)
     told = subprocess.run(
         [probe, "control", daemon.control, "status", "", desk], capture_output=True, text=True
@@ -482,3 +486,35 @@ def test_garbage_over_a_socket_is_skipped(sensor: FakeSensor, checked: Path) -> 
         sensor.publish(sequence=9_999)
         seen = skin.wait(lambda s: s["frame"] and s["frame"]["sequence"] == 9_999, "the whole one")
     assert seen["malformed"] > 100
+
+
+def test_no_reply_crashes_it(checked: Path) -> None:
+    dice = random.Random(8)
+    port = {"url": "/dev/x", "connected": True, "state": "running", "problem": None}
+    words = {name: name for name in ("sensor", "session", "version", "state")}
+    result = {**words, "uptime_s": 1.5, "tier": None, "flags": ["a"], "rates": {"frames_hz": 20.0}}
+    whole = {"schema": 1, "ok": True, "result": {**result, "ports": [port]}}
+    refusal = {"name": "tare_refused", "cause": "somebody presses", "next_step": ""}
+    refused = {"schema": 1, "ok": False, "error": refusal}
+
+    class Answers(dict[str, bytes]):
+        """Another one at each time: whole, mutated, corrupted."""
+
+        given = 0
+
+        def get(self, command: str, otherwise: Any = None) -> Any:
+            self.given += 1
+            fields = refused if self.given % 5 == 0 else whole
+            if self.given % 3 == 0:
+                return msgpack.packb(fields)
+            if self.given % 3 == 1:
+                return msgpack.packb(mutated(fields, dice))
+            return corrupted(msgpack.packb(fields), dice) or b"?"
+
+    with FakeControl() as daemon:
+        daemon.answers = Answers()
+        said = run(checked, "statuses", daemon.address, 600).split()
+    assert len(said) == 600
+    assert said.count('""') > 150
+    assert said.count('"malformed_message"') > 150
+    assert said.count('"tare_refused"') > 30

@@ -117,6 +117,42 @@ def test_from_nothing_to_a_running_controller(newcomer: Newcomer, pressed: str) 
     assert "7 at (10.0, -5.0) mm, 183 kPa\n" in by_pkg_config
 
 
+HERE = "add_subdirectory({source} tactomo)"
+FETCHED = """include(FetchContent)
+FetchContent_Declare(tactomo SOURCE_DIR {root} SOURCE_SUBDIR clients/cpp)
+FetchContent_MakeAvailable(tactomo)"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", [HERE, FETCHED], ids=["add_subdirectory", "FetchContent"])
+def test_without_an_installation(newcomer: Newcomer, way: str, pressed: str) -> None:
+    folder = newcomer.checkout.parent / "other"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    lists = file_in_readme("robot/CMakeLists.txt")
+    found = "find_package(tactomo 0.1 CONFIG REQUIRED)"
+    assert found in lists
+    places = {"source": newcomer.checkout / "clients" / "cpp", "root": newcomer.checkout}
+    (folder / "CMakeLists.txt").write_text(lists.replace(found, way.format(**places)))
+    (folder / "robot.cpp").write_text(file_in_readme("robot/robot.cpp"))
+    newcomer.run(f"cmake -S {folder} -B {folder}/build && cmake --build {folder}/build")
+    assert not list(folder.rglob("controller"))
+    assert "7 at (10.0, -5.0) mm" in newcomer.run(f"{folder}/build/robot {pressed}")
+
+
+def test_a_missing_library_is_named(newcomer: Newcomer, tmp_path: Path) -> None:
+    newcomer.run(f"cmake -S clients/cpp -B {tmp_path} -DTACTOMO_EXAMPLES=OFF")
+    newcomer.run(f"cmake --install {tmp_path} --prefix {tmp_path}/prefix")
+    (tmp_path / "CMakeLists.txt").write_text(file_in_readme("robot/CMakeLists.txt"))
+    (tmp_path / "robot.cpp").write_text("")
+    command = ["cmake", "-S", tmp_path, "-B", tmp_path / "b", "-DTACTOMO_MSGPACK_INCLUDE=NOTFOUND"]
+    command += [f"-DCMAKE_PREFIX_PATH={tmp_path}/prefix", "-DCMAKE_FIND_ROOT_PATH=/nowhere"]
+    command += ["-DCMAKE_FIND_ROOT_PATH_MODE_INCLUDE=ONLY"]
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=BUILD_S)
+    assert done.returncode != 0
+    assert "apt install cppzmq-dev libmsgpack-dev" in " ".join(done.stderr.split())
+
+
 def test_what_it_installs_is_what_the_suite_installs() -> None:
     told = next(command for command in commands() if command.startswith("sudo apt install "))
     packages = told.removeprefix("sudo apt install ")

@@ -6,6 +6,7 @@
 //                                                  at every silence of 200 ms
 //     probe loop SENSOR ADDRESS KIND TURNS         latest() at 1 kHz: what it took
 //     probe control ADDRESS COMMAND [ARGUMENT] [KEYS]     an empty argument: none
+//     probe statuses ADDRESS COUNT                 so many commands, and the name of each one's error
 
 #include <tactomo/client.hpp>
 
@@ -301,6 +302,19 @@ int control(tactomo::Control daemon, const std::string& command, const std::stri
     return 0;
 }
 
+int statuses(tactomo::Control daemon, long count) {
+    for (long i = 0; i < count; ++i) {
+        try {
+            daemon.status();
+            print("\"\"\n");
+        } catch (const tactomo::Error& error) {
+            print_text(error.name());
+            print("\n");
+        }
+    }
+    return 0;
+}
+
 }  // namespace
 
 int main(int count, char** words) {
@@ -316,6 +330,7 @@ int main(int count, char** words) {
             return watch(word(1), options);
         }
         if (word(0) == "loop") return loop(word(1), options, std::atol(word(4).c_str()));
+        if (word(0) == "statuses") return statuses(tactomo::Control(word(1)), std::atol(word(2).c_str()));
         tactomo::Keys keys;
         if (!word(4).empty()) keys = tactomo::Keys::load(word(4));
         return control(tactomo::Control(word(1), keys), word(2), word(3));

@@ -71,13 +71,12 @@ std::optional<Value> member_or_nil(const Members& members, const std::string& na
 }
 
 inline msgpack::object_handle unpack(const zmq::message_t& message) {
-    try {
-        const msgpack::unpack_limit limit(max_entries, max_entries, max_message_bytes,
-                                          max_message_bytes, max_message_bytes, max_depth);
-        return msgpack::unpack(message.data<char>(), message.size(), nullptr, nullptr, limit);
-    } catch (const msgpack::unpack_error&) {
-        throw MessageError("the reply is not MessagePack");
+    // The rules for messages are the parser's; msgpack then takes what kept them.
+    Parser parser;
+    if (parser.parse({message.data<char>(), message.size()}) == nullptr) {
+        throw MessageError("the reply is not MessagePack, or beyond the limits");
     }
+    return msgpack::unpack(message.data<char>(), message.size());
 }
 
 inline Members members(const msgpack::object& object) {

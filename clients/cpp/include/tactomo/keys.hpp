@@ -162,7 +162,10 @@ public:
 
     /// Takes note of what has happened.
     Door look() {
-        while (check_event(0)) {
+        try {
+            while (check_event(0)) {
+            }
+        } catch (const zmq::error_t&) {  // a signal; what is left is seen the next time
         }
         // One connection may have been cut in the middle of a handshake: the server was stopped.
         if (failures_ == 0 || (failures_ == 1 && is_vague_)) return Door::open;

@@ -222,7 +222,7 @@ class Fields {
 public:
     /// `problem` gets the name of the first field that is wrong.
     Fields(const Tape& tape, std::size_t index, std::string_view& problem) noexcept
-        : tape_(tape), index_(index), problem_(problem) {
+        : tape_(tape), index_(index), next_(index + 1), problem_(problem) {
         if (tape_[index].type != Token::map) fail("not a map");
     }
 
@@ -263,7 +263,7 @@ public:
     void list(std::string_view name, const Each& each) {
         const Token* const token = value(name, Token::list);
         if (token == nullptr) return;
-        std::size_t at = *find(name) + 1;
+        std::size_t at = index_of(token) + 1;
         for (std::uint32_t entry = 0; entry < token->size; ++entry, at = tape_[at].next) each(at);
     }
     /// Two positions, [first, last].
@@ -284,8 +284,9 @@ public:
     /// A two-dimensional array of float32; cleared where there is none.
     void image(std::string_view name, Image& into) {
         into.clear();
-        if (value(name, Allow::both) == nullptr) return;
-        Fields array(tape_, *find(name), problem_);
+        const Token* const token = value(name, Allow::both);
+        if (token == nullptr) return;
+        Fields array(tape_, index_of(token), problem_);
         const Token* const shape = array.value("shape", Token::list);
         const Token* const data = array.value("data", Token::binary);
         if (array.text("dtype") != "<f4") fail(name);
@@ -319,16 +320,20 @@ private:
         fail(name);
         return nullptr;
     }
-    /// Index of a field's value. Of two of a name, the last one counts.
-    std::optional<std::size_t> find(std::string_view name) const noexcept {
-        std::optional<std::size_t> found;
-        if (tape_[index_].type != Token::map) return found;
-        std::size_t at = index_ + 1;
+    /// Index of a field's value. Looks on from the field found last, for they mostly come in the order
+    /// in which they are read.
+    std::optional<std::size_t> find(std::string_view name) noexcept {
+        if (tape_[index_].type != Token::map) return {};
         for (std::uint32_t entry = 0; entry < tape_[index_].size; ++entry) {
-            if (tape_[at].view() == name) found = at + 1;
-            at = tape_[at + 1].next;
+            if (next_ == tape_[index_].next) next_ = index_ + 1;
+            const std::size_t key = next_;
+            next_ = tape_[key + 1].next;
+            if (tape_[key].view() == name) return key + 1;
         }
-        return found;
+        return {};
+    }
+    std::size_t index_of(const Token* token) const noexcept {
+        return static_cast<std::size_t>(token - &tape_[0]);
     }
     static std::optional<double> as_number(const Token& token) noexcept {
         if (token.type == Token::positive) return static_cast<double>(token.unsigned_value);
@@ -352,6 +357,7 @@ private:
 
     const Tape& tape_;
     std::size_t index_;
+    std::size_t next_;  // where to look for the next field's name
     std::string_view& problem_;
 };
 
@@ -379,12 +385,12 @@ inline Contact contact(Fields& fields) noexcept {
     read.magnitude = fields.number("magnitude", Allow::both);
     read.magnitude_sigma = fields.number("magnitude_sigma", Allow::both);
     read.pressure_kpa = fields.number("pressure_kpa", Allow::both);
-    read.pressure_sigma_kpa = fields.number("pressure_sigma_kpa", Allow::both);
-    read.force_n = fields.number("force_n", Allow::both);
-    read.force_sigma_n = fields.number("force_sigma_n", Allow::both);
     read.x_sigma_mm = fields.number("x_sigma_mm", Allow::both);
     read.y_sigma_mm = fields.number("y_sigma_mm", Allow::both);
     read.area_sigma_mm2 = fields.number("area_sigma_mm2", Allow::both);
+    read.pressure_sigma_kpa = fields.number("pressure_sigma_kpa", Allow::both);
+    read.force_n = fields.number("force_n", Allow::both);
+    read.force_sigma_n = fields.number("force_sigma_n", Allow::both);
     read.pressure_range = pressure_range(fields.text("pressure_range", Allow::absence));
     return read;
 }

@@ -165,14 +165,14 @@ private:
         const auto now = std::chrono::steady_clock::now();
         if (now < knock_at_) return;
         knock_at_ = now + knock_period;
+        door_ = handshakes_.look();
+        if (door_ == Door::open) return;
         try {
-            door_ = handshakes_.look();
-            if (door_ == Door::open) return;
             socket_.disconnect(options_.address);
-        } catch (const zmq::error_t&) {  // a signal, or the connection is gone altogether
+        } catch (const zmq::error_t&) {  // it is gone altogether
         }
         try {
-            if (door_ != Door::open) socket_.connect(options_.address);
+            socket_.connect(options_.address);
         } catch (const zmq::error_t&) {  // the next knock tries once more
         }
     }
