@@ -131,6 +131,33 @@ def test_a_recording_in_several_files(tactomo: Run, tmp_path: Path) -> None:
     np.testing.assert_allclose(times, np.arange(FRAMES) * PERIOD_NS * 1e-9)
 
 
+def test_a_wall_clock_that_is_set_does_not_fold_the_times(tactomo: Run, tmp_path: Path) -> None:
+    def set_back(number: int) -> dict[str, Any]:
+        hour = 3_600_000_000_000 if number >= 30 else 0
+        return {"acquired_realtime_ns": START_NS + number * PERIOD_NS - hour}
+
+    write_grasp(tmp_path / "set.mcap", change=set_back)
+    assert tactomo("export", "set.mcap", "set.csv").returncode == 0
+    times = sorted({float(row["time_s"]) for row in rows_of(tmp_path / "set.csv")})
+    np.testing.assert_allclose(times, np.arange(FRAMES) * PERIOD_NS * 1e-9)
+
+
+def test_a_daemon_that_was_restarted_begins_anew(tactomo: Run, tmp_path: Path) -> None:
+    """Its computer was, too: the monotonic clock begins at nought, and so do the identities."""
+
+    def restart(number: int) -> dict[str, Any]:
+        if number < 45:
+            return {}
+        return {"session": "again", "acquired_monotonic_ns": (number - 45) * PERIOD_NS}
+
+    write_grasp(tmp_path / "two.mcap", change=restart)
+    assert tactomo("export", "two.mcap", "two.csv").returncode == 0
+    times = sorted({float(row["time_s"]) for row in rows_of(tmp_path / "two.csv")})
+    np.testing.assert_allclose(times, np.arange(FRAMES) * PERIOD_NS * 1e-9)
+    result = tactomo("plot", "two.mcap", "-o", "two.svg", "--what", "path")
+    assert "wrote two.svg: 4 contact(s)" in result.stdout  # 1 and 2, then 1' and 2'
+
+
 def test_a_cut_recording_gives_what_is_there_and_says_so(tactomo: Run, grasp: Path) -> None:
     data = grasp.read_bytes()
     grasp.write_bytes(data[: len(data) * 2 // 3])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +95,19 @@ def test_what_goes_wrong_is_told(
     result = tactomo("plot", *arguments)
     assert result.returncode == status
     assert says in result.stderr.replace("\n", " ")
+
+
+def test_a_sensor_without_magnitude_shows_areas(grasp: Path) -> None:
+    with recorded_frames(grasp, None) as frames:
+        course = read_course(frames, 0.0)
+    for track in course.tracks.values():
+        track.contacts = [
+            replace(c, magnitude=None, pressure_kpa=None, force_n=None, pressure_range="unknown")
+            for c in track.contacts
+        ]
+    figure = draw_page(course, [], None, ("path", "pressure", "force"), "a tank")
+    assert "area (mm²)" in axes_labels(figure)
+    assert "force (N)" not in axes_labels(figure)
 
 
 def moments_of(*stretches: tuple[int, str]) -> list[str]:

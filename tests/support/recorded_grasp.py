@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -72,8 +72,8 @@ def images_of(number: int) -> dict[str, NDArray[np.float32] | None]:
     }
 
 
-def messages_of(number: int) -> list[tuple[str, bytes]]:
-    """Return what a daemon publishes for one dual scan."""
+def messages_of(number: int, changes: Mapping[str, Any]) -> list[tuple[str, bytes]]:
+    """Return what a daemon publishes for one dual scan, with some fields otherwise."""
     at_ns = START_NS + number * PERIOD_NS
     monotonic_ns = MONOTONIC_NS + number * PERIOD_NS
     fields: dict[str, Any] = {
@@ -89,6 +89,7 @@ def messages_of(number: int) -> list[tuple[str, bytes]]:
         "flags": ["misfit_high"] if number in (33, 34) else [],
         "misfit": 1.0 + 0.01 * (number % 7),
         "contacts": [dataclasses.asdict(contact) for contact in contacts_of(number)],
+        **changes,
     }
     images = {
         name: None if image is None else array_to_wire(image)
@@ -102,13 +103,18 @@ def messages_of(number: int) -> list[tuple[str, bytes]]:
 
 
 def write_grasp(
-    path: Path, numbers: Sequence[int] = range(FRAMES), description: str = "paper_square"
+    path: Path,
+    numbers: Sequence[int] = range(FRAMES),
+    change: Callable[[int], Mapping[str, Any]] = lambda _: {},
 ) -> Path:
-    """Write the recording; frames that are left out of `numbers` were lost on the way."""
-    writer = RecordingWriter(path, Origin(SENSOR, description, "ab" * 32, ("/dev/x",), "0.1.0"))
+    """Write the recording; frames that are left out of `numbers` were lost on the way.
+
+    `change` says of each frame which fields are otherwise.
+    """
+    writer = RecordingWriter(path, Origin(SENSOR, "paper_square", "ab" * 32, ("/dev/x",), "0.1.0"))
     for number in numbers:
         at_ns = START_NS + number * PERIOD_NS
-        for topic, data in [("port/0", b"\0bytes\0"), *messages_of(number)]:
+        for topic, data in [("port/0", b"\0bytes\0"), *messages_of(number, change(number))]:
             writer.write(topic, data, at_ns, at_ns)
     writer.flush()
     writer.close()

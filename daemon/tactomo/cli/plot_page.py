@@ -35,6 +35,7 @@ GAP_S: Final = 0.5
 INK: Final = "0.25"
 UNKNOWN_INK: Final = "#4f7fb5"
 LISTED: Final = 8
+LETTERS_APART_MM: Final = 8.0
 LETTERS: Final = "abcdefghijkl"
 
 
@@ -63,10 +64,10 @@ def draw_page(
         _draw_strip(areas["strip"], maps, about)
     if has_path and rows:
         left, right = areas["body"].subfigures(1, 2, width_ratios=(1.0, 1.35))
-        _draw_path(left, course, description, colours)
+        _draw_path(left, course, maps, description, colours)
         _draw_rows(right, rows, course, maps, colours)
     elif has_path:
-        _draw_path(areas["body"], course, description, colours)
+        _draw_path(areas["body"], course, maps, description, colours)
     elif rows:
         _draw_rows(areas["body"], rows, course, maps, colours)
     return figure
@@ -156,6 +157,7 @@ def _short_words(contact: Contact) -> str:
 def _draw_path(
     figure: Any,
     course: Course,
+    maps: Sequence[Moment],
     description: SensorDescription | None,
     colours: dict[str, Any],
 ) -> None:
@@ -165,6 +167,7 @@ def _draw_path(
         _draw_sheet(axes, description)
     for name, track in course.tracks.items():
         _draw_track(axes, track, colours[name], name)
+        _letter_track(axes, track, maps)
     axes.set(aspect="equal", xlabel="x (mm)", ylabel="y (mm)")
     axes.set_title("path, from ○ to ●; dots by area", fontsize=10)
 
@@ -178,9 +181,12 @@ def _draw_table(axes: Any, course: Course, colours: dict[str, Any]) -> None:
     axes.axis("off")
     lasting = sorted(course.tracks, key=lambda name: -_lasted_s(course.tracks[name]))[:LISTED]
     shown = [name for name in course.tracks if name in lasting]
-    cells = [[name, *_summary(course.tracks[name])] for name in shown]
-    columns = ["contact", "s", "kPa, most", "N, most", "mm², mean", "moved mm"]
-    table = axes.table(cells, colLabels=columns, loc="upper center", cellLoc="center")
+    rows = [[name, *_summary(course.tracks[name])] for name in shown]
+    titles = ["contact", "s", "kPa, most", "N, most", "mm², mean", "moved mm, most"]
+    kept = [n for n in range(len(titles)) if any(row[n] for row in rows)]
+    cells = [[row[n] or "unknown" for n in kept] for row in rows]
+    names = [titles[n] for n in kept]
+    table = axes.table(cells, colLabels=names, loc="upper center", cellLoc="center")
     table.auto_set_font_size(False)
     table.set_fontsize(8)
     table.scale(1.0, 1.25)
@@ -197,8 +203,7 @@ def _lasted_s(track: Track) -> float:
 
 
 def _summary(track: Track) -> list[str]:
-    first, last = track.contacts[0], track.contacts[-1]
-    moved_mm = math.hypot(last.x_mm - first.x_mm, last.y_mm - first.y_mm)
+    moved_mm = max(_distance_mm(track.contacts[0], contact) for contact in track.contacts)
     area_mm2 = float(np.mean([contact.area_mm2 for contact in track.contacts]))
     return [
         f"{_lasted_s(track):.1f}",
@@ -211,7 +216,7 @@ def _summary(track: Track) -> list[str]:
 
 def _most(track: Track, name: str) -> str:
     known = [value for contact in track.contacts if (value := getattr(contact, name)) is not None]
-    return f"{max(known):.0f}" if known else "unknown"
+    return f"{max(known):.0f}" if known else ""
 
 
 def _draw_sheet(axes: Any, description: SensorDescription) -> None:
@@ -239,6 +244,32 @@ def _draw_track(axes: Any, track: Track, colour: Any, name: str) -> None:
     axes.plot(x[0], y[0], "o", color=colour, markerfacecolor="white", markersize=7)
     axes.plot(x[-1], y[-1], "o", color=colour, markersize=7)
     axes.annotate(name, (x[-1], y[-1]), (7, 5), textcoords="offset points", color=colour)
+
+
+def _letter_track(axes: Any, track: Track, maps: Sequence[Moment]) -> None:
+    """Write the maps' letters to where the contact was; those of one place together."""
+    places: list[tuple[str, Contact]] = []
+    for letter, moment in zip(LETTERS, maps, strict=False):
+        if track.times_s[0] <= moment.time_s <= track.times_s[-1]:
+            contact = track.contacts[int(np.searchsorted(track.times_s, moment.time_s))]
+            if places and _distance_mm(places[-1][1], contact) < LETTERS_APART_MM:
+                places[-1] = (places[-1][0] + letter, places[-1][1])
+            else:
+                places.append((letter, contact))
+    for letters, contact in places:
+        axes.annotate(
+            letters,
+            (contact.x_mm, contact.y_mm),
+            (-8, -3),
+            textcoords="offset points",
+            ha="right",
+            fontsize=8,
+            color=INK,
+        )
+
+
+def _distance_mm(one: Contact, other: Contact) -> float:
+    return math.hypot(one.x_mm - other.x_mm, one.y_mm - other.y_mm)
 
 
 def _draw_rows(
@@ -273,16 +304,18 @@ def _draw_rows(
 
 
 def _draw_pressure(axes: Any, course: Course, colours: dict[str, Any]) -> None:
+    """Draw how hard is pressed, by what is known of it."""
     contacts = [contact for track in course.tracks.values() for contact in track.contacts]
-    if all(
-        contact.pressure_kpa is None and contact.pressure_range != "below" for contact in contacts
-    ):
-        _draw_quantity(axes, course, colours, "magnitude", "magnitude_sigma")
-        axes.set_ylabel("|Δσ|/σ₀")
-    else:
+    if any(c.pressure_kpa is not None or c.pressure_range == "below" for c in contacts):
         _draw_quantity(axes, course, colours, "pressure_kpa", "pressure_sigma_kpa")
         _draw_out_of_range(axes, course, colours)
         axes.set_ylabel("pressure (kPa)")
+    elif any(contact.magnitude is not None for contact in contacts):
+        _draw_quantity(axes, course, colours, "magnitude", "magnitude_sigma")
+        axes.set_ylabel("|Δσ|/σ₀")
+    else:
+        _draw_quantity(axes, course, colours, "area_mm2", "area_sigma_mm2")
+        axes.set_ylabel("area (mm²)")
     axes.set_ylim(bottom=0)
 
 
@@ -408,7 +441,10 @@ def _draw_timing(axes: Any, course: Course, _: dict[str, Any]) -> None:
         ages = f"age {np.median(known_ms):.1f} ms (99 %: {np.percentile(known_ms, 99):.1f})"
     words = f"{rate_hz:.1f} frames/s; {ages}; {sum(course.lost)} frames lost"
     axes.set_title(words, fontsize=8, loc="right", pad=2, color=INK)
-    axes.set_yscale("log")
+    if known_ms:
+        axes.set_yscale("log")
+    else:
+        axes.set_ylim(0.0, 2.0 * float(np.median(periods_ms)) if len(periods_ms) else None)
     axes.set_ylabel("ms")
     axes.legend(fontsize=7, loc="upper right", ncols=2, handlelength=1.0)
 
