@@ -251,6 +251,8 @@ class Imaging:
             self._give(*self._asked)
         if mark.is_cold:
             self._reconstructor.reset()
+        if mark.is_cut:
+            self._reconstructor.forget_shape()
         if mark.reference is not None:
             self.reference_realtime_ns = time.time_ns()
             self._reconstructor.set_reference(mark.reference)

@@ -1,5 +1,7 @@
 """A mock serial port that says again what a recorded one said: ``replay:///path.mcap?port=0``.
 
+The path may also be a folder of recordings that a daemon has cut, see `recording_set`.
+
 pyserial finds this module by its name once `tactomo` is among its `protocol_handler_packages`, so
 ``serial.serial_for_url`` opens such a URL like any device's path. Options of the URL:
 
@@ -23,7 +25,8 @@ import serial
 from serial import PortNotOpenError, SerialBase, SerialException
 
 from tactomo.errors import PortError
-from tactomo.recording import REPLAY_SCHEME, Chunk, Recording, open_recording
+from tactomo.recording import REPLAY_SCHEME, Chunk, Recording
+from tactomo.recording_set import open_replayable
 
 _WAIT_FOR_EVER_S: Final = 1e9
 
@@ -141,7 +144,7 @@ def parse_replay_url(url: str) -> tuple[Recording, int, float]:
             f"{url} is not a replay URL",
             f"use {REPLAY_SCHEME}:///absolute/path.mcap?port=0&speed=1",
         ) from error
-    recording = open_recording(unquote(parts.netloc + parts.path))
+    recording = open_replayable(unquote(parts.netloc + parts.path))
     if not 0 <= port < len(recording.origin.ports):
         raise PortError(
             f"{url}: the recording has {len(recording.origin.ports)} port(s), numbered from 0",

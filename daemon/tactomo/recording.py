@@ -101,6 +101,8 @@ class Mark:
     """Whether what came before is unknown, so that the reconstruction starts anew with it."""
     timing: Timing | None = None
     """None where an older version recorded."""
+    is_cut: bool = False
+    """Whether it began another file, so that the reconstruction forgot what shapes there were."""
 
 
 class Chunk(NamedTuple):
@@ -209,10 +211,15 @@ class Recording:
 
     def chunks(self, port: int) -> Iterator[Chunk]:
         """Yield what port `port` said; before all else its preamble, if there is one."""
+        for message in self.port_messages(port):
+            yield Chunk(message.log_time, message.data)
+
+    def port_messages(self, port: int) -> Iterator[Message]:
+        """Yield the same as messages, with the time on the wall clock, too."""
         topics = (f"port/{port}", f"port/{port}/hello")
         for topic, message in _messages(self.path):
             if topic in topics:
-                yield Chunk(message.log_time, message.data)
+                yield message
 
     def marks(self) -> list[Mark]:
         """Return the dual scans that were reconstructed, each with the reference before it."""

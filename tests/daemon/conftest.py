@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from tactomo.config import load_config
 from tactomo.daemon import Daemon
 from tactomo.log import configure_logging
-from tactomo.recording import open_recording
+from tactomo.recording_set import open_replayable
 from tactomo_client import Keys, request
 from tactomo_client.keys import secure
 from tactomo_client.messages import KINDS, Message, decode_message, topic
@@ -439,7 +439,7 @@ def replay(tmp_path: Path) -> Callable[..., Any]:
         out = tmp_path / f"replayed-{next(count)}.mcap"
         settings = {
             "name": "left",
-            "ports": open_recording(path).replay_urls(speed),
+            "ports": open_replayable(path).replay_urls(speed),
             "stream": "tcp://127.0.0.1:0",
             "control": "tcp://127.0.0.1:0",
             "tare_scans": 3,

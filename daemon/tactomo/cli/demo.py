@@ -134,9 +134,9 @@ def show_replay(
     announce: bool = False,
 ) -> None:
     """Play a recording through a daemon and show it in the viewer until Ctrl-C."""
-    from tactomo.recording import open_recording
+    from tactomo.recording_set import open_replayable
 
-    name = sensor or open_recording(recording).summary.origin.sensor or DEFAULT_NAME
+    name = sensor or open_replayable(recording).origin.sensor or DEFAULT_NAME
     with _family(verbose) as family:
         daemon = family.start(
             *("replay", "replay", str(recording), "--speed", speed, "--sensor", name),

@@ -23,7 +23,6 @@ from tactomo.cli.app import (
     KeysFolder,
     Method,
     Protocol,
-    RecordingFile,
     SensorName,
     StreamAddress,
     app,
@@ -348,10 +347,13 @@ def proxy(
         "tactomo replay grasp.mcap --viewer",
         "tactomo replay grasp.mcap --speed 0.25",
         "tactomo replay grasp.mcap --speed max --record frames.mcap",
+        "tactomo replay ~/.local/share/tactomo/recordings --speed 10",
     ),
 )
 def replay(
-    recording: RecordingFile,
+    recording: Annotated[
+        Path, typer.Argument(help="A recording (.mcap), or a folder of those a daemon has cut.")
+    ],
     speed: Annotated[
         str, typer.Option(help="Factor of the recorded speed, or max: as fast as reconstructed.")
     ] = "1.0",
@@ -385,12 +387,15 @@ def replay(
 
     The bytes come back by a mock serial port and take the same way as live ones: the maps equal
     those of the live run. Without --viewer and --stay it ends with the recording.
+
+    A folder of files that a daemon has cut is played as the one recording that it was, from the
+    oldest to the newest; pauses between them are shortened to a second.
     """
-    from tactomo.recording import open_recording
+    from tactomo.recording_set import RecordingSet, open_replayable
 
     factor = _speed(speed)
-    opened = open_recording(recording)
-    origin = opened.summary.origin
+    opened = open_replayable(recording)
+    origin = opened.origin
     if with_viewer:
         if record is not None:
             raise typer.BadParameter("--record goes without --viewer")
@@ -415,7 +420,8 @@ def replay(
         record=record,
         record_maps=record is not None or None,
     )
-    warn_of_damage(opened)
+    for part in opened.parts if isinstance(opened, RecordingSet) else [opened]:
+        warn_of_damage(part)
     raise typer.Exit(_run_daemon(settings))
 
 
