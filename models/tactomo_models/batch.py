@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 from tactomo_models.archive import read_arrays
 from tactomo_models.description import SensorDescription
 from tactomo_models.errors import DataError
+from tactomo_models.pressure import PressureCurve
 from tactomo_models.reconstruct import Reconstruction, Reconstructor
 from tactomo_models.reference import Reference, noise_of_reciprocity
 from tactomo_models.tier import METHODS, Tier
@@ -30,6 +31,7 @@ def reconstruct_file(
     *,
     description: SensorDescription,
     method: str = Tier.AUTO,
+    curve: PressureCurve | None = None,
     progress: Progress | None = None,
 ) -> int:
     """Reconstruct every frame of `source` into `target`; returns how many there were.
@@ -41,6 +43,7 @@ def reconstruct_file(
         target: .npz that is written; see DESIGN 6.4 or `tactomo reconstruct --help`.
         description: the sensor.
         method: one of `METHODS`.
+        curve: of a pressure calibration; the description's if None.
         progress: called with frames done and frames in all.
 
     Raises:
@@ -54,7 +57,9 @@ def reconstruct_file(
     frames: list[Reconstruction] = []
     seconds = np.zeros(total)
     with threadpool_limits(1):  # as the daemon runs, so that `seconds` are what a robot would see
-        reconstructor = Reconstructor(description, tier=Tier(method), budget_s=BUDGET_S)
+        reconstructor = Reconstructor(
+            description, tier=Tier(method), budget_s=BUDGET_S, curve=curve
+        )
         reconstructor.set_reference(reference)
         for index in range(total):
             magnitude, structure = (_scan(scans, n, index) for n in ("magnitude", "structure"))
@@ -198,4 +203,9 @@ def frame_arrays(
         "contact_x_sigma_mm": column([c.x_sigma_m * 1e3 for _, c in contacts]),
         "contact_y_sigma_mm": column([c.y_sigma_m * 1e3 for _, c in contacts]),
         "contact_area_sigma_mm2": column([c.area_sigma_m2 * 1e6 for _, c in contacts]),
+        "contact_pressure_kpa": column([c.pressure_kpa for _, c in contacts]),
+        "contact_pressure_sigma_kpa": column([c.pressure_sigma_kpa for _, c in contacts]),
+        "contact_pressure_range": np.array([str(c.pressure_range) for _, c in contacts], "U7"),
+        "contact_force_n": column([c.force_n for _, c in contacts]),
+        "contact_force_sigma_n": column([c.force_sigma_n for _, c in contacts]),
     }

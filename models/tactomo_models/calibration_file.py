@@ -223,6 +223,22 @@ def load_calibration(
     return found
 
 
+def calibration_of(description: SensorDescription, path: Path) -> PressureCalibration:
+    """Read a calibration of such a sensor, whatever its name.
+
+    Raises:
+        CalibrationError: there is none, or it is of another description; see `read_calibration`.
+    """
+    try:
+        found = read_calibration(path)
+    except FileNotFoundError as error:
+        raise CalibrationError(f"there is no calibration {path}; give another path") from error
+    mismatch = found.subject.mismatch(found.subject.sensor, description)
+    if mismatch:
+        raise CalibrationError(f"{path} {mismatch}; give the one of this sensor")
+    return found
+
+
 def calibration_for(
     sensor: str, description: SensorDescription, source: str, warn: Callable[[str], None]
 ) -> PressureCalibration | None:

@@ -7,8 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from tactomo.cli import app
 from tactomo_models import METHODS, Flag, Press, SkinSimulator, load_description
+from tactomo_models.calibration import Reading
+from tactomo_models.calibration_file import PressureCalibration, Subject, save_calibration
 from typer.testing import CliRunner
 
 Run = Callable[..., Any]
@@ -29,6 +32,36 @@ def test_a_press_is_found_in_a_file(tactomo: Run, tmp_path: Path) -> None:
         assert maps["contact_frame"].tolist() == [1]
         assert abs(maps["contact_x_mm"][0] + 30.0) < 3.0
         assert abs(maps["contact_y_mm"][0] - 30.0) < 3.0
+        assert maps["contact_pressure_range"].tolist() == ["within"]
+        assert maps["contact_pressure_kpa"][0] == pytest.approx(180, abs=10)
+        assert 0 < maps["contact_pressure_sigma_kpa"][0] < 10
+        force_n = 1e-3 * maps["contact_pressure_kpa"] * maps["contact_area_mm2"]
+        np.testing.assert_allclose(maps["contact_force_n"], force_n)
+        assert np.isfinite(maps["contact_force_sigma_n"]).all()
+
+
+def test_a_calibration_says_how_hard_is_pressed(tactomo: Run, tmp_path: Path) -> None:
+    sensor = load_description("paper_square")
+    skin = SkinSimulator(sensor)
+    empty = skin.voltages([])
+    pressed = skin.voltages([Press(x_m=-0.03, y_m=0.03, pressure_kpa=180.0)])
+    references = {f"{name}_reference": volts for name, volts in empty.items()}
+    scans = {str(name): volts[None] for name, volts in pressed.items()}
+    np.savez(tmp_path / "in.npz", **scans, **references)  # type: ignore[arg-type]
+    readings = [
+        Reading(pressure_kpa=kpa, magnitude=max(0.0, (kpa - 50) * 2e-3))
+        for kpa in (20.0, 60.0, 80.0, 100.0, 130.0, 160.0)
+    ]
+    subject = Subject(sensor="left", description=sensor.name, sha256=sensor.sha256)
+    made = PressureCalibration.of_readings(subject, readings)
+    save_calibration(made, tmp_path / "left.pressure.json")
+    options = ("--calibration", "left.pressure.json")
+    assert tactomo("reconstruct", "in.npz", "out.npz", *options).returncode == 0
+    with np.load(tmp_path / "out.npz") as maps:  # 180 kPa change it by 0.177
+        assert maps["contact_pressure_kpa"][0] == pytest.approx(50 + 0.177 / 2e-3, abs=5)
+    refused = tactomo("reconstruct", "in.npz", "out.npz", *options, "-d", "skin_round")
+    assert refused.returncode == 1
+    assert "is of a sensor as paper_square describes it" in refused.stderr
 
 
 def test_every_method_can_be_asked_for(tmp_path: Path) -> None:

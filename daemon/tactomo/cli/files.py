@@ -293,6 +293,10 @@ def reconstruct(
         Method, typer.Option(help="One for every frame, or auto: what each frame needs.")
     ] = "auto",
     sensor: DescriptionOption = DEFAULT_DESCRIPTION,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(help="Of pressure, by `tactomo calibrate`. [the description's response]"),
+    ] = None,
 ) -> None:
     """Reconstruct a file of scans, without a daemon.
 
@@ -302,9 +306,11 @@ def reconstruct(
     correlation with the truth that the network expects, where one was asked), `flags` and
     `seconds` (T,); and the contacts as flat arrays `contact_frame`, `contact_x_mm`, `contact_y_mm`,
     `contact_area_mm2`, `contact_magnitude`, `contact_sigma` (of the magnitude), and the standard
-    uncertainties `contact_x_sigma_mm`, `contact_y_sigma_mm`, `contact_area_sigma_mm2`. Where the
-    sensor's objects conduct `either_way`, such as metal and plastic in a tank, `structure` is -1 in
-    those that conduct worse.
+    uncertainties `contact_x_sigma_mm`, `contact_y_sigma_mm`, `contact_area_sigma_mm2`; and how hard
+    is pressed, `contact_pressure_kpa`, `contact_force_n`, their uncertainties
+    `contact_pressure_sigma_kpa`, `contact_force_sigma_n`, and `contact_pressure_range` (*within*,
+    *below*, *above* or *unknown*). Where the sensor's objects conduct `either_way`, such as metal
+    and plastic in a tank, `structure` is -1 in those that conduct worse.
 
     Frames follow one another, as in a stream: each one starts from what the last one found. Give
     scenes that have nothing to do with each other in files of their own.
@@ -328,8 +334,10 @@ def reconstruct(
     from rich.progress import Progress
     from tactomo_models import load_description
     from tactomo_models.batch import reconstruct_file
+    from tactomo_models.calibration_file import calibration_of
 
     description = load_description(sensor)
+    curve = None if calibration is None else calibration_of(description, calibration).curve
     with Progress(transient=True) as progress:
         task = progress.add_task("reconstructing", total=None)
 
@@ -337,6 +345,6 @@ def reconstruct(
             progress.update(task, completed=done, total=total)
 
         frames = reconstruct_file(
-            scans, maps, description=description, method=method, progress=show
+            scans, maps, description=description, method=method, progress=show, curve=curve
         )
     typer.echo(f"wrote {maps}: {frames} frames")
