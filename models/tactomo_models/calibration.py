@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Annotated, Final, Literal, NamedTuple
 
 import numpy as np
@@ -39,7 +38,7 @@ APART: Final = 0.02  # of the range: pressures closer than this are the same one
 ENOUGH_READINGS: Final = 10
 ENOUGH_PRESSURES: Final = 6
 MOST_PIECES: Final = 6
-ONSETS: Final = 12  # that are tried
+ONSETS: Final = 20  # that are tried
 RESAMPLED: Final = 100
 FINER: Final = 4  # points to a piece of the curve, where its uncertainty is kept
 EXPLAINED: Final = 0.5  # of the magnitudes' variance, that a rise must explain
@@ -120,18 +119,19 @@ class _Rise(NamedTuple):
 
 
 def directions_of(pressures_kpa: Sequence[float]) -> list[Direction]:
-    """Whether the load rose or fell to each of the pressures, in the order of their taking.
+    """Whether the load rose or fell to each of the pressures, in the order of their taking."""
+    taken = np.array(pressures_kpa, np.float64)
+    return [direction_at(taken, i) for i in range(len(taken))]
 
-    Steps of less than a fiftieth of the largest pressure go on as before.
+
+def direction_at(pressures_kpa: FloatArray, index: int) -> Direction:
+    """Whether the load rose or fell to one of the pressures (n,), in the order of their taking.
+
+    It goes by the last one before that differs by more than a fiftieth of the largest.
     """
-    least = APART * max(pressures_kpa, default=0.0)
-    directions: list[Direction] = ["up"] * len(pressures_kpa)
-    for i, (before, now) in enumerate(pairwise(pressures_kpa), start=1):
-        if now - before > least:
-            directions[i] = "up"
-        else:
-            directions[i] = "down" if before - now > least else directions[i - 1]
-    return directions
+    step = pressures_kpa[index] - pressures_kpa[:index]
+    clear = step[np.abs(step) > APART * pressures_kpa.max(initial=0.0)]
+    return "up" if not len(clear) or clear[-1] > 0 else "down"
 
 
 def fit_curve(readings: Sequence[Reading], *, seed: int = 0) -> Fit:

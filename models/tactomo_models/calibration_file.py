@@ -65,6 +65,27 @@ class Subject(BaseModel):
         return f"was made with {', '.join(self.device_ids)}, and {', '.join(others)} is connected"
 
 
+def subject_of(
+    sensor: str, description: SensorDescription, device_ids: Sequence[str] = ()
+) -> Subject:
+    """What a calibration of such a sensor is of.
+
+    Raises:
+        CalibrationError: it has no pressure that could be calibrated.
+    """
+    if description.magnitude is None:
+        raise CalibrationError(
+            f"{description.name} has no magnitude channel; its structure channel tells where it is "
+            "touched, and never how hard"
+        )
+    return Subject(
+        sensor=sensor,
+        description=description.name,
+        sha256=description.sha256,
+        device_ids=tuple(device_ids),
+    )
+
+
 class PressureCalibration(BaseModel):
     """What was found for one sensor, and from what.
 

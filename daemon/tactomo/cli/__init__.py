@@ -12,6 +12,7 @@ import traceback
 from tactomo.cli import (
     bench,
     bench_solves,
+    calibrate,
     demo,
     doctor,
     evaluate,
@@ -44,6 +45,7 @@ __all__ = ["app", "main"]
 COMMANDS = (
     bench,
     bench_solves,
+    calibrate,
     demo,
     doctor,
     evaluate,

@@ -25,7 +25,7 @@ SERVICE = "On a robot"
 
 ORDER = (
     *("demo", "daemon", "ports", "proxy", "twin", "viewer", "foxglove"),
-    *("status", "doctor", "watch", "tare", "record", "tier", "poke", "keys"),
+    *("status", "doctor", "watch", "tare", "calibrate", "record", "tier", "poke", "keys"),
     *("info", "import", "replay", "recover", "reconstruct", "plot", "export"),
     "service",
     *("models", "bench", "bench-solves", "evaluate"),

@@ -1,0 +1,213 @@
+"""`calibrate`: from files, and guided at a terminal; what it keeps is what it then shows."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tactomo_client import Contact
+from tactomo_client.fake import FakeSensor
+from tactomo_models import SkinSimulator, load_description
+from tactomo_models.calibration_file import calibration_path, read_calibration
+from tactomo_models.scene import Press
+from terminal import Terminal
+
+Run = Callable[..., Any]
+
+SENSOR = load_description("paper_square")
+STATUS = {
+    "state": "running",
+    "description": {
+        "model": SENSOR.name,
+        "sha256": SENSOR.sha256,
+        "modalities": ["magnitude", "structure"],
+        "magnitude_response": {"pressure_kpa": [0, 130, 300], "relative_change": [0, 0, 0.45]},
+    },
+    "ports": [{"device": {"device_id": "skin-7f3a"}}],
+}
+ROWS = [(kpa, max(0.0, (kpa - 120) * 2e-3)) for kpa in (90, 130, 160, 190, 220, 200, 170, 140)]
+CSV = "pressure_kpa,magnitude\n" + "".join(f"{kpa},{m:.4f}\n" for kpa, m in ROWS)
+
+
+@pytest.fixture(autouse=True)
+def _own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
+
+
+def test_a_table_of_magnitudes_is_fitted_kept_and_shown(tactomo: Run, tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text(CSV)
+    tried = tactomo("calibrate", "palm", "--readings", "log.csv", "--dry-run")
+    assert tried.returncode == 0, tried.stderr
+    assert not calibration_path("palm").exists()
+    assert "kept in" not in tried.stdout
+    options = ("--picture", "curve.png", "--device-id", "skin-7f3a")
+    made = tactomo("calibrate", "palm", "--readings", "log.csv", *options)
+    assert made.returncode == 0, made.stderr
+    assert "palm: 8 readings of" in made.stdout
+    assert "kPa contacts are `below` (touched, pressure unknown)" in made.stdout
+    assert "beyond 220 kPa they are `above`" in made.stdout
+    assert f"kept in {calibration_path('palm')}" in made.stdout
+    assert (tmp_path / "curve.png").stat().st_size > 10_000
+    kept = read_calibration(calibration_path("palm"))
+    assert kept.subject.device_ids == ("skin-7f3a",)
+    assert kept.curve.range_kpa == pytest.approx((120, 220), abs=4)
+    assert kept.curve.pressure(np.array(0.12)) == pytest.approx(180, abs=1)
+    shown = tactomo("calibrate", "palm", "--show")
+    assert shown.stdout.splitlines()[:12] == made.stdout.splitlines()[:12]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--readings", "absent.csv"), "cannot read absent.csv"),
+        (("--readings", "few.csv"), "answers to 2 of 2 readings"),
+        (("--readings", "force.csv"), "give --diameter-mm or --area-mm2"),
+        (("--readings", "times.csv"), "give the recording of that time by --recording"),
+        (("--readings", "log.csv", "-d", "tank_disc"), "has no magnitude channel"),
+        (("--readings", "log.csv", "--recording", "a.mcap"), "no column time_s or realtime_s"),
+        (("--readings", "times.csv", "--recording", "a.mcap"), "a.mcap"),
+        (("--show",), "run: tactomo calibrate palm --live"),
+        (("--live", "--stream", "ipc:///nowhere/at/all"), "no daemon answers"),
+    ],
+)
+def test_what_cannot_be_used_is_told(
+    tactomo: Run, tmp_path: Path, options: tuple[str, ...], said: str
+) -> None:
+    (tmp_path / "log.csv").write_text(CSV)
+    (tmp_path / "few.csv").write_text("pressure_kpa,magnitude\n150,0.1\n200,0.2\n")
+    (tmp_path / "force.csv").write_text("force_n,magnitude\n100,0.1\n")
+    (tmp_path / "times.csv").write_text("time_s,pressure_kpa\n1,100\n")
+    result = tactomo("calibrate", "palm", *options)
+    assert result.returncode == 1
+    assert said in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        (),
+        ("--live", "--show"),
+        ("--recording", "a.mcap", "--live"),
+        ("--readings", "a", "--diameter-mm", "3", "--area-mm2", "3"),
+    ],
+)
+def test_options_that_do_not_go_together(tactomo: Run, options: tuple[str, ...]) -> None:
+    assert tactomo("calibrate", "palm", *options).returncode == 2
+
+
+def test_a_recording_tells_what_the_sensor_showed(tactomo: Run, tmp_path: Path) -> None:
+    """Six presses of one second each, ten scans a second, and what a load cell said at each."""
+    skin = SkinSimulator(SENSOR, unevenness=0.03, seed=4)
+    rng = np.random.default_rng(2)
+    levels = (0.0, 120.0, 150.0, 170.0, 190.0, 210.0, 180.0)
+    volts = [skin.voltages([Press(0.01, 0.0, kpa)] if kpa else []) for kpa in levels]
+    scans: dict[str, Any] = {}
+    for name, rest in volts[0].items():
+        noise = (
+            1e-3 * np.sqrt(np.mean(rest**2)) * rng.standard_normal((10 * len(levels), len(rest)))
+        )
+        scans[name] = np.repeat([each[name] for each in volts], 10, axis=0) + noise
+        scans[f"{name}_reference"] = rest
+    np.savez(tmp_path / "presses.npz", **scans)
+    imported = tactomo(
+        *("import", "presses.npz", "presses.mcap", "--rate", "10", "--name", "palm"),
+        *("--reference-frames", "0:10"),
+    )
+    assert imported.returncode == 0, imported.stderr
+    area_mm2 = np.pi / 4 * 30**2
+    rows = [f"{i + 0.5},{1e-3 * kpa * area_mm2:.3f}\n" for i, kpa in enumerate(levels)]
+    (tmp_path / "log.csv").write_text("time_s,force_n\n" + "".join(rows))
+    options = ("--recording", "presses.mcap", "--diameter-mm", "30")
+    made = tactomo("calibrate", "palm", "--readings", "log.csv", *options)
+    assert made.returncode == 0, made.stderr
+    kept = read_calibration(calibration_path("palm"))
+    assert len(kept.readings) == 6
+    assert kept.subject.device_ids
+    for reading in kept.readings:
+        shown = float(np.interp(reading.pressure_kpa, [130, 140, 200, 300], [0, 0.03, 0.25, 0.45]))
+        assert reading.magnitude == pytest.approx(shown, abs=0.02)
+    other = tactomo("calibrate", "sole", "--readings", "log.csv", *options)
+    assert "is a recording of palm, not of sole" in other.stderr
+
+
+class Pressed(FakeSensor):
+    """A stream of one contact of a magnitude that a test sets, twenty times a second."""
+
+    def __init__(self) -> None:
+        super().__init__("palm")
+        self.magnitude = 0.0
+        self.contacts = 1
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stop.wait(0.05):
+            contact = Contact(1, 3.0, -2.0, 700.0, self.magnitude, 0.003, None)
+            self.publish([contact] * self.contacts)
+            self.publish_message("status", STATUS)
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+@pytest.fixture
+def pressed() -> Iterator[Pressed]:
+    with Pressed() as sensor:
+        yield sensor
+        sensor.stop()
+
+
+def take(terminal: Terminal, pressed: Pressed, number: int, kpa: float, magnitude: float) -> None:
+    terminal.wait_for(f"Reading {number}, going")
+    pressed.magnitude = magnitude
+    terminal.enter("")
+    terminal.wait_for("still: |Δσ|/σ₀")
+    terminal.wait_for("Load cell in N")
+    terminal.enter(f"{kpa:g}")  # on an indenter of 1000 mm²
+    terminal.wait_for("kPa, taken")
+
+
+def test_a_session_keeps_what_was_taken_and_goes_on(pressed: Pressed) -> None:
+    command = ("calibrate", "palm", "--live", "--stream", pressed.address, "--area-mm2", "1000")
+    log = calibration_path("palm").with_name("palm.readings.csv")
+    with Terminal(*command) as terminal:
+        take(terminal, pressed, 1, *ROWS[0])
+        terminal.wait_for("Still wanted: 10 more")
+        take(terminal, pressed, 2, 400, 0.4)
+        terminal.wait_for("Reading 3")
+        terminal.enter("undo")
+        terminal.wait_for("dropped the reading at 400 kPa")
+        pressed.contacts = 2
+        terminal.enter("")
+        terminal.wait_for("2 contacts: press one place only")
+        terminal.press_ctrl_c()
+        terminal.wait_for("1 readings are kept in")
+        assert terminal.wait() == 1  # nothing that could be a curve
+        assert "the magnitude channel does not answer to any" in terminal.shown
+    assert len(log.read_text().splitlines()) == 2
+    assert not calibration_path("palm").exists()
+    pressed.contacts = 1
+    with Terminal(*command) as terminal:
+        terminal.wait_for("Going on with 1 readings")
+        for number, row in enumerate(ROWS[1:], start=2):
+            take(terminal, pressed, number, *row)
+        terminal.wait_for("curve: ±")
+        terminal.press_ctrl_c()
+        assert terminal.wait() == 0, terminal.shown
+    kept = read_calibration(calibration_path("palm"))
+    assert [(r.pressure_kpa, r.magnitude) for r in kept.readings] == pytest.approx(ROWS)
+    assert [r.direction for r in kept.readings] == ["up"] * 5 + ["down"] * 3
+    assert kept.subject.device_ids == ("skin-7f3a",)
+    with Terminal(*command, "--fresh") as terminal:
+        terminal.wait_for("Reading 1, going")
+        terminal.enter("done")
+        assert terminal.wait() == 1
+    assert log.with_suffix(".csv.old").exists()

@@ -1,0 +1,136 @@
+"""A skin that answers otherwise than its description says: calibrated, its pressures are right.
+
+The twin's sheet needs a fifth more pressure for the same change. The load cell is the truth; the
+session is at a terminal, the daemon reads the twin's serial ports, contacts come by the stream.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib import resources
+from pathlib import Path
+
+import pytest
+from daemon_process import DaemonProcess
+from tactomo_client import Contact, request, subscribe
+from terminal import Terminal
+from whole_system import ANYWHERE, PATIENCE_S, wait_for
+
+NAME = "palm"
+STIFFER = 1.2
+DIAMETER_MM = 30.0
+AREA_MM2 = math.pi / 4 * DIAMETER_MM**2
+LEVELS_KPA = (110, 165, 190, 220, 250, 235, 205, 175)
+HELD_OUT_KPA = (180, 200, 230)
+
+
+@pytest.fixture
+def twin(tmp_path: Path) -> Iterator[dict[str, list[str]]]:
+    """A twin whose response table lies at higher pressures than the description's."""
+    text = resources.files("tactomo_models.sensors").joinpath("paper_square.toml").read_text()
+    table = re.search(r"\[magnitude.response\]\npressure_kpa *= \[(.*?)\]", text)
+    assert table
+    higher = ", ".join(str(STIFFER * float(kpa)) for kpa in table[1].split(","))
+    sensor = tmp_path / "stiffer.toml"
+    sensor.write_text(text.replace(table[1], higher, 1))
+    command = [
+        *(sys.executable, "-m", "tactomo.cli", "twin", "--announce", "--control", ANYWHERE),
+        *("--description", str(sensor), "--link", str(tmp_path / "ports")),
+    ]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            yield json.loads(next(line for line in process.stdout if line.startswith("{")))
+        finally:
+            process.terminate()
+            process.wait(PATIENCE_S)
+
+
+class Bench:
+    """The skin under a press of known force, and a daemon that looks at it."""
+
+    def __init__(self, twin: dict[str, list[str]], folder: Path) -> None:
+        self._control = str(twin["control"])
+        self.daemon = DaemonProcess(folder, twin["ports"], name=NAME)
+        wait_for(lambda: self.daemon.status()["state"] == "running", "a reference")
+
+    def press(self, kpa: float) -> float:
+        """Press, and return what the load cell says, N."""
+        request("press", self._control, x_mm=5.0, y_mm=-8.0, radius_mm=15, pressure_kpa=kpa)
+        return kpa * 1e-3 * AREA_MM2
+
+    def clear(self) -> None:
+        request("clear", self._control)
+
+    def contact(self, kpa: float) -> Contact:
+        """What the daemon says of a press that it has had time to look at."""
+        self.press(kpa)
+        with subscribe(NAME, address=self.daemon.stream) as frames:
+            seen = 0
+            for frame in frames:
+                seen += len(frame.contacts) == 1
+                if seen > 12:
+                    return frame.contacts[0]
+        raise AssertionError
+
+    def close(self) -> None:
+        self.clear()
+        self.daemon.popen.send_signal(signal.SIGINT)
+        self.daemon.popen.wait(PATIENCE_S)
+
+
+def test_a_guided_session_makes_pressures_right(
+    twin: dict[str, list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    before = Bench(twin, tmp_path)
+    wrong = before.contact(200)
+    assert wrong.pressure_kpa == pytest.approx(200 / STIFFER, abs=6), "the description's table"
+    before.clear()
+    picture = tmp_path / "curve.png"
+    options = ("--live", "--stream", before.daemon.stream, "--picture", str(picture))
+    with Terminal("calibrate", NAME, *options) as terminal:
+        terminal.wait_for("Diameter of the indenter in mm")
+        terminal.enter(str(DIAMETER_MM))
+        for number, kpa in enumerate(LEVELS_KPA, start=1):
+            terminal.wait_for(f"Reading {number}, going")
+            force_n = before.press(kpa)
+            terminal.enter("")
+            terminal.wait_for("still: |Δσ|/σ₀")
+            terminal.wait_for("Load cell in N")
+            terminal.enter(f"{force_n:.2f}")
+            terminal.wait_for(f"{kpa} kPa, taken")
+        said = terminal.wait_for("Reading 9")
+        assert "Still wanted: 3 more" in said
+        terminal.enter("done")
+        assert terminal.wait() == 0, terminal.shown
+    assert f"palm: {len(LEVELS_KPA)} readings" in terminal.shown
+    assert picture.stat().st_size > 10_000
+    before.close()
+
+    after = Bench(twin, tmp_path)
+    calibration = after.daemon.status()["description"]["calibration"]
+    assert calibration["readings"] == len(LEVELS_KPA)
+    assert calibration["device_ids"]
+    errors = []
+    for kpa in HELD_OUT_KPA:
+        found = after.contact(kpa)
+        assert found.pressure_range == "within"
+        assert found.pressure_kpa is not None
+        assert found.pressure_sigma_kpa is not None
+        assert found.pressure_sigma_kpa < 15
+        errors.append((found.pressure_kpa - kpa) / found.pressure_sigma_kpa)
+        assert found.force_n == pytest.approx(kpa * 1e-3 * AREA_MM2, rel=0.12)
+    assert max(map(abs, errors)) < 2.5, errors
+    light = after.contact(100)
+    assert (light.pressure_range, light.pressure_kpa) == ("below", None)
+    hard = after.contact(300)
+    assert hard.pressure_range == "above"
+    assert hard.pressure_kpa == pytest.approx(250, abs=0.1)
+    after.close()
