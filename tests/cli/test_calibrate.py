@@ -25,9 +25,12 @@ STATUS = {
         "model": SENSOR.name,
         "sha256": SENSOR.sha256,
         "modalities": ["magnitude", "structure"],
-        "magnitude_response": {"pressure_kpa": [0, 130, 300], "relative_change": [0, 0, 0.45]},
+        "magnitude_response": {
+            "pressure_kpa": [0.0, 130.0, 300.0],
+            "relative_change": [0.0, 0.0, 0.45],
+        },
     },
-    "ports": [{"device": {"device_id": "skin-7f3a"}}],
+    "ports": [{"url": "/dev/ttySKIN", "device": {"device_id": "skin-7f3a"}}],
 }
 ROWS = [(kpa, max(0.0, (kpa - 120) * 2e-3)) for kpa in (90, 130, 160, 190, 220, 200, 170, 140)]
 CSV = "pressure_kpa,magnitude\n" + "".join(f"{kpa},{m:.4f}\n" for kpa, m in ROWS)
@@ -203,7 +206,8 @@ def test_a_session_keeps_what_was_taken_and_goes_on(pressed: Pressed) -> None:
         terminal.press_ctrl_c()
         assert terminal.wait() == 0, terminal.shown
     kept = read_calibration(calibration_path("palm"))
-    assert [(r.pressure_kpa, r.magnitude) for r in kept.readings] == pytest.approx(ROWS)
+    taken = [(r.pressure_kpa, r.magnitude) for r in kept.readings]
+    np.testing.assert_allclose(taken, ROWS, rtol=1e-6)
     assert [r.direction for r in kept.readings] == ["up"] * 5 + ["down"] * 3
     assert kept.subject.device_ids == ("skin-7f3a",)
     with Terminal(*command, "--fresh") as terminal:

@@ -32,6 +32,24 @@ class MagnitudeResponse:
 
 
 @dataclass(frozen=True, slots=True)
+class Calibration:
+    """A pressure calibration: what it rests on, and how good it is."""
+
+    taken: str = ""
+    """ISO 8601, UTC."""
+    readings: int = 0
+    range_kpa: tuple[float, ...] = ()
+    """Between which two pressures it answers."""
+    sigma_kpa: float | None = None
+    """Its own standard uncertainty: median over the range."""
+    onset_kpa: float | None = None
+    """From where the channel answers; None where its lightest reading did already."""
+    hysteresis_kpa: float | None = None
+    """By how much falling loads read higher; None where that was not measured."""
+    device_ids: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class SensorDescription:
     """The sensor: its sheet, its electrodes and what it answers to."""
 
@@ -53,6 +71,8 @@ class SensorDescription:
     """The top of a sensible colour scale for `Frame.map`."""
     pressure_max_kpa: float | None = None
     magnitude_response: MagnitudeResponse | None = None
+    calibration: Calibration | None = None
+    """Of pressure, in force; None where pressures go by the description."""
 
 
 @dataclass(frozen=True, slots=True)

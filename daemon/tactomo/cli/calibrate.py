@@ -249,18 +249,20 @@ def _with_recording(
 ) -> tuple[Subject, Joined]:
     from dataclasses import replace
 
+    from tactomo_client.recording import open_recording
     from tactomo_models import CalibrationError
     from tactomo_models.calibration_file import subject_of
     from tactomo_models.load_cell import joined_readings
 
     from tactomo.cli.recorded import recorded_frames
 
+    recorded = open_recording(path).sensor
+    if recorded and recorded != sensor:
+        raise CalibrationError(
+            f"{path} is a recording of {recorded}, not of {sensor}; run: tactomo calibrate "
+            f"{recorded}"
+        )
     with recorded_frames(path, description) as frames:
-        if frames.sensor and frames.sensor != sensor:
-            raise CalibrationError(
-                f"{path} is a recording of {frames.sensor}, not of {sensor}; run: tactomo "
-                f"calibrate {frames.sensor}"
-            )
         if frames.description is None:
             raise CalibrationError(
                 f"the sensor description that {path} was recorded with is not on this computer; "

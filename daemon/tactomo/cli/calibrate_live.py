@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 from tactomo.cli.calibrate import distrusted
 from tactomo.cli.calibrate_picture import curve_text
@@ -23,17 +23,17 @@ from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from tactomo_client import Frame
+    from tactomo_client import Frame, Status
     from tactomo_models.calibration import Fit, Reading
     from tactomo_models.calibration_file import PressureCalibration, Subject
 
-STATUS_WAIT_S: Final = 5.0
+STATUS_WAIT_S: Final = 3.0
 STILL_S: Final = 1.0
 """For how long a press is to be held still, and is averaged."""
 LEAST_FRAMES: Final = 5
 STILL_MM: Final = 1.0
-STILL_SHARE: Final = 0.05
-"""Of the magnitude, by which it may vary meanwhile; or twice its uncertainty."""
+STILL_SHARE: Final = 0.03
+"""Of the magnitude, by which it may change from the first half to the second."""
 SHARES: Final = (-0.3, -0.05, 0.1, 0.25, 0.4, 0.6, 0.8, 1.0)
 """Of the way from the onset to the top, that are suggested going up; and down again."""
 COLUMNS: Final = (
@@ -79,11 +79,10 @@ def guided(
         CalibrationError: what was taken makes no curve yet.
     """
     from rich.console import Console
-    from tactomo_client.keys import as_keys
     from tactomo_models.calibration_file import PressureCalibration
 
     console = Console(highlight=False, soft_wrap=True)
-    view = View(sensor, stream, as_keys(keys))
+    view = View(sensor, stream, keys)
     try:
         status = _first_status(view)
         session = _Session(view, console, status, area_mm2, _log_path(path), fresh=fresh)
@@ -99,17 +98,17 @@ def _log_path(path: Path) -> Path:
     return path.with_name(path.name.removesuffix(SUFFIX) + ".readings.csv")
 
 
-def _first_status(view: View) -> dict[str, Any]:
+def _first_status(view: View) -> Status:
     """What the daemon says of itself, once it is certain that it can be asked to measure."""
     end_s = time.monotonic() + STATUS_WAIT_S
-    while not view.status and time.monotonic() < end_s:
+    while view.status is None and time.monotonic() < end_s:
         view.update(0.1)
-    if not view.status:
+    if view.status is None or view.status.description is None:
         raise TactomoError(
             f"no daemon answers at {view.stream} for a sensor {view.sensor!r}",
             "start it, or give --stream; `tactomo daemon --help`",
         )
-    if "magnitude" not in view.status["description"]["modalities"]:
+    if "magnitude" not in view.status.description.modalities:
         raise TactomoError(
             f"{view.sensor} has no magnitude channel",
             "its structure channel tells where it is touched, and never how hard",
@@ -117,23 +116,26 @@ def _first_status(view: View) -> dict[str, Any]:
     return view.status
 
 
-def _subject(sensor: str, status: dict[str, Any]) -> Subject:
+def _subject(sensor: str, status: Status) -> Subject:
     from tactomo_models.calibration_file import Subject
 
-    description = status["description"]
-    devices = {port["device"]["device_id"] for port in status["ports"] if port["device"]}
+    description = status.description
+    assert description is not None
+    devices = {port.device.device_id for port in status.ports if port.device is not None}
     return Subject(
         sensor=sensor,
-        description=description["model"],
-        sha256=description["sha256"],
+        description=description.model,
+        sha256=description.sha256,
         device_ids=tuple(sorted(devices)),
     )
 
 
-def suggestions_kpa(status: dict[str, Any]) -> list[float]:
+def suggestions_kpa(status: Status) -> list[float]:
     """Pressures to take, up and down again, by the response that the daemon has now."""
-    response = status["description"]["magnitude_response"]
-    kpa, change = response["pressure_kpa"], [abs(c) for c in response["relative_change"]]
+    assert status.description is not None
+    response = status.description.magnitude_response
+    assert response is not None
+    kpa, change = response.pressure_kpa, response.relative_change
     onset = max((p for p, c in zip(kpa, change, strict=True) if c == 0), default=kpa[0])
     up = [onset + share * (kpa[-1] - onset) for share in SHARES]
     up = [max(p, 0.05 * kpa[-1]) for p in up]
@@ -147,7 +149,7 @@ class _Session:
         self,
         view: View,
         console: Console,
-        status: dict[str, Any],
+        status: Status,
         area_mm2: float | None,
         log: Path,
         *,
@@ -329,19 +331,16 @@ def _are_still(frames: Sequence[Frame]) -> bool:
         return False
     if any(len(f.contacts) != 1 or f.contacts[0].magnitude is None for f in frames):
         return False
-    contacts = [f.contacts[0] for f in frames]
-    magnitudes = [c.magnitude or 0.0 for c in contacts]
-    allowed = max(STILL_SHARE * max(magnitudes), 2 * (contacts[-1].magnitude_sigma or 0.0))
-    moved_mm = math.hypot(_spread([c.x_mm for c in contacts]), _spread([c.y_mm for c in contacts]))
-    return _spread(magnitudes) <= allowed and moved_mm <= STILL_MM
+    # The means of both halves: single frames are as noisy as they are.
+    half = len(frames) // 2
+    before, after = _mean_of(list(frames)[:half]), _mean_of(list(frames)[half:])
+    allowed = max(STILL_SHARE * after.magnitude, after.magnitude_sigma)
+    moved_mm = math.hypot(after.x_mm - before.x_mm, after.y_mm - before.y_mm)
+    return abs(after.magnitude - before.magnitude) <= allowed and moved_mm <= STILL_MM
 
 
 def _span_s(frames: Sequence[Frame]) -> float:
     return (frames[-1].acquired_monotonic_ns - frames[0].acquired_monotonic_ns) * 1e-9
-
-
-def _spread(values: Sequence[float]) -> float:
-    return max(values) - min(values)
 
 
 def _mean_of(frames: Sequence[Frame]) -> Held:
