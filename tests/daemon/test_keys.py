@@ -108,6 +108,55 @@ def test_an_allowed_client_commands_and_reads_frames(guarded: Any, robot: Robot)
     pytest.fail("no frame came")
 
 
+def test_an_allowed_client_does_so_in_an_event_loop(guarded: Any, robot: Robot) -> None:
+    guarded.tare()
+    folder = robot.folder.parent / "clients" / "desk"
+
+    async def look() -> None:
+        stream, control = guarded.daemon.stream_address, guarded.daemon.control_address
+        async with (
+            aio.subscribe(SERVER, address=stream, keys=folder) as skin,
+            aio.Daemon(control, keys=folder, timeout_s=PATIENCE_S) as daemon,
+            asyncio.timeout(PATIENCE_S),
+        ):
+            assert (await daemon.status()).session == guarded.daemon.session
+            while (frame := await skin.wait(0.2)) is None:
+                await asyncio.to_thread(guarded.step, 0.1)
+            assert frame.sensor == SERVER
+
+    asyncio.run(look())
+
+
+def test_a_stranger_is_turned_away_in_an_event_loop_until_allowed(
+    guarded: Any, robot: Robot
+) -> None:
+    guarded.tare()
+    folder = robot.client("stranger")
+
+    async def look() -> None:
+        stream, control = guarded.daemon.stream_address, guarded.daemon.control_address
+        async with (
+            aio.subscribe(SERVER, address=stream, kind="status", keys=folder) as statuses,
+            aio.Daemon(control, keys=folder, timeout_s=PATIENCE_S) as daemon,
+            asyncio.timeout(PATIENCE_S),
+        ):
+            with pytest.raises(KeysError, match="does not let this client in"):
+                await anext(statuses)
+            with pytest.raises(KeysError, match="does not let this client in"):
+                await daemon.status()
+            robot.allow(folder, may_command=True)
+            while True:  # it knocks again by itself
+                with contextlib.suppress(KeysError):
+                    assert (await anext(statuses)).session == guarded.daemon.session
+                    break
+            while True:
+                with contextlib.suppress(KeysError):
+                    assert (await daemon.status()).session == guarded.daemon.session
+                    break
+
+    asyncio.run(look())
+
+
 def test_another_process_gets_in_with_the_folder_alone(guarded: Any, robot: Robot) -> None:
     command = [sys.executable, "-m", "tactomo.cli", "status", "--json"]
     command += ["--control", guarded.daemon.control_address]

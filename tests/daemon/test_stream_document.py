@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,6 +15,7 @@ import tactomo.control
 import tactomo.twin.control
 from tables import table as cells_of
 from tactomo.errors import CommandError
+from tactomo_client import status
 from tactomo_models import METHODS, Flag, Tier
 from tactomo_models.reconstruct import BAD_MISFIT, UNSURE_MISFIT
 
@@ -64,6 +66,17 @@ def test_every_field_is_in_a_table_and_every_row_is_sent(bench: Callable[..., An
         if isinstance(inside, dict) and name not in ("description", *NAMED_BY_THEMSELVES):
             told = set(re.findall(r"`(\w+)`", rows[name]))
             assert inside.keys() <= told, name
+
+
+def test_the_python_client_has_every_field_of_a_status() -> None:
+    def names(kind: type) -> set[str]:
+        return {field.name for field in dataclasses.fields(kind) if field.name[0] != "_"}
+
+    of_the_frame = {"sensor", "session", "sequence", "flags", "tier", "misfit"}
+    assert names(status.Status) == table("### `status`") | of_the_frame | {"fields"}
+    assert names(status.SensorDescription) == table("`description`:")
+    assert names(status.Calibration) == table("`calibration`:")
+    assert names(status.Port) == table("Each of `ports`:")
 
 
 def test_every_flag_is_explained() -> None:

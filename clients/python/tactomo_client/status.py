@@ -178,6 +178,30 @@ class Reference:
 
 
 @dataclass(frozen=True, slots=True)
+class ChannelDrift:
+    """How far one channel's voltages have drifted since the tare."""
+
+    gain: float
+    """Their common relative change."""
+    uneven: float
+    """The rms of their relative changes beyond that."""
+
+
+@dataclass(frozen=True, slots=True)
+class Baseline:
+    """How the reference follows the skin's drift."""
+
+    state: str = "off"
+    """``off``, ``waiting``, ``following``, ``held`` or ``refused``."""
+    refusal: str | None = None
+    """Why it does not follow, in words."""
+    moves: int = 0
+    """How often the reference has moved since the tare."""
+    drift: Mapping[str, ChannelDrift] = field(default_factory=dict)
+    """By channel."""
+
+
+@dataclass(frozen=True, slots=True)
 class Plan:
     """What frames are given for the tier and the budget that were asked for."""
 
@@ -282,6 +306,7 @@ class Status:
     wall_clock: WallClock = field(default_factory=WallClock)
     reference: Reference | None = None
     """None before the first tare."""
+    baseline: Baseline = field(default_factory=Baseline)
     stage_ms: Mapping[str, Percentiles] = field(default_factory=dict)
     """For each stage of the pipeline."""
     latency_ms: Percentiles | None = None

@@ -1,0 +1,262 @@
+"""The client in an event loop: the same frames and commands, cancelled and closed at any time."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import threading
+from collections.abc import Awaitable, Callable, Coroutine, Iterator
+from typing import Any
+
+import pytest
+from tactomo_client import (
+    Contact,
+    ControlError,
+    Event,
+    Frame,
+    MessageError,
+    NoAnswer,
+    Status,
+    StreamTimeout,
+    TareRefused,
+    aio,
+)
+from tactomo_client.fake import FakeControl, FakeSensor
+from tactomo_client.reception import Kind
+
+Run = Callable[[Coroutine[Any, Any, None]], None]
+CONTACT = Contact(3, 10.0, -20.0, 700.0, 0.15, 0.01, 170.0)
+PATIENCE_S = 30.0
+
+
+@pytest.fixture(params=["asyncio", "uvloop"])
+def run(request: pytest.FixtureRequest) -> Run:
+    """Run a coroutine in an event loop of this make; nothing of it may be left open."""
+    factory = None
+    if request.param == "uvloop":
+        factory = pytest.importorskip("uvloop").new_event_loop
+
+    def run_in_loop(main: Coroutine[Any, Any, None]) -> None:
+        with asyncio.Runner(loop_factory=factory, debug=True) as runner:
+            runner.run(within(main))
+        gc.collect()  # what was left open would warn now, and warnings of this kind are errors
+
+    return run_in_loop
+
+
+async def within(main: Awaitable[None]) -> None:
+    async with asyncio.timeout(PATIENCE_S):
+        await main
+
+
+@pytest.fixture
+def pressed(sensor: FakeSensor) -> Iterator[FakeSensor]:
+    """The sensor, publishing frames from a thread of its own."""
+    stop = threading.Event()
+
+    def publish() -> None:
+        while not stop.wait(0.005):
+            sensor.publish([CONTACT])
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    yield sensor
+    stop.set()
+    thread.join()
+
+
+def test_frames_come_to_several_subscriptions_in_one_loop(run: Run, pressed: FakeSensor) -> None:
+    async def collect(kind: Any) -> list[Frame]:
+        frames: list[Frame] = []
+        async with aio.subscribe("left", address=pressed.address, kind=kind) as skin:
+            async for frame in skin:
+                frames.append(frame)
+                if len(frames) == 20:
+                    break
+        return frames
+
+    async def main() -> None:
+        each = await asyncio.gather(*(collect(kind) for kind in ("map", "contacts") * 3))
+        for frames in each:
+            assert all(frame.contacts == (CONTACT,) for frame in frames)
+            numbers = [frame.sequence for frame in frames]
+            assert numbers == list(range(numbers[0], numbers[0] + 20))
+
+    run(main())
+
+
+def test_a_cancelled_wait_loses_no_frame(run: Run, pressed: FakeSensor) -> None:
+    async def main() -> None:
+        async with aio.subscribe("left", address=pressed.address) as skin:
+            numbers = [(await anext(skin)).sequence]
+            cancelled = 0
+            while len(numbers) < 40:
+                waiting = asyncio.create_task(skin.wait(PATIENCE_S))
+                await asyncio.sleep(0 if len(numbers) % 3 else 0.002)
+                waiting.cancel()
+                try:
+                    frame = await waiting
+                except asyncio.CancelledError:
+                    cancelled += 1
+                    frame = await skin.wait(PATIENCE_S)
+                assert frame is not None
+                numbers.append(frame.sequence)
+            assert cancelled
+            assert numbers == list(range(numbers[0], numbers[0] + 40))
+            assert skin.missed == 0
+
+    run(main())
+
+
+def test_latest_is_the_newest_and_does_not_wait(run: Run, sensor: FakeSensor) -> None:
+    async def main() -> None:
+        async with aio.subscribe("left", address=sensor.address, latest_only=True) as skin:
+            assert await skin.latest() is None
+            assert skin.is_stale
+            await asyncio.to_thread(sensor.wait_for_subscriber)
+            for _ in range(50):
+                sensor.publish([CONTACT])
+            while (frame := await skin.latest()) is None or frame.sequence < 50:
+                await asyncio.sleep(0.001)
+            assert await skin.latest() is frame
+            assert not skin.is_stale
+
+    run(main())
+
+
+def test_silence_is_an_error_or_none(run: Run, sensor: FakeSensor) -> None:
+    async def main() -> None:
+        async with aio.subscribe("left", address=sensor.address, timeout_s=0.05) as skin:
+            with pytest.raises(StreamTimeout, match=r"no map of sensor 'left'.*tactomo status"):
+                await anext(skin)
+            assert await skin.wait(0.01) is None
+            async with asyncio.timeout(PATIENCE_S):
+                with pytest.raises(TimeoutError):
+                    async with asyncio.timeout(0.02):
+                        await skin.wait(PATIENCE_S)
+
+    run(main())
+
+
+def test_closing_ends_the_iteration_of_another_task(run: Run, sensor: FakeSensor) -> None:
+    async def count(skin: aio.Subscription[Frame]) -> int:
+        return len([frame async for frame in skin])
+
+    async def main() -> None:
+        skin = aio.subscribe("left", address=sensor.address)
+        counting = asyncio.create_task(count(skin))
+        await asyncio.to_thread(sensor.wait_for_subscriber)
+        await asyncio.sleep(0.05)
+        skin.close()
+        skin.close()
+        assert await counting == 0
+        assert await skin.latest() is None
+
+    run(main())
+
+
+def test_what_is_left_open_closes_itself(run: Run, pressed: FakeSensor) -> None:
+    left: list[Any] = []
+
+    async def main() -> None:
+        left.append(aio.subscribe("left", address=pressed.address))
+        await anext(left[0])
+
+    run(main())
+    socket = left[0]._connection.owner
+    left.clear()
+    gc.collect()
+    assert socket.closed
+
+
+def test_status_and_events_come_typed_in_one_stream(run: Run, sensor: FakeSensor) -> None:
+    async def main() -> None:
+        kinds: tuple[Kind, ...] = ("contacts", "status", "event")
+        async with aio.subscribe("left", address=sensor.address, kind=kinds) as news:
+            for _ in kinds:
+                await asyncio.to_thread(sensor.wait_for_subscriber)
+            sensor.publish_message("status", {"state": "running"})
+            sensor.publish([CONTACT])
+            sensor.publish_message("event", {"name": "tared"})
+            status, frame, event = [await anext(news) for _ in range(3)]
+        assert isinstance(status, Status)
+        assert isinstance(frame, Frame)
+        assert isinstance(event, Event)
+        assert (status.state, frame.contacts, event.name) == ("running", (CONTACT,), "tared")
+
+    run(main())
+
+
+def test_commands_of_several_tasks_are_carried_out_one_by_one(run: Run) -> None:
+    answers: dict[str, Any] = {
+        "tare": {"scans": 20},
+        "set_tier": {"tier": "fit"},
+        "status": {"state": "running"},
+    }
+
+    async def main() -> None:
+        with FakeControl(answers) as control:
+            async with aio.Daemon(control.address, timeout_s=PATIENCE_S) as daemon:
+                tare, tier, status = await asyncio.gather(
+                    daemon.tare(), daemon.set_tier("fit"), daemon.status()
+                )
+            assert (tare.scans, tier.tier, status.state) == (20, "fit", "running")
+            assert [name for name, _ in control.requests] == ["tare", "set_tier", "status"]
+            assert await aio.request("tare", control.address, PATIENCE_S) == {"scans": 20}
+
+    run(main())
+
+
+def test_a_command_that_is_given_up_does_not_spoil_the_next(run: Run) -> None:
+    async def main() -> None:
+        with FakeControl({"tare": {"scans": 20}}) as control:
+            async with aio.Daemon(control.address) as daemon:
+                giving_up = asyncio.create_task(daemon.tare())
+                await asyncio.sleep(0)
+                giving_up.cancel()
+                with pytest.raises(asyncio.CancelledError):
+                    await giving_up
+                assert (await daemon.tare()).scans == 20
+
+    run(main())
+
+
+def test_errors_have_their_class(run: Run) -> None:
+    async def main() -> None:
+        refusal = ControlError("somebody presses", "lift it", "tare_refused")
+        with FakeControl({"tare": refusal}) as control:
+            async with aio.Daemon(control.address) as daemon:
+                with pytest.raises(TareRefused, match="somebody presses; lift it"):
+                    await daemon.tare()
+        with pytest.raises(NoAnswer, match="nothing answered"):
+            await aio.Daemon("tcp://127.0.0.1:1", timeout_s=0.05).status()
+        with pytest.raises(MessageError, match="not a sensor name"):
+            aio.subscribe("left forearm")
+
+    run(main())
+
+
+def test_a_recording_ends_with_its_block(run: Run) -> None:
+    answers: dict[str, Any] = {
+        "record_start": {"path": "/data/a.mcap"},
+        "record_stop": {"path": "/data/a.mcap", "bytes": 7},
+    }
+
+    async def main() -> None:
+        with FakeControl(answers) as control:
+            async with aio.Daemon(control.address, timeout_s=PATIENCE_S) as daemon:
+                async with daemon.record("/data/a.mcap", maps=True) as recording:
+                    assert recording.file is None
+                assert recording.file is not None
+                assert recording.file.bytes == 7
+                with pytest.raises(ZeroDivisionError):
+                    async with daemon.record():
+                        raise ZeroDivisionError
+            assert control.requests == [
+                ("record_start", {"path": "/data/a.mcap", "maps": True}),
+                ("record_stop", {}),
+                ("record_start", {}),
+                ("record_stop", {}),
+            ]
+
+    run(main())
