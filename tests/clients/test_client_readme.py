@@ -1,69 +1,106 @@
-"""The README's examples, run as they stand there against a sensor that is pressed."""
+"""The README's examples, every one run as it stands there against a sensor that is pressed."""
 
 from __future__ import annotations
 
 import re
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import tactomo_client
-from tactomo_client import Contact, ControlError
+from tactomo.recording import Origin
+from tactomo.recording_writer import RecordingWriter, message_entry
+from tactomo_client import Contact, ControlError, aio
 from tactomo_client.fake import FakeControl, FakeSensor
+from tactomo_client.messages import MAP, encode_message
 
 README = (Path(__file__).parents[2] / "clients" / "python" / "README.md").read_text("utf-8")
+EXAMPLES = {
+    heading.strip(): code
+    for section in README.split("\n## ")[1:]
+    for heading, _, text in [section.partition("\n")]
+    for code in re.findall(r"```python\n(.*?)```", text, re.S)
+}
 CONTACT = Contact(1, 10.0, -5.0, 700.0, 0.2, 0.01, 183.0)
 PATIENCE_S = 30.0
 
 
-def example(heading: str) -> str:
-    found = re.search(rf"## {heading}\n.*?```python\n(.*?)```", README, re.S)
-    assert found
-    return found[1]
+class EnoughError(Exception):
+    """Ends an example that would go on for ever."""
+
+
+class Printed(list[tuple[Any, ...]]):
+    """What an example prints, until that is enough."""
+
+    def __init__(self, is_enough: Callable[[tuple[Any, ...]], bool]) -> None:
+        super().__init__()
+        self._is_enough = is_enough
+
+    def __call__(self, *values: Any) -> None:
+        self.append(values)
+        if self._is_enough(values):
+            raise EnoughError
+
+
+def run_until(heading: str, is_enough: Callable[[tuple[Any, ...]], bool]) -> Printed:
+    printed = Printed(is_enough)
+    with pytest.raises(EnoughError):
+        exec(EXAMPLES[heading], {"print": printed})
+    return printed
+
+
+def test_there_is_a_test_of_every_example() -> None:
+    tests = {name.removeprefix("test_") for name in globals() if name.startswith("test_")}
+    blocks = README.count("```python\n")
+    assert len(EXAMPLES) == blocks  # one in each section
+    named = {heading.lower().replace(" ", "_") for heading in EXAMPLES}
+    assert named <= tests, named - tests
 
 
 @pytest.fixture
-def _pressed(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def pressed(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeSensor]:
     """A sensor of the README's name, where `subscribe` looks by default, pressed all the time."""
-    subscribe = tactomo_client.subscribe
     stop = threading.Event()
 
     def publish() -> None:
         while not stop.wait(0.02):
             sensor.publish([CONTACT])
+            sensor.publish_message("status", {"state": "running"})
+            sensor.publish_message("event", {"name": "tared", "detail": "a new reference"})
+
+    def here(subscribe: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda name, **options: subscribe(name, **{"address": sensor.address} | options)
 
     with FakeSensor("left_forearm") as sensor:
-        address = sensor.address
-        monkeypatch.setattr(
-            tactomo_client,
-            "subscribe",
-            lambda name, **options: subscribe(name, address=address, **options),
-        )
+        for module in (tactomo_client, aio):
+            monkeypatch.setattr(module, "subscribe", here(module.subscribe))
         thread = threading.Thread(target=publish)
         thread.start()
-        yield
+        yield sensor
         stop.set()
         thread.join()
 
 
-@pytest.mark.usefixtures("_pressed")
+@pytest.fixture
+def control(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeControl]:
+    """A control socket where `Daemon` looks by default."""
+    with FakeControl({"tare": {"scans": 20}, "status": {"state": "running"}}) as fake:
+        for module in (tactomo_client, aio):
+            daemon = module.Daemon
+            monkeypatch.setattr(module, "Daemon", lambda of=daemon: of(fake.address))
+        yield fake
+
+
+@pytest.mark.usefixtures("pressed")
 def test_every_frame() -> None:
-    printed: list[Any] = []
-
-    def print_once(*values: Any) -> None:
-        printed.append(values)
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        exec(example("Every frame"), {"print": print_once})
-    assert printed == [(1, 10.0, -5.0, 183.0)]
+    assert run_until("Every frame", lambda _: True) == [(1, 10.0, -5.0, 183.0)]
 
 
-@pytest.mark.usefixtures("_pressed")
+@pytest.mark.usefixtures("pressed")
 def test_in_a_control_loop() -> None:
     done: list[str] = []
     deadline = time.monotonic() + PATIENCE_S
@@ -78,24 +115,88 @@ def test_in_a_control_loop() -> None:
         be_careful=lambda: done.append("be_careful"),
         retreat=lambda: done.append("retreat"),
     )
-    exec(example("In a control loop"), {"robot": robot})
+    exec(EXAMPLES["In a control loop"], {"robot": robot})
     assert done[-1] == "retreat"
     assert "be_careful" not in done
 
 
-def test_commands(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    request = tactomo_client.request
-    with FakeControl({"tare": {"scans": 20}}) as daemon:
-        monkeypatch.setattr(
-            tactomo_client,
-            "request",
-            lambda command, **options: request(command, daemon.address, **options),
-        )
-        exec(example("Commands"), {})
-        daemon.answers["tare"] = ControlError("somebody presses", "lift it", "tare_refused")
-        exec(example("Commands"), {})
-    assert capsys.readouterr().out == "{'scans': 20}\ntare_refused somebody presses lift it\n"
+def test_what_stale_means(pressed: FakeSensor, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pressed, "publish", lambda _: FakeSensor.publish(pressed))  # let go
+    (said,) = run_until("What stale means", lambda _: True)
+    assert re.fullmatch(r"nothing pressed \d+ ms ago", said[0])
+
+
+def test_commands(control: FakeControl, capsys: pytest.CaptureFixture[str]) -> None:
+    exec(EXAMPLES["Commands"], {})
+    control.answers["tare"] = ControlError("somebody presses", "lift it", "tare_refused")
+    exec(EXAMPLES["Commands"], {})
+    control.answers["tare"] = ControlError("no scans", "plug it in", "no_data")
+    exec(EXAMPLES["Commands"], {})
+    assert capsys.readouterr().out.splitlines() == [
+        "reference of 20 dual scans",
+        "let go of the skin",
+        "no_data no scans plug it in",
+    ]
+
+
+@pytest.mark.usefixtures("pressed")
+def test_status_and_events() -> None:
+    seen: set[str] = set()
+
+    def is_enough(values: tuple[Any, ...]) -> bool:
+        seen.add(values[0])
+        return seen >= {"is", "tared"}
+
+    printed = run_until("Status and events", is_enough)
+    assert ("is", "running") in printed
+    assert ("tared", "a new reference", "") in printed
+
+
+def test_recordings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    writer = RecordingWriter(Path("grasp.mcap"), Origin("left", "", "", ("a",), "0.1.0"))
+    for number in range(41):
+        at_ns = number * 50_000_000
+        header: dict[str, Any] = {
+            **{"session": "a", "sequence": number, "scan_counter": number, "device_us": None},
+            **{"acquired_realtime_ns": at_ns, "acquired_monotonic_ns": at_ns, "age_ns": 0},
+            **{"tier": None, "tier_reason": None, "flags": [], "misfit": None, "contacts": []},
+        }
+        extent = {"x_mm": [0.0, 1.0], "y_mm": [0.0, 1.0]}
+        for kind, fields in ((MAP, header | extent), ("contacts", header)):
+            message = encode_message("left", kind, fields)
+            writer.add(message_entry(kind, message, at_ns, at_ns))
+    writer.close()
+    exec(EXAMPLES["Recordings"], {})
+    lines = capsys.readouterr().out.splitlines()
+    assert lines == ["left 2.0 s whole", *(f"{number} 0" for number in range(10, 20))]
+
+
+@pytest.mark.usefixtures("pressed", "control")
+def test_asyncio() -> None:
+    printed = run_until("asyncio", lambda values: values == ((CONTACT,),))
+    assert printed[0] == ("running",)
+
+
+def test_from_another_computer(pressed: FakeSensor, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With real keys it is tried beside the daemon that asks for them."""
+    subscribe = tactomo_client.subscribe
+
+    def as_there(name: str, *, address: str, keys: str) -> Any:
+        assert (address, keys) == ("tcp://robot:5560", "~/keys/robot")
+        return subscribe(name)
+
+    monkeypatch.setattr(tactomo_client, "subscribe", as_there)
+    assert run_until("From another computer", lambda _: True) == [((CONTACT,),)]
 
 
 def test_testing_a_controller_without_a_skin() -> None:
-    exec(example("Testing a controller without a skin"), {})
+    exec(EXAMPLES["Testing a controller without a skin"], {})
+
+
+def test_every_public_name_is_documented() -> None:
+    for module in (tactomo_client, aio):
+        things = {name: getattr(module, name) for name in module.__all__}
+        assert all(isinstance(each, str) or each.__doc__ for each in things.values()), things

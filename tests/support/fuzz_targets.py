@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import tempfile
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -27,16 +28,20 @@ from tactomo.recording import Mark, Origin, ScanKey, open_recording
 from tactomo.recording_writer import (
     RecordingWriter,
     mark_entry,
+    message_entry,
     port_entry,
     preamble_entry,
     reference_entry,
 )
 from tactomo.twin import control as twin_control
 from tactomo_client import ClientError
+from tactomo_client.event import event_from_message
 from tactomo_client.frame import frame_from_message
 from tactomo_client.messages import (
     CONTACTS,
+    EVENT,
     MAP,
+    STATUS,
     decode_message,
     decode_reply,
     decode_request,
@@ -45,6 +50,9 @@ from tactomo_client.messages import (
     encode_reply,
     encode_request,
 )
+from tactomo_client.recording import RecordingWarning
+from tactomo_client.recording import open_recording as open_frames
+from tactomo_client.status import status_from_message
 from tactomo_models import Reference, SensorDescription, load_description, shipped_descriptions
 from tactomo_models.errors import DescriptionError
 from tactomo_models.sensors import __path__ as sensors_path
@@ -152,14 +160,17 @@ def _message_examples() -> list[bytes]:
     return [
         encode_message("left", MAP, {**contacts, **images, **extent}),
         encode_message("left", CONTACTS, contacts),
+        encode_message("left", STATUS, {**ENVELOPE, "ports": [{"url": "a"}], "rates": {}}),
+        encode_message("left", EVENT, {**ENVELOPE, "name": "tared", "detail": "a reference"}),
         encode_reply({"scans": 20}),
         encode_error("tare_refused", "somebody presses", "let go"),
     ]
 
 
 def _parse_message(data: bytes) -> None:
-    with suppress(ClientError):
-        frame_from_message(decode_message(data), time.monotonic_ns(), 0.5)
+    for read in (frame_from_message, status_from_message, event_from_message):
+        with suppress(ClientError):
+            read(decode_message(data), time.monotonic_ns(), 0.5)
     with suppress(ClientError):
         decode_reply(data)
 
@@ -211,6 +222,9 @@ def _recording_examples() -> list[bytes]:
     writer.add(reference_entry(reference, 1, 2, 2))
     writer.add(port_entry(0, encode(SCAN), 3, 3))
     writer.add(port_entry(1, b"\0\1\2", 4, 4))
+    contacts = encode_message("left", CONTACTS, {**HEADER, "contacts": [CONTACT]})
+    writer.add(message_entry(MAP, encode_message("left", MAP, {**HEADER, "contacts": []}), 4, 4))
+    writer.add(message_entry(CONTACTS, contacts, 4, 4))
     key = ScanKey(Channel.STRUCTURE, 7, 350_000)
     writer.add(mark_entry(Mark((key,), "fit", 4.0, reference_number=1), 5, 5))
     writer.flush()
@@ -235,6 +249,12 @@ def _parse_recording(data: bytes) -> None:
         ):
             with suppress(RecordingError):
                 read()
+    with suppress(ClientError), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RecordingWarning)
+        frames = open_frames(path)
+        assert frames.duration_s is not None
+        assert frames.damage is not None
+        list(frames.frames("contacts"))
 
 
 TANK = load_description("tank_disc")
