@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tables import table
 from tactomo_client import (
     AlreadyRecording,
     ControlError,
@@ -18,7 +19,6 @@ from tactomo_client import (
 )
 from tactomo_client.fake import FakeControl
 
-DOCUMENT = (Path(__file__).parents[2] / "clients" / "STREAM.md").read_text("utf-8")
 PATIENCE_S = 30.0
 
 
@@ -53,11 +53,8 @@ def test_each_command_has_its_typed_result() -> None:
 
 
 def test_every_error_of_the_document_has_its_class_and_no_other() -> None:
-    rows = re.search(
-        r"^\| Command \| Arguments \| Result \| Own errors \|\n((?:\|.*\n)+)", DOCUMENT, re.M
-    )
-    assert rows
-    named = {n for row in rows[1].splitlines() for n in re.findall(r"`(\w+)`", row.split("|")[-2])}
+    rows = table("clients/STREAM.md", "### Commands of the daemon", "Command")
+    named = {n for row in rows.values() for n in re.findall(r"`(\w+)`", row["Own errors"])}
     assert named | {"bad_argument", "no_answer"} == errors._OF_NAME.keys()
 
 
