@@ -152,6 +152,7 @@ class PortReader:
         self._liveness = Liveness()
         self._protocol = protocol
         self._recording = 0  # number of the recording that has the last chunk
+        self._preamble_s = 0.0  # when a recording was last given one
         self._is_known = False  # the device that is plugged in has said hello
         self._asked_s = 0.0  # when the device was last asked, or last sent a scan
         self._trouble_of_protocol: Trouble | None = None
@@ -348,9 +349,11 @@ class PortReader:
 
     def _record_to(self, active: ActiveRecording, data: bytes, times: tuple[int, int]) -> bool:
         entries = [port_entry(self.index, data, *times)]
-        if active.number != self._recording:
+        age_s = times[0] * 1e-9 - self._preamble_s
+        if active.number != self._recording or age_s >= self._protocol.preamble_period_s:
             # So that its first scan is whole and what it means is known.
             preamble = self._protocol.preamble()
+            self._preamble_s = times[0] * 1e-9
             if preamble:
                 entries.insert(0, preamble_entry(self.index, preamble, *times))
         previous = active.previous

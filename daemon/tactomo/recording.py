@@ -8,7 +8,8 @@ topic          encoding    message
 port/N         raw         bytes of port N exactly as read, in the protocol of its device
 port/N/hello   raw         what a replay must be told before those: the hello in force when the
                            recording began, and the packet that had begun to come; for a foreign
-                           protocol also where in its scans the port was (`protocols.interface`)
+                           protocol also where in its scans the port was (`protocols.interface`),
+                           and again every second
 reference      msgpack     the reference that holds from here on: its number in this recording,
                            volts and noise of each channel, and how far they have drifted since;
                            repeated every minute

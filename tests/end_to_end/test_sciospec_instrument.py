@@ -119,6 +119,7 @@ def test_an_instrument_is_configured_believed_and_stopped(start: Start, tmp_path
     summary = open_recording(tmp_path / "a.mcap").summary
     assert summary.origin.protocol == "sciospec"
     assert sum(summary.scans.values()) >= summary.frames > 20
+    assert summary.corrupt > 0
 
 
 @pytest.mark.slow

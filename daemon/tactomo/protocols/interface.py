@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tactomo_models import SensorDescription
 from tactomo_protocol import (
+    MAX_SAMPLES,
     SCAN_COUNTERS,
     Channel,
     Decoder,
@@ -55,6 +56,10 @@ class PortProtocol(Protocol):
         """How long a device may send no scan before it is introduced to us again."""
 
     @property
+    def preamble_period_s(self) -> float:
+        """How often a recording is given a preamble, for what comes after damage; may be inf."""
+
+    @property
     def has_clock(self) -> bool:
         """Whether its scans say by the device's own clock when they were taken."""
 
@@ -85,9 +90,10 @@ class PortProtocol(Protocol):
         """Take note that the port was opened anew: what had begun to come is not finished."""
 
     def preamble(self) -> bytes:
-        """Return what a recording begins with if it begins now.
+        """Return what a recording that begins now begins with.
 
-        Fed to a new object before the bytes to come, it makes the same scans of them.
+        Fed to a new object before the bytes to come, it makes the same scans of them; fed to one
+        that has lost bytes, too.
         """
 
 
@@ -125,7 +131,7 @@ class ForeignProtocol:
         rate_hz: scans a second, 0 where only the device knows.
 
     Raises:
-        ConfigError: the description has two channels.
+        ConfigError: the description has two channels, or more voltages than a scan can have.
 
     Attributes:
         device_us: the newest reading's time, to go on from.
@@ -137,6 +143,7 @@ class ForeignProtocol:
     baud: ClassVar[int]
     device_id: ClassVar[str]
     patience_s: float = 4.0
+    preamble_period_s: float = 1.0
     has_clock: bool = False
 
     def __init__(self, description: SensorDescription, rate_hz: float = 0.0) -> None:
@@ -146,6 +153,12 @@ class ForeignProtocol:
                 "carries one",
                 "give the description of a sensor with one channel, such as tank_disc",
             )
+        if description.measurements > MAX_SAMPLES:
+            raise ConfigError(
+                f"{description.name} has {description.measurements} voltages, and a scan at most "
+                f"{MAX_SAMPLES}",
+                "list fewer drive or measuring pairs in its [pattern]",
+            )
         self.description = description
         self.counts = DecoderCounts()
         self.trouble: Trouble | None = None
@@ -154,14 +167,13 @@ class ForeignProtocol:
         self._channel = Channel[description.modalities[0].upper()]
         self._rate_hz = rate_hz
         self._counter = 0
-        self._has_begun = self._has_greeted = False
+        self._has_greeted = False
         self._is_hello_due = True
 
     def feed(self, data: bytes) -> list[Packet]:
         """See `PortProtocol`."""
         packets: list[Packet] = []
-        if not self._has_begun and data:
-            self._has_begun = True
+        if data.startswith(b"\0"):
             data = self._resume(data, packets)
         for reading in self.parse(data):
             if self._is_hello_due:
@@ -234,7 +246,10 @@ class ForeignProtocol:
         return Scan(self._channel, counter, reading.device_us, ScanFlag(0), samples)
 
     def _resume(self, data: bytes, packets: list[Packet]) -> bytes:
-        """Take a recording's preamble, if `data` begins with one; return what comes after it."""
+        """Take a recording's preamble, if `data` is one; return what comes after it.
+
+        Where nothing was lost before it, it says nothing new.
+        """
         parts = data.split(b"\0", 4)  # two frames, each with both delimiters, and the rest
         if parts[0] or len(parts) < 5:
             return data
@@ -243,6 +258,9 @@ class ForeignProtocol:
         position = _position(said)
         if position is None:
             return data
+        if self._has_greeted and self._counter == position.counter:
+            return b""
+        self.restart()
         self._counter, self.device_us = position.counter, position.device_us
         self.clock_format = position.clock_format
         self._has_greeted, self._is_hello_due = True, False

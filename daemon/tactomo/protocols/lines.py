@@ -14,9 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 from tactomo_models import SensorDescription
-from tactomo_protocol import MAX_SAMPLES
 
-from tactomo.errors import ConfigError
 from tactomo.protocols.interface import ForeignProtocol, Reading, Trouble
 
 MAX_LINE_BYTES: Final = 65_536
@@ -29,23 +27,12 @@ _PREFIX: Final = re.compile(rb"[A-Za-z][\w .-]*[:=]")
 
 
 class LineProtocol(ForeignProtocol):
-    """A board that prints; a subclass says what a line means.
-
-    Raises:
-        ConfigError: the description has two channels, or more voltages than a scan can have.
-
-    """
+    """A board that prints; a subclass says what a line means."""
 
     baud = 115_200
 
     def __init__(self, description: SensorDescription) -> None:
         super().__init__(description)
-        if description.measurements > MAX_SAMPLES:
-            raise ConfigError(
-                f"{description.name} has {description.measurements} voltages, and a scan at most "
-                f"{MAX_SAMPLES}",
-                "list fewer drive or measuring pairs in its [pattern]",
-            )
         self._line = bytearray()
         self._is_dropping = True  # until the next line end
         self._misfits: tuple[Trouble | None, int] = (None, 0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 from tactomo_protocol import (
@@ -24,6 +25,7 @@ class Ours:
     name: Final = "tactomo"
     baud: Final = 921_600
     patience_s: Final = 1.5
+    preamble_period_s: Final = math.inf  # the device itself says hello every second
     has_clock: Final = True
     trouble: Trouble | None = None
 

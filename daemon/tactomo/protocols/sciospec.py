@@ -38,6 +38,7 @@ successive frames come about as far apart as was asked for is believed; by defau
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 from collections import deque
@@ -84,6 +85,8 @@ _FLOAT_FROM: Final = 0x3A80_0000  # floats above a thousandth; 11 days, read as 
 _GAP: Final = 8.0
 """Times the usual one between messages, above which they are of two frames; it is a frame's 16."""
 _CLOCK_TRIES: Final = 5
+_EDGE: Final = 0.8
+"""Of what is too much out of phase, what is little enough again."""
 
 
 class Ack(IntEnum):
@@ -141,7 +144,7 @@ class Sciospec(ForeignProtocol):
         super().__init__(description, description.instrument.scan_rate_hz)
         _check(description)
         drives = description.drive_pairs
-        self.patience_s = max(4.0, 3 / description.instrument.scan_rate_hz)
+        self.patience_s = self._usual_patience_s = max(4.0, 3 / description.instrument.scan_rate_hz)
         self._groups = -(-description.electrode_count // CHANNELS)
         self._sinks = {(b, a): (row, -1) for row, (a, b) in enumerate((drives + 1).tolist())}
         self._sinks |= {(a, b): (row, 1) for row, (a, b) in enumerate((drives + 1).tolist())}
@@ -181,6 +184,7 @@ class Sciospec(ForeignProtocol):
     def restart(self) -> None:
         """See `PortProtocol`."""
         super().restart()
+        self.patience_s = self._usual_patience_s
         self._buffer, self._replies, self._asked = b"", [], None
         self._requests.clear()
         self._forget_frame()
@@ -267,10 +271,19 @@ class Sciospec(ForeignProtocol):
         differences = self._differences(parts)
         size = float(np.linalg.norm(differences))
         quadrature = float(np.linalg.norm(differences.imag)) / size if size else 0.0
-        self.trouble = _out_of_phase(quadrature) if quadrature > MAX_QUADRATURE else None
-        if self.trouble is not None or self.clock_format == Clock.UNDECIDED:
+        if not self._is_in_phase(quadrature) or self.clock_format == Clock.UNDECIDED:
             return None
         return Reading(differences.real, microseconds(int(times[0]), Clock(self.clock_format)))
+
+    def _is_in_phase(self, quadrature: float) -> bool:
+        """Tell whether the real part is the signal; not to and fro where it is on the edge."""
+        limit = MAX_QUADRATURE * (_EDGE if math.isinf(self.patience_s) else 1.0)
+        is_in_phase = quadrature <= limit
+        if is_in_phase:
+            self.trouble, self.patience_s = None, self._usual_patience_s
+        elif math.isfinite(self.patience_s):  # to ask it anew would change nothing
+            self.trouble, self.patience_s = _out_of_phase(quadrature), math.inf
+        return is_in_phase
 
     def _differences(self, parts: NDArray[np.void]) -> NDArray[np.complex128]:
         """Return the description's voltages of a frame's potentials."""
@@ -312,7 +325,7 @@ class Sciospec(ForeignProtocol):
     def _note_stranger(self, found: bytes) -> None:
         """Say so where all that comes is of another pattern."""
         self._strangers += 1
-        if self._strangers > 8 * CHANNELS * self._groups:
+        if self._strangers > 8 * CHANNELS * self._groups and self.trouble is None:
             self.trouble = Trouble(
                 f"the instrument injects at {found[3]} and {found[4]} (from 1), which is "
                 f"not in the pattern of {self.description.name}",
