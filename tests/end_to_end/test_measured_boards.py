@@ -167,13 +167,15 @@ def test_tanks_come_as_well_through_a_board_that_prints_tables(tmp_path: Path) -
         frames = frames_of(daemon, last[-1], missed=1)
     found = []
     for number, truth in zip(last, tanks.truth, strict=True):
-        image = frames[number].structure
+        newest = max(n for n in frames if n <= number)  # a busy machine leaves some out
+        assert newest > number - 7
+        image = frames[newest].structure
         assert image is not None
         found.append(correlation(on_pixels(sensor, image, truth.shape), truth))
-    print(np.round(found, 3), np.mean(found))
     assert np.mean(found) > 0.82
 
 
+@pytest.mark.slow
 def test_a_broken_device_is_flagged_in_every_frame_and_called_broken(tmp_path: Path) -> None:
     with np.load(measured("skin_bad_device_32el.npz")) as arrays:
         baseline, changes = arrays["baseline"].astype(float), arrays["dv"].astype(float)

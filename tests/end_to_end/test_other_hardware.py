@@ -15,7 +15,8 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 from tactomo.cli.app import Protocol
-from tactomo.protocols import PROTOCOLS
+from tactomo.config import load_config
+from tactomo.protocols import FOREIGN, PROTOCOLS
 from tactomo.twin.sciospec import SciospecSpeaker
 from tactomo_client import request
 from tactomo_models import Press as Cup
@@ -134,6 +135,43 @@ def test_its_files_become_a_recording(terminal: Terminal) -> None:
     assert "30 scans" in terminal.run(into)
     terminal.run(replay, "--stream", ANYWHERE, "--control", ANYWHERE)
     assert "reciprocity" in terminal.run(doctor)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("heading", "x_mm", "y_mm"), [("OpenEIT", 30, -20), ("Tables", 25, 10)])
+def test_a_researcher_with_a_board_that_prints(
+    terminal: Terminal, heading: str, x_mm: float, y_mm: float
+) -> None:
+    twin, daemon, poke, status = commands(f"{heading}, emulated")
+    address = f"ipc://{terminal.folder}/twin"
+    next(line for line in terminal.start(twin, "--control", address) if "control" in line)
+    log = terminal.start(daemon, "--stream", ANYWHERE, "--control", ANYWHERE)
+    ready = event(log, "ready")
+    event(log, "tared")
+    terminal.run(poke, "--control", address)
+    assert "skin: running" in terminal.run(status, "--control", ready["control"])
+    (program,) = re.findall(r"```python\n(.*?)```", PAGE, re.S)
+    program = program.replace('"skin"', f'"skin", address="{ready["stream"]}"')
+    said = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True
+    ).stdout
+    place = re.match(r"\((-?[\d.]+), (-?[\d.]+)\) mm", said)
+    assert place is not None
+    assert [float(mm) for mm in place.groups()] == pytest.approx([x_mm, y_mm], abs=3)
+
+
+def test_a_board_that_prints_is_described(terminal: Terminal) -> None:
+    for command in commands("OpenEIT, the board") + commands("Tables, the board"):
+        terminal.run(command)
+        name, copied = command[-2:]
+        assert load_description(terminal.folder / copied) == load_description(name)
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_each_protocol_has_an_example_of_a_configuration(name: str) -> None:
+    config = load_config(repository() / "deploy" / "examples" / f"{name}.toml")
+    assert config.protocol == name
+    FOREIGN[name](load_description(config.description))
 
 
 def test_every_protocol_is_on_the_page() -> None:

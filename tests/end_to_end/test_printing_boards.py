@@ -83,7 +83,7 @@ def press(twin: Twin, x_mm: float, y_mm: float, radius_mm: float = 9.0) -> None:
     ("protocol", "board", "changes"),
     [
         ("openeit", "openeit_disc", ()),
-        ("matrix", "matrix_disc", (*WAITING, *SIXTEENTHS)),
+        pytest.param("matrix", "matrix_disc", (*WAITING, *SIXTEENTHS), marks=pytest.mark.slow),
         pytest.param("matrix", "matrix_disc", SINGLE_ENDED, marks=pytest.mark.slow),
         pytest.param("matrix", "matrix_square", (), marks=pytest.mark.slow),
     ],
@@ -104,6 +104,7 @@ def test_a_press_on_an_emulated_board_is_where_it_is(
     assert port["corrupt"] == 0
 
 
+@pytest.mark.slow
 def test_a_board_of_another_kind_is_refused_by_name(start: Start, tmp_path: Path) -> None:
     board, sensor = changed(tmp_path, "openeit_disc"), changed(tmp_path, "matrix_disc")
     _, daemon = start("openeit", board, sensor, as_if="matrix")

@@ -76,6 +76,9 @@ class Built(dict[str, Artifact]):
 BUILT = Built()
 
 
+SLOW = ("16, skip 3", "32, opposite")  # as the others, and dear
+
+
 def pressed(
     sensor: SensorDescription, *, unsigned: bool = False, press: Press = PRESS
 ) -> Reconstruction:
@@ -89,7 +92,10 @@ def pressed(
     return made.reconstruct(None, read(skin.scan(press)["structure"]))
 
 
-@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in SENSORS],
+)
 def test_a_press_is_found_by_any_pattern(name: str) -> None:
     frame = pressed(SENSORS[name])
     assert not frame.flags & ~Flag.MISFIT_HIGH
