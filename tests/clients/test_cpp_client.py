@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import os
 import random
 import shutil
 import subprocess
@@ -38,7 +39,7 @@ from tactomo_client.messages import CONTACTS, MAP, decode_message, encode_messag
 
 PATIENCE_S = 60.0
 
-pytestmark = pytest.mark.timeout(400)  # compilers are slow where others work, too
+pytestmark = pytest.mark.timeout(600)  # compilers are slow where others work, too
 IMAGES = ("map", "pressure_kpa", "structure")
 ANYWHERE = "tcp://127.0.0.1:0"
 
@@ -304,6 +305,25 @@ def test_a_folder_of_keys_that_cannot_be_used(
     )
     assert told.returncode == 1
     assert complaint in told.stderr
+
+
+def test_keys_that_systemd_holds_and_a_folder_at_home(
+    probe: Path, tmp_path: Path, sensor: FakeSensor
+) -> None:
+    """Others may read what systemd guards by its own means: then it is the stream that says no."""
+    folder = tmp_path / "keys"
+    for owner in ("desk", "server"):
+        key_files.make_pair(folder, owner)
+    key_files.secret_path(folder, "server").unlink()
+    key_files.secret_path(folder, "desk").chmod(0o644)
+    command = [probe, "control", sensor.address, "status", "", "~/keys"]
+    said = []
+    for more in ({}, {"CREDENTIALS_DIRECTORY": str(folder)}):
+        environment = {**os.environ, "HOME": str(tmp_path), **more}
+        done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        said.append(done.stderr.partition(":")[0])
+    assert said[0] == "bad_keys"
+    assert said[1] in ("wrong_server", "no_answer")
 
 
 def test_gaps_malformed_messages_and_a_flag_of_tomorrow(sensor: FakeSensor, probe: Path) -> None:
