@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ from cpp_client import (
 from daemon_process import SENSOR, DaemonProcess, wait_until
 from fuzz_targets import CONTACT, HEADER
 from tactomo import keys as key_files
-from tactomo_client import ClientError, Contact, Frame, request, subscribe
+from tactomo_client import ClientError, Contact, ControlError, Frame, request, subscribe
 from tactomo_client.fake import FakeControl, FakeSensor
 from tactomo_client.frame import frame_from_message
 from tactomo_client.messages import CONTACTS, MAP, decode_message, encode_message
@@ -316,7 +316,7 @@ def test_keys_that_systemd_holds_and_a_folder_at_home(
         key_files.make_pair(folder, owner)
     key_files.secret_path(folder, "server").unlink()
     key_files.secret_path(folder, "desk").chmod(0o644)
-    command = [probe, "control", sensor.address, "status", "", "~/keys"]
+    command = [str(probe), "control", sensor.address, "status", "", "~/keys"]
     said = []
     for more in ({}, {"CREDENTIALS_DIRECTORY": str(folder)}):
         environment = {**os.environ, "HOME": str(tmp_path), **more}
@@ -517,7 +517,7 @@ def test_no_reply_crashes_it(checked: Path) -> None:
     refusal = {"name": "tare_refused", "cause": "somebody presses", "next_step": ""}
     refused = {"schema": 1, "ok": False, "error": refusal}
 
-    class Answers(dict[str, bytes]):
+    class Answers(dict[str, Mapping[str, Any] | ControlError | bytes]):
         """Another one at each time: whole, mutated, corrupted."""
 
         given = 0
