@@ -64,6 +64,24 @@ class Speaker(Protocol):
         """Return what it says when the host did not take a frame; often nothing."""
 
 
+class Grounded:
+    """A scan's voltages as instruments have them that read each electrode against ground.
+
+    The voltages between pairs say nothing of a potential that all electrodes share, nor of the
+    driven ones: of all potentials that have them, the least are taken.
+    """
+
+    def __init__(self, description: SensorDescription) -> None:
+        pairs, electrodes = description.pairs, np.eye(description.electrode_count)
+        differences = electrodes[pairs.measure[:, 0]] - electrodes[pairs.measure[:, 1]]
+        of_drives = [(pairs.drive == drive).all(axis=1) for drive in description.drive_pairs]
+        self._least = [(here, np.linalg.pinv(differences[here])) for here in of_drives]
+
+    def potentials(self, volts: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return potentials (drives, electrodes) that have a scan's voltages (M,)."""
+        return np.array([least @ volts[here] for here, least in self._least])
+
+
 MakeSpeaker = Callable[[SensorDescription, float], Speaker]
 """Of the sensor and the frames a second that it starts with."""
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tactomo_models import SensorDescription
 
 from tactomo.protocols.openeit import KEYS
-from tactomo.twin.foreign import Frame
+from tactomo.twin.foreign import Frame, Grounded
 
 FloatArray = NDArray[np.float64]
 
@@ -117,6 +117,7 @@ class MatrixBoard(_Printer):
             _numbered(description.drive_pairs, pairs.drive),
             _numbered(description.measure_pairs, pairs.measure),
         )
+        self._grounded = Grounded(description)
         self._start = description.instrument.start.encode()
         self._is_single_ended = description.instrument.referenced == "single_ended"
 
@@ -139,23 +140,12 @@ class MatrixBoard(_Printer):
 
     def _table(self, frame: Frame) -> FloatArray:
         if self._is_single_ended:
-            return self._against_lowest(self._read(frame.volts))
+            potentials = self._grounded.potentials(self._read(frame.volts))
+            return np.asarray(potentials - potentials.min(axis=1, keepdims=True))
         drives, pairs = len(self._description.drive_pairs), len(self._description.measure_pairs)
         table = np.zeros((drives, pairs))
         table[self._place] = self._read(frame.volts)
         return table
-
-    def _against_lowest(self, volts: FloatArray) -> FloatArray:
-        """Potentials (drives, electrodes) of these differences, above each drive's lowest one."""
-        electrodes = np.eye(self._description.electrode_count)
-        potentials = np.zeros((len(self._description.drive_pairs), len(electrodes)))
-        plus, minus = self._description.pairs.measure.T
-        for drive, row in enumerate(potentials):
-            here = self._place[0] == drive
-            steps = electrodes[plus[here]] - electrodes[minus[here]]
-            row[:] = np.linalg.lstsq(steps, volts[here], rcond=None)[0]
-            row -= row.min()
-        return potentials
 
 
 def _numbered(listed: NDArray[np.intp], pairs: NDArray[np.intp]) -> NDArray[np.intp]:

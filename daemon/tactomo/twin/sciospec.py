@@ -27,7 +27,7 @@ from tactomo.protocols.sciospec import (
     Ack,
     message,
 )
-from tactomo.twin.foreign import Frame
+from tactomo.twin.foreign import Frame, Grounded
 
 GROUPS: Final = 4
 RATE_HZ: Final = (0.1, 100.0)
@@ -43,7 +43,7 @@ class SciospecSpeaker:
         self.rate_hz = rate_hz
         self.is_streaming = False
         self._description = description
-        self._spread = _spread(description)
+        self._grounded = Grounded(description)
         self._drives = {tuple(pair): row for row, pair in enumerate(_drives(description))}
         self._buffer = b""
         self._heard_s = 0.0
@@ -117,8 +117,7 @@ class SciospecSpeaker:
 
     def potentials_of(self, volts: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return potentials (drives, electrodes) that have a scan's voltages (M,), the least."""
-        rows = [least @ volts[voltages] for voltages, least in self._spread]
-        return np.array(rows, dtype=np.complex128)
+        return self._grounded.potentials(volts).astype(np.complex128)
 
     def _answer(self, tag: int, content: bytes) -> list[bytes]:
         if tag == DATA_TAG and content in (b"\0", b"\1"):
@@ -202,18 +201,3 @@ def _number(form: str, content: bytes) -> float:
 
 def _drives(description: SensorDescription) -> list[tuple[int, int]]:
     return [(int(source), int(sink)) for source, sink in description.drive_pairs]
-
-
-def _spread(
-    description: SensorDescription,
-) -> list[tuple[NDArray[np.intp], NDArray[np.float64]]]:
-    """Return of each drive its voltages' places in a scan, and what makes potentials of them."""
-    pairs, electrodes = description.pairs, description.electrode_count
-    spread: list[tuple[NDArray[np.intp], NDArray[np.float64]]] = []
-    for drive in description.drive_pairs:
-        voltages = np.flatnonzero((pairs.drive == drive).all(axis=1))
-        incidence = np.zeros((len(voltages), electrodes))
-        incidence[np.arange(len(voltages)), pairs.measure[voltages, 0]] = 1
-        incidence[np.arange(len(voltages)), pairs.measure[voltages, 1]] = -1
-        spread.append((voltages, np.linalg.pinv(incidence).astype(np.float64)))
-    return spread
