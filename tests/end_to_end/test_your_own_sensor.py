@@ -34,8 +34,10 @@ SHORTER = {"--seconds 5": "--seconds 1", "doctor ": "doctor --seconds 2 "}
 
 
 @pytest.fixture
-def newcomer(tmp_path: Path) -> Newcomer:
-    (tmp_path / FILE).write_text(PAGE.file(FILE))
+def newcomer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Newcomer:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    for name in (FILE, "readings.csv"):
+        (tmp_path / name).write_text(PAGE.file(name))
     return Newcomer(tmp_path, SMALLER | SHORTER)
 
 
@@ -64,6 +66,8 @@ def test_a_device_is_found_examined_tared_and_recorded(newcomer: Newcomer) -> No
     with newcomer:
         newcomer.follow(PAGE.commands(7))
         assert (newcomer.folder / "first.mcap").exists()
+    (calibrated,) = newcomer.follow(PAGE.commands(8))
+    assert "answers from" in calibrated
     (install,) = PAGE.commands(9)
     assert "/etc/tactomo/palm.toml" in newcomer.run(install)
 

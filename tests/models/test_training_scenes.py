@@ -182,7 +182,7 @@ def test_displaced_electrodes_act_as_electrodes_meshed_there(
     """A wider pitch: the outer ones of each side move along it, by three times as much."""
     spacing_m, refinements = 0.0025, 3
     here = mesh_sheet(paper, spacing_m, refinements)
-    pitch_m = (paper.electrodes.pitch_m or 0) + 2 / 3 * shift_m
+    pitch_m = paper.electrodes.pitches_m[0] + 2 / 3 * shift_m
     moved = variant(paper, electrodes={"pitch_m": pitch_m})
     along = np.tile([-1.0, -1 / 3, 1 / 3, 1.0], 4) * shift_m
 
