@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 import json
 import resource
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -222,17 +224,17 @@ def test_what_was_there_stays_where_writing_fails(tactomo: Run, grasp: Path) -> 
     assert len(list(grasp.parent.iterdir())) == 4
 
 
-def test_what_holds_no_frames_is_reconstructed_first(
-    tactomo: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The small sheet is pressed at rest, on the right, and not again; the scans are imported."""
+def bare_recording(
+    tactomo: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scans_pressed: int
+) -> Path:
+    """Record a small sheet without maps: at rest for 25 scans, pressed on the right, let go."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     (tmp_path / "small.toml").write_text(SMALL)
     skin = SkinSimulator(load_description(str(tmp_path / "small.toml")), spacing_m=0.002)
     rest, pressed = skin.voltages(()), skin.voltages([Press(0.01, 0.0, 180.0, 0.008)])
     noise = np.random.default_rng(1)
     scans = {
-        name: np.array([rest[name]] * 25 + [pressed[name]] * 10 + [rest[name]] * 5)
+        name: np.array([rest[name]] * 25 + [pressed[name]] * scans_pressed + [rest[name]] * 5)
         for name in ("magnitude", "structure")
     }
     scans = {n: v + noise.normal(0, 1e-5 * np.abs(v).max(), v.shape) for n, v in scans.items()}
@@ -241,16 +243,41 @@ def test_what_holds_no_frames_is_reconstructed_first(
     np.savez(tmp_path / "in.npz", **arrays)
     arguments = ("import", "in.npz", "bare.mcap", "--sensor", "small.toml", "--rate", 20)
     assert tactomo(*arguments, "--reference-frames", "0:20").returncode == 0
+    return tmp_path / "bare.mcap"
+
+
+def test_what_holds_no_frames_is_reconstructed_first(
+    tactomo: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bare_recording(tactomo, tmp_path, monkeypatch, scans_pressed=10)
     result = tactomo("export", "bare.mcap", "made.csv", "--from", 1)
     assert result.returncode == 0, result.stderr
     rows = rows_of(tmp_path / "made.csv")
     assert {float(row["time_s"]) >= 1.0 for row in rows} == {True}
+    assert {row["age_s"] for row in rows} == {""}  # nobody knows it
     touched = [row for row in rows if row["id"]]
     times = [float(row["time_s"]) for row in touched]
     assert (min(times), max(times)) == pytest.approx((1.25, 1.7), abs=0.02)
     assert float(touched[5]["x_mm"]) == pytest.approx(10.0, abs=2.0)
     result = tactomo("plot", "bare.mcap", "-o", "made.png", "--what", "path")
     assert result.returncode == 0, result.stderr
+    assert not list(tmp_path.glob(".tactomo*"))
+
+
+def test_half_a_reconstruction_is_no_export(
+    tactomo: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bare_recording(tactomo, tmp_path, monkeypatch, scans_pressed=3000)
+    command = [sys.executable, "-m", "tactomo.cli", "export", "bare.mcap", "made.csv"]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE) as process:
+        deadline = time.monotonic() + 60
+        while not list(tmp_path.glob(".tactomo*/bare.mcap")):
+            assert time.monotonic() < deadline
+            assert process.poll() is None
+            time.sleep(0.01)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 130
+    assert not (tmp_path / "made.csv").exists()
     assert not list(tmp_path.glob(".tactomo*"))
 
 

@@ -300,6 +300,13 @@ def test_the_command_serves_until_it_is_stopped(
     assert "/left/contacts" in layout.read_text()
 
 
+def test_without_the_extra(tactomo: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    result = tactomo("foxglove")
+    assert result.returncode == 1
+    assert "pip install 'tactomo[foxglove]'" in result.stderr
+
+
 def test_wrong_usage(tactomo: Callable[..., Any]) -> None:
     result = tactomo("foxglove", "--pose", "1,2")
     assert result.returncode == 2

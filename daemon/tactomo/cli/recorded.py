@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import typer
 
+from tactomo.cli.children import interrupt_on_sigterm
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
@@ -231,6 +232,7 @@ def _reconstructed(given: Recording, description: str, folder: Path) -> list[Rec
     """Replay each file of a recording through a daemon of our own, into one that has frames."""
     from tactomo_client.recording import open_recording
 
+    interrupt_on_sigterm()
     made: list[Recording] = []
     for file in given.files:
         _reconstruct_file(file, given.sensor, description, folder / file.name)
@@ -265,7 +267,12 @@ def _reconstruct_file(path: Path, sensor: str, description: str, target: Path) -
         )
         total = max(recording.summary.scans.values(), default=0)
         with _watched(config.control, total, f"reconstructing {path.name}"):
-            status = Daemon(config).run()
+            daemon = Daemon(config)
+            daemon.start()
+            try:  # not by `run`, for which Ctrl-C is a good end
+                status = daemon.wait()
+            finally:
+                daemon.stop()
     if status != 0:
         raise TactomoError(f"{path} could not be replayed", "`tactomo replay` tells more")
 
