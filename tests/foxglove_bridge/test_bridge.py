@@ -160,6 +160,7 @@ def test_the_grid_has_the_numbers_and_lies_where_the_map_is(client: FoxgloveClie
     assert grid.pose.position.x + grid.cell_size.x / 2 == pytest.approx(-0.075)
     assert grid.cell_size.y == pytest.approx(0.003)
     assert (cells["alpha"] == 255).all()
+    assert (cells["red"] != cells["blue"]).any()  # grey is for what is old
 
 
 def test_the_image_has_y_up_and_its_labels_lie_on_it(client: FoxgloveClient) -> None:
