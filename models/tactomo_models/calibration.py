@@ -37,6 +37,7 @@ LEAST_PRESSURES: Final = 4  # different ones among them
 APART: Final = 0.02  # of the range: pressures closer than this are the same one again
 ENOUGH_READINGS: Final = 10
 ENOUGH_PRESSURES: Final = 6
+NEAR_ONSET: Final = 0.15  # of the largest pressure: the onset is to be known so well
 MOST_PIECES: Final = 6
 ONSETS: Final = 20  # that are tried
 RESAMPLED: Final = 100
@@ -185,11 +186,23 @@ def still_wanted(readings: Sequence[Reading]) -> list[str]:
         wanted.append(f"{ENOUGH_PRESSURES - different} more pressures, different from these")
     if len(answered) == len(readings):
         wanted.append("one so light that the channel does not answer, for the onset")
+    elif answered:
+        wanted += _wanted_near_onset(_from_onset(_columns(ordered)))
     if "up" not in {r.direction for r in answered}:
         wanted.append("some with the load rising")
     if "down" not in {r.direction for r in answered}:
         wanted.append("some with the load falling, for the hysteresis")
     return wanted
+
+
+def _wanted_near_onset(data: _Columns) -> list[str]:
+    if data.onset is None:
+        return []
+    start, first = data.onset
+    last = (start + first) / 2 if start else 0.0
+    if first - last < NEAR_ONSET * data.kpa[-1]:
+        return []
+    return [f"one between {last:.0f} and {first:.0f} kPa, for the onset"]
 
 
 def _columns(readings: Sequence[Reading]) -> _Columns:

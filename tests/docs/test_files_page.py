@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,10 @@ from tables import table
 from tactomo.recording import Mark, Origin
 from tactomo.recording_writer import RecordingWriter, pack_mark, reference_entry
 from tactomo_client.recording_file import CHANNELS, PROFILE
-from tactomo_models import Flag, Press, Reference, SkinSimulator, load_description
+from tactomo_models import Flag, Press, Reference, SkinSimulator, load_cell, load_description
 from tactomo_models.batch import reconstruct_file
+from tactomo_models.calibration_file import PressureCalibration
+from tactomo_models.load_cell import read_load_cell
 
 PAGE = "docs/files.md"
 
@@ -53,6 +56,22 @@ def test_the_arrays_that_are_written_have_their_rows(batch: Path) -> None:
         assert made[name].dtype == np.dtype(dtype), name
         wanted = [sizes[axis] for axis in shape.strip("(),").replace(",", " ").split()]
         assert list(made[name].shape) == wanted, name
+
+
+def test_every_column_of_a_load_cells_log_has_its_row(tmp_path: Path) -> None:
+    told = table(PAGE, "## A load cell's log").keys()
+    values = {"direction": "up", "pressure_kpa": "100", "magnitude": "0.1"}
+    log = tmp_path / "log.csv"
+    log.write_text(",".join(told) + "\n" + ",".join(values.get(name, "50") for name in told))
+    cell = read_load_cell(log)
+    assert (cell.pressure_kpa[0], cell.magnitude[0], cell.direction(0)) == (100, 0.1, "up")
+    assert told == set(re.findall(r"^`(\w+)`", load_cell.__doc__ or "", re.M))
+
+
+def test_every_field_of_a_calibration_has_its_row() -> None:
+    assert (
+        table(PAGE, "## A pressure calibration").keys() == PressureCalibration.model_fields.keys()
+    )
 
 
 def test_every_flag_has_its_bit() -> None:
