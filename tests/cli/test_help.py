@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 
 Run = Callable[..., Any]
 
-TABLES = {"curve", "recording"}
+TABLES = {"baseline", "curve", "recording"}
 """Keys of the configuration that hold others, which have flags only where one is often wanted."""
 
 
