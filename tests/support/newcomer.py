@@ -119,7 +119,7 @@ class Newcomer:
         return here.get(name, [])
 
     def _start(self, name: str, line: list[str]) -> str:
-        if "--port" in line and self.addresses.get("ports"):
+        if "/dev/ttyACM0" in line and self.addresses.get("ports"):
             line[line.index("/dev/ttyACM0")] = self.addresses["ports"][0]
         process = subprocess.Popen(
             line,

@@ -130,7 +130,8 @@ def _draw_sheet(axes: Axes, description: SensorDescription, paper_mm: float) -> 
     half_x, half_y = 5e2 * description.width_m, 5e2 * description.height_m
     _draw_outline(axes, description, 0.0, facecolor="0.88", edgecolor="black")
     frame_mm = 1e3 * description.sheet.frame_width_m
-    _draw_outline(axes, description, frame_mm, facecolor="white", edgecolor="0.5", linestyle="--")
+    line = "--" if frame_mm else "none"
+    _draw_outline(axes, description, frame_mm, facecolor="white", edgecolor="0.5", linestyle=line)
     x, y = np.meshgrid(description.map_x_m, description.map_y_m)
     on = description.on_sheet(x, y)
     axes.plot(1e3 * x[on], 1e3 * y[on], ",", color="0.6", zorder=2)
