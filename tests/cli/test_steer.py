@@ -67,6 +67,30 @@ def test_status_shows_what_matters(tactomo: Run, control: Any) -> None:
         assert words in result.stdout
 
 
+@pytest.mark.parametrize(
+    ("description", "words"),
+    [
+        ({"pressure_max_kpa": None}, "no magnitude channel"),
+        ({"pressure_max_kpa": 300.0, "calibration": None}, "by the description's table"),
+        (
+            {
+                "pressure_max_kpa": 250.0,
+                "calibration": {
+                    **{"taken": "2026-01-31T12:00:00+00:00", "readings": 14},
+                    **{"range_kpa": [131.2, 250.0], "sigma_kpa": 2.34},
+                },
+            },
+            "calibrated 2026-01-31 by 14 readings: 131 to 250 kPa ± 2.3",
+        ),
+    ],
+)
+def test_status_says_what_a_pressure_rests_on(
+    tactomo: Run, control: Any, description: dict[str, Any], words: str
+) -> None:
+    control.answers["status"] = {**STATUS, "description": description}
+    assert words in tactomo("status", "--control", control.address).stdout
+
+
 def test_status_begins_with_what_is_wrong_and_what_to_do(tactomo: Run, control: Any) -> None:
     closed = {"url": "/dev/ttyACM1", "connected": False, "state": "closed", "problem": "no device"}
     trouble = {"name": "port_lost", "severity": "error", "detail": "gone", "age_s": 240.0}

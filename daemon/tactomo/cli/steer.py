@@ -244,6 +244,7 @@ def _status_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
     rows = [
         ("daemon", f"{status.get('version')}, up {status.get('uptime_s', 0.0):.0f} s"),
         ("sensor", f"{description.get('model')} ({', '.join(description.get('modalities', []))})"),
+        ("pressure", _pressure(description)),
         ("source", str((status.get("source") or {}).get("kind"))),
         *(("port", _port_line(port)) for port in status.get("ports", [])),
         (
@@ -277,6 +278,20 @@ def _status_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
         ("process", _process(status.get("process") or {}, status.get("uptime_s") or 0.0)),
     ]
     return rows
+
+
+def _pressure(description: dict[str, Any]) -> str:
+    """Say what turns a change into a pressure."""
+    calibration = description.get("calibration")
+    if calibration:
+        low, high = calibration["range_kpa"]
+        return (
+            f"calibrated {calibration['taken'][:10]} by {calibration['readings']} readings: "
+            f"{low:.0f} to {high:.0f} kPa ± {calibration['sigma_kpa']:.1f}"
+        )
+    if description.get("pressure_max_kpa") is None:
+        return "none: no magnitude channel"
+    return "by the description's table; `tactomo calibrate` makes it this sensor's"
 
 
 def _recording(recording: dict[str, Any] | None, recorder: dict[str, Any]) -> str:
