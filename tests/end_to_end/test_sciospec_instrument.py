@@ -40,6 +40,8 @@ def start(tmp_path: Path) -> Iterator[Start]:
         sensor: str, daemon: dict[str, Any] | None = None, **config: Any
     ) -> tuple[Twin, DaemonProcess]:
         settings = {"protocol": "sciospec", "control": "tcp://127.0.0.1:0", **config}
+        # By a link, which goes with the twin: the number of a pty is somebody else's afterwards.
+        settings["link_folder"] = tmp_path / "links"
         twin = Twin(TwinConfig(load_description(sensor), **settings))
         running.append(twin.stop)
         twin.start()
@@ -88,9 +90,8 @@ def tactomo(*arguments: object) -> str:
 
 
 def test_an_instrument_is_configured_believed_and_stopped(start: Start, tmp_path: Path) -> None:
-    links = tmp_path / "links"
     record = {"recording": {"file": str(tmp_path / "a.mcap")}}
-    twin, daemon = start(sensor(tmp_path, COARSE), record, link_folder=links)
+    twin, daemon = start(sensor(tmp_path, COARSE), record)
     wait_until(lambda: daemon.told("tared"), "a reference")
     for x_mm in (40.0, -40.0):
         request("press", twin.control, x_mm=x_mm, y_mm=20.0, radius_mm=15.0)
