@@ -85,8 +85,9 @@ def event(lines: Iterator[str], name: str) -> dict[str, Any]:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(400)
 def test_a_researcher_with_a_sciospec_and_no_instrument_yet(terminal: Terminal) -> None:
-    twin, daemon, poke, status, record, info = commands("Sciospec, emulated")
+    twin, daemon, poke, status, record, info, plot = commands("Sciospec, emulated")
     address = f"ipc://{terminal.folder}/twin"
     next(line for line in terminal.start(twin, "--control", address) if "control" in line)
     log = terminal.start(daemon, "--stream", ANYWHERE, "--control", ANYWHERE)
@@ -96,6 +97,7 @@ def test_a_researcher_with_a_sciospec_and_no_instrument_yet(terminal: Terminal) 
     assert "sciospec" in terminal.run(status, "--control", control)
     terminal.run(record, "--control", control)
     assert "sciospec, protocol sciospec" in terminal.run(info)
+    assert "1 contact(s)" in terminal.run(plot)
     port = request("status", control)["ports"][0]
     assert (port["state"], port["protocol"]) == ("running", "sciospec")
 
