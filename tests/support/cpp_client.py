@@ -18,7 +18,7 @@ import pytest
 CPP_FOLDER: Final = Path(__file__).parents[2] / "clients" / "cpp"
 PROBE: Final = CPP_FOLDER / "tests" / "probe.cpp"
 STRICT: Final = "-std=c++17 -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Werror"
-SANITIZED: Final = "-O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all"
+SANITIZED: Final = "-g -fsanitize=address,undefined -fno-sanitize-recover=all"
 PACKAGES: Final = "apt install g++ cmake pkg-config cppzmq-dev libmsgpack-dev"
 BUILD_S: Final = 300.0
 PATIENCE_S: Final = 60.0
