@@ -10,16 +10,20 @@ import sys
 import time
 import weakref
 from collections.abc import Callable
+from typing import assert_type
 
 import numpy as np
 import pytest
 from tactomo_client import (
     Contact,
     ControlError,
+    Event,
     Frame,
     MessageError,
+    Status,
     StreamTimeout,
     Subscription,
+    aio,
     subscribe,
 )
 from tactomo_client.fake import FakeSensor
@@ -273,6 +277,44 @@ def test_ctrl_c_interrupts_the_wait(sensor: FakeSensor) -> None:
     finally:
         child.kill()
         child.communicate()
+
+
+def test_what_comes_has_the_type_that_was_asked_for(sensor: FakeSensor) -> None:
+    """The types are for `mypy --strict` to check; here it runs."""
+    with (
+        subscribe("left", address=sensor.address, kind="contacts") as frames,
+        subscribe("left", address=sensor.address, kind="status") as statuses,
+        subscribe("left", address=sensor.address, kind="event", timeout_s=10) as events,
+        subscribe("left", address=sensor.address, kind=("map", "event"), timeout_s=10) as news,
+    ):
+        assert_type(frames, Subscription[Frame])
+        assert_type(statuses.latest(), Status | None)
+        assert_type(news.wait(0.01), Frame | Status | Event | None)
+        assert_type(aio.subscribe("left", kind="event"), aio.Subscription[Event])
+        for _ in range(5):
+            sensor.wait_for_subscriber()
+        sensor.publish_message(
+            "event", {"name": "port_lost", "severity": "error", "detail": "gone"}
+        )
+        assert_type(event := next(events), Event)
+        assert (event.name, event.severity, event.detail) == ("port_lost", "error", "gone")
+        assert next(news) == event
+
+
+def test_a_status_is_stale_when_none_has_come_for_three_seconds(sensor: FakeSensor) -> None:
+    with subscribe("left", address=sensor.address, kind="status", timeout_s=10) as statuses:
+        sensor.wait_for_subscriber()
+        sensor.publish_message("status", {"state": "running", "ports": [{"url": "/dev/x"}]})
+        status = next(statuses)
+        assert (status.state, status.ports[0].url) == ("running", "/dev/x")
+        assert not statuses.is_stale
+        old = dataclasses.replace(status, _received_ns=status._received_ns - 3_100_000_000)
+        assert old.is_stale
+
+
+def test_latest_only_goes_with_one_kind() -> None:
+    with pytest.raises(MessageError, match="latest_only keeps the newest message of one kind"):
+        subscribe("left", kind=("map", "status"), latest_only=True)
 
 
 def test_what_cannot_be_subscribed_to_is_named() -> None:
