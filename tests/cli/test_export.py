@@ -99,6 +99,15 @@ def test_maps_as_arrays(tactomo: Run, grasp: Path) -> None:
         assert (arrays["contact_sigma"][~light] == 0.005).all()
 
 
+def test_an_image_that_the_sensor_never_has_is_nan(tactomo: Run, tmp_path: Path) -> None:
+    write_grasp(tmp_path / "one.mcap", change=lambda _: {"map": None, "pressure_kpa": None})
+    assert tactomo("export", "one.mcap", "one.npz").returncode == 0
+    with np.load(tmp_path / "one.npz") as arrays:
+        assert arrays["pressure_kpa"].shape == arrays["structure"].shape == (FRAMES, 51, 51)
+        assert np.isnan(arrays["pressure_kpa"]).all()
+        np.testing.assert_array_equal(arrays["structure"][50], images_of(50)["structure"])
+
+
 def test_a_file_for_foxglove(tactomo: Run, grasp: Path) -> None:
     result = tactomo("export", grasp, "fox.mcap", "--layout", "left.json", "--pose", "0,0,1")
     assert result.returncode == 0, result.stderr

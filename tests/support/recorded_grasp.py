@@ -97,7 +97,7 @@ def messages_of(number: int, changes: Mapping[str, Any]) -> list[tuple[str, byte
     }
     extent = {"x_mm": [-75.0, 75.0], "y_mm": [-75.0, 75.0], "magnitude_max": 0.25}
     return [
-        ("map", encode_message(SENSOR, "map", fields | images | extent)),
+        ("map", encode_message(SENSOR, "map", fields | images | extent | dict(changes))),
         ("contacts", encode_message(SENSOR, "contacts", fields)),
     ]
 

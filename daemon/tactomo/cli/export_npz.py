@@ -10,7 +10,7 @@ import contextlib
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import IO, Any, Final
@@ -57,33 +57,58 @@ def write_maps(moments: Iterable[Moment], output: IO[bytes], scratch: Path) -> i
         scratch: a folder with room for all of it, uncompressed.
 
     """
-    count = 0
-    with contextlib.ExitStack() as undo:
-        folder = undo.enter_context(tempfile.TemporaryDirectory(prefix=".tactomo-", dir=scratch))
+    with (
+        tempfile.TemporaryDirectory(prefix=".tactomo-", dir=scratch) as folder,
+        contextlib.ExitStack() as undo,
+    ):
+        arrays = _Arrays(Path(folder), undo)
+        for moment in moments:
+            arrays.append(moment)
+        arrays.store(output)
+        return arrays.count
 
-        def column(name: str, dtype: str) -> _Column:
-            return undo.enter_context(_Column.opened(Path(folder) / name, np.dtype(dtype)))
 
-        of_frames = {name: column(name, dtype) for name, dtype in FRAME_TYPES.items()}
-        of_contacts = {name: column(name, dtype) for name, dtype in CONTACT_TYPES.items()}
-        images = {name: column(name, "<f4") for name in IMAGES}
-        axes: dict[str, NDArray[np.float64]] = {}
-        for count, moment in enumerate(moments, 1):
-            _append(of_frames, _frame_values(moment))
-            for contact in moment.frame.contacts:
-                _append(of_contacts, _contact_values(count - 1, contact))
-            for name, grown in images.items():
-                grown.put(count - 1, getattr(moment.frame, name))
-            axes = axes or _axes(moment.frame)
+class _Arrays:
+    """All arrays of a file while they grow; `undo` closes theirs.
+
+    Attributes:
+        count: how many frames are in them.
+
+    """
+
+    def __init__(self, folder: Path, undo: contextlib.ExitStack) -> None:
+        def columns(types: Mapping[str, str]) -> dict[str, _Column]:
+            files = {name: undo.enter_context((folder / name).open("w+b")) for name in types}
+            return {name: _Column(files[name], np.dtype(dtype)) for name, dtype in types.items()}
+
+        self.count = 0
+        self._frames = columns(FRAME_TYPES)
+        self._contacts = columns(CONTACT_TYPES)
+        self._images = columns(dict.fromkeys(IMAGES, "<f4"))
+        self._axes: dict[str, NDArray[np.float64]] = {}
+
+    def append(self, moment: Moment) -> None:
+        """Append a frame."""
+        _append(self._frames, _frame_values(moment))
+        for contact in moment.frame.contacts:
+            _append(self._contacts, _contact_values(self.count, contact))
+        for name, column in self._images.items():
+            column.put(self.count, getattr(moment.frame, name))
+        self._axes = self._axes or _axes(moment.frame)
+        self.count += 1
+
+    def store(self, output: IO[bytes]) -> None:
+        """Write all of them as an archive."""
+        if self._axes:
+            shape = (len(self._axes["y_mm"]), len(self._axes["x_mm"]))
+            for column in self._images.values():
+                column.fill(self.count, shape)
         with zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-            for grown in images.values():
-                grown.fill(count)
-            for name, grown in {**of_frames, **images, **of_contacts}.items():
-                grown.store(archive, name)
-            for name, positions in axes.items():
+            for name, column in {**self._frames, **self._images, **self._contacts}.items():
+                column.store(archive, name)
+            for name, positions in self._axes.items():
                 with archive.open(f"{name}.npy", "w") as entry:
                     npy.write_array(entry, positions)
-    return count
 
 
 class _Column:
@@ -93,31 +118,22 @@ class _Column:
         self.rows = 0
         self._file = file
         self._dtype = dtype
-        self._shape: tuple[int, ...] | None = None
-
-    @classmethod
-    @contextlib.contextmanager
-    def opened(cls, path: Path, dtype: np.dtype[Any]) -> Iterator[_Column]:
-        """Open a column in a new file."""
-        with path.open("w+b") as file:
-            yield cls(file, dtype)
+        self._shape: tuple[int, ...] = ()
 
     def put(self, row: int, value: Any) -> None:
-        """Set a row at or beyond the end; NaN where it is None, and in rows that are left out."""
+        """Set a row at or beyond the end; NaN in those that are left out. None leaves it out."""
         if value is None:
             return
         array = np.asarray(value, self._dtype)
-        self._shape = array.shape
-        self.fill(row)
+        self.fill(row, array.shape)
         self._file.write(array.tobytes())
         self.rows += 1
 
-    def fill(self, rows: int) -> None:
-        """Make it so many rows long, by NaN; by nothing, as long as its rows have no shape."""
-        if self._shape is None:
-            return
+    def fill(self, rows: int, shape: tuple[int, ...]) -> None:
+        """Make it so many rows of this shape long, by NaN."""
+        self._shape = shape
         while self.rows < rows:
-            self._file.write(np.full(self._shape, np.nan, self._dtype).tobytes())
+            self._file.write(np.full(shape, np.nan, self._dtype).tobytes())
             self.rows += 1
 
     def store(self, archive: zipfile.ZipFile, name: str) -> None:
@@ -125,7 +141,7 @@ class _Column:
         header = {
             "descr": npy.dtype_to_descr(self._dtype),
             "fortran_order": False,
-            "shape": (self.rows, *(self._shape or ())),
+            "shape": (self.rows, *self._shape),
         }
         self._file.seek(0)
         with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
