@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from faulty_skin import rewired
 from newcomer import Newcomer, Page
+from tactomo.port import contradiction
 from tactomo_models import (
     DescriptionError,
     Flag,
@@ -24,6 +25,7 @@ from tactomo_models import (
     Tier,
     load_description,
 )
+from tactomo_protocol import Channel, Hello, SampleFormat
 
 pytestmark = pytest.mark.timeout(300)  # a dozen programs, one after another
 
@@ -89,6 +91,13 @@ def test_what_is_refused_is_refused_in_the_pages_words(tmp_path: Path) -> None:
         said = str(caught.value).removeprefix(f"{tmp_path / FILE}: ")
         told = [cell for cell in PAGE.text.split("`") if cell and cell in said]
         assert max(map(len, told)) > 20, said
+
+
+def test_a_device_of_another_pattern_is_refused_in_the_pages_words(tmp_path: Path) -> None:
+    (tmp_path / FILE).write_text(PAGE.file(FILE))
+    both = (Channel.MAGNITUDE, Channel.STRUCTURE)
+    round_ = Hello("twin-skin_round", "1", both, 16, 8, 1, 192, SampleFormat.INT32, 1.0, 20.0)
+    assert contradiction(round_, load_description(tmp_path / FILE)) in PAGE.text
 
 
 @pytest.mark.parametrize(
