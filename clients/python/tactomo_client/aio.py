@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, closing, suppress
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self, TypeVar, Unpack, cast, overload
@@ -307,14 +307,15 @@ class Daemon(Control):
 
 async def _wait(steps: Waiting[T]) -> T:
     """Run a generator to its end, letting other tasks run while it waits, and return its value."""
-    with closing(steps):
-        try:
-            socket, wait_ms = next(steps)
-            while True:
-                socket, wait_ms = steps.send(await _is_readable(socket, wait_ms))
-        except StopIteration as done:
-            result: T = done.value
-            return result
+    try:
+        socket, wait_ms = next(steps)
+        while True:
+            socket, wait_ms = steps.send(await _is_readable(socket, wait_ms))
+    except StopIteration as done:
+        result: T = done.value
+        return result
+    finally:
+        steps.close()
 
 
 async def _is_readable(socket: Owner, wait_ms: int) -> bool:

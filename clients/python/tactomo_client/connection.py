@@ -31,14 +31,15 @@ there."""
 
 def wait(steps: Waiting[T]) -> T:
     """Run a generator to its end, blocking this thread while it waits, and return its value."""
-    with contextlib.closing(steps):
-        try:
-            socket, wait_ms = next(steps)
-            while True:
-                socket, wait_ms = steps.send(bool(socket.poll(wait_ms)))
-        except StopIteration as done:
-            result: T = done.value
-            return result
+    try:
+        socket, wait_ms = next(steps)
+        while True:
+            socket, wait_ms = steps.send(bool(socket.poll(wait_ms)))
+    except StopIteration as done:
+        result: T = done.value
+        return result
+    finally:
+        steps.close()
 
 
 def whole_ms(seconds: float) -> int:
