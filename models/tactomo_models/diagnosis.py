@@ -40,6 +40,7 @@ from tactomo_models.plausibility import (
     deviation,
     examine_reference,
 )
+from tactomo_models.signs import Signs
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -226,24 +227,27 @@ class _Examined:
         excess = _excess_noise(self.mean, self.noise)
         self.electrode_noise = np.array([np.median(excess[t]) for t in self.wiring.electrodes])
         of_mean = self.noise / np.sqrt(self.count)
+        self.sought = _sought(wiring, layout, transfer)
         self.order = self._order(layout, transfer, of_mean)
         expected = self.order.expected
         if (scans >= 0).all():  # a device that reports sizes alone
             expected = np.abs(expected)
-        self.verdict = examine_reference(self.wiring, self.mean, expected, of_mean, contrast)
+        self.verdict = examine_reference(
+            self.wiring, self.mean, expected, of_mean, contrast, self.sought
+        )
         self.later = self._each(scans, contrast)
         self.states = self._states(layout.electrode_count, excess, expected)
         self.good = self._good()
 
     def _order(self, layout: Layout, transfer: FloatArray | None, noise: FloatArray) -> Order:
         if isinstance(layout, SensorDescription) and transfer is not None:
-            return find_order(layout, transfer, self.mean, noise)
+            return find_order(layout, transfer, self.mean, noise, self.sought)
         return Order((), 0, _likes(layout, self.mean))
 
     def _each(self, scans: FloatArray, contrast: float) -> list[tuple[Flag, tuple[int, ...]]]:
         """What is wrong with each single scan, by laws that hold whatever presses."""
         bad = list(self.verdict.electrodes)
-        usable = (self.mean != 0) & ~self.wiring.electrodes[bad].any(axis=0)
+        usable = (self.mean != 0) & self.sought & ~self.wiring.electrodes[bad].any(axis=0)
         own = asymmetry_of(self.wiring, self.mean)
         check = ScanCheck(self.wiring, self.mean, self.noise, usable, contrast, own)
         verdicts = [check.examine(scan) for scan in scans]
@@ -267,9 +271,16 @@ class _Examined:
     def _good(self) -> BoolArray:
         """Voltages (M,) that no bad electrode has part in; all where most electrodes are bad."""
         bad = [n for n, state in enumerate(self.states) if state not in ("good", "swapped")]
-        good = ~self.wiring.electrodes[bad].any(axis=0)
+        good = self.sought & ~self.wiring.electrodes[bad].any(axis=0)
         few = len(bad) > BROKEN_SHARE * len(self.states)
-        return np.ones_like(good) if few or not good.any() else good
+        return self.sought if few or not good.any() else good
+
+
+def _sought(wiring: Wiring, layout: Layout, transfer: FloatArray | None) -> BoolArray:
+    """Voltages (M,) that the instrument reads at all."""
+    if not isinstance(layout, SensorDescription) or transfer is None:
+        return np.ones(len(layout.pairs.drive), dtype=bool)
+    return Signs(layout, wiring, scan_voltages(layout, transfer)).certain
 
 
 def noise_about_line(scans: FloatArray) -> FloatArray:
@@ -368,7 +379,11 @@ class Order:
 
 
 def find_order(
-    description: SensorDescription, transfer: FloatArray, volts: FloatArray, noise: FloatArray
+    description: SensorDescription,
+    transfer: FloatArray,
+    volts: FloatArray,
+    noise: FloatArray,
+    sought: BoolArray | bool = True,
 ) -> Order:
     """Find the order of leads that explains the voltages (M,) of an unpressed skin.
 
@@ -381,14 +396,16 @@ def find_order(
         transfer: (L, L) the model's transfer resistances.
         volts: (M,) measured, on any scale; where none is negative, sizes alone are compared.
         noise: (M,) their standard deviation.
+        sought: (M,) those to go by.
     """
+    known = np.broadcast_to(sought, volts.shape)
     count = description.electrode_count
     is_unsigned = bool((volts >= 0).all())
 
     def trial(order: Sequence[int]) -> tuple[float, FloatArray]:
         moved = scan_voltages(description, exchanged(transfer, order))
         moved = np.abs(moved) if is_unsigned else moved
-        return _deviation(volts, moved, noise), moved
+        return _deviation(volts[known], moved[known], noise[known]), moved
 
     straight = list(range(count))
     left, described = trial(straight)

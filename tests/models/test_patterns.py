@@ -21,6 +21,7 @@ from tactomo_models import (
     build_artifact,
     load_description,
 )
+from tactomo_models.diagnosis import Level, diagnose
 from tactomo_models.forward import ForwardModel
 from tactomo_models.plausibility import Wiring
 from tactomo_models.signs import Signs
@@ -152,6 +153,23 @@ def test_a_converter_of_one_sign_is_believed_in_its_half(kind: str, sign: float)
     [contact] = frame.contacts
     assert np.hypot(contact.x_m - PRESS.x_m, contact.y_m - PRESS.y_m) < 1.5e-3
     assert not frame.flags & ~Flag.MISFIT_HIGH
+
+
+@pytest.mark.parametrize("kind", ["signed", "unsigned", "positive"])
+def test_a_healthy_device_of_any_kind_is_called_so(kind: str) -> None:
+    sensor = SENSORS["16, opposite"]
+    _, predicted, _ = signs_of(sensor)
+    skin = Skin(simulator(sensor))
+    scans = np.array([skin.scan()["structure"] for _ in range(30)])
+    if kind != "signed":
+        scans = np.abs(scans)
+    if kind == "positive":
+        noise = 1e-3 * scans.max() * np.random.default_rng(0).standard_normal(scans.shape)
+        scans = np.where(predicted > 0, scans, np.abs(noise))
+    sensor = variant(sensor, instrument={"voltages": kind})
+    found = diagnose(sensor, scans, transfer=BUILT.of(sensor).bare.transfer, contrast=20.0)
+    assert found.level is Level.OK
+    assert set(found.electrodes) == {"good"}
 
 
 def test_a_device_that_tells_signs_is_believed() -> None:
