@@ -37,6 +37,7 @@ MAX_BYTES: Final = 64 << 20
 WINDOW_S: Final = 0.5  # of a log: the load is to be still for so long
 NEAR_S: Final = 0.25  # between a line and the frames that it is of
 STILL: Final = 0.02  # share of the largest load that a still one varies by at most
+MOST: Final = 1e12  # of any number; seconds since 1970 are 2e9
 UNLOADED_KPA: Final = 1.0
 CLOCKS: Final = ("time_s", "realtime_s")
 
@@ -190,14 +191,14 @@ class _Table:
         self._path, self._rows, self._lines, self._columns = path, rows, lines, columns
         self.unknown = np.full(len(rows), np.nan)
 
-    def numbers(self, column: str, least: float = -np.inf) -> FloatArray:
+    def numbers(self, column: str, least: float = -MOST) -> FloatArray:
         values = np.empty(len(self._rows))
         for i, row in enumerate(self._rows):
             try:
                 values[i] = float(row[column])
             except (TypeError, ValueError):
                 raise self._bad(i, column, "is no number") from None
-            if not np.isfinite(values[i]) or values[i] < least:
+            if not least <= values[i] <= MOST:
                 raise self._bad(i, column, "is out of range")
         return values
 
@@ -261,15 +262,22 @@ def _rows(path: Path) -> tuple[list[dict[str, str]], list[int], list[str]]:
     header = kept[0][1]
     delimiter = max(",;\t", key=header.count)
     columns = [name.strip().lower() for name in header.split(delimiter)]
-    lines = csv.reader((line for _, line in kept[1:]), delimiter=delimiter)
-    rows = [dict(zip(columns, (cell.strip() for cell in cells), strict=False)) for cells in lines]
-    for (number, _), row in zip(kept[1:], rows, strict=True):
-        if len(row) < len(columns):
-            raise CalibrationError(
-                f"{path}, line {number} has {len(row)} of {len(columns)} columns; complete it, or "
-                "leave it out"
-            )
+    rows = [_row(path, number, line, columns, delimiter) for number, line in kept[1:]]
     return rows, [number for number, _ in kept[1:]], columns
+
+
+def _row(path: Path, number: int, line: str, columns: list[str], delimiter: str) -> dict[str, str]:
+    """One line's cells by column."""
+    try:
+        (cells,) = csv.reader([line], delimiter=delimiter, strict=True)
+    except (csv.Error, ValueError) as error:
+        raise CalibrationError(f"{path}, line {number}: {error}; correct it") from error
+    if len(cells) < len(columns):
+        raise CalibrationError(
+            f"{path}, line {number} has {len(cells)} of {len(columns)} columns; complete it, or "
+            "leave it out"
+        )
+    return {name: cell.strip() for name, cell in zip(columns, cells, strict=False)}
 
 
 def _still_pieces(cell: LoadCell) -> list[NDArray[np.intp]]:

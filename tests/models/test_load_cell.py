@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tactomo_models import CalibrationError
 from tactomo_models.load_cell import Seen, direct_readings, joined_readings, read_load_cell
@@ -48,6 +50,7 @@ def test_what_is_told_is_taken(log: Path) -> None:
         ("force_n,magnitude\n100,0.1\n", "no area_mm2 or diameter_mm"),
         ("pressure_kpa,magnitude\n100,much\n", "line 2: magnitude = 'much' is no number"),
         ("pressure_kpa,magnitude\n100,nan\n", "line 2: magnitude = 'nan' is out of range"),
+        ("force_n,area_mm2,magnitude\n1e308,1,0.1\n", "force_n = '1e308' is out of range"),
         ("pressure_kpa,magnitude\n100,0.1\n100\n", "line 3 has 1 of 2 columns"),
         ("pressure_kpa,time_s\n100,2\n100,1\n", "line 3: time_s goes back"),
         ("pressure_kpa,magnitude,direction\n100,0.1,left\n", "is not up, down or unknown"),
@@ -59,6 +62,23 @@ def test_a_bad_log_is_refused_with_the_line(log: Path, text: str, said: str) -> 
     log.write_text(text)
     with pytest.raises(CalibrationError, match=said):
         direct_readings(read_load_cell(log))
+
+
+HEADERS = ("pressure_kpa,magnitude", "force_n;area_mm2;time_s", 'pressure_kpa\trealtime_s\t"')
+
+
+@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.sampled_from(HEADERS), st.text("0123456789.,;\t\n\"'eE-+naif#\0\r", max_size=60))
+def test_any_text_is_a_log_or_is_refused(log: Path, header: str, text: str) -> None:
+    log.write_text(f"{header}\n{text}", "utf-8")
+    try:
+        cell = read_load_cell(log)
+        readings = joined_readings(cell, seen(20, np.full(400, 100.0))) if cell.clock else None
+        readings = readings or direct_readings(cell)
+    except CalibrationError:
+        return
+    assert len(readings.readings) <= len(cell.lines)
+    assert np.isfinite(cell.pressure_kpa).all()
 
 
 def test_a_file_that_is_no_log_is_refused(tmp_path: Path) -> None:
