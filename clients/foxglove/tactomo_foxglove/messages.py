@@ -229,7 +229,7 @@ def _warning(sensor: str, description: Mapping[str, Any], text: str, at: Timesta
         timestamp=at,
         frame_id=sensor,
         id="stale",
-        texts=[_text(text, above, Color(r=1.0, g=0.35, b=0.3, a=1.0), 18.0)],
+        texts=[_text(text.replace("; ", "\n"), above, Color(r=1.0, g=0.35, b=0.3, a=1.0), 16.0)],
     )
 
 
