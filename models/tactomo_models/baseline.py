@@ -265,7 +265,7 @@ class BaselineTracker:
             if name not in look.data or frame.flags & ~DISTRUST:
                 channel.drop_block()
             elif channel.add(time_s, scans[name], look.data[name]):
-                channel.follow_gain(time_s)
+                channel.follow_under_contact(time_s, self._memory.creep(time_s, name))
 
     def _note_distrust(self, time_s: float, frame: Reconstruction) -> None:
         if not frame.flags & DISTRUST:
@@ -374,6 +374,7 @@ class _Channel:
         self._sum, self._frames = np.zeros_like(self._now), 0
         self._begun_s = None
         self._anchor: FloatArray | None = None
+        self._anchor_amounts, self._anchored_s = np.zeros_like(self._amounts), 0.0
 
     def add(self, time_s: float, scan: FloatArray | None, taken: Changes) -> bool:
         """Take a scan (M,), volts, into the block; returns whether it is full."""
@@ -408,22 +409,49 @@ class _Channel:
         self._seen_s = self._gain_seen_s = time_s
         return size < MOST_REST and self._excess(wanted) < 1
 
-    def follow_gain(self, time_s: float) -> None:
-        """Follow the factor by which all voltages of a still contact have changed in common."""
+    def follow_under_contact(self, time_s: float, creep: FloatArray) -> None:
+        """Follow the factor that all voltages of a still contact share since its anchor.
+
+        Beside it what is smooth, as far as skins drift in that time and creep does not explain it.
+        """
         frames, mean = self._frames, self._take_block(time_s)
         if self._anchor is None:
-            self._anchor, self._anchor_gain = mean, 0.0
+            self._drop_anchor(time_s, mean)
             return
         gain, is_common = self._common_factor(mean, self._anchor, frames)
-        step = gain - self._anchor_gain
+        step = gain - self._anchor_amounts[0]
         reach = OUT_OF_BOUNDS * GAIN_PER_S * max(BLOCK_S, time_s - self._gain_seen_s)
         if not is_common or abs(step) > reach or abs(self._amounts[0] + step) > MOST_GAIN:
-            self._anchor, self._anchor_gain = mean, 0.0
+            self._drop_anchor(time_s, mean)
             return
-        self._anchor_gain = gain
-        self._amounts[0] += step
-        self._now = self._now + step
+        found = self._smooth_since_anchor(time_s, mean, gain, creep)
+        step_of_all = found - self._anchor_amounts
+        self._anchor_amounts = found
+        self._amounts = self._amounts + step_of_all
+        self._now = self._now + self._subspace.modes @ step_of_all
         self._gain_seen_s = time_s
+
+    def _drop_anchor(self, time_s: float, mean: FloatArray) -> None:
+        """Measure from here on; what has been followed so far stays."""
+        self._anchor, self._anchored_s = mean, time_s
+        self._anchor_amounts = np.zeros_like(self._amounts)
+
+    def _smooth_since_anchor(
+        self, time_s: float, mean: FloatArray, gain: float, creep: FloatArray
+    ) -> FloatArray:
+        """Amounts (K,) of the gain and of what is smooth since the anchor; creep takes its part."""
+        assert self._anchor is not None
+        sigma = creep.copy()
+        sigma[self._subspace.smooth] = SMOOTH_PER_S * max(0.0, time_s - self._anchored_s)
+        valid = (mean > 0) & (self._anchor > 0)
+        ratio = np.divide(mean, self._anchor, out=np.ones_like(mean), where=valid)
+        change = np.where(valid, np.log(ratio) - gain, 0.0)
+        found = self._subspace.explain(change, self._certainty * valid, sigma)
+        bounds = OUT_OF_BOUNDS * sigma
+        amounts = np.clip(found.amounts, -bounds, bounds)
+        amounts[self._subspace.cells] = 0.0
+        amounts[0] = gain
+        return amounts
 
     def _common_factor(
         self, mean: FloatArray, anchor: FloatArray, frames: int

@@ -71,3 +71,20 @@ def test_moving_scenes(tactomo: Run, tmp_path: Path) -> None:
     numbers = json.loads(tactomo(*moving, "--method", "noser", "--json").stdout)
     assert numbers["simulated"] is True
     assert numbers["phases"]["all"]["frames"] == len(numbers["sequences"][0])
+
+
+@pytest.mark.slow
+def test_an_hour_of_drift(tactomo: Run, tmp_path: Path) -> None:
+    picture = tmp_path / "drift.png"
+    ask = ("evaluate", "drift", "--hours", 0.75)
+    result = tactomo(*ask, "--json", "--picture", picture)
+    assert result.returncode == 0
+    told = json.loads(result.stdout)
+    assert (told["simulated"], told["seeds"], told["hours"]) == (True, "tuning", 0.75)
+    (day,) = told["days"]
+    assert day["tracked"]["ghosts_per_hour"] == day["tracked"]["erased"] == 0
+    assert day["tracked"]["presses"] == day["untracked"]["presses"] == 3
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    words = tactomo(*ask).stdout
+    assert "Simulated, not measured: paper_square, 0.75 hours after one tare." in words
+    assert "tuning 0, untracked" in words
