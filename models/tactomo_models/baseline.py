@@ -351,13 +351,18 @@ class PressMemory:
 
 
 class _Channel:
-    """One channel's baseline: logarithms of factors on its tare, split into modes and a rest."""
+    """One channel's baseline: logarithms of factors on its tare, split into modes and a rest.
+
+    Attributes:
+        has_moved: whether what is in force is behind what is known by more than is worth a change.
+    """
 
     def __init__(self, subspace: DriftSubspace, tare: FloatArray) -> None:
         self._subspace = subspace
         self._per_tare = np.divide(1.0, tare, out=np.zeros_like(tare), where=tare != 0)
         self._now = np.zeros(len(tare))  # as it is known; what is in force follows in steps
         self._in_force = self._now
+        self.has_moved = False
         self._amounts = np.zeros(subspace.modes.shape[1])
         self._rest = np.zeros(len(tare))
         self._certainty = np.zeros(len(tare))
@@ -405,7 +410,7 @@ class _Channel:
         rest = self._now + share * change - drift
         size = float(np.sqrt(np.mean(self._certainty * rest**2)))
         self._rest = rest * min(1.0, MOST_REST / max(size, 1e-12))
-        self._now = drift + self._rest
+        self._know(drift + self._rest)
         self._seen_s = self._gain_seen_s = time_s
         return size < MOST_REST and self._excess(wanted) < 1
 
@@ -428,7 +433,7 @@ class _Channel:
         step_of_all = found - self._anchor_amounts
         self._anchor_amounts = found
         self._amounts = self._amounts + step_of_all
-        self._now = self._now + self._subspace.modes @ step_of_all
+        self._know(self._now + self._subspace.modes @ step_of_all)
         self._gain_seen_s = time_s
 
     def _drop_anchor(self, time_s: float, mean: FloatArray) -> None:
@@ -487,7 +492,7 @@ class _Channel:
     def jump(self, time_s: float, found: Explained) -> None:
         """The baseline is where a scan was explained to be."""
         self._amounts = self._kept() + found.amounts
-        self._now = self._subspace.modes @ self._amounts + self._rest
+        self._know(self._subspace.modes @ self._amounts + self._rest)
         self._seen_s = self._gain_seen_s = self._jumped_s = time_s
 
     def _since(self, over_tare: FloatArray) -> FloatArray:
@@ -530,15 +535,14 @@ class _Channel:
         limited[smooth] = np.clip(limited[smooth], -MOST_SMOOTH, MOST_SMOOTH)
         return limited
 
-    @property
-    def has_moved(self) -> bool:
-        """Whether what is in force is behind what is known by more than is worth a change."""
-        behind = self._certainty * (self._now - self._in_force) ** 2
-        return bool(behind.mean() > LEAST_MOVE**2)
+    def _know(self, baseline: FloatArray) -> None:
+        self._now = baseline
+        behind = self._certainty * (baseline - self._in_force) ** 2
+        self.has_moved = bool(behind.mean() > LEAST_MOVE**2)
 
     def put_in_force(self) -> FloatArray:
         """The baseline (M,) as it is known; from now on it is in force."""
-        self._in_force = self._now
+        self._in_force, self.has_moved = self._now, False
         return self._now
 
     def drift(self) -> Drift:

@@ -134,9 +134,9 @@ def _draw(day: Day, tracked: Sequence[Seen], untracked: Sequence[Seen], output: 
     for each in day.skin.presses:
         for axis in axes:
             axis.axvspan(each.start_s / 3600, each.end_s / 3600, color="0.93", lw=0)
-    for seen, label in ((untracked, "untracked"), (tracked, "tracked")):
+    for seen, label, colour in ((tracked, "tracked", "C0"), (untracked, "untracked", "C1")):
         ghosts = [each.ghosts for each in seen]
-        axes[2].plot([e.time_s / 3600 for e in seen], ghosts, label=label)
+        axes[2].plot([e.time_s / 3600 for e in seen], ghosts, color=colour, label=label)
     axes[2].set_ylabel("contacts where\nnothing presses")
     axes[2].set_xlabel("hours since the tare; grey: something presses (simulated)")
     axes[2].legend(frameon=False)
