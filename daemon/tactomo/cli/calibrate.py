@@ -173,7 +173,7 @@ def _facts(made: PressureCalibration) -> list[str]:
         "onset not seen: the lightest reading is answered to"
         if onset is None
         else f"answers from {onset:.0f} kPa",
-        f"readings scatter by {made.repeatability_kpa:.1f} kPa (half way up)",
+        f"readings scatter by {made.repeatability_kpa:.1f} kPa beyond their own uncertainty",
         "hysteresis not measured: loads only rose, or only fell"
         if hysteresis is None
         else f"falling loads read {hysteresis:+.1f} kPa against rising ones",
