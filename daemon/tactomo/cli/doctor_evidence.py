@@ -225,9 +225,18 @@ def _scans_of_messages(
         there = [m for m in messages if m[channel] is not None]
         if there:
             scans[channel] = np.array([array_from_wire(m[channel]) for m in there])
-            device_us = np.array([m["device_us"] for m in there], dtype=np.float64)
-            times_s[channel] = (device_us - device_us[0]) * 1e-6
+            times_s[channel] = _times(
+                [m["device_us"] for m in there], [m["acquired_monotonic_ns"] for m in there]
+            )
     return scans, times_s
+
+
+def _times(device_us: list[int], arrived_ns: list[int]) -> FloatArray:
+    """When scans were taken, s from the first: by the device's clock, or ours where it has none."""
+    device = np.array(device_us, dtype=np.float64)
+    if np.ptp(device):
+        return np.asarray((device - device[0]) * 1e-6)
+    return np.asarray((np.array(arrived_ns) - arrived_ns[0]) * 1e-9)
 
 
 def _heard_of_messages(
@@ -262,10 +271,10 @@ def _gaps(counters: list[int]) -> int:
 
 def _delays(arrived_ms: FloatArray, device_ms: FloatArray) -> FloatArray:
     """How much later than the promptest each scan arrived; two clocks may run at unlike rates."""
-    if len(arrived_ms) < 3:
+    if len(arrived_ms) < 3 or not np.ptp(device_ms):  # of a protocol without a clock
         return np.zeros(0)
     device_ms, arrived_ms = device_ms - device_ms[0], arrived_ms - arrived_ms[0]
-    rate = np.polyfit(device_ms, arrived_ms, 1)[0] if np.ptp(device_ms) > 0 else 1.0
+    rate = np.polyfit(device_ms, arrived_ms, 1)[0]
     late = arrived_ms - rate * device_ms
     return np.asarray(late - late.min())
 
@@ -273,7 +282,7 @@ def _delays(arrived_ms: FloatArray, device_ms: FloatArray) -> FloatArray:
 def _period(device_ms: FloatArray, counters: list[int]) -> float | None:
     steps = np.diff(np.array(counters, dtype=np.int64))
     spans = np.diff(device_ms)[steps == 1]
-    return float(np.median(spans)) if len(spans) else None
+    return float(np.median(spans)) or None if len(spans) else None
 
 
 def of_recording(recording: Recording, description: str | None, frames: slice | None) -> Evidence:
@@ -293,7 +302,7 @@ def of_recording(recording: Recording, description: str | None, frames: slice | 
         if taken and channel.name.lower() in known.modalities:
             name = channel.name.lower()
             scans[name] = np.array([scan.volts for scan in taken])
-            times_s[name] = np.array([scan.device_us for scan in taken]) * 1e-6
+            times_s[name] = _times([s.device_us for s in taken], [s.arrived_ns for s in taken])
             saturated[name] = sum(bool(scan.flags & ScanFlag.SATURATED) for scan in taken)
     if not scans:
         raise DoctorError(
