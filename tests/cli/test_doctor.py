@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tactomo.recording_writer import write_recording
 from tactomo_client import request
 from tactomo_models import SensorDescription, load_description, load_or_build_artifact
 from tactomo_models.forward import scan_voltages
 from tactomo_models.pattern import reciprocal_pairs, scan_pairs
+from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag
 from whole_system import SENSOR, Demo, repository, running_demo
 
 Run = Callable[..., Any]
@@ -154,6 +156,32 @@ def test_a_recording_is_examined_by_its_own_scans(tactomo: Run, rest: FloatArray
     assert about(found["stream"], "lost_scans")["number"] == 0
     drift = about(found["channels"]["magnitude"]["findings"], "drift")
     assert abs(drift["percent_per_min"]) < 0.5
+
+
+def test_a_device_without_a_clock_is_not_late(
+    tactomo: Run, rest: FloatArray, paper: SensorDescription
+) -> None:
+    """As boards that print: when their scans came is all that is known of time."""
+    both = (Channel.MAGNITUDE, Channel.STRUCTURE)
+    offsets = (paper.electrode_count, *paper.offsets, paper.measurements)
+    hello = Hello("board", "1", both, *offsets, SampleFormat.FLOAT32, 1.0, 0.0)
+    scans = [
+        (0.1 * number, Scan(channel, number, 0, ScanFlag(0), volts.astype(np.float32)))
+        for number, volts in enumerate(noisy(rest))
+        for channel in both
+    ]
+    write_recording(
+        "still.mcap",
+        hello,
+        scans,
+        sensor="skin",
+        description="paper_square",
+        description_sha256=paper.sha256,
+    )
+    found = report(tactomo("doctor", "still.mcap", "--json"))
+    drift = about(found["channels"]["magnitude"]["findings"], "drift")
+    assert abs(drift["percent_per_min"]) < 0.5
+    assert {each["about"] for each in found["stream"]} == {"packets", "lost_scans"}
 
 
 def test_nobody_there(tactomo: Run) -> None:
