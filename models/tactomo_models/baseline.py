@@ -46,6 +46,7 @@ MOVE_S: Final = 10.0  # least time between two references, unless something was 
 LEAST_MOVE: Final = 0.05  # rms, in standard deviations of one scan, that is worth a new one
 
 GAIN_PER_S: Final = 0.01 / 60  # standard deviation of what temperature does to a sheet
+GAIN_SHARE: Final = 1 / 6  # of the time constant, for a gain: it holds no contact
 GAIN_AT_ONCE: Final = 0.1  # ... however long nobody looked
 SMOOTH_PER_S: Final = 0.0002 / 60  # likewise, of conductivity that wanders smoothly
 SMOOTH_AT_ONCE: Final = 0.02
@@ -399,15 +400,19 @@ class _Channel:
 
     def follow(self, time_s: float, creep: FloatArray, time_constant_s: float) -> bool:
         """Move towards the block's mean; returns whether all of the move is like drift."""
-        share = -np.expm1(-max(0.0, time_s - self._seen_s) / time_constant_s)
+        elapsed_s = max(0.0, time_s - self._seen_s)
+        share = -np.expm1(-elapsed_s / time_constant_s)
+        ahead = -np.expm1(-elapsed_s / (GAIN_SHARE * time_constant_s)) - share
         sigma = self._prior(time_s, creep, time_constant_s)
         change = self._since(self._take_block(time_s))
         found = self._explain(change + self._rest, self._certainty, sigma)
         bounds = OUT_OF_BOUNDS * sigma
         wanted = self._kept() + np.clip(found.amounts, -bounds, bounds)
-        self._amounts = self._amounts + share * (self._limited(wanted) - self._amounts)
+        missing = self._limited(wanted) - self._amounts
+        self._amounts = self._amounts + share * missing
+        self._amounts[0] += ahead * missing[0]
         drift = self._subspace.modes @ self._amounts
-        rest = self._now + share * change - drift
+        rest = self._now + share * change + ahead * missing[0] - drift
         size = float(np.sqrt(np.mean(self._certainty * rest**2)))
         self._rest = rest * min(1.0, MOST_REST / max(size, 1e-12))
         self._know(drift + self._rest)
@@ -518,7 +523,8 @@ class _Channel:
         """
         sigma = creep.copy()
         lag_s = min(lag_s, max(0.0, time_s - self._jumped_s))
-        sigma[0] = min(GAIN_PER_S * (max(0.0, time_s - self._gain_seen_s) + lag_s), GAIN_AT_ONCE)
+        gain_s = max(0.0, time_s - self._gain_seen_s) + GAIN_SHARE * lag_s
+        sigma[0] = min(GAIN_PER_S * gain_s, GAIN_AT_ONCE)
         smooth = SMOOTH_PER_S * (max(0.0, time_s - self._seen_s) + lag_s)
         sigma[self._subspace.smooth] = min(smooth, SMOOTH_AT_ONCE)
         return sigma
