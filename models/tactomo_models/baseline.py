@@ -65,6 +65,7 @@ DOUBTFUL: Final = 1.5  # times the bounds, from which what is left is certainly 
 DISTRUSTED_S: Final = 30.0  # of frames that nothing explains, before that is said
 UNEVEN_SHARE: Final = 0.25  # of a factor, by which voltages may miss it and still share it
 FARTHEST: Final = (0.3, 3.0)  # factors between which a voltage is taken as what it is
+STILL: Final = 1e-3  # spread of voltages' changes that a still contact's creep may have
 NORMAL_MEDIAN: Final = 0.6745  # standard deviations that hold half of a normal distribution
 DISTRUST: Final = Flag.MISFIT_HIGH | Flag.REFERENCE_MISMATCH | Flag.LOW_CONFIDENCE
 
@@ -476,7 +477,7 @@ class _Channel:
         spread = float(np.median(np.abs(each - gain))) / NORMAL_MEDIAN
         noise = np.sqrt(np.maximum(1 / self._certainty[sure] - MODEL_ERROR**2, 0)) / mean[sure]
         doubt = float(np.median(noise)) * np.sqrt(2 / frames)
-        return gain, spread < max(UNEVEN_SHARE * abs(gain), 3 * doubt)
+        return gain, spread < max(UNEVEN_SHARE * abs(gain), 3 * doubt, STILL)
 
     def explain(
         self,
