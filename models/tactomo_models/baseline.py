@@ -264,7 +264,7 @@ class BaselineTracker:
         self._release.add(time_s, elapsed_s, _signal(look))
         self._note_distrust(time_s, frame)
         for name, channel in self._channels.items():
-            if name not in look.data or frame.flags & ~DISTRUST:
+            if name not in look.data or look.flags & ~DISTRUST:
                 channel.drop_block()
             elif channel.add(time_s, scans[name], look.data[name]):
                 channel.follow_under_contact(time_s, self._memory.creep(time_s, name))
