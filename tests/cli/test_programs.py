@@ -139,7 +139,7 @@ def twin_command() -> Any:
     [
         (["twin", "--description", "nosuch"], "cannot read the sensor description nosuch"),
         (["twin", "--scene", "none.toml"], "cannot read the scene none.toml"),
-        (["twin", "--description", "tank_disc"], "1 channel"),
+        (["twin", "--description", "tank_disc", "--ports", "2"], "1 channel"),
         (["twin", "--rate", "0"], "a rate of 0 Hz"),
         (["twin", "--control", "tcp://0.0.0.0:5562"], "other computers"),
         (["daemon"], "ports is missing"),

@@ -53,12 +53,15 @@ def test_each_line_of_a_traceback_has_the_priority(written: io.StringIO) -> None
     assert all(line.startswith("<3>") for line in lines)
 
 
+ADDRESSES = ("--stream", "tcp://127.0.0.1:0", "--control", "tcp://127.0.0.1:0")
+
+
 def daemon(*arguments: str, **environment: str) -> subprocess.Popen[str]:
     """Run a daemon whose standard error is a pipe that journald might hold."""
     reader, writer = os.pipe()
     status = os.fstat(writer)
     stream = f"{status.st_dev}:{status.st_ino}"
-    command = [sys.executable, "-m", "tactomo.cli", "daemon", *arguments]
+    command = [sys.executable, "-m", "tactomo.cli", "daemon", *ADDRESSES, *arguments]
     try:
         process = subprocess.Popen(
             command,
@@ -92,8 +95,7 @@ def test_elsewhere_it_stays_json(tmp_path: Path) -> None:
 
 def test_its_last_words_say_why(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> None:
     skin = make_skin(tmp_path, 1)
-    addresses = ("--stream", "tcp://127.0.0.1:0", "--control", "tcp://127.0.0.1:0")
-    with daemon("--port", str(skin.lines[0].path), *addresses) as process:
+    with daemon("--port", str(skin.lines[0].path)) as process:
         assert process.stderr is not None
         for line in process.stderr:
             if "ready" in line:

@@ -218,14 +218,12 @@ def test_a_live_press_shows_until_it_is_released(bench: Start) -> None:
     host.wait_for(lambda: host.scans() and host.kind(Hello))
     started.ask("press", id="a", x_mm=10.0, y_mm=-5.0, pressure_kpa=150.0)
     started.ask("press", id="b", x_mm=0.0, y_mm=0.0, pressure_kpa=50.0)
-    host.wait_for(lambda: volts(host, host.scans()[-1]) > 0.28)
-    magnitude, structure = host.wait_for(
-        lambda: (
-            [s for s in host.scans() if s.counter == host.scans()[-1].counter][:2]
-            if len(host.scans()) % 2 == 0
-            else None
-        )
-    )
+
+    def pressed_by_both() -> list[Scan] | None:
+        newest = [s for s in host.scans() if s.counter == host.scans()[-1].counter]
+        return newest if len(newest) == 2 and volts(host, newest[0]) > 0.28 else None
+
+    magnitude, structure = host.wait_for(pressed_by_both)
     assert volts(host, magnitude) == pytest.approx(0.3, abs=1e-3)
     assert volts(host, structure) == pytest.approx(0.5, abs=1e-3)
     assert [p["id"] for p in started.ask("scene")["presses"]] == ["a", "b"]
