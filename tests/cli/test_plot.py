@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import matplotlib.image as mpl_image
 import numpy as np
 import pytest
-from recorded_grasp import FIRST_PRESSED, FRAMES, LAST_PRESSED, LIGHT_FROM, PERIOD_NS, write_grasp
+from recorded_grasp import (
+    FIRST_PRESSED,
+    FRAMES,
+    LAST_PRESSED,
+    LIGHT_FROM,
+    PERIOD_NS,
+    contacts_of,
+    write_grasp,
+)
 from tactomo.cli.plot_course import read_course, read_maps, telling_moments
 from tactomo.cli.plot_page import draw_page
 from tactomo.cli.recorded import recorded_frames
@@ -61,6 +69,42 @@ def test_what_the_page_is_drawn_from(grasp: Path) -> None:
     assert all(moment.frame.map is not None for moment in maps)
     labels = axes_labels(figure)
     assert {"pressure (kPa)", "force (N)", "misfit", "ms", "y (mm)"} <= set(labels)
+
+
+def drawn(grasp: Path, panel: str) -> Any:
+    with recorded_frames(grasp, None) as frames:
+        course = read_course(frames, 0.0)
+        return draw_page(course, [], frames.description, (panel,), "").axes[0]
+
+
+def test_scans_that_were_not_reconstructed_are_not_called_nothing_lost(tmp_path: Path) -> None:
+    kept = range(0, FRAMES, 2)
+    path = write_grasp(tmp_path / "a.mcap", kept, lambda n: {"sequence": n // 2})
+    words = drawn(path, "timing").get_title(loc="right")
+    assert words.startswith("10.0 frames/s")
+    assert words.endswith("0 frames lost, 39 dual scans left out")
+
+
+def test_a_pressure_between_two_unknown_ones_is_seen(tmp_path: Path) -> None:
+    def change(number: int) -> dict[str, Any]:
+        known = number == 30
+        pressure, of = (150.0, "within") if known else (None, "below")
+        contacts = [replace(c, pressure_kpa=pressure, pressure_range=of) for c in contacts_of(30)]
+        return {"contacts": [asdict(c) for c in contacts]}
+
+    axes = drawn(write_grasp(tmp_path / "a.mcap", change=change), "pressure")
+    dots = [line for line in axes.lines if line.get_marker() == "."]
+    assert [y for line in dots for y in line.get_ydata()] == [150.0]
+
+
+def test_the_headings_of_the_table_are_within_their_cells(grasp: Path) -> None:
+    with recorded_frames(grasp, None) as frames:
+        course = read_course(frames, 0.0)
+        figure = draw_page(course, [], frames.description, ("path", "force"), "")
+    figure.canvas.draw()
+    (table,) = [axes.tables[0] for axes in figure.axes if axes.tables]
+    for cell in table.get_celld().values():
+        assert cell.get_text().get_window_extent().width < cell.get_window_extent().width
 
 
 def test_some_panels_of_some_seconds(tactomo: Run, grasp: Path) -> None:

@@ -41,6 +41,8 @@ class Course:
     """How old each was when it was published; None for what was made of the recording just now."""
     lost: list[int] = field(default_factory=list)
     """How many frames were published since the one before, but are not in the recording."""
+    left_out: list[int] = field(default_factory=list)
+    """How many dual scans were taken since the one before, but not reconstructed in time."""
     tracks: dict[str, Track] = field(default_factory=dict)
     """Contacts by identity, in the order in which they came."""
 
@@ -60,7 +62,9 @@ def read_course(frames: RecordedFrames, smallest_mm2: float) -> Course:
         course.flags.append(frame.flags)
         course.misfits.append(frame.misfit)
         course.ages_s.append(moment.age_s)
-        course.lost.append(_lost(last, moment))
+        lost = _missing(last, moment, "sequence")
+        course.lost.append(lost)
+        course.left_out.append(max(0, _missing(last, moment, "scan_counter") - lost))
         for contact in contacts:
             track = course.tracks.setdefault(f"{contact.id}{run}", Track())
             track.times_s.append(moment.time_s)
@@ -69,10 +73,11 @@ def read_course(frames: RecordedFrames, smallest_mm2: float) -> Course:
     return course
 
 
-def _lost(last: Moment | None, moment: Moment) -> int:
+def _missing(last: Moment | None, moment: Moment, counter: str) -> int:
     if last is None or last.frame.session != moment.frame.session:
         return 0
-    return max(0, moment.frame.sequence - last.frame.sequence - 1)
+    step = getattr(moment.frame, counter) - getattr(last.frame, counter)
+    return int(max(0, step - 1))
 
 
 def read_maps(frames: RecordedFrames, course: Course) -> list[Moment]:

@@ -182,13 +182,13 @@ def _draw_table(axes: Any, course: Course, colours: dict[str, Any]) -> None:
     lasting = sorted(course.tracks, key=lambda name: -_lasted_s(course.tracks[name]))[:LISTED]
     shown = [name for name in course.tracks if name in lasting]
     rows = [[name, *_summary(course.tracks[name])] for name in shown]
-    titles = ["contact", "s", "kPa, most", "N, most", "mm², mean", "moved mm, most"]
+    titles = ["contact", "s", "kPa, most", "N, most", "mm², mean", "mm moved"]
     kept = [n for n in range(len(titles)) if any(row[n] for row in rows)]
     cells = [[row[n] or "unknown" for n in kept] for row in rows]
     names = [titles[n] for n in kept]
     table = axes.table(cells, colLabels=names, loc="upper center", cellLoc="center")
     table.auto_set_font_size(False)
-    table.set_fontsize(8)
+    table.set_fontsize(7)
     table.scale(1.0, 1.25)
     for (row, column), cell in table.get_celld().items():
         cell.set_edgecolor("0.85")
@@ -374,6 +374,7 @@ def _draw_quantity(
         _, bands = _broken(times, spread)
         style = {"color": colours[identity]}
         axes.plot(xs, ys, linewidth=1.1, linestyle=linestyle, **style)
+        axes.plot(*_alone(xs, ys), ".", markersize=3, **style)
         axes.fill_between(xs, ys - bands, ys + bands, alpha=0.22, linewidth=0, **style)
 
 
@@ -387,6 +388,13 @@ def _broken(times: Sequence[float], values: Iterable[Any]) -> tuple[Any, Any]:
     ys = np.asarray([math.nan if value is None else value for value in values], dtype=float)
     gaps = np.flatnonzero(np.diff(xs) > GAP_S) + 1
     return np.insert(xs, gaps, np.nan), np.insert(ys, gaps, np.nan)
+
+
+def _alone(xs: Any, ys: Any) -> tuple[Any, Any]:
+    """Return the points between two gaps, which no line shows."""
+    known = np.concatenate([[False], ~np.isnan(ys), [False]])
+    alone = known[1:-1] & ~known[:-2] & ~known[2:]
+    return xs[alone], ys[alone]
 
 
 def _draw_misfit(axes: Any, course: Course, _: dict[str, Any]) -> None:
@@ -435,11 +443,12 @@ def _draw_timing(axes: Any, course: Course, _: dict[str, Any]) -> None:
     lost_at = [t for t, lost in zip(course.times_s, course.lost, strict=True) if lost]
     for time_s in lost_at:
         axes.axvline(time_s, color="tab:red", linewidth=0.8, alpha=0.6)
-    rate_hz = 1e3 / float(np.median(periods_ms)) if len(periods_ms) else math.nan
+    rate_hz = 1e3 / float(np.mean(periods_ms)) if len(periods_ms) else math.nan
     ages = "age unknown: made of the recording"
     if known_ms:
         ages = f"age {np.median(known_ms):.1f} ms (99 %: {np.percentile(known_ms, 99):.1f})"
-    words = f"{rate_hz:.1f} frames/s; {ages}; {sum(course.lost)} frames lost"
+    words = f"{rate_hz:.1f} frames/s; {ages}; {sum(course.lost)} frames lost, "
+    words += f"{sum(course.left_out)} dual scans left out"
     axes.set_title(words, fontsize=8, loc="right", pad=2, color=INK)
     if known_ms:
         axes.set_yscale("log")
