@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 import pytest
-from tactomo_client import ControlError, MessageError, request
+from tactomo_client import ControlError, MessageError, request, subscribe
 from tactomo_client.fake import FakeControl
 
 
@@ -45,3 +45,6 @@ def test_a_wrong_address_is_named() -> None:
     with pytest.raises(ControlError, match="cannot connect to 'localhost'") as caught:
         request("status", "localhost")
     assert caught.value.name == "bad_address"
+    with pytest.raises(ControlError, match=r"127\.0\.0\.1:5560") as of_stream:
+        subscribe("left", address="localhost")
+    assert "5561" in of_stream.value.next_step

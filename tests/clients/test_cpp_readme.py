@@ -109,6 +109,9 @@ def test_from_nothing_to_a_running_controller(newcomer: Newcomer, pressed: str) 
             newcomer.run(exported + command)
     assert "retreat: pressed hard\n" in said["controller"]
     assert "5000 turns" in said["controller"]
+    for seconds in ("soon", "-3", "nan", "5x", "1e99"):
+        refused = newcomer.run(f"! build/controller skin --seconds {seconds} 2>&1")
+        assert refused.startswith("usage: "), seconds
     assert re.search(
         r"latest\(\): p50 [\d.]+ us, p99 [\d.]+ us, worst [\d.]+ us\n", said["controller"]
     )

@@ -137,7 +137,12 @@ Settings read_arguments(int count, char** words) {
         } else if (word == "--keys" && !is_last) {
             settings.options.keys = tactomo::Keys::load(words[++i]);
         } else if (word == "--seconds" && !is_last) {
-            settings.seconds = std::atof(words[++i]);
+            char* rest = nullptr;
+            settings.seconds = std::strtod(words[++i], &rest);
+            if (*rest != '\0' || !(settings.seconds > 0 && settings.seconds <= 1e9)) {
+                settings.sensor.clear();
+                break;
+            }
         } else if (settings.sensor.empty() && word.substr(0, 1) != "-") {
             settings.sensor = word;
         } else {

@@ -169,6 +169,7 @@ def bad_address(address: str, error: zmq.ZMQError) -> ControlError:
     """Return the error for an address that ZeroMQ cannot connect to."""
     return control_error(
         f"cannot connect to {address!r}: {error.strerror}",
-        "an address looks like tcp://127.0.0.1:5561 or ipc:///run/tactomo/control",
+        "an address looks like tcp://127.0.0.1:5560 (the stream), tcp://127.0.0.1:5561 (the "
+        "control socket) or ipc:///run/tactomo/stream",
         "bad_address",
     )

@@ -56,7 +56,8 @@ namespace detail {
 
 inline ControlError bad_address(const std::string& address, const char* reason) {
     return {"bad_address", "cannot connect to '" + address + "': " + reason,
-            "an address looks like tcp://127.0.0.1:5560 or ipc:///run/tactomo/stream"};
+            "an address looks like tcp://127.0.0.1:5560 (the stream), tcp://127.0.0.1:5561 (the "
+            "control socket) or ipc:///run/tactomo/stream"};
 }
 
 }  // namespace detail
