@@ -108,6 +108,7 @@ class Imaging:
         self._on_event = on_event
         self._tare: Tare | None = None
         self._tare_deadline_s = 0.0
+        self._contacts = 0  # in the last frame
         self._marked: ActiveRecording | None = None  # the recording that gets marks
         self._repeat_reference_s = 0.0
         self._failure_limit = RateLimit()
@@ -207,7 +208,7 @@ class Imaging:
             self._record_reference()
 
     def start_tare(self, answer: Future[Mapping[str, Any]] | None = None) -> None:
-        """Take a reference from the dual scans to come; `answer` gets its `scans`, or why not."""
+        """Take a reference from the dual scans to come; `answer` gets what it became, or why."""
         self._tare = self._tare or Tare(self._tare_scans)
         self._tare_deadline_s = time.monotonic() + NO_DATA_S
         if answer is not None:
@@ -235,6 +236,7 @@ class Imaging:
         self._publish_scan(dual, timing, volts)
         frame = self._reconstruct(volts, _saturated(dual), is_exact=mark is not None)
         if frame is not None:
+            self._contacts = len(frame.contacts)
             self._publish_frame(dual, timing, frame)
         if self._marked is not None and dual.recording == self._marked.number:
             keys = tuple(ScanKey(s.channel, s.counter, s.device_us) for s in dual.scans)
@@ -367,8 +369,9 @@ class Imaging:
         self._tare = None
         self.use_reference(reference, time.time_ns())
         for answer in tare.answers:
-            answer.set_result({"scans": reference.scans})
-        self._on_event("tared", "info", f"{reference.scans} dual scans")
+            answer.set_result({"scans": reference.scans, "contacts": self._contacts})
+        shown = f", while {self._contacts} contact(s) were shown" if self._contacts else ""
+        self._on_event("tared", "info", f"{reference.scans} dual scans{shown}")
 
     def _refuse_tare(self, tare: Tare, refusal: CommandError) -> None:
         self._tare = None

@@ -177,7 +177,7 @@ class Pipeline:
                     self._discard_oldest()
 
     def tare(self) -> Future[Mapping[str, Any]]:
-        """Ask for a new reference; for any thread. The future gets its `scans`.
+        """Ask for a new reference; for any thread. The future gets its `scans` and `contacts`.
 
         Raises:
             CommandError: the references are those of the recording that is replayed.

@@ -1,7 +1,8 @@
 """Taking a reference: the mean of some dual scans of the unloaded skin, and their noise.
 
 Somebody who presses meanwhile would be averaged into the reference, so scans that move while they
-are collected are refused. A press that lasts and stays the same cannot be told from a bare skin.
+are collected are refused. A press that lasts and stays the same cannot be told from a bare skin
+whose reference is out of date: whoever tares is told how many contacts were shown meanwhile.
 """
 
 from __future__ import annotations

@@ -156,6 +156,15 @@ def test_tare_says_what_the_reference_is_made_of(tactomo: Run, control: Any) -> 
     control.answers["tare"] = {"scans": 20}
     result = tactomo("tare", "--control", control.address)
     assert (result.returncode, result.stdout) == (0, "new reference from 20 dual scans\n")
+    assert result.stderr == ""
+
+
+def test_tare_says_that_contacts_were_shown(tactomo: Run, control: Any) -> None:
+    control.answers["tare"] = {"scans": 20, "contacts": 2}
+    result = tactomo("tare", "--control", control.address)
+    assert (result.returncode, result.stdout) == (0, "new reference from 20 dual scans\n")
+    assert "2 contact(s) were shown meanwhile" in result.stderr
+    assert "tare again" in result.stderr
 
 
 def test_a_refusal_is_one_line_with_cause_and_next_step(tactomo: Run, control: Any) -> None:

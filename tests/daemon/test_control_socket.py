@@ -56,14 +56,16 @@ def test_rates_are_what_comes_and_nothing_when_nothing_comes(bench: Start) -> No
 def test_tare_is_answered_when_the_new_reference_holds(bench: Start) -> None:
     b = bench(ports=2)
     b.tare()
-    b.step(load=0.2)
+    shown = len(b.step(load=0.2)["contacts"])
+    assert shown
     answers: list[dict[str, Any]] = []
     asking = threading.Thread(target=lambda: answers.append(b.ask("tare")))
     asking.start()
     while not answers:
         b.step(load=0.2)  # the maps go on meanwhile, against the old reference
     asking.join()
-    assert answers == [{"scans": 3}]
+    assert answers == [{"scans": 3, "contacts": shown}]
+    b.listener.wait("event", lambda event: f"{shown} contact(s) were shown" in event["detail"])
     frame = b.step(load=0.2)
     assert abs(array_from_wire(frame["map"])).max() < 1e-3
     assert frame["contacts"] == []

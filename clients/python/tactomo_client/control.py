@@ -117,6 +117,8 @@ class Tare:
 
     scans: int
     """How many dual scans it is made of."""
+    contacts: int = 0
+    """How many contacts were shown meanwhile: they count as nothing pressed now."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -93,7 +93,14 @@ def tare(control: ControlAddress = DEFAULT_CONTROL, keys: KeysFolder = None) -> 
     from tactomo_client import Daemon
 
     with Daemon(control, keys=keys) as daemon:
-        typer.echo(f"new reference from {daemon.tare().scans} dual scans")
+        taken = daemon.tare()
+    typer.echo(f"new reference from {taken.scans} dual scans")
+    if taken.contacts:
+        typer.echo(
+            f"{taken.contacts} contact(s) were shown meanwhile and now count as nothing pressed; "
+            "if something was on the skin, take it off and tare again",
+            err=True,
+        )
 
 
 @app.command(

@@ -175,7 +175,8 @@ public:
     }
 
     /// Takes the skin as it is now, with nothing on it, as the reference; returns of how many dual
-    /// scans. Refused ("tare_refused") while somebody presses.
+    /// scans. Refused ("tare_refused") while the load changes; what lies
+    /// still counts as nothing pressed from then on.
     int tare() { return request("tare", std::chrono::seconds(10)).get<int>("scans"); }
 
     /// Starts recording, and returns to which file; an absolute path on the daemon's computer, or

@@ -308,7 +308,8 @@ function choose(name, value) {
 }
 
 byId("tare").onclick = () =>
-  command("tare", {}, ({ scans }) => `Tared: the reference is the mean of ${scans} scans.`);
+  command("tare", {}, ({ scans, contacts }) => `Tared: the reference is the mean of ${scans} scans.` +
+    (contacts ? ` ${contacts} contact(s) were shown: was something on the skin? Then tare again without it.` : ""));
 byId("record").onclick = () =>
   state.status?.fields.recording
     ? command("record_stop", {}, ({ path }) => `Recorded to ${path}`)
