@@ -231,6 +231,8 @@ def test_a_live_press_shows_until_it_is_released(bench: Start) -> None:
     assert started.ask("scene")["presses"][0]["x_mm"] == 20.0
     assert started.ask("release", id="a") == {"released": True}
     assert started.ask("release", id="a") == {"released": False}
+    started.ask("press", id=7, x_mm=0.0, y_mm=0.0)  # as `tactomo poke press id=7` sends it
+    assert started.ask("release", id="7") == {"released": True}
     started.ask("clear")
     host.wait_for(lambda: volts(host, host.scans()[-1]) < 0.11)
     assert started.ask("scene")["presses"] == []

@@ -26,7 +26,7 @@ from tactomo.errors import AddressError, CommandError
 from tactomo.twin.scene import Indenter, Scene, SkinDriftSettings, complaints
 
 Handler = Callable[[Any], Mapping[str, Any]]
-PressId = Annotated[str, Field(min_length=1, max_length=64)]
+PressId = Annotated[str, Field(min_length=1, max_length=64, coerce_numbers_to_str=True)]
 
 ANOTHER_ADDRESS = (
     "stop the twin or demo that runs already, or give another address: "
