@@ -8,10 +8,12 @@ TRAIN_READY := $(VENV)/.ready-train
 LOCKED := pyproject.toml --universal --python-version 3.11 --generate-hashes \
   --no-emit-package tactomo-client --no-emit-package tactomo
 
-.PHONY: help run test test-slow test-train faults soak firmware fuzz lint format bench deb lock clean
+.PHONY: help setup run test test-slow test-train faults soak firmware fuzz lint format bench deb lock clean
 
 help:            ## list these targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
+
+setup: $(READY) ## the environment in .venv, which the others make by themselves
 
 run: $(READY)    ## twin, daemon and viewer: a skin to press in the browser
 	$(BIN)/tactomo demo $(ARGS)

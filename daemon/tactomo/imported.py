@@ -195,7 +195,8 @@ def load_arrays(path: Path | Sequence[Path]) -> dict[str, NDArray[Any]]:
         return read_arrays(one)
     except OSError as error:
         raise ImportFileError(
-            f"cannot read {one}: {error.strerror or error}", "give the path of an .npz file"
+            f"cannot read {one}: {error.strerror or error}",
+            f"give the path of an .npz or {SUFFIX} file",
         ) from error
 
 
@@ -291,7 +292,7 @@ def _injection_rows(
     if missing:
         raise ImportFileError(
             f"{path} has no injection {missing[0]}, which the sensor's pattern needs",
-            "give the description of the sensor that was measured with --sensor",
+            "give the description of the sensor that was measured",
         )
     rows, signs = np.array([where[pair] for pair in wanted]).T
     return rows, signs

@@ -1,0 +1,56 @@
+"""Commands in the pages that people read: each is one of ours, with options that it has."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tactomo.cli import app
+from typer.main import get_command
+
+ROOT = Path(__file__).parents[2]
+PAGES = [
+    *(ROOT / "README.md", ROOT / "deploy" / "README.md"),
+    # The decisions tell of commands that were, too.
+    *(page for page in sorted((ROOT / "docs").glob("*.md")) if page.name != "decisions.md"),
+]
+
+
+def told(page: Path) -> list[str]:
+    """What follows `tactomo` in blocks of shell commands, and between backquotes."""
+    text = page.read_text("utf-8")
+    blocks = re.findall(r"^```sh\n(.*?)^```", text, re.M | re.S)
+    lines = [line.split("#")[0] for block in blocks for line in block.splitlines()]
+    spans = [" ".join(span.split()) for span in re.findall(r"`(tactomo [^`]+)`", text)]
+    found = [re.search(r"\btactomo ([a-z][^|>]*)", line) for line in [*lines, *spans]]
+    return [each[1].strip() for each in found if each]
+
+
+def options_of(words: list[str]) -> tuple[str, set[str]]:
+    """The command that some words name, and its options."""
+    command: Any = get_command(app)
+    name = "tactomo"
+    for word in words:
+        if word not in getattr(command, "commands", ()):
+            break
+        command, name = command.commands[word], f"{name} {word}"
+    return name, {
+        flag for each in command.params for flag in (*each.opts, *each.secondary_opts, "--help")
+    }
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_each_option_is_one_that_the_command_has(page: Path) -> None:
+    for line in told(page):
+        name, options = options_of(line.split())
+        assert name != "tactomo", line
+        unknown = set(re.findall(r"(?<=\s)--[a-z][a-z0-9-]*", f" {line}")) - options
+        assert not unknown, f"{name}: {line}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_each_make_has_its_target(page: Path) -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text("utf-8"), re.M))
+    assert set(re.findall(r"(?:^|`)make ([a-z-]+)", page.read_text("utf-8"), re.M)) <= targets
