@@ -44,6 +44,10 @@ STATUS = {
     "dropped_scans": 2,
     "incomplete_scans": 7,
     "reference": {"scans": 20, "taken_realtime_ns": 0},
+    "baseline": {
+        **{"state": "refused", "refusal": "[neither] contact nor drift", "moves": 3},
+        "drift": {"magnitude": {"gain": -0.0123, "uneven": 0.0009}},
+    },
     "recording": {"path": "/tmp/a.mcap", "bytes": 2_500_000},
     "subscribers": 1,
 }
@@ -62,6 +66,7 @@ def test_status_shows_what_matters(tactomo: Run, control: Any) -> None:
         *("left_forearm: running", "/dev/ttyACM0 (open)", "3 corrupt", "(not open)"),
         *("p50 4.25 ms", "structure_missing", "19.96 frames/s", "2 dual scans dropped"),
         *("20 dual scans", "/tmp/a.mcap (2.5 MB)", "levelset (asked for: auto)"),
+        *("refused: [neither] contact nor drift", "magnitude -1.23%, unevenly 0.09%"),
         "12 ms: fit, 4.50 modelled ms; machine speed: measured here",
     ):
         assert words in result.stdout

@@ -20,6 +20,12 @@ if TYPE_CHECKING:
     from tactomo_models.evaluation.drifting import Day, DaySummary, Seen
 
 FEWER = 10  # frames without tracking are slow, for all that they show
+FIGURES = (
+    *("frames", "ghosts that begin, an hour", "frames with a ghost"),
+    *("presses", "presses missed", "presses that vanished for a while"),
+    *("frames under a press that do not show it", "frames distrusted", "frames not followed"),
+    "error of firm presses' magnitude",
+)
 
 
 @evaluate_app.command(
@@ -85,28 +91,31 @@ def _print(sensor: str, hours: float, told: Sequence[tuple[str, DaySummary, DayS
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(box=box.SIMPLE_HEAD)
-    columns = ("frames", "ghosts/h", "with ghosts", "presses", "missed", "erased", "not shown")
-    for column in ("", *columns, "distrusted", "refused", "magnitude error"):
-        table.add_column(column, justify="right" if column else "left")
-    for name, *pair in told:
-        for how, each in zip(("tracked", "untracked"), pair, strict=True):
-            table.add_row(
-                f"{name}, {how}",
-                str(each.frames),
-                f"{each.ghosts_per_hour:.2f}",
-                f"{each.ghost_share:.1%}",
-                str(each.presses),
-                str(each.missed),
-                str(each.erased),
-                f"{each.erased_share:.1%}",
-                f"{each.distrusted:.1%}",
-                f"{each.refused:.1%}",
-                f"{each.magnitude_error:.1%}".replace("nan%", "-"),
-            )
     console = Console()
     console.print(f"Simulated, not measured: {sensor}, {hours:g} hours after one tare.")
-    console.print(table)
+    for name, tracked, untracked in told:
+        table = Table(box=box.SIMPLE_HEAD)
+        table.add_column(name)
+        for how in ("tracked", "untracked"):
+            table.add_column(how, justify="right")
+        for figure, with_it, without in zip(FIGURES, _told(tracked), _told(untracked), strict=True):
+            table.add_row(figure, with_it, without)
+        console.print(table)
+
+
+def _told(summary: DaySummary) -> list[str]:
+    return [
+        str(summary.frames),
+        f"{summary.ghosts_per_hour:.2f}",
+        f"{summary.ghost_share:.1%}",
+        str(summary.presses),
+        str(summary.missed),
+        str(summary.erased),
+        f"{summary.erased_share:.1%}",
+        f"{summary.distrusted:.1%}",
+        f"{summary.refused:.1%}",
+        f"{summary.magnitude_error:.1%}".replace("nan%", "-"),
+    ]
 
 
 def _draw(day: Day, tracked: Sequence[Seen], untracked: Sequence[Seen], output: Path) -> None:

@@ -278,6 +278,7 @@ def _status_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
             f"{status.get('incomplete_scans', 0)} incomplete",
         ),
         ("reference", f"{reference['scans']} dual scans" if reference else "none yet"),
+        ("baseline", _baseline(status.get("baseline") or {})),
         ("recording", _recording(recording, status.get("recorder") or {})),
         ("subscribers", str(status.get("subscribers", "-"))),
         ("events", _events(status.get("events") or {})),
@@ -299,6 +300,19 @@ def _pressure(description: dict[str, Any]) -> str:
     if description.get("pressure_max_kpa") is None:
         return "none: no magnitude channel"
     return "by the description's table; `tactomo calibrate` makes it this sensor's"
+
+
+def _baseline(baseline: dict[str, Any]) -> str:
+    """Say whether the reference follows drift, and how far it has gone since the tare."""
+    from rich.markup import escape
+
+    state, refusal = str(baseline.get("state") or "-"), baseline.get("refusal")
+    told = f"[yellow]{state}:[/] {escape(refusal)}" if refusal else state
+    gone = [
+        f"{channel} {drift['gain']:+.2%}, unevenly {drift['uneven']:.2%}"
+        for channel, drift in (baseline.get("drift") or {}).items()
+    ]
+    return "; ".join([told, *gone])
 
 
 def _recording(recording: dict[str, Any] | None, recorder: dict[str, Any]) -> str:
