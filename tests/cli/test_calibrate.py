@@ -74,6 +74,7 @@ def test_a_table_of_magnitudes_is_fitted_kept_and_shown(tactomo: Run, tmp_path: 
         (("--readings", "log.csv", "-d", "tank_disc"), "has no magnitude channel"),
         (("--readings", "log.csv", "--recording", "a.mcap"), "no column time_s or realtime_s"),
         (("--readings", "times.csv", "--recording", "a.mcap"), "a.mcap"),
+        (("--readings", "log.csv", "-o", "."), "cannot write .: Is a directory"),
         (("--show",), "run: tactomo calibrate palm --live"),
         (("--live", "--stream", "ipc:///nowhere/at/all"), "no daemon answers"),
     ],
@@ -89,6 +90,14 @@ def test_what_cannot_be_used_is_told(
     assert result.returncode == 1
     assert said in result.stderr
     assert "Traceback" not in result.stderr
+
+
+def test_a_name_that_no_sensor_can_have(tactomo: Run, tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text(CSV)
+    result = tactomo("calibrate", "../palm", "--readings", "log.csv")
+    assert result.returncode == 1
+    assert "'../palm' is not a sensor name; use 1 to 64 letters" in result.stderr
+    assert not list(tmp_path.rglob("*.pressure.json"))
 
 
 @pytest.mark.parametrize(
@@ -203,6 +212,12 @@ def test_a_session_keeps_what_was_taken_and_goes_on(pressed: Pressed) -> None:
         for number, row in enumerate(ROWS[1:], start=2):
             take(terminal, pressed, number, *row)
         terminal.wait_for("curve: ±")
+        assert "off the curve" not in terminal.shown
+        take(terminal, pressed, 9, 1.9, 0.15)  # for 195
+        terminal.wait_for("That is -193 kPa off the curve of the others: undo drops it")
+        terminal.wait_for("Reading 10")
+        terminal.enter("undo")
+        terminal.wait_for("dropped the reading at 2 kPa")
         terminal.press_ctrl_c()
         assert terminal.wait() == 0, terminal.shown
     kept = read_calibration(calibration_path("palm"))

@@ -114,6 +114,9 @@ def calibrate(
         raise typer.BadParameter("--recording goes with --readings")
     if diameter_mm is not None and area_mm2 is not None:
         raise typer.BadParameter("--diameter-mm and --area-mm2: give one of them")
+    from tactomo_client.messages import check_sensor_name
+
+    check_sensor_name(sensor)
     if picture is not None:
         prepare_picture(picture)
     area = area_mm2 if diameter_mm is None else math.pi / 4 * diameter_mm**2

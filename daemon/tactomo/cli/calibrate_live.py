@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
+import numpy as np
+
 from tactomo.cli.calibrate import distrusted
 from tactomo.cli.calibrate_picture import curve_text
 from tactomo.cli.watch import View
@@ -36,6 +38,9 @@ STILL_SHARE: Final = 0.03
 """Of the magnitude, by which it may change from the first half to the second."""
 SHARES: Final = (-0.3, -0.05, 0.1, 0.25, 0.4, 0.6, 0.8, 1.0)
 """Of the way from the onset to the top, that are suggested going up; and down again."""
+SLIP_SHARE: Final = 0.25
+"""Of the curve's top, by which a reading that is no slip may be off: hysteresis, and scatter."""
+SLIP_SIGMAS: Final = 4.0
 COLUMNS: Final = (
     *("realtime_s", "pressure_kpa", "force_n", "area_mm2", "magnitude", "magnitude_sigma"),
     *("direction", "x_mm", "y_mm"),
@@ -299,6 +304,11 @@ class _Session:
         fit = _fit_so_far(self.readings)
         self._console.print(curve_text(self.readings, fit.curve if fit else None), markup=False)
         wanted = still_wanted(self.readings)
+        off_kpa = _off_kpa(self.readings)
+        if off_kpa:
+            self._console.print(
+                f"[red]That is {off_kpa:+.0f} kPa off the curve of the others[/]: undo drops it."
+            )
         if fit is not None:
             sigma_kpa = statistics.median(fit.curve.sigma_kpa.tolist())
             self._console.print(f"curve: ± {sigma_kpa:.1f} kPa (median of the range)")
@@ -317,6 +327,19 @@ def _fit_so_far(readings: Sequence[Reading]) -> Fit | None:
         return fit_curve(readings)
     except CalibrationError:
         return None
+
+
+def _off_kpa(readings: Sequence[Reading]) -> float:
+    """By how much the last reading is off the curve of those before, if that is a slip; else 0."""
+    *others, last = readings
+    fit = _fit_so_far(others)
+    if fit is None or not fit.curve.magnitude[0] < last.magnitude < fit.curve.magnitude[-1]:
+        return 0.0
+    magnitude, sigma = np.array(last.magnitude), np.array(last.magnitude_sigma)
+    off_kpa = last.pressure_kpa - float(fit.curve.pressure(magnitude))
+    usual_kpa = math.hypot(fit.curve.sigma(magnitude), fit.curve.spread(magnitude, sigma))
+    most_kpa = max(SLIP_SIGMAS * usual_kpa, SLIP_SHARE * fit.curve.range_kpa[1])
+    return off_kpa if abs(off_kpa) > most_kpa else 0.0
 
 
 def _direction(pressures_kpa: list[float]) -> Literal["up", "down", "unknown"]:
