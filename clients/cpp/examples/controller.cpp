@@ -67,7 +67,7 @@ struct Decision {
 };
 
 Decision decide(const tactomo::Frame* frame) {
-    if (frame == nullptr) return {"stop", "no frame yet"};
+    if (frame == nullptr) return {"stop", "no frame yet: what does `tactomo status` say?"};
     if (frame->is_stale()) return {"stop", "stale"};
     if (!frame->flags.empty()) return {"slow", frame->flags.front()};
     for (const tactomo::Contact& contact : frame->contacts) {
