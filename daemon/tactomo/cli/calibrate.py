@@ -134,14 +134,14 @@ def calibrate(
         ids = tuple(device_id or ())
         made = _of_files(sensor, readings, recording, area, time_offset, description, ids)
     tell(made)
+    if not (dry_run or show):
+        save_calibration(made, path)
+        typer.echo(f"kept in {path}: the daemon of {sensor} takes it when it starts next")
     if picture is not None:
         from tactomo.cli.calibrate_picture import draw_calibration
 
         draw_calibration(made, picture)
         typer.echo(f"wrote {picture}")
-    if not (dry_run or show):
-        save_calibration(made, path)
-        typer.echo(f"kept in {path}: the daemon of {sensor} takes it when it starts next")
 
 
 def tell(made: PressureCalibration) -> None:
