@@ -303,6 +303,8 @@ def seen_of(frames: Sequence[tuple[float, Frame]]) -> Seen:
     from tactomo_models import CalibrationError
     from tactomo_models.load_cell import Seen
 
+    from tactomo.cli.calibrate_live import distrusted
+
     trusted = [(time_s, frame) for time_s, frame in frames if not distrusted(frame)]
     if not trusted:
         raise CalibrationError(
@@ -315,13 +317,6 @@ def seen_of(frames: Sequence[tuple[float, Frame]]) -> Seen:
         magnitude_sigma=np.array([_number(c.magnitude_sigma if c else None) for c in single]),
         contacts=np.array([len(frame.contacts) for _, frame in trusted]),
     )
-
-
-def distrusted(frame: Frame) -> frozenset[str]:
-    """Flags of a frame that tell not to trust it."""
-    from tactomo_models.evaluation.measures import DISTRUST
-
-    return frame.flags & frozenset(DISTRUST.names())
 
 
 def _number(value: float | None) -> float:

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from tactomo.cli.calibrate import distrusted
 from tactomo.cli.calibrate_picture import curve_text
 from tactomo.cli.watch import View
 from tactomo.errors import TactomoError
@@ -95,6 +94,13 @@ def guided(
     finally:
         view.close()
     return PressureCalibration.of_readings(_subject(sensor, status), session.readings)
+
+
+def distrusted(frame: Frame) -> frozenset[str]:
+    """Flags of a frame that tell not to trust it."""
+    from tactomo_models.evaluation.measures import DISTRUST
+
+    return frame.flags & frozenset(DISTRUST.names())
 
 
 def _log_path(path: Path) -> Path:
