@@ -24,7 +24,17 @@ from tactomo.daemon import Daemon
 from tactomo.doorkeeper import Doorkeeper, ServerKeys
 from tactomo.endpoint import bind
 from tactomo.errors import AddressError, ConfigError
-from tactomo_client import Keys, KeysError, Status, StreamTimeout, aio, request, subscribe
+from tactomo_client import (
+    ClientError,
+    Keys,
+    KeysError,
+    Status,
+    StreamTimeout,
+    aio,
+    request,
+    subscribe,
+)
+from tactomo_client import Daemon as Commander
 from tactomo_client.keys import read_public, read_secret
 from tactomo_viewer.feed import Feed
 
@@ -275,6 +285,18 @@ def test_who_is_revoked_is_cut_off_and_the_others_come_back(guarded: Any, robot:
         with pytest.raises(KeysError):
             next(skin)
     assert guarded.ask("status")["state"]
+
+
+def test_a_command_of_one_who_was_revoked_ends(guarded: Any, robot: Robot) -> None:
+    """ZeroMQ drops a connection that was refused; sending into what is left would never return."""
+    ros = robot.allow(robot.client("ros"), may_command=True)
+    with Commander(guarded.daemon.control_address, keys=ros, timeout_s=PATIENCE_S) as commander:
+        assert commander.status().state
+        robot.revoke("ros")
+        guarded.listener.event("client_refused")
+        commander.timeout_s = 2.0
+        with pytest.raises(ClientError):
+            commander.status()
 
 
 def test_one_who_listens_in_sees_nothing(guarded: Any) -> None:

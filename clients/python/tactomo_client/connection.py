@@ -104,6 +104,14 @@ class Connection:
         """Whether the server has ever taken this client in, as far as `refusal` has looked."""
         return self._handshakes.have_succeeded
 
+    def send(self, message: bytes) -> bool:
+        """Send a message, if that can be done now: not while the server lets nobody in."""
+        try:
+            self.socket.send(message, zmq.NOBLOCK)
+        except zmq.Again:
+            return False
+        return True
+
     def receive(self) -> bytes | None:
         """Return the message that waits; None if there is none after all."""
         try:

@@ -82,11 +82,11 @@ class ControlLine:
         """
         message = encode_request(command, arguments)
         connection = self._connection or self._connect()
-        reply = None
+        reply, is_sent = None, False
+        deadline_s = time.monotonic() + timeout_s
         try:
-            connection.socket.send(message)
-            deadline_s = time.monotonic() + timeout_s
             while reply is None:
+                is_sent = is_sent or connection.send(message)
                 left_s = deadline_s - time.monotonic()
                 if (yield connection.owner, whole_ms(min(LOOK_S, left_s))):
                     reply = connection.receive()

@@ -232,18 +232,20 @@ private:
         } catch (const zmq::error_t& error) {
             throw detail::bad_address(address_, error.what());
         }
-        socket.send(message, zmq::send_flags::none);
-        await(socket, handshakes, timeout);
+        exchange(socket, message, handshakes, timeout);
         zmq::message_t reply;
         (void)socket.recv(reply);
         return detail::unpack(reply);
     }
 
-    void await(zmq::socket_t& socket, detail::Handshakes& handshakes,
-               std::chrono::milliseconds timeout) const {
+    // Send, and wait until the reply is there. While the server lets nobody in, sending would block.
+    void exchange(zmq::socket_t& socket, zmq::message_t& message, detail::Handshakes& handshakes,
+                  std::chrono::milliseconds timeout) const {
         constexpr std::chrono::milliseconds look{100};
+        bool is_sent = false;
         const auto deadline = std::chrono::steady_clock::now() + timeout;
         for (;;) {
+            is_sent = is_sent || socket.send(message, zmq::send_flags::dontwait).has_value();
             const auto left = std::chrono::ceil<std::chrono::milliseconds>(
                 deadline - std::chrono::steady_clock::now());
             zmq_pollitem_t item{socket.handle(), 0, ZMQ_POLLIN, 0};
