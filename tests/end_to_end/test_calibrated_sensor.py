@@ -128,8 +128,11 @@ def test_a_guided_session_makes_pressures_right(
         errors.append((found.pressure_kpa - kpa) / found.pressure_sigma_kpa)
         assert found.force_n == pytest.approx(kpa * 1e-3 * AREA_MM2, rel=0.12)
     assert max(map(abs, errors)) < 2.5, errors
-    light = after.contact(100)
-    assert (light.pressure_range, light.pressure_kpa) == ("below", None)
+    # What is two standard uncertainties above nothing counts as something: by chance, one in forty.
+    light = [after.contact(kpa) for kpa in (80, 90, 100)]
+    below = [contact for contact in light if contact.pressure_range == "below"]
+    assert len(below) >= 2
+    assert all(contact.pressure_kpa is None for contact in below)
     hard = after.contact(300)
     assert hard.pressure_range == "above"
     assert hard.pressure_kpa == pytest.approx(250, abs=0.1)
