@@ -19,12 +19,8 @@ from tactomo_models.artifact import (
 )
 from tactomo_models.baseline import BaselineTracker
 from tactomo_models.contacts import Contact
-from tactomo_models.description import (
-    Modality,
-    SensorDescription,
-    load_description,
-    shipped_descriptions,
-)
+from tactomo_models.description import Modality, SensorDescription
+from tactomo_models.description_file import load_description, shipped_descriptions
 from tactomo_models.errors import (
     ArtifactError,
     CalibrationError,

@@ -21,7 +21,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from tactomo_models.archive import write_whole
 from tactomo_models.calibration import Fit, Reading, fit_curve
-from tactomo_models.description import SensorDescription, shipped_descriptions
+from tactomo_models.description import SensorDescription
+from tactomo_models.description_file import shipped_descriptions
 from tactomo_models.errors import CalibrationError, explain
 from tactomo_models.pressure import PressureCurve
 

@@ -1,130 +1,38 @@
-"""The sensor description: what a skin is made of, read from a TOML file.
+"""The sensor description: what a skin is made of.
 
-Nothing about a sensor is hard-coded elsewhere. The shipped descriptions lie in
-`tactomo_models/sensors`; a user with another sheet copies one and changes it.
+Nothing about a sensor is hard-coded elsewhere.
+.
 """
 
 from __future__ import annotations
 
 import hashlib
 from functools import cached_property
-from importlib import resources
-from itertools import pairwise
-from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Discriminator,
-    Field,
-    Tag,
-    ValidationError,
-    model_validator,
-)
+from pydantic import Field, model_validator
 
-from tactomo_models.errors import DescriptionError, explain
 from tactomo_models.pattern import Pairs, combined, ring_pairs
-from tactomo_models.toml_file import parse_toml, read_toml
+from tactomo_models.response import MagnitudeChannel, StructureChannel
+from tactomo_models.section import Section
+from tactomo_models.sheet import Electrodes, Sheet, check_electrodes, electrode_ends
 
 Modality = Literal["magnitude", "structure"]
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
-# Below ten micrometres the mesh would be refined for ever.
-Metres = Annotated[float, Field(ge=1e-5, le=10, allow_inf_nan=False)]
-# TOML has lists where a frozen model has tuples; what is in them is as strict as the rest.
-Table = Annotated[tuple[float, ...], Field(min_length=2, max_length=64, strict=False)]
 Electrode = Annotated[int, Field(ge=0, le=63)]
 PairList = Annotated[
     tuple[Annotated[tuple[Electrode, Electrode], Field(strict=False)], ...],
     Field(min_length=1, max_length=256, strict=False),
 ]
 
-
 MAX_TABLE_BYTES = 2_000_000_000
 """Of a sensor's influence tables, which grow as the square of the map's nodes."""
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
-
-
-class Sheet(_Section):
-    """The conductive sheet. A disc has `width_m` as its diameter and no height."""
-
-    shape: Literal["rectangle", "disc"]
-    width_m: Metres
-    height_m: Metres | None = None
-    frame_width_m: Annotated[float, Field(ge=0, le=1)] = 0.0
-    conductivity_s_m: Annotated[float, Field(gt=0, le=1e8)]
-    thickness_m: Annotated[float, Field(gt=0, le=1)]
-
-    @model_validator(mode="after")
-    def _shape_has_its_size(self) -> Self:
-        if self.shape == "rectangle" and self.height_m is None:
-            raise ValueError("height_m is required for a rectangle")
-        if self.shape == "disc" and self.height_m not in (None, self.width_m):
-            raise ValueError(
-                f"height_m = {self.height_m}: must be left out for a disc, width_m is its diameter"
-            )
-        limit = min(self.width_m, self.height_m or self.width_m) / 4
-        if self.frame_width_m >= limit:
-            raise ValueError(
-                f"frame_width_m = {self.frame_width_m}: must be below a quarter of the sheet's "
-                f"smaller side, {limit:.4g}"
-            )
-        return self
-
-
-def _one_or_two(given: object) -> str:
-    return "two" if isinstance(given, list | tuple) else "one"
-
-
-# One value for all four sides, or two: of bottom and top, of right and left.
-Count = Annotated[int, Field(ge=1, le=16)]
-OfSides = Discriminator(_one_or_two)
-PerSide = Annotated[
-    Annotated[Count, Tag("one")] | Annotated[tuple[Count, Count], Field(strict=False), Tag("two")],
-    OfSides,
-]
-Pitch = Annotated[
-    Annotated[Metres, Tag("one")]
-    | Annotated[tuple[Metres, Metres], Field(strict=False), Tag("two")],
-    OfSides,
-]
-
-
-class Electrodes(_Section):
-    """Electrodes on the rim: `per_side` and `pitch_m` on a rectangle, `count` on a disc."""
-
-    length_m: Metres
-    contact_impedance_ohm_m: Annotated[float, Field(gt=0, le=1e9)]
-    per_side: PerSide | None = None
-    pitch_m: Pitch | None = None
-    count: Annotated[int, Field(ge=6, le=64)] | None = None
-    first_angle_deg: Annotated[float, Field(ge=-360, le=360)] = -90.0
-
-    @property
-    def each_side(self) -> tuple[int, int]:
-        """How many are on the bottom and on the top of a rectangle, and on its right and left."""
-        return _both(self.per_side or 0)
-
-    @property
-    def pitches_m(self) -> tuple[float, float]:
-        """Their distance, centre to centre, on those sides."""
-        return _both(self.pitch_m or 0.0)
-
-
-_Number = TypeVar("_Number", int, float)
-
-
-def _both(given: _Number | tuple[_Number, _Number]) -> tuple[_Number, _Number]:
-    return given if isinstance(given, tuple) else (given, given)
-
-
-class Pattern(_Section):
+class Pattern(Section):
     """Drive pair k is (k, k + drive_offset), measuring pair m is (m, m + measure_offset).
 
     Or as listed by `drive`, `measure`: each pair once, source and sink, plus and minus.
@@ -163,7 +71,7 @@ class Pattern(_Section):
         return f"drive {drive}, measure {measure}"
 
 
-class Instrument(_Section):
+class Instrument(Section):
     """What the device that reads the electrodes makes of their voltages.
 
     `unsigned` ones are sizes, as of a peak or RMS detector: see `signs`. A converter that reads
@@ -191,111 +99,14 @@ class Instrument(_Section):
         return self
 
 
-class MagnitudeResponse(_Section):
-    """Relative conductivity change (sigma - sigma_0) / sigma_0 against pressure in kPa."""
-
-    pressure_kpa: Table
-    relative_change: Table
-
-    @model_validator(mode="after")
-    def _is_a_monotone_table(self) -> Self:
-        _check_table(self.pressure_kpa, self.relative_change, "relative_change", start=0.0)
-        if min(self.relative_change) <= -1:
-            raise ValueError(
-                f"relative_change = {list(self.relative_change)}: must stay above -1, "
-                "conductivity is positive"
-            )
-        return self
-
-    @property
-    def sign(self) -> float:
-        """+1 where pressure raises conductivity, -1 where it lowers it."""
-        return 1.0 if self.relative_change[-1] > 0 else -1.0
-
-    def change(self, pressure_kpa: FloatArray) -> FloatArray:
-        """Relative conductivity change at a pressure, any shape."""
-        return np.asarray(np.interp(pressure_kpa, self.pressure_kpa, self.relative_change))
-
-
-class StructureResponse(_Section):
-    """Ratio of the pressed to the unpressed conductivity against pressure in kPa."""
-
-    pressure_kpa: Table
-    conductivity_ratio: Table
-
-    @model_validator(mode="after")
-    def _is_a_monotone_table(self) -> Self:
-        _check_table(self.pressure_kpa, self.conductivity_ratio, "conductivity_ratio", start=1.0)
-        if min(self.conductivity_ratio) <= 0:
-            raise ValueError(
-                f"conductivity_ratio = {list(self.conductivity_ratio)}: must stay above 0"
-            )
-        return self
-
-    def ratio(self, pressure_kpa: FloatArray) -> FloatArray:
-        """Conductivity ratio at a pressure, any shape; the logarithm is interpolated."""
-        logs = np.log(self.conductivity_ratio)
-        return np.asarray(np.exp(np.interp(pressure_kpa, self.pressure_kpa, logs)))
-
-
-def _check_table(x: Table, y: Table, name: str, start: float) -> None:
-    if len(x) != len(y):
-        raise ValueError(f"{name} = {list(y)}: must have as many entries as pressure_kpa, {len(x)}")
-    if x[0] != 0 or any(b <= a for a, b in pairwise(x)):
-        raise ValueError(f"pressure_kpa = {list(x)}: must start at 0 and rise")
-    steps = np.diff(y)
-    if y[0] != start or not (np.all(steps >= 0) or np.all(steps <= 0)) or y[-1] == y[0]:
-        raise ValueError(f"{name} = {list(y)}: must start at {start:g} and only rise or only fall")
-
-
-class MagnitudeChannel(_Section):
-    """The channel that answers with the pressure's size."""
-
-    response: MagnitudeResponse
-
-
-class StructureChannel(_Section):
-    """The saturating channel: pressed or not. Give a response, or the saturated ratio alone.
-
-    With `either_way`, as in a tank that holds metal and plastic, objects of both kinds may be in
-    one scene: of this ratio, or of one over it.
-    """
-
-    response: StructureResponse | None = None
-    conductivity_ratio: Annotated[float, Field(gt=0, le=1e6)] | None = None
-    either_way: bool = False
-
-    @model_validator(mode="after")
-    def _one_of_the_two(self) -> Self:
-        if (self.response is None) == (self.conductivity_ratio is None):
-            raise ValueError("response or conductivity_ratio: give one of the two")
-        if self.saturated_ratio == 1:
-            raise ValueError("conductivity_ratio = 1: must differ from 1")
-        if self.either_way and self.saturated_ratio < 1:
-            raise ValueError(
-                f"conductivity_ratio = {self.saturated_ratio:g}: must be above 1 with either_way, "
-                "objects of one over it are the other kind"
-            )
-        return self
-
-    @property
-    def saturated_ratio(self) -> float:
-        """Conductivity of a fully pressed area over that of the bare sheet."""
-        return (
-            self.response.conductivity_ratio[-1]
-            if self.response
-            else self.conductivity_ratio or 1.0
-        )
-
-
-class MapGrid(_Section):
+class MapGrid(Section):
     """Nodes of the published map along x and y; the outermost lie on the bounding box."""
 
     nodes_x: Annotated[int, Field(ge=11, le=401)] = 51
     nodes_y: Annotated[int, Field(ge=11, le=401)] = 51
 
 
-class SensorDescription(_Section):
+class SensorDescription(Section):
     """A whole sensor: sheet, electrodes, pattern, map and the channels' contact response."""
 
     schema_version: Literal[1] = Field(alias="schema")
@@ -313,7 +124,7 @@ class SensorDescription(_Section):
     def _parts_fit(self) -> Self:
         if self.magnitude is None and self.structure is None:
             raise ValueError("give at least one of [magnitude.response] and [structure]")
-        _check_electrodes(self.sheet, self.electrodes)
+        check_electrodes(self.sheet, self.electrodes)
         if not 6 <= self.electrode_count <= 64:
             raise ValueError(f"electrodes: {self.electrode_count} in all; 6 to 64 are supported")
         for key in ("drive_offset", "measure_offset"):
@@ -360,7 +171,7 @@ class SensorDescription(_Section):
     @property
     def height_m(self) -> float:
         """Height of the bounding box."""
-        return self.sheet.height_m or self.sheet.width_m
+        return self.sheet.size_m[1]
 
     @property
     def modalities(self) -> tuple[Modality, ...]:
@@ -392,7 +203,7 @@ class SensorDescription(_Section):
     @property
     def electrode_count(self) -> int:
         """Number of electrodes of one sheet."""
-        return self.electrodes.count or 2 * sum(self.electrodes.each_side)
+        return self.electrodes.total
 
     def __eq__(self, other: object) -> bool:
         """Descriptions are equal by what they say, whatever has been worked out from them."""
@@ -440,8 +251,7 @@ class SensorDescription(_Section):
     @cached_property
     def electrode_ends_m(self) -> FloatArray:
         """Both ends of every electrode on the rim, counter-clockwise: (electrodes, 2, 2)."""
-        rim = _disc_electrodes if self.sheet.shape == "disc" else _rectangle_electrodes
-        return rim(self)
+        return electrode_ends(self.sheet, self.electrodes)
 
     @property
     def electrode_centres_m(self) -> FloatArray:
@@ -480,115 +290,3 @@ class SensorDescription(_Section):
             exclude={"pattern": unlisted},  # hashes are older than these keys
         )
         return hashlib.sha256(physics.encode()).hexdigest()
-
-
-def _check_electrodes(sheet: Sheet, electrodes: Electrodes) -> None:
-    if sheet.shape == "disc":
-        if electrodes.count is None or electrodes.per_side or electrodes.pitch_m:
-            raise ValueError("electrodes: a disc takes count, and no per_side or pitch_m")
-        room = np.pi * sheet.width_m / electrodes.count
-    else:
-        if electrodes.per_side is None or electrodes.pitch_m is None or electrodes.count:
-            raise ValueError("electrodes: a rectangle takes per_side and pitch_m, and no count")
-        for side, name in ((0, "width_m"), (1, "height_m")):
-            _check_side(electrodes, side, name, getattr(sheet, name))
-        room = min(electrodes.pitches_m)
-    if electrodes.length_m >= room:
-        raise ValueError(
-            f"electrodes.length_m = {electrodes.length_m}: must be below their distance, {room:.4g}"
-        )
-
-
-def _check_side(electrodes: Electrodes, side: int, name: str, length_m: float) -> None:
-    count, pitch_m = electrodes.each_side[side], electrodes.pitches_m[side]
-    needed = pitch_m * (count - 1) + electrodes.length_m
-    if needed > length_m:
-        raise ValueError(
-            f"electrodes: {count} of them at pitch_m = {pitch_m} need {needed:.4g} m, but the "
-            f"sheet's {name} is {length_m:.4g} m; give a smaller pitch_m, or two in brackets: of "
-            "bottom and top, of right and left (so for per_side, too)"
-        )
-
-
-def _rectangle_electrodes(description: SensorDescription) -> FloatArray:
-    half = description.electrodes.length_m / 2
-    across, upright = (
-        ((np.arange(n) - (n - 1) / 2) * pitch_m)[:, None] + [-half, half]  # (n, 2), as one travels
-        for n, pitch_m in zip(
-            description.electrodes.each_side, description.electrodes.pitches_m, strict=True
-        )
-    )
-    w, h = description.width_m / 2, description.height_m / 2
-    sides = [
-        (across, np.full_like(across, -h)),
-        (np.full_like(upright, w), upright),
-        (-across, np.full_like(across, h)),
-        (np.full_like(upright, -w), -upright),
-    ]
-    return np.concatenate([np.stack(side, axis=-1) for side in sides])
-
-
-def _disc_electrodes(description: SensorDescription) -> FloatArray:
-    n, radius = description.electrode_count, description.width_m / 2
-    centre = np.radians(description.electrodes.first_angle_deg) + 2 * np.pi * np.arange(n) / n
-    half = description.electrodes.length_m / 2 / radius
-    angle = np.stack([centre - half, centre + half], axis=1)
-    return radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-
-
-def shipped_descriptions() -> list[str]:
-    """Names of the descriptions that come with tactomo."""
-    folder = resources.files("tactomo_models.sensors")
-    return sorted(
-        f.name.removesuffix(".toml") for f in folder.iterdir() if f.name.endswith(".toml")
-    )
-
-
-def shipped_text(name: str) -> str:
-    """The TOML text of a shipped description, comments and all.
-
-    Raises:
-        DescriptionError: there is none of that name.
-    """
-    if name not in shipped_descriptions():
-        raise DescriptionError(
-            f"no description is shipped as {name!r}; choose one of: "
-            f"{', '.join(shipped_descriptions())}"
-        )
-    return resources.files("tactomo_models.sensors").joinpath(f"{name}.toml").read_text("utf-8")
-
-
-def load_description(source: str | Path) -> SensorDescription:
-    """Read a sensor description by its shipped name or from a TOML file.
-
-    Raises:
-        DescriptionError: the file cannot be read, is not TOML, or a key is unknown, missing
-            or out of range; the message names the key, its value and what is allowed.
-    """
-    name = str(source)
-    try:
-        return SensorDescription.model_validate(_read(name))
-    except ValidationError as error:
-        raise DescriptionError(
-            "\n".join(f"{name}: {explain(item)}" for item in error.errors())
-        ) from error
-
-
-def _read(name: str) -> dict[str, Any]:
-    try:
-        if name in shipped_descriptions():
-            return parse_toml(shipped_text(name))
-        return read_toml(Path(name))
-    except OSError as error:
-        raise _cannot_read(name, error.strerror) from error
-    except UnicodeDecodeError as error:
-        raise _cannot_read(name, "not UTF-8 text") from error
-    except ValueError as error:
-        raise DescriptionError(f"{name} is not valid TOML: {error}") from error
-
-
-def _cannot_read(name: str, reason: str | None) -> DescriptionError:
-    return DescriptionError(
-        f"cannot read the sensor description {name}: {reason}; give the path of a TOML file "
-        f"or one of: {', '.join(shipped_descriptions())}"
-    )

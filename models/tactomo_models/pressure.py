@@ -13,7 +13,8 @@ from enum import StrEnum, auto
 import numpy as np
 from numpy.typing import NDArray
 
-from tactomo_models.description import MagnitudeResponse, SensorDescription
+from tactomo_models.description import SensorDescription
+from tactomo_models.response import MagnitudeResponse
 
 FloatArray = NDArray[np.float64]
 

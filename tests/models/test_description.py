@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tactomo_models import DescriptionError, SensorDescription, load_description
-from tactomo_models.description import shipped_descriptions
+from tactomo_models.description_file import shipped_descriptions
 from tactomo_models.pattern import scan_pairs
 from variants import variant
 

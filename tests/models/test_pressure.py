@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tactomo_models import PressureCurve, PressureRange
-from tactomo_models.description import MagnitudeResponse
 from tactomo_models.pressure import Pressures, pressures_of
+from tactomo_models.response import MagnitudeResponse
 
 CURVE = PressureCurve(np.array([0.02, 0.2]), np.array([140.0, 200.0]), np.array([2.0, 4.0]))
 AREA_M2 = 7e-4

@@ -63,7 +63,7 @@ def copy(
     path: Annotated[Path, typer.Argument(metavar="FILE.toml", help="The file to write.")],
 ) -> None:
     """Copy a shipped sensor description to a file of your own, to be changed there."""
-    from tactomo_models.description import shipped_text
+    from tactomo_models.description_file import shipped_text
 
     from tactomo.errors import TactomoError
 
@@ -82,7 +82,7 @@ def copy(
 def list_sensors() -> None:
     """List the sensor descriptions that come with tactomo."""
     from tactomo_models import load_description
-    from tactomo_models.description import shipped_descriptions
+    from tactomo_models.description_file import shipped_descriptions
 
     for name in shipped_descriptions():
         typer.echo(f"{name}  {load_description(name).title}")

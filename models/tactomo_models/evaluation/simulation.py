@@ -14,16 +14,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tactomo_models.description import (
+from tactomo_models.description import Modality, SensorDescription
+from tactomo_models.forward import exchanged, scan_voltages, transfer_resistances, volts_per_unit
+from tactomo_models.mesh import SheetMesh, electrode_facets, mesh_sheet
+from tactomo_models.response import (
     MagnitudeChannel,
     MagnitudeResponse,
-    Modality,
-    SensorDescription,
     StructureChannel,
     StructureResponse,
 )
-from tactomo_models.forward import exchanged, scan_voltages, transfer_resistances, volts_per_unit
-from tactomo_models.mesh import SheetMesh, electrode_facets, mesh_sheet
 from tactomo_models.scene import Press, Shape, strongest
 from tactomo_models.simulator import conductivity_ratio, smooth_noise
 
