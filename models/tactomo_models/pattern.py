@@ -1,9 +1,12 @@
 """Which electrodes drive and which measure: the order of the voltages in a scan."""
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from tactomo_models.errors import DataError
 
 
 @dataclass(frozen=True)
@@ -56,3 +59,48 @@ def reciprocal_pairs(pairs: Pairs) -> NDArray[np.intp]:
     }
     found = [(i, order[k[2:] + k[:2]]) for k, i in order.items() if k[2:] + k[:2] in order]
     return np.array([(i, j) for i, j in found if i < j], dtype=np.intp).reshape(-1, 2)
+
+
+@dataclass(frozen=True)
+class PatternLayout:
+    """A pattern without a sheet: for devices of which no description is at hand."""
+
+    pairs: Pairs
+    electrode_count: int
+
+
+def pattern_of_zeros(scans: NDArray[np.float64]) -> PatternLayout:
+    """Read the pattern off scans (T, L * L) of every drive pair by every measuring pair.
+
+    A device that reports all L measuring pairs for each of L drives has 0 where a measuring pair
+    touches a driven electrode: that happens at m - k in {0, drive offset, minus measuring offset,
+    their difference}, which tells both offsets. `without_zeros` leaves them out.
+
+    Raises:
+        DataError: the number of voltages is no square, or the zeros do not fit just one pattern.
+    """
+    count = round(np.sqrt(scans.shape[1]))
+    if count * count != scans.shape[1]:
+        raise DataError(
+            f"scans of {scans.shape[1]} voltages are not every drive by every measuring pair; "
+            "give --description, or a lookup of electrodes"
+        )
+    zero = (scans == 0).all(axis=0).reshape(count, count)
+    always = [n for n in range(count) if np.all(zero[range(count), (np.arange(count) + n) % count])]
+    fits = [
+        (drive, measure)
+        for drive, measure in itertools.product(range(1, count // 2 + 1), repeat=2)
+        if {0, drive, -measure % count, (drive - measure) % count} == set(always)
+    ]
+    if len(fits) != 1:
+        raise DataError(
+            f"the zeros of these {count} x {count} voltages fit {len(fits)} patterns of drive and "
+            "measuring pairs; give --description, or a lookup of electrodes"
+        )
+    return PatternLayout(scan_pairs(count, *fits[0]), count)
+
+
+def without_zeros(layout: PatternLayout, scans: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the scans (T, M) without the measuring pairs that touch a driven electrode."""
+    position = layout.pairs.drive[:, 0] * layout.electrode_count + layout.pairs.measure[:, 0]
+    return np.asarray(scans[:, position])

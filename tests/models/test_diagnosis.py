@@ -13,18 +13,11 @@ from hypothesis import strategies as st
 from noisy_skin import rms
 from numpy.typing import NDArray
 from tactomo_models import Artifact, DataError, Press, SensorDescription, SkinSimulator
-from tactomo_models.diagnosis import (
-    Diagnosis,
-    Finding,
-    Level,
-    PatternLayout,
-    diagnose,
-    noise_about_line,
-    pattern_of_zeros,
-    without_zeros,
-)
+from tactomo_models.diagnosis import Diagnosis, diagnose
 from tactomo_models.evaluation.faults import with_lead
-from tactomo_models.pattern import scan_pairs
+from tactomo_models.examination import noise_about_line
+from tactomo_models.findings import Finding, Level
+from tactomo_models.pattern import PatternLayout, pattern_of_zeros, scan_pairs, without_zeros
 from whole_system import repository
 
 FloatArray = NDArray[np.float64]

@@ -21,7 +21,8 @@ from tactomo_models import (
     build_artifact,
     load_description,
 )
-from tactomo_models.diagnosis import Level, diagnose
+from tactomo_models.diagnosis import diagnose
+from tactomo_models.findings import Level
 from tactomo_models.forward import ForwardModel
 from tactomo_models.plausibility import Wiring
 from tactomo_models.signs import Signs

@@ -22,7 +22,8 @@ from tactomo.cli.app import (
 
 if TYPE_CHECKING:
     from rich.table import Table
-    from tactomo_models.diagnosis import Diagnosis, Finding, Level
+    from tactomo_models.diagnosis import Diagnosis
+    from tactomo_models.findings import Finding, Level
 
     from tactomo.cli.doctor_evidence import Evidence
 
@@ -106,7 +107,7 @@ def doctor(
     """
     from rich.console import Console
     from tactomo_client.keys import as_keys
-    from tactomo_models.diagnosis import worst
+    from tactomo_models.findings import worst
 
     from tactomo.cli.doctor_evidence import of_daemon
     from tactomo.cli.doctor_stream import stream_findings

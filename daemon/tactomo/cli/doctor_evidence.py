@@ -16,8 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from tactomo_client import Keys
 from tactomo_models import DescriptionError, SensorDescription, load_description
-from tactomo_models.diagnosis import PatternLayout, pattern_of_zeros, without_zeros
-from tactomo_models.pattern import Pairs, scan_pairs
+from tactomo_models.pattern import (
+    Pairs,
+    PatternLayout,
+    pattern_of_zeros,
+    scan_pairs,
+    without_zeros,
+)
 from tactomo_models.plausibility import Layout
 from tactomo_protocol import SCAN_COUNTERS, Channel, Hello, Scan, ScanFlag
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from tactomo_models.diagnosis import Finding, Level
+from tactomo_models.findings import Finding, Level
 
 from tactomo.cli.complaints import CORRUPT_NOTED, FLAG_ADVICE, complaints
 from tactomo.cli.doctor_evidence import Evidence, Heard

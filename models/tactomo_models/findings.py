@@ -1,0 +1,328 @@
+"""What is found in scans of a skin at rest: how bad each thing is, and what to do about it.
+
+- signal-to-noise ratio: root mean square of the voltages over that of their standard deviation
+  about a straight line in time, so that drift is not counted as noise.
+- reciprocity error: the mean of |V - V'| over the mean size of V and V', where V' is read with
+  drive and measuring pair exchanged; and the same of all voltages together, which goes by their
+  size and is what is judged, since a voltage near zero has a large share of any noise.
+
+Sources: Adler et al., "GREIT" (Physiol. Meas. 30, 2009) and Yerworth & Bayford, "The effect of
+serial data collection on the accuracy of EIT" on signal-to-noise and reciprocity as figures of
+merit; Asfaw & Adler (2005), see `plausibility`, on erroneous electrodes.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactomo_models.examination import (
+    BROKEN_SHARE,
+    FEWEST_FOR_NOISE,
+    Examination,
+    noise_about_line,
+    rms,
+)
+from tactomo_models.pattern import Pairs
+from tactomo_models.plausibility import TINY, Flag
+
+FloatArray = NDArray[np.float64]
+
+GOOD_SNR_DB = 36.0  # 40 dB, less what a few scans know of their own noise
+POOR_SNR_DB = 20.0  # presses change voltages by some per cent: below, none can be seen
+GOOD_RECIPROCITY = 0.05  # of all voltages together; devices that serve have 1 to 6 %
+POOR_RECIPROCITY = 0.2  # nothing can be located
+DRIFT_NOTED = 0.5  # per cent a minute: tare now and then
+DRIFT_POOR = 5.0  # per cent a minute
+SHORTEST_FOR_DRIFT_S = 2.0
+MOST_CHANCE = 2.0  # mean square of changes over their noise: more is no chance with 50 voltages
+UNEVEN_CHANGE = 0.5  # of the even change
+SIGNIFICANT = 4.0  # standard deviations
+
+
+class Level(StrEnum):
+    """How bad a finding is; from harmless to worst."""
+
+    OK = "ok"
+    UNKNOWN = "unknown"
+    ADVICE = "advice"  # it serves; better is possible
+    FAULT = "fault"  # to be mended
+    BROKEN = "broken"  # nothing can be trusted
+
+
+def worst(levels: Iterator[Level]) -> Level:
+    """Return the worst of some levels; ok if there are none."""
+    order = list(Level)
+    return max(levels, key=order.index, default=Level.OK)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at.
+
+    Attributes:
+        about: what, in a word that programs may rely on.
+        level: how bad it is.
+        detail: what was found, for people.
+        next_step: what to do about it; empty where nothing need be done.
+        figures: the numbers, each with its unit in its name.
+    """
+
+    about: str
+    level: Level
+    detail: str
+    next_step: str = ""
+    figures: Mapping[str, float | list[float] | list[int] | None] = field(default_factory=dict)
+
+
+def scans_found(count: int, lost: int, still: slice, is_moved: bool) -> Finding:
+    """How many scans there are, and which of them are looked at."""
+    figures = {"scans": float(count)}
+    if is_moved:
+        which = f"{still.start} to {still.stop - 1}, the stillest, are looked at"
+        whole = still.stop - still.start == count
+        return Finding(
+            "scans",
+            Level.ADVICE,
+            f"{count} scans, in which something moves" + ("" if whole else f": {which}"),
+            "leave the skin alone while it is examined",
+            {**figures, "examined": [still.start, still.stop]},
+        )
+    if lost:
+        return Finding(
+            "scans",
+            Level.ADVICE,
+            f"{count} scans; {lost} more hold values that are not numbers",
+            "check the converter and the firmware",
+            figures,
+        )
+    return Finding("scans", Level.OK, f"{count} scan(s)", "", figures)
+
+
+def snr_found(examined: Examination) -> Finding:
+    """The signal-to-noise ratio of all voltages, and of the worst ones."""
+    if examined.is_frozen:
+        return Finding(
+            "snr",
+            Level.ADVICE,
+            "there is no noise at all",
+            "a real converter has some; is it simulated, or does the firmware send one scan again?",
+        )
+    if examined.is_moving:
+        step = "leave the skin alone while it is examined; give scans of one device at rest"
+        return Finding("snr", Level.UNKNOWN, "not known: something moves all the time", step)
+    if not examined.has_noise:
+        step = f"give at least {FEWEST_FOR_NOISE} scans of the unpressed skin"
+        return Finding("snr", Level.UNKNOWN, f"not known from {examined.count} scan(s)", step)
+    good = examined.good
+    signal, noise = rms(examined.mean[good]), rms(examined.noise[good])
+    overall = float(20 * np.log10(max(signal, TINY) / max(noise, TINY)))
+    level, step = Level.OK, ""
+    if overall < GOOD_SNR_DB:
+        level = Level.BROKEN if overall < POOR_SNR_DB else Level.FAULT
+        step = "look for interference: cable shields, a loose ground, a motor or charger near by"
+    known = np.flatnonzero(np.isfinite(examined.snr_db))
+    order = known[np.argsort(examined.snr_db[known])][:3]
+    pairs = _voltages_words(examined.pairs, order)
+    middle = float(np.median(examined.snr_db[known])) if len(known) else np.nan
+    beside = "" if good.all() else " beside the electrodes named below"
+    return Finding(
+        "snr",
+        level,
+        f"{overall:.1f} dB{beside}; of single voltages {middle:.1f} dB (median), worst {pairs}",
+        step,
+        {
+            "snr_db": overall,
+            "median_db": middle,
+            "worst_voltages": order.tolist(),
+            "worst_db": examined.snr_db[order].tolist(),
+        },
+    )
+
+
+def _voltages_words(pairs: Pairs, which: NDArray[np.intp]) -> str:
+    """Name voltages as V(drive pair; measuring pair)."""
+    return ", ".join(
+        f"V({'-'.join(map(str, pairs.drive[n]))}; {'-'.join(map(str, pairs.measure[n]))})"
+        for n in which.tolist()
+    )
+
+
+def reciprocity_found(examined: Examination) -> Finding:
+    """How far voltages differ that are the same on any sheet."""
+    i, j = examined.wiring.reciprocal.T
+    if len(i) == 0:
+        return Finding(
+            "reciprocity",
+            Level.UNKNOWN,
+            "the pattern has no reciprocal pairs: no voltage is read twice",
+            "no fault; drive and measure by the same offset to have this check",
+        )
+    one, other = examined.mean[i], examined.mean[j]
+    difference, size = np.abs(one - other), (np.abs(one) + np.abs(other)) / 2
+    together = float(difference.sum() / max(size.sum(), TINY))
+    each = float(np.mean(difference / np.maximum(size, TINY)))
+    chance = np.hypot(examined.noise[i], examined.noise[j]) / np.sqrt(examined.count)
+    by_noise = float(np.sqrt(2 / np.pi) * chance.sum() / max(size.sum(), TINY))
+    beyond = float(np.sqrt(max(together**2 - by_noise**2, 0.0)))
+    level, step = Level.OK, ""
+    if beyond > GOOD_RECIPROCITY:
+        level, step = Level.FAULT, "mend the electrodes that are named; else compare the gains"
+    if beyond > POOR_RECIPROCITY:
+        level = Level.BROKEN if _reciprocity_of_good(examined) > POOR_RECIPROCITY else Level.FAULT
+    if level == Level.BROKEN:
+        step = (
+            "nothing can be located from these voltages: check the order of drive and measuring "
+            "pairs, the current source and the multiplexer; measure a resistor phantom"
+        )
+    return Finding(
+        "reciprocity",
+        level,
+        f"error {each:.1%} (mean of pairs), {together:.1%} of all voltages together",
+        step,
+        {"pairs_percent": 1e2 * each, "together_percent": 1e2 * together},
+    )
+
+
+def _reciprocity_of_good(examined: Examination) -> float:
+    """Reciprocity error of all voltages together but those of electrodes that are known bad."""
+    i, j = examined.wiring.reciprocal.T
+    keep = examined.good[i] & examined.good[j]
+    one, other = examined.mean[i[keep]], examined.mean[j[keep]]
+    size = (np.abs(one) + np.abs(other)).sum() / 2
+    return float(np.abs(one - other).sum() / max(size, TINY))
+
+
+_ELECTRODE_WORDS = {
+    "dead": ("reads next to nothing", "check its lead and its contact with the sheet"),
+    "loose": ("is noisier than the others, or jumps", "fasten its connector; move its lead gently"),
+    "misread": ("breaks laws that any sheet obeys", "check its lead for a break or a short"),
+}
+
+
+def electrodes_found(examined: Examination) -> Iterator[Finding]:
+    """The electrodes that are bad, by what is wrong with them."""
+    states = examined.states
+    bad = [n for n, state in enumerate(states) if state != "good"]
+    if not bad:
+        yield Finding("electrodes", Level.OK, f"all {len(states)} read as they should")
+        return
+    many = len(bad) > BROKEN_SHARE * len(states)
+    for state, (what, step) in _ELECTRODE_WORDS.items():
+        named = [n for n in bad if states[n] == state]
+        if named:
+            plural = f"electrodes {_numbers(named)}: each" if len(named) > 1 else _only(named)
+            yield Finding(
+                f"{state}_electrodes",
+                Level.BROKEN if many else Level.FAULT,
+                f"{plural} {what}",
+                "so many at once are rather the multiplexer, the ground or the order of the pairs"
+                if many
+                else step,
+                {"electrodes": named},
+            )
+    if examined.order.exchanged:
+        told = " and ".join(f"{a} with {b}" for a, b in examined.order.exchanged)
+        yield Finding(
+            "swapped_electrodes",
+            Level.FAULT,
+            f"leads changed places: {told}",
+            "exchange the plugs, then tare",
+            {"electrodes": sorted(itertools.chain(*examined.order.exchanged))},
+        )
+
+
+def _numbers(named: Sequence[int]) -> str:
+    return ", ".join(map(str, named))
+
+
+def _only(named: Sequence[int]) -> str:
+    return f"electrode {named[0]}"
+
+
+def model_found(examined: Examination, has_model: bool, is_moved: bool) -> Finding:
+    """Whether the voltages are those of the sensor that is described."""
+    if not has_model:
+        return Finding(
+            "model",
+            Level.UNKNOWN,
+            "no description of the sheet: swapped electrodes cannot be told",
+            "give the sensor's description",
+        )
+    if examined.order.turned:
+        return Finding(
+            "model",
+            Level.FAULT,
+            f"all leads are on by {examined.order.turned} of {len(examined.states)} electrodes",
+            "turn the plug, or renumber the electrodes in the description",
+        )
+    if Flag.REFERENCE_MISMATCH not in examined.verdict.flags:
+        return Finding("model", Level.OK, "as the description says")
+    return Finding(
+        "model",
+        Level.ADVICE if is_moved else Level.FAULT,
+        "the voltages are not those of this sensor unloaded",
+        "does something press, are leads in another order, or is this another sensor?",
+    )
+
+
+def saturation_found(examined: Examination, saturated: int) -> Finding:
+    """How many scans the converter clipped; `saturated` is what the device says of that."""
+    count = len(examined.later)
+    clipped = max(saturated, sum(Flag.SATURATED in flags for flags, _ in examined.later))
+    if not clipped:
+        return Finding("saturation", Level.OK, "no scan was clipped")
+    return Finding(
+        "saturation",
+        Level.FAULT,
+        f"{clipped} of {count} scans were clipped",
+        "lower the gain or the current",
+        {"clipped_percent": 1e2 * clipped / count},
+    )
+
+
+def drift_found(still: FloatArray, times_s: FloatArray | None) -> Finding:
+    """How fast the scans at rest (n, M) change; `times_s` (n,) says when each was taken."""
+    span_s = 0.0 if times_s is None or len(times_s) < 3 else float(times_s[-1] - times_s[0])
+    if times_s is None or span_s < SHORTEST_FOR_DRIFT_S:
+        step = f"look at {SHORTEST_FOR_DRIFT_S:g} s or more, with times"
+        return Finding("drift", Level.UNKNOWN, "not known", step)
+    mean = still.mean(axis=0)
+    gain = still @ mean / max(float(mean @ mean), TINY)
+    time = times_s - times_s.mean()
+    slope = float(time @ (gain - gain.mean()) / (time @ time))
+    rest = gain - gain.mean() - slope * time
+    sigma = float(np.sqrt((rest @ rest) / (len(time) - 2) / (time @ time)))
+    percent, sigma = 6e3 * slope, 6e3 * sigma
+    if _changes_unevenly(still, time):
+        return Finding(
+            "drift",
+            Level.ADVICE,
+            "the voltages change, and not all alike: something presses, or a contact changes",
+            "leave the skin alone while it is examined; if it stays so, check the electrodes",
+        )
+    level, step = Level.OK, ""
+    if abs(percent) > max(DRIFT_NOTED, SIGNIFICANT * sigma):
+        level, step = Level.ADVICE, "let it warm up; tare now and then"
+    if abs(percent) > max(DRIFT_POOR, SIGNIFICANT * sigma):
+        level, step = Level.FAULT, "let it warm up; look for moisture, strain or a weak contact"
+    figures = {"percent_per_min": percent, "sigma_percent_per_min": sigma}
+    detail = f"{percent:+.2f} % a minute (standard uncertainty {sigma:.2f})"
+    return Finding("drift", level, detail, step, figures)
+
+
+def _changes_unevenly(still: FloatArray, time: FloatArray) -> bool:
+    """Tell whether voltages change otherwise than all by the same factor."""
+    slopes = time @ (still - still.mean(axis=0)) / (time @ time)
+    mean = still.mean(axis=0)
+    alike = mean * (mean @ slopes) / max(float(mean @ mean), TINY)
+    sigma = noise_about_line(still) / np.sqrt(time @ time)
+    if not sigma.all():
+        return False
+    chance = np.mean(((slopes - alike) / sigma) ** 2)
+    return bool(chance > MOST_CHANCE and rms(slopes - alike) > UNEVEN_CHANGE * rms(alike))
