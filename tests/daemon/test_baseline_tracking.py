@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tactomo.recording import open_recording
 from tactomo_client.messages import array_from_wire
-from tactomo_models import Press, SkinSimulator, baseline, load_description
+from tactomo_models import Press, SkinSimulator, baseline, channel_baseline, load_description
 
 Start = Callable[..., Any]
 
@@ -18,10 +18,10 @@ Start = Callable[..., Any]
 @pytest.fixture
 def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every frame counts at once: what takes minutes otherwise takes frames."""
-    monkeypatch.setattr(baseline, "BLOCK_S", 0.0)
+    monkeypatch.setattr(channel_baseline, "BLOCK_S", 0.0)
     monkeypatch.setattr(baseline, "MOVE_S", 0.0)
     monkeypatch.setattr(baseline, "TIME_CONSTANT_S", 1.0)
-    monkeypatch.setattr(baseline, "GAIN_PER_S", 1.0)
+    monkeypatch.setattr(channel_baseline, "GAIN_PER_S", 1.0)
 
 
 @pytest.mark.usefixtures("hasty")

@@ -18,7 +18,7 @@ from tactomo_models import (
     SensorDescription,
     SkinSimulator,
 )
-from tactomo_models.baseline import CREEP
+from tactomo_models.press_memory import CREEP
 from tactomo_models.tier import Tier
 
 FloatArray = NDArray[np.float64]
