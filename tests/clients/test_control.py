@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import socket
+import threading
 import time
 
 import pytest
-from tactomo_client import ControlError, MessageError, request, subscribe
+from tactomo_client import ControlError, Daemon, MessageError, NoAnswer, request, subscribe
+from tactomo_client.control import TARE_TIMEOUT_S
 from tactomo_client.fake import FakeControl
+
+PATIENCE_S = 60.0
 
 
 def test_a_command_is_sent_and_its_result_returned() -> None:
@@ -48,3 +53,50 @@ def test_a_wrong_address_is_named() -> None:
     with pytest.raises(ControlError, match=r"127\.0\.0\.1:5560") as of_stream:
         subscribe("left", address="localhost")
     assert "5561" in of_stream.value.next_step
+
+
+def test_nothing_listens_is_told_long_before_a_commands_own_time_is_over() -> None:
+    begin_s = time.monotonic()
+    with (
+        Daemon("ipc:///nowhere/at/all", connect_timeout_s=0.3) as daemon,
+        pytest.raises(NoAnswer, match=r"within 0\.\d+ s: nothing listens there; start the daemon"),
+    ):
+        daemon.tare()
+    assert time.monotonic() - begin_s < TARE_TIMEOUT_S / 2
+
+
+def test_a_daemon_that_starts_a_moment_later_is_reached() -> None:
+    with FakeControl() as control:
+        address = control.address
+    later: list[FakeControl] = []
+    starting = threading.Timer(
+        1.0, lambda: later.append(FakeControl({"tare": {"scans": 7}}, address))
+    )
+    starting.start()
+    try:
+        assert Daemon(address, connect_timeout_s=PATIENCE_S).tare(PATIENCE_S).scans == 7
+    finally:
+        starting.join()
+        later[0].close()
+
+
+def test_a_busy_daemon_is_waited_for_though_it_says_nothing() -> None:
+    """The kernel answers for a program that does not come round to its socket."""
+    with socket.create_server(("127.0.0.1", 0)) as busy:
+        address = f"tcp://127.0.0.1:{busy.getsockname()[1]}"
+        begin_s = time.monotonic()
+        with (
+            Daemon(address, connect_timeout_s=0.1) as daemon,
+            pytest.raises(NoAnswer, match=r"though something listens there; .* its log") as caught,
+        ):
+            daemon.tare(1.0)
+        assert time.monotonic() - begin_s >= 1.0
+        assert "1 s" in caught.value.cause
+
+
+def test_a_daemon_that_goes_away_during_a_command_is_missed() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        threading.Timer(0.5, server.shutdown, [socket.SHUT_RDWR]).start()
+        with pytest.raises(NoAnswer, match="nothing listens there"):
+            Daemon(address, connect_timeout_s=0.3).tare(PATIENCE_S)

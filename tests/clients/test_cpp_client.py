@@ -8,6 +8,7 @@ import json
 import os
 import random
 import shutil
+import socket
 import subprocess
 import sys
 import threading
@@ -248,6 +249,64 @@ def test_nothing_answers(probe: Path) -> None:
     assert bad.stderr.startswith("bad_address: ")
     name = subprocess.run([probe, "watch", "a b", free, "map"], capture_output=True, text=True)
     assert name.stderr.startswith("malformed_message: 'a b' is not a sensor name")
+
+
+def give(program: Path, option: str, value: int, address: str) -> tuple[int, str]:
+    """Use an option of this value; what came of it, and all that was said."""
+    command = [str(program), "give", option, str(value), address]
+    did = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
+    return did.returncode, did.stdout + did.stderr
+
+
+LEAST, MOST = -(2**63), 2**63 - 1
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "says"),
+    [
+        ("timeout", 0, "timeout is 0 ms: give more than 0"),
+        ("timeout", LEAST, "give more than 0"),
+        ("connect_timeout", -5, "connect_timeout is -5 ms: give more than 0"),
+        ("stale_after", -1, "stale_after is negative"),
+        ("max_contacts", -1, "a frame has at most 4096"),
+        ("max_contacts", 4097, "max_contacts is 4097: a frame has at most 4096"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_at_once(
+    checked: Path, option: str, value: int, says: str
+) -> None:
+    status, said = give(checked, option, value, "ipc:///nowhere/at/all")
+    assert status == 1
+    assert said.startswith("invalid_argument: ")
+    assert says in said
+
+
+def test_the_longest_times_serve(checked: Path) -> None:
+    with FakeControl({"tare": {"scans": 3}}) as control, FakeSensor("left") as sensor:
+        assert give(checked, "timeout", MOST, control.address) == (0, "")
+        assert give(checked, "connect_timeout", MOST, control.address) == (0, "3\n")
+        for option in ("stale_after", "max_contacts"):
+            value = MOST if option == "stale_after" else 4096
+            assert give(checked, option, value, sensor.address) == (0, "no frame\n")
+        assert give(checked, "wait", LEAST, sensor.address) == (0, "no frame\n")
+        with ThreadPoolExecutor() as beside:
+            waiting = beside.submit(give, checked, "wait", MOST, sensor.address)
+            while not waiting.done():
+                sensor.publish()
+                time.sleep(0.05)
+            assert waiting.result() == (0, "a frame\n")
+
+
+def test_nothing_listens_and_something_busy_does(probe: Path) -> None:
+    status, said = give(probe, "connect_timeout", 300, "ipc:///nowhere/at/all")
+    assert status == 1
+    assert said.startswith("no_answer: nothing answered at ipc:///nowhere/at/all within ")
+    assert "ms: nothing listens there; start the daemon" in said
+    with socket.create_server(("127.0.0.1", 0)) as busy:  # the kernel answers for it
+        address = f"tcp://127.0.0.1:{busy.getsockname()[1]}"
+        status, said = give(probe, "timeout", 700, address)
+    assert status == 1
+    assert ", though something listens there; " in said
 
 
 def test_with_keys(probe: Path, start: Callable[..., DaemonProcess], tmp_path: Path) -> None:

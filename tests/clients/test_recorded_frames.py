@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+import re
 import sys
 import warnings
 from collections.abc import Sequence
@@ -248,3 +250,28 @@ def test_without_the_extra_the_error_says_what_to_install(monkeypatch: pytest.Mo
 
 def test_it_is_opened_by_its_path_as_text(whole: Path) -> None:
     assert isinstance(open_recording(str(whole)), Recording)
+
+
+@pytest.mark.parametrize(
+    ("times", "says"),
+    [
+        ({"start_s": -1}, "start_s = -1: give finite seconds, 0 or more"),
+        ({"start_s": math.inf}, "start_s = inf: give finite seconds, 0 or more"),
+        ({"end_s": -2.5}, "end_s = -2.5: give seconds, 0 or more"),
+        ({"end_s": math.nan}, "end_s = nan"),
+        ({"stale_after_s": -1}, "stale_after_s = -1"),
+        ({"start_s": 5, "end_s": 2}, "end_s = 2.0 is before start_s = 5.0"),
+        ({"end_s": "2"}, "end_s = '2' is no number"),
+    ],
+)
+def test_times_of_a_recording(whole: Path, times: dict[str, Any], says: str) -> None:
+    recording = open_recording(whole)
+    with pytest.raises((TypeError, ValueError), match=re.escape(says)):
+        recording.frames(**times)
+
+
+def test_a_recording_that_ends_sooner_than_was_asked_for(whole: Path) -> None:
+    recording = open_recording(whole)
+    for end_s in (1e9, 1e300, 10**400, math.inf):
+        assert len(list(recording.frames("contacts", end_s=end_s))) == 40
+    assert not list(recording.frames(start_s=1e300))

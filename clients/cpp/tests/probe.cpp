@@ -7,6 +7,7 @@
 //     probe loop SENSOR ADDRESS KIND TURNS         latest() at 1 kHz: what it took
 //     probe control ADDRESS COMMAND [ARGUMENT] [KEYS]     an empty argument: none
 //     probe statuses ADDRESS COUNT                 so many commands, and the name of each one's error
+//     probe give OPTION VALUE ADDRESS              an option of this value, and one use of it
 
 #include <tactomo/client.hpp>
 
@@ -315,6 +316,25 @@ int statuses(tactomo::Control daemon, long count) {
     return 0;
 }
 
+// Times are in milliseconds, but for stale_after: nanoseconds.
+int give(const std::string& option, long long value, tactomo::Options options) {
+    const auto time = std::chrono::milliseconds(value);
+    if (option == "connect_timeout") {
+        std::printf("%d\n", tactomo::Control(options.address, {}, time).tare());
+        return 0;
+    }
+    if (option == "timeout") {
+        tactomo::Control(options.address).request("clear", time);
+        return 0;
+    }
+    if (option == "stale_after") options.stale_after = std::chrono::nanoseconds(value);
+    if (option == "max_contacts") options.max_contacts = static_cast<std::size_t>(value);
+    tactomo::Subscription skin("left", options);
+    const auto wait = option == "wait" ? time : std::chrono::milliseconds(0);
+    std::puts(skin.wait(wait) == nullptr ? "no frame" : "a frame");
+    return 0;
+}
+
 }  // namespace
 
 int main(int count, char** words) {
@@ -331,11 +351,16 @@ int main(int count, char** words) {
         }
         if (word(0) == "loop") return loop(word(1), options, std::atol(word(4).c_str()));
         if (word(0) == "statuses") return statuses(tactomo::Control(word(1)), std::atol(word(2).c_str()));
+        options.address = word(3);
+        if (word(0) == "give") return give(word(1), std::atoll(word(2).c_str()), options);
         tactomo::Keys keys;
         if (!word(4).empty()) keys = tactomo::Keys::load(word(4));
         return control(tactomo::Control(word(1), keys), word(2), word(3));
     } catch (const tactomo::Error& error) {
         std::fprintf(stderr, "%s: %s\n", error.name().c_str(), error.what());
+        return 1;
+    } catch (const std::invalid_argument& error) {
+        std::fprintf(stderr, "invalid_argument: %s\n", error.what());
         return 1;
     }
 }

@@ -29,8 +29,10 @@ from typing import Any, Literal, Self, TypeVar, Unpack, cast, overload
 import zmq
 import zmq.asyncio
 
+from tactomo_client.arguments import checked_seconds
 from tactomo_client.connection import Owner, Waiting
 from tactomo_client.control import (
+    CONNECT_TIMEOUT_S,
     RECORD_TIMEOUT_S,
     TARE_TIMEOUT_S,
     TIMEOUT_S,
@@ -131,11 +133,13 @@ class Subscription(Reception[T_co], AsyncIterator[T_co]):
     async def wait(self, timeout_s: float) -> T_co | None:
         """Wait for the next frame, but no longer than `timeout_s`; None if it has not come then.
 
+        0 or less, what is left of a time that is over, takes a frame that has come.
+
         Raises:
             KeysError: the server does not let this client in. The next call knocks once more.
 
         """
-        return await _wait(self._arrival(timeout_s))
+        return await _wait(self._arrival(checked_seconds("timeout_s", timeout_s, past=True)))
 
     async def latest(self) -> T_co | None:
         """Return the newest frame there is, without waiting for one; None before the first one.
@@ -180,6 +184,7 @@ class Control:
         address: where it is.
         keys: keys, or the folder that holds them, for a daemon beyond this computer.
         timeout_s: how long to wait for replies, seconds, where nothing else is said.
+        connect_timeout_s: how long, of that, while nothing listens at the address.
 
     """
 
@@ -189,10 +194,11 @@ class Control:
         *,
         keys: Keys | str | Path | None = None,
         timeout_s: float = TIMEOUT_S,
+        connect_timeout_s: float = CONNECT_TIMEOUT_S,
     ) -> None:
         self.address = address
-        self.timeout_s = timeout_s
-        self._line = ControlLine(_open_requester, address, as_keys(keys))
+        self.timeout_s = checked_seconds("timeout_s", timeout_s, zero=False)
+        self._line = ControlLine(_open_requester, address, as_keys(keys), connect_timeout_s)
         self._turn = asyncio.Lock()
 
     async def request(

@@ -104,6 +104,11 @@ class Connection:
         """Whether the server has ever taken this client in, as far as `refusal` has looked."""
         return self._handshakes.have_succeeded
 
+    @property
+    def is_connected(self) -> bool:
+        """Whether something listened at the address when `refusal` last looked."""
+        return self._handshakes.is_connected
+
     def send(self, message: bytes) -> bool:
         """Send a message, if that can be done now: not while the server lets nobody in."""
         try:

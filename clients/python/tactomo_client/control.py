@@ -12,6 +12,7 @@ from typing import Any, Final, Self
 
 import zmq
 
+from tactomo_client.arguments import checked_seconds
 from tactomo_client.connection import Connection, Owner, Waiting, wait, whole_ms
 from tactomo_client.errors import ClientError, ControlError, control_error
 from tactomo_client.filled import filled
@@ -24,6 +25,8 @@ TARE_TIMEOUT_S: Final = 30.0
 """For a tare: as long as its dual scans take to come."""
 RECORD_TIMEOUT_S: Final = 10.0
 """For a recording: a disk may take its time."""
+CONNECT_TIMEOUT_S: Final = 5.0
+"""How long nothing may listen at the address: a daemon that was started just now takes 2 to 3 s."""
 LOOK_S: Final = 0.1
 
 
@@ -40,7 +43,8 @@ def request(
     Args:
         command: one of the control commands of STREAM.md, for example ``tare``.
         address: the control socket of the daemon, or of the twin.
-        timeout_s: how long to wait for the reply, seconds.
+        timeout_s: how long to wait for the reply, seconds; but no longer than 5 s where nothing
+            listens at the address (see `Control`).
         keys: keys, or the folder that holds them, for a daemon beyond this computer.
         **arguments: the command's arguments, for example ``tier="quiet"``.
 
@@ -48,6 +52,7 @@ def request(
         ControlError: the command was refused, or nothing answered (`NoAnswer`).
         KeysError: the keys cannot be used, or the server does not let them in.
         MessageError: what answered does not speak this protocol.
+        TypeError, ValueError: `timeout_s` makes no sense.
 
     Example::
 
@@ -65,10 +70,19 @@ class ControlLine:
     answered: a REQ socket cannot send again then.
     """
 
-    def __init__(self, owner: Callable[[], Owner], address: str, keys: Keys | None) -> None:
+    def __init__(
+        self,
+        owner: Callable[[], Owner],
+        address: str,
+        keys: Keys | None,
+        connect_timeout_s: float,
+    ) -> None:
         self.address = address
         self._owner = owner
         self._keys = keys
+        self._connect_timeout_s = checked_seconds(
+            "connect_timeout_s", connect_timeout_s, zero=False
+        )
         self._connection: Connection | None = None
 
     def exchange(
@@ -80,20 +94,26 @@ class ControlLine:
             ControlError, KeysError, MessageError: as `request`.
 
         """
+        checked_seconds("timeout_s", timeout_s, zero=False)
         message = encode_request(command, arguments)
         connection = self._connection or self._connect()
         reply, is_sent = None, False
-        deadline_s = time.monotonic() + timeout_s
+        begin_s = time.monotonic()
+        replied_by_s, connected_by_s = begin_s + timeout_s, begin_s + self._connect_timeout_s
         try:
             while reply is None:
                 is_sent = is_sent or connection.send(message)
-                left_s = deadline_s - time.monotonic()
-                if (yield connection.owner, whole_ms(min(LOOK_S, left_s))):
+                end_s = min(replied_by_s, connected_by_s)
+                if (yield connection.owner, whole_ms(min(LOOK_S, end_s - time.monotonic()))):
                     reply = connection.receive()
-                elif refusal := connection.refusal():
+                    continue
+                if refusal := connection.refusal():
                     raise refusal
-                elif left_s <= 0 or not connection.is_open:
-                    raise _no_answer(self.address, timeout_s)
+                now_s = time.monotonic()
+                if connection.is_connected:
+                    connected_by_s = now_s + self._connect_timeout_s
+                if now_s >= min(replied_by_s, connected_by_s) or not connection.is_open:
+                    raise _no_answer(connection, min(timeout_s, now_s - begin_s))
         finally:
             if reply is None:
                 self.close()
@@ -173,6 +193,12 @@ class Control:
         address: where it is.
         keys: keys, or the folder that holds them, for a daemon beyond this computer.
         timeout_s: how long to wait for replies, seconds, where nothing else is said.
+        connect_timeout_s: how long, of that, while nothing listens at the address. A program that
+            starts a daemon and gives it a command at once may need more, as where the sensor's
+            models are to be built first.
+
+    Raises:
+        TypeError, ValueError: a time is no number, or is not above 0.
 
     Example::
 
@@ -187,10 +213,11 @@ class Control:
         *,
         keys: Keys | str | Path | None = None,
         timeout_s: float = TIMEOUT_S,
+        connect_timeout_s: float = CONNECT_TIMEOUT_S,
     ) -> None:
         self.address = address
-        self.timeout_s = timeout_s
-        self._line = ControlLine(_open, address, as_keys(keys))
+        self.timeout_s = checked_seconds("timeout_s", timeout_s, zero=False)
+        self._line = ControlLine(_open, address, as_keys(keys), connect_timeout_s)
 
     def request(
         self, command: str, timeout_s: float | None = None, /, **arguments: Any
@@ -336,9 +363,17 @@ def _open() -> Owner:
     return zmq.Context.instance().socket(zmq.REQ)
 
 
-def _no_answer(address: str, timeout_s: float) -> ControlError:
+def _no_answer(connection: Connection, waited_s: float) -> ControlError:
+    silence = f"nothing answered at {connection.address} within {waited_s:.2g} s"
+    if connection.is_connected:
+        return control_error(
+            f"{silence}, though something listens there",
+            "if it is the daemon's control socket, its log says what it is busy with",
+            "no_answer",
+        )
     return control_error(
-        f"nothing answered at {address} within {timeout_s:g} s",
-        "start the daemon with `tactomo daemon`, or give the address of the one that runs",
+        f"{silence}: nothing listens there",
+        "start the daemon with `tactomo daemon` (a simulated skin: `tactomo twin`), or give the "
+        "address of the one that runs",
         "no_answer",
     )

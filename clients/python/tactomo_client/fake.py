@@ -26,6 +26,7 @@ from typing import Any, Self
 import zmq
 from numpy.typing import NDArray
 
+from tactomo_client.arguments import checked_seconds
 from tactomo_client.errors import ControlError
 from tactomo_client.frame import Contact
 from tactomo_client.messages import (
@@ -56,7 +57,7 @@ class FakeSensor:
 
         What is published before a subscriber is there is lost, as with every publisher.
         """
-        deadline = time.monotonic() + timeout_s
+        deadline = time.monotonic() + checked_seconds("timeout_s", timeout_s, endless=False)
         while self._socket.poll(max(0, int((deadline - time.monotonic()) * 1000))):
             message = self._socket.recv()
             if message[:1] == b"\1":

@@ -25,8 +25,10 @@ SECRET_SUFFIX: Final = ".key_secret"
 
 _KEY = re.compile(rb"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
 _MAX_FILE_BYTES: Final = 16 * 1024
-_HANDSHAKE_EVENTS: Final = (
-    zmq.Event.HANDSHAKE_SUCCEEDED
+_WATCHED: Final = (
+    zmq.Event.CONNECTED
+    | zmq.Event.DISCONNECTED
+    | zmq.Event.HANDSHAKE_SUCCEEDED
     | zmq.Event.HANDSHAKE_FAILED_AUTH
     | zmq.Event.HANDSHAKE_FAILED_PROTOCOL
     | zmq.Event.HANDSHAKE_FAILED_NO_DETAIL
@@ -142,23 +144,29 @@ def secure(socket: zmq.Socket[Any], address: str, keys: Keys | None) -> None:
 class Handshakes:
     """Watches what becomes of a socket's handshakes, to tell a closed door from nobody at home.
 
-    Belongs to the socket's thread, and is to be closed before the socket.
+    Belongs to the socket's thread, and is to be closed before the socket. The attributes are as of
+    the last call of `refusal`.
 
     Attributes:
-        have_succeeded: whether `refusal` has ever seen a server take this client in.
+        have_succeeded: whether a server has ever taken this client in.
+        is_connected: whether something listens at the other end, busy or not.
 
     """
 
     def __init__(self, socket: zmq.Socket[bytes]) -> None:
         self._socket = socket
-        self._monitor = socket.get_monitor_socket(_HANDSHAKE_EVENTS)
+        self._monitor = socket.get_monitor_socket(_WATCHED)
         self._failures: list[int] = []  # since the last success
         self.have_succeeded = False
+        self.is_connected = False
 
     def refusal(self, address: str, keys: Keys | None) -> KeysError | None:
         """Return why the server lets nobody in by these keys; None as long as it may do so."""
         while self._monitor.poll(0):
             event = recv_monitor_message(self._monitor)["event"]
+            if event in (zmq.Event.CONNECTED, zmq.Event.DISCONNECTED):
+                self.is_connected = event == zmq.Event.CONNECTED
+                continue
             self.have_succeeded |= event == zmq.Event.HANDSHAKE_SUCCEEDED
             self._failures = (
                 [] if event == zmq.Event.HANDSHAKE_SUCCEEDED else [*self._failures[-1:], event]

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final, Generic, Literal, NamedTuple, TypedDict, TypeVar, cast
 
+from tactomo_client.arguments import checked_seconds
 from tactomo_client.connection import (
     KNOCK_PERIOD_S,
     Owner,
@@ -78,10 +79,12 @@ class Reception(Generic[T_co]):
         self.sensor = sensor
         self.address = address
         self.kinds = _checked(kind, latest_only)
-        self.timeout_s = timeout_s
+        self.timeout_s = None if timeout_s is None else checked_seconds("timeout_s", timeout_s)
         self.missed = 0
         self.malformed = 0
-        self._stale_after_s = stale_after_s
+        self._stale_after_s = (
+            None if stale_after_s is None else checked_seconds("stale_after_s", stale_after_s)
+        )
         self._newest: T_co | None = None
         self._last: dict[str, tuple[str, int]] = {}  # of each kind, session and sequence
         topics = [topic(sensor, each) for each in self.kinds]

@@ -22,6 +22,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
+from tactomo_client.arguments import checked_seconds
 from tactomo_client.errors import MessageError, RecordingError
 from tactomo_client.frame import Frame, frame_from_message
 from tactomo_client.messages import decode_message
@@ -133,6 +134,7 @@ class Recording:
             MessageError: `kind` is neither of the two.
             RecordingError: there are no frames in the recording at all (`name` is ``no_frames``),
                 or a file has vanished.
+            TypeError, ValueError: a time is no number, is negative, or the end is before the start.
 
         Example::
 
@@ -143,6 +145,11 @@ class Recording:
         """
         if kind not in ("map", "contacts"):
             raise MessageError(f"there are no frames of {kind!r}", "use 'map' or 'contacts'")
+        start_s = checked_seconds("start_s", start_s, endless=False)
+        end_s = checked_seconds("end_s", end_s)
+        stale_after_s = checked_seconds("stale_after_s", stale_after_s)
+        if end_s < start_s:
+            raise ValueError(f"end_s = {end_s!r} is before start_s = {start_s!r}: give a later one")
         if not self.has_frames:
             raise self._no_frames()
         start_ns = self.start_ns + _nanoseconds(start_s)
@@ -216,7 +223,7 @@ def _damage(path: Path) -> str:
 
 
 def _nanoseconds(seconds: float) -> int:
-    return ENDLESS_NS if math.isinf(seconds) else round(seconds * 1e9)
+    return round(min(seconds * 1e9, ENDLESS_NS))
 
 
 def _warn(what: str) -> None:

@@ -9,6 +9,7 @@ from typing import Any, Literal, Self, Unpack, overload
 
 import zmq
 
+from tactomo_client.arguments import checked_seconds
 from tactomo_client.connection import Owner, wait
 from tactomo_client.event import Event
 from tactomo_client.frame import Frame
@@ -69,6 +70,7 @@ def subscribe(
         MessageError: `sensor` cannot be a sensor's name, or `kind` a kind.
         ControlError: `address` is not an address.
         KeysError: the keys cannot be used.
+        TypeError, ValueError: `stale_after_s` or `timeout_s` is no number, or is negative.
 
     Example::
 
@@ -105,6 +107,8 @@ class Subscription(Reception[T_co], Iterator[T_co]):
     def wait(self, timeout_s: float) -> T_co | None:
         """Wait for the next frame, but no longer than `timeout_s`; None if it has not come then.
 
+        0 or less, what is left of a time that is over, takes a frame that has come.
+
         Raises:
             KeysError: the server does not let this client in. The next call knocks once more.
 
@@ -113,7 +117,7 @@ class Subscription(Reception[T_co], Iterator[T_co]):
             frame = skin.wait(0.02)  # 50 times a second, or as soon as there is a frame
 
         """
-        return wait(self._arrival(timeout_s))
+        return wait(self._arrival(checked_seconds("timeout_s", timeout_s, past=True)))
 
     def latest(self) -> T_co | None:
         """Return the newest frame there is, without waiting; None before the first one.

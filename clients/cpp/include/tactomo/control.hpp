@@ -148,11 +148,17 @@ private:
 };
 
 /// Takes commands to one control socket. All throw ControlError (the command was refused, or nothing
-/// answered: "no_answer"), MessageError (what answered does not speak this protocol) or KeysError.
+/// answered: "no_answer"), MessageError (what answered does not speak this protocol) or KeysError, and
+/// std::invalid_argument where a time is not above 0.
 class Control {
 public:
-    explicit Control(std::string address = "tcp://127.0.0.1:5561", Keys keys = {})
-        : address_(std::move(address)), keys_(std::move(keys)) {}
+    /// `connect_timeout` is how long a command waits while nothing listens at the address, of the time
+    /// that it has. A daemon that was started just now takes 2 to 3 s.
+    explicit Control(std::string address = "tcp://127.0.0.1:5561", Keys keys = {},
+                     std::chrono::milliseconds connect_timeout = std::chrono::seconds(5))
+        : address_(std::move(address)),
+          keys_(std::move(keys)),
+          connect_timeout_(detail::above_zero("connect_timeout", connect_timeout)) {}
 
     Status status() {
         const Reply reply = request("status");
@@ -207,6 +213,7 @@ public:
     template <typename... Values>
     Reply request(std::string_view command, std::chrono::milliseconds timeout = patience,
                   const std::pair<const char*, Values>&... arguments) {
+        timeout = detail::above_zero("timeout", timeout);
         msgpack::sbuffer bytes;
         msgpack::packer<msgpack::sbuffer> packer(bytes);
         packer.pack_map(3);
@@ -243,26 +250,40 @@ private:
                   std::chrono::milliseconds timeout) const {
         constexpr std::chrono::milliseconds look{100};
         bool is_sent = false;
-        const auto deadline = std::chrono::steady_clock::now() + timeout;
+        const auto begin = std::chrono::steady_clock::now();
+        const auto replied_by = begin + timeout;
+        auto connected_by = begin + connect_timeout_;
         for (;;) {
             is_sent = is_sent || socket.send(message, zmq::send_flags::dontwait).has_value();
             const auto left = std::chrono::ceil<std::chrono::milliseconds>(
-                deadline - std::chrono::steady_clock::now());
+                std::min(replied_by, connected_by) - std::chrono::steady_clock::now());
             zmq_pollitem_t item{socket.handle(), 0, ZMQ_POLLIN, 0};
             const auto wait = std::clamp(left, std::chrono::milliseconds(0), look);
             if (zmq_poll(&item, 1, static_cast<long>(wait.count())) > 0) return;
             detail::throw_if_shut(handshakes.look(), address_);
-            if (left.count() > 0) continue;
-            throw ControlError("no_answer",
-                               "nothing answered at " + address_ + " within " +
-                                   std::to_string(timeout.count()) + " ms",
-                               "start the daemon with `tactomo daemon`, or give the address of the "
-                               "one that runs");
+            const auto now = std::chrono::steady_clock::now();
+            if (handshakes.is_connected()) connected_by = now + connect_timeout_;
+            if (now < std::min(replied_by, connected_by)) continue;
+            throw no_answer(std::chrono::duration_cast<std::chrono::milliseconds>(now - begin),
+                            handshakes.is_connected());
         }
+    }
+
+    ControlError no_answer(std::chrono::milliseconds waited, bool is_connected) const {
+        const std::string silence = "nothing answered at " + address_ + " within " +
+                                    std::to_string(waited.count()) + " ms";
+        if (is_connected) {
+            return {"no_answer", silence + ", though something listens there",
+                    "if it is the daemon's control socket, its log says what it is busy with"};
+        }
+        return {"no_answer", silence + ": nothing listens there",
+                "start the daemon with `tactomo daemon` (a simulated skin: `tactomo twin`), or give "
+                "the address of the one that runs"};
     }
 
     std::string address_;
     Keys keys_;
+    std::chrono::milliseconds connect_timeout_;
     zmq::context_t context_;
 };
 

@@ -5,9 +5,12 @@
 // ├── ControlError   a command was refused, or nothing answered it
 // └── KeysError      keys cannot be used: a file is missing, or others may read it
 //
+// std::invalid_argument says that a time or a number which a caller gave makes no sense.
 // None of these comes out of Subscription::latest(): what the wire brings is counted, not thrown.
 #pragma once
 
+#include <algorithm>
+#include <chrono>
 #include <stdexcept>
 #include <string>
 #include <utility>
@@ -53,6 +56,18 @@ public:
 };
 
 namespace detail {
+
+/// A wait, of a year at most: what is over is none, and a clock cannot be moved on for ever.
+inline std::chrono::milliseconds bounded(std::chrono::milliseconds wait) {
+    return std::clamp(wait, std::chrono::milliseconds(0),
+                      std::chrono::milliseconds(std::chrono::hours(24 * 365)));
+}
+
+inline std::chrono::milliseconds above_zero(const char* name, std::chrono::milliseconds time) {
+    if (time.count() > 0) return bounded(time);
+    throw std::invalid_argument(std::string(name) + " is " + std::to_string(time.count()) +
+                                " ms: give more than 0");
+}
 
 inline ControlError bad_address(const std::string& address, const char* reason) {
     return {"bad_address", "cannot connect to '" + address + "': " + reason,

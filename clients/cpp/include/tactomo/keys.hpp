@@ -156,8 +156,9 @@ public:
         // Unique within the socket's own context.
         const auto name = std::to_string(reinterpret_cast<std::uintptr_t>(socket.handle()));
         init(socket, "inproc://tactomo-handshakes-" + name,
-             ZMQ_EVENT_HANDSHAKE_SUCCEEDED | ZMQ_EVENT_HANDSHAKE_FAILED_AUTH |
-                 ZMQ_EVENT_HANDSHAKE_FAILED_PROTOCOL | ZMQ_EVENT_HANDSHAKE_FAILED_NO_DETAIL);
+             ZMQ_EVENT_CONNECTED | ZMQ_EVENT_DISCONNECTED | ZMQ_EVENT_HANDSHAKE_SUCCEEDED |
+                 ZMQ_EVENT_HANDSHAKE_FAILED_AUTH | ZMQ_EVENT_HANDSHAKE_FAILED_PROTOCOL |
+                 ZMQ_EVENT_HANDSHAKE_FAILED_NO_DETAIL);
     }
 
     /// Takes note of what has happened.
@@ -173,6 +174,11 @@ public:
         return has_keys_ ? Door::wrong_server : Door::keys_needed;
     }
 
+    /// Whether something listens at the other end, busy or not, as of the last look().
+    bool is_connected() const noexcept { return is_connected_; }
+
+    void on_event_connected(const zmq_event_t&, const char*) override { is_connected_ = true; }
+    void on_event_disconnected(const zmq_event_t&, const char*) override { is_connected_ = false; }
     void on_event_handshake_succeeded(const zmq_event_t&, const char*) override { failures_ = 0; }
     void on_event_handshake_failed_auth(const zmq_event_t&, const char*) override {
         note(true, false);
@@ -195,6 +201,7 @@ private:
     unsigned failures_ = 0;  // since the last success
     bool is_auth_ = false;
     bool is_vague_ = false;
+    bool is_connected_ = false;
 };
 
 }  // namespace detail

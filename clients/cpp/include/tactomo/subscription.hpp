@@ -5,7 +5,7 @@
 #include <array>
 #include <chrono>
 #include <cstdint>
-#include <exception>
+#include <stdexcept>
 #include <string>
 #include <string_view>
 #include <utility>
@@ -21,12 +21,13 @@ namespace tactomo {
 struct Options {
     std::string address = "tcp://127.0.0.1:5560";  ///< the daemon's stream
     Kind kind = Kind::contacts;
-    /// The age from which a frame is stale.
+    /// The age from which a frame is stale; 0 or more.
     std::chrono::nanoseconds stale_after = std::chrono::milliseconds(500);
     /// Queue frames while the caller is busy, for wait() to return each of them. Otherwise only the
     /// newest is kept, which is what a control loop wants.
     bool every_frame = false;
-    /// How many contacts there is room for from the start. A frame with more makes room, once.
+    /// How many contacts there is room for from the start, up to 4096. A frame with more makes room,
+    /// once.
     std::size_t max_contacts = 64;
     Keys keys{};  ///< for a daemon beyond this computer: Keys::load("FOLDER")
 };
@@ -36,9 +37,10 @@ struct Options {
 class Subscription {
 public:
     /// Returns at once, whether or not a daemon is there: frames come when it is, and again after it
-    /// was restarted. Throws MessageError, ControlError ("bad_address") or KeysError.
+    /// was restarted. Throws MessageError, ControlError ("bad_address"), KeysError, or
+    /// std::invalid_argument where an option makes no sense.
     explicit Subscription(std::string sensor, Options options = {})
-        : options_(std::move(options)),
+        : options_(sensible(std::move(options))),
           sensor_(detail::sensor_name(std::move(sensor))),
           decoder_(sensor_, options_.kind, options_.max_contacts),
           socket_(context_, zmq::socket_type::sub),
@@ -65,10 +67,10 @@ public:
     }
 
     /// The next frame: waits for it, and returns nullptr where none comes in time or a signal
-    /// interrupts. Valid until the next call.
+    /// interrupts. 0 or less, what is left of a time that is over, takes a frame that has come.
+    /// Valid until the next call.
     const Frame* wait(std::chrono::milliseconds timeout) {
-        constexpr std::chrono::milliseconds year = std::chrono::hours(24 * 365);
-        const auto deadline = std::chrono::steady_clock::now() + std::min(timeout, year);
+        const auto deadline = std::chrono::steady_clock::now() + detail::bounded(timeout);
         for (;;) {
             while (take()) {
                 if (read()) return newest_;
@@ -100,6 +102,18 @@ public:
 private:
     static constexpr std::chrono::milliseconds knock_period{1000};
     static constexpr std::size_t queued = 1000;  // what ZeroMQ keeps for a reader
+
+    static Options sensible(Options options) {
+        if (options.stale_after.count() < 0) {
+            throw std::invalid_argument("stale_after is negative: give the age from which a frame "
+                                        "is stale");
+        }
+        if (options.max_contacts > detail::max_entries) {
+            throw std::invalid_argument("max_contacts is " + std::to_string(options.max_contacts) +
+                                        ": a frame has at most 4096");
+        }
+        return options;
+    }
 
     void connect() {
         socket_.set(zmq::sockopt::linger, 0);
