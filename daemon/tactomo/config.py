@@ -205,7 +205,12 @@ def load_config(path: str | Path | None = None, **overrides: Any) -> DaemonConfi
 
 
 def _known_keys(items: Sequence[ErrorDetails]) -> str:
-    """Return the keys that there are where one is unknown or missing."""
+    """Return the keys that there are where one is unknown or missing; both ways to give ports."""
+    if [(item["type"], item["loc"]) for item in items] == [("missing", ("ports",))]:
+        return (
+            "give --port /dev/ttyACM0, twice for two boards (`tactomo ports` shows those that are "
+            'there), or a configuration file with ports = ["/dev/ttyACM0"]'
+        )
     tables: dict[str, type[BaseModel]] = {
         "baseline": BaselineConfig,
         "recording": RecordingConfig,

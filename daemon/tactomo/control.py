@@ -8,10 +8,12 @@ it is known, and holds up no other client meanwhile.
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
+import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, NamedTuple
 
 import zmq
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -30,9 +32,21 @@ POLL_WHILE_PENDING_MS: Final = 10
 MAX_PENDING: Final = 64
 QUEUED_PER_CLIENT: Final = 64
 LINGER_MS: Final = 100
+SETTLE_S: Final = 1.0
+"""How long a change may wait for the frame that is being made: clients wait 2 s for the answer."""
 
 Result = Mapping[str, Any]
-Handler = Callable[[Any], Result | Future[Result]]
+
+
+class Settling(NamedTuple):
+    """A result that is known before it is in force; told when it is, or after SETTLE_S."""
+
+    result: Result
+    in_force: Future[None]
+
+
+Outcome = Result | Future[Result] | Settling
+Handler = Callable[[Any], Outcome]
 
 
 class Arguments(BaseModel):
@@ -74,6 +88,15 @@ COMMANDS: Final[Mapping[str, type[Arguments]]] = {
 }
 
 
+class _Pending(NamedTuple):
+    """A request whose answer is to come: what the future says, else `result`; by `by_s` at last."""
+
+    envelope: list[bytes]
+    future: Future[Any]
+    result: Result
+    by_s: float
+
+
 class Control:
     """Answers commands. `open` it, `start` its thread, `stop` it.
 
@@ -92,7 +115,7 @@ class Control:
         self.turns = 0
         self._handlers = handlers
         self._on_idle = on_idle
-        self._pending: list[tuple[list[bytes], Future[Result]]] = []
+        self._pending: list[_Pending] = []
         self._socket: zmq.Socket[bytes]
         self._stopping = threading.Event()
         self._cut = threading.Event()
@@ -141,9 +164,9 @@ class Control:
                 self._cut.clear()
                 rebind(self._socket, self.address)
             self._on_idle()
-        for _, future in self._pending:
-            if not future.done():
-                future.set_exception(CommandError("the daemon stops", "start it again"))
+        for waiting in self._pending:
+            if not waiting.future.done():
+                waiting.future.set_exception(CommandError("the daemon stops", "start it again"))
         self._answer_pending()
 
     def _receive(self) -> None:
@@ -155,11 +178,14 @@ class Control:
             self._send(envelope, encode_error(error.name, error.cause, error.next_step))
             return
         if isinstance(outcome, Future):
-            self._pending.append((envelope, outcome))
+            self._pending.append(_Pending(envelope, outcome, {}, math.inf))
+        elif isinstance(outcome, Settling):
+            by_s = time.monotonic() + SETTLE_S
+            self._pending.append(_Pending(envelope, outcome.in_force, outcome.result, by_s))
         else:
             self._send(envelope, encode_reply(outcome))
 
-    def _obey(self, command: str, arguments: dict[str, Any]) -> Result | Future[Result]:
+    def _obey(self, command: str, arguments: dict[str, Any]) -> Outcome:
         if command not in COMMANDS:
             raise CommandError(
                 f"unknown command {command[:40]!r}",
@@ -179,13 +205,16 @@ class Control:
         return self._handlers[command](checked)
 
     def _answer_pending(self) -> None:
+        now_s = time.monotonic()
         waiting = []
-        for envelope, future in self._pending:
-            if not future.done():
-                waiting.append((envelope, future))
+        for pending in self._pending:
+            envelope, future, result, by_s = pending
+            if not future.done() and now_s < by_s:
+                waiting.append(pending)
                 continue
             try:
-                self._send(envelope, encode_reply(future.result()))
+                told = future.result() if future.done() else None
+                self._send(envelope, encode_reply(result if told is None else told))
             except TactomoError as error:
                 self._send(envelope, encode_error(error.name, error.cause, error.next_step))
         self._pending = waiting

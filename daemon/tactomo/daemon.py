@@ -58,7 +58,7 @@ from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
 
 from tactomo.config import DaemonConfig
-from tactomo.control import Control, RecordStart, SetBudget, SetTier
+from tactomo.control import Control, RecordStart, SetBudget, SetTier, Settling
 from tactomo.doorkeeper import Doorkeeper, load_server_keys
 from tactomo.endpoint import allow_connections
 from tactomo.errors import CommandError, ConfigError
@@ -355,18 +355,17 @@ class Daemon:
         path = Path(arguments.path) if arguments.path else None
         return self._recorder.start(path, arguments.maps)
 
-    def _set_tier(self, arguments: SetTier) -> Mapping[str, Any]:
+    def _set_tier(self, arguments: SetTier) -> Settling:
         tier = Tier(arguments.tier)
         try:
             check_tier(self._description, tier)
         except ArtifactError as error:
             raise CommandError(str(error), "ask for another tier", "no_network") from error
-        self._pipeline.set_tier(tier)
-        return {"tier": arguments.tier}
+        return Settling({"tier": arguments.tier}, self._pipeline.set_tier(tier))
 
-    def _set_budget(self, arguments: SetBudget) -> Mapping[str, Any]:
-        self._pipeline.set_budget(arguments.budget_ms)
-        return {"budget_ms": arguments.budget_ms}
+    def _set_budget(self, arguments: SetBudget) -> Settling:
+        budget_ms = arguments.budget_ms
+        return Settling({"budget_ms": budget_ms}, self._pipeline.set_budget(budget_ms))
 
     def _zero_counters(self) -> None:
         for port in self._ports:

@@ -368,18 +368,18 @@ class Imaging:
             return
         self._tare = None
         self.use_reference(reference, time.time_ns())
-        for answer in tare.answers:
-            answer.set_result({"scans": reference.scans, "contacts": self._contacts})
         shown = f", while {self._contacts} contact(s) were shown" if self._contacts else ""
         self._on_event("tared", "info", f"{reference.scans} dual scans{shown}")
+        for answer in tare.answers:  # when all is in force: a status asked for now shows it
+            answer.set_result({"scans": reference.scans, "contacts": self._contacts})
 
     def _refuse_tare(self, tare: Tare, refusal: CommandError) -> None:
         self._tare = None
-        for answer in tare.answers:
-            answer.set_exception(refusal)
         self._on_event("tare_refused", "warning", refusal.cause, refusal.next_step)
         if self.reference is None:
             self.start_tare()  # without a reference there is nothing else to do
+        for answer in tare.answers:
+            answer.set_exception(refusal)
 
     def _time(self, stage: str, seconds: float) -> None:
         if stage not in self.stages:  # a new dictionary, for those who iterate over the old one

@@ -82,7 +82,7 @@ class Pipeline:
         dropped: dual scans left out because newer ones had come.
         overflowed: deliveries lost because this thread did not come round to them for seconds;
             written by the port threads under a lock.
-        incomplete: dual scans of which one channel did not come.
+        incomplete: dual scans of which one channel did not come that had come before, or is lost.
         scan_rates: how often each channel's scans come.
         finished: set once every replayed port has ended and what came of it was published.
         turns: of the loop, and frames; the watchdog goes by them.
@@ -129,10 +129,13 @@ class Pipeline:
         self._dropped_told = 0
         self._is_excused = False  # the dual scans to be dropped next are not worth a warning
         self._announced: dict[int, Hello] = {}  # what each port's device says of itself
+        self._begun: set[Channel] = set()  # channels that have been in a dual scan
         self._clocks: dict[int, int] = {}  # the newest time on each replayed port that goes on
         self._ended: set[int] = set()
         self._deliveries: queue.Queue[Delivery | None] = queue.Queue(QUEUED_DELIVERIES)
-        self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+        self._commands: queue.SimpleQueue[tuple[Callable[[], None], Future[None]]] = (
+            queue.SimpleQueue()
+        )
         self._overflow_lock = threading.Lock()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="pipeline")
@@ -193,13 +196,13 @@ class Pipeline:
         self._ask(lambda: self._imaging.start_tare(answer))
         return answer
 
-    def set_tier(self, tier: Tier) -> None:
-        """Ask for a tier; for any thread."""
-        self._ask(lambda: setattr(self._imaging, "tier", tier))
+    def set_tier(self, tier: Tier) -> Future[None]:
+        """Ask for a tier; for any thread. The future is done when it is in force."""
+        return self._ask(lambda: setattr(self._imaging, "tier", tier))
 
-    def set_budget(self, budget_ms: float | None) -> None:
-        """Ask for a time budget; for any thread."""
-        self._ask(lambda: setattr(self._imaging, "budget_ms", budget_ms))
+    def set_budget(self, budget_ms: float | None) -> Future[None]:
+        """Ask for a time budget; for any thread. The future is done when it is in force."""
+        return self._ask(lambda: setattr(self._imaging, "budget_ms", budget_ms))
 
     def _run(self) -> None:
         self._begin()
@@ -217,11 +220,17 @@ class Pipeline:
                 self._process(dual)
                 if self._imaging.reference_realtime_ns != taken_ns:
                     self._is_excused = True
-            while not self._commands.empty():
-                self._commands.get()()
+                self._obey_commands()
+            self._obey_commands()
             self._imaging.check_tare()
             if len(self._ended) == self._ports:
                 self.finished.set()
+
+    def _obey_commands(self) -> None:
+        while not self._commands.empty():
+            command, done = self._commands.get()
+            command()
+            done.set_result(None)
 
     def _process(self, dual: DualScan) -> None:
         recorded = dual.mark.timing if dual.mark is not None else None
@@ -252,8 +261,14 @@ class Pipeline:
             pass
         if self._replay is None:
             ready += self.sync.advance(time.monotonic_ns())
-        self.incomplete += sum(len(dual.scans) < len(self._channels) for dual in ready)
+        self.incomplete += sum(map(self._lacks_a_channel, ready))
         return ready
+
+    def _lacks_a_channel(self, dual: DualScan) -> bool:
+        """Tell whether one did not come; of two, one begins a little before the other."""
+        there = {scan.channel for scan in dual.scans}
+        self._begun |= there
+        return any(c in self._begun | self.sync.lost for c in self._channels if c not in there)
 
     def _wait_s(self) -> float:
         deadline_ns = self.sync.deadline_ns
@@ -376,9 +391,11 @@ class Pipeline:
             self.overflowed += 1
             self._discarded += 0 if oldest is None else len(oldest.scans)
 
-    def _ask(self, command: Callable[[], None]) -> None:
-        self._commands.put(command)
+    def _ask(self, command: Callable[[], None]) -> Future[None]:
+        done: Future[None] = Future()
+        self._commands.put((command, done))
         self._wake()
+        return done
 
     def _wake(self) -> None:
         with contextlib.suppress(queue.Full):  # then it is busy, and looks soon

@@ -11,6 +11,7 @@ import msgpack  # type: ignore[import-untyped]
 import pytest
 import zmq
 from tactomo.config import load_config
+from tactomo.control import SETTLE_S
 from tactomo.daemon import Daemon
 from tactomo.errors import AddressError
 from tactomo_client import ControlError
@@ -114,17 +115,28 @@ def test_tare_without_data_says_so(bench: Start) -> None:
     assert caught.value.name == "no_data"
 
 
-def test_tier_and_budget_hold_from_the_next_frame(bench: Start) -> None:
-    b = bench()
-    assert b.ask("set_tier", tier="levelset") == {"tier": "levelset"}
-    assert b.ask("set_budget", budget_ms=25) == {"budget_ms": 25}
-    b.until(
-        lambda: (
-            [b.ask("status")[key] for key in ("tier_requested", "budget_ms")] == ["levelset", 25.0]
-        )
-    )
-    assert b.ask("set_budget", budget_ms=None) == {"budget_ms": None}
-    b.until(lambda: b.ask("status")["budget_ms"] is None)
+def test_tier_and_budget_are_answered_when_they_are_in_force(bench: Start) -> None:
+    b = bench(seconds=0.2)
+    b.tare()
+    for tier, budget_ms in [("levelset", 25.0), ("fit", 30.0), ("tikhonov", None)]:
+        b.skin.scan()  # a frame that takes its time, and the commands come meanwhile
+        assert b.ask("set_tier", tier=tier) == {"tier": tier}
+        assert b.ask("status")["tier_requested"] == tier
+        b.skin.scan()
+        assert b.ask("set_budget", budget_ms=budget_ms) == {"budget_ms": budget_ms}
+        status = b.ask("status")
+        assert (status["tier_requested"], status["budget_ms"]) == (tier, budget_ms)
+        assert status["plan"]["tier"] == tier
+
+
+def test_a_frame_that_takes_long_holds_up_no_command(bench: Start) -> None:
+    b = bench(seconds=4 * SETTLE_S)
+    b.skin.introduce()
+    b.skin.scan()
+    b.until(lambda: b.ask("status")["scans"]["structure"])
+    assert b.ask("set_tier", tier="fit") == {"tier": "fit"}
+    assert b.ask("status")["frames"] == 0  # it is still being made
+    b.until(lambda: b.ask("status")["tier_requested"] == "fit")
 
 
 @pytest.mark.parametrize(

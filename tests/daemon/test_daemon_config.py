@@ -77,6 +77,17 @@ def test_the_keys_that_there_are_are_told_where_one_is_not(
     assert next_step in caught.value.next_step
 
 
+def test_ports_may_be_given_in_both_ways(tmp_path: Path) -> None:
+    for path in (None, config_file(tmp_path, "name = 'left'")):
+        with pytest.raises(ConfigError, match="ports is missing") as caught:
+            load_config(path)
+        assert "give --port /dev/ttyACM0" in caught.value.next_step
+        assert 'a configuration file with ports = ["/dev/ttyACM0"]' in caught.value.next_step
+    with pytest.raises(ConfigError, match="unknown key port") as misspelt:
+        load_config(config_file(tmp_path, "port = '/dev/ttyACM0'"))
+    assert "known keys: name, " in misspelt.value.next_step
+
+
 def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="No such file"):
         load_config(tmp_path / "none.toml")

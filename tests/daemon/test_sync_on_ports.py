@@ -140,3 +140,15 @@ def test_voltages_that_are_no_numbers_are_left_to_the_models_and_never_tared(
         assert b.listener.frame(number)["flags"] == ["invalid_voltage"]
     assert "not numbers" in str(answer.exception(30))
     assert b.ask("status")["reference"]["scans"] == 3
+
+
+def test_a_channel_that_begins_after_the_other_was_never_missing(bench: Start) -> None:
+    b = bench(ports=2, sync_wait_ms=200)
+    b.skin.introduce()
+    for _ in range(2):
+        assert "structure_missing" in b.step(channels=(Channel.MAGNITUDE,))["flags"]
+    assert b.ask("status")["incomplete_scans"] == 0
+    b.tare()
+    assert b.ask("status")["incomplete_scans"] == 0
+    b.step(channels=(Channel.MAGNITUDE,))
+    assert b.ask("status")["incomplete_scans"] == 1
