@@ -43,6 +43,7 @@ SHORTEST_FOR_DRIFT_S = 2.0
 MOST_CHANCE = 2.0  # mean square of changes over their noise: more is no chance with 50 voltages
 UNEVEN_CHANGE = 0.5  # of the even change
 SIGNIFICANT = 4.0  # standard deviations
+AT_REST = "leave the skin alone while it is examined; of a file, choose scans at rest by --frames"
 
 
 class Level(StrEnum):
@@ -114,8 +115,7 @@ def snr_found(examined: Examination) -> Finding:
             "a real converter has some; is it simulated, or does the firmware send one scan again?",
         )
     if examined.is_moving:
-        step = "leave the skin alone while it is examined; give scans of one device at rest"
-        return Finding("snr", Level.UNKNOWN, "not known: something moves all the time", step)
+        return Finding("snr", Level.UNKNOWN, "not known: something moves all the time", AT_REST)
     if not examined.has_noise:
         step = f"give at least {FEWEST_FOR_NOISE} scans of the unpressed skin"
         return Finding("snr", Level.UNKNOWN, f"not known from {examined.count} scan(s)", step)
@@ -288,10 +288,14 @@ def saturation_found(examined: Examination, saturated: int) -> Finding:
 
 def drift_found(still: FloatArray, times_s: FloatArray | None) -> Finding:
     """How fast the scans at rest (n, M) change; `times_s` (n,) says when each was taken."""
-    span_s = 0.0 if times_s is None or len(times_s) < 3 else float(times_s[-1] - times_s[0])
-    if times_s is None or span_s < SHORTEST_FOR_DRIFT_S:
-        step = f"look at {SHORTEST_FOR_DRIFT_S:g} s or more, with times"
-        return Finding("drift", Level.UNKNOWN, "not known", step)
+    if times_s is None:
+        step = "give scans with their times, or a recording"
+        return Finding("drift", Level.UNKNOWN, "not known: nobody says when scans were taken", step)
+    span_s = float(times_s[-1] - times_s[0])
+    if len(times_s) < 3 or span_s < SHORTEST_FOR_DRIFT_S:
+        step = f"examine {SHORTEST_FOR_DRIFT_S:g} s at rest, or more"
+        detail = f"not known from {len(times_s)} scan(s) at rest in {span_s:.1f} s"
+        return Finding("drift", Level.UNKNOWN, detail, step)
     mean = still.mean(axis=0)
     gain = still @ mean / max(float(mean @ mean), TINY)
     time = times_s - times_s.mean()
@@ -304,7 +308,7 @@ def drift_found(still: FloatArray, times_s: FloatArray | None) -> Finding:
             "drift",
             Level.ADVICE,
             "the voltages change, and not all alike: something presses, or a contact changes",
-            "leave the skin alone while it is examined; if it stays so, check the electrodes",
+            f"{AT_REST}; if it stays so, check the electrodes",
         )
     level, step = Level.OK, ""
     if abs(percent) > max(DRIFT_NOTED, SIGNIFICANT * sigma):

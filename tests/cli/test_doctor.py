@@ -158,6 +158,36 @@ def test_a_recording_is_examined_by_its_own_scans(tactomo: Run, rest: FloatArray
     assert abs(drift["percent_per_min"]) < 0.5
 
 
+@pytest.mark.parametrize(
+    ("count", "pressed", "says", "step"),
+    [
+        (12, False, "not known from 12 scan(s) at rest in 1.1 s", "examine 2 s at rest, or more"),
+        (40, True, "something presses, or a contact changes", "choose scans at rest by --frames"),
+    ],
+)
+def test_what_a_recording_does_not_tell_is_said_of_a_recording(
+    tactomo: Run, rest: FloatArray, count: int, pressed: bool, says: str, step: str
+) -> None:
+    volts = noisy(rest, count)
+    if pressed:
+        volts[count // 2 :, :60] *= 1.01
+    np.savez("in.npz", magnitude=volts, structure=volts)
+    assert tactomo("import", "in.npz", "in.mcap", "--rate", "10").returncode == 0
+    found = report(tactomo("doctor", "in.mcap", "--json"))
+    drift = about(found["channels"]["magnitude"]["findings"], "drift")
+    assert says in drift["detail"]
+    assert step in drift["next_step"]
+
+
+def test_scans_without_times_say_nothing_of_drift(tactomo: Run, rest: FloatArray) -> None:
+    np.savez("in.npz", rest=noisy(rest))
+    drift = about(
+        report(tactomo("doctor", "in.npz", "--json"))["channels"]["rest"]["findings"], "drift"
+    )
+    assert drift["detail"] == "not known: nobody says when scans were taken"
+    assert "with their times" in drift["next_step"]
+
+
 def test_a_device_without_a_clock_is_not_late(
     tactomo: Run, rest: FloatArray, paper: SensorDescription
 ) -> None:
