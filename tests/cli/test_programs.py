@@ -121,6 +121,25 @@ def test_a_twin_whose_control_address_is_taken_says_what_to_do(tactomo: Run, con
     assert "is in use; stop the twin or demo that runs already" in result.stderr
 
 
+def test_a_link_is_one_twins_as_long_as_it_lives(start: Run, tactomo: Run, tmp_path: Path) -> None:
+    command = ("twin", "--ports", 1, "--link", "dev", "--control", "tcp://127.0.0.1:0")
+    first = start(*command, "--announce")
+    announced(first.stdout)
+    device = os.readlink(tmp_path / "dev" / "skin")
+    second = tactomo(*command)
+    assert second.returncode == 1
+    said = f"the link dev/skin is that of another twin that runs (pid {first.pid}); stop that one"
+    assert said in second.stderr
+    assert "--link another folder" in second.stderr
+    assert os.readlink(tmp_path / "dev" / "skin") == device
+    first.kill()
+    first.wait(PATIENCE_S)
+    assert os.path.lexists(tmp_path / "dev" / "skin")
+    third = start(*command, "--announce")
+    assert announced(third.stdout)["ports"] == ["dev/skin"]
+    assert os.path.exists(tmp_path / "dev" / "skin")
+
+
 def test_the_twins_defaults_are_those_of_its_configuration() -> None:
     options = {option.name: option.default for option in twin_command().params}
     usual = TwinConfig(load_description("paper_square"))

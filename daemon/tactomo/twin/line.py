@@ -13,22 +13,28 @@ user.
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import hashlib
 import os
 import select
+import socket
+import struct
 import tty
 from pathlib import Path
 
 from tactomo.errors import TactomoError
 
 READ_BYTES = 4096
+HOLDER_WAIT_S = 1.0
 
 
 class SerialLine:
     """The device's end of one line. For use by one thread.
 
     Attributes:
-        name: what the line carries, for people and for the name of the link.
+        name: what the line carries, for people and for the name of the link; no two twins that
+            run have the same link.
         sent: frames handed to the line whole.
         dropped: frames lost because the line was full.
         unheard: frames lost because nobody had the port open, or the cable was out.
@@ -39,10 +45,15 @@ class SerialLine:
         self.name = name
         self.sent = self.dropped = self.unheard = 0
         self._link = None if link_folder is None else link_folder / name
+        self._claim = None if self._link is None else _claim(self._link)
         self._descriptor: int | None = None
         self._device = ""
         self._rest = b""
-        self.plug()
+        try:
+            self.plug()
+        except BaseException:
+            self.close()
+            raise
 
     @property
     def path(self) -> str:
@@ -85,7 +96,11 @@ class SerialLine:
         self._descriptor, self._rest = None, b""
         self._remove_link()
 
-    close = unplug
+    def close(self) -> None:
+        """Pull the cable for good: the link's name is free for another twin."""
+        self.unplug()
+        if self._claim is not None:
+            self._claim.close()
 
     def send(self, frame: bytes) -> None:
         """Put one frame on the line, or lose it; never waits."""
@@ -147,10 +162,50 @@ class SerialLine:
             ) from error
 
     def _remove_link(self) -> None:
-        """Remove the link, unless another twin has meanwhile taken the name."""
+        """Remove the link, unless somebody has meanwhile taken the name."""
         link = self._link
         if link is not None and link.is_symlink() and os.readlink(link) == self._device:
             link.unlink()
+
+
+def _claim(link: Path) -> socket.socket:
+    """Return what keeps other twins off a link's name, until it is closed or this process ends.
+
+    A socket's abstract name is held by one process and outlives none; whoever finds it taken asks
+    by whom. The link itself could not tell: what a killed twin left behind points to a terminal
+    whose number may be another's by now.
+
+    Raises:
+        TactomoError: a twin that runs has the name.
+
+    """
+    place = str(link.parent.resolve() / link.name).encode(errors="surrogateescape")
+    name = b"\0tactomo-twin-" + hashlib.sha256(place).hexdigest().encode()
+    claim = socket.socket(socket.AF_UNIX)
+    try:
+        claim.bind(name)
+        claim.listen()
+    except OSError as error:
+        claim.close()
+        if error.errno != errno.EADDRINUSE:
+            raise
+        raise TactomoError(
+            f"the link {link} is that of another twin that runs{_holder(name)}",
+            "stop that one, or give --link another folder",
+        ) from error
+    return claim
+
+
+def _holder(name: bytes) -> str:
+    """Return which process holds a socket's name, for people; empty where that cannot be told."""
+    credentials = struct.Struct("3i")  # pid, user, group
+    with socket.socket(socket.AF_UNIX) as caller, contextlib.suppress(OSError):
+        caller.settimeout(HOLDER_WAIT_S)
+        caller.connect(name)
+        told = caller.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, credentials.size)
+        pid, _, _ = credentials.unpack(told)
+        return f" (pid {pid})" if pid else ""  # 0: in another container
+    return ""
 
 
 def _events(descriptor: int) -> int:
