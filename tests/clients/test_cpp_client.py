@@ -304,7 +304,7 @@ def test_nothing_listens_and_something_busy_does(probe: Path) -> None:
     assert "ms: nothing listens there; start the daemon" in said
     with socket.create_server(("127.0.0.1", 0)) as busy:  # the kernel answers for it
         address = f"tcp://127.0.0.1:{busy.getsockname()[1]}"
-        status, said = give(probe, "timeout", 700, address)
+        status, said = give(probe, "timeout", 1500, address)
     assert status == 1
     assert ", though something listens there; " in said
 
