@@ -13,7 +13,7 @@ counted in modelled work, so that a recording reconstructs exactly as the live s
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -22,28 +22,26 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from tactomo_models.areas import AreaFinder, Areas
 from tactomo_models.artifact import Artifact, load_or_build_artifact
 from tactomo_models.changes import WRONG_WAY, Changes, MeasuredChannel, missing, towards_pressing
-from tactomo_models.contacts import (
-    AreaFinder,
-    Areas,
-    Contact,
+from tactomo_models.contacts import Contact, Tracker, contacts_of, map_of, pressure_map
+from tactomo_models.description import Modality, SensorDescription
+from tactomo_models.following import Freedom, ShapeFollower
+from tactomo_models.forward import ForwardModel
+from tactomo_models.magnitudes import (
     MagnitudeFollower,
     Magnitudes,
-    Tracker,
     bare_tangent,
     linear_magnitudes,
     without_holes,
 )
-from tactomo_models.description import Modality, SensorDescription
-from tactomo_models.following import Freedom, ShapeFollower
-from tactomo_models.forward import ForwardModel
 from tactomo_models.network import NONE_TRAINED, NetworkImage, SensorNetworks
 from tactomo_models.objects import ObjectFollower
 from tactomo_models.outlines import Outlines, ellipses_of
 from tactomo_models.paper_level_set import PaperLevelSet
 from tactomo_models.plausibility import Flag, Wiring
-from tactomo_models.pressure import PressureCurve, described_curve, pressures_of
+from tactomo_models.pressure import PressureCurve, described_curve
 from tactomo_models.redrawing import Drawing, Redrawer, SecondOpinion
 from tactomo_models.reference import Reference
 from tactomo_models.shape_fit import Shape
@@ -59,7 +57,6 @@ MUCH_MORE = 5.0  # ratio of the channels' contrasts (logarithms) for that
 HOLLOW_MISFIT = 1.1  # of the magnitude channel: enough to ask whether a contact is a ring
 LINEAR_PART = 0.5  # of the misfit of nothing, that areas cut out of a linear image may leave
 MOST_HELD = 10  # frames without a structure scan that the last shape stands in for: half a second
-TOUCHED = 0.05  # share of a node that a contact covers, from which it is touched
 LOW_CONFIDENCE = 0.8  # expected correlation below which a map is better not trusted
 SURE_CONFIDENCE = 0.9  # ... from which one is, although the physics cannot explain the data
 SURE_SHARE = 0.85  # of the second opinion, from which contacts are its own: outlines know theirs
@@ -537,7 +534,7 @@ class Reconstructor:
             flags |= Flag.LOW_CONFIDENCE
         return Reconstruction(
             map=image.map if "magnitude" in data else None,
-            pressure_kpa=_pressure_map(areas, contacts) if "magnitude" in data else None,
+            pressure_kpa=pressure_map(areas, contacts) if "magnitude" in data else None,
             structure=image.structure if "structure" in data else None,
             contacts=contacts,
             tier=tier,
@@ -572,7 +569,7 @@ class Reconstructor:
         magnitude, pressure = None, None
         if "magnitude" in data:
             magnitude = own.map(self.description.sign("magnitude"))
-            pressure = _pressure_map(shown.areas, contacts)
+            pressure = pressure_map(shown.areas, contacts)
         if second is not None and magnitude is not None:
             other = second.drawing.map(self.description.sign("magnitude"))
             magnitude += second.share * (other - magnitude)
@@ -650,8 +647,8 @@ class Reconstructor:
             contacts = self._contacts(areas, fitted)
         assert fitted is not None
         return Reconstruction(
-            map=_fused(areas, np.array([c.magnitude for c in contacts])),
-            pressure_kpa=_pressure_map(areas, contacts),
+            map=map_of(areas, np.array([c.magnitude for c in contacts])),
+            pressure_kpa=pressure_map(areas, contacts),
             structure=None,
             contacts=contacts,
             tier=self._shown.tier,
@@ -773,26 +770,7 @@ class Reconstructor:
         self, areas: Areas, size: FloatArray, sigma: FloatArray
     ) -> tuple[Contact, ...]:
         ids = self._tracker.update(areas.centres_m)
-        pressures = pressures_of(self.curve, size, sigma, areas.areas_m2, areas.sigmas[:, 2])
-        return tuple(
-            Contact(
-                id=ids[k],
-                x_m=float(areas.centres_m[k, 0]),
-                y_m=float(areas.centres_m[k, 1]),
-                area_m2=float(areas.areas_m2[k]),
-                magnitude=float(size[k]),
-                magnitude_sigma=float(sigma[k]),
-                pressure_kpa=float(pressures.kpa[k]),
-                x_sigma_m=float(areas.sigmas[k, 0]),
-                y_sigma_m=float(areas.sigmas[k, 1]),
-                area_sigma_m2=float(areas.sigmas[k, 2]),
-                pressure_sigma_kpa=float(pressures.sigma_kpa[k]),
-                force_n=float(pressures.force_n[k]),
-                force_sigma_n=float(pressures.force_sigma_n[k]),
-                pressure_range=pressures.ranges[k],
-            )
-            for k in range(len(areas))
-        )
+        return contacts_of(areas, ids, size, sigma, self.curve)
 
     @contextmanager
     def _timed(self, stage: str) -> Iterator[None]:
@@ -813,17 +791,3 @@ def _named(name: Modality, electrodes: list[int]) -> str:
     """Say in words which electrodes are left out; they are counted from 0."""
     word = "electrode" if len(electrodes) == 1 else "electrodes"
     return f"{name} {word} {', '.join(map(str, electrodes))} left out"
-
-
-def _fused(areas: Areas, values: FloatArray) -> Image:
-    """Map on which each area carries its own value; areas of unknown value stay 0."""
-    fused = np.einsum("k,kyx->yx", np.nan_to_num(values), areas.on_map)
-    return np.asarray(fused, dtype=np.float32)
-
-
-def _pressure_map(areas: Areas, contacts: Sequence[Contact]) -> Image:
-    """Each contact's pressure on its area; NaN, and not 0, where it is touched but unknown."""
-    values = np.array([contact.pressure_kpa for contact in contacts])
-    fused = _fused(areas, values)
-    fused[(areas.on_map[np.isnan(values)] > TOUCHED).any(axis=0)] = np.nan
-    return fused

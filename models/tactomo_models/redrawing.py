@@ -14,10 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tactomo_models.areas import AreaFinder, Areas
 from tactomo_models.changes import Changes, towards_pressing
-from tactomo_models.contacts import AreaFinder, Areas, MagnitudeFollower, Magnitudes
 from tactomo_models.description import Modality, SensorDescription
 from tactomo_models.forward import ForwardModel
+from tactomo_models.magnitudes import MagnitudeFollower, Magnitudes
 from tactomo_models.network import FusionNetwork, NetworkImage
 
 FloatArray = NDArray[np.float64]

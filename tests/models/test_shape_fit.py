@@ -8,9 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tactomo_models import SensorDescription
-from tactomo_models.contacts import AreaFinder, Areas, Magnitudes, Tangent, fit_magnitudes
+from tactomo_models.areas import AreaFinder, Areas
 from tactomo_models.forward import ForwardModel, build_forward_model
 from tactomo_models.levelset import LevelSet
+from tactomo_models.magnitudes import Magnitudes, Tangent, fit_magnitudes
 from tactomo_models.outlines import PARAMETERS, UNIT_M, outlines_on
 from tactomo_models.search import ContactSearch
 from tactomo_models.shape_fit import (
