@@ -45,6 +45,7 @@ class AreaFinder:
     def __init__(self, forward: ForwardModel) -> None:
         description = forward.description
         self._nodes = forward.bare.points[:, forward.bare.pressable]
+        self._map_weights = forward.bare.map_weights
         self._node_m2 = forward.node_areas_m2
         self._x, self._y = np.meshgrid(description.map_x_m, description.map_y_m)
         self._cell_m2 = (description.map_x_m[1] - description.map_x_m[0]) * (
@@ -59,6 +60,10 @@ class AreaFinder:
     def map_places(self) -> tuple[FloatArray, FloatArray]:
         """X and y (nodes_y, nodes_x) of the map's nodes, metres."""
         return self._x, self._y
+
+    def on_map(self, nodes: FloatArray | Image) -> FloatArray:
+        """What is shown at the pressable nodes (P,), as an image (nodes_y, nodes_x)."""
+        return np.asarray(self._map_weights @ nodes).reshape(self._x.shape)
 
     def on_nodes(self, image: FloatArray | Image) -> FloatArray:
         """What an image (nodes_y, nodes_x) shows at the pressable nodes, (P,)."""

@@ -215,6 +215,14 @@ class MeasuredChannel:
         )
         return Taken(changes, flags, electrodes)
 
+    def image(self, change: FloatArray, method: Tier) -> Image:
+        """Linear image (P,) of a change (M,) in the channel's own direction; the rest cut off."""
+        signed = self._description.sign(self._name) * change
+        image = self.matrix(method) @ signed.astype(np.float32)
+        return (
+            image if self._description.either_way(self._name) else np.maximum(image, 0.0, out=image)
+        )
+
     def matrix(self, method: Tier) -> Image:
         """Reconstruction matrix (P, M) of a linear method for the noise at hand.
 

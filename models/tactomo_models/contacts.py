@@ -121,7 +121,7 @@ def contacts_of(
         ids: the identity of each.
         size: (K,) magnitudes; NaN where unknown.
         sigma: (K,) their standard uncertainties.
-        curve: turns magnitudes into pressures; None where nothing is known of them.
+        curve: the sensor's; None where it has none.
     """
     pressures = pressures_of(curve, size, sigma, areas.areas_m2, areas.sigmas[:, 2])
     return tuple(

@@ -27,22 +27,17 @@ from tactomo_models.artifact import Artifact, load_or_build_artifact
 from tactomo_models.changes import WRONG_WAY, Changes, MeasuredChannel, missing, towards_pressing
 from tactomo_models.contacts import Contact, Tracker, contacts_of, map_of, pressure_map
 from tactomo_models.description import Modality, SensorDescription
+from tactomo_models.drawing import Drawer, Drawing
 from tactomo_models.following import Freedom, ShapeFollower
 from tactomo_models.forward import ForwardModel
-from tactomo_models.magnitudes import (
-    MagnitudeFollower,
-    Magnitudes,
-    bare_tangent,
-    linear_magnitudes,
-    without_holes,
-)
+from tactomo_models.magnitudes import Magnitudes, bare_tangent, linear_magnitudes
 from tactomo_models.network import NONE_TRAINED, NetworkImage, SensorNetworks
 from tactomo_models.objects import ObjectFollower
 from tactomo_models.outlines import Outlines, ellipses_of
 from tactomo_models.paper_level_set import PaperLevelSet
 from tactomo_models.plausibility import Flag, Wiring
 from tactomo_models.pressure import PressureCurve, described_curve
-from tactomo_models.redrawing import Drawing, Redrawer, SecondOpinion
+from tactomo_models.redrawing import Redrawer, SecondOpinion
 from tactomo_models.reference import Reference
 from tactomo_models.shape_fit import Shape
 from tactomo_models.tier import LINEAR, NETWORKS_OF, PAPER_NETWORKS, Tier, check_tier
@@ -54,7 +49,6 @@ DEFAULT_BUDGET_S = 0.05
 BAD_MISFIT = 2.0  # the data are not explained: what is shown may be wrong
 SWAPPED = 2.0  # times the structure channel's signal that the magnitude channel's never reaches
 MUCH_MORE = 5.0  # ratio of the channels' contrasts (logarithms) for that
-HOLLOW_MISFIT = 1.1  # of the magnitude channel: enough to ask whether a contact is a ring
 LINEAR_PART = 0.5  # of the misfit of nothing, that areas cut out of a linear image may leave
 MOST_HELD = 10  # frames without a structure scan that the last shape stands in for: half a second
 LOW_CONFIDENCE = 0.8  # expected correlation below which a map is better not trusted
@@ -118,17 +112,6 @@ class Look:
         return bool(self.data) and all(taken.quiet for taken in self.data.values())
 
 
-@dataclass(frozen=True)
-class _Shown:
-    """What was made of a shape: it serves again while the shape stays as it is."""
-
-    pressed: FloatArray
-    on_map: FloatArray
-    areas: Areas
-    tier: Tier
-    holes_sought: bool = False
-
-
 class Reconstructor:
     """Turns dual scans into maps and contacts; keeps the warm start between them.
 
@@ -174,18 +157,14 @@ class Reconstructor:
         self._wiring = Wiring(description)
         self._areas = AreaFinder(self._forward)
         self._jacobian_by_node = np.ascontiguousarray(self._artifact.jacobian.T)
-        self._follower: ShapeFollower | ObjectFollower | None = None
-        if description.structure is not None:
-            ratio = description.structure.saturated_ratio
-            if description.structure.either_way:
-                self._follower = ObjectFollower(self._forward, ratio, self._object_image)
-            else:
-                self._follower = ShapeFollower(self._forward, ratio)
+        self._follower = self._make_follower()
+        self._drawer: Drawer | None = None
+        if self._follower is not None:
+            self._drawer = Drawer(self._forward, self._areas, self._follower.fit)
         self._reference: Reference | None = None
         self._channels: dict[Modality, MeasuredChannel] = {}
         self._tracker = Tracker()
-        self._magnitudes = MagnitudeFollower(self._forward)
-        self._shown: _Shown | None = None
+        self._shape_tier = Tier.QUIET  # what made the last shape
         self._frames_held = 0  # since the last structure scan
         self._stage_s: dict[str, float] = {}
         self._left_out: list[str] = []
@@ -195,6 +174,14 @@ class Reconstructor:
             > MUCH_MORE * np.log(description.contrast("magnitude"))
         )
         self._make_ready()
+
+    def _make_follower(self) -> ShapeFollower | ObjectFollower | None:
+        structure = self.description.structure
+        if structure is None:
+            return None
+        if structure.either_way:
+            return ObjectFollower(self._forward, structure.saturated_ratio, self._object_image)
+        return ShapeFollower(self._forward, structure.saturated_ratio)
 
     def set_reference(self, reference: Reference) -> None:
         """Measure changes against this unpressed scan from now on.
@@ -268,12 +255,11 @@ class Reconstructor:
 
     def forget_shape(self) -> None:
         """Forget the warm start; contacts keep their identities."""
-        if self._follower:
+        if self._follower and self._drawer:
             self._follower.forget()
-        self._magnitudes.forget()
+            self._drawer.forget()
         if "_redrawer" in self.__dict__:
             self._redrawer.forget()
-        self._shown = None
 
     def reconstruct(
         self,
@@ -401,15 +387,17 @@ class Reconstructor:
         """Linear images of both channels; areas above half of the clearest one's peak."""
         self.forget_shape()
         with self._timed(method):
-            images = {name: self._linear_image(name, d.change, method) for name, d in data.items()}
-            maps = {name: self._on_map(image) for name, image in images.items()}
+            images = {
+                name: self._channels[name].image(d.change, method) for name, d in data.items()
+            }
+            maps = {name: self._areas.on_map(image) for name, image in images.items()}
         with self._timed("contacts"):
             shown = images.get("structure", images.get("magnitude"))
             assert shown is not None
             peak = max(float(np.abs(shown).max()), 1e-12)
             # The rest of the image is blur: a contact there would be as large as the sheet.
             inside = np.where(np.abs(shown) > 0.5 * peak, 1.0, 0.0)
-            areas = self._areas.find(self._on_map(inside), inside)
+            areas = self._areas.find(self._areas.on_map(inside), inside)
             fitted = self._linear_magnitudes(areas, data)
             contacts = self._contacts(areas, fitted)
         # Its outlines are a guess, so all that can be asked is that they explain most.
@@ -429,14 +417,8 @@ class Reconstructor:
             flags=flags,
         )
 
-    def _linear_image(self, name: Modality, change: FloatArray, method: Tier) -> Image:
-        """Linear image (P,) of the change in the channel's own direction; the rest cut off."""
-        signed = self.description.sign(name) * change
-        image = self._channels[name].matrix(method) @ signed.astype(np.float32)
-        return image if self.description.either_way(name) else np.maximum(image, 0.0, out=image)
-
     def _object_image(self, change: FloatArray) -> FloatArray:
-        return self._linear_image("structure", change, Tier.NOSER).astype(np.float64)
+        return self._channels["structure"].image(change, Tier.NOSER).astype(np.float64)
 
     def _linear_magnitudes(self, areas: Areas, data: dict[Modality, Changes]) -> Magnitudes | None:
         """Magnitudes of a linear method: no forward solve, the bare sheet's Jacobian says all."""
@@ -445,10 +427,6 @@ class Reconstructor:
         tangent = bare_tangent(self._jacobian_by_node, areas)
         taken = data["magnitude"]
         return linear_magnitudes(tangent, taken.change, taken.weight, taken.spread)
-
-    def _on_map(self, nodes: FloatArray | Image) -> FloatArray:
-        shape = (self.description.map.nodes_y, self.description.map.nodes_x)
-        return np.asarray(self._artifact.bare.map_weights @ nodes).reshape(shape)
 
     def _by_network(
         self, data: dict[Modality, Changes], flags: Flag, reason: str
@@ -494,9 +472,9 @@ class Reconstructor:
             # The artifact's matrix, whose regularisation is fixed, as the paper's is: what a
             # network was trained on must not depend on the noise.
             signed = self.description.sign("magnitude") * data["magnitude"].change
-            images["magnitude"] = self._on_map(self._artifact.tikhonov @ signed)
+            images["magnitude"] = self._areas.on_map(self._artifact.tikhonov @ signed)
         if "structure" in data and "structure" in modalities:
-            images["structure"] = self._on_map(self._paper_shape(data["structure"]).coverage)
+            images["structure"] = self._areas.on_map(self._paper_shape(data["structure"]).coverage)
         return images
 
     def preliminary_images(
@@ -550,8 +528,10 @@ class Reconstructor:
         with self._timed("shape"):
             shape, how = self._shape_of(data, self.budget_s or DEFAULT_BUDGET_S)
         solves = 3 if shape.converged else 1
+        assert self._drawer is not None
         with self._timed("contacts"):
-            own = self._drawing_of(shape, data, solves)
+            own = self._drawer.draw(shape, data, solves)
+        self._shape_tier = self._tier_of(shape)
         second = self._second_opinion(own, data, solves)
         shown = second.drawing if second is not None and second.share > SURE_SHARE else own
         if not shape.converged:
@@ -578,7 +558,7 @@ class Reconstructor:
             pressure_kpa=pressure,
             structure=shown.pressed.astype(np.float32),
             contacts=contacts,
-            tier=self._tier_of(shape) if second is None else Tier.HYBRID,
+            tier=self._shape_tier if second is None else Tier.HYBRID,
             reason=how,
             misfit=shape.misfit,
             flags=flags,
@@ -613,15 +593,6 @@ class Reconstructor:
         made = self._imaged(image, data, flags, Tier.NETWORK, "no even presses explain the data")
         return replace(made, misfit=shape.misfit)
 
-    def _drawing_of(self, shape: Shape, data: dict[Modality, Changes], solves: int) -> Drawing:
-        """The physics' account of a shape."""
-        areas, pressed = self._areas_of(shape, data["structure"])
-        fitted = self._fit_magnitudes(areas, data, solves)
-        if fitted is not None and self._may_be_hollow(shape, fitted):
-            areas, pressed = self._hollowed(shape, data["magnitude"])
-            fitted = self._fit_magnitudes(areas, data, 3)
-        return Drawing(areas, pressed, fitted)
-
     def _second_opinion(
         self, own: Drawing, data: dict[Modality, Changes], solves: int
     ) -> SecondOpinion | None:
@@ -637,23 +608,22 @@ class Reconstructor:
     def _held(self, data: dict[Modality, Changes], flags: Flag) -> Reconstruction | None:
         """Bridge a lost structure scan with the last shape, as long as it explains the other."""
         self._frames_held += 1
-        if self._shown is None or self._frames_held > MOST_HELD:
+        if self._drawer is None or not self._drawer.has_drawn or self._frames_held > MOST_HELD:
             return None
         with self._timed("contacts"):
-            areas = self._shown.areas
-            fitted = self._fit_magnitudes(areas, data, 1)
-            if self._magnitude_unexplained(data, fitted, BAD_MISFIT):
+            shown = self._drawer.draw_again(data)
+            if self._magnitude_unexplained(data, shown.fitted, BAD_MISFIT):
                 return None
-            contacts = self._contacts(areas, fitted)
-        assert fitted is not None
+            contacts = self._contacts(shown.areas, shown.fitted)
+        assert shown.fitted is not None
         return Reconstruction(
-            map=map_of(areas, np.array([c.magnitude for c in contacts])),
-            pressure_kpa=pressure_map(areas, contacts),
+            map=map_of(shown.areas, np.array([c.magnitude for c in contacts])),
+            pressure_kpa=pressure_map(shown.areas, contacts),
             structure=None,
             contacts=contacts,
-            tier=self._shown.tier,
+            tier=self._shape_tier,
             reason="the last shape: the structure scan is missing",
-            misfit=fitted.misfit,
+            misfit=shown.fitted.misfit,
             flags=flags,
         )
 
@@ -685,7 +655,7 @@ class Reconstructor:
         return self.tier is Tier.HYBRID or (self.tier is Tier.AUTO and not self._networks.missing)
 
     def _paper_shape(self, structure: Changes) -> Shape:
-        image = np.maximum(self._linear_image("structure", structure.change, Tier.TIKHONOV), 0.0)
+        image = np.maximum(self._channels["structure"].image(structure.change, Tier.TIKHONOV), 0.0)
         return self._paper.fit(structure.change, structure.weight, image)
 
     def _tier_of(self, shape: Shape) -> Tier:
@@ -714,49 +684,6 @@ class Reconstructor:
             return data["magnitude"].misfit > bad_misfit
         wrong_way = self.description.sign("magnitude") * fitted.change < -WRONG_WAY * fitted.sigma
         return fitted.misfit > bad_misfit or bool(wrong_way.any())
-
-    def _areas_of(self, shape: Shape, structure: Changes) -> tuple[Areas, FloatArray]:
-        """Areas of a shape and its map; those of the frame before while it has not moved."""
-        assert self._follower is not None
-        if self._shown is not None and self._shown.pressed is shape.pressed:
-            return self._shown.areas, self._shown.on_map
-        coverage = shape.coverage
-        on_map = self._on_map(coverage)
-        areas = self._areas.find(np.abs(on_map), np.abs(coverage))
-        if len(areas):
-            covariance = self._follower.fit.covariance(shape, structure.weight, structure.spread)
-            areas = self._areas.with_sigmas(areas, shape, covariance)
-        self._shown = _Shown(shape.pressed, on_map, areas, self._tier_of(shape))
-        return areas, on_map
-
-    def _may_be_hollow(self, shape: Shape, fitted: Magnitudes) -> bool:
-        """Tell whether to look for rings: once for a shape, where something is unexplained."""
-        assert self._shown is not None
-        unasked = not self._shown.holes_sought and isinstance(shape.family, Outlines)
-        return unasked and shape.converged and fitted.misfit > HOLLOW_MISFIT
-
-    def _hollowed(self, shape: Shape, magnitude: Changes) -> tuple[Areas, FloatArray]:
-        """The shape's areas and map with the holes of rings taken out."""
-        assert self._shown is not None
-        assert isinstance(shape.family, Outlines)
-        solid, coverage = self._shown.areas, shape.family.inner_coverage(shape.parameters)
-        inner = self._areas.inner_parts(solid, coverage, self._on_map(coverage))
-        change, weight, spread = magnitude.change, magnitude.weight, magnitude.spread
-        areas = without_holes(self._forward, solid, inner, change, weight, spread)
-        on_map = self._shown.on_map
-        if areas is not solid:
-            on_map = on_map - (solid.on_map - areas.on_map).sum(axis=0)
-        self._shown = replace(self._shown, areas=areas, on_map=on_map, holes_sought=True)
-        return areas, on_map
-
-    def _fit_magnitudes(
-        self, areas: Areas, data: dict[Modality, Changes], solves: int
-    ) -> Magnitudes | None:
-        if "magnitude" not in data:
-            self._magnitudes.forget()
-            return None
-        taken = data["magnitude"]
-        return self._magnitudes.fit(areas, taken.change, taken.weight, taken.spread, solves=solves)
 
     def _contacts(self, areas: Areas, fitted: Magnitudes | None) -> tuple[Contact, ...]:
         unknown = np.full(len(areas), np.nan)

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from tactomo_models.areas import AreaFinder, Areas
 from tactomo_models.changes import Changes, towards_pressing
 from tactomo_models.description import Modality, SensorDescription
+from tactomo_models.drawing import Drawing
 from tactomo_models.forward import ForwardModel
-from tactomo_models.magnitudes import MagnitudeFollower, Magnitudes
+from tactomo_models.magnitudes import MagnitudeFollower
 from tactomo_models.network import FusionNetwork, NetworkImage
 
 FloatArray = NDArray[np.float64]
@@ -30,28 +31,6 @@ HANDICAP = 0.1
 DECISION = 0.1  # of the misfits' ratio, in logarithm, that tips the scales
 SAME_M = 0.012  # centres within this are of the same contact
 STILL = 1.5  # mean square of a still scene's differences over their noise
-
-
-@dataclass(frozen=True)
-class Drawing:
-    """One account of what presses.
-
-    Attributes:
-        areas: K pressed areas.
-        pressed: (nodes_y, nodes_x) share pressed.
-        fitted: their magnitudes; None where there is no area or no magnitude channel.
-    """
-
-    areas: Areas
-    pressed: FloatArray | Image
-    fitted: Magnitudes | None
-
-    def map(self, sign: float) -> FloatArray:
-        """|Relative conductivity change| (nodes_y, nodes_x), of areas that change by this sign."""
-        if self.fitted is None:
-            return np.zeros(self.pressed.shape)
-        size = np.maximum(sign * self.fitted.change, 0.0)
-        return np.asarray(np.einsum("k,kyx->yx", size, self.areas.on_map))
 
 
 @dataclass(frozen=True)
