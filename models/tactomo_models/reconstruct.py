@@ -612,10 +612,10 @@ class Reconstructor:
             return None
         with self._timed("contacts"):
             shown = self._drawer.draw_again(data)
-            if self._magnitude_unexplained(data, shown.fitted, BAD_MISFIT):
+            fitted = shown.fitted
+            if fitted is None or self._magnitude_unexplained(data, fitted, BAD_MISFIT):
                 return None
-            contacts = self._contacts(shown.areas, shown.fitted)
-        assert shown.fitted is not None
+            contacts = self._contacts(shown.areas, fitted)
         return Reconstruction(
             map=map_of(shown.areas, np.array([c.magnitude for c in contacts])),
             pressure_kpa=pressure_map(shown.areas, contacts),
@@ -623,7 +623,7 @@ class Reconstructor:
             contacts=contacts,
             tier=self._shape_tier,
             reason="the last shape: the structure scan is missing",
-            misfit=shown.fitted.misfit,
+            misfit=fitted.misfit,
             flags=flags,
         )
 

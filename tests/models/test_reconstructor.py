@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -178,6 +179,20 @@ def test_a_lost_structure_scan_is_bridged_by_the_last_shape(
     assert contact.pressure_kpa == pytest.approx(160, abs=8)
     elsewhere = skin.scan(press_mm(40, -40, 190))["magnitude"]
     assert reconstructor.reconstruct(elsewhere, None).tier is Tier.NETWORK
+
+
+def test_a_last_shape_without_contacts_stands_in_for_nothing(
+    reconstructor: Reconstructor, simulator: SkinSimulator
+) -> None:
+    """In much noise the magnitude channel may see a press where the structure channel has none."""
+    noisy = Skin(simulator, noise_share=0.02)
+    reconstructor.set_reference(noisy.reference())
+    press = replace(CENTRE, pressure_kpa=195, radius_m=0.04)
+    frame = reconstructor.reconstruct(noisy.scan(press)["magnitude"], noisy.scan()["structure"])
+    assert (frame.tier, frame.contacts) == (Tier.FIT, ())
+    frame = reconstructor.reconstruct(noisy.scan(press)["magnitude"], None)
+    assert frame.tier is Tier.NETWORK
+    assert Flag.STRUCTURE_MISSING in frame.flags
 
 
 def test_the_last_shape_is_not_held_for_ever(reconstructor: Reconstructor, skin: Skin) -> None:
