@@ -3,13 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import pty
-import re
-import select
-import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -21,6 +14,7 @@ from tactomo.cli.watch import frame_line, map_text
 from tactomo_client import Contact, subscribe
 from tactomo_client.appearance import PRESSED_COLOUR
 from tactomo_client.fake import FakeSensor
+from terminal import Terminal
 
 Run = Callable[..., Any]
 
@@ -61,29 +55,13 @@ def sensor() -> Iterator[FakeSensor]:
         thread.join()
 
 
-def in_a_terminal(*arguments: str, until: str, timeout_s: float = 60.0) -> tuple[str, int]:
-    """Run watch in a terminal of 120 x 40 until it shows something, then press Ctrl-C."""
-    main, side = pty.openpty()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tactomo.cli", "watch", *arguments],
-        stdin=side,
-        stdout=side,
-        stderr=side,
-        env={**os.environ, "COLUMNS": "120", "LINES": "40", "TERM": "xterm-256color"},
-    )
-    shown = ""
-    end_s = time.monotonic() + timeout_s
-    while until not in shown and time.monotonic() < end_s and process.poll() is None:
-        if select.select([main], [], [], 0.1)[0]:
-            text = os.read(main, 65_536).decode(errors="replace")
-            shown += re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", text)
-    process.send_signal(signal.SIGINT)
-    while process.poll() is None:
-        if select.select([main], [], [], 0.1)[0]:
-            os.read(main, 65_536)
-    os.close(side)
-    os.close(main)
-    return shown, process.returncode
+def in_a_terminal(*arguments: str, until: str) -> tuple[str, int]:
+    """Run watch in a terminal until it shows something, then press Ctrl-C."""
+    with Terminal("watch", *arguments) as terminal:
+        terminal.wait_for(until)
+        terminal.press_ctrl_c()
+        status = terminal.wait()
+        return terminal.shown, status
 
 
 def test_it_shows_map_contacts_and_health_and_ends_by_ctrl_c(sensor: FakeSensor) -> None:

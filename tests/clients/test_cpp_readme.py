@@ -12,28 +12,17 @@ from pathlib import Path
 
 import pytest
 from cpp_client import CPP_FOLDER, need_headers
+from page import Page
 from tactomo_client import Contact
 from tactomo_client.fake import FakeSensor
 
-README = (CPP_FOLDER / "README.md").read_text("utf-8")
+README = Page("clients/cpp/README.md")
 ROOT = Path(__file__).parents[2]
 CONTACT = Contact(7, 10.0, -5.0, 700.0, 0.2, 0.01, 183.0)
 STRICT = "-Wall -Wextra -Wpedantic -Wconversion -Wshadow -Werror"
 BUILD_S = 300.0
 
 pytestmark = pytest.mark.timeout(600)  # compilers are slow where others work, too
-
-
-def commands() -> list[str]:
-    """All commands of the README, in order."""
-    blocks: list[str] = re.findall(r"```sh\n(.*?)```", README, re.S)
-    return [line for block in blocks for line in block.splitlines()]
-
-
-def file_in_readme(name: str) -> str:
-    found = re.search(rf"`{re.escape(name)}`:\n\n```\w+\n(.*?)```", README, re.S)
-    assert found
-    return found[1]
 
 
 @pytest.fixture(scope="module")
@@ -53,13 +42,13 @@ def pressed() -> Iterator[str]:
         thread.join()
 
 
-class Newcomer:
-    """Somebody in a checkout, with a home."""
+class Checkout:
+    """A checkout, and commands run in it with an empty home."""
 
     def __init__(self, folder: Path) -> None:
-        self.checkout = folder / "tactomo"
-        (self.checkout / "clients").mkdir(parents=True)
-        shutil.copytree(CPP_FOLDER, self.checkout / "clients" / "cpp")
+        self.folder = folder / "tactomo"
+        (self.folder / "clients").mkdir(parents=True)
+        shutil.copytree(CPP_FOLDER, self.folder / "clients" / "cpp")
         self._environment = {
             **os.environ,
             "HOME": str(folder),
@@ -71,7 +60,7 @@ class Newcomer:
         """Run a command of the README in the checkout, with which all is well."""
         done = subprocess.run(
             ["bash", "-ec", command],
-            cwd=self.checkout,
+            cwd=self.folder,
             env=self._environment,
             capture_output=True,
             text=True,
@@ -82,41 +71,41 @@ class Newcomer:
 
 
 @pytest.fixture(scope="module")
-def newcomer(tmp_path_factory: pytest.TempPathFactory) -> Newcomer:
+def checkout(tmp_path_factory: pytest.TempPathFactory) -> Checkout:
     need_headers()
     if shutil.which("cmake") is None or shutil.which("pkg-config") is None:
         pytest.skip("needs cmake and pkg-config")
-    return Newcomer(tmp_path_factory.mktemp("home"))
+    return Checkout(tmp_path_factory.mktemp("home"))
 
 
-def test_from_nothing_to_a_running_controller(newcomer: Newcomer, pressed: str) -> None:
+def test_from_nothing_to_a_running_controller(checkout: Checkout, pressed: str) -> None:
     """Every command but `apt`, in order; only the address is another one."""
-    (newcomer.checkout / "robot").mkdir()
+    (checkout.folder / "robot").mkdir()
     for name in ("robot/CMakeLists.txt", "robot/robot.cpp"):
-        (newcomer.checkout / name).write_text(file_in_readme(name))
+        (checkout.folder / name).write_text(README.file(name))
     said = {}
     exported = ""
-    for command in commands():
+    for command in README.commands():
         if command.startswith("sudo apt "):
             continue
         if command.startswith("export "):
             exported = f"{command}\n"
         elif command.startswith("build/controller"):
-            said["controller"] = newcomer.run(f"{command} --stream {pressed}")
+            said["controller"] = checkout.run(f"{command} --stream {pressed}")
         elif command == "robot/build/robot":
-            said["robot"] = newcomer.run(f"{command} {pressed}")
+            said["robot"] = checkout.run(f"{command} {pressed}")
         else:
-            newcomer.run(exported + command)
+            checkout.run(exported + command)
     assert "retreat: pressed hard\n" in said["controller"]
     assert "5000 turns" in said["controller"]
     for seconds in ("soon", "-3", "nan", "5x", "1e99"):
-        refused = newcomer.run(f"! build/controller skin --seconds {seconds} 2>&1")
+        refused = checkout.run(f"! build/controller skin --seconds {seconds} 2>&1")
         assert refused.startswith("usage: "), seconds
     assert re.search(
         r"latest\(\): p50 [\d.]+ us, p99 [\d.]+ us, worst [\d.]+ us\n", said["controller"]
     )
     assert "7 at (10.0, -5.0) mm, 183 kPa\n" in said["robot"]
-    by_pkg_config = newcomer.run(f"robot/robot {pressed}")
+    by_pkg_config = checkout.run(f"robot/robot {pressed}")
     assert "7 at (10.0, -5.0) mm, 183 kPa\n" in by_pkg_config
 
 
@@ -128,25 +117,25 @@ FetchContent_MakeAvailable(tactomo)"""
 
 @pytest.mark.slow
 @pytest.mark.parametrize("way", [HERE, FETCHED], ids=["add_subdirectory", "FetchContent"])
-def test_without_an_installation(newcomer: Newcomer, way: str, pressed: str) -> None:
-    folder = newcomer.checkout.parent / "other"
+def test_without_an_installation(checkout: Checkout, way: str, pressed: str) -> None:
+    folder = checkout.folder.parent / "other"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
-    lists = file_in_readme("robot/CMakeLists.txt")
+    lists = README.file("robot/CMakeLists.txt")
     found = "find_package(tactomo 0.1 CONFIG REQUIRED)"
     assert found in lists
-    places = {"source": newcomer.checkout / "clients" / "cpp", "root": newcomer.checkout}
+    places = {"source": checkout.folder / "clients" / "cpp", "root": checkout.folder}
     (folder / "CMakeLists.txt").write_text(lists.replace(found, way.format(**places)))
-    (folder / "robot.cpp").write_text(file_in_readme("robot/robot.cpp"))
-    newcomer.run(f"cmake -S {folder} -B {folder}/build && cmake --build {folder}/build")
+    (folder / "robot.cpp").write_text(README.file("robot/robot.cpp"))
+    checkout.run(f"cmake -S {folder} -B {folder}/build && cmake --build {folder}/build")
     assert not list(folder.rglob("controller"))
-    assert "7 at (10.0, -5.0) mm" in newcomer.run(f"{folder}/build/robot {pressed}")
+    assert "7 at (10.0, -5.0) mm" in checkout.run(f"{folder}/build/robot {pressed}")
 
 
-def test_a_missing_library_is_named(newcomer: Newcomer, tmp_path: Path) -> None:
-    newcomer.run(f"cmake -S clients/cpp -B {tmp_path} -DTACTOMO_EXAMPLES=OFF")
-    newcomer.run(f"cmake --install {tmp_path} --prefix {tmp_path}/prefix")
-    (tmp_path / "CMakeLists.txt").write_text(file_in_readme("robot/CMakeLists.txt"))
+def test_a_missing_library_is_named(checkout: Checkout, tmp_path: Path) -> None:
+    checkout.run(f"cmake -S clients/cpp -B {tmp_path} -DTACTOMO_EXAMPLES=OFF")
+    checkout.run(f"cmake --install {tmp_path} --prefix {tmp_path}/prefix")
+    (tmp_path / "CMakeLists.txt").write_text(README.file("robot/CMakeLists.txt"))
     (tmp_path / "robot.cpp").write_text("")
     command = ["cmake", "-S", tmp_path, "-B", tmp_path / "b", "-DTACTOMO_MSGPACK_INCLUDE=NOTFOUND"]
     command += [f"-DCMAKE_PREFIX_PATH={tmp_path}/prefix", "-DCMAKE_FIND_ROOT_PATH=/nowhere"]
@@ -157,7 +146,7 @@ def test_a_missing_library_is_named(newcomer: Newcomer, tmp_path: Path) -> None:
 
 
 def test_what_it_installs_is_what_the_suite_installs() -> None:
-    told = next(command for command in commands() if command.startswith("sudo apt install "))
+    told = next(command for command in README.commands() if command.startswith("sudo apt install "))
     packages = told.removeprefix("sudo apt install ")
     assert f"install {packages}\n" in (ROOT / ".ci" / "run").read_text()
 
@@ -172,9 +161,7 @@ def test_its_version_is_the_python_clients() -> None:
 def test_the_other_examples_compile(tmp_path: Path) -> None:
     """Commands, and keys: not run, for they would be sent to whoever listens."""
     need_headers()
-    blocks = [
-        block for block in re.findall(r"```cpp\n(.*?)```", README, re.S) if "main(" not in block
-    ]
+    blocks = [block for block in README.blocks("cpp") if "main(" not in block]
     assert len(blocks) == 2
     functions = [f"void example_{i}() {{\n{block}}}\n" for i, block in enumerate(blocks)]
     source = tmp_path / "examples.cpp"

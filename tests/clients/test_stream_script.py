@@ -10,19 +10,17 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from page import Page
 from tactomo_client import Contact
 from tactomo_client.fake import FakeSensor
 
-DOCUMENT = Path(__file__).parents[2] / "clients" / "STREAM.md"
 HEAVY = Contact(4, 12.34, -56.7, 812.4, 0.2, 0.01, 183.2)
 LIGHT = Contact(5, -1.0, 2.0, 300.0, None, None, None)
 
 
 def example() -> str:
-    text = DOCUMENT.read_text("utf-8").partition("\n## A complete client\n")[2]
-    scripts: list[str] = re.findall(r"```python\n(.*?)```", text, re.S)
-    assert len(scripts) == 1
-    return scripts[0]
+    (script,) = Page("clients/STREAM.md").blocks("python", "A complete client")
+    return script
 
 
 @pytest.fixture

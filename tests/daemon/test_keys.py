@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-import re
 import shutil
 import socket
 import subprocess
@@ -18,6 +17,7 @@ from typing import Any
 
 import pytest
 import zmq
+from page import Page
 from tactomo import keys as key_files
 from tactomo.config import load_config
 from tactomo.daemon import Daemon
@@ -41,7 +41,6 @@ from tactomo_viewer.feed import Feed
 
 Start = Callable[..., Any]
 SERVER = "left"
-DOCUMENT = Path(__file__).parents[2] / "clients" / "STREAM.md"
 PATIENCE_S = 30.0
 
 
@@ -205,11 +204,9 @@ def test_the_viewer_gets_in(guarded: Any) -> None:
 def test_the_example_of_the_specification_gets_in(
     guarded: Any, robot: Robot, tmp_path: Path
 ) -> None:
-    text = DOCUMENT.read_text("utf-8").partition("\n## Beyond the machine\n")[2]
-    example = re.search(r"```python\n(.*?)```", text, re.S)
-    assert example
+    (example,) = Page("clients/STREAM.md").blocks("python", "Beyond the machine")
     script = tmp_path / "health.py"
-    script.write_text(example[1])
+    script.write_text(example)
     folder = robot.allow(robot.client("ros"))
     command = [sys.executable, "-I", script, folder, SERVER, guarded.daemon.stream_address]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:

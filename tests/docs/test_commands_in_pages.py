@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from page import Page
 from tactomo.cli import app
 from typer.main import get_command
 
@@ -20,10 +21,9 @@ PAGES = [
 
 def told(page: Path) -> list[str]:
     """What follows `tactomo` in blocks of shell commands, and between backquotes."""
-    text = page.read_text("utf-8")
-    blocks = re.findall(r"^```sh\n(.*?)^```", text, re.M | re.S)
-    lines = [line.split("#")[0] for block in blocks for line in block.splitlines()]
-    spans = [" ".join(span.split()) for span in re.findall(r"`(tactomo [^`]+)`", text)]
+    read = Page(page.relative_to(ROOT).as_posix())
+    lines = [line.split("#")[0] for line in read.commands()]
+    spans = [" ".join(span.split()) for span in re.findall(r"`(tactomo [^`]+)`", read.text)]
     found = [re.search(r"\btactomo ([a-z][^|>]*)", line) for line in [*lines, *spans]]
     return [each[1].strip() for each in found if each]
 

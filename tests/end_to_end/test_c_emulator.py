@@ -14,6 +14,7 @@ import pytest
 from c_firmware import C_FOLDER, SANITIZED, build, need, runs
 from daemon_process import DaemonProcess, wait_until
 from ears import Ears, Heard
+from page import Page
 
 QUICK = {"tier": "tikhonov"}  # what the map is worth is tried elsewhere
 
@@ -81,7 +82,7 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def presses(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """The files that the README's Python makes: a bare skin, and a press."""
     folder = tmp_path_factory.mktemp("press")
-    [code] = re.findall(r"```python\n(.*?)```", (C_FOLDER / "README.md").read_text(), re.DOTALL)
+    [code] = Page("firmware_protocol/c/README.md").blocks("python")
     subprocess.run([sys.executable, "-c", code], cwd=folder, check=True)
     return folder / "bare.csv", folder / "press.csv"
 

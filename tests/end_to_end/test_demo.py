@@ -10,9 +10,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from page import Page
 from selenium.webdriver import ActionChains, Chrome
 from selenium.webdriver.common.by import By
-from whole_system import PATIENCE_S, SENSOR, Demo, repository, running_demo, wait_for
+from whole_system import PATIENCE_S, SENSOR, Demo, running_demo, wait_for
 
 
 @pytest.mark.browser
@@ -79,9 +80,7 @@ while True:
 
 
 def test_the_readme_subscribes_in_six_lines(demo: Demo, tmp_path: Path) -> None:
-    readme = (repository() / "README.md").read_text("utf-8")
-    blocks = re.findall(r"```python\n(.*?)```", readme, flags=re.DOTALL)
-    code = next(block for block in blocks if "subscribe" in block)
+    code = next(block for block in Page("README.md").blocks("python") if "subscribe" in block)
     assert len(code.strip().splitlines()) <= 6
     code = code.replace("subscribe(", f"subscribe(address={demo.stream!r}, sensor=", 1)
     code = re.sub(r'sensor="\w+"', f'sensor="{SENSOR}"', code)

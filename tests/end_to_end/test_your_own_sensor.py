@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from faulty_skin import rewired
-from newcomer import Newcomer, Page
+from newcomer import Newcomer
+from page import Page
 from tactomo.port import contradiction
 from tactomo_models import (
     DescriptionError,
@@ -29,7 +30,7 @@ from tactomo_protocol import Channel, Hello, SampleFormat
 
 pytestmark = pytest.mark.timeout(300)  # a dozen programs, one after another
 
-PAGE = Page("your_own_sensor.md")
+PAGE = Page("docs/your_own_sensor.md")
 FILE = "my_sheet.toml"
 SMALLER = {"--count 5 --contacts 1-4": "--count 1 --contacts 1", "--seconds 3": "--seconds 1"}
 SHORTER = {"--seconds 5": "--seconds 1", "doctor ": "doctor --seconds 2 "}
@@ -45,12 +46,12 @@ def newcomer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Newcomer:
 
 def test_a_description_is_drawn_built_pressed_and_judged(newcomer: Newcomer) -> None:
     with newcomer:
-        drawn, built, info = newcomer.follow(PAGE.commands(2) + PAGE.commands(3))
+        drawn, built, info = newcomer.follow(PAGE.commands("2") + PAGE.commands("3"))
         assert "scale 1 : 1" in drawn
         assert (newcomer.folder / "my_sheet.png").exists()
         assert "is up to date" in built  # drawing has built them
         assert "my_sheet" in info
-        demo, press, watch, status, release = PAGE.commands(4)
+        demo, press, watch, status, release = PAGE.commands("4")
         newcomer.run(demo)
         newcomer.run(press)
         seen = newcomer.wait_for(watch, " mm ")
@@ -59,18 +60,18 @@ def test_a_description_is_drawn_built_pressed_and_judged(newcomer: Newcomer) -> 
         assert " fit (asked for: auto)" in newcomer.wait_for(status, "fit (asked")
         newcomer.run(release)
         newcomer.stop()
-        (judged,) = newcomer.follow(PAGE.commands(5))
+        (judged,) = newcomer.follow(PAGE.commands("5"))
         assert "Simulated, not measured: my_sheet" in judged
         assert (newcomer.folder / "fit.png").exists()
 
 
 def test_a_device_is_found_examined_tared_and_recorded(newcomer: Newcomer) -> None:
     with newcomer:
-        newcomer.follow(PAGE.commands(7))
+        newcomer.follow(PAGE.commands("7"))
         assert (newcomer.folder / "first.mcap").exists()
-    (calibrated,) = newcomer.follow(PAGE.commands(8))
+    (calibrated,) = newcomer.follow(PAGE.commands("8"))
     assert "answers from" in calibrated
-    (install,) = PAGE.commands(9)
+    (install,) = PAGE.commands("9")
     assert "/etc/tactomo/palm.toml" in newcomer.run(install)
 
 

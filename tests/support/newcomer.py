@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import shlex
 import signal
 import subprocess
@@ -19,29 +18,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from whole_system import ANYWHERE, PATIENCE_S, repository
+from whole_system import ANYWHERE, PATIENCE_S
 
-KEEP_RUNNING = ("demo", "twin", "daemon")
-
-
-class Page:
-    """A page of the documentation: its commands by section, and the files that it tells to save."""
-
-    def __init__(self, name: str) -> None:
-        self.text = (repository() / "docs" / name).read_text("utf-8")
-
-    def commands(self, number: int) -> list[str]:
-        """Return the commands of a numbered section, in order."""
-        section = re.search(rf"^## {number} .*?(?=^## |\Z)", self.text, re.M | re.S)
-        assert section, f"there is no section {number}"
-        blocks = re.findall(r"^```sh\n(.*?)^```", section[0], re.M | re.S)
-        return [line for block in blocks for line in block.splitlines() if line]
-
-    def file(self, name: str) -> str:
-        """Return the contents of the file that is to be saved under this name."""
-        found = re.search(rf"`{re.escape(name)}`:\n\n```\w+\n(.*?)^```", self.text, re.M | re.S)
-        assert found, f"{name} is not told to be saved"
-        return found[1]
+KEEP_RUNNING = ("demo", "twin", "daemon", "foxglove")
 
 
 class Newcomer:
@@ -86,37 +65,45 @@ class Newcomer:
         line = [sys.executable, "-m", "tactomo.cli", name, *rest, *self._at(name)]
         if name in KEEP_RUNNING:
             return self._start(name, line)
+        return self._finish(line)
+
+    def python(self, program: str) -> str:
+        """Run a program in Python there, and return what it has printed."""
+        return self._finish([sys.executable, "-c", program])
+
+    def stop(self) -> None:
+        """Ctrl-C in every terminal, with which all is well."""
+        for name, running in reversed(self._running.items()):
+            with running:  # closes its output
+                running.send_signal(signal.SIGINT)
+                assert running.wait(PATIENCE_S) == 0, name
+        self._running.clear()
+
+    def _finish(self, line: list[str]) -> str:
         done = subprocess.run(
             line, cwd=self.folder, capture_output=True, text=True, timeout=300, check=False
         )
-        assert done.returncode == 0, f"{command}: {done.stderr}"
+        assert done.returncode == 0, f"{shlex.join(line)}: {done.stderr}"
         return done.stdout + done.stderr
 
-    def stop(self) -> None:
-        """Ctrl-C in every terminal."""
-        for running in reversed(self._running.values()):
-            running.send_signal(signal.SIGINT)
-            running.wait(PATIENCE_S)
-            if running.stdout is not None:
-                running.stdout.close()
-        self._running.clear()
-
     def _at(self, name: str) -> list[str]:
-        """Options by which a program finds, or is given, free addresses."""
-        stream = ["--stream", self.addresses.get("stream", "")]
-        control = ["--control", self.addresses.get("control", "")]
+        """Options by which a program is given free addresses, or finds those that it asks."""
+        served = ["--stream", ANYWHERE, "--control", ANYWHERE]
+        page = ["--port", "0", "--announce"]
         here = {
-            "demo": [
-                *("--stream", ANYWHERE, "--control", ANYWHERE, "--twin-control", ANYWHERE),
-                *("--port", "0", "--no-browser", "--announce"),
-            ],
+            "demo": [*served, "--twin-control", ANYWHERE, "--no-browser", *page],
             "twin": ["--control", ANYWHERE, "--announce"],
-            "daemon": ["--stream", ANYWHERE, "--control", ANYWHERE],
-            "poke": ["--control", self.addresses.get("twin", "")],
-            **dict.fromkeys(("watch", "doctor"), stream),
-            **dict.fromkeys(("status", "tare", "record", "tier"), control),
+            "foxglove": [*page, *self._known("stream")],
+            "poke": self._known("control", "twin"),
+            **dict.fromkeys(("daemon", "replay"), served),
+            **dict.fromkeys(("watch", "doctor"), self._known("stream")),
+            **dict.fromkeys(("status", "tare", "record", "tier"), self._known("control")),
         }
         return here.get(name, [])
+
+    def _known(self, option: str, name: str = "") -> list[str]:
+        address = self.addresses.get(name or option)
+        return [f"--{option}", address] if address else []
 
     def _start(self, name: str, line: list[str]) -> str:
         if "/dev/ttyACM0" in line and self.addresses.get("ports"):
@@ -138,7 +125,8 @@ class Newcomer:
             if name == "daemon" and told.get("event") != "ready":
                 continue
             if told:
-                told = {"twin": told.pop("control"), **told} if name == "twin" else told
+                if name == "twin":
+                    told["twin"] = told.pop("control")
                 self.addresses |= told
                 return heard
         raise AssertionError(f"{name} ended: {heard}")

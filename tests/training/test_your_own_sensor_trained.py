@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from newcomer import Newcomer, Page
+from newcomer import Newcomer
+from page import Page
 
 pytestmark = [pytest.mark.train, pytest.mark.timeout(600)]
 
-PAGE = Page("your_own_sensor.md")
+PAGE = Page("docs/your_own_sensor.md")
 FILE = "my_sheet.toml"
 SMALLER = {
     "--scenes 2000": "--scenes 60 --jobs 1",
@@ -25,9 +26,9 @@ def test_networks_of_ones_own_make_auto_hybrid(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     (tmp_path / FILE).write_text(PAGE.file(FILE))
     with Newcomer(tmp_path, SMALLER) as newcomer:
-        *_, judged = newcomer.follow(PAGE.commands(6))
+        *_, judged = newcomer.follow(PAGE.commands("6"))
         assert "method auto" in judged
-        demo, press, _, status, _ = PAGE.commands(4)
+        demo, press, _, status, _ = PAGE.commands("4")
         newcomer.run(demo)
         newcomer.run(press)
         said = newcomer.wait_for(f"{status} --json", '"tier": "')
