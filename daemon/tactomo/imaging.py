@@ -235,16 +235,21 @@ class Imaging:
         volts = {scan.channel: scan.volts for scan in dual.scans}
         self._publish_scan(dual, timing, volts)
         frame = self._reconstruct(volts, _saturated(dual), is_exact=mark is not None)
+        self._record_mark(dual, timing)  # first: whatever was seen is in the recording
         if frame is not None:
             self._contacts = len(frame.contacts)
             self._publish_frame(dual, timing, frame)
-        if self._marked is not None and dual.recording == self._marked.number:
-            keys = tuple(ScanKey(s.channel, s.counter, s.device_us) for s in dual.scans)
-            tier, budget_ms = self.given
-            number = self._marked.references or None
-            done = Mark(keys, str(tier), budget_ms, timing=timing, reference_number=number)
-            self._marked.add(mark_entry(done, time.monotonic_ns(), time.time_ns()))
         self._go_on_taring(volts, lost)
+
+    def _record_mark(self, dual: DualScan, timing: Timing) -> None:
+        """Put into the recording that a frame was made of these scans, and how."""
+        if self._marked is None or dual.recording != self._marked.number:
+            return
+        keys = tuple(ScanKey(s.channel, s.counter, s.device_us) for s in dual.scans)
+        tier, budget_ms = self.given
+        number = self._marked.references or None
+        done = Mark(keys, str(tier), budget_ms, timing=timing, reference_number=number)
+        self._marked.add(mark_entry(done, time.monotonic_ns(), time.time_ns()))
 
     def _obey(self, mark: Mark) -> None:
         """Put in force what was in force when this dual scan was recorded."""

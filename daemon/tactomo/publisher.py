@@ -48,7 +48,8 @@ class Publisher:
         sensor: the name in every topic.
         session: identity of this run of the daemon.
         status: returns the current fields of a `status` message; called by the thread.
-        on_sent: called by the thread with kind and bytes of each frame's message just sent.
+        on_frame: called by the thread with kind and bytes of each frame's message, before it is
+            sent: whatever was seen is in the recording.
         on_event: told of a flood of subscriptions.
 
     Attributes:
@@ -65,7 +66,7 @@ class Publisher:
         sensor: str,
         session: str,
         status: Callable[[], Mapping[str, Any]],
-        on_sent: Callable[[str, bytes], None],
+        on_frame: Callable[[str, bytes], None],
         on_event: OnEvent,
     ) -> None:
         self.address = ""
@@ -76,7 +77,7 @@ class Publisher:
         self._sensor = sensor
         self._session = session
         self._status = status
-        self._on_sent = on_sent
+        self._on_frame = on_frame
         self._on_event = on_event
         self._sequence: Counter[str] = Counter()  # the last one of each kind, under _lock
         self._lock = threading.Lock()
@@ -200,11 +201,11 @@ class Publisher:
     def _send(self, message: _Outgoing) -> bytes:
         envelope = self._stamp(message.sequence, message.header)
         data = encode_message(self._sensor, message.kind, {**envelope, **message.fields})
+        if message.kind not in (STATUS, EVENT):
+            self._on_frame(message.kind, data)
         self._socket.send(data, zmq.DONTWAIT)
         if message.kind == CONTACTS and envelope["age_ns"] is not None:
             self.latency.add((envelope["age_ns"] - envelope["delay_ns"]) * 1e-9)
-        if message.kind not in (STATUS, EVENT):
-            self._on_sent(message.kind, data)
         return data
 
     def _send_status(self) -> None:
