@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 from selenium import webdriver
 from selenium.common.exceptions import WebDriverException
 from selenium.webdriver.chrome.service import Service
@@ -26,6 +27,11 @@ CHROMIUM_OPTIONS = (
     "--force-device-scale-factor=1",
     "--window-size=1280,900",
 )
+
+
+# Nothing depends on the wall clock, nor on how fast the computer is.
+settings.register_profile("tactomo", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("tactomo")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

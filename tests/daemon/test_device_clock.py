@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tactomo.clock import ClockState, DeviceClock, Point, lower_hull, slope_below
 from tactomo_protocol import Channel
@@ -246,7 +246,6 @@ def test_two_channels_of_one_device_are_one_clock() -> None:
     assert late_ns == 20_000_000  # it was taken 20 ms before the other and came with it
 
 
-@settings(deadline=None)
 @given(
     st.lists(
         st.tuples(st.integers(0, 2**64 - 1), st.integers(0, 4_000_000_000)), min_size=1, max_size=80
@@ -263,7 +262,6 @@ def test_whatever_a_device_says_nothing_is_acquired_after_it_came(
         assert late_ns is None or late_ns >= 0
 
 
-@settings(deadline=None)
 @given(
     st.dictionaries(st.integers(0, 10**12), st.integers(0, 10**12), min_size=2, max_size=40).map(
         lambda points: [Point(at, lag) for at, lag in sorted(points.items())]

@@ -63,7 +63,7 @@ def fed(data: bytes, kind: type[ForeignProtocol] = Matrix, **changes: Any) -> Fo
 
 
 @given(st.lists(st.integers(1, 400), max_size=30))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_an_openeit_frame_comes_whole_in_any_chunking(cuts: list[int]) -> None:
     stream = BANNER + openeit_line(VALUES[:192]) + b"Imaging\n" + openeit_line(VALUES[1:193])
     protocol, packets = OpenEit(OPENEIT), []
@@ -220,7 +220,7 @@ def test_a_line_that_never_ends_takes_no_memory() -> None:
 
 
 @given(st.data())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_a_recording_may_begin_anywhere(data: st.DataObject) -> None:
     """What a new object is told at the cut makes it say what the old one goes on to say."""
     rows = b"A\n" + b"".join(teensy_line(VALUES[k : k + 16]) for k in range(16))
@@ -255,7 +255,7 @@ def test_a_new_cable_does_not_finish_the_old_line(kind: type[ForeignProtocol]) -
 
 @pytest.mark.parametrize("kind", [OpenEit, Matrix])
 @given(data=st.data())
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_any_bytes_are_survived(kind: type[ForeignProtocol], data: st.DataObject) -> None:
     fields = st.sampled_from([b"1", b"2.5", b"-3e2", b"nan", b"inf", b"1e999", b"A", b"x", b"\xff"])
     pieces = st.sampled_from([b",", b", ", b"\t", b";", b"\n", b"\r\n", b"A\n", b"magnitudes: "])

@@ -37,9 +37,7 @@ A_CHUNK = 2
 """Dual scans in each chunk."""
 ORIGIN = Origin("left", "paper_square", "ab" * 32, ("/dev/ttyACM0",), "0.1.0")
 HELLO = Hello("bench-1", "1.2.3", tuple(Channel), 16, 1, 1, 208, SampleFormat.INT32, 1e-6, 20.0)
-TAKES_FILES = settings(
-    deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+TAKES_FILES = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def scan(channel: Channel, counter: int) -> Scan:

@@ -68,7 +68,7 @@ def test_frames_become_scans_after_a_hello() -> None:
     assert (port.counts.packets, port.counts.corrupt) == (6 * 64, 0)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.lists(st.integers(1, 9000), max_size=40))
 def test_any_chunking_says_the_same(lengths: list[int]) -> None:
     data, port, packets, at = stream(MESSAGES), Sciospec(TANK), list[Packet](), 0
@@ -79,7 +79,7 @@ def test_any_chunking_says_the_same(lengths: list[int]) -> None:
     assert numbers(packets) == [1, 2, 3, 4, 5]
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(st.integers(128, 6 * 64 - 1), st.binary(max_size=300))
 def test_what_is_lost_or_damaged_costs_its_frame_and_no_other(place: int, junk: bytes) -> None:
     said = [message for frame in MESSAGES for message in frame]
@@ -282,7 +282,7 @@ def test_what_the_instrument_cannot_do_is_refused_at_once(tmp_path: Path) -> Non
         protocol_named("sciospec", sensor(tmp_path, current_a="current_a = 0.1"))
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(st.binary(max_size=2000))
 def test_any_bytes_are_survived(data: bytes) -> None:
     port = Sciospec(TANK)

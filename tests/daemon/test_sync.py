@@ -6,7 +6,7 @@ from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tactomo.port import ChannelScan
 from tactomo.sync import DualScan, Sync
@@ -35,7 +35,6 @@ arrivals = st.lists(
 )
 
 
-@settings(deadline=None)
 @given(arrivals, st.integers(0, 2**32 - 1))
 def test_every_scan_is_joined_sent_alone_or_counted_once(
     steps: list[tuple[Channel, int, int, int]], start: int
@@ -64,7 +63,6 @@ def test_every_scan_is_joined_sent_alone_or_counted_once(
         assert {single.counter for single in dual.scans} == {dual.counter}
 
 
-@settings(deadline=None)
 @given(st.lists(st.tuples(st.booleans(), st.booleans(), st.booleans()), max_size=60))
 def test_what_comes_in_time_is_joined_and_stays_in_order(
     instants: list[tuple[bool, bool, bool]],
@@ -108,7 +106,6 @@ instants = st.lists(st.builds(Instant, lag(), lag(), st.booleans()), max_size=40
 PERIODS_NS = st.sampled_from([2_000_000, 10_000_000, 50_000_000])
 
 
-@settings(deadline=None)
 @given(instants, PERIODS_NS, st.sampled_from([0, 5, 2**32 - 7]), st.integers(1, 40) | st.none())
 def test_lags_skips_and_repeats_lose_no_pair_and_make_no_wrong_one(
     taken: list[Instant], period_ns: int, start: int, zero_at: int | None

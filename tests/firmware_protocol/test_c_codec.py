@@ -22,7 +22,7 @@ VECTORS = C_FOLDER.parent / "vectors"
 COMMAND_TYPE = 0x81
 JsonMap = dict[str, Any]
 # One program serves all examples.
-quickly = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+quickly = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def load(name: str) -> list[JsonMap]:

@@ -316,7 +316,7 @@ def test_hello_without_room_is_not_forgotten(device: SimulatedDevice) -> None:
     assert device.poll() == []
 
 
-@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     st.lists(
         st.one_of(

@@ -34,7 +34,6 @@ def feed_all(decoder: Decoder, chunks: Iterable[bytes]) -> list[Packet]:
     return [packet for chunk in chunks for packet in decoder.feed(chunk)]
 
 
-@settings(deadline=None)
 @given(st.data(), st.lists(PACKETS, max_size=8))
 def test_any_packets_round_trip_in_any_chunks(data: st.DataObject, packets: list[Packet]) -> None:
     frames = [encode(packet) for packet in packets]
@@ -47,7 +46,6 @@ def test_any_packets_round_trip_in_any_chunks(data: st.DataObject, packets: list
     assert decoder.counts.unknown_type == sum(isinstance(p, UnknownPacket) for p in packets)
 
 
-@settings(deadline=None)
 @given(st.lists(SMALL_PACKETS, min_size=1, max_size=4))
 def test_byte_by_byte_is_the_same(packets: list[Packet]) -> None:
     stream = b"".join(map(encode, packets))
@@ -88,7 +86,7 @@ ANY_STREAM = st.lists(
 ).map(b"".join)
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(st.data(), ANY_STREAM)
 def test_any_bytes_decode_without_an_exception_and_alike_in_any_chunks(
     data: st.DataObject, stream: bytes
@@ -112,7 +110,7 @@ def is_for_the_device_to_refuse(packet: Packet) -> bool:
     )
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(contents())
 def test_whatever_decodes_is_a_packet_that_can_be_sent(content: bytes) -> None:
     decoder = Decoder()
@@ -189,7 +187,7 @@ def is_subsequence(part: Iterable[Packet], whole: Iterable[Packet]) -> bool:
     return all(any(candidate == packet for candidate in rest) for packet in part)
 
 
-@settings(deadline=None, max_examples=400)
+@settings(max_examples=400)
 @given(st.data(), st.lists(SMALL_PACKETS, min_size=1, max_size=6), st.integers(1, 4))
 def test_damage_loses_only_what_it_touches_and_invents_nothing(
     data: st.DataObject, sent: list[Packet], times: int

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tactomo_protocol import Decoder, Packet, encode, vectors
 
@@ -235,7 +235,6 @@ PIECES = st.one_of(
 )
 
 
-@settings(deadline=None)
 @given(st.lists(PIECES, max_size=6).map(b"".join))
 def test_both_readings_of_the_specification_agree_on_any_stream(stream: bytes) -> None:
     assert fields_and_counts(stream) == read_stream(stream)

@@ -9,7 +9,7 @@ from typing import Any
 import msgpack  # type: ignore[import-untyped]
 import pytest
 from fuzz_targets import HEADER, TARGETS
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from tactomo_client import MessageError
 from tactomo_client.messages import MAX_DEPTH, MAX_ENTRIES, decode_message, encode_message
@@ -17,7 +17,7 @@ from tactomo_models import load_description
 from tactomo_models.errors import DescriptionError
 from tactomo_models.sensors import __path__ as sensors_path
 
-QUICK = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+QUICK = settings(max_examples=150)
 POSITION = st.integers(0, 2**16)
 
 

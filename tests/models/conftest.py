@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
 from noisy_skin import Skin
 from small_sensor import SMALL
 from tactomo_models import (
@@ -19,9 +18,6 @@ from tactomo_models import (
 )
 from tactomo_models.forward import ForwardModel
 from threadpoolctl import threadpool_limits
-
-settings.register_profile("models", deadline=None)  # nothing here depends on the wall clock
-settings.load_profile("models")
 
 
 @pytest.fixture(scope="session")
