@@ -83,7 +83,7 @@ def test_it_says_when_data_are_stale() -> None:
 
 def old_frame(fake: FakeSensor) -> None:
     for _ in ("map", "status", "event"):
-        fake.wait_for_subscriber()
+        fake.wait_for_subscriber(60)
     fake.publish_message("status", STATUS)
     fake.publish([], **images(), acquired_monotonic_ns=time.monotonic_ns() - 2_000_000_000)
 

@@ -99,10 +99,12 @@ def test_a_path_here_is_made_absolute(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_a_daemon_that_was_away_answers_again() -> None:
     with FakeControl({"tare": {"scans": 1}}) as control:
-        daemon = Daemon(control.address, timeout_s=0.05)
+        daemon = Daemon(control.address, timeout_s=PATIENCE_S)
         assert daemon.tare().scans == 1
+    daemon.timeout_s = 0.05
     with pytest.raises(NoAnswer, match=r"nothing answered at .* start the daemon"):
         daemon.status()
+    daemon.timeout_s = PATIENCE_S
     with FakeControl({"tare": {"scans": 2}}, control.address):
         assert daemon.tare().scans == 2
     daemon.close()

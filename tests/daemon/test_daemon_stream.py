@@ -112,7 +112,7 @@ def test_a_stalled_subscriber_slows_nobody(bench: Start, connect: Start) -> None
         b.step(load=0.1)
     maps = [m for m in b.listener.of("map") if m["scan_counter"] > start]
     assert len(maps) == 400
-    assert np.percentile([m["age_ns"] for m in maps], 50) < 50e6
+    assert np.percentile([m["age_ns"] for m in maps], 50) < 500e6
 
 
 def test_the_newest_scan_wins_when_the_reconstruction_lags(bench: Start) -> None:

@@ -230,7 +230,7 @@ def test_a_client_that_is_not_listed_is_refused_and_told_of(guarded: Any, robot:
         assert command in event["next_step"]
         assert f"`tactomo keys allow stranger.key --for {SERVER}`" in caught.value.next_step
         with pytest.raises(KeysError) as refused:
-            request("status", guarded.daemon.control_address, 5.0, keys=stranger)
+            request("status", guarded.daemon.control_address, PATIENCE_S, keys=stranger)
         assert refused.value.name == "key_refused"
         robot.allow(stranger)  # and now it is let in, without a restart of either
         guarded.tare()
@@ -243,7 +243,7 @@ def test_a_client_that_is_not_listed_is_refused_and_told_of(guarded: Any, robot:
 def test_a_reader_may_not_command(guarded: Any, robot: Robot) -> None:
     ros = robot.allow(robot.client("ros"))
     with pytest.raises(KeysError) as refused:
-        request("tare", guarded.daemon.control_address, 5.0, keys=ros)
+        request("tare", guarded.daemon.control_address, PATIENCE_S, keys=ros)
     assert refused.value.name == "key_refused"
     event = guarded.listener.event("client_refused")
     assert "may not use the control" in event["detail"]
@@ -254,7 +254,7 @@ def test_the_wrong_server_key_is_noticed(guarded: Any, robot: Robot) -> None:
     key_files.make_pair(robot.folder, "impostor", is_server=True)
     misled = robot.allow(robot.client("misled", server="impostor"))
     with pytest.raises(KeysError) as caught:
-        request("status", guarded.daemon.control_address, 5.0, keys=misled)
+        request("status", guarded.daemon.control_address, PATIENCE_S, keys=misled)
     assert caught.value.name == "wrong_server"
 
 
@@ -377,7 +377,7 @@ def test_without_a_doorkeeper_the_door_stays_shut(robot: Robot) -> None:
         server.setsockopt(zmq.LINGER, 0)
         address = bind(server, "tcp://127.0.0.1:0", "control", secret=secret)
         with pytest.raises(KeysError):
-            request("status", address, 1.0, keys=keys)
+            request("status", address, PATIENCE_S, keys=keys)
         assert not server.poll(0)
 
 

@@ -53,12 +53,12 @@ def test_one_channel_missing_is_flagged_and_the_maps_go_on(
 
 def test_a_channel_that_stays_out_is_lost_and_comes_back(bench: Start) -> None:
     # A wait that would be noticed if every frame had to pay for it.
-    b = bench(ports=2, sync_wait_ms=300)
+    b = bench(ports=2, sync_wait_ms=800)
     b.tare()
     while not any(e["name"] == "channel_lost" for e in b.listener.of("event")):
         b.step(channels=(Channel.MAGNITUDE,))
     frame = b.step(channels=(Channel.MAGNITUDE,))
-    assert frame["age_ns"] < 250e6  # not waited for any more
+    assert frame["age_ns"] < 750e6  # not waited for any more
     # The first pair is what shows that the channel is back: it may still be sent on alone.
     b.step()
     b.listener.event("channel_back")

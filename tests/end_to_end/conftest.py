@@ -21,7 +21,7 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         os.environ["XDG_CACHE_HOME"] = before
 
 
-@pytest.fixture(scope="session", params=[1, 2], ids=["one port", "two ports"])
+@pytest.fixture(scope="module", params=[1, 2], ids=["one port", "two ports"])
 def any_demo(request: pytest.FixtureRequest) -> Iterator[Demo]:
     """A demo with one port for both channels, and one with a port for each."""
     with running_demo("--ports", str(request.param)) as demo:

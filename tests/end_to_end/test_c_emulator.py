@@ -148,7 +148,7 @@ def test_a_press_on_the_emulator_is_found_where_it_was(
 ) -> None:
     rig = Rig(program, tmp_path, "--ports", ports, *presses)
     rigs.append(rig)
-    rig.event(0, "tared")
+    wait_until(lambda: rig.daemon.told("tared"), "a reference")
     rig.emulator.press_enter()
     pressed = rig.frame(0, "a contact", lambda fields: len(fields["contacts"]) == 1)
     [contact] = pressed["contacts"]

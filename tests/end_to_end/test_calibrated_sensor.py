@@ -71,11 +71,10 @@ class Bench:
     def contact(self, kpa: float) -> Contact:
         """What the daemon says of a press that it has had time to look at."""
         self.press(kpa)
-        with subscribe(NAME, address=self.daemon.stream) as frames:
-            seen = 0
+        before = request("status", self._control)["counter"]
+        with subscribe(NAME, address=self.daemon.stream, timeout_s=PATIENCE_S) as frames:
             for frame in frames:
-                seen += len(frame.contacts) == 1
-                if seen > 12:
+                if frame.scan_counter > before + 12 and len(frame.contacts) == 1:
                     return frame.contacts[0]
         raise AssertionError
 
@@ -85,6 +84,7 @@ class Bench:
         self.daemon.popen.wait(PATIENCE_S)
 
 
+@pytest.mark.timeout(300)
 def test_a_guided_session_makes_pressures_right(
     twin: dict[str, list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

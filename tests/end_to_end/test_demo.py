@@ -13,6 +13,7 @@ import pytest
 from page import Page
 from selenium.webdriver import ActionChains, Chrome
 from selenium.webdriver.common.by import By
+from small_sensor import SMALL
 from whole_system import PATIENCE_S, SENSOR, Demo, running_demo, wait_for
 
 
@@ -118,8 +119,10 @@ def is_gone(pid: int) -> bool:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_a_demo_that_ends_leaves_no_process_behind(number: signal.Signals) -> None:
-    with running_demo("--ports", "1") as demo:
+def test_a_demo_that_ends_leaves_no_process_behind(number: signal.Signals, tmp_path: Path) -> None:
+    sensor = tmp_path / "small.toml"
+    sensor.write_text(SMALL)
+    with running_demo("--description", str(sensor)) as demo:
         children = children_of(demo.process.pid)
         assert len(children) == 3
         os.kill(demo.process.pid, number)

@@ -6,9 +6,8 @@ import math
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pytest
@@ -46,34 +45,44 @@ class Listener(threading.Thread):
         self._subscription = subscribe(SENSOR, address=demo.stream, timeout_s=PATIENCE_S)
         self._done = threading.Event()
 
+    def __enter__(self) -> Self:
+        self.start()
+        wait_for(lambda: self.frames, "the first frame")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._done.set()
+        self.join(PATIENCE_S)
+        self._subscription.close()
+
+    def hear_more(self, count: int) -> None:
+        """Wait for so many more frames than there are now."""
+        heard = len(self.frames)
+        wait_for(lambda: len(self.frames) >= heard + count, f"{count} frames")
+
     def run(self) -> None:
         for frame in self._subscription:
             self.frames[frame.scan_counter] = frame
             if self._done.is_set():
                 break
 
-    def stop(self) -> None:
-        self._done.set()
-        self.join(PATIENCE_S)
-        self._subscription.close()
-
 
 def test_a_replay_gives_the_maps_of_the_live_run(demo: Demo, tmp_path: Path) -> None:
     live, again = tmp_path / "live.mcap", tmp_path / "again.mcap"
     demo.press(15.0, 20.0, id="a")  # begun under load: the reference must come along
     wait_for(lambda: request("status", demo.control)["tier"] == "hybrid", "a contact")
-    listener = Listener(demo)
-    listener.start()
-    request("record_start", demo.control, path=str(live))
-    for x_mm, y_mm in ((15.0, 20.0), (0.0, 0.0), (-40.0, -35.0)):
-        demo.press(x_mm, y_mm, id="a", pressure_kpa=170)
-        time.sleep(0.6)
-    demo.press(40.0, -40.0, id="b", shape="rectangle")
-    time.sleep(0.6)
-    demo.clear()
-    time.sleep(0.4)
-    request("record_stop", demo.control)
-    listener.stop()
+    with Listener(demo) as listener:
+        request("record_start", demo.control, path=str(live))
+        for x_mm, y_mm in ((15.0, 20.0), (0.0, 0.0), (-40.0, -35.0)):
+            demo.press(x_mm, y_mm, id="a", pressure_kpa=170)
+            listener.hear_more(12)
+        demo.press(40.0, -40.0, id="b", shape="rectangle")
+        listener.hear_more(12)
+        demo.clear()
+        listener.hear_more(8)
+        request("record_stop", demo.control)
+        last = request("status", demo.twin)["counter"]
+        wait_for(lambda: max(listener.frames) > last, "all that was recorded")
     replayed = tactomo(
         *("daemon", "--port", f"replay://{live}?port=0&speed=0"),
         *("--port", f"replay://{live}?port=1&speed=0", "--record", again, "--record-maps"),
