@@ -10,6 +10,7 @@ against ground in volts, real and imaginary part by turns, with tabs between the
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -22,7 +23,7 @@ from tactomo.errors import TactomoError
 SUFFIX: Final = ".eit"
 HEADERS: Final = (9, 11, 18)
 MAX_BYTES: Final = 1 << 24
-_DATE: Final = "%Y.%m.%d. %H:%M:%S"
+_DATES: Final = ("%Y.%m.%d. %H:%M:%S.%f", "%Y.%m.%d. %H:%M:%S")
 _ANOTHER: Final = "is it a Sciospec file? Other programs have a format of that name, too"
 
 
@@ -133,14 +134,11 @@ class _Lines:
             raise self._wrong(number, f"{what} is no number", _ANOTHER) from None
 
     def _date(self, number: int) -> float:
-        text, _, thousandths = self._text(number).rpartition(".")
-        if ":" in thousandths:  # no thousandths
-            text, thousandths = self._text(number), "0"
-        try:
-            moment = datetime.strptime(text, _DATE).replace(tzinfo=UTC)
-            return moment.timestamp() + float(f"0.{thousandths}")
-        except ValueError:
-            raise self._wrong(number, "it is no date such as 2024.01.31. 12:30:05.250") from None
+        for form in _DATES:
+            with suppress(ValueError):
+                moment = datetime.strptime(self._text(number), form)
+                return moment.replace(tzinfo=UTC).timestamp()
+        raise self._wrong(number, "it is no date such as 2024.01.31. 12:30:05.250")
 
     def _pair(self, number: int) -> tuple[int, int]:
         try:

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tactomo_models import Reference, SensorDescription
 from tactomo_models.archive import read_arrays
-from tactomo_models.batch import scans_of
+from tactomo_models.batch import all_nan, scans_of
 from tactomo_models.plausibility import Layout
 from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag
 
@@ -41,6 +41,8 @@ from tactomo.errors import TactomoError
 FloatArray = NDArray[np.float64]
 # Share of the quadrature part above which the real part is not the whole story.
 MAX_QUADRATURE = 0.3
+# Of times and electrodes' numbers: seconds since 1970 until 2096.
+MOST = 4e9
 
 
 class ImportFileError(TactomoError):
@@ -158,7 +160,7 @@ def read_scans(
     """
     arrays = load_arrays(path)
     path = path if isinstance(path, Path) else path[0]
-    if "volts" in arrays and "injection" in arrays:
+    if is_single_ended(arrays):
         channel = channel or _only_channel(description)
         volts, time_s, notes = single_ended(path, arrays, description)
         return Scans({channel: volts}, time_s, notes=notes)
@@ -200,6 +202,11 @@ def load_arrays(path: Path | Sequence[Path]) -> dict[str, NDArray[Any]]:
         ) from error
 
 
+def is_single_ended(arrays: Mapping[str, Any]) -> bool:
+    """Tell whether a file's arrays are of the single-ended layout."""
+    return "volts" in arrays and "injection" in arrays
+
+
 def _only_channel(description: SensorDescription) -> Channel:
     if len(description.modalities) != 1:
         raise ImportFileError(
@@ -211,7 +218,7 @@ def _only_channel(description: SensorDescription) -> Channel:
 
 def _batch(path: Path, arrays: dict[str, NDArray[Any]], description: SensorDescription) -> Scans:
     foreign = sorted(arrays.keys() & _CHANNELS.keys() - set(description.modalities))
-    if any(not np.isnan(arrays[name]).all() for name in foreign):
+    if any(not all_nan(arrays[name]) for name in foreign):
         raise ImportFileError(
             f"{path} holds a channel that {description.name} does not have: {', '.join(foreign)}",
             "give another description with --sensor",
@@ -240,7 +247,7 @@ def single_ended(
     rows, signs = _injection_rows(path, injection - injection.min(), layout)
     plus, minus = layout.pairs.measure.T
     differences = signs * (raw[:, rows, plus] - raw[:, rows, minus])
-    quadrature = float(np.linalg.norm(differences.imag) / np.linalg.norm(differences))
+    quadrature = _quadrature(differences)
     notes = () if raw.dtype.kind != "c" else (f"real part taken; {quadrature:.0%} is quadrature",)
     if quadrature > MAX_QUADRATURE:
         raise ImportFileError(
@@ -249,6 +256,12 @@ def single_ended(
         )
     volts = np.asarray(differences.real, dtype=np.float64)
     return volts, _times(path, arrays, len(raw)), notes
+
+
+def _quadrature(differences: NDArray[Any]) -> float:
+    """Return the share of the signal that is out of phase with the current."""
+    known = differences[np.isfinite(differences)]
+    return float(np.linalg.norm(known.imag) / max(np.linalg.norm(known), np.finfo(float).tiny))
 
 
 def electrode_potentials(
@@ -273,12 +286,13 @@ def _single_ended_arrays(
 ) -> tuple[NDArray[np.int_], NDArray[Any]]:
     injection = _checked(path, "injection", arrays["injection"], (-1, 2)).astype(int)
     raw, electrodes = arrays["volts"], layout.electrode_count
-    if raw.shape[1:] != (len(injection), electrodes) or raw.dtype.kind not in "fciu":
+    fits = raw.shape[1:] == (len(injection), electrodes) and raw.size > 0
+    if not fits or raw.dtype.kind not in "fciu":
         raise ImportFileError(
             f"{path}: volts is {raw.dtype} {raw.shape}",
             f"it must be numbers (T, {len(injection)}, {electrodes})",
         )
-    return injection, raw
+    return injection, raw.astype(np.result_type(raw, np.float64))
 
 
 def _injection_rows(
@@ -303,7 +317,9 @@ def _times(path: Path, arrays: dict[str, NDArray[Any]], count: int) -> FloatArra
         return None
     time_s = _checked(path, "t", arrays["t"], (count,))
     if np.any(np.diff(time_s) < 0):
-        raise ImportFileError(f"{path}: t does not rise", "sort the frames, or give --rate")
+        raise ImportFileError(
+            f"{path}: t does not rise", "sort the frames by it, or leave it out and give --rate"
+        )
     return np.asarray(time_s - time_s[0])
 
 
@@ -316,4 +332,7 @@ def _checked(path: Path, name: str, array: NDArray[Any], shape: tuple[int, ...])
         raise ImportFileError(
             f"{path}: {name} is {array.dtype} {array.shape}", f"it must be real numbers {wanted}"
         )
-    return array.astype(np.float64)
+    numbers = array.astype(np.float64)
+    if not np.all(np.abs(numbers) <= MOST):
+        raise ImportFileError(f"{path}: {name} holds what is out of range", "correct it")
+    return numbers

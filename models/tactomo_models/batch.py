@@ -137,7 +137,7 @@ def scans_of(
     scans: dict[str, FloatArray] = {}
     references: dict[str, FloatArray] = {}
     for name in description.modalities:
-        if name in arrays and not _all_nan(arrays[name]):
+        if name in arrays and not all_nan(arrays[name]):
             scans[name] = _checked(source, name, arrays[name], (None, description.measurements))
             key = f"{name}_reference"
             if key in arrays:
@@ -160,7 +160,8 @@ def _averaged(noise: FloatArray | None, rest: FloatArray | None) -> int:
     return int(np.clip((noise.max() / max(rest.max(), 1e-30)) ** 2, 1, 1e6))
 
 
-def _all_nan(array: Any) -> bool:
+def all_nan(array: Any) -> bool:
+    """Whether an array stands for a channel that is not there."""
     return array.dtype.kind == "f" and bool(np.isnan(array).all())
 
 

@@ -87,6 +87,16 @@ def test_a_reversed_and_shuffled_injection_is_put_right(tactomo: Run, tmp_path: 
     assert [time_s for time_s, _ in read] == pytest.approx([0.0, 0.1, 0.2], abs=1e-6)
 
 
+def test_a_converters_counts_are_taken_as_they_are(tactomo: Run, tmp_path: Path) -> None:
+    """Also unsigned ones, whose differences may be below zero."""
+    counts = np.random.default_rng(2).integers(0, 1 << 16, (2, ELECTRODES, ELECTRODES), np.uint16)
+    np.savez(tmp_path / "in.npz", injection=INJECTION, volts=counts)
+    result = tactomo("import", "in.npz", "out.mcap", "--sensor", "tank_disc", "--rate", "10")
+    assert result.returncode == 0, result.stderr
+    got = np.array([scan.samples for _, scan in scans(open_recording(tmp_path / "out.mcap"))])
+    assert np.array_equal(got, expected(counts.astype(float)))
+
+
 def test_the_batch_layout_keeps_channels_reference_and_gaps(tactomo: Run, tmp_path: Path) -> None:
     arrays: dict[str, Any] = {
         "magnitude": potentials(4).reshape(4, -1)[:, :208],
@@ -122,6 +132,18 @@ def test_the_batch_layout_keeps_channels_reference_and_gaps(tactomo: Run, tmp_pa
             "differ in length",
         ),
         ({"magnitude": np.zeros((4, 208)), "t": [0, 2, 1, 3]}, [], "t does not rise"),
+        ({"magnitude": np.zeros((4, 208)), "t": [0, 1, np.nan, 3]}, [], "t holds what is out of"),
+        ({"magnitude": np.zeros((4, 208)), "t": [0, 1, 2, 1e13]}, [], "t holds what is out of"),
+        (
+            {"structure": np.zeros((4, 208)), "magnitude": np.array(["a"])},
+            ["--rate", "1", "--sensor", "tank_disc"],
+            "a channel that tank_disc does not have",
+        ),
+        (
+            {"injection": INJECTION, "volts": potentials(2)[:0]},
+            ["--rate", "1", "--sensor", "tank_disc"],
+            "volts is float64 (0, 16, 16)",
+        ),
         (
             {"magnitude": np.zeros((4, 208))},
             ["--rate", "1", "--sensor", "tank_disc"],
@@ -207,6 +229,7 @@ def test_sciospecs_files_are_read_in_the_order_of_their_dates(
         (1, "12", "line 1: 12, not 9 or 11 or 18 header lines; is it a Sciospec file"),
         (1, "eit", "line 1: the number of header lines is no number"),
         (4, "yesterday", "line 4: it is no date such as"),
+        (4, "2024.01.31. 12:30:05.5e999", "line 4: it is no date such as"),
         (8, "3", "line 8: 3 frequencies; save one"),
         (19, "1 1", "line 19: 1 1 is no injection"),
         (20, "0.1\t0.2\t0.3", "line 20: 3 numbers, not pairs"),

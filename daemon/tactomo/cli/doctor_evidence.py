@@ -27,7 +27,7 @@ from tactomo_models.plausibility import Layout
 from tactomo_protocol import SCAN_COUNTERS, Channel, Hello, Scan, ScanFlag
 
 from tactomo.errors import TactomoError
-from tactomo.imported import load_arrays, read_scans, single_ended
+from tactomo.imported import is_single_ended, load_arrays, read_scans, single_ended
 from tactomo.recording import Recording
 
 FloatArray = NDArray[np.float64]
@@ -389,7 +389,7 @@ def of_arrays(
     """
     known = None if description is None else load_description(description)
     arrays = load_arrays(path)
-    if array is None and "volts" in arrays and "injection" in arrays:
+    if array is None and is_single_ended(arrays):
         evidence = _single_ended_evidence(path, arrays, known)
     elif array is None and arrays.keys() & {"magnitude", "structure"}:
         evidence = _batch_evidence(path, known or load_description("paper_square"))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tactomo_models import Modality, Press, SensorDescription
 
-from tactomo.imported import electrode_potentials, load_arrays, read_scans
+from tactomo.imported import electrode_potentials, is_single_ended, load_arrays, read_scans
 
 REST_FRAMES = 40
 """How often a file's reference is said first, so that a daemon can tare by it."""
@@ -68,9 +68,8 @@ class Player:
     def __init__(self, path: Path, description: SensorDescription, once: bool = False) -> None:
         scans = read_scans(path, description, None)
         arrays = load_arrays(path)
-        is_single_ended = "injection" in arrays
         self._potentials = (
-            electrode_potentials(path, arrays, description) if is_single_ended else None
+            electrode_potentials(path, arrays, description) if is_single_ended(arrays) else None
         )
         self._volts: dict[Modality, NDArray[np.float64]] = {
             _modality(channel.name.lower()): volts for channel, volts in scans.volts.items()
