@@ -259,25 +259,31 @@ def _rows(path: Path) -> tuple[list[dict[str, str]], list[int], list[str]]:
         raise CalibrationError(
             f"{path} holds no readings; give a line of column names, and a line for each"
         )
-    header = kept[0][1]
+    number, header = kept[0]
     delimiter = max(",;\t", key=header.count)
-    columns = [name.strip().lower() for name in header.split(delimiter)]
+    columns = [name.lower() for name in _cells(path, number, header, delimiter)]
     rows = [_row(path, number, line, columns, delimiter) for number, line in kept[1:]]
     return rows, [number for number, _ in kept[1:]], columns
 
 
 def _row(path: Path, number: int, line: str, columns: list[str], delimiter: str) -> dict[str, str]:
     """One line's cells by column."""
-    try:
-        (cells,) = csv.reader([line], delimiter=delimiter, strict=True)
-    except (csv.Error, ValueError) as error:
-        raise CalibrationError(f"{path}, line {number}: {error}; correct it") from error
+    cells = _cells(path, number, line, delimiter)
     if len(cells) < len(columns):
         raise CalibrationError(
             f"{path}, line {number} has {len(cells)} of {len(columns)} columns; complete it, or "
             "leave it out"
         )
-    return {name: cell.strip() for name, cell in zip(columns, cells, strict=False)}
+    return dict(zip(columns, cells, strict=False))
+
+
+def _cells(path: Path, number: int, line: str, delimiter: str) -> list[str]:
+    """One line's cells; quotes about them, as some programs put, are not part of them."""
+    try:
+        (cells,) = csv.reader([line], delimiter=delimiter, strict=True)
+    except (csv.Error, ValueError) as error:
+        raise CalibrationError(f"{path}, line {number}: {error}; correct it") from error
+    return [cell.strip() for cell in cells]
 
 
 def _still_pieces(cell: LoadCell) -> list[NDArray[np.intp]]:

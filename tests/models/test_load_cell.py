@@ -27,6 +27,10 @@ def test_forces_become_pressures_by_the_indenter(log: Path) -> None:
     assert (first.magnitude, second.direction) == (0.1, "up")
     log.write_text("force_n,magnitude\n100,0.1\n-0.2,0\n")
     assert read_load_cell(log, area_mm2=1000).pressure_kpa.tolist() == [100, 0]
+    log.write_text('"Force_N","magnitude, shown"\n"100","0.1"\n')
+    with pytest.raises(CalibrationError, match="it has: force_n, magnitude, shown"):
+        read_load_cell(log)
+    log.write_text('"force_n","magnitude"\n"100",0.1\n"-0.2","0"\n')
     joined = direct_readings(read_load_cell(log, area_mm2=1000))
     assert len(joined.readings) == 1
     assert joined.notes == ("1 lines without a load left out",)
