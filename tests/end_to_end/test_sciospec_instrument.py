@@ -84,7 +84,7 @@ def is_streaming(twin: Twin) -> bool:
 
 def tactomo(*arguments: object) -> str:
     command = [sys.executable, "-m", "tactomo.cli", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=500, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
