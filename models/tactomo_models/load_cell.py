@@ -86,9 +86,10 @@ class Seen:
 
 @dataclass(frozen=True)
 class Joined:
-    """Readings, and in words what was left out of them."""
+    """Readings, the number of the first line of each, and in words what was left out of them."""
 
     readings: tuple[Reading, ...]
+    lines: tuple[int, ...]
     notes: tuple[str, ...]
 
 
@@ -149,7 +150,8 @@ def direct_readings(cell: LoadCell) -> Joined:
         for i in loaded
     )
     left = len(cell.lines) - len(loaded)
-    return Joined(readings, (f"{left} lines without a load left out",) if left else ())
+    notes = (f"{left} lines without a load left out",) if left else ()
+    return Joined(readings, tuple(cell.lines[loaded].tolist()), notes)
 
 
 def joined_readings(cell: LoadCell, seen: Seen) -> Joined:
@@ -164,11 +166,13 @@ def joined_readings(cell: LoadCell, seen: Seen) -> Joined:
             "nothing was held still under a load for half a second; hold each press longer"
         )
     readings: list[Reading] = []
+    lines: list[int] = []
     missed: list[str] = []
     for piece in pieces:
         found = _reading(cell, piece, seen)
         if isinstance(found, Reading):
             readings.append(found)
+            lines.append(int(cell.lines[piece[0]]))
         else:
             missed.append(f"line {cell.lines[piece[0]]}, {found}")
     if len(missed) > len(readings):
@@ -179,7 +183,7 @@ def joined_readings(cell: LoadCell, seen: Seen) -> Joined:
             "shifts the load cell's"
         )
     notes = (f"{len(missed)} presses left out, such as {missed[0]}",) if missed else ()
-    return Joined(tuple(readings), notes)
+    return Joined(tuple(readings), tuple(lines), notes)
 
 
 class _Table:

@@ -48,6 +48,7 @@ def test_a_table_of_magnitudes_is_fitted_kept_and_shown(tactomo: Run, tmp_path: 
     assert tried.returncode == 0, tried.stderr
     assert not calibration_path("palm").exists()
     assert "kept in" not in tried.stdout
+    assert "disagrees" not in tried.stderr
     options = ("--picture", "curve.png", "--device-id", "skin-7f3a")
     made = tactomo("calibrate", "palm", "--readings", "log.csv", *options)
     assert made.returncode == 0, made.stderr
@@ -62,6 +63,22 @@ def test_a_table_of_magnitudes_is_fitted_kept_and_shown(tactomo: Run, tmp_path: 
     assert kept.curve.pressure(np.array(0.12)) == pytest.approx(180, abs=1)
     shown = tactomo("calibrate", "palm", "--show")
     assert shown.stdout.splitlines()[:12] == made.stdout.splitlines()[:12]
+
+
+@pytest.mark.parametrize(
+    ("row", "kpa", "magnitude"),
+    [(5, 220, 2.0), (4, 190, 0.014), (6, 2000, 0.16), (6, 20, 0.16), (5, 2200, 0.2)],
+)
+def test_a_slip_in_a_table_is_named_by_its_line(
+    tactomo: Run, tmp_path: Path, row: int, kpa: float, magnitude: float
+) -> None:
+    lines = CSV.splitlines()
+    lines[row] = f"{kpa:g},{magnitude:g}"
+    (tmp_path / "log.csv").write_text("\n".join(["# by hand", *lines, "0,0"]) + "\n")
+    made = tactomo("calibrate", "palm", "--readings", "log.csv", "--dry-run")
+    said = f"line {row + 2} ({kpa:.0f} kPa, |Δσ|/σ₀ {magnitude:.3f}) disagrees with the others"
+    assert said in made.stderr
+    assert made.stderr.count("disagrees") == 1
 
 
 @pytest.mark.parametrize(

@@ -228,9 +228,24 @@ def _of_files(
         subject, joined = _with_recording(sensor, cell, recording, offset_s, description)
     if device_ids:
         subject = subject.model_copy(update={"device_ids": device_ids})
-    for note in joined.notes:
+    for note in (*joined.notes, *_slips(joined)):
         typer.echo(note, err=True)
     return PressureCalibration.of_readings(subject, joined.readings)
+
+
+def _slips(joined: Joined) -> list[str]:
+    """Name the lines that the others contradict."""
+    from tactomo_models.odd_readings import odd_readings
+
+    told = []
+    for index in odd_readings(joined.readings):
+        reading = joined.readings[index]
+        told.append(
+            f"line {joined.lines[index]} ({reading.pressure_kpa:.0f} kPa, |Δσ|/σ₀ "
+            f"{reading.magnitude:.3f}) disagrees with the others; if it is a slip, correct it or "
+            "leave it out, and run this again"
+        )
+    return told
 
 
 def _need(cell: LoadCell, path: Path, what: str) -> None:
