@@ -1,4 +1,4 @@
-"""Archives of arrays (.npz), which users bring and disks damage."""
+"""Files that are whole or not there, and archives of arrays (.npz), which disks damage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Batch reconstruction: scans from an .npz file to maps and contacts in another (design 6.4)."""
+"""Batch reconstruction: scans from an .npz file to maps and contacts in another."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def reconstruct_file(
         source: .npz with `magnitude` (T, M), `structure` (T, M), `magnitude_reference` (M,) and
             `structure_reference` (M,), volts on any common scale. A channel that is missing or
             all NaN is taken as absent.
-        target: .npz that is written; see DESIGN 6.4 or `tactomo reconstruct --help`.
+        target: .npz that is written; docs/files.md says what is in it.
         description: the sensor.
         method: one of `METHODS`.
         curve: of a pressure calibration; the description's if None.
@@ -181,7 +181,7 @@ def _checked(source: Path, name: str, array: Any, shape: tuple[int | None, ...])
 def frame_arrays(
     frames: list[Reconstruction], description: SensorDescription
 ) -> dict[str, NDArray[Any]]:
-    """Stack frames into the arrays of DESIGN 6.4; a map that is absent is NaN throughout."""
+    """Stack frames into the arrays of docs/files.md; a map that is absent is NaN throughout."""
     shape = (description.map.nodes_y, description.map.nodes_x)
     absent = np.full(shape, np.nan, np.float32)
     contacts = [(i, contact) for i, frame in enumerate(frames) for contact in frame.contacts]

@@ -214,22 +214,11 @@ def draw_sequence(
     )
     true_sensor = with_contrast(sensor, contrast)
 
-    def simulate() -> dict[str, FloatArray]:
-        seed = seed_of(seed_set, "moving sheet", number)
-        skin = UnevenSkin(true_sensor, fine_mesh(true_sensor), seed)
-        known: dict[tuple[Press, ...], dict[Modality, FloatArray]] = {}
-        for step in steps:
-            presses = tuple(step.presses.values())
-            if presses not in known:
-                known[presses] = skin.voltages(presses)
-        arrays = {f"{name}_rest": volts for name, volts in skin.voltages([]).items()}
-        for name in MODALITIES:
-            frames = [known[tuple(step.presses.values())][name] for step in steps]
-            arrays[f"{name}_pressed"] = np.array(frames)
-        return arrays
-
     what = f"{SIMULATION} {seed_set} {number} {steps!r} {true_sensor.model_dump_json()}"
-    arrays = cached(cache or cache_folder() / "scenes", what, simulate)
+    sheet_seed = seed_of(seed_set, "moving sheet", number)
+    arrays = cached(
+        cache or cache_folder() / "scenes", what, lambda: _simulate(true_sensor, steps, sheet_seed)
+    )
     volts = SimulatedVolts(
         rest={name: arrays[f"{name}_rest"] for name in MODALITIES},
         pressed={name: arrays[f"{name}_pressed"] for name in MODALITIES},
@@ -246,6 +235,23 @@ def draw_sequence(
         noise={name: noise_std(loaded, name, snr_db, snr_of) for name in MODALITIES},
         seed=seed_of(seed_set, "moving noise", number),
     )
+
+
+def _simulate(
+    sensor: SensorDescription, steps: tuple[Step, ...], seed: np.random.SeedSequence
+) -> dict[str, FloatArray]:
+    """Voltages of each channel at rest (M,) and in every step (T, M); each scene is solved once."""
+    skin = UnevenSkin(sensor, fine_mesh(sensor), seed)
+    known: dict[tuple[Press, ...], dict[Modality, FloatArray]] = {}
+    for step in steps:
+        presses = tuple(step.presses.values())
+        if presses not in known:
+            known[presses] = skin.voltages(presses)
+    arrays = {f"{name}_rest": volts for name, volts in skin.voltages([]).items()}
+    for name in MODALITIES:
+        frames = [known[tuple(step.presses.values())][name] for step in steps]
+        arrays[f"{name}_pressed"] = np.array(frames)
+    return arrays
 
 
 def _draw_indenters(rng: np.random.Generator, millimetre_m: float) -> Presses:
