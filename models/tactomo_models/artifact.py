@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from platformdirs import user_cache_path
 
 from tactomo_models.archive import read_arrays, write_whole
+from tactomo_models.bare_sheet import BareSheet, solve_bare_sheet
 from tactomo_models.description import SensorDescription
 from tactomo_models.errors import ArtifactError, DataError
-from tactomo_models.forward import BareSheet, ForwardModel, solve_bare_sheet
+from tactomo_models.forward import ForwardModel
 from tactomo_models.mesh import mesh_sheet
 from tactomo_models.tikhonov import even_spread, prior_weight, tikhonov_matrix
 

@@ -16,9 +16,9 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from tactomo_models.artifact import Artifact
+from tactomo_models.bare_sheet import scan_voltages, transfer_resistances
 from tactomo_models.changes import noise_limit
 from tactomo_models.description import SensorDescription
-from tactomo_models.forward import scan_voltages, transfer_resistances
 from tactomo_models.mesh import SheetMesh, mesh_sheet
 
 FloatArray = NDArray[np.float64]

@@ -11,8 +11,8 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
+from tactomo_models.bare_sheet import scan_voltages
 from tactomo_models.description import SensorDescription
-from tactomo_models.forward import scan_voltages
 from tactomo_models.lead_order import Order, find_order
 from tactomo_models.plausibility import (
     TINY,

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tactomo_models.bare_sheet import exchanged, scan_voltages
 from tactomo_models.description import SensorDescription
-from tactomo_models.forward import exchanged, scan_voltages
 from tactomo_models.plausibility import MOST_DEVIATION, deviation
 
 FloatArray = NDArray[np.float64]

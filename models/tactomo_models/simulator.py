@@ -11,13 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from tactomo_models.bare_sheet import scan_voltages, solve_bare_sheet, transfer_resistances
 from tactomo_models.description import Modality, SensorDescription
-from tactomo_models.forward import (
-    ForwardModel,
-    scan_voltages,
-    solve_bare_sheet,
-    transfer_resistances,
-)
+from tactomo_models.forward import ForwardModel
 from tactomo_models.mesh import mesh_sheet
 from tactomo_models.scene import Press, strongest
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tactomo.recording_writer import write_recording
 from tactomo_client import request
 from tactomo_models import SensorDescription, load_description, load_or_build_artifact
-from tactomo_models.forward import scan_voltages
+from tactomo_models.bare_sheet import scan_voltages
 from tactomo_models.pattern import reciprocal_pairs, scan_pairs
 from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag
 from whole_system import SENSOR, Demo, repository, running_demo

@@ -30,8 +30,9 @@ from tactomo_models import (
     SkinSimulator,
     build_artifact,
 )
+from tactomo_models.bare_sheet import solve_bare_sheet
 from tactomo_models.evaluation.faults import with_lead
-from tactomo_models.forward import ForwardModel, solve_bare_sheet
+from tactomo_models.forward import ForwardModel
 from tactomo_models.mesh import mesh_sheet
 from variants import variant
 

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import spherical_jn
 from tactomo_models import Press, SensorDescription, load_description
+from tactomo_models.bare_sheet import solve_bare_sheet, volts_per_unit
 from tactomo_models.evaluation.simulation import UnevenSkin, fine_mesh, with_contrast
-from tactomo_models.forward import ForwardModel, solve_bare_sheet, volts_per_unit
+from tactomo_models.forward import ForwardModel
 from tactomo_models.mesh import mesh_sheet
 from variants import variant
 

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tactomo_models import DataError, Press, SensorDescription, load_description
+from tactomo_models.bare_sheet import transfer_resistances
 from tactomo_models.evaluation.scenes import (
     GAP_M,
     MODALITIES,
@@ -29,7 +30,6 @@ from tactomo_models.evaluation.simulation import (
     with_contrast,
     with_opposite_magnitude,
 )
-from tactomo_models.forward import transfer_resistances
 from tactomo_models.mesh import SheetMesh, mesh_sheet
 from variants import variant
 

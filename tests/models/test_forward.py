@@ -9,12 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
 from tactomo_models import Artifact, SensorDescription, load_description
-from tactomo_models.forward import (
-    ForwardModel,
-    scan_voltages,
-    solve_bare_sheet,
-    transfer_resistances,
-)
+from tactomo_models.bare_sheet import scan_voltages, solve_bare_sheet, transfer_resistances
+from tactomo_models.forward import ForwardModel
 from tactomo_models.mesh import SheetMesh, mesh_sheet
 from variants import variant
 

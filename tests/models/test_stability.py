@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from tactomo_models import Artifact, DataError, Reconstructor, SensorDescription, build_artifact
 from tactomo_models import tikhonov as linear
+from tactomo_models.bare_sheet import exchanged
 from tactomo_models.evaluation.regimes import REGIMES, Plan, draw_plan
 from tactomo_models.evaluation.scenes import MODALITIES, gap_m, outline_of
 from tactomo_models.evaluation.simulation import (
@@ -30,7 +31,6 @@ from tactomo_models.evaluation.stability import (
     trust,
     trust_by_regime,
 )
-from tactomo_models.forward import exchanged
 from tactomo_models.training.simulate import displaced
 from variants import variant
 

@@ -21,6 +21,7 @@ from tactomo_models import (
     build_artifact,
     load_description,
 )
+from tactomo_models.bare_sheet import volts_per_unit
 from tactomo_models.batch import reconstruct_file
 from tactomo_models.evaluation.tanks import (
     TankImager,
@@ -32,7 +33,7 @@ from tactomo_models.evaluation.tanks import (
     read_tanks,
     simulated_tanks,
 )
-from tactomo_models.forward import ForwardModel, volts_per_unit
+from tactomo_models.forward import ForwardModel
 from tactomo_models.objects import SignedLevelSet
 from tactomo_models.shape_fit import ShapeFit, conductivity
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from tactomo_models import DataError, Press, SensorDescription, load_description
+from tactomo_models.bare_sheet import scan_voltages, transfer_resistances, volts_per_unit
 from tactomo_models.evaluation.scenes import draw_layout, gap_m, outline_of
 from tactomo_models.evaluation.simulation import UnevenSkin, fine_mesh, with_opposite_magnitude
-from tactomo_models.forward import scan_voltages, transfer_resistances, volts_per_unit
 from tactomo_models.mesh import SheetMesh, mesh_sheet
 from tactomo_models.training.presets import PRESET_NAMES, TrainingScene, draw_scene
 from tactomo_models.training.simulate import SceneSimulator, displaced

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from tactomo_models import SensorDescription, SkinSimulator
-from tactomo_models.forward import ForwardModel, exchanged
+from tactomo_models.bare_sheet import exchanged
+from tactomo_models.forward import ForwardModel
 from tactomo_models.greens import GreensFunction
 
 FloatArray = NDArray[np.float64]

@@ -183,7 +183,8 @@ class _Scene:
     @classmethod
     def build(cls, series: str, sensor: SensorDescription, spacing_m: float | None) -> _Scene:
         from tactomo_models.artifact import INVERSE_REFINEMENTS
-        from tactomo_models.forward import ForwardModel, solve_bare_sheet
+        from tactomo_models.bare_sheet import solve_bare_sheet
+        from tactomo_models.forward import ForwardModel
         from tactomo_models.mesh import mesh_sheet
 
         sheet = mesh_sheet(sensor, spacing_m, INVERSE_REFINEMENTS)
@@ -194,7 +195,7 @@ class _Scene:
     def measure(self, radius: float, places: tuple[tuple[float, float], ...]) -> Row:
         import numpy as np
         from tactomo_models import Press
-        from tactomo_models.forward import assemble_sheet, transfer_resistances
+        from tactomo_models.bare_sheet import assemble_sheet, transfer_resistances
 
         forward, bare = self.forward, self.forward.bare
         half_m = np.array([self.sensor.width_m, self.sensor.height_m]) / 2

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tactomo_models.bare_sheet import exchanged, scan_voltages, transfer_resistances, volts_per_unit
 from tactomo_models.description import Modality, SensorDescription
-from tactomo_models.forward import exchanged, scan_voltages, transfer_resistances, volts_per_unit
 from tactomo_models.mesh import SheetMesh, electrode_facets, mesh_sheet
 from tactomo_models.response import (
     MagnitudeChannel,

@@ -30,6 +30,7 @@ from scipy.spatial.distance import pdist
 from threadpoolctl import threadpool_limits
 
 from tactomo_models.archive import read_arrays, write_arrays, write_whole
+from tactomo_models.bare_sheet import scan_voltages, transfer_resistances, volts_per_unit
 from tactomo_models.description import Modality, SensorDescription
 from tactomo_models.errors import DataError, ModelError
 from tactomo_models.evaluation.simulation import (
@@ -37,7 +38,6 @@ from tactomo_models.evaluation.simulation import (
     with_contrast,
     with_opposite_magnitude,
 )
-from tactomo_models.forward import scan_voltages, transfer_resistances, volts_per_unit
 from tactomo_models.mesh import SheetMesh, mesh_sheet
 from tactomo_models.scene import strongest
 from tactomo_models.simulator import conductivity_ratio, smooth_noise
