@@ -244,7 +244,7 @@ class ShapeFit:
             shape: the shape.
             weight: (M,) inverse standard deviations of the data.
             spread: (M,) factor by which the variance of an estimate exceeds what independent
-                errors of that size would give it (see `reconstruct.CORRELATED`).
+                errors of that size would give it (see `changes.CORRELATED`).
         """
         J = self.jacobian(shape, weight) if shape.jacobian is None else shape.jacobian
         prior = np.diag(self._prior(shape)[0])
