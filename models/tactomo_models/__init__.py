@@ -6,7 +6,24 @@
     frame = reconstructor.reconstruct(magnitude, structure)
 
 Nothing here opens a port or a socket; what the daemon does live and what a researcher does
-offline run this same code.
+offline run this same code. Its modules, in the order in which each builds on those before:
+
+===============  =================================================================================
+a skin           pattern, sheet, response, section, description, description_file, symmetry
+its physics      mesh, condensation, greens, bare_sheet, forward, artifact, visibility
+a scan           plausibility, signs, reference, changes
+linear images    tikhonov
+networks         prefilter, network
+shapes           shape_fit, outlines, levelset, search, following, objects, paper_level_set
+contacts         areas, magnitudes, pressure, contacts, drawing, redrawing
+a frame          tier, reconstruct, batch, machine_speed
+drift            drift, press_memory, channel_baseline, baseline
+health           lead_order, examination, findings, diagnosis
+pressure         calibration, calibration_file, load_cell
+simulated skins  scene, simulator, skin_drift
+apart            evaluation, training: what is measured and learnt on scenes whose truth is known
+for all          errors, archive, toml_file
+===============  =================================================================================
 """
 
 from tactomo_models.artifact import (
