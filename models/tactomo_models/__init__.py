@@ -19,7 +19,7 @@ contacts         areas, magnitudes, pressure, contacts, drawing, redrawing
 a frame          tier, reconstruct, batch, machine_speed
 drift            drift, press_memory, channel_baseline, baseline
 health           lead_order, examination, findings, diagnosis
-pressure         calibration, calibration_file, load_cell
+pressure         calibration, odd_readings, calibration_file, load_cell
 simulated skins  scene, simulator, skin_drift
 apart            evaluation, training: what is measured and learnt on scenes whose truth is known
 for all          errors, archive, toml_file
