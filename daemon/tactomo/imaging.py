@@ -45,7 +45,8 @@ from tactomo.timing import Durations, Rate
 REPEAT_REFERENCE_S: Final = 60.0
 REFUSAL_PERIOD_S: Final = 600.0
 NO_DATA_S: Final = 3.0
-"""How long a tare on command waits for usable dual scans before it gives up."""
+"""How long a tare on command waits for usable dual scans before it gives up; where they come more
+slowly, a few of their periods."""
 
 MODALITIES: Final[tuple[tuple[Modality, Channel], ...]] = (
     ("magnitude", Channel.MAGNITUDE),
@@ -210,9 +211,13 @@ class Imaging:
     def start_tare(self, answer: Future[Mapping[str, Any]] | None = None) -> None:
         """Take a reference from the dual scans to come; `answer` gets what it became, or why."""
         self._tare = self._tare or Tare(self._tare_scans)
-        self._tare_deadline_s = time.monotonic() + NO_DATA_S
+        self._tare_deadline_s = time.monotonic() + self._no_data_s
         if answer is not None:
             self._tare.answers.append(answer)
+
+    @property
+    def _no_data_s(self) -> float:
+        return max(NO_DATA_S, self.frame_rate.pace.few_s)
 
     def check_tare(self) -> None:
         """Give up a tare on command for which nothing comes."""
@@ -220,7 +225,7 @@ class Imaging:
             self._refuse_tare(
                 self._tare,
                 CommandError(
-                    f"no usable dual scan for {NO_DATA_S:g} s",
+                    f"no usable dual scan for {self._no_data_s:.3g} s",
                     "`tactomo status` shows what the ports say",
                     "no_data",
                 ),
@@ -360,7 +365,7 @@ class Imaging:
         needed = {channel for channel in self._channels if channel not in lost}
         if not needed or not needed <= volts.keys():
             return
-        self._tare_deadline_s = time.monotonic() + NO_DATA_S
+        self._tare_deadline_s = time.monotonic() + self._no_data_s
         if not tare.add(volts, needed):
             return
         try:

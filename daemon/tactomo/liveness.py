@@ -5,6 +5,10 @@ out for `PATIENCE_S`, the device is in trouble of that kind. A device that answe
 that can be understood may have been left so by its USB bridge, which often comes to its senses
 when the port is closed and opened; so that is due after a while, and ever more rarely.
 
+A device that takes seconds for a scan is late after a few of its own periods, not sooner; what it
+says of its rate and what was seen of it tell how long those are. One that says hello in between is
+known to be silent as soon as any other.
+
 Nothing here reads a clock: times are handed in, in seconds on any one clock.
 """
 
@@ -13,8 +17,11 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Final
 
+from tactomo.timing import FEW, LONGEST_PERIOD_S, Pace
+
 PATIENCE_S: Final = 3.0
-"""A device says hello every second; without a word for so long it counts as silent."""
+"""A device says hello every second; without a word for so long it counts as silent, and without a
+scan as idle, unless it is slow by nature."""
 REOPEN_S: Final = 6.0
 REOPEN_MOST_S: Final = 60.0
 
@@ -37,21 +44,50 @@ class DeviceState(StrEnum):
 class Liveness:
     """Told what comes; says how the device does. For use by one thread.
 
+    Args:
+        says_hello: every second, scans or not, so that silence tells.
+        first_s: how long it may take until its pace is known.
+
     Attributes:
         state: as of the last call.
 
     """
 
-    def __init__(self) -> None:
+    def __init__(self, says_hello: bool = True, first_s: float = 0.0) -> None:
         self.state = DeviceState.STARTING
+        self._says_hello = says_hello
+        self._first_s = first_s
+        self._told_s = 0.0  # a few periods, by the rate that the device says
+        self._pace = Pace()  # of scans, as they come
         self._bytes_s = self._packet_s = self._scan_s = 0.0  # when each kind last came
-        self._reopen_wait_s = REOPEN_S
+        self._reopen_wait_s = self._reopen_after_s
         self._reopen_s = 0.0
+
+    @property
+    def patience_s(self) -> float:
+        """How long it may send no scan, in seconds."""
+        few_s = max(self._told_s, self._pace.few_s)
+        return max(PATIENCE_S, few_s or self._first_s)
+
+    @property
+    def silence_s(self) -> float:
+        """How long it may say nothing, in seconds."""
+        return PATIENCE_S if self._says_hello else self.patience_s
+
+    @property
+    def _reopen_after_s(self) -> float:
+        return max(REOPEN_S, 2 * self.silence_s)
+
+    def told(self, rate_hz: float) -> None:
+        """Take note of the scans a second that the device says it sends; 0 for no steady rate."""
+        self._told_s = FEW * min(1 / rate_hz, LONGEST_PERIOD_S) if rate_hz > 0 else 0.0
 
     def opened(self, now_s: float) -> None:
         """Take note that a device was plugged in: it gets its time to answer."""
         self.state = DeviceState.STARTING
-        self._reopen_wait_s = REOPEN_S
+        self._told_s = 0.0
+        self._pace.clear()
+        self._reopen_wait_s = self._reopen_after_s
         self.reopened(now_s)
 
     def reopened(self, now_s: float) -> None:
@@ -62,21 +98,22 @@ class Liveness:
     def heard(self, now_s: float, packets: int, scans: int) -> None:
         """Take note of what a read brought: bytes, with so many packets, so many of them scans."""
         self._bytes_s = now_s
-        if packets:
-            self._packet_s = now_s
-            self._reopen_wait_s = REOPEN_S
-            self._reopen_s = now_s + REOPEN_S
         if scans:
+            self._pace.add(now_s - self._scan_s)
             self._scan_s = now_s
             self.state = DeviceState.RUNNING
+        if packets:
+            self._packet_s = now_s
+            self._reopen_wait_s = self._reopen_after_s
+            self._reopen_s = now_s + self._reopen_wait_s
 
     def judge(self, now_s: float) -> DeviceState:
         """Return how the device does; a trouble lasts until what was missing comes again."""
-        if now_s - self._bytes_s >= PATIENCE_S:
+        if now_s - self._bytes_s >= self.silence_s:
             self.state = DeviceState.SILENT
-        elif now_s - self._packet_s >= PATIENCE_S:
+        elif now_s - self._packet_s >= self.silence_s:
             self.state = DeviceState.GARBAGE
-        elif now_s - self._scan_s >= PATIENCE_S:
+        elif now_s - self._scan_s >= self.patience_s:
             self.state = DeviceState.IDLE
         return self.state
 

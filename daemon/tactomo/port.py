@@ -37,7 +37,7 @@ from tactomo.adapters import ROOT
 from tactomo.clock import MAX_RATE, ClockState, DeviceClock
 from tactomo.connection import Connection
 from tactomo.events import OnEvent, RateLimit
-from tactomo.liveness import PATIENCE_S, DeviceState, Liveness
+from tactomo.liveness import DeviceState, Liveness
 from tactomo.open_serial import other_holders
 from tactomo.protocol_replay import ReplayEnded
 from tactomo.protocols import PortProtocol, Trouble
@@ -149,7 +149,7 @@ class PortReader:
         self._on_event = on_event
         self._connection = Connection(url, baud, on_event, root)
         self._is_replay = url.startswith(f"{REPLAY_SCHEME}://")
-        self._liveness = Liveness()
+        self._liveness = Liveness(protocol.says_hello, protocol.patience_s)
         self._protocol = protocol
         self._recording = 0  # number of the recording that has the last chunk
         self._preamble_s = 0.0  # when a recording was last given one
@@ -281,7 +281,7 @@ class PortReader:
 
     def _attend(self, now_s: float) -> None:
         """See to a device that does not do as it should."""
-        if now_s - self._asked_s > self._protocol.patience_s:
+        if now_s - self._asked_s > self._ask_after_s:
             self._ask()
         if self._is_zeroing.is_set():
             self._is_zeroing.clear()
@@ -289,6 +289,12 @@ class PortReader:
         self._tell_trouble(self._liveness.judge(now_s))
         if self._liveness.is_reopening_due(now_s):
             self._reopen()
+
+    @property
+    def _ask_after_s(self) -> float:
+        """Asking begins some foreign devices' scans anew: those that are slow get their time."""
+        least_s = self._protocol.patience_s
+        return least_s if self._protocol.says_hello else max(least_s, self._liveness.patience_s)
 
     def _reopen(self) -> None:
         """Close and open the port: what a USB bridge that hangs often needs."""
@@ -387,6 +393,7 @@ class PortReader:
 
     def _greet(self, hello: Hello) -> None:
         self._is_known = True
+        self._liveness.told(hello.scan_rate_hz)
         before = self.hello
         if hello == before:
             return
@@ -442,7 +449,7 @@ class PortReader:
         """Return in words what is the matter with a device in this state; empty if nothing is."""
         hello = self.hello
         if state is DeviceState.SILENT:
-            return f"nothing came for {PATIENCE_S:g} s"
+            return f"nothing came for {self._liveness.silence_s:.3g} s"
         if state is DeviceState.GARBAGE:
             return f"bytes come, but no packet of protocol {self.protocol} at {self._baud} baud"
         if state is DeviceState.IDLE and (hello is None or hello.scan_rate_hz > 0):

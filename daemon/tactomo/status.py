@@ -23,7 +23,8 @@ from tactomo.timing import Durations
 
 VERSION: Final = version("tactomo")  # read from a file, which may fail later
 STALE_S: Final = 1.0
-"""How old the newest dual scan may be before the daemon says that there are no data any more."""
+"""How old the newest dual scan may be before the daemon says that there are no data any more; where
+they come more slowly, a few of their periods."""
 
 
 class Status:
@@ -104,7 +105,8 @@ class Status:
         if not last_ns:
             is_waiting = any(port.state == "closed" for port in self._ports)
             return "waiting_for_port" if is_waiting else "waiting_for_data"
-        if time.monotonic_ns() - last_ns > STALE_S * 1e9:
+        stale_s = max(STALE_S, self._imaging.frame_rate.pace.few_s)
+        if time.monotonic_ns() - last_ns > stale_s * 1e9:
             return "stale"
         return "taring" if self._imaging.is_taring else "running"
 

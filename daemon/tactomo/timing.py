@@ -7,12 +7,18 @@ which a percentile does not mind.
 from __future__ import annotations
 
 import time
+from collections import deque
+from statistics import median_low
 from typing import Final
 
 import numpy as np
 
 RING: Final = 256
 RATE_WINDOW_NS: Final = 3_000_000_000
+WAITS: Final = 5
+FEW: Final = 3.0
+"""As many of its own periods late, and something has stopped."""
+LONGEST_PERIOD_S: Final = 60.0
 
 
 class Durations:
@@ -44,26 +50,56 @@ class Durations:
         return {"p50": float(p50), "p99": float(p99)}
 
 
+class Pace:
+    """How long the next of something takes to come: the median of the last few waits.
+
+    So what is slow by nature is given its time, and one long pause is nobody's pace.
+
+    Attributes:
+        few_s: seconds after which it is late: a few of its periods. 0 before the first one.
+
+    """
+
+    def __init__(self) -> None:
+        self.few_s = 0.0
+        self._waits_s: deque[float] = deque(maxlen=WAITS)
+
+    def add(self, wait_s: float) -> None:
+        """Take note of how long one was waited for."""
+        self._waits_s.append(wait_s)
+        self.few_s = FEW * min(median_low(self._waits_s), LONGEST_PERIOD_S)
+
+    def clear(self) -> None:
+        """Forget it: something else comes from now on."""
+        self._waits_s.clear()
+        self.few_s = 0.0
+
+
 class Rate:
-    """How often something comes, over the last seconds.
+    """How often something comes, over the last seconds, or a few periods of what is slower.
 
     Attributes:
         count: how often it came in all.
+        pace: how long the next one usually takes.
 
     """
 
     def __init__(self) -> None:
         self.count = 0
+        self.pace = Pace()
         self._times_ns = np.zeros(RING, dtype=np.int64)
 
     def add(self, monotonic_ns: int) -> None:
         """Take note of one that came at that time."""
+        if self.count:
+            self.pace.add((monotonic_ns - int(self._times_ns[(self.count - 1) % RING])) * 1e-9)
         self._times_ns[self.count % RING] = monotonic_ns
         self.count += 1
 
     def per_second(self) -> float:
         """Return the rate in Hz; 0 when nothing came for a while."""
-        since_ns = time.monotonic_ns() - RATE_WINDOW_NS
+        window_ns = max(RATE_WINDOW_NS, int(self.pace.few_s * 1e9))
+        since_ns = time.monotonic_ns() - window_ns
         recent = self._times_ns[self._times_ns > since_ns]
         if recent.size < 2:
             return 0.0

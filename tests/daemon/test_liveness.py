@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from tactomo.liveness import PATIENCE_S, REOPEN_MOST_S, REOPEN_S, DeviceState, Liveness
+from tactomo.timing import FEW, LONGEST_PERIOD_S
 
 
 @pytest.fixture
@@ -78,3 +81,71 @@ def test_a_device_that_is_plugged_in_again_begins_anew(device: Liveness) -> None
     assert device.judge(300.1) is DeviceState.STARTING
     device.judge(300 + REOPEN_S)
     assert device.is_reopening_due(300 + REOPEN_S)
+
+
+# Slow by nature
+
+
+def states_until(device: Liveness, now_s: float, end_s: float) -> set[DeviceState]:
+    """Return what it is taken for, looked at ten times a second; it is never opened anew."""
+    seen = set()
+    while now_s < end_s:
+        seen.add(device.judge(now_s))
+        assert not device.is_reopening_due(now_s)
+        now_s += 0.1
+    return seen
+
+
+@given(st.floats(PATIENCE_S, LONGEST_PERIOD_S))
+def test_a_slow_foreign_device_runs_and_one_that_stops_is_told_by_its_own_pace(
+    period_s: float,
+) -> None:
+    device = Liveness(says_hello=False)
+    device.opened(0.0)
+    for number in range(1, 4):  # each frame comes at once; the first one is too late to be known of
+        device.heard(number * period_s, 1, 1)
+    states = states_until(device, 3 * period_s, 3 * period_s + 0.9 * FEW * period_s)
+    assert states == {DeviceState.RUNNING}
+    assert device.judge(3 * period_s + 1.01 * FEW * period_s) is DeviceState.SILENT
+
+
+def test_until_its_pace_is_known_a_device_has_what_its_protocol_says() -> None:
+    device = Liveness(says_hello=False, first_s=10.0)
+    device.opened(0.0)
+    assert states_until(device, 0.0, 9.9) == {DeviceState.STARTING}
+    assert device.judge(10.1) is DeviceState.SILENT
+    for tenth in range(111, 120):
+        device.heard(tenth / 10, 1, 1)
+    assert device.judge(11.9 + PATIENCE_S + 0.1) is DeviceState.SILENT
+
+
+def test_a_device_of_ours_has_the_rate_that_it_says_and_is_silent_as_soon_as_any(
+    device: Liveness,
+) -> None:
+    device.told(rate_hz=0.1)
+    for number in range(3):
+        device.heard(110.0 + 10 * number, 2, 2)  # two channels at once: that is not its pace
+        device.heard(110.0 + 10 * number, 2, 2)
+        for second in range(1, 10):
+            device.heard(110.0 + 10 * number + second, 1, 0)
+            assert device.judge(110.0 + 10 * number + second) is DeviceState.RUNNING
+    assert device.judge(139.0 + PATIENCE_S) is DeviceState.SILENT
+    for second in range(140, 165):
+        device.heard(float(second), 1, 0)
+    assert device.judge(164.0) is DeviceState.IDLE
+
+
+def test_one_long_pause_is_nobodys_pace(device: Liveness) -> None:
+    for number in range(100):
+        device.heard(101.0 + number / 20, 1, 1)
+    device.heard(4000.0, 1, 1)
+    device.heard(4000.05, 1, 1)
+    assert device.patience_s == PATIENCE_S
+
+
+def test_another_device_has_another_pace(device: Liveness) -> None:
+    for number in range(5):
+        device.heard(110.0 + 10 * number, 1, 1)
+    assert device.patience_s == pytest.approx(30.0)
+    device.opened(200.0)
+    assert device.patience_s == PATIENCE_S

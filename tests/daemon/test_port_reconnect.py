@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from tactomo.connection import Connection
 from tactomo.errors import PortAbsentError, PortBusyError
 from tactomo.liveness import PATIENCE_S
 from tactomo.open_serial import DEVICE_GONE, open_serial
+from tactomo_models import load_description
 from tactomo_protocol import CommandCode
 
 Start = Callable[..., Any]
@@ -367,6 +369,30 @@ def test_a_device_that_says_hello_and_nothing_else_is_asked_to_start(
     (port,) = b.ask("status")["ports"]
     assert (port["state"], port["reopened"]) == ("idle", 0)
     assert port["problem"] == "the device speaks, but sends no scans"
+
+
+@pytest.mark.usefixtures("_short_patience")
+def test_a_slow_board_runs_between_its_frames_until_it_stops(bench: Start, until: Until) -> None:
+    """Its protocol gives the first frame 4 s; then its own pace counts, here one frame a second."""
+    count = load_description("matrix_square").measurements
+    line = b",".join(b"%d" % (1000 + number) for number in range(count)) + b"\n"
+    b = bench(protocol="matrix", description="matrix_square")
+    b.skin.lines[0].say(b"the rest of a line\n")
+
+    def frames_of(sent: int) -> bool:
+        return bool(b.ask("status")["frames"] >= sent)
+
+    for sent in range(1, 5):
+        time.sleep(1.0)
+        b.skin.lines[0].say(line)
+        until(partial(frames_of, sent))
+    time.sleep(1.0)  # longer than others are given
+    status = b.ask("status")
+    assert (status["state"], status["ports"][0]["state"]) == ("running", "running")
+    assert status["rates"]["frames_hz"] > 0.0
+    assert [e["name"] for e in b.listener.of("event")] == ["tared"]
+    assert "nothing came for 3" in b.listener.event("device_silent")["detail"]
+    assert b.ask("status")["ports"][0]["state"] == "silent"
 
 
 # Noise

@@ -60,6 +60,10 @@ class PortProtocol(Protocol):
         """How often a recording is given a preamble, for what comes after damage; may be inf."""
 
     @property
+    def says_hello(self) -> bool:
+        """Whether it says hello every second, scans or not."""
+
+    @property
     def has_clock(self) -> bool:
         """Whether its scans say by the device's own clock when they were taken."""
 
@@ -144,6 +148,7 @@ class ForeignProtocol:
     device_id: ClassVar[str]
     patience_s: float = 4.0
     preamble_period_s: float = 1.0
+    says_hello: bool = False
     has_clock: bool = False
 
     def __init__(self, description: SensorDescription, rate_hz: float = 0.0) -> None:

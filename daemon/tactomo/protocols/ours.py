@@ -26,6 +26,7 @@ class Ours:
     baud: Final = 921_600
     patience_s: Final = 1.5
     preamble_period_s: Final = math.inf  # the device itself says hello every second
+    says_hello: Final = True
     has_clock: Final = True
     trouble: Trouble | None = None
 
