@@ -71,7 +71,8 @@ class Changes:
         spread: (M,) factor on variances because model errors go together.
         between: (M,) variances of each of two frames' changes, where the scene is still.
         quiet: whether nothing presses.
-        signal: root mean square of the changes over their noise.
+        signal: root mean square of the changes over their noise and what no noise accounts for;
+            what is quiet is below the root of `noise_limit` over the count (1.24 of 208).
         certainty: (M,) inverse variances of the changes by noise; 0 where invalid.
     """
 

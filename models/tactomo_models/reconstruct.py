@@ -76,6 +76,7 @@ class Reconstruction:
         tier: what made this frame.
         reason: why that tier.
         misfit: root mean square of the noise-weighted residual; about 1 where all is explained.
+            Of a quiet frame, `Changes.signal`.
         flags: what stands in the way of trusting it.
         stage_s: seconds spent in each stage.
         confidence: expected correlation of the map with the truth, 0 to 1, as a network judges
@@ -367,9 +368,12 @@ class Reconstructor:
     def _quiet(self, data: dict[Modality, Changes], flags: Flag) -> Reconstruction:
         blank = np.zeros((self.description.map.nodes_y, self.description.map.nodes_x), np.float32)
         magnitude = blank if "magnitude" in data else None
-        misfit = max(d.misfit for d in data.values())
-        if misfit > BAD_MISFIT and flags & (Flag.NOISE_HIGH | Flag.STRUCTURE_MISSING):
-            flags |= Flag.MISFIT_HIGH
+        # The measure that told quiet; where it is blunt, changes are held against noise alone, too.
+        misfit = max(d.signal for d in data.values())
+        if flags & (Flag.NOISE_HIGH | Flag.STRUCTURE_MISSING):
+            misfit = max(d.misfit for d in data.values())
+            if misfit > BAD_MISFIT:
+                flags |= Flag.MISFIT_HIGH
         return Reconstruction(
             map=magnitude,
             pressure_kpa=magnitude,

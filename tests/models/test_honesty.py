@@ -24,6 +24,8 @@ from tactomo_models import (
     SkinSimulator,
     Tier,
 )
+from tactomo_models.changes import noise_limit
+from tactomo_models.reconstruct import BAD_MISFIT
 
 FloatArray = NDArray[np.float64]
 Scans = dict[str, FloatArray]
@@ -206,6 +208,21 @@ def test_noise_is_not_pressing(
     for _ in range(5):  # a tare is a draw, too
         reconstructor = tared(paper, artifact, skin.reference(scans))
         assert {frame.tier for frame in frames(reconstructor, skin, count=60)} == {Tier.QUIET}
+
+
+@pytest.mark.parametrize("noise_share", [1e-4, 1e-3])
+def test_what_is_quiet_has_no_misfit_that_would_be_flagged(
+    paper: SensorDescription, artifact: Artifact, simulator: SkinSimulator, noise_share: float
+) -> None:
+    skin = Skin(simulator, noise_share)
+    reconstructor = tared(paper, artifact, skin.reference())
+
+    def drift(scans: Scans) -> Scans:
+        return {name: 1.003 * volts for name, volts in scans.items()}
+
+    for frame in frames(reconstructor, skin, change=drift):
+        assert (frame.tier, frame.flags) == (Tier.QUIET, Flag(0))
+        assert 0.5 < frame.misfit < math.sqrt(noise_limit(208) / 208) < BAD_MISFIT
 
 
 def test_a_budget_that_is_too_small_is_said_and_made_up_for(

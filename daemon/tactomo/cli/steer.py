@@ -270,7 +270,7 @@ def _status_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
         ("flags", ", ".join(status.get("flags", [])) or "none"),
         (
             "misfit",
-            f"{_number(status.get('misfit'))} (1: explained to the noise; above 2: flagged)",
+            f"{_number(status.get('misfit'))} (1: explained to the noise; too much is flagged)",
         ),
         (
             "lost",
