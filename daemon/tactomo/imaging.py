@@ -337,7 +337,8 @@ class Imaging:
                 "baseline_refused",
                 "warning",
                 tracker.refusal,
-                "tare with nothing on the skin: `tactomo tare`",
+                "take off what presses, and away what heats or cools the skin; once it is steady: "
+                "`tactomo tare`",
             )
 
     def _publish_scan(self, dual: DualScan, timing: Timing, volts: Volts) -> None:

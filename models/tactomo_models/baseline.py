@@ -15,6 +15,9 @@ share between two times of a contact that is still. A factor cannot hold a conta
 the data to their noise, by amounts that skins reach in that time, the reference is there at once.
 Only a signal that has just dropped is asked so: a contact that stays is none.
 
+A lead that was broken at the tare is left out of all that: what is flagged since then and explained
+does not keep the rest from being followed. A fault that comes later does, until the next tare.
+
 What passes as neither is shown as it is, and `refusal` says so. Time is the frames' own: equal
 frames lead to equal references.
 """
@@ -94,7 +97,7 @@ class BaselineTracker:
         self.reference = reference = reference.taken_as_it_is()
         self._reconstructor.set_reference(reference)
         self._channels = {
-            name: ChannelBaseline(self._subspace, tare)
+            name: ChannelBaseline(self._subspace, tare, self._reconstructor.usable(name))
             for name in self._reconstructor.description.modalities
             if (tare := getattr(reference, name)) is not None
         }
@@ -164,7 +167,8 @@ class BaselineTracker:
 
     def _settles(self, time_s: float, look: Look, scans: Scans) -> bool:
         """Whether what is seen is nothing but drift; if so, the baseline is there now."""
-        if not self._is_ready or look.is_quiet or look.flags & ~Flag.REFERENCE_MISMATCH:
+        known = Flag.REFERENCE_MISMATCH | look.standing
+        if not self._is_ready or look.is_quiet or look.flags & ~known:
             return False
         if look.data.keys() != self._channels.keys():
             return False
@@ -199,7 +203,7 @@ class BaselineTracker:
         elapsed_s = max(0.0, time_s - self._last_s) if self._is_ready else 0.0
         self._last_s = time_s
         self._memory.add(time_s, elapsed_s, frame)
-        if look.is_quiet and not frame.flags:
+        if look.is_quiet and not frame.flags & ~look.standing:
             self._follow(time_s, look, scans)
         elif look.is_quiet or not look.data:
             self._drop_blocks()  # it says nothing of the baseline
@@ -232,7 +236,7 @@ class BaselineTracker:
         self._release.add(time_s, elapsed_s, _signal(look))
         self._note_distrust(time_s, frame)
         for name, channel in self._channels.items():
-            if name not in look.data or look.flags & ~DISTRUST:
+            if name not in look.data or look.flags & ~(DISTRUST | look.standing):
                 channel.drop_block()
             elif channel.add(time_s, scans[name], look.data[name]):
                 channel.follow_under_contact(time_s, self._memory.creep(time_s, name))

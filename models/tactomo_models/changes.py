@@ -99,6 +99,8 @@ class Taken(NamedTuple):
     flags: Flag
     electrodes: list[int]
     """Those left out, ascending."""
+    own_flags: Flag
+    """Those of `flags` that this scan raises, and not its reference."""
 
 
 class MeasuredChannel:
@@ -114,6 +116,9 @@ class MeasuredChannel:
         noise: (M,) standard deviation of one scan in volts; None where it is not known.
         scans: how many `volts` is the mean of.
         regularisation: factor on the linear methods' regularisation parameter.
+
+    Attributes:
+        usable: (M,) voltages that the tare has found nothing wrong with.
 
     Raises:
         DataError: another number of voltages than the sensor has.
@@ -147,7 +152,7 @@ class MeasuredChannel:
             wiring, volts, predicted, noise / np.sqrt(scans), contrast, sought
         )
         self._flags, self._electrodes = verdict.flags, verdict.electrodes
-        valid = verdict.usable
+        self.usable = valid = verdict.usable
         reference = np.where(valid, volts, 0.0)
         noise = np.where(valid, noise, 0.0)
         self._tare = self._reference = reference
@@ -191,7 +196,8 @@ class MeasuredChannel:
         electrodes = sorted({*self._electrodes, *verdict.electrodes})
         count = int(np.count_nonzero(valid))
         if count < self._least_valid or not scan[valid].any():
-            return Taken(None, flags | missing(self._name) | Flag.INVALID_VOLTAGE, electrodes)
+            gone = missing(self._name) | Flag.INVALID_VOLTAGE
+            return Taken(None, flags | gone, electrodes, verdict.flags | gone)
         change = np.where(valid, scan - self._reference, 0.0) * self._per_volt
         square = change * change
         grown = verdict.noise**2
@@ -214,7 +220,7 @@ class MeasuredChannel:
             signal=(statistic / count) ** 0.5,
             certainty=valid / variance,
         )
-        return Taken(changes, flags, electrodes)
+        return Taken(changes, flags, electrodes, flags & ~self._flags | verdict.flags)
 
     def image(self, change: FloatArray, method: Tier) -> Image:
         """Linear image (P,) of a change (M,) in the channel's own direction; the rest cut off."""

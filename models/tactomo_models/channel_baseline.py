@@ -52,14 +52,18 @@ class ChannelBaseline:
     Args:
         subspace: the modes of the sensor's drift.
         tare: (M,) volts.
+        usable: (M,) voltages that it is right about; nothing is learned from the others.
 
     Attributes:
         has_moved: whether what is in force is behind what is known by more than is worth a change.
     """
 
-    def __init__(self, subspace: DriftSubspace, tare: FloatArray) -> None:
+    def __init__(
+        self, subspace: DriftSubspace, tare: FloatArray, usable: NDArray[np.bool_]
+    ) -> None:
         self._subspace = subspace
-        self._per_tare = np.divide(1.0, tare, out=np.zeros_like(tare), where=tare != 0)
+        usable = usable & (tare != 0)
+        self._per_tare = np.divide(1.0, tare, out=np.zeros_like(tare), where=usable)
         self._now = np.zeros(len(tare))  # as it is known; what is in force follows in steps
         self._in_force = self._now
         self.has_moved = False

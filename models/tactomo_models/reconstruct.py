@@ -58,6 +58,7 @@ UNSURE_MISFIT = 1.5  # of both channels together
 UNSURE_MAGNITUDE = 0.5  # uncertainty of all magnitudes together, share of themselves
 
 
+LEFT_OUT: Final = Flag.ELECTRODE_FAULT | Flag.INVALID_VOLTAGE  # what is known to be missing
 FREEDOM: Final = {Tier.FIT: Freedom.OUTLINES, Tier.LEVELSET: Freedom.LEVEL_SET}  # else as needed
 
 
@@ -102,10 +103,13 @@ class Look:
     Attributes:
         data: the changes of each channel that has any.
         flags: what stands in the way of trusting them.
+        standing: those of them that say what was left out at the tare, and is ever since: these
+            scans have nothing to add.
     """
 
     data: dict[Modality, Changes]
     flags: Flag
+    standing: Flag
 
     @property
     def is_quiet(self) -> bool:
@@ -291,15 +295,20 @@ class Reconstructor:
         """The first half of `reconstruct`, which costs little: what has changed."""
         self._stage_s = {}
         self._left_out = [self._unusable_network] if self._unusable_network else []
-        flags = Flag(0)
+        flags = own = Flag(0)
         data: dict[Modality, Changes] = {}
         with self._timed("data"):
             for name, scan in (("magnitude", magnitude), ("structure", structure)):
                 if name in self.description.modalities:
-                    flags |= self._take(name, scan, data, saturated=name in saturated)
+                    found = self._take(name, scan, data, saturated=name in saturated)
+                    flags, own = flags | found[0], own | found[1]
             if self._swapped(data):
                 flags |= Flag.CHANNELS_SWAPPED
-        return Look(data, flags)
+        return Look(data, flags, flags & LEFT_OUT & ~own)
+
+    def usable(self, name: Modality) -> NDArray[np.bool_]:
+        """Voltages (M,) of a channel that the tare has found nothing wrong with."""
+        return self._channels[name].usable
 
     def image(self, look: Look) -> Reconstruction:
         """The second half of `reconstruct`: what follows from the last `look`."""
@@ -323,19 +332,22 @@ class Reconstructor:
         data: dict[Modality, Changes],
         *,
         saturated: bool,
-    ) -> Flag:
-        """Put a channel's relative changes into `data`, or say by a flag why it has none."""
+    ) -> tuple[Flag, Flag]:
+        """Put a channel's relative changes into `data`, or say by a flag why it has none.
+
+        Returns the flags, and those that the scan itself raises.
+        """
         if scan is None:
-            return missing(name)
+            return missing(name), missing(name)
         channel = self._channels.get(name)
         if channel is None:
-            return missing(name) | Flag.NO_REFERENCE
-        changes, flags, electrodes = channel.take(scan, saturated=saturated)
-        if electrodes:
-            self._left_out.append(_named(name, electrodes))
-        if changes is not None:
-            data[name] = changes
-        return flags
+            return (missing(name) | Flag.NO_REFERENCE,) * 2
+        taken = channel.take(scan, saturated=saturated)
+        if taken.electrodes:
+            self._left_out.append(_named(name, taken.electrodes))
+        if taken.changes is not None:
+            data[name] = taken.changes
+        return taken.flags, taken.own_flags
 
     def _by_tier(self, data: dict[Modality, Changes], flags: Flag) -> Reconstruction:
         if not data:

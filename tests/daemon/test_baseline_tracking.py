@@ -82,7 +82,11 @@ def test_a_change_that_no_skin_makes_is_refused_and_a_tare_helps(
         b.step(volts=cold)
     refused = b.listener.event("baseline_refused")
     assert refused["severity"] == "warning"
+    assert "heats or cools" in refused["next_step"]
     assert "tactomo tare" in refused["next_step"]
+    for _ in range(4):
+        b.step(volts=cold)
+    assert [e["name"] for e in b.listener.of("event")].count("baseline_refused") == 1
     assert b.ask("status")["baseline"]["state"] == "refused"
 
 

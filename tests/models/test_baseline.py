@@ -7,10 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from faulty_skin import touches
+from noisy_skin import rms
 from numpy.typing import NDArray
 from tactomo_models import (
     Artifact,
     BaselineTracker,
+    Flag,
     Press,
     Reconstruction,
     Reconstructor,
@@ -32,8 +35,14 @@ NOISE_SHARE = 2.5e-4  # of the largest voltage at rest, as the twin has it
 class Life:
     """A skin in time: what presses on it, how its gain drifts, and what the tracker makes of it."""
 
-    def __init__(self, simulator: SkinSimulator, reconstructor: Reconstructor) -> None:
+    def __init__(
+        self,
+        simulator: SkinSimulator,
+        reconstructor: Reconstructor,
+        lead: Callable[[FloatArray], FloatArray] = lambda volts: volts,
+    ) -> None:
         self.now_s = 1000.0
+        self.lead = lead  # what a broken one makes of the voltages
         self.gain = 1.0
         self._simulator = simulator
         self._rest = simulator.voltages(())
@@ -49,8 +58,12 @@ class Life:
 
     def scan(self, *presses: Press) -> dict[str, FloatArray]:
         return {
-            name: self.gain * volts
-            + NOISE_SHARE * np.abs(self._rest[name]).max() * self._rng.standard_normal(len(volts))
+            name: self.lead(
+                self.gain * volts
+                + NOISE_SHARE
+                * np.abs(self._rest[name]).max()
+                * self._rng.standard_normal(len(volts))
+            )
             for name, volts in self._simulator.voltages(presses).items()
         }
 
@@ -155,6 +168,65 @@ def test_flagged_frames_teach_nothing(life: Life) -> None:
         life.tracker.reconstruct(life.now_s, **life.scan(), saturated=["structure"])
         life.tracker.reconstruct(life.now_s, life.scan()["magnitude"], None)
     assert life.tracker.drift == before
+
+
+# A broken lead
+
+
+LEAD = 5  # at the right side, 18 mm below the middle
+BESIDE_LEAD = Press(0.05, -0.018, 1.5)
+
+
+@pytest.fixture(params=["silent", "floats"])
+def broken(
+    request: pytest.FixtureRequest,
+    simulator: SkinSimulator,
+    paper: SensorDescription,
+    artifact: Artifact,
+) -> Life:
+    """A life with a lead that was broken before the tare."""
+    rng, size = np.random.default_rng(8), rms(simulator.voltages(())["magnitude"])
+    mine = touches(paper, LEAD)
+    made: dict[str, Callable[[FloatArray], FloatArray]] = {
+        "silent": lambda volts: np.where(mine, 0.0, volts),
+        "floats": lambda volts: np.where(mine, size * rng.normal(size=len(volts)), volts),
+    }
+    life = Life(simulator, Reconstructor(paper, artifact), made[request.param])
+    life.lives(20)
+    assert life.tracker.state == "following"
+    return life
+
+
+def test_a_skin_with_a_lead_broken_for_good_is_followed_like_any(broken: Life) -> None:
+    frames = broken.lives(1200, gain=0.95)
+    frames += broken.lives(300)
+    assert {frame.tier for frame in frames} == {Tier.QUIET}
+    assert {Flag.ELECTRODE_FAULT in frame.flags for frame in frames} == {True}
+    assert broken.tracker.drift["structure"].gain == pytest.approx(-0.05, abs=2e-3)
+    assert broken.tracker.reference is not None
+    assert broken.tracker.reference.structure_drift is not None
+    assert np.abs(broken.tracker.reference.structure_drift).max() < 0.1  # also of that lead's
+
+
+@pytest.mark.parametrize("press", [PRESS, BESIDE_LEAD], ids=["firm", "light, beside the lead"])
+def test_a_contact_that_lasts_is_never_erased_where_a_lead_is_broken(
+    broken: Life, press: Press
+) -> None:
+    frames = broken.lives(12 * 3600, press, step_s=600.0, gain=1.02)
+    assert set(count(frames)) == {1}
+    assert set(count(broken.lives(20))) == {0}
+
+
+def test_a_lead_that_breaks_after_the_tare_ends_the_following_until_the_next(
+    life: Life, paper: SensorDescription
+) -> None:
+    before = life.tracker.drift
+    life.lead = lambda volts: np.where(touches(paper, LEAD), 0.0, volts)
+    life.lives(120, gain=1.002)
+    assert life.tracker.drift == before
+    life.tare()
+    life.lives(300, gain=1.01)
+    assert life.tracker.drift["structure"].gain == pytest.approx(0.01, abs=2e-3)
 
 
 def test_equal_frames_lead_to_equal_references(
