@@ -85,6 +85,7 @@ COMMANDS: Final[Mapping[str, type[Arguments]]] = {
     "record_stop": Nothing,
     "set_tier": SetTier,
     "set_budget": SetBudget,
+    "reload_calibration": Nothing,
 }
 
 

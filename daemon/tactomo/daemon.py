@@ -29,6 +29,7 @@ import time
 import uuid
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -50,7 +51,6 @@ from tactomo_models.calibration_file import (
     PressureCalibration,
     calibration_for,
     load_calibration,
-    parse_calibration,
 )
 from tactomo_models.machine_speed import MachineSpeed, machine_speed_for
 from tactomo_models.tier import check_tier
@@ -63,14 +63,14 @@ from tactomo.doorkeeper import Doorkeeper, load_server_keys
 from tactomo.endpoint import allow_connections
 from tactomo.errors import CommandError, ConfigError
 from tactomo.events import EventBook, Severity
-from tactomo.imaging import Imaging
+from tactomo.imaging import Imaging, recorded_calibration
 from tactomo.pipeline import Pipeline, Replay
 from tactomo.port import PortReader
 from tactomo.protocol_replay import parse_replay_url
 from tactomo.protocols import default_baud, protocol_named
 from tactomo.publisher import Publisher
 from tactomo.recorder import Recorder
-from tactomo.recording import REPLAY_SCHEME, Origin, Recording
+from tactomo.recording import REPLAY_SCHEME, Mark, Origin, Recording, calibration_text
 from tactomo.recording_writer import message_entry
 from tactomo.status import Status
 from tactomo.supervision import Supervision, notify
@@ -122,6 +122,9 @@ class Daemon:
         description = load_description(config.description)
         self._description = description
         replay = read_replay(config.ports, description)
+        if replay is not None and config.calibration is not None:
+            replay = replace(replay, marks=_without_calibrations(replay.marks))
+        self._replay = replay
         protocol = _protocol(config)
         channels = tuple(c for c in Channel if c.name.lower() in description.modalities)
         calibration, self._unused = _find_calibration(config, description, replay)
@@ -173,6 +176,7 @@ class Daemon:
                 "record_stop": lambda _: self._recorder.stop(),
                 "set_tier": self._set_tier,
                 "set_budget": self._set_budget,
+                "reload_calibration": lambda _: self._reload_calibration(),
             },
             on_idle=self._check,
         )
@@ -367,6 +371,28 @@ class Daemon:
         budget_ms = arguments.budget_ms
         return Settling({"budget_ms": budget_ms}, self._pipeline.set_budget(budget_ms))
 
+    def _reload_calibration(self) -> Future[Mapping[str, Any]]:
+        """Look for the sensor's calibration as at the start; what cannot be used changes nothing.
+
+        Reads a small file, on the control thread.
+        """
+        config, replay = self.config, self._replay
+        if replay is not None and replay.marks and config.calibration is None:
+            raise CommandError(
+                "an exact replay goes by the calibrations that were recorded",
+                "give the replay another one: `tactomo replay --calibration FILE`",
+                "calibration_refused",
+            )
+        try:
+            found, unused = _find_calibration(config, self._description, replay)
+        except CalibrationError as error:
+            found, unused = None, [str(error)]
+        if unused:
+            step = "what was in force stays so"
+            self._on_event("calibration_refused", "warning", unused[0], step)
+            raise CommandError(unused[0], step, "calibration_refused")
+        return self._pipeline.reload_calibration(found)
+
     def _zero_counters(self) -> None:
         for port in self._ports:
             port.zero_counters()
@@ -420,27 +446,24 @@ def read_replay(urls: Sequence[str], description: SensorDescription) -> Replay |
         _check_reference(reference, recording, description)
     # A part of the ports cannot give the dual scans that all of them gave.
     is_whole = len(urls) == len(recording.origin.ports)
+    marks = recording.marks() if is_whole else []
+    if recording.origin.description_sha256 != description.sha256:
+        marks = _without_calibrations(marks)
+    text = recording.origin.calibration
+    calibration = recorded_calibration(text, f"the calibration in {recording.path}", description)
+    had_none = not text and any(mark.calibration is not None for mark in marks)
     return Replay(
-        marks=recording.marks() if is_whole else [],
+        marks=marks,
         reference=reference,
         is_paced=speed > 0,
-        calibration=_recorded_calibration(recording, description),
+        calibration=calibration,
+        knows_calibration=calibration is not None or had_none,
     )
 
 
-def _recorded_calibration(
-    recording: Recording, description: SensorDescription
-) -> PressureCalibration | None:
-    """Return the one that the daemon had that recorded; None where it does not fit here."""
-    text = recording.origin.calibration
-    if not text:
-        return None
-    try:
-        found = parse_calibration(text, f"the calibration in {recording.path}")
-    except CalibrationError as error:
-        log.warning("calibration_unused", detail=str(error))
-        return None
-    return None if found.subject.mismatch(found.subject.sensor, description) else found
+def _without_calibrations(marks: Sequence[Mark]) -> list[Mark]:
+    """Return marks that leave the pressure calibration as it is."""
+    return [replace(mark, calibration=None) for mark in marks]
 
 
 def _check_reference(
@@ -496,7 +519,7 @@ def _find_calibration(
                 f"there is no calibration {config.calibration}; run: tactomo calibrate "
                 f"{config.name}, or leave the key out"
             ) from error
-    if replay is not None and replay.calibration is not None:
+    if replay is not None and replay.knows_calibration:
         return replay.calibration, unused
     found = calibration_for(config.name, description, config.description, unused.append)
     return found, unused
@@ -515,5 +538,5 @@ def _origin(
         ports=config.ports,
         version=version("tactomo"),
         protocol=protocol,
-        calibration="" if calibration is None else calibration.model_dump_json(),
+        calibration=calibration_text(calibration),
     )

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from tactomo_client.messages import CONTACTS, MAP, SCAN
 from tactomo_models import (
     BaselineTracker,
+    CalibrationError,
     Modality,
     ModelError,
     Reconstruction,
@@ -25,7 +26,7 @@ from tactomo_models import (
     SensorDescription,
     Tier,
 )
-from tactomo_models.calibration_file import PressureCalibration
+from tactomo_models.calibration_file import PressureCalibration, parse_calibration
 from tactomo_models.machine_speed import MachineSpeed
 from tactomo_models.pressure import described_curve
 from tactomo_protocol import Channel, ScanFlag
@@ -33,16 +34,23 @@ from tactomo_protocol import Channel, ScanFlag
 from tactomo.config import BaselineConfig
 from tactomo.errors import CommandError
 from tactomo.events import OnEvent, RateLimit
-from tactomo.frames import contacts_fields, frame_header, map_fields, scan_fields, scan_header
+from tactomo.frames import (
+    calibration_fields,
+    contacts_fields,
+    frame_header,
+    map_fields,
+    scan_fields,
+    scan_header,
+)
 from tactomo.publisher import Publisher
 from tactomo.recorder import ActiveRecording, Recorder
-from tactomo.recording import Mark, ScanKey, Timing
-from tactomo.recording_writer import mark_entry, reference_entry
+from tactomo.recording import Mark, ScanKey, Timing, calibration_text
+from tactomo.recording_writer import calibration_entry, mark_entry, reference_entry
 from tactomo.sync import DualScan
 from tactomo.tare import Tare
 from tactomo.timing import Durations, Rate
 
-REPEAT_REFERENCE_S: Final = 60.0
+REPEAT_S: Final = 60.0
 REFUSAL_PERIOD_S: Final = 600.0
 NO_DATA_S: Final = 3.0
 """How long a tare on command waits for usable dual scans before it gives up; where they come more
@@ -111,9 +119,11 @@ class Imaging:
         self._tare_deadline_s = 0.0
         self._contacts = 0  # in the last frame
         self._marked: ActiveRecording | None = None  # the recording that gets marks
-        self._repeat_reference_s = 0.0
+        self._repeat_s = 0.0
         self._failure_limit = RateLimit()
         self._own_calibration = calibration
+        self._calibration_text = calibration_text(calibration)
+        self._device_ids: frozenset[str] = frozenset()  # of those that have spoken
         self._foreign = ""  # why it is not in force
         self._use_calibration(calibration)
         self._refusal_limit = RateLimit(REFUSAL_PERIOD_S)
@@ -139,13 +149,45 @@ class Imaging:
 
     def meet(self, device_ids: Collection[str]) -> None:
         """Take note of who speaks: a calibration holds for the devices that it was made with."""
-        own = self._own_calibration
-        foreign = "" if own is None else own.subject.foreign(device_ids)
-        if own is None or foreign == self._foreign:
+        self._device_ids = frozenset(device_ids)
+        self._judge_calibration()
+
+    def reload_calibration(
+        self, calibration: PressureCalibration | None, answer: Future[Mapping[str, Any]]
+    ) -> None:
+        """Put in force what was read again, None for the description's curve, or refuse it.
+
+        `answer` gets what became of it.
+        """
+        subject = None if calibration is None else calibration.subject
+        if subject is not None and (foreign := subject.foreign(self._device_ids)):
+            cause = f"the pressure calibration of {subject.sensor} {foreign}"
+            step = f"what was in force stays so; run: tactomo calibrate {subject.sensor}"
+            self._on_event("calibration_refused", "warning", cause, step)
+            answer.set_exception(CommandError(cause, step, "calibration_refused"))
             return
-        self._foreign = foreign
+        self._take_calibration(calibration, calibration_text(calibration))
+        words = "none is kept: pressures are the description's"
+        detail = words if calibration is None else calibration.words
+        self._on_event("calibration_reloaded", "info", detail)
+        self._publisher.tell_status()
+        answer.set_result({"calibration": calibration and calibration_fields(calibration)})
+
+    def _take_calibration(self, calibration: PressureCalibration | None, text: str) -> None:
+        """Go by another calibration from the next dual scan on, and say so in the recording."""
+        self._own_calibration, self._calibration_text = calibration, text
+        self._judge_calibration()
+        self._recorder.set_calibration(text)
+        if self._marked is not None:
+            self._marked.calibrations += 1
+            self._record_calibration()
+
+    def _judge_calibration(self) -> None:
+        """Put this sensor's calibration in force, if it was made with the devices that speak."""
+        own = self._own_calibration
+        foreign = "" if own is None else own.subject.foreign(self._device_ids)
         self._use_calibration(None if foreign else own)
-        if foreign:
+        if own is not None and foreign and foreign != self._foreign:
             self._on_event(
                 "calibration_refused",
                 "warning",
@@ -153,6 +195,7 @@ class Imaging:
                 f"until you run `tactomo calibrate {own.subject.sensor}`, pressures are the "
                 "description's",
             )
+        self._foreign = foreign
 
     def _use_calibration(self, calibration: PressureCalibration | None) -> None:
         self.calibration = calibration
@@ -252,8 +295,14 @@ class Imaging:
             return
         keys = tuple(ScanKey(s.channel, s.counter, s.device_us) for s in dual.scans)
         tier, budget_ms = self.given
-        number = self._marked.references or None
-        done = Mark(keys, str(tier), budget_ms, timing=timing, reference_number=number)
+        done = Mark(
+            keys,
+            str(tier),
+            budget_ms,
+            timing=timing,
+            reference_number=self._marked.references or None,
+            calibration_number=self._marked.calibrations,
+        )
         self._marked.add(mark_entry(done, time.monotonic_ns(), time.time_ns()))
 
     def _obey(self, mark: Mark) -> None:
@@ -265,6 +314,10 @@ class Imaging:
             self._reconstructor.reset()
         if mark.is_cut:
             self._reconstructor.forget_shape()
+        if mark.calibration is not None and mark.calibration != self._calibration_text:
+            source = "the calibration that was read again while this was recorded"
+            recorded = recorded_calibration(mark.calibration, source, self._description)
+            self._take_calibration(recorded, mark.calibration)
         if mark.reference is not None:
             self.reference_realtime_ns = time.time_ns()
             self._reconstructor.set_reference(mark.reference)
@@ -278,8 +331,9 @@ class Imaging:
         """
         active = self._recorder.active
         if active is self._marked:
-            if time.monotonic() >= self._repeat_reference_s:
+            if time.monotonic() >= self._repeat_s:
                 self._record_reference()
+                self._record_calibration()
             return
         if active is None:
             self._marked = None
@@ -290,14 +344,23 @@ class Imaging:
             if self.reference is not None:
                 active.references += 1
                 self._record_reference()
+            if active.calibration != self._calibration_text:
+                active.calibrations += 1
+                self._record_calibration()
 
     def _record_reference(self) -> None:
         """Put the reference into the recording, and again every minute: some of it may be lost."""
-        self._repeat_reference_s = time.monotonic() + REPEAT_REFERENCE_S
+        self._repeat_s = time.monotonic() + REPEAT_S
         if self.reference is not None and self._marked is not None:
             number = self._marked.references
             times = (time.monotonic_ns(), self.reference_realtime_ns)
             self._marked.add(reference_entry(self.reference, number, *times))
+
+    def _record_calibration(self) -> None:
+        """Likewise the calibration, where it is another one than the recording began with."""
+        if self._marked is not None and self._marked.calibrations:
+            number, text = self._marked.calibrations, self._calibration_text
+            self._marked.add(calibration_entry(text, number, time.monotonic_ns(), time.time_ns()))
 
     def _reconstruct(
         self, volts: Volts, saturated: list[Modality], *, is_exact: bool
@@ -396,6 +459,23 @@ class Imaging:
         if stage not in self.stages:  # a new dictionary, for those who iterate over the old one
             self.stages = {**self.stages, stage: Durations()}
         self.stages[stage].add(seconds)
+
+
+def recorded_calibration(
+    text: str, source: str, description: SensorDescription
+) -> PressureCalibration | None:
+    """Return a pressure calibration that a recording holds; None where it does not fit here.
+
+    `source` names it in the log.
+    """
+    if not text:
+        return None
+    try:
+        found = parse_calibration(text, source)
+    except CalibrationError as error:
+        log.warning("calibration_unused", detail=str(error))
+        return None
+    return None if found.subject.mismatch(found.subject.sensor, description) else found
 
 
 def _saturated(dual: DualScan) -> list[Modality]:

@@ -50,7 +50,9 @@ class Replay:
     is_paced: bool
     """Whether bytes come in their own time rather than as fast as they are taken."""
     calibration: PressureCalibration | None = None
-    """Of pressure, that the daemon had that recorded."""
+    """Of pressure, that the daemon had when it began to record."""
+    knows_calibration: bool = False
+    """Whether it had that one, or none, and no other is to be looked for."""
 
 
 class _SyncState(NamedTuple):
@@ -203,6 +205,17 @@ class Pipeline:
     def set_budget(self, budget_ms: float | None) -> Future[None]:
         """Ask for a time budget; for any thread. The future is done when it is in force."""
         return self._ask(lambda: setattr(self._imaging, "budget_ms", budget_ms))
+
+    def reload_calibration(
+        self, calibration: PressureCalibration | None
+    ) -> Future[Mapping[str, Any]]:
+        """Ask for a pressure calibration, None for the description's curve; for any thread.
+
+        The future gets the `calibration` in force, or CommandError where it is another device's.
+        """
+        answer: Future[Mapping[str, Any]] = Future()
+        self._ask(lambda: self._imaging.reload_calibration(calibration, answer))
+        return answer
 
     def _run(self) -> None:
         self._begin()

@@ -40,7 +40,7 @@ class _Outgoing(NamedTuple):
 
 
 class Publisher:
-    """Numbers, stamps and sends messages; publishes the status every second.
+    """Numbers, stamps and sends messages; publishes the status every second, or when asked to.
 
     `open` it, `start` its thread, `stop` it.
 
@@ -88,6 +88,7 @@ class Publisher:
         self._queue: deque[_Outgoing] = deque(maxlen=MAX_QUEUED)
         self._stopping = threading.Event()
         self._cut = threading.Event()
+        self._status_asked = threading.Event()
         self._socket: zmq.Socket[bytes]
         self._wake_reader = self._wake_writer = -1
         self._thread = threading.Thread(target=self._run, name="publisher")
@@ -124,6 +125,11 @@ class Publisher:
     def cut_connections(self) -> None:
         """Have every subscriber connect anew, those who still may; for any thread."""
         self._cut.set()
+        self._wake()
+
+    def tell_status(self) -> None:
+        """Have the status published now, after what was handed over before; for any thread."""
+        self._status_asked.set()
         self._wake()
 
     @property
@@ -187,6 +193,9 @@ class Publisher:
             if self._cut.is_set():
                 self._cut.clear()
                 self._readers.cut()
+            if self._status_asked.is_set():
+                self._status_asked.clear()
+                self._send_status()
             if time.monotonic() >= status_at_s:
                 status_at_s += STATUS_PERIOD_S
                 self._send_status()

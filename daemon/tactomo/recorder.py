@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, InvalidStateError
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -54,7 +55,9 @@ class ActiveRecording:
         number: tells it from the daemon's other recordings; rises from 1.
         previous: the file before it, as long as that gets the ports' bytes, too. The pipeline's
             thread ends that, or the recorder's when it has waited long enough.
+        calibration: the pressure calibration that the file's metadata tell, as text.
         references: how many references were added; the pipeline's thread counts.
+        calibrations: how many pressure calibrations were added, likewise.
         bytes_written: length of the file at the last flush; written by the recorder's thread.
         is_overflowed: the queue was full once, and nothing is taken any more.
         is_empty: nothing was written yet; written by the recorder's thread.
@@ -67,13 +70,16 @@ class ActiveRecording:
         path: Path,
         writer: RecordingWriter,
         with_maps: bool,
+        calibration: str,
         previous: ActiveRecording | None = None,
     ) -> None:
         self.number = number
         self.path = path
         self.with_maps = with_maps
+        self.calibration = calibration
         self.previous = previous
         self.references = 0
+        self.calibrations = 0
         self.bytes_written = 0
         self.is_overflowed = False
         self.is_empty = True
@@ -177,7 +183,7 @@ class Recorder:
         self.deleted = 0
         self.failures = 0
         self.waits_for = ""
-        self._origin = origin
+        self._origin = origin  # replaced by the pipeline's thread, see `set_calibration`
         self._rules = rules
         self._on_event = on_event
         self._folder: Path | None = None  # where a set of files is recorded, or is to be
@@ -226,6 +232,10 @@ class Recorder:
         CommandError where none runs, or RecordingError where it could not be written to its end.
         """
         return self._ask(self._stop)
+
+    def set_calibration(self, text: str) -> None:
+        """Have the files to come tell this pressure calibration; for the pipeline's thread."""
+        self._origin = replace(self._origin, calibration=text)
 
     def close(self) -> None:
         """End the recording, if one runs, and the thread; a disk that hangs is not waited for."""
@@ -349,9 +359,12 @@ class Recorder:
             raise RecordingError(_no_room(free, reserve), "make room on the disk", "cannot_write")
         if path is None:
             path = next_path(folder, self._origin.sensor, time.time())
-        writer = create(path, self._origin)
+        origin = self._origin  # read once: a calibration may be put in force meanwhile
+        writer = create(path, origin)
         self.files += 1
-        return ActiveRecording(self.files, path, writer, self._with_maps, previous)
+        return ActiveRecording(
+            self.files, path, writer, self._with_maps, origin.calibration, previous
+        )
 
     def _stop(self) -> Mapping[str, Any]:
         active, is_wanted = self.active, self._folder is not None

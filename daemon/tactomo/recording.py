@@ -15,8 +15,12 @@ reference      msgpack     the reference that holds from here on: its number in 
                            repeated every minute
 frame          msgpack     a dual scan that the daemon reconstructed: channel, counter and device
                            time of each of its scans, the tier and the budget (ms of modelled
-                           work, not of time) that it was reconstructed with, the number of the
-                           reference in force, whether it started cold, and its timing
+                           work, not of time) that it was reconstructed with, the numbers of the
+                           reference and of the calibration in force, whether it started cold, and
+                           its timing
+calibration    msgpack     the pressure calibration that holds from here on, where another one than
+                           the metadata's was put in force meanwhile: its number in this recording
+                           and its text; repeated every minute
 map, contacts  stream      messages exactly as published, if asked for; scan likewise, as long as
                            anybody subscribes to it
 =============  ==========  =======================================================================
@@ -53,6 +57,7 @@ from tactomo_client.errors import RecordingError as ClientRecordingError
 from tactomo_client.intact_chunks import intact_chunks
 from tactomo_client.messages import MAX_ENTRIES, array_from_wire
 from tactomo_models import Reference, load_description
+from tactomo_models.calibration_file import PressureCalibration
 from tactomo_models.errors import DescriptionError
 from tactomo_protocol import Channel, Hello, Scan
 
@@ -104,6 +109,10 @@ class Mark:
     """None where an older version recorded."""
     is_cut: bool = False
     """Whether it began another file, so that the reconstruction forgot what shapes there were."""
+    calibration: str | None = None
+    """Of pressure, to be put in force just before it: the text of its file, empty for none."""
+    calibration_number: int = 0
+    """Which of those that were read again meanwhile was in force, from 1; 0 for the origin's."""
 
 
 class Chunk(NamedTuple):
@@ -126,7 +135,8 @@ class Origin:
     protocol: str = OURS
     """What the ports speak."""
     calibration: str = ""
-    """The pressure calibration that the daemon had, as the text of its file; empty for none."""
+    """The pressure calibration that the daemon began it with, as the text of its file; empty for
+    none."""
 
     def new_protocol(self) -> PortProtocol:
         """Return what turns a port's bytes into packets.
@@ -223,18 +233,22 @@ class Recording:
                 yield message
 
     def marks(self) -> list[Mark]:
-        """Return the dual scans that were reconstructed, each with the reference before it."""
+        """Return the dual scans that were reconstructed, each with what was new just before it."""
         marks: list[Mark] = []
         reference: Reference | None = None
+        calibration: str | None = None
         number: int | None = None
         for topic, message in _messages(self.path):
             if topic == "reference":
                 before, number = number, read_reference_number(message.data)
                 if number is None or number != before:  # else it is repeated
                     reference = _read_reference(message.data)
+            elif topic == "calibration":
+                calibration = read_calibration(message.data).text
             elif topic == "frame":
-                marks.append(replace(read_mark(message.data), reference=reference))
-                reference = None
+                mark = read_mark(message.data)
+                marks.append(replace(mark, reference=reference, calibration=calibration))
+                reference = calibration = None
         return marks
 
     def first_reference(self) -> Reference | None:
@@ -374,6 +388,28 @@ def read_reference_number(data: bytes) -> int | None:
     return None if number is None else _integer(number)
 
 
+class KeptCalibration(NamedTuple):
+    """A pressure calibration that was put in force during a recording."""
+
+    number: int
+    """Which of its recording's, from 1."""
+    text: str
+    """Of its file; empty for none."""
+
+
+def read_calibration(data: bytes) -> KeptCalibration:
+    """Read a message of the topic ``calibration``; raise RecordingError where it is none."""
+    fields = _fields(data, "number", "text")
+    if not isinstance(fields["text"], str):
+        raise _malformed()
+    return KeptCalibration(_integer(fields["number"]), fields["text"])
+
+
+def calibration_text(calibration: PressureCalibration | None) -> str:
+    """Return a pressure calibration as recordings have it; empty for none."""
+    return "" if calibration is None else calibration.model_dump_json()
+
+
 def read_mark(data: bytes) -> Mark:
     """Read a message of the topic ``frame``; raise RecordingError where it is none."""
     try:
@@ -382,7 +418,16 @@ def read_mark(data: bytes) -> Mark:
     except ValueError as error:
         raise _malformed() from error
     timing = None if mark.timing is None else Timing(*mark.timing)
-    return Mark(tuple(keys), mark.tier, mark.budget_ms, None, mark.reference, mark.cold, timing)
+    return Mark(
+        tuple(keys),
+        mark.tier,
+        mark.budget_ms,
+        None,
+        mark.reference,
+        mark.cold,
+        timing,
+        calibration_number=mark.calibration,
+    )
 
 
 class _Mark(BaseModel):
@@ -390,6 +435,7 @@ class _Mark(BaseModel):
     tier: StrictStr
     budget_ms: Annotated[float, Strict()] | None
     reference: StrictInt | None = None
+    calibration: StrictInt = 0
     cold: StrictBool = False
     timing: tuple[StrictInt, StrictBool, StrictInt | None, StrictBool] | None = None
 

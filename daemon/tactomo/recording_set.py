@@ -61,9 +61,10 @@ class RecordingSet(Recording):
             before = yield from _chunks(part, port, shift_ns, before)
 
     def marks(self) -> list[Mark]:
-        """Return the dual scans that were reconstructed, each with the reference before it."""
+        """Return the dual scans that were reconstructed, each with what was new just before it."""
         marks: list[Mark] = []
         in_force: Reference | None = None
+        calibration = self.origin.calibration
         for part in self.parts:
             of_part = part.marks()
             if of_part and marks:
@@ -71,8 +72,12 @@ class RecordingSet(Recording):
                 again = _is_same(first.reference, in_force)
                 reference = None if again else first.reference
                 of_part[0] = replace(first, reference=reference, is_cut=True)
+            begun_with = part.origin.calibration
+            if of_part and of_part[0].calibration is None and begun_with != calibration:
+                of_part[0] = replace(of_part[0], calibration=begun_with)
             for mark in of_part:
                 in_force = mark.reference or in_force
+                calibration = calibration if mark.calibration is None else mark.calibration
             marks += of_part
         return marks
 

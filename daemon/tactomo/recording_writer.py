@@ -60,6 +60,12 @@ def reference_entry(
     return Entry("reference", msgpack.packb(fields), monotonic_ns, realtime_ns)
 
 
+def calibration_entry(text: str, number: int, monotonic_ns: int, realtime_ns: int) -> Entry:
+    """The pressure calibration that holds from here on, read again for the `number`-th time."""
+    data = msgpack.packb({"number": number, "text": text})
+    return Entry("calibration", data, monotonic_ns, realtime_ns)
+
+
 def mark_entry(mark: Mark, monotonic_ns: int, realtime_ns: int) -> Entry:
     """A dual scan that was reconstructed; a new reference is an entry of its own, before it."""
     return Entry("frame", pack_mark(mark), monotonic_ns, realtime_ns)
@@ -72,6 +78,7 @@ def pack_mark(mark: Mark) -> bytes:
         "tier": mark.tier,
         "budget_ms": mark.budget_ms,
         "reference": mark.reference_number,
+        "calibration": mark.calibration_number,
         "cold": mark.is_cold,
         "timing": mark.timing,
     }

@@ -2,8 +2,8 @@
 
 Every chunk that its CRC confirms is kept, also beyond damage in the middle. What a replay of the
 new file gives is what the live run gave, with two exceptions that follow from what is lost: after
-a gap the reconstruction starts cold, and frames whose reference or whose scans lay in the gap have
-no marks any more, so that they are absent rather than wrong.
+a gap the reconstruction starts cold, and frames whose reference, calibration or scans lay in the
+gap have no marks any more, so that they are absent rather than wrong.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from tactomo.recording import (
     ScanKey,
     open_file,
     open_recording,
+    read_calibration,
     read_mark,
     read_reference_number,
     to_origin,
@@ -73,7 +74,7 @@ class Recovery:
     is_cut: bool = False
     """Whether the end is missing; nobody can tell how much of it."""
     frames_lost: int = 0
-    """Reconstructed dual scans after a gap whose reference or whose scans are lost."""
+    """Reconstructed dual scans after a gap whose reference, calibration or scans are lost."""
 
     @property
     def is_intact(self) -> bool:
@@ -139,6 +140,7 @@ class _Salvage:
         self._counters: dict[Channel, int] = {}
         self._time_ns: int | None = None  # of the newest bytes of a port
         self._reference: int | None = None
+        self._calibration = 0
         self._open_gap: Gap | None = None  # whose other side in time has not been reached
         self._open_gap_of: dict[Channel, Gap] = {}  # likewise by each channel's counter
         self._starts_cold = False
@@ -194,6 +196,8 @@ class _Salvage:
             self._follow(int(rest.partition("/")[0]), message)
         elif kind == "reference":
             self._reference = read_reference_number(message.data)
+        elif kind == "calibration":
+            self._calibration = read_calibration(message.data).number
         elif kind == "frame" and self.recovery.gaps:
             data = self._mend(message.data)
         if data is not None:
@@ -221,7 +225,8 @@ class _Salvage:
     def _mend(self, data: bytes) -> bytes | None:
         """Return what a mark after a gap says now; None where a replay could not follow it."""
         mark = read_mark(data)
-        is_known = mark.reference_number == self._reference
+        in_force = (mark.reference_number, mark.calibration_number)
+        is_known = in_force == (self._reference, self._calibration)
         if not is_known or not all(key in self._scans for key in mark.scans):
             self.recovery.frames_lost += 1
             return None

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tactomo_client import Contact
-from tactomo_client.fake import FakeSensor
+from tactomo_client import Contact, ControlError
+from tactomo_client.fake import FakeControl, FakeSensor
 from tactomo_models import SkinSimulator, load_description
 from tactomo_models.calibration_file import calibration_path, read_calibration
 from tactomo_models.scene import Press
@@ -107,6 +107,70 @@ def test_what_cannot_be_used_is_told(
     assert result.returncode == 1
     assert said in result.stderr
     assert "Traceback" not in result.stderr
+
+
+KEPT = {"taken": "2026-01-31T12:00:00+00:00", "readings": 9, "range_kpa": [120.0, 220.0]}
+
+
+@pytest.mark.parametrize(
+    ("answers", "said"),
+    [
+        ({"status": {"sensor": "sole"}}, "that of sole, not of palm. It is in force when the"),
+        (
+            {"reload_calibration": ControlError("of b", "stays", "calibration_refused")},
+            "not in force: the daemon of palm refused it: of b; stays",
+        ),
+        (
+            {"reload_calibration": ControlError("an old one", "", "unknown_command")},
+            "not in force yet: an old one. It is in force when the daemon of palm starts next",
+        ),
+        (
+            {"reload_calibration": {"calibration": None}},
+            "goes by the description's table. It looks",
+        ),
+        ({"reload_calibration": {"calibration": KEPT}}, "goes by the one taken 2026-01-31T12"),
+    ],
+)
+def test_what_the_running_daemon_makes_of_it_is_told(
+    tactomo: Run, tmp_path: Path, answers: dict[str, Any], said: str
+) -> None:
+    (tmp_path / "log.csv").write_text(CSV)
+    with FakeControl({"status": {"sensor": "palm"}} | answers) as control:
+        made = tactomo("calibrate", "palm", "--readings", "log.csv", "--control", control.address)
+    assert made.returncode == 0, made.stderr
+    assert f"kept in {calibration_path('palm')}" in made.stdout
+    assert said in made.stdout
+    assert "in force now" not in made.stdout
+
+
+def test_the_daemon_that_runs_is_asked_to_read_it_again(tactomo: Run) -> None:
+    answers: dict[str, Any] = {"status": {"sensor": "palm"}}
+    with FakeControl(answers) as control:
+        command = ("calibrate", "palm", "--reload", "--control", control.address)
+        control.answers["reload_calibration"] = {"calibration": KEPT}
+        told = tactomo(*command)
+        assert "in force now: the daemon of palm goes by 9 readings of 2026-01-31" in told.stdout
+        control.answers["reload_calibration"] = {"calibration": None}
+        assert "found none: pressures are the description's" in tactomo(*command).stdout
+        control.answers["reload_calibration"] = ControlError("damaged", "", "calibration_refused")
+        refused = tactomo(*command)
+        assert (refused.returncode, refused.stdout) == (1, "")
+        assert "damaged" in refused.stderr
+        control.answers["status"] = {"sensor": "sole"}
+        other = tactomo(*command)
+        assert other.returncode == 1
+        assert "is that of sole, not of palm" in other.stderr
+
+
+def test_without_a_daemon_it_says_when_it_will_be_in_force(tactomo: Run, tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text(CSV)
+    command = ("calibrate", "palm", "--readings", "log.csv", "--control")
+    for address in (f"ipc://{tmp_path}/nobody", "tcp://127.0.0.1:1", "nonsense"):
+        made = tactomo(*command, address)
+        assert made.returncode == 0, made.stderr
+        assert f"kept in {calibration_path('palm')}" in made.stdout
+        assert "not in force yet: " in made.stdout
+        assert "It is in force when the daemon of palm starts next, or by: tact" in made.stdout
 
 
 def test_a_name_that_no_sensor_can_have(tactomo: Run, tmp_path: Path) -> None:

@@ -192,6 +192,7 @@ def test_commands_of_several_tasks_are_carried_out_one_by_one(run: Run) -> None:
         "tare": {"scans": 20},
         "set_tier": {"tier": "fit"},
         "status": {"state": "running"},
+        "reload_calibration": {"calibration": None},
     }
 
     async def main() -> None:
@@ -200,8 +201,10 @@ def test_commands_of_several_tasks_are_carried_out_one_by_one(run: Run) -> None:
                 tare, tier, status = await asyncio.gather(
                     daemon.tare(), daemon.set_tier("fit"), daemon.status()
                 )
+                assert (await daemon.reload_calibration()).calibration is None
             assert (tare.scans, tier.tier, status.state) == (20, "fit", "running")
-            assert [name for name, _ in control.requests] == ["tare", "set_tier", "status"]
+            asked = [name for name, _ in control.requests]
+            assert asked == ["tare", "set_tier", "status", "reload_calibration"]
             assert await aio.request("tare", control.address, PATIENCE_S) == {"scans": 20}
 
     run(main())

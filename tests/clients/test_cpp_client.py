@@ -223,6 +223,7 @@ def test_commands(probe: Path, start: Callable[..., DaemonProcess], tmp_path: Pa
     wait_until(lambda: daemon.status()["budget_ms"] == 25, "the budget")
     assert ask("set_budget") is None
     wait_until(lambda: daemon.status()["budget_ms"] is None, "no budget")
+    assert ask("reload_calibration") == "none"
     refused = subprocess.run(
         [probe, "control", daemon.control, "set_tier", "best"], capture_output=True, text=True
     )

@@ -30,6 +30,7 @@ def test_each_command_has_its_typed_result() -> None:
         "record_stop": {"path": "/data/a.mcap", "bytes": 123},
         "set_tier": {"tier": "fit"},
         "set_budget": {"budget_ms": None},
+        "reload_calibration": {"calibration": {"readings": 12, "range_kpa": [140.0, 240.0]}},
     }
     with FakeControl(answers) as control, Daemon(control.address, timeout_s=PATIENCE_S) as daemon:
         status = daemon.status()
@@ -42,6 +43,9 @@ def test_each_command_has_its_typed_result() -> None:
         assert daemon.record_stop().bytes == 123
         assert daemon.set_tier("fit").tier == "fit"
         assert daemon.set_budget(None).budget_ms is None
+        calibration = daemon.reload_calibration().calibration
+        assert calibration is not None
+        assert (calibration.readings, calibration.range_kpa) == (12, (140.0, 240.0))
     assert control.requests == [
         ("status", {}),
         ("tare", {}),
@@ -49,6 +53,7 @@ def test_each_command_has_its_typed_result() -> None:
         ("record_stop", {}),
         ("set_tier", {"tier": "fit"}),
         ("set_budget", {"budget_ms": None}),
+        ("reload_calibration", {}),
     ]
 
 

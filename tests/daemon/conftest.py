@@ -30,6 +30,7 @@ from tactomo_client.keys import secure
 from tactomo_client.messages import KINDS, Message, decode_message, topic
 from tactomo_models import Contact, Flag, Modality, Reconstruction, Reference, Tier
 from tactomo_models.machine_speed import MachineSpeed
+from tactomo_models.pressure import PressureCurve
 from tactomo_protocol import (
     Channel,
     Command,
@@ -224,13 +225,17 @@ class Listener:
 
 
 class Memory:
-    """A reconstructor: half of each map is the map before, until it is told to forget."""
+    """A reconstructor: half of each map is the map before, until it is told to forget.
+
+    Its contacts have a pressure by the curve in force.
+    """
 
     def __init__(self, seconds: float = 0.0) -> None:
         self.tier = Tier.AUTO
         self.budget_s: float | None = None
         self.seconds = seconds
         self.reference: Reference | None = None
+        self.curve: PressureCurve | None = None
         self._before = np.zeros((51, 51), np.float32)
 
     def set_reference(self, reference: Reference) -> None:
@@ -272,7 +277,8 @@ class Memory:
 
     def _result(self, image: NDArray[np.float32] | None, flags: Flag) -> Reconstruction:
         value = 0.0 if image is None else float(image[0, 0])
-        contacts = [Contact(1, 0.01, -0.02, 7e-4, value, 1e-3, float("nan"))]
+        kpa = np.nan if self.curve is None else self.curve.pressure(np.array(value))
+        contacts = [Contact(1, 0.01, -0.02, 7e-4, value, 1e-3, float(kpa))]
         return Reconstruction(
             map=image,
             pressure_kpa=None,

@@ -58,7 +58,7 @@ def test_the_client_reads_maps_and_contacts(bench: Start) -> None:
         (contact,) = next(few).contacts
         assert (contact.x_mm, contact.y_mm) == pytest.approx((10, -20))
         assert contact.area_mm2 == pytest.approx(700)
-        assert contact.pressure_kpa is None
+        assert contact.pressure_sigma_kpa is None
         assert frame.contacts == (contact,)
 
 

@@ -18,6 +18,7 @@ from tactomo.errors import RecordingError
 from tactomo.recording import Mark, Origin, ScanKey, open_recording
 from tactomo.recording_writer import (
     RecordingWriter,
+    calibration_entry,
     mark_entry,
     port_entry,
     preamble_entry,
@@ -33,6 +34,7 @@ Start = Callable[..., Any]
 Run = Callable[..., Any]
 PERIOD_NS = 50_000_000
 SCANS = 40
+RECALIBRATED = 30
 A_CHUNK = 2
 """Dual scans in each chunk."""
 ORIGIN = Origin("left", "paper_square", "ab" * 32, ("/dev/ttyACM0",), "0.1.0")
@@ -46,7 +48,10 @@ def scan(channel: Channel, counter: int) -> Scan:
 
 
 def write(path: Path) -> None:
-    """Write a recording of many chunks: a hello, references at 1 and in the middle, marks."""
+    """Write a recording of many chunks: a hello, references at 1 and in the middle, marks.
+
+    After three quarters another pressure calibration is put in force.
+    """
     rest = np.linspace(0.05, 0.2, 208)
     reference = Reference.from_scans(np.stack([rest, rest * 1.0001]), None)
     writer = RecordingWriter(path, ORIGIN)
@@ -57,11 +62,16 @@ def write(path: Path) -> None:
         if counter in (0, SCANS // 2):
             references += 1
             writer.add(reference_entry(reference, references, time_ns, time_ns))
+        if counter == RECALIBRATED:
+            writer.add(calibration_entry("another", 1, time_ns, time_ns))
         packets = [scan(channel, counter) for channel in Channel]
         data = b"".join(encode(packet) for packet in packets)
         writer.add(port_entry(0, data, time_ns, time_ns))
         keys = tuple(ScanKey(p.channel, p.counter, p.device_us) for p in packets)
-        mark = Mark(keys, "auto", None, reference_number=references)
+        calibrations = int(counter >= RECALIBRATED)
+        mark = Mark(
+            keys, "auto", None, reference_number=references, calibration_number=calibrations
+        )
         writer.add(mark_entry(mark, time_ns, time_ns))
         if counter % A_CHUNK == A_CHUNK - 1:
             writer.flush()
@@ -145,9 +155,12 @@ def assert_honest(folder: Path, data: bytes) -> None:
     assert known + at_ends == lost
     assert recovery.is_cut or want[-1] == SCANS - 1
     assert not (recovery.is_intact and lost)
-    # A mark is there only with its scans and after its own reference.
+    # A mark is there only with its scans and after its own reference and calibration.
     number: int | None = None
+    calibration = ""
     for mark in recording.marks():
+        calibration = calibration if mark.calibration is None else mark.calibration
+        assert calibration == ("another" if mark.scans[0].counter >= RECALIBRATED else "")
         assert all(key.counter in want for key in mark.scans)
         number = 1 if mark.scans[0].counter < SCANS // 2 else 2
         assert mark.reference_number == number
@@ -178,7 +191,7 @@ def test_cut_at_every_byte(tmp_path: Path) -> None:
 
 @TAKES_FILES
 @given(st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 7)), min_size=1, max_size=12))
-@example([(6175, 0)])  # a chunk whose length reaches into the next one
+@example([(6202, 0)])  # a chunk whose length reaches into the next one
 def test_bits_flipped_anywhere(tmp_path: Path, flips: list[tuple[int, int]]) -> None:
     data = bytearray(whole())
     for position, bit in flips:

@@ -13,7 +13,12 @@ from mcap.reader import make_reader
 from small_sensor import SMALL
 from tables import table
 from tactomo.recording import Mark, Origin
-from tactomo.recording_writer import RecordingWriter, pack_mark, reference_entry
+from tactomo.recording_writer import (
+    RecordingWriter,
+    calibration_entry,
+    pack_mark,
+    reference_entry,
+)
 from tactomo_client.recording_file import CHANNELS, PROFILE
 from tactomo_models import Flag, Press, Reference, SkinSimulator, load_cell, load_description
 from tactomo_models.batch import reconstruct_file
@@ -94,10 +99,12 @@ def test_every_word_of_a_recordings_origin_has_its_row(tmp_path: Path) -> None:
     assert table(PAGE, "## A recording's origin").keys() == metadata.metadata.keys()
 
 
-def test_every_field_of_a_frame_and_of_a_reference_has_its_row() -> None:
+def test_every_field_of_what_is_recorded_has_its_row() -> None:
     frame = msgpack.unpackb(pack_mark(Mark((), "auto", None)))
     assert table(PAGE, "## A frame").keys() == frame.keys()
     scan = np.ones(3)
     whole = Reference(scan, scan, scan, scan, 1, scan, scan)
     reference = msgpack.unpackb(reference_entry(whole, 1, 0, 0).data)
     assert table(PAGE, "## A reference").keys() == reference.keys()
+    calibration = msgpack.unpackb(calibration_entry("", 1, 0, 0).data)
+    assert table(PAGE, "## A calibration put in force").keys() == calibration.keys()

@@ -1,7 +1,8 @@
 """A skin that answers otherwise than its description says: calibrated, its pressures are right.
 
 The twin's sheet needs a fifth more pressure for the same change. The load cell is the truth; the
-session is at a terminal, the daemon reads the twin's serial ports, contacts come by the stream.
+session is at a terminal, the daemon reads the twin's serial ports, contacts come by the stream. It
+goes by the new calibration as soon as that is kept, and so does a replay of what is recorded then.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from pathlib import Path
 import pytest
 from daemon_process import DaemonProcess
 from tactomo_client import Contact, request, subscribe
+from tactomo_client.recording import open_recording
 from terminal import Terminal
 from whole_system import ANYWHERE, PATIENCE_S, wait_for
 
@@ -89,18 +91,19 @@ def test_a_guided_session_makes_pressures_right(
     twin: dict[str, list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-    before = Bench(twin, tmp_path)
-    wrong = before.contact(200)
+    bench = Bench(twin, tmp_path)
+    wrong = bench.contact(200)
     assert wrong.pressure_kpa == pytest.approx(200 / STIFFER, abs=6), "the description's table"
-    before.clear()
+    bench.clear()
     picture = tmp_path / "curve.png"
-    options = ("--live", "--stream", before.daemon.stream, "--picture", str(picture))
+    addresses = ("--stream", bench.daemon.stream, "--control", bench.daemon.control)
+    options = ("--live", *addresses, "--picture", str(picture))
     with Terminal("calibrate", NAME, *options) as terminal:
         terminal.wait_for("Diameter of the indenter in mm")
         terminal.enter(str(DIAMETER_MM))
         for number, kpa in enumerate(LEVELS_KPA, start=1):
             terminal.wait_for(f"Reading {number}, going")
-            force_n = before.press(kpa)
+            force_n = bench.press(kpa)
             terminal.enter("")
             terminal.wait_for("still: |Δσ|/σ₀")
             terminal.wait_for("Load cell in N")
@@ -108,19 +111,20 @@ def test_a_guided_session_makes_pressures_right(
             terminal.wait_for(f"{kpa} kPa, taken")
         said = terminal.wait_for("Reading 9")
         assert "Still wanted: 3 more that the channel answers to; one between 110" in said
+        recording = tmp_path / "recalibrated.mcap"
+        bench.daemon.ask("record_start", path=str(recording), maps=True)
         terminal.enter("done")
         assert terminal.wait() == 0, terminal.shown
     assert f"palm: {len(LEVELS_KPA)} readings" in terminal.shown
     assert picture.stat().st_size > 10_000
-    before.close()
+    assert "in force now: the daemon of palm goes by it" in terminal.shown
 
-    after = Bench(twin, tmp_path)
-    calibration = after.daemon.status()["description"]["calibration"]
+    calibration = bench.daemon.status()["description"]["calibration"]
     assert calibration["readings"] == len(LEVELS_KPA)
     assert calibration["device_ids"]
     errors = []
     for kpa in HELD_OUT_KPA:
-        found = after.contact(kpa)
+        found = bench.contact(kpa)
         assert found.pressure_range == "within"
         assert found.pressure_kpa is not None
         assert found.pressure_sigma_kpa is not None
@@ -128,12 +132,32 @@ def test_a_guided_session_makes_pressures_right(
         errors.append((found.pressure_kpa - kpa) / found.pressure_sigma_kpa)
         assert found.force_n == pytest.approx(kpa * 1e-3 * AREA_MM2, rel=0.12)
     assert max(map(abs, errors)) < 2.5, errors
+    bench.daemon.ask("record_stop")
     # What is two standard uncertainties above nothing counts as something: by chance, one in forty.
-    light = [after.contact(kpa) for kpa in (80, 90, 100)]
+    light = [bench.contact(kpa) for kpa in (80, 90, 100)]
     below = [contact for contact in light if contact.pressure_range == "below"]
     assert len(below) >= 2
     assert all(contact.pressure_kpa is None for contact in below)
-    hard = after.contact(300)
+    hard = bench.contact(300)
     assert hard.pressure_range == "above"
     assert hard.pressure_kpa == pytest.approx(250, abs=0.1)
-    after.close()
+    bench.close()
+    assert replayed(recording, tmp_path / "again.mcap") == pressures(recording)
+
+
+def replayed(recording: Path, again: Path) -> dict[int, list[float | None]]:
+    """Replay a recording as a user would, and return what its contacts read then."""
+    command = ("replay", recording, "--speed", "max", "--record", again)
+    addresses = ("--stream", ANYWHERE, "--control", ANYWHERE)
+    subprocess.run(
+        [sys.executable, "-m", "tactomo.cli", *command, *addresses], check=True, timeout=300
+    )
+    return pressures(again)
+
+
+def pressures(recording: Path) -> dict[int, list[float | None]]:
+    """What the contacts of each frame read, by its counter."""
+    return {
+        frame.scan_counter: [contact.pressure_kpa for contact in frame.contacts]
+        for frame in open_recording(recording).frames("contacts")
+    }

@@ -292,6 +292,8 @@ int control(tactomo::Control daemon, const std::string& command, const std::stri
     } else if (command == "set_budget") {
         print_value(daemon.set_budget(
             argument.empty() ? std::nullopt : std::optional(std::atof(argument.c_str()))));
+    } else if (command == "reload_calibration") {
+        print_text(daemon.reload_calibration().value_or("none"));
     } else if (command == "press") {
         daemon.request("press", tactomo::Control::patience, std::pair("x_mm", 20.0),
                        std::pair("y_mm", -10.0), std::pair("id", "probe"));

@@ -16,6 +16,7 @@ nothing of the daemon.
 
 from tactomo_client.control import (
     BudgetInForce,
+    CalibrationInForce,
     Control,
     Daemon,
     RecordedFile,
@@ -28,6 +29,7 @@ from tactomo_client.control import (
 from tactomo_client.errors import (
     AlreadyRecording,
     BadArgument,
+    CalibrationRefused,
     CannotWrite,
     ClientError,
     ControlError,
@@ -59,6 +61,8 @@ __all__ = [
     "AlreadyRecording",
     "BadArgument",
     "BudgetInForce",
+    "CalibrationInForce",
+    "CalibrationRefused",
     "CannotWrite",
     "ClientError",
     "Contact",

@@ -34,9 +34,11 @@ from tactomo_client.connection import Owner, Waiting
 from tactomo_client.control import (
     CONNECT_TIMEOUT_S,
     RECORD_TIMEOUT_S,
+    RELOAD_TIMEOUT_S,
     TARE_TIMEOUT_S,
     TIMEOUT_S,
     BudgetInForce,
+    CalibrationInForce,
     ControlLine,
     RecordedFile,
     RecordingStarted,
@@ -309,6 +311,17 @@ class Daemon(Control):
 
         """
         return filled(BudgetInForce, await self.request("set_budget", budget_ms=budget_ms))
+
+    async def reload_calibration(self) -> CalibrationInForce:
+        """Have the sensor's pressure calibration read again: a new one is in force at once.
+
+        Raises:
+            CalibrationRefused: it is damaged, or of another sensor or device; what was in force
+                stays so.
+
+        """
+        result = await self.request("reload_calibration", RELOAD_TIMEOUT_S)
+        return filled(CalibrationInForce, result)
 
 
 async def _wait(steps: Waiting[T]) -> T:

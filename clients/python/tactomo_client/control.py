@@ -18,7 +18,7 @@ from tactomo_client.errors import ClientError, ControlError, control_error
 from tactomo_client.filled import filled
 from tactomo_client.keys import Keys, as_keys
 from tactomo_client.messages import DEFAULT_CONTROL, decode_reply, encode_request
-from tactomo_client.status import Status, status_from_fields
+from tactomo_client.status import Calibration, Status, status_from_fields
 
 TIMEOUT_S: Final = 2.0
 TARE_TIMEOUT_S: Final = 30.0
@@ -27,6 +27,8 @@ RECORD_TIMEOUT_S: Final = 10.0
 """For a recording: a disk may take its time."""
 CONNECT_TIMEOUT_S: Final = 5.0
 """How long nothing may listen at the address: a daemon that was started just now takes 2 to 3 s."""
+RELOAD_TIMEOUT_S: Final = 10.0
+"""For a calibration: until the frame that is being made is done."""
 LOOK_S: Final = 0.1
 
 
@@ -171,6 +173,14 @@ class BudgetInForce:
 
     budget_ms: float | None
     """None: the tier's own."""
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationInForce:
+    """What changes are turned into pressures by from now on."""
+
+    calibration: Calibration | None
+    """None: the table of the sensor's description."""
 
 
 @dataclass(slots=True)
@@ -346,6 +356,18 @@ class Daemon(Control):
 
         """
         return filled(BudgetInForce, self.request("set_budget", budget_ms=budget_ms))
+
+    def reload_calibration(self) -> CalibrationInForce:
+        """Have the sensor's pressure calibration read again: a new one is in force at once.
+
+        It is looked for on the daemon's computer, where it is looked for at the start.
+
+        Raises:
+            CalibrationRefused: it is damaged, or of another sensor or device; what was in force
+                stays so.
+
+        """
+        return filled(CalibrationInForce, self.request("reload_calibration", RELOAD_TIMEOUT_S))
 
 
 def to_status(result: Mapping[str, Any]) -> Status:

@@ -11,7 +11,8 @@ ClientError
 │   ├── AlreadyRecording  a recording runs already
 │   ├── NotRecording      none runs that could be stopped
 │   ├── CannotWrite       the recording's file exists, may not be written, or the disk is full
-│   └── NoNetwork         the sensor has no network for the tier that was asked for
+│   ├── NoNetwork         the sensor has no network for the tier that was asked for
+│   └── CalibrationRefused  the pressure calibration is damaged, another sensor's or device's
 ├── StreamTimeout   no frame came within `timeout_s`: the cable is out, the name is misspelt
 ├── KeysError       keys cannot be used (the file is missing, others may read it), or the server
 │                   does not let them in: the client is not on its list, it is another server
@@ -91,6 +92,10 @@ class NoNetwork(ControlError):  # noqa: N818
     """``no_network``: the sensor has no network for the tier that was asked for."""
 
 
+class CalibrationRefused(ControlError):  # noqa: N818
+    """``calibration_refused``: damaged, or of another sensor or device; the old one stays."""
+
+
 _OF_NAME = {
     "no_answer": NoAnswer,
     "bad_argument": BadArgument,
@@ -100,6 +105,7 @@ _OF_NAME = {
     "not_recording": NotRecording,
     "cannot_write": CannotWrite,
     "no_network": NoNetwork,
+    "calibration_refused": CalibrationRefused,
 }
 
 

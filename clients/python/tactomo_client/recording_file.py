@@ -37,6 +37,7 @@ CHANNELS: Final[Mapping[str, str]] = {
         for port in (0, 1)
         for hello in ("", "/hello")
     },
+    "calibration": "msgpack",
 }
 """Encoding of each topic, in the order of their MCAP channel numbers from 1."""
 ROTATED_NAME: Final = r"(?P<sensor>.+)-(?P<number>\d{6,})-(?P<begin>\d{8}T\d{6}Z)\.mcap"

@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tactomo.cli.app import (
+    DEFAULT_CONTROL,
     DEFAULT_DESCRIPTION,
     DEFAULT_NAME,
     DEFAULT_STREAM,
     STEER,
+    ControlAddress,
     KeysFolder,
     StreamAddress,
     app,
@@ -37,6 +39,7 @@ ROWS = 9  # of the table
         "tactomo calibrate left_forearm --readings load_cell.csv --recording presses.mcap",
         "tactomo calibrate left_forearm --readings magnitudes.csv --dry-run --picture curve.png",
         "tactomo calibrate left_forearm --show",
+        "tactomo calibrate left_forearm --reload",
     ),
 )
 def calibrate(
@@ -82,10 +85,14 @@ def calibrate(
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Keep nothing.")] = False,
     show: Annotated[bool, typer.Option("--show", help="Show the one that is kept.")] = False,
+    reload: Annotated[
+        bool, typer.Option("--reload", help="Have the running daemon read the one it finds again.")
+    ] = False,
     fresh: Annotated[
         bool, typer.Option("--fresh", help="With --live: begin anew, not with what was taken.")
     ] = False,
     stream: StreamAddress = DEFAULT_STREAM,
+    control: ControlAddress = DEFAULT_CONTROL,
     keys: KeysFolder = None,
 ) -> None:
     """Find out what pressure the magnitude channel's change means on this very sensor.
@@ -94,7 +101,8 @@ def calibrate(
     than the sensor answers to as hard as it will be pressed, and back again: ten presses or more,
     each held still. A rising curve is fitted to the readings, with its uncertainty; below its onset
     and beyond the last reading contacts say so instead of a pressure. It is kept by the sensor's
-    name and devices, and a daemon takes it when it starts.
+    name and devices. The sensor's daemon goes by it at once if it runs (at --control), else from
+    its next start.
 
     **--live** says what to press, waits until the contact is still, asks what the load cell says,
     and tells when it is enough. Ctrl-C keeps what was taken; the same command goes on from there.
@@ -108,8 +116,8 @@ def calibrate(
     A service keeps its own: `sudo -u tactomo STATE_DIRECTORY=/var/lib/tactomo/NAME tactomo
     calibrate NAME ...`, or `calibration = "FILE"` in its configuration.
     """
-    if [live, readings is not None, show].count(True) != 1:
-        raise typer.BadParameter("give one of --live, --readings and --show")
+    if [live, readings is not None, show, reload].count(True) != 1:
+        raise typer.BadParameter("give one of --live, --readings, --show and --reload")
     if recording is not None and readings is None:
         raise typer.BadParameter("--recording goes with --readings")
     if diameter_mm is not None and area_mm2 is not None:
@@ -117,6 +125,11 @@ def calibrate(
     from tactomo_client.messages import check_sensor_name
 
     check_sensor_name(sensor)
+    if reload:
+        from tactomo.cli.calibrate_reload import reload_kept
+
+        typer.echo(reload_kept(sensor, control, keys))
+        return
     if picture is not None:
         prepare_picture(picture)
     area = area_mm2 if diameter_mm is None else math.pi / 4 * diameter_mm**2
@@ -135,8 +148,11 @@ def calibrate(
         made = _of_files(sensor, readings, recording, area, time_offset, description, ids)
     tell(made)
     if not (dry_run or show):
+        from tactomo.cli.calibrate_reload import taken_up
+
         save_calibration(made, path)
-        typer.echo(f"kept in {path}: the daemon of {sensor} takes it when it starts next")
+        typer.echo(f"kept in {path}")
+        typer.echo(taken_up(made, path, control, keys))
     if picture is not None:
         from tactomo.cli.calibrate_picture import draw_calibration
 

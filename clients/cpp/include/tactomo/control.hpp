@@ -209,6 +209,16 @@ public:
             .get_or_nil<double>("budget_ms");
     }
 
+    /// Has the sensor's pressure calibration read again, as after `tactomo calibrate`: a new one is in
+    /// force at once. Returns when it was taken (ISO 8601, UTC); nothing where pressures go by the
+    /// description. Refused ("calibration_refused") where it is damaged, or another sensor's or device's.
+    std::optional<std::string> reload_calibration() {
+        const Reply reply = request("reload_calibration", std::chrono::seconds(10));
+        const auto found = reply.get_or_nil<detail::Members>("calibration");
+        if (!found) return std::nullopt;
+        return detail::member<std::string>(*found, "taken");
+    }
+
     /// Any command, those of the twin, too: request("press", 2s, std::pair("x_mm", 10.0), ...).
     template <typename... Values>
     Reply request(std::string_view command, std::chrono::milliseconds timeout = patience,
