@@ -51,10 +51,14 @@ def test_it_names_no_topic_and_no_field_that_there_is_not() -> None:
         assert topic in TOPICS, path
         schema: Any = SCHEMAS.get(topic)
         for step in filter(None, rest.split(".")):
-            name, index = re.fullmatch(r"(\w+)(\[\d+\])?", step).groups()  # type: ignore[union-attr]
+            name, _, field = re.fullmatch(  # type: ignore[union-attr]
+                r"(\w+)(\[:\]\{(\w+)==\d+\})?", step
+            ).groups()
             assert name in schema["properties"], path
             schema = schema["properties"][name]
-            schema = schema["items"] if index else schema
+            if field:
+                schema = schema["items"]
+                assert schema["properties"][field]["type"] == "integer", path
 
 
 @pytest.mark.parametrize("sensor", ["left_forearm", "left.arm-2"])

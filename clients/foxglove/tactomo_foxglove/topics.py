@@ -14,7 +14,10 @@ topic                  schema                      what
 /SENSOR/events         foxglove.Log                live only: the daemon's events
 =====================  ==========================  =================================================
 
-What is unknown is left out of the JSON messages.
+What is unknown is left out of the JSON messages. A contact there has a `trace`, which it keeps for
+as long as it is followed: the least number, from 1, that no other has. Its id would not do for a
+layout, since ids are never used again; nor its place in the list, where others move up when one
+lifts.
 """
 
 from __future__ import annotations
@@ -60,7 +63,8 @@ CONTACT_SCHEMA: Final = _object(
     **{
         field.name: {"int": _INTEGER, "str": _TEXT}.get(str(field.type), _NUMBER)
         for field in fields(Contact)
-    }
+    },
+    trace=_INTEGER,
 )
 FRAME_SCHEMA: Final = {
     "title": "tactomo.Frame",
@@ -116,6 +120,7 @@ class SensorTopics:
         self.description: Mapping[str, Any] = {}
         self._placement = placement
         self._last: Frame | None = None
+        self._traces = _Traces()
         self._transforms = transforms
 
         def topic(name: str) -> str:
@@ -140,7 +145,8 @@ class SensorTopics:
         """Say what a frame shows, and its numbers; `age_s` is None where nobody knows it."""
         self._hang(time_ns)
         self._show(frame, time_ns, "")
-        self._frame.log(_frame_numbers(frame, self._last, age_s), log_time=time_ns)
+        numbers = _frame_numbers(frame, self._last, age_s)
+        self._frame.log(numbers | {"contacts": self._traces.of(frame)}, log_time=time_ns)
         self._last = frame
 
     def stale(self, frame: Frame, words: str, time_ns: int) -> None:
@@ -179,6 +185,28 @@ class SensorTopics:
             self._annotations.log(marks, log_time=time_ns)
 
 
+class _Traces:
+    """Which contact has which trace of the plots."""
+
+    def __init__(self) -> None:
+        self._session = ""
+        self._ids: list[int] = []  # of each trace, that of the contact which has it or had it last
+
+    def of(self, frame: Frame) -> list[dict[str, Any]]:
+        """Return the numbers of the frame's contacts by their ids, the trace of each among them."""
+        if frame.session != self._session:
+            self._session, self._ids = frame.session, []
+        contacts = sorted(frame.contacts, key=lambda contact: contact.id)
+        shown = {contact.id for contact in contacts}
+        for new in sorted(shown - set(self._ids)):
+            free = next((i for i, last in enumerate(self._ids) if last not in shown), None)
+            if free is None:
+                self._ids.append(new)
+            else:
+                self._ids[free] = new
+        return [{**contact_numbers(c), "trace": self._ids.index(c.id) + 1} for c in contacts]
+
+
 def _frame_numbers(frame: Frame, last: Frame | None, age_s: float | None) -> dict[str, Any]:
     follows = last is not None and last.session == frame.session
     forces = [c.force_n for c in frame.contacts if c.force_n is not None]
@@ -193,7 +221,6 @@ def _frame_numbers(frame: Frame, last: Frame | None, age_s: float | None) -> dic
             "flags": sorted(frame.flags),
             "flag_count": len(frame.flags),
             "contact_count": len(frame.contacts),
-            "contacts": [contact_numbers(c) for c in sorted(frame.contacts, key=lambda c: c.id)],
             "misfit": frame.misfit,
             "confidence": frame.confidence,
             "age_ms": None if age_s is None else age_s * 1e3,
