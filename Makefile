@@ -37,10 +37,11 @@ firmware:        ## the C firmware library's emulator of a skin: firmware_protoc
 	$(MAKE) -C firmware_protocol/c
 
 FUZZ_SECONDS ?= 60
-fuzz: $(READY)   ## a minute of each parser, ours (x86_64) and the C one (clang): FUZZ_SECONDS=3600
+fuzz: $(READY)   ## a minute of each parser, in Python (x86_64), C and C++ (clang): FUZZ_SECONDS=3600
 	$(BIN)/python -m pip install --quiet 'atheris==3.0.0'
-	set -e; for target in wire lines message request description recording; do \
+	set -e; for target in $$($(BIN)/python tests/fuzz/run.py list); do \
 	  $(BIN)/python tests/fuzz/run.py $$target -max_total_time=$(FUZZ_SECONDS); done
+	$(BIN)/python tests/fuzz/run_cpp.py -max_total_time=$(FUZZ_SECONDS)
 	$(MAKE) -C firmware_protocol/c fuzz FUZZ_SECONDS=$(FUZZ_SECONDS)
 
 lint: $(READY)   ## ruff and mypy --strict

@@ -1,7 +1,8 @@
 """Fuzz one parser by libFuzzer, led by coverage: ``python tests/fuzz/run.py TARGET [FLAGS]``.
 
-Flags are libFuzzer's, such as ``-max_total_time=300``. What breaks the parser is left in a file
-``crash-...`` in the current folder; give that file as the only flag to see it again. Needs atheris.
+``list`` in place of a target names all of them. Flags are libFuzzer's, such as
+``-max_total_time=300``. What breaks the parser is left in ``crash-...`` in the current folder;
+give that file as the only flag to see it again. Needs atheris.
 """
 
 from __future__ import annotations
@@ -21,6 +22,9 @@ def main() -> None:
     sys.path.insert(0, str(SUPPORT))
     with atheris.instrument_imports(include=PACKAGES):
         from fuzz_targets import TARGETS
+    if sys.argv[1:] == ["list"]:
+        print(*TARGETS)
+        return
     if len(sys.argv) < 2 or sys.argv[1] not in TARGETS:
         sys.exit(f"usage: run.py {'|'.join(TARGETS)} [FLAGS]")
     target = TARGETS[sys.argv.pop(1)]

@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import msgpack  # type: ignore[import-untyped]
+import numpy as np
 import pytest
-from fuzz_targets import HEADER, TARGETS
+from fuzz_targets import HEADER, TANK, TARGETS, import_anything
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from tactomo_client import MessageError
 from tactomo_client.messages import MAX_DEPTH, MAX_ENTRIES, decode_message, encode_message
 from tactomo_models import load_description
@@ -61,6 +63,38 @@ def test_no_mutation_breaks_a_parser(name: str) -> None:
         target.parse(data)
 
     try_it()
+
+
+@st.composite
+def archives(draw: st.DrawFn) -> dict[str, NDArray[Any]]:
+    """Arrays of both layouts that can be imported, and what becomes of them in other hands."""
+    count = TANK.electrode_count
+    volts = np.sin(np.arange(3.0 * count**2)).reshape(3, count, count)
+    pairs = np.array([(k, (k + 1) % count) for k in range(count)], float)
+    structure = volts.reshape(3, -1)[:, : TANK.measurements]
+    scans = {"structure": structure, "structure_reference": structure[0]}
+    scans["magnitude"] = structure * np.nan
+    single = {"volts": volts, "injection": pairs}
+    arrays = {**draw(st.sampled_from([scans, single])), "t": np.arange(3.0)}
+    for name in draw(st.sets(st.sampled_from(sorted(arrays)), max_size=2)):
+        array = arrays[name].copy()
+        at = draw(POSITION) % array.size
+        array.flat[at] = draw(st.sampled_from([np.nan, np.inf, -1e300, 1e18, 0.0, -1.0]))
+        cut = draw(st.sampled_from([slice(None), slice(None), slice(0, 0), slice(1, None), None]))
+        kind = draw(st.sampled_from(["f8", "f8", "f4", "c16", "i8", "u4", "?", "U4", "M8[s]"]))
+        arrays[name] = array[cut].astype(kind)
+    return arrays
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@settings(max_examples=200)
+@given(arrays=archives())
+def test_any_arrays_are_scans_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, arrays: dict[str, NDArray[Any]]
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "any.npz"
+    np.savez(path, **arrays)  # type: ignore[arg-type]
+    import_anything(path)
 
 
 def hostile_bodies() -> dict[str, bytes]:

@@ -20,8 +20,10 @@ from typing import Any
 import numpy as np
 import sciospec_stream
 from pydantic import ValidationError
+from tactomo.config import load_config
 from tactomo.control import COMMANDS
-from tactomo.errors import RecordingError
+from tactomo.errors import ConfigError, RecordingError, TactomoError
+from tactomo.imported import read_scans
 from tactomo.protocols import protocol_named
 from tactomo.protocols.sciospec import Sciospec
 from tactomo.recording import Mark, Origin, ScanKey, open_recording
@@ -34,6 +36,7 @@ from tactomo.recording_writer import (
     reference_entry,
 )
 from tactomo.twin import control as twin_control
+from tactomo.twin.scene import load_scene
 from tactomo_client import ClientError
 from tactomo_client.event import event_from_message
 from tactomo_client.frame import frame_from_message
@@ -54,7 +57,11 @@ from tactomo_client.recording import RecordingWarning
 from tactomo_client.recording import open_recording as open_frames
 from tactomo_client.status import status_from_message
 from tactomo_models import Reference, SensorDescription, load_description, shipped_descriptions
-from tactomo_models.errors import DescriptionError
+from tactomo_models.calibration import Reading
+from tactomo_models.calibration_file import PressureCalibration, parse_calibration, subject_of
+from tactomo_models.errors import CalibrationError, DataError, DescriptionError
+from tactomo_models.load_cell import Seen, direct_readings, joined_readings, read_load_cell
+from tactomo_models.pressure import pressures_of
 from tactomo_models.sensors import __path__ as sensors_path
 from tactomo_protocol import (
     Acknowledge,
@@ -71,6 +78,7 @@ from tactomo_protocol import (
     encode,
 )
 
+DEPLOY = Path(__file__).parents[2] / "deploy"
 BOTH = (Channel.MAGNITUDE, Channel.STRUCTURE)
 HELLO = Hello("fuzz-1", "1.0", BOTH, 16, 1, 1, 208, SampleFormat.INT32, 1e-6, 20.0)
 SCAN = Scan(Channel.STRUCTURE, 7, 350_000, ScanFlag(0), np.arange(208, dtype=np.int32))
@@ -279,6 +287,113 @@ def _parse_sciospec(data: bytes) -> None:
     assert len(whole.begun()) < 9000
 
 
+def _eit_examples() -> list[bytes]:
+    """A frame with each of the three headers."""
+    date = "2024.01.31. 12:30:05.250"
+    said = ["setup_00001", date, "10000", "10000", "0", "1", "0.001", "20"]
+    row = "\t".join(f"{n % 5}e-2\t-1e-4" for n in range(TANK.electrode_count))
+    frame = [f"{k + 1} {(k + 1) % 16 + 1}\n{row}" for k in range(TANK.electrode_count)]
+    headers = [["9", *said], ["11", "2", *said, ""], ["18", "2", *said, *[""] * 8]]
+    return ["\n".join([*header, *frame, ""]).encode() for header in headers]
+
+
+def _parse_eit(data: bytes) -> None:
+    path = _scratch("fuzzed.eit")
+    path.write_bytes(data)
+    import_anything(path)
+
+
+def import_anything(path: Path) -> None:
+    """Import a file of scans: it becomes packets by its own times, or is refused."""
+    with suppress(TactomoError, DataError):
+        scans = read_scans(path, TANK, None)
+        assert scans.count > 0
+        times_s = scans.times(20.0 if scans.time_s is None else None)
+        assert np.isfinite(times_s).all()
+        assert (np.diff(times_s) >= 0).all()
+        for time_s, packet in scans.packets(times_s):
+            assert time_s >= 0
+            encode(packet)
+
+
+def _calibration_examples() -> list[bytes]:
+    """As `tactomo calibrate` writes them."""
+    readings = [
+        Reading(pressure_kpa=kpa, magnitude=max(kpa - 60.0, 0.0) / 1000)
+        for kpa in np.linspace(20.0, 200.0, 12).tolist()
+    ]
+    subject = subject_of("left", load_description("paper_square"), ("fuzz-1",))
+    made = PressureCalibration.of_readings(subject, readings)
+    return [made.model_dump_json(indent=1).encode()]
+
+
+def _parse_calibration(data: bytes) -> None:
+    """A curve, by which any magnitude becomes a pressure that is known or said to be unknown."""
+    with suppress(CalibrationError):
+        calibration = parse_calibration(data, "fuzzed")
+        curve = calibration.curve
+        low, high = curve.range_kpa
+        magnitude = np.array([0.0, 0.01, 0.1, 1.0, 5.0])
+        areas_m2, unknown = np.full(5, 1e-3), np.full(5, np.nan)
+        found = pressures_of(curve, magnitude, 0.1 * magnitude, areas_m2, unknown)
+        known = found.kpa[~np.isnan(found.kpa)]
+        assert ((low <= known) & (known <= high)).all()
+        assert calibration.words
+
+
+def _load_cell_examples() -> list[bytes]:
+    presses = "".join(f"{n};{n / 10};{n / 1000};0.001;up\r\n" for n in range(0, 200, 9))
+    held = "".join(f"{n / 10},{50 * (n // 10)},706.9\n" for n in range(60))
+    return [
+        b"pressure_kpa;time_s;magnitude;magnitude_sigma;direction\r\n" + presses.encode(),
+        b"# by hand\ntime_s,force_n,area_mm2\n" + held.encode(),
+        b'\xef\xbb\xbf"force_n"\tdiameter_mm\tmagnitude\n"100"\t30\t0.1\n\n50\t30\t.05\n',
+    ]
+
+
+def _parse_load_cell(data: bytes) -> None:
+    """As far as readings, from the log alone and with what a sensor showed meanwhile."""
+    path = _scratch("fuzzed.csv")
+    path.write_bytes(data)
+    for area_mm2 in (None, 700.0):
+        with suppress(CalibrationError):
+            cell = read_load_cell(path, area_mm2)
+            assert np.isfinite(cell.pressure_kpa).all()
+            if (cell.magnitude >= 0).any():
+                direct_readings(cell)
+            if cell.clock:
+                assert len(joined_readings(cell, SEEN).readings) <= len(cell.lines)
+
+
+SEEN = Seen(np.arange(200) / 20, np.linspace(0, 0.2, 200), np.full(200, 0.01), np.ones(200, int))
+
+
+def _config_examples() -> list[bytes]:
+    return [(DEPLOY / "daemon.example.toml").read_bytes(), b'ports = ["/dev/ttyACM0"]\n[curve]\n']
+
+
+def _parse_config(data: bytes) -> None:
+    path = _scratch("daemon.toml")
+    path.write_bytes(data)
+    with suppress(ConfigError):
+        load_config(path)
+
+
+def _scene_examples() -> list[bytes]:
+    return [path.read_bytes() for path in sorted((DEPLOY / "scenes").glob("*.toml"))]
+
+
+def _parse_scene(data: bytes) -> None:
+    """Including what presses at some times of it."""
+    path = _scratch("scene.toml")
+    path.write_bytes(data)
+    with suppress(ConfigError):
+        scene = load_scene(path)
+        for share in (0.0, 0.3, 0.9, 1.5):
+            for indenter in scene.presses_at(share * scene.length_s).values():
+                indenter.press()
+
+
 @cache
 def _folder() -> tempfile.TemporaryDirectory[str]:
     return tempfile.TemporaryDirectory(prefix="tactomo-fuzz-")
@@ -295,5 +410,10 @@ TARGETS: Mapping[str, Target] = {
     "message": Target(_message_examples, _parse_message),
     "request": Target(_request_examples, _parse_request),
     "description": Target(_description_examples, _parse_description),
+    "config": Target(_config_examples, _parse_config),
+    "scene": Target(_scene_examples, _parse_scene),
     "recording": Target(_recording_examples, _parse_recording),
+    "eit": Target(_eit_examples, _parse_eit),
+    "calibration": Target(_calibration_examples, _parse_calibration),
+    "load_cell": Target(_load_cell_examples, _parse_load_cell),
 }
