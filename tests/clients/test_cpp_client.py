@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import math
 import os
 import random
 import shutil
@@ -458,6 +459,7 @@ def any_value(dice: random.Random) -> Any:
     return dice.choice(
         [
             *(None, True, 0, 1, -1, 255, 2**32, -(2**31), 2**62, 1.5, -0.0, "", "within", "ä€😀"),
+            *(math.nan, -math.inf, 2**63, 2**64 - 1, -(2**63)),
             *(b"", b"\0" * 48, [], {}, [1, 2], [3.5, -4], [[]], {"a": 1}, ["misfit_high"]),
             *(
                 "left",

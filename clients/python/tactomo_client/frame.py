@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactomo_client.errors import MessageError
-from tactomo_client.messages import MAP, Message, array_from_wire, clock_id
+from tactomo_client.messages import MAP, Message, array_from_wire, clock_id, is_integer
 
 Image = NDArray[np.float32]
 
@@ -228,8 +228,8 @@ def _word(fields: Mapping[str, object], name: str, absent: str) -> str:
 
 def _integer(fields: Mapping[str, object], name: str) -> int:
     value = fields.get(name)
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise MessageError(f"field {name!r} is not an integer")
+    if not is_integer(value):
+        raise MessageError(f"field {name!r} is not an integer of 64 bits")
     return value
 
 

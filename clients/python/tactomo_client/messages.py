@@ -15,7 +15,7 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeGuard
 
 import msgpack  # type: ignore[import-untyped]
 import numpy as np
@@ -46,7 +46,8 @@ ARRAY_DTYPES: Final = ("<f4", "<f8", "<i2", "<i4", "<i8", "<u2", "<u4", "<u8", "
 
 _SENSOR_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 _KIND_NAME = re.compile(r"[a-z][a-z_]{0,31}")
-_UINT64_MAX = 2**64 - 1
+_INT64 = range(-(2**63), 2**63)
+_UINT64 = range(2**64)
 
 # Header field -> (accepted types, may be nil, may be left out). STREAM.md has the meanings.
 _HEADER: Final[dict[str, tuple[tuple[type, ...], bool, bool]]] = {
@@ -273,6 +274,15 @@ def _check_depth(fields: Any) -> None:
     raise MessageError(f"the body is nested more than {MAX_DEPTH} deep")
 
 
+def is_integer(value: object, within: range = _INT64) -> TypeGuard[int]:
+    """Whether a value is an integer that its field has room for."""
+    return isinstance(value, int) and not isinstance(value, bool) and value in within
+
+
+def _is_finite(value: object) -> bool:
+    return not isinstance(value, float) or math.isfinite(value)
+
+
 def _check_header(fields: Mapping[str, Any]) -> None:
     for name, (types, may_be_nil, may_be_absent) in _HEADER.items():
         if name not in fields:
@@ -284,7 +294,8 @@ def _check_header(fields: Mapping[str, Any]) -> None:
             continue
         if not isinstance(value, types) or isinstance(value, bool):
             raise MessageError(f"header field {name!r} is a {type(value).__name__}")
-    if not 0 <= fields["sequence"] <= _UINT64_MAX:
-        raise MessageError(f"header field 'sequence' is {fields['sequence']}")
+        within = _UINT64 if name == "sequence" else _INT64
+        if not (is_integer(value, within) if types == (int,) else _is_finite(value)):
+            raise MessageError(f"header field {name!r} is {value}")
     if not all(isinstance(flag, str) for flag in fields["flags"]):
         raise MessageError("header field 'flags' holds something that is not a string")
