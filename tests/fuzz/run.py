@@ -28,10 +28,14 @@ def main() -> None:
     if len(sys.argv) < 2 or sys.argv[1] not in TARGETS:
         sys.exit(f"usage: run.py {'|'.join(TARGETS)} [FLAGS]")
     target = TARGETS[sys.argv.pop(1)]
+
+    def parse(data: bytes) -> None:
+        target.parse(data)
+
     with tempfile.TemporaryDirectory() as corpus:
         for number, example in enumerate(target.examples()):
             (Path(corpus) / f"example-{number}").write_bytes(example)
-        atheris.Setup([*sys.argv, corpus, "-timeout=5", "-rss_limit_mb=2048"], target.parse)
+        atheris.Setup([*sys.argv, corpus, "-timeout=5", "-rss_limit_mb=2048"], parse)
         atheris.Fuzz()
 
 

@@ -49,7 +49,7 @@ def mutations(draw: st.DrawFn, examples: list[bytes]) -> bytes:
 @pytest.mark.parametrize("name", TARGETS)
 def test_what_is_valid_is_taken(name: str) -> None:
     for example in TARGETS[name].examples():
-        TARGETS[name].parse(example)
+        assert TARGETS[name].parse(example)
 
 
 @pytest.mark.parametrize("name", TARGETS)

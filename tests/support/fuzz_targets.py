@@ -1,8 +1,8 @@
 """What is fuzzed: every parser of ours that reads what others wrote, with examples to start from.
 
-A target takes any bytes and raises nothing: what its parser documents, it takes in itself. The
-default suite mutates the examples for a moment (`test_fuzz`); `make fuzz` has libFuzzer do so for
-long, led by the coverage of our code (`run`).
+A target takes any bytes and raises nothing: what its parser documents, it takes in itself. It tells
+whether the bytes were what the parser reads. The default suite mutates the examples for a moment
+(`test_fuzz`); `make fuzz` has libFuzzer do so for long, led by the coverage of our code (`run`).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from tactomo.recording_writer import (
 )
 from tactomo.twin import control as twin_control
 from tactomo.twin.scene import load_scene
-from tactomo_client import ClientError
+from tactomo_client import ClientError, ControlError, MessageError
 from tactomo_client.event import event_from_message
 from tactomo_client.frame import frame_from_message
 from tactomo_client.messages import (
@@ -102,6 +102,7 @@ ENVELOPE: dict[str, Any] = {
     "misfit": 1.25,
 }
 HEADER = {**ENVELOPE, "scan_counter": 3}
+PRESS = {"at_s": 0.0, "duration_s": 1.0, "x_mm": 1.0, "y_mm": 2.0}
 CONTACT = {"id": 1, "x_mm": 1.0, "y_mm": -2.0, "area_mm2": 700.0, "magnitude": None}
 
 
@@ -110,7 +111,7 @@ class Target:
     """One parser: valid input, and what to do with any other."""
 
     examples: Callable[[], list[bytes]] = field(repr=False)
-    parse: Callable[[bytes], None]
+    parse: Callable[[bytes], bool]
 
 
 def _wire_examples() -> list[bytes]:
@@ -118,7 +119,7 @@ def _wire_examples() -> list[bytes]:
     return [*packets, b"".join(packets)]
 
 
-def _parse_wire(data: bytes) -> None:
+def _parse_wire(data: bytes) -> bool:
     """Cut into reads of several lengths, the outcome is the same, and little is kept."""
     whole, pieces = Decoder(), Decoder()
     expected = [encode(packet) for packet in whole.feed(data) if _has_form(packet)]
@@ -128,6 +129,7 @@ def _parse_wire(data: bytes) -> None:
         found += [encode(p) for p in pieces.feed(data[start : start + step]) if _has_form(p)]
     assert found == expected
     assert whole.counts == pieces.counts
+    return bool(found)
 
 
 def _has_form(packet: object) -> bool:
@@ -143,8 +145,9 @@ def _line_examples() -> list[bytes]:
     return [b"\n" + frame * 2, table * 2, b"\nA\n" + rows.encode() * 2]
 
 
-def _parse_lines(data: bytes) -> None:
+def _parse_lines(data: bytes) -> bool:
     """Cut into reads of several lengths, the outcome is the same, also told to a new object."""
+    taken = False
     for name in ("openeit", "matrix"):
         whole, pieces = (protocol_named(name, _described(name)) for _ in range(2))
         expected = whole.feed(data)
@@ -153,6 +156,8 @@ def _parse_lines(data: bytes) -> None:
         assert found == expected
         assert whole.counts == pieces.counts
         protocol_named(name, _described(name)).feed(pieces.preamble())
+        taken |= bool(found)
+    return taken
 
 
 @cache
@@ -175,12 +180,17 @@ def _message_examples() -> list[bytes]:
     ]
 
 
-def _parse_message(data: bytes) -> None:
+def _parse_message(data: bytes) -> bool:
+    taken = False
     for read in (frame_from_message, status_from_message, event_from_message):
         with suppress(ClientError):
             read(decode_message(data), time.monotonic_ns(), 0.5)
-    with suppress(ClientError):
-        decode_reply(data)
+            taken = True
+    with suppress(MessageError):
+        with suppress(ControlError):  # a refusal is a reply, too
+            decode_reply(data)
+        taken = True
+    return taken
 
 
 def _request_examples() -> list[bytes]:
@@ -189,17 +199,20 @@ def _request_examples() -> list[bytes]:
         encode_request("set_budget", {"budget_ms": 20.0}),
         encode_request("record_start", {"path": "/tmp/a.mcap"}),
         encode_request("press", {"x_mm": 1.0, "y_mm": 2.0, "shape": "ring"}),
-        encode_request("play", {"scene": {"press": [{"from_s": 0.0, "duration_s": 1.0}]}}),
+        encode_request("play", {"scene": {"press": [PRESS]}}),
     ]
 
 
-def _parse_request(data: bytes) -> None:
+def _parse_request(data: bytes) -> bool:
     """As far as the handlers, of the daemon and of the twin."""
+    taken = False
     with suppress(ClientError, ValidationError):
         command, arguments = decode_request(data)
         for commands in (COMMANDS, twin_control.COMMANDS):
             if command in commands:
                 commands[command].model_validate(arguments)
+                taken = True
+    return taken
 
 
 def _description_examples() -> list[bytes]:
@@ -207,7 +220,7 @@ def _description_examples() -> list[bytes]:
     return [(folder / f"{name}.toml").read_bytes() for name in shipped_descriptions()]
 
 
-def _parse_description(data: bytes) -> None:
+def _parse_description(data: bytes) -> bool:
     """Including what is worked out from it at once."""
     path = _scratch("description.toml")
     path.write_bytes(data)
@@ -218,6 +231,8 @@ def _parse_description(data: bytes) -> None:
         assert 0 < description.measurements <= description.electrode_count**2
         assert len(description.map_x_m) * len(description.map_y_m) < 20_000
         assert description.sha256
+        return True
+    return False
 
 
 def _recording_examples() -> list[bytes]:
@@ -241,11 +256,13 @@ def _recording_examples() -> list[bytes]:
     return [path.read_bytes(), cut]
 
 
-def _parse_recording(data: bytes) -> None:
+def _parse_recording(data: bytes) -> bool:
     path = _scratch("fuzzed.mcap")
     path.write_bytes(data)
+    taken = False
     with suppress(RecordingError):
         recording = open_recording(path)
+        taken = True
         for read in (
             lambda: recording.summary.ending,
             lambda: recording.span,
@@ -263,6 +280,7 @@ def _parse_recording(data: bytes) -> None:
         assert frames.duration_s is not None
         assert frames.damage is not None
         list(frames.frames("contacts"))
+    return taken
 
 
 TANK = load_description("tank_disc")
@@ -276,7 +294,7 @@ def _sciospec_examples() -> list[bytes]:
     ]
 
 
-def _parse_sciospec(data: bytes) -> None:
+def _parse_sciospec(data: bytes) -> bool:
     """Cut into reads of several lengths, the outcome is the same, and little is kept."""
     whole, pieces = Sciospec(TANK), Sciospec(TANK)
     expected = whole.feed(data)
@@ -285,6 +303,7 @@ def _parse_sciospec(data: bytes) -> None:
     assert found == expected
     assert whole.counts == pieces.counts
     assert len(whole.begun()) < 9000
+    return whole.counts.packets > 0
 
 
 def _eit_examples() -> list[bytes]:
@@ -297,13 +316,13 @@ def _eit_examples() -> list[bytes]:
     return ["\n".join([*header, *frame, ""]).encode() for header in headers]
 
 
-def _parse_eit(data: bytes) -> None:
+def _parse_eit(data: bytes) -> bool:
     path = _scratch("fuzzed.eit")
     path.write_bytes(data)
-    import_anything(path)
+    return import_anything(path)
 
 
-def import_anything(path: Path) -> None:
+def import_anything(path: Path) -> bool:
     """Import a file of scans: it becomes packets by its own times, or is refused."""
     with suppress(TactomoError, DataError):
         scans = read_scans(path, TANK, None)
@@ -314,6 +333,8 @@ def import_anything(path: Path) -> None:
         for time_s, packet in scans.packets(times_s):
             assert time_s >= 0
             encode(packet)
+        return True
+    return False
 
 
 def _calibration_examples() -> list[bytes]:
@@ -327,7 +348,7 @@ def _calibration_examples() -> list[bytes]:
     return [made.model_dump_json(indent=1).encode()]
 
 
-def _parse_calibration(data: bytes) -> None:
+def _parse_calibration(data: bytes) -> bool:
     """A curve, by which any magnitude becomes a pressure that is known or said to be unknown."""
     with suppress(CalibrationError):
         calibration = parse_calibration(data, "fuzzed")
@@ -339,6 +360,8 @@ def _parse_calibration(data: bytes) -> None:
         known = found.kpa[~np.isnan(found.kpa)]
         assert ((low <= known) & (known <= high)).all()
         assert calibration.words
+        return True
+    return False
 
 
 def _load_cell_examples() -> list[bytes]:
@@ -351,8 +374,9 @@ def _load_cell_examples() -> list[bytes]:
     ]
 
 
-def _parse_load_cell(data: bytes) -> None:
+def _parse_load_cell(data: bytes) -> bool:
     """As far as readings, from the log alone and with what a sensor showed meanwhile."""
+    taken = False
     path = _scratch("fuzzed.csv")
     path.write_bytes(data)
     for area_mm2 in (None, 700.0):
@@ -363,27 +387,32 @@ def _parse_load_cell(data: bytes) -> None:
                 direct_readings(cell)
             if cell.clock:
                 assert len(joined_readings(cell, SEEN).readings) <= len(cell.lines)
+            taken = True
+    return taken
 
 
 SEEN = Seen(np.arange(200) / 20, np.linspace(0, 0.2, 200), np.full(200, 0.01), np.ones(200, int))
 
 
 def _config_examples() -> list[bytes]:
-    return [(DEPLOY / "daemon.example.toml").read_bytes(), b'ports = ["/dev/ttyACM0"]\n[curve]\n']
+    with_keys = b'ports = ["/dev/ttyACM0"]\n[curve]\nsecret = "a.key_secret"\nclients = "clients"\n'
+    return [(DEPLOY / "daemon.example.toml").read_bytes(), with_keys]
 
 
-def _parse_config(data: bytes) -> None:
+def _parse_config(data: bytes) -> bool:
     path = _scratch("daemon.toml")
     path.write_bytes(data)
     with suppress(ConfigError):
         load_config(path)
+        return True
+    return False
 
 
 def _scene_examples() -> list[bytes]:
     return [path.read_bytes() for path in sorted((DEPLOY / "scenes").glob("*.toml"))]
 
 
-def _parse_scene(data: bytes) -> None:
+def _parse_scene(data: bytes) -> bool:
     """Including what presses at some times of it."""
     path = _scratch("scene.toml")
     path.write_bytes(data)
@@ -392,6 +421,8 @@ def _parse_scene(data: bytes) -> None:
         for share in (0.0, 0.3, 0.9, 1.5):
             for indenter in scene.presses_at(share * scene.length_s).values():
                 indenter.press()
+        return True
+    return False
 
 
 @cache
