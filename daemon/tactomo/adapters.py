@@ -97,15 +97,23 @@ def look_alikes(adapter: Adapter, others: list[Adapter]) -> list[Adapter]:
     ]
 
 
+def device_of(path: str) -> str:
+    """Return the device that a name stands for, or the name if it goes while it is looked at."""
+    try:
+        return os.path.realpath(path)
+    except OSError:  # it was a link a moment ago
+        return path
+
+
 def latency_timer_ms(path: str, root: Path = ROOT) -> int | None:
     """Return the latency timer of an FTDI adapter in force, in ms; None for any other port."""
-    name = os.path.basename(os.path.realpath(path))
+    name = os.path.basename(device_of(path))
     return _number(root / "sys/class/tty" / name / "device/latency_timer")
 
 
 def holders(path: str, root: Path = ROOT) -> list[Holder]:
     """Return the processes that have a device open, as far as this user may see."""
-    device = os.path.realpath(path)
+    device = device_of(path)
     opened = {folder: dict(_open_files(folder)) for folder in (root / "proc").glob("[0-9]*")}
     return [
         _holder(folder, files)

@@ -13,7 +13,7 @@ from typing import Final
 
 import serial
 
-from tactomo.adapters import LOW_LATENCY_MS, ROOT
+from tactomo.adapters import LOW_LATENCY_MS, ROOT, device_of
 from tactomo.errors import PortAbsentError, TactomoError
 from tactomo.events import OnEvent, RateLimit
 from tactomo.open_serial import DEVICE_GONE, is_path, lower_latency, open_serial
@@ -129,7 +129,7 @@ class Connection:
         self._on_event("port_lost", "error", detail, next_step)
 
     def _tell_slow_adapter(self) -> None:
-        timer_ms, name = self.latency_timer_ms, os.path.basename(os.path.realpath(self.url))
+        timer_ms, name = self.latency_timer_ms, os.path.basename(device_of(self.url))
         if timer_ms is not None and timer_ms > LOW_LATENCY_MS:
             self._on_event(
                 "latency_timer",

@@ -126,6 +126,20 @@ def test_holders_are_named_by_their_command_line(machine: FakeMachine) -> None:
     assert str(holder) == "pid 812: screen /dev/ttyUSB0 115200"
 
 
+def test_a_link_may_go_while_it_is_followed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link = tmp_path / "skin"
+    link.symlink_to("/dev/null")
+
+    def gone(path: str) -> str:
+        raise FileNotFoundError(path)
+
+    monkeypatch.setattr(os, "readlink", gone)
+    assert holders(str(link)) == []
+    assert latency_timer_ms(str(link)) is None
+
+
 def test_an_adapter_may_go_while_it_is_looked_at(machine: FakeMachine) -> None:
     machine.plug_ftdi("ttyUSB0", "1-3", "A5")
     device = machine.root / USB / "1-3"
