@@ -343,9 +343,10 @@ def test_files_that_were_cut_replay_by_the_calibration_of_each(
     assert {counter: kpa for counter, kpa in again.items() if counter in live} == live
     parts = sorted(folder.iterdir())
     assert len(parts) >= 4
-    for path in (path for path in parts if open_recording(path).origin.calibration):
-        alone = pressures(replay(path).of("contacts"))
-        assert alone == {counter: live.get(counter, []) for counter in alone}
+    for part in map(open_recording, parts):
+        if part.summary.frames and part.origin.calibration:  # none: begun just before the end
+            alone = pressures(replay(part.path).of("contacts"))
+            assert alone == {counter: live.get(counter, []) for counter in alone}
 
 
 def test_an_exact_replay_does_not_look_for_another(

@@ -19,6 +19,7 @@ import pytest
 import zmq
 from page import Page
 from tactomo import keys as key_files
+from tactomo.cli.calibrate_reload import taken_up
 from tactomo.config import load_config
 from tactomo.daemon import Daemon
 from tactomo.doorkeeper import Doorkeeper, ServerKeys
@@ -37,6 +38,9 @@ from tactomo_client import (
 )
 from tactomo_client import Daemon as Commander
 from tactomo_client.keys import read_public, read_secret
+from tactomo_models import load_description
+from tactomo_models.calibration import Reading
+from tactomo_models.calibration_file import PressureCalibration, calibration_path, subject_of
 from tactomo_viewer.feed import Feed
 
 Start = Callable[..., Any]
@@ -248,6 +252,21 @@ def test_a_reader_may_not_command(guarded: Any, robot: Robot) -> None:
     event = guarded.listener.event("client_refused")
     assert "may not use the control" in event["detail"]
     assert f"--for {SERVER} --may-command --keys {robot.folder}`" in event["next_step"]
+
+
+def test_a_reader_is_told_who_can_put_a_calibration_in_force(guarded: Any, robot: Robot) -> None:
+    sensor = load_description("paper_square")
+    readings = [Reading(pressure_kpa=k, magnitude=(k - 140) * 2e-3) for k in range(150, 241, 10)]
+    made = PressureCalibration.of_readings(subject_of("left", sensor), readings)
+    path = calibration_path("left")
+    reader = robot.allow(robot.client("reader"))
+    told = taken_up(made, path, guarded.daemon.control_address, reader)
+    assert told.startswith("not in force yet: ")
+    assert "does not let this client in" in told
+    assert "somebody who may command run tactomo calibrate left --reload, or start" in told
+    commander = robot.allow(robot.client("chief"), may_command=True)
+    told = taken_up(made, path, guarded.daemon.control_address, commander)
+    assert "goes by the description's table. It looks on its own computer" in told
 
 
 def test_the_wrong_server_key_is_noticed(guarded: Any, robot: Robot) -> None:

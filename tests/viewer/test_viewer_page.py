@@ -229,6 +229,19 @@ def quiet_console(page: Page) -> Iterator[None]:
 # What it draws
 
 
+def test_the_scale_follows_a_calibration_that_is_put_in_force(page: Page) -> None:
+    page.skin.press(36, -48, kpa=200)
+    page.open()
+    wait_for(lambda: sum(page.colour(30, -48)) > 350)
+    described = sum(page.colour(30, -48))
+    calibrated = DESCRIPTION | {"pressure_max_kpa": 800.0}
+    page.skin.status = page.skin.status | {"description": calibrated}
+    wait_for(lambda: 60 < sum(page.colour(30, -48)) < described - 60)
+    assert page["pressure"].get_attribute("max") == "800"
+    page.skin.status = page.skin.status | {"description": DESCRIPTION}
+    wait_for(lambda: sum(page.colour(30, -48)) == described)
+
+
 @pytest.mark.usefixtures("quiet_console")
 @pytest.mark.parametrize("smooth", [True, False])
 def test_a_press_is_bright_where_it_is(page: Page, smooth: bool) -> None:
