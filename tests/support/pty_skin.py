@@ -151,6 +151,8 @@ class PtySkin:
     def close(self) -> None:
         """Pull every cable for good."""
         self.unplug()
+        for line in self.each:
+            line.close()
 
 
 class Playing:
