@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri  # scipy.stats takes half a second to import
 
 from tactomo_models.artifact import (
     MODEL_ERROR,
@@ -276,7 +276,7 @@ def missing(name: Modality) -> Flag:
 @cache
 def noise_limit(count: int) -> float:
     """Sum of squares that noise alone in so many voltages stays below, but for false alarms."""
-    return float(chi2.isf(FALSE_ALARM, count))
+    return float(chdtri(count, FALSE_ALARM))
 
 
 def _fell(total: FloatArray, variance: FloatArray) -> bool:

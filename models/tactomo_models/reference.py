@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from tactomo_models.description import SensorDescription
 from tactomo_models.errors import DataError
@@ -101,7 +101,7 @@ def noise_of_scans(scans: FloatArray) -> FloatArray | None:
     if len(scans) < 2:
         return None
     own, freedom = scans.var(axis=0, ddof=1), len(scans) - 1
-    common = float(np.median(own)) * freedom / chi2.median(freedom)
+    common = float(np.median(own)) * freedom / chdtri(freedom, 0.5)
     share = len(scans) / (len(scans) + TRUSTED_SCANS)
     return np.asarray(np.sqrt(share * own + (1 - share) * common))
 
