@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import signal
 from collections.abc import Callable, Iterator
@@ -14,6 +15,7 @@ from selenium import webdriver
 from selenium.common.exceptions import WebDriverException
 from selenium.webdriver.chrome.service import Service
 from tactomo.cli import main
+from threadpoolctl import threadpool_limits
 
 CHROMIUM_OPTIONS = (
     "--headless=new",
@@ -44,11 +46,26 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _own_data_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """What is kept on this computer, such as calibrations of skins, does not get into tests."""
+def _own_folders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What is kept on this computer, such as calibrations of skins, does not get into tests.
+
+    Models are built anew, as on a fresh machine, once for all workers.
+    """
+    run = tmp_path_factory.getbasetemp()
+    run = run.parent if "PYTEST_XDIST_WORKER" in os.environ else run
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_DATA_HOME", str(tmp_path_factory.mktemp("data")))
-        patch.delenv("STATE_DIRECTORY", raising=False)
+        patch.setenv("XDG_CACHE_HOME", str(run / "cache"))
+        for name in ("STATE_DIRECTORY", "CACHE_DIRECTORY"):
+            patch.delenv(name, raising=False)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_thread() -> Iterator[None]:
+    """As the daemon runs; more threads only get into each other's way on a busy machine."""
+    with threadpool_limits(1, user_api="blas"), pytest.MonkeyPatch.context() as patch:
+        patch.setenv("OPENBLAS_NUM_THREADS", "1")  # for the processes that tests start
         yield
 
 

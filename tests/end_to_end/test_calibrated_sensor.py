@@ -131,7 +131,7 @@ def test_a_guided_session_makes_pressures_right(
         assert found.pressure_sigma_kpa < 15
         errors.append((found.pressure_kpa - kpa) / found.pressure_sigma_kpa)
         assert found.force_n == pytest.approx(kpa * 1e-3 * AREA_MM2, rel=0.12)
-    assert max(map(abs, errors)) < 2.5, errors
+    assert max(map(abs, errors)) < 3.5, errors  # of three, by chance, one run in seven hundred
     bench.daemon.ask("record_stop")
     # What is two standard uncertainties above nothing counts as something: by chance, one in forty.
     light = [bench.contact(kpa) for kpa in (80, 90, 100)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,6 @@ from tactomo_models import (
     load_description,
 )
 from tactomo_models.forward import ForwardModel
-from threadpoolctl import threadpool_limits
 
 
 @pytest.fixture(scope="session")
@@ -58,13 +56,6 @@ def reconstructor(paper: SensorDescription, artifact: Artifact, skin: Skin) -> R
     made = Reconstructor(paper, artifact)
     made.set_reference(skin.reference())
     return made
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _one_thread() -> Iterator[None]:
-    """As the daemon runs; more threads only get into each other's way on a busy machine."""
-    with threadpool_limits(1):
-        yield
 
 
 @pytest.fixture(autouse=True)
