@@ -120,7 +120,7 @@ def test_a_device_is_asked_who_it_is(tactomo: Run, device: Callable[[bytes], str
 def test_who_does_not_say_hello_is_no_skin(
     device: Callable[[bytes], str], reply: bytes, says: str
 ) -> None:
-    answer = identify(device(reply), 115_200, patience_s=0.3)
+    answer = identify(device(reply), 115_200, patience_s=1.0)
     assert answer.hello is None
     assert says in answer.problem
 

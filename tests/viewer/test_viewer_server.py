@@ -434,7 +434,7 @@ def test_it_prints_its_address_and_stops_when_told(number: signal.Signals) -> No
         line = viewer.stdout.readline()
         assert re.fullmatch(r"viewer: http://127\.0\.0\.1:[1-9]\d*/\n", line)
         os.kill(viewer.pid, number)
-        output, errors = viewer.communicate(timeout=20)
+        output, errors = viewer.communicate(timeout=60)
         assert (viewer.returncode, output, errors) == (0, "", "")
     finally:
         viewer.kill()
@@ -455,11 +455,11 @@ def test_open_pages_do_not_hold_up_the_end(sensor: FakeSensor) -> None:
                 await websocket.receive()
                 viewer.terminate()
                 while not websocket.closed:
-                    await websocket.receive(timeout=20)
+                    await websocket.receive(timeout=60)
                 assert websocket.close_code == aiohttp.WSCloseCode.GOING_AWAY
 
         asyncio.run(stop_under_a_page())
-        assert viewer.wait(20) == 0
+        assert viewer.wait(60) == 0
     finally:
         viewer.kill()
         viewer.communicate()
