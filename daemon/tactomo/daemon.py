@@ -27,7 +27,7 @@ import signal
 import threading
 import time
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import Future
 from dataclasses import replace
 from importlib.metadata import version
@@ -41,7 +41,6 @@ from tactomo_models import (
     ArtifactError,
     CalibrationError,
     Reconstructor,
-    Reference,
     SensorDescription,
     Tier,
     load_description,
@@ -61,17 +60,18 @@ from tactomo.config import DaemonConfig
 from tactomo.control import Control, RecordStart, SetBudget, SetTier, Settling
 from tactomo.doorkeeper import Doorkeeper, load_server_keys
 from tactomo.endpoint import allow_connections
-from tactomo.errors import CommandError, ConfigError
+from tactomo.errors import CommandError
 from tactomo.events import EventBook, Severity
-from tactomo.imaging import Imaging, recorded_calibration
-from tactomo.pipeline import Pipeline, Replay
+from tactomo.imaging import Imaging
+from tactomo.pipeline import Pipeline
 from tactomo.port import PortReader
 from tactomo.protocol_replay import parse_replay_url
 from tactomo.protocols import default_baud, protocol_named
 from tactomo.publisher import Publisher
 from tactomo.recorder import Recorder
-from tactomo.recording import REPLAY_SCHEME, Mark, Origin, Recording, calibration_text
+from tactomo.recording import REPLAY_SCHEME, Origin, calibration_text
 from tactomo.recording_writer import message_entry
+from tactomo.replay import Replay, read_replay, without_calibrations
 from tactomo.status import Status
 from tactomo.supervision import Supervision, notify
 
@@ -123,7 +123,7 @@ class Daemon:
         self._description = description
         replay = read_replay(config.ports, description)
         if replay is not None and config.calibration is not None:
-            replay = replace(replay, marks=_without_calibrations(replay.marks))
+            replay = replace(replay, marks=without_calibrations(replay.marks))
         self._replay = replay
         protocol = _protocol(config)
         channels = tuple(c for c in Channel if c.name.lower() in description.modalities)
@@ -419,63 +419,6 @@ class Daemon:
 def _log_thread_failure(failure: threading.ExceptHookArgs) -> None:
     thread = failure.thread.name if failure.thread else "unknown"
     log.error("thread_failed", thread=thread, exc_info=failure.exc_value)
-
-
-def read_replay(urls: Sequence[str], description: SensorDescription) -> Replay | None:
-    """Return what the recording says that the ports replay; None where they are live.
-
-    Raises:
-        ConfigError: only some of the ports are replayed, or not all from one recording, or that
-            is of another sensor.
-        RecordingError, PortError: a URL leads to no recording.
-
-    """
-    replayed = [url for url in urls if url.startswith(f"{REPLAY_SCHEME}://")]
-    if not replayed:
-        return None
-    parsed = [parse_replay_url(url) for url in replayed]
-    recording, _, speed = parsed[0]
-    others = {(other.path, other_speed) for other, _, other_speed in parsed}
-    if len(replayed) < len(urls) or len(others) > 1:
-        raise ConfigError(
-            f"the ports {', '.join(urls)} do not replay one recording",
-            "replay all ports from one file at one speed, or none",
-        )
-    reference = recording.first_reference()
-    if reference is not None:
-        _check_reference(reference, recording, description)
-    # A part of the ports cannot give the dual scans that all of them gave.
-    is_whole = len(urls) == len(recording.origin.ports)
-    marks = recording.marks() if is_whole else []
-    if recording.origin.description_sha256 != description.sha256:
-        marks = _without_calibrations(marks)
-    text = recording.origin.calibration
-    calibration = recorded_calibration(text, f"the calibration in {recording.path}", description)
-    had_none = not text and any(mark.calibration is not None for mark in marks)
-    return Replay(
-        marks=marks,
-        reference=reference,
-        is_paced=speed > 0,
-        calibration=calibration,
-        knows_calibration=calibration is not None or had_none,
-    )
-
-
-def _without_calibrations(marks: Sequence[Mark]) -> list[Mark]:
-    """Return marks that leave the pressure calibration as it is."""
-    return [replace(mark, calibration=None) for mark in marks]
-
-
-def _check_reference(
-    reference: Reference, recording: Recording, description: SensorDescription
-) -> None:
-    lengths = {len(v) for v in (reference.magnitude, reference.structure) if v is not None}
-    if lengths != {description.measurements}:
-        raise ConfigError(
-            f"{recording.path} has {' or '.join(map(str, sorted(lengths)))} voltages a scan, "
-            f"{description.name} has {description.measurements}",
-            f"replay it with the description it was recorded with, {recording.origin.description}",
-        )
 
 
 def _make_reconstructor(config: DaemonConfig, description: SensorDescription) -> Reconstructor:

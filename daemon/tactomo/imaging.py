@@ -31,6 +31,7 @@ from tactomo_models.machine_speed import MachineSpeed
 from tactomo_models.pressure import described_curve
 from tactomo_protocol import Channel, ScanFlag
 
+from tactomo.active_recording import ActiveRecording
 from tactomo.config import BaselineConfig
 from tactomo.errors import CommandError
 from tactomo.events import OnEvent, RateLimit
@@ -43,7 +44,7 @@ from tactomo.frames import (
     scan_header,
 )
 from tactomo.publisher import Publisher
-from tactomo.recorder import ActiveRecording, Recorder
+from tactomo.recorder import Recorder
 from tactomo.recording import Mark, ScanKey, Timing, calibration_text
 from tactomo.recording_writer import calibration_entry, mark_entry, reference_entry
 from tactomo.sync import DualScan

@@ -16,10 +16,9 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
-from tactomo_models import Reference, Tier
+from tactomo_models import Tier
 from tactomo_models.calibration_file import PressureCalibration
 from tactomo_protocol import Channel, Hello
 
@@ -27,7 +26,7 @@ from tactomo.errors import CommandError
 from tactomo.events import OnEvent, RateLimit
 from tactomo.imaging import Imaging
 from tactomo.port import Delivery
-from tactomo.recording import Mark
+from tactomo.replay import Replay
 from tactomo.skew import Skew
 from tactomo.sync import DualScan, Joiner, MarkedSync, Sync
 from tactomo.timing import Rate
@@ -37,22 +36,6 @@ IDLE_S: Final = 0.1
 QUEUED_DELIVERIES: Final = 256
 ZERO_PERIOD_S: Final = 10.0
 """How often devices are asked to zero their counters, while that does not bring them in step."""
-
-
-@dataclass(frozen=True, slots=True)
-class Replay:
-    """What a recording tells the pipeline beyond the bytes on the ports."""
-
-    marks: list[Mark]
-    """The dual scans to reconstruct; empty where the recording does not say."""
-    reference: Reference | None
-    """The one in force at its beginning."""
-    is_paced: bool
-    """Whether bytes come in their own time rather than as fast as they are taken."""
-    calibration: PressureCalibration | None = None
-    """Of pressure, that the daemon had when it began to record."""
-    knows_calibration: bool = False
-    """Whether it had that one, or none, and no other is to be looked for."""
 
 
 class _SyncState(NamedTuple):

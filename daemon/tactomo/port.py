@@ -33,6 +33,7 @@ from tactomo_protocol import (
     ScanFlag,
 )
 
+from tactomo.active_recording import ActiveRecording
 from tactomo.adapters import ROOT
 from tactomo.clock import MAX_RATE, ClockState, DeviceClock
 from tactomo.connection import Connection
@@ -41,7 +42,7 @@ from tactomo.liveness import DeviceState, Liveness
 from tactomo.open_serial import other_holders
 from tactomo.protocol_replay import ReplayEnded
 from tactomo.protocols import PortProtocol, Trouble
-from tactomo.recorder import ActiveRecording, Recorder
+from tactomo.recorder import Recorder
 from tactomo.recording import REPLAY_SCHEME
 from tactomo.recording_writer import port_entry, preamble_entry
 

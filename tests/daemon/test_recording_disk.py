@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tactomo import recorder
+from tactomo import active_recording, recorder
 from tactomo.recording import open_recording
 from tactomo.recovery import recover
 from tactomo_client import ControlError, request
@@ -178,7 +178,7 @@ def test_a_disk_that_stays_stuck_ends_the_recording_when_enough_waits(
     stuck_disk: tuple[Path, Callable[[str], None]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(recorder, "MAX_QUEUED_BYTES", 200_000)
+    monkeypatch.setattr(active_recording, "MAX_QUEUED_BYTES", 200_000)
     disk, turn = stuck_disk
     b = bench(recording={"folder": disk / "set", "at_start": True})
     b.tare()

@@ -131,16 +131,16 @@ def test_a_recording_of_before_these_dates_replays_with_dates_of_its_own(
     from dataclasses import replace
 
     import tactomo.daemon as module
+    from tactomo.replay import read_replay
 
     path = tmp_path / "live.mcap"
     b = bench(record=path)
     b.tare()
     b.step()
     b.daemon.stop()
-    read = module.read_replay
 
     def without_timing(*arguments: Any) -> Any:
-        found = read(*arguments)
+        found = read_replay(*arguments)
         assert found is not None
         return replace(found, marks=[replace(mark, timing=None) for mark in found.marks])
 
