@@ -248,9 +248,9 @@ def test_a_truncated_recording_opens_up_to_where_it_ends(
     b.tare()
     start = b.skin.counter
     for index in range(60):
+        size = path.stat().st_size
         b.step(load=0.001 * index)
         if index % 10 == 0:  # so that the file has several chunks
-            size = path.stat().st_size
             b.until(lambda size=size: path.stat().st_size > size)
     b.daemon.stop()
     live = maps(b.listener.of("map"))
