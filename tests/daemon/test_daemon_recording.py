@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from tactomo import daemon, imaging
 from tactomo.config import load_config
 from tactomo.daemon import Daemon
 from tactomo.errors import ConfigError, PortError, RecordingError
@@ -110,6 +112,30 @@ def test_a_replay_leaves_out_what_the_live_run_dropped(
     live = maps([f for f in b.listener.of("map") if f["scan_counter"] > start])
     assert len(live) < 40
     assert_same(live, maps(replay(path).of("map")))
+
+
+@pytest.mark.parametrize(
+    ("module", "name"), [(imaging, "mark_entry"), (daemon, "message_entry")], ids=["mark", "map"]
+)
+def test_a_frame_that_was_seen_is_in_the_recording(
+    bench: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: Any, name: str
+) -> None:
+    """However slowly it gets there."""
+    entry = getattr(module, name)
+
+    def slowly(*arguments: Any) -> Any:
+        time.sleep(0.3)
+        return entry(*arguments)
+
+    monkeypatch.setattr(module, name, slowly)
+    path = tmp_path / "seen.mcap"
+    b = bench()
+    b.tare()
+    b.ask("record_start", path=str(path), maps=True)
+    seen = b.step(load=0.1)
+    b.ask("record_stop")
+    assert open_recording(path).summary.frames == 1
+    assert [frame.scan_counter for frame in open_frames(path)] == [seen["scan_counter"]]
 
 
 def test_a_recording_from_the_start_has_the_first_tare(
