@@ -14,6 +14,7 @@ from typing import IO, Any
 
 import pytest
 import serial
+from processes import children_of, is_running
 from tactomo.cli import app
 from tactomo.cli.children import ChildError, Family
 from tactomo.twin import TwinConfig
@@ -70,27 +71,6 @@ def wait_for(condition: Callable[[], Any]) -> Any:
             return value
         time.sleep(0.05)
     raise AssertionError(f"did not happen within {PATIENCE_S} s")
-
-
-def children_of(pid: int) -> list[int]:
-    """Processes whose parent is `pid`."""
-    found = []
-    for status in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = status.read_text().rpartition(")")[2].split()
-        except OSError:  # gone by now
-            continue
-        if int(fields[1]) == pid and fields[0] != "Z":
-            found.append(int(status.parent.name))
-    return found
-
-
-def is_running(pid: int) -> bool:
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return False
-    return state != "Z"
 
 
 def test_a_twin_of_the_papers_sensor(start: Run, tmp_path: Path) -> None:

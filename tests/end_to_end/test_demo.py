@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from page import Page
+from processes import children_of, is_running
 from selenium.webdriver import ActionChains, Chrome
 from selenium.webdriver.common.by import By
 from small_sensor import SMALL
@@ -98,26 +99,6 @@ def test_the_readme_subscribes_in_six_lines(demo: Demo, tmp_path: Path) -> None:
     assert "kPa" in line
 
 
-def children_of(pid: int) -> list[int]:
-    found = []
-    for entry in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = entry.read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        if int(fields[1]) == pid:
-            found.append(int(entry.parent.name))
-    return found
-
-
-def is_gone(pid: int) -> bool:
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return True
-    return state == "Z"
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_a_demo_that_ends_leaves_no_process_behind(number: signal.Signals, tmp_path: Path) -> None:
     sensor = tmp_path / "small.toml"
@@ -126,7 +107,7 @@ def test_a_demo_that_ends_leaves_no_process_behind(number: signal.Signals, tmp_p
         children = children_of(demo.process.pid)
         assert len(children) == 3
         os.kill(demo.process.pid, number)
-        wait_for(lambda: all(is_gone(pid) for pid in children), "the children to end")
+        wait_for(lambda: not any(is_running(pid) for pid in children), "the children to end")
         wait_for(lambda: demo.process.poll() is not None, "the demo to end")
     if number != signal.SIGKILL:
         assert demo.process.returncode in (0, 130)
