@@ -182,6 +182,15 @@ def test_cut_anywhere_in_the_last_chunks(tmp_path: Path) -> None:
         assert_honest(tmp_path, whole()[:length])
 
 
+def test_frames_whose_calibration_is_lost_are_absent(tmp_path: Path) -> None:
+    start, end = chunks()[RECALIBRATED // A_CHUNK]
+    data = bytearray(whole())
+    data[(start + end) // 2] ^= 1
+    assert_honest(tmp_path, bytes(data))
+    marks = open_recording(tmp_path / "out.mcap").marks()
+    assert [mark.scans[0].counter for mark in marks] == list(range(RECALIBRATED))
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_cut_at_every_byte(tmp_path: Path) -> None:
