@@ -8,6 +8,7 @@ another device would have another curve.
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Callable, Collection, Sequence
 from datetime import UTC, datetime
 from functools import cached_property
@@ -27,6 +28,7 @@ from tactomo_models.errors import CalibrationError, explain
 from tactomo_models.pressure import PressureCurve
 
 SUFFIX: Final = ".pressure.json"
+READABLE: Final = "put a file there that may be read, or nothing"
 Points = Annotated[tuple[float, ...], Field(min_length=2, max_length=256)]
 
 
@@ -201,11 +203,13 @@ def read_calibration(path: Path) -> PressureCalibration:
         FileNotFoundError: there is none.
     """
     try:
+        if not stat.S_ISREG(path.stat().st_mode):  # reading a pipe may never end
+            raise CalibrationError(f"cannot read {path}: it is no regular file; {READABLE}")
         return parse_calibration(path.read_bytes(), str(path))
     except FileNotFoundError:
         raise
     except OSError as error:
-        raise CalibrationError(f"cannot read {path}: {error.strerror}") from error
+        raise CalibrationError(f"cannot read {path}: {error.strerror}; {READABLE}") from error
 
 
 def parse_calibration(content: bytes | str, source: str) -> PressureCalibration:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -255,11 +256,17 @@ def test_any_bytes_are_a_calibration_or_are_refused(content: bytes) -> None:
 def test_what_cannot_be_read_or_written_is_told(
     small: SensorDescription, made: PressureCalibration, tmp_path: Path
 ) -> None:
-    with pytest.raises(CalibrationError, match="cannot read"):
+    with pytest.raises(CalibrationError, match=r"cannot read .*: it is no regular file; put"):
         load_calibration(tmp_path, "left", small)
     (tmp_path / "file").touch()
     with pytest.raises(CalibrationError, match="cannot write"):
         save_calibration(made, tmp_path / "file" / "left.pressure.json")
+
+
+def test_a_pipe_in_a_calibrations_place_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "left.pressure.json")
+    with pytest.raises(CalibrationError, match="no regular file"):
+        read_calibration(tmp_path / "left.pressure.json")
 
 
 def test_foreign_devices_are_named(subject: Subject) -> None:
