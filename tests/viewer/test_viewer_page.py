@@ -661,6 +661,7 @@ def test_a_daemon_that_never_came_is_waited_for(page: Page) -> None:
     page.browser.get(f"http://127.0.0.1:{page.port}/")
     wait_for(lambda: page.health == "no-daemon")
     assert f"“left” at {page.skin.address}" in page.banner
+    assert page["no-contacts"].text == "Not known."
     with Skin(page.skin.address):
         wait_for(lambda: page.health == "good")
 
