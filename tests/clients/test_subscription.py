@@ -319,8 +319,10 @@ def test_latest_only_goes_with_one_kind() -> None:
 def test_what_cannot_be_subscribed_to_is_named() -> None:
     with pytest.raises(MessageError, match="not a sensor name"):
         subscribe("left forearm")
-    with pytest.raises(MessageError, match="kind='map' or 'contacts'"):
+    with pytest.raises(MessageError, match="kind='map', 'contacts'"):
         subscribe("left", kind="scan")  # type: ignore[call-overload]
+    with pytest.raises(MessageError, match="or a tuple of some"):
+        subscribe("left", kind=["status", "event"])  # type: ignore[call-overload]
     with pytest.raises(ControlError, match="cannot connect to '5560'"):
         subscribe("left", address="5560")
 

@@ -177,9 +177,10 @@ class Reception(Generic[T_co]):
 
 def _checked(kind: Kind | tuple[Kind, ...], latest_only: bool) -> tuple[Kind, ...]:
     kinds = kind if isinstance(kind, tuple) else (kind,)
-    if not kinds or not all(each in _KINDS for each in kinds):
+    if not kinds or not all(each in list(_KINDS) for each in kinds):
         raise MessageError(
-            f"cannot subscribe to {kind!r}", "use kind='map' or 'contacts', 'status' or 'event'"
+            f"cannot subscribe to {kind!r}",
+            "use kind='map', 'contacts', 'status' or 'event', or a tuple of some of them",
         )
     if latest_only and len(kinds) > 1:
         raise MessageError(
