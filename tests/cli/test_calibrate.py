@@ -188,9 +188,13 @@ def test_a_name_that_no_sensor_can_have(tactomo: Run, tmp_path: Path) -> None:
         ("--live", "--show"),
         ("--recording", "a.mcap", "--live"),
         ("--readings", "a", "--diameter-mm", "3", "--area-mm2", "3"),
+        ("--readings", "a", "--diameter-mm", "1e300"),
+        ("--readings", "a", "--time-offset", "nan"),
     ],
 )
-def test_options_that_do_not_go_together(tactomo: Run, options: tuple[str, ...]) -> None:
+def test_options_that_do_not_go_together_or_make_no_sense(
+    tactomo: Run, options: tuple[str, ...]
+) -> None:
     assert tactomo("calibrate", "palm", *options).returncode == 2
 
 

@@ -55,10 +55,11 @@ def calibrate(
         typer.Option(metavar="FILE.mcap", help="With --readings: what the sensor said meanwhile."),
     ] = None,
     diameter_mm: Annotated[
-        float | None, typer.Option("--diameter-mm", min=1.0, help="Of a round, flat indenter.")
+        float | None,
+        typer.Option("--diameter-mm", min=1.0, max=1e3, help="Of a round, flat indenter."),
     ] = None,
     area_mm2: Annotated[
-        float | None, typer.Option("--area-mm2", min=1.0, help="Of one of another shape.")
+        float | None, typer.Option("--area-mm2", min=1.0, max=1e6, help="Of one of another shape.")
     ] = None,
     time_offset: Annotated[
         float, typer.Option(metavar="SECONDS", help="Added to the load cell's times.")
@@ -122,6 +123,8 @@ def calibrate(
         raise typer.BadParameter("--recording goes with --readings")
     if diameter_mm is not None and area_mm2 is not None:
         raise typer.BadParameter("--diameter-mm and --area-mm2: give one of them")
+    if not math.isfinite(time_offset):
+        raise typer.BadParameter(f"--time-offset {time_offset}: give seconds")
     from tactomo_client.messages import check_sensor_name
 
     check_sensor_name(sensor)
