@@ -60,6 +60,7 @@ class Liveness:
         self._told_s = 0.0  # a few periods, by the rate that the device says
         self._pace = Pace()  # of scans, as they come
         self._bytes_s = self._packet_s = self._scan_s = 0.0  # when each kind last came
+        self._since_s: float | None = None  # when they began, after silence or an opening
         self._reopen_wait_s = self._reopen_after_s
         self._reopen_s = 0.0
 
@@ -93,10 +94,13 @@ class Liveness:
     def reopened(self, now_s: float) -> None:
         """Take note that the port was opened anew; what ails the device still does."""
         self._bytes_s = self._packet_s = self._scan_s = now_s
+        self._since_s = None
         self._reopen_s = now_s + self._reopen_wait_s
 
     def heard(self, now_s: float, packets: int, scans: int) -> None:
         """Take note of what a read brought: bytes, with so many packets, so many of them scans."""
+        if self._since_s is None or now_s - self._bytes_s >= self.silence_s:
+            self._since_s = now_s
         self._bytes_s = now_s
         if scans:
             self._pace.add(now_s - self._scan_s)
@@ -109,8 +113,12 @@ class Liveness:
 
     def judge(self, now_s: float) -> DeviceState:
         """Return how the device does; a trouble lasts until what was missing comes again."""
+        since_s = self._bytes_s if self._since_s is None else self._since_s
         if now_s - self._bytes_s >= self.silence_s:
             self.state = DeviceState.SILENT
+        elif self._packet_s < since_s:  # what comes may yet become a packet
+            if now_s - since_s >= self.silence_s:
+                self.state = DeviceState.GARBAGE
         elif now_s - self._packet_s >= self.silence_s:
             self.state = DeviceState.GARBAGE
         elif now_s - self._scan_s >= self.patience_s:

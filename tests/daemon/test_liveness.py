@@ -149,3 +149,26 @@ def test_another_device_has_another_pace(device: Liveness) -> None:
     assert device.patience_s == pytest.approx(30.0)
     device.opened(200.0)
     assert device.patience_s == PATIENCE_S
+
+
+@pytest.mark.parametrize("since_s", [4.0, 60.0])
+def test_what_comes_after_silence_has_its_time_to_become_a_packet(since_s: float) -> None:
+    """A frame reaches the reader in pieces: the first one alone is no garbage."""
+    device = Liveness(says_hello=False)
+    device.opened(0.0)
+    device.judge(since_s)
+    device.heard(since_s, 0, 0)
+    assert device.judge(since_s + PATIENCE_S - 0.1) is DeviceState.SILENT
+    device.heard(since_s + PATIENCE_S - 0.1, 0, 0)
+    assert device.judge(since_s + PATIENCE_S) is DeviceState.GARBAGE
+    device.heard(since_s + PATIENCE_S, 1, 1)
+    assert device.judge(since_s + PATIENCE_S) is DeviceState.RUNNING
+
+
+def test_a_board_that_is_opened_amid_a_frame_has_its_time_for_a_whole_one() -> None:
+    device = Liveness(says_hello=False, first_s=4.0)
+    device.opened(0.0)
+    device.heard(3.5, 0, 0)
+    assert states_until(device, 3.5, 7.4) == {DeviceState.STARTING}
+    device.heard(7.4, 1, 1)
+    assert device.judge(7.4) is DeviceState.RUNNING
