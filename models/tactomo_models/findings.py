@@ -44,6 +44,7 @@ MOST_CHANCE = 2.0  # mean square of changes over their noise: more is no chance 
 UNEVEN_CHANGE = 0.5  # of the even change
 SIGNIFICANT = 4.0  # standard deviations
 AT_REST = "leave the skin alone while it is examined; of a file, choose scans at rest by --frames"
+LONGER = "; from a daemon by --seconds"
 
 
 class Level(StrEnum):
@@ -117,7 +118,7 @@ def snr_found(examined: Examination) -> Finding:
     if examined.is_moving:
         return Finding("snr", Level.UNKNOWN, "not known: something moves all the time", AT_REST)
     if not examined.has_noise:
-        step = f"give at least {FEWEST_FOR_NOISE} scans of the unpressed skin"
+        step = f"give at least {FEWEST_FOR_NOISE} scans of the unpressed skin{LONGER}"
         return Finding("snr", Level.UNKNOWN, f"not known from {examined.count} scan(s)", step)
     good = examined.good
     signal, noise = rms(examined.mean[good]), rms(examined.noise[good])
@@ -293,7 +294,8 @@ def drift_found(still: FloatArray, times_s: FloatArray | None) -> Finding:
         return Finding("drift", Level.UNKNOWN, "not known: nobody says when scans were taken", step)
     span_s = float(times_s[-1] - times_s[0])
     if len(times_s) < 3 or span_s < SHORTEST_FOR_DRIFT_S:
-        step = f"examine {SHORTEST_FOR_DRIFT_S:g} s at rest, or more"
+        at_least = "3 scans" if len(times_s) < 3 else f"{SHORTEST_FOR_DRIFT_S:g} s"
+        step = f"examine {at_least} at rest, or more{LONGER}"
         detail = f"not known from {len(times_s)} scan(s) at rest in {span_s:.1f} s"
         return Finding("drift", Level.UNKNOWN, detail, step)
     mean = still.mean(axis=0)

@@ -120,6 +120,20 @@ def test_status_begins_with_what_is_wrong_and_what_to_do(tactomo: Run, control: 
     assert "pid 7, 10.0 % of a core on average, 90 MB, 6 threads" in result.stdout
 
 
+def test_a_channel_whose_scans_come_is_not_missing_because_it_has_no_reference_yet(
+    tactomo: Run, control: Any
+) -> None:
+    flags = ["no_reference", "magnitude_missing", "structure_missing"]
+    rates = {"magnitude_hz": 0.25, "structure_hz": 0.0, "frames_hz": 0.25}
+    ports = {"ports": [], "rates": rates, "flags": flags, "dropped_scans": 0, "incomplete_scans": 0}
+    control.answers["status"] = {**STATUS, **ports, "state": "taring"}
+    shown = tactomo("status", "--control", control.address).stdout
+    assert "a reference is being taken" in shown
+    assert "no scans of the structure channel" in shown
+    assert "no scans of the magnitude channel" not in shown
+    assert "tactomo tare" not in shown
+
+
 def test_every_flag_has_its_advice() -> None:
     assert set(FLAG_ADVICE) == {flag.name.lower() for flag in Flag if flag.name}
 
@@ -162,6 +176,14 @@ def test_tare_says_what_the_reference_is_made_of(tactomo: Run, control: Any) -> 
     result = tactomo("tare", "--control", control.address)
     assert (result.returncode, result.stdout) == (0, "new reference from 20 dual scans\n")
     assert result.stderr == ""
+
+
+def test_tare_says_how_long_a_slow_board_takes(tactomo: Run, control: Any) -> None:
+    control.answers["status"] = {"reference": None, "rates": {"frames_hz": 0.25}}
+    control.answers["tare"] = {"scans": 20}
+    result = tactomo("tare", "--control", control.address)
+    assert result.stdout == "new reference from 20 dual scans\n"
+    assert "80 s" in result.stderr
 
 
 def test_tare_says_that_contacts_were_shown(tactomo: Run, control: Any) -> None:

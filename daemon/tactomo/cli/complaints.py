@@ -66,6 +66,7 @@ STATES: Mapping[str, tuple[str, str]] = {
     "waiting_for_data": ("no scan has come yet", "check the ports below"),
     "stale": ("scans have stopped coming", "check the ports below"),
 }
+TARING = ("a reference is being taken", "leave the skin alone until it runs")
 
 
 class Complaint(NamedTuple):
@@ -120,10 +121,22 @@ def _of_port(port: Mapping[str, Any]) -> Iterator[Complaint]:
 
 
 def _of_flags(status: Mapping[str, Any]) -> Iterator[Complaint]:
-    for flag in status.get("flags") or []:
+    flags = status.get("flags") or []
+    for flag in flags:
+        if "no_reference" in flags and _comes(flag, status):
+            continue
         what, step = FLAG_ADVICE.get(flag, (flag.replace("_", " "), ""))
+        if flag == "no_reference" and status.get("state") == "taring":
+            what, step = TARING
         because = status.get("tier_reason") if flag == "electrode_fault" else None
         yield Complaint("warning", f"{what} ({because})" if because else what, step)
+
+
+def _comes(flag: str, status: Mapping[str, Any]) -> bool:
+    """Whether `flag` calls a channel missing whose scans come: it has no reference yet."""
+    channel, _, missing = flag.partition("_")
+    rates = status.get("rates") or {}
+    return missing == "missing" and bool(rates.get(f"{channel}_hz"))
 
 
 def _of_losses(status: Mapping[str, Any]) -> Iterator[Complaint]:

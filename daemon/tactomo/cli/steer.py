@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -32,6 +33,9 @@ if TYPE_CHECKING:
 
 HEARD_WITHIN_S = 3.0
 """A status comes every second."""
+SOON_S = 3.0
+USUAL_TARE_SCANS = 20
+"""Where no reference says yet how many the daemon takes."""
 
 
 @app.command(
@@ -91,9 +95,13 @@ def tare(control: ControlAddress = DEFAULT_CONTROL, keys: KeysFolder = None) -> 
     change of temperature, and when contacts show up where nobody presses.
     """
     from tactomo_client import Daemon
+    from tactomo_client.control import TARE_TIMEOUT_S
 
     with Daemon(control, keys=keys) as daemon:
-        taken = daemon.tare()
+        needs_s = _tare_s(daemon.request("status"))
+        if needs_s > SOON_S:
+            typer.echo(f"leave the skin alone: its scans take {needs_s:.0f} s to come", err=True)
+        taken = daemon.tare(TARE_TIMEOUT_S + 2 * needs_s)
     typer.echo(f"new reference from {taken.scans} dual scans")
     if taken.contacts:
         typer.echo(
@@ -101,6 +109,13 @@ def tare(control: ControlAddress = DEFAULT_CONTROL, keys: KeysFolder = None) -> 
             "if something was on the skin, take it off and tare again",
             err=True,
         )
+
+
+def _tare_s(status: Mapping[str, Any]) -> float:
+    """Return how long a reference's scans take to come, in seconds, by the last one's number."""
+    scans = (status.get("reference") or {}).get("scans") or USUAL_TARE_SCANS
+    rate_hz = (status.get("rates") or {}).get("frames_hz") or 0.0
+    return float(scans / rate_hz) if rate_hz else 0.0
 
 
 @app.command(
