@@ -31,7 +31,7 @@ def test_info_of_a_file_of_arrays(tactomo: Run, tmp_path: Path) -> None:
     ("name", "content", "says"),
     [
         ("none.mcap", None, "cannot open the recording none.mcap"),
-        ("text.mcap", "hello", "text.mcap was not made by tactomo"),
+        ("text.mcap", "hello", "text.mcap is no recording that tactomo made"),
         ("none.npz", None, "cannot read none.npz"),
         ("bad.toml", "schema = [", "not valid TOML"),
         ("bad.toml", "schema = 1\ncolour = 2", "unknown key colour"),

@@ -422,3 +422,6 @@ def test_the_command_says_what_was_kept_and_lost(tactomo: Run, tmp_path: Path) -
     again = tactomo("recover", "a.mcap")
     assert again.returncode == 1
     assert "exists already" in again.stderr
+    folder = tactomo("recover", ".")
+    assert folder.returncode == 1
+    assert folder.stderr.strip().endswith("Is a directory; give the path of a .mcap file")

@@ -160,7 +160,7 @@ def read_metadata(path: Path) -> Mapping[str, str]:
             if header is not None and header.profile == PROFILE:
                 return record.metadata
             break
-    raise _not_a_recording(path, "was not made by tactomo")
+    raise _not_a_recording(path, "is no recording that tactomo made")
 
 
 def read_span(path: Path) -> Span:

@@ -37,7 +37,7 @@ def recover(
     from tactomo.recording import open_recording
     from tactomo.recovery import recover as rewrite
 
-    target = output or recording.with_name(f"{recording.stem}-recovered.mcap")
+    target = output or recording.parent / f"{recording.stem}-recovered.mcap"
     columns = ("recovering", BarColumn(), DownloadColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("")
