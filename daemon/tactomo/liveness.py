@@ -61,6 +61,7 @@ class Liveness:
         self._pace = Pace()  # of scans, as they come
         self._bytes_s = self._packet_s = self._scan_s = 0.0  # when each kind last came
         self._since_s: float | None = None  # when they began, after silence or an opening
+        self._has_scan = False  # since the port was opened
         self._reopen_wait_s = self._reopen_after_s
         self._reopen_s = 0.0
 
@@ -95,6 +96,7 @@ class Liveness:
         """Take note that the port was opened anew; what ails the device still does."""
         self._bytes_s = self._packet_s = self._scan_s = now_s
         self._since_s = None
+        self._has_scan = False
         self._reopen_s = now_s + self._reopen_wait_s
 
     def heard(self, now_s: float, packets: int, scans: int) -> None:
@@ -103,8 +105,9 @@ class Liveness:
             self._since_s = now_s
         self._bytes_s = now_s
         if scans:
-            self._pace.add(now_s - self._scan_s)
-            self._scan_s = now_s
+            if self._has_scan:  # how soon after the opening the first one comes is chance
+                self._pace.add(now_s - self._scan_s)
+            self._scan_s, self._has_scan = now_s, True
             self.state = DeviceState.RUNNING
         if packets:
             self._packet_s = now_s

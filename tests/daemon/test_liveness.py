@@ -172,3 +172,12 @@ def test_a_board_that_is_opened_amid_a_frame_has_its_time_for_a_whole_one() -> N
     assert states_until(device, 3.5, 7.4) == {DeviceState.STARTING}
     device.heard(7.4, 1, 1)
     assert device.judge(7.4) is DeviceState.RUNNING
+
+
+def test_a_first_scan_that_comes_at_once_is_nobodys_pace() -> None:
+    device = Liveness(says_hello=False, first_s=10.0)
+    device.opened(0.0)
+    device.heard(0.1, 1, 1)
+    assert states_until(device, 0.1, 5.0) == {DeviceState.RUNNING}
+    device.heard(5.1, 1, 1)
+    assert device.patience_s == pytest.approx(3 * 5.0)
