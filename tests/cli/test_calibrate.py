@@ -171,6 +171,8 @@ def test_without_a_daemon_it_says_when_it_will_be_in_force(tactomo: Run, tmp_pat
         assert f"kept in {calibration_path('palm')}" in made.stdout
         assert "not in force yet: " in made.stdout
         assert "It is in force when the daemon of palm starts next, or by: tact" in made.stdout
+    made = tactomo(*command, "nonsense", "-o", "elsewhere.json")
+    assert f"Copied to {calibration_path('palm')}, it is in force when the daemon" in made.stdout
 
 
 def test_a_name_that_no_sensor_can_have(tactomo: Run, tmp_path: Path) -> None:
@@ -268,6 +270,8 @@ def take(terminal: Terminal, pressed: Pressed, number: int, kpa: float, magnitud
     terminal.enter("")
     terminal.wait_for("still: |Δσ|/σ₀")
     terminal.wait_for("Load cell in N")
+    terminal.enter(f"{1e5 * kpa:g}")  # a slip
+    terminal.wait_for("a number from 0 to 5000, please")
     terminal.enter(f"{kpa:g}")  # on an indenter of 1000 mm²
     terminal.wait_for("kPa, taken")
 

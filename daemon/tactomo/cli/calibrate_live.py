@@ -193,7 +193,7 @@ class _Session:
             "was taken is kept at once."
         )
         if self._area_mm2 is None:
-            diameter_mm = self._asked("Diameter of the indenter in mm: ", least=1.0)
+            diameter_mm = self._asked("Diameter of the indenter in mm: ", least=1.0, most=1e3)
             self._area_mm2 = math.pi / 4 * diameter_mm**2
         if self.readings:
             say(f"Going on with {len(self.readings)} readings in {self._log}; --fresh begins anew.")
@@ -213,9 +213,16 @@ class _Session:
             f"still: |Δσ|/σ₀ {held.magnitude:.4f} ± {held.magnitude_sigma:.4f} at "
             f"({held.x_mm:.1f}, {held.y_mm:.1f}) mm, {held.frames} frames"
         )
-        force_n = self._asked("Load cell in N: ", least=0.0)
+        force_n = self._asked("Load cell in N: ", least=0.0, most=self._largest_n())
         self._keep(held, force_n)
         return True
+
+    def _largest_n(self) -> float:
+        """By what no skin bears: a slip beyond that would spoil the fit of all others."""
+        from tactomo_models.calibration import LARGEST_KPA
+
+        assert self._area_mm2 is not None
+        return LARGEST_KPA * 1e-3 * self._area_mm2
 
     def _what_to_press(self) -> str:
         assert self._area_mm2 is not None
@@ -226,15 +233,15 @@ class _Session:
         way = "up" if rises else "down"
         return f"Reading {number + 1}, going {way}: about {force_n:.0f} N ({kpa:.0f} kPa)."
 
-    def _asked(self, question: str, least: float) -> float:
+    def _asked(self, question: str, least: float, most: float) -> float:
         while True:
             try:
                 value = float(self._console.input(question).strip().removesuffix("N"))
             except ValueError:
                 value = math.nan
-            if least <= value < math.inf:
+            if least <= value <= most:
                 return value
-            self._console.print(f"a number of at least {least:g}, please")
+            self._console.print(f"a number from {least:g} to {most:.0f}, please")
 
     def _wait_still(self) -> Held:
         """Wait until one contact has been still for a while; says meanwhile what it waits for."""

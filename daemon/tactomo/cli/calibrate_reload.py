@@ -49,10 +49,13 @@ def taken_up(made: PressureCalibration, path: Path, control: str, keys: Path | N
     Returns in words what became of it, and what is to be done.
     """
     from tactomo_client import CalibrationRefused, ClientError, KeysError, NoAnswer
+    from tactomo_models.calibration_file import calibration_path
 
     sensor = made.subject.sensor
     again = f"tactomo calibrate {sensor} --reload"
-    later = f"It is in force when the daemon of {sensor} starts next, or by: {again}"
+    own = calibration_path(sensor)
+    it = "It" if path.absolute() == own.absolute() else f"Copied to {own}, it"
+    later = f"{it} is in force when the daemon of {sensor} starts next, or by: {again}"
     try:
         found = _reloaded(sensor, control, keys)
     except (NoAnswer, OtherSensorError) as error:
