@@ -81,6 +81,19 @@ def test_a_slip_in_a_table_is_named_by_its_line(
     assert made.stderr.count("disagrees") == 1
 
 
+def test_a_table_with_a_slip_is_kept_on_request_alone(tactomo: Run, tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text(CSV + "220,2.0\n")
+    words = ("calibrate", "palm", "--readings", "log.csv", "--picture", "curve.png")
+    refused = tactomo(*words)
+    assert refused.returncode == 1
+    assert "line 10 (220 kPa, |Δσ|/σ₀ 2.000)" in refused.stderr.splitlines()[-1]
+    assert not calibration_path("palm").exists()
+    assert (tmp_path / "curve.png").exists()  # which shows the slip
+    kept = tactomo(*words, "--keep-odd")
+    assert kept.returncode == 0, kept.stderr
+    assert read_calibration(calibration_path("palm")).subject.sensor == "palm"
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [

@@ -144,7 +144,7 @@ async def test_a_frame_comes_whole(sensor: FakeSensor) -> None:
             map=RAMP,
             structure=structure.astype(np.float32),
             flags=["misfit_high"],
-            misfit=float("nan"),
+            misfit=None,
         )
         frame = await page.frame(1)
         assert [image["name"] for image in frame["images"]] == ["map", "structure"]

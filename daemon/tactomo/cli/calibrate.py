@@ -85,6 +85,9 @@ def calibrate(
         typer.Option("--output", "-o", help="Keep it in this file. [where the daemon looks]"),
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Keep nothing.")] = False,
+    keep_odd: Annotated[
+        bool, typer.Option("--keep-odd", help="Keep it with lines that the others contradict.")
+    ] = False,
     show: Annotated[bool, typer.Option("--show", help="Show the one that is kept.")] = False,
     reload: Annotated[
         bool, typer.Option("--reload", help="Have the running daemon read the one it finds again.")
@@ -112,7 +115,8 @@ def calibrate(
     `diameter_mm` of the indenter; and `magnitude` (|Δσ|/σ₀), with `magnitude_sigma` if that is
     known, or, with --recording, the time: `time_s` from the recording's beginning, or `realtime_s`
     since 1970 (UTC). `direction` (up, down) may be told, else it follows from the order. A log of
-    many lines a second will do: it is cut into pieces in which the load was still.
+    many lines a second will do: it is cut into pieces in which the load was still. Lines that the
+    others contradict are named, and nothing is kept until they are mended (or --keep-odd is given).
 
     A service keeps its own: `sudo -u tactomo STATE_DIRECTORY=/var/lib/tactomo/NAME tactomo
     calibrate NAME ...`, or `calibration = "FILE"` in its configuration.
@@ -139,6 +143,7 @@ def calibrate(
     from tactomo_models.calibration_file import calibration_path, save_calibration
 
     path = output or calibration_path(sensor)
+    odd: list[str] = []
     if show:
         made = _kept(sensor, path)
     elif live:
@@ -148,9 +153,10 @@ def calibrate(
     else:
         assert readings is not None
         ids = tuple(device_id or ())
-        made = _of_files(sensor, readings, recording, area, time_offset, description, ids)
+        made, odd = _of_files(sensor, readings, recording, area, time_offset, description, ids)
     tell(made)
-    if not (dry_run or show):
+    is_refused = bool(odd) and not keep_odd
+    if not (dry_run or show or is_refused):
         from tactomo.cli.calibrate_reload import taken_up
 
         save_calibration(made, path)
@@ -161,6 +167,14 @@ def calibrate(
 
         draw_calibration(made, picture)
         typer.echo(f"wrote {picture}")
+    if is_refused and not dry_run:
+        from tactomo_models import CalibrationError
+
+        # One slip moves the whole curve, and a running robot would go by it at once.
+        raise CalibrationError(
+            f"nothing is kept, as lines of {readings} disagree: {'; '.join(odd)}. Correct them, or "
+            "leave them out, and run this again; or keep it as it is by --keep-odd"
+        )
 
 
 def tell(made: PressureCalibration) -> None:
@@ -231,8 +245,8 @@ def _of_files(
     offset_s: float,
     description: str | None,
     device_ids: tuple[str, ...],
-) -> PressureCalibration:
-    """Fit what a load cell's log says, with the magnitudes in it or in a recording."""
+) -> tuple[PressureCalibration, list[str]]:
+    """Fit what a load cell says, with the magnitudes in it or in a recording; and its odd lines."""
     from tactomo_models import load_description
     from tactomo_models.calibration_file import PressureCalibration, subject_of
     from tactomo_models.load_cell import direct_readings, read_load_cell
@@ -247,24 +261,21 @@ def _of_files(
         subject, joined = _with_recording(sensor, cell, recording, offset_s, description)
     if device_ids:
         subject = subject.model_copy(update={"device_ids": device_ids})
-    for note in (*joined.notes, *_slips(joined)):
+    odd = _odd_lines(joined)
+    for note in (*joined.notes, *(f"{line} disagrees with the others" for line in odd)):
         typer.echo(note, err=True)
-    return PressureCalibration.of_readings(subject, joined.readings)
+    return PressureCalibration.of_readings(subject, joined.readings), odd
 
 
-def _slips(joined: Joined) -> list[str]:
+def _odd_lines(joined: Joined) -> list[str]:
     """Name the lines that the others contradict."""
     from tactomo_models.odd_readings import odd_readings
 
-    told = []
-    for index in odd_readings(joined.readings):
-        reading = joined.readings[index]
-        told.append(
-            f"line {joined.lines[index]} ({reading.pressure_kpa:.0f} kPa, |Δσ|/σ₀ "
-            f"{reading.magnitude:.3f}) disagrees with the others; if it is a slip, correct it or "
-            "leave it out, and run this again"
-        )
-    return told
+    odd = [(joined.lines[i], joined.readings[i]) for i in odd_readings(joined.readings)]
+    return [
+        f"line {line} ({reading.pressure_kpa:.0f} kPa, |Δσ|/σ₀ {reading.magnitude:.3f})"
+        for line, reading in odd
+    ]
 
 
 def _need(cell: LoadCell, path: Path, what: str) -> None:
