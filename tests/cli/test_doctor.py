@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -199,30 +199,47 @@ def test_scans_without_times_say_nothing_of_drift(tactomo: Run, rest: FloatArray
     assert "with their times" in drift["next_step"]
 
 
-def test_a_device_without_a_clock_is_not_late(
-    tactomo: Run, rest: FloatArray, paper: SensorDescription
-) -> None:
-    """As boards that print: when their scans came is all that is known of time."""
+def record_board(paper: SensorDescription, volts: FloatArray, numbers: Sequence[int]) -> None:
+    """Record a board that prints: when its scans came is all that is known of time."""
     both = (Channel.MAGNITUDE, Channel.STRUCTURE)
     offsets = (paper.electrode_count, *paper.offsets, paper.measurements)
     hello = Hello("board", "1", both, *offsets, SampleFormat.FLOAT32, 1.0, 0.0)
     scans = [
-        (0.1 * number, Scan(channel, number, 0, ScanFlag(0), volts.astype(np.float32)))
-        for number, volts in enumerate(noisy(rest))
+        (0.1 * number, Scan(channel, number, 0, ScanFlag(0), scan.astype(np.float32)))
+        for number, scan in zip(numbers, volts, strict=True)
         for channel in both
     ]
     write_recording(
-        "still.mcap",
+        "board.mcap",
         hello,
         scans,
         sensor="skin",
         description="paper_square",
         description_sha256=paper.sha256,
     )
-    found = report(tactomo("doctor", "still.mcap", "--json"))
+
+
+def test_a_device_without_a_clock_is_not_late(
+    tactomo: Run, rest: FloatArray, paper: SensorDescription
+) -> None:
+    record_board(paper, noisy(rest), range(40))
+    found = report(tactomo("doctor", "board.mcap", "--json"))
     drift = about(found["channels"]["magnitude"]["findings"], "drift")
     assert abs(drift["percent_per_min"]) < 0.5
     assert {each["about"] for each in found["stream"]} == {"packets", "lost_scans"}
+
+
+@pytest.mark.parametrize(
+    ("lost", "level", "verdict"), [(1, "advice", "healthy"), (3, "fault", "ill")]
+)
+def test_one_lost_scan_is_no_rate_of_loss(
+    tactomo: Run, rest: FloatArray, paper: SensorDescription, lost: int, level: str, verdict: str
+) -> None:
+    record_board(paper, noisy(rest), [*range(20), *range(20 + lost, 40 + lost)])
+    found = report(tactomo("doctor", "board.mcap", "--json"))
+    assert about(found["stream"], "lost_scans")["number"] == lost
+    assert about(found["stream"], "lost_scans")["level"] == level
+    assert found["verdict"] == verdict
 
 
 def test_nobody_there(tactomo: Run) -> None:

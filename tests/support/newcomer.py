@@ -83,7 +83,7 @@ class Newcomer:
         done = subprocess.run(
             line, cwd=self.folder, capture_output=True, text=True, timeout=300, check=False
         )
-        assert done.returncode == 0, f"{shlex.join(line)}: {done.stderr}"
+        assert done.returncode == 0, f"{shlex.join(line)}: {done.stdout}{done.stderr}"
         return done.stdout + done.stderr
 
     def _at(self, name: str) -> list[str]:

@@ -15,7 +15,8 @@ FLAG_FAULTS = frozenset(
     {"electrode_fault", "noise_high", "saturated", "channels_swapped", "reference_mismatch"}
 )
 FLAG_SHARE = 0.05  # of the frames: what comes and goes more rarely is advice
-LOST_NOTED = 1e-3  # share of the dual scans
+LOST_SHARE = 0.01  # of the dual scans: less is advice
+FEWEST_LOST = 3  # below that it is no rate: one of the first 41 says little of the next thousand
 
 
 def stream_findings(evidence: Evidence) -> list[Finding]:
@@ -76,7 +77,8 @@ def _share_found(about: str, number: int, count: int, what: str, step: str) -> F
     if not number:
         return Finding(about, Level.OK, f"none of {count + number} dual scans", "", figures)
     share = number / (count + number)
-    level = Level.FAULT if share > LOST_NOTED * 10 else Level.ADVICE
+    is_fault = share > LOST_SHARE and number >= FEWEST_LOST
+    level = Level.FAULT if is_fault else Level.ADVICE
     told = f"{number} of {count + number} dual scans ({share:.1%}) {what}"
     return Finding(about, level, told, step, figures)
 
