@@ -2,27 +2,41 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+RUN_READY := $(VENV)/.ready-run
 READY := $(VENV)/.ready
 TRAIN_READY := $(VENV)/.ready-train
+SHELL := bash
+.SHELLFLAGS := -eo pipefail -c
+
+# A line for each package, of all that pip says. Compiled at install, modules that nothing imports
+# would take longer than all else.
+INSTALL := $(BIN)/python -m pip install --no-compile
+SHOW := sed -un 's/^Collecting \([^=; ]*\).*/  \1/p; s/^Installing.*/  unpacking/p'
+BUILD := --quiet --no-build-isolation --no-deps
+LAB := models/tactomo_lab
 
 LOCKED := pyproject.toml --universal --python-version 3.11 --generate-hashes \
-  --no-emit-package tactomo-client --no-emit-package tactomo
+  --no-emit-package tactomo-client --no-emit-package tactomo --no-emit-package tactomo-lab
 
-.PHONY: help setup run test test-slow test-train faults soak firmware fuzz lint format bench deb lock clean
+.PHONY: help setup run test test-all test-long test-train faults soak firmware fuzz lint format bench deb lock clean
 
 help:            ## list these targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
 
 setup: $(READY) ## the environment in .venv, which the others make by themselves
 
-run: $(READY)    ## twin, daemon and viewer: a skin to press in the browser
+run: $(RUN_READY)  ## twin, daemon and viewer: a skin to press in the browser
 	$(BIN)/tactomo demo $(ARGS)
 
 test: $(READY)   ## the default test suite
 	$(BIN)/pytest -n auto --dist loadfile $(ARGS)
 
-test-slow: $(READY)  ## the tests too long for every run
-	$(BIN)/pytest -m 'slow and not train' $(ARGS)
+test-all: $(READY)  ## every test but the long ones, training and faults; more examples in each
+	$(BIN)/pytest -n auto --dist loadfile -m 'not long and not train and not faults' \
+	  --hypothesis-profile many $(ARGS)
+
+test-long: $(READY)  ## statistics, measured sets and days of drift: minutes each
+	$(BIN)/pytest -m long $(ARGS)
 
 test-train: $(TRAIN_READY)  ## the tests of training; installs PyTorch
 	$(BIN)/pytest -m train $(ARGS)
@@ -60,24 +74,34 @@ deb: $(READY)    ## the Debian package, for this distribution and processor, in 
 	deploy/debian/build.sh $(BIN)/python
 
 lock:            ## refresh the lock files (needs uv on the PATH)
-	uv pip compile $(LOCKED) --extra dev -o requirements.lock
-	uv pip compile $(LOCKED) --extra train -c requirements.lock -c requirements-torch.txt \
+	uv pip compile $(LOCKED) --extra dev --group build -o requirements.lock
+	uv pip compile $(LOCKED) --group build -c requirements.lock -o requirements-run.lock
+	uv pip compile $(LAB)/$(LOCKED) --extra train -c requirements.lock -c requirements-torch.txt \
 	  --no-emit-package torch -o requirements-train.lock
 
 clean:           ## remove the environment and caches
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
-# Built in place under a temporary marker so that an interrupted install is simply redone.
-$(READY): requirements.lock pyproject.toml clients/python/pyproject.toml
-	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "tactomo needs Python 3.11 or newer")'
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --require-hashes -r requirements.lock
-	$(BIN)/python -m pip install --quiet --no-build-isolation --no-deps -e clients/python -e .
-	touch $@
+# Built in place under a temporary marker so that an interrupted install is simply redone. First what
+# runs, then on top of that what tests, then what trains.
+$(RUN_READY): requirements-run.lock pyproject.toml clients/python/pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "tactomo needs Python 3.11 or newer")'
+	@echo "setting up $(VENV): what runs"
+	@$(PYTHON) -m venv $(VENV)
+	@$(INSTALL) --require-hashes -r requirements-run.lock | $(SHOW)
+	@$(INSTALL) $(BUILD) -e clients/python -e .
+	@touch $@
 
-# On top of that: torch last, when all it needs has come with its hash. Where its own index cannot
-# be reached, pip says so and takes what the others have.
+$(READY): $(RUN_READY) requirements.lock $(LAB)/pyproject.toml
+	@echo "setting up $(VENV): what tests, and the laboratory"
+	@$(INSTALL) --require-hashes -r requirements.lock | $(SHOW)
+	@$(INSTALL) $(BUILD) -e $(LAB)
+	@touch $@
+
+# Torch comes last, when all it needs has come with its hash. Where its own index cannot be reached,
+# pip says so and takes what the others have.
 $(TRAIN_READY): $(READY) requirements-train.lock requirements-torch.txt
-	$(BIN)/python -m pip install --quiet --require-hashes -r requirements-train.lock
-	$(BIN)/python -m pip install --quiet -r requirements-torch.txt
-	touch $@
+	@echo "setting up $(VENV): what trains"
+	@$(INSTALL) --require-hashes -r requirements-train.lock | $(SHOW)
+	@$(INSTALL) -r requirements-torch.txt | $(SHOW)
+	@touch $@

@@ -8,6 +8,7 @@ import signal
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -16,6 +17,8 @@ from selenium.common.exceptions import WebDriverException
 from selenium.webdriver.chrome.service import Service
 from tactomo.cli import main
 from threadpoolctl import threadpool_limits
+
+pytest_plugins = ["model_fixtures"]
 
 CHROMIUM_OPTIONS = (
     "--headless=new",
@@ -32,8 +35,14 @@ CHROMIUM_OPTIONS = (
 
 
 # Nothing depends on the wall clock, nor on how fast the computer is.
-settings.register_profile("tactomo", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("tactomo")
+PATIENT: dict[str, Any] = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
+settings.register_profile("few", max_examples=20, **PATIENT)
+settings.register_profile("many", max_examples=100, **PATIENT)  # `make test-all`
+settings.load_profile("few")
+
+
+# A shell that starts this in the background ignores Ctrl-C, and so would the programs under test.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -1,4 +1,4 @@
-"""The daemon's configuration: a TOML file, and flags that override it.
+"""The daemon's configuration: a TOML file, and options that override it.
 
 Every key has a default but `ports`. Errors name the file, the key, its value and what is allowed.
 `deploy/daemon.example.toml` shows every key with its meaning.
@@ -14,21 +14,21 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from pydantic_core import ErrorDetails
 from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM, MessageError
 from tactomo_client.messages import check_sensor_name
-from tactomo_models import METHODS
-from tactomo_models.baseline import TIME_CONSTANT_S
-from tactomo_models.calibration_file import data_folder
-from tactomo_models.errors import explain
+from tactomo_models.calibration.calibration_file import data_folder
+from tactomo_models.drift.baseline import TIME_CONSTANT_S
+from tactomo_models.errors import MethodError, explain
+from tactomo_models.methods.registry import find_method
 from tactomo_models.toml_file import read_toml
 
 from tactomo.endpoint import check_endpoint, check_metrics_address, is_local, needs_keys
 from tactomo.errors import ConfigError
 from tactomo.log import LogFormat, LogLevel
-from tactomo.protocols import OURS, PROTOCOLS
+from tactomo.protocols import NATIVE, find_protocol
 
 MAX_PORTS = 2
 
-_IN_TABLES = {"record": ("recording", "file"), "record_maps": ("recording", "maps")}
-"""Flags whose key is in a table of the file."""
+_RENAMED = {"tier": "method"}
+"""Keys of earlier versions, and what they are called now."""
 
 
 def _sensor_name(name: str) -> str:
@@ -39,19 +39,23 @@ def _sensor_name(name: str) -> str:
 
 
 def _method(name: str) -> str:
-    if name not in METHODS:
-        raise ValueError(f"use one of: {', '.join(METHODS)}")
+    try:
+        find_method(name)
+    except MethodError as error:
+        raise ValueError(str(error)) from error
     return name
 
 
 def _protocol(name: str) -> str:
-    if name not in PROTOCOLS:
-        raise ValueError(f"use one of: {', '.join(PROTOCOLS)}")
+    try:
+        find_protocol(name)
+    except ConfigError as error:
+        raise ValueError(f"{error.cause}; {error.next_step}") from error
     return name
 
 
 Endpoint = Annotated[str, AfterValidator(check_endpoint)]
-TierName = Annotated[str, AfterValidator(_method)]
+MethodName = Annotated[str, AfterValidator(_method)]
 ProtocolName = Annotated[str, AfterValidator(_protocol)]
 DeviceId = Annotated[str, Field(min_length=1, max_length=64)]
 MetricsAddress = Annotated[str, AfterValidator(check_metrics_address)]
@@ -134,7 +138,7 @@ class DaemonConfig(BaseModel):
     """The devices that make up this sensor, as their hello says; empty accepts any."""
     wait_for_ports: bool = False
     """Start without a port that cannot be opened yet, and wait for it."""
-    protocol: ProtocolName = OURS
+    protocol: ProtocolName = NATIVE
     """What the device speaks: ours, or that of other people's hardware."""
     baud: Annotated[int, Field(ge=1200, le=12_000_000)] | None = None
     """Of a real UART; None for what is usual with the protocol."""
@@ -142,9 +146,10 @@ class DaemonConfig(BaseModel):
     control: Endpoint = DEFAULT_CONTROL
     curve: Curve | None = None
     """Encrypt ``tcp://`` addresses and let in the listed clients only; needed beyond loopback."""
-    tier: TierName = "auto"
+    method: MethodName = "auto"
+    """How to reconstruct: a method's name, or ``my_module:MyMethod``."""
     budget_ms: BudgetMs | None = None
-    """Time that one reconstruction may take; None leaves it to the tier."""
+    """Time that one reconstruction may take; None leaves it to the method."""
     tare_scans: Annotated[int, Field(ge=2, le=10_000)] = 20
     """Dual scans averaged into a reference."""
     sync_wait_ms: Annotated[float, Field(ge=0, le=1000)] = 30.0
@@ -164,7 +169,7 @@ class DaemonConfig(BaseModel):
     def _ports_differ(self) -> Self:
         if len(set(self.ports)) != len(self.ports):
             raise ValueError("ports: the two ports are the same one")
-        if self.protocol != OURS and len(self.ports) > 1:
+        if self.protocol != NATIVE and len(self.ports) > 1:
             raise ValueError(f"ports: a device of protocol {self.protocol} has one port; give one")
         return self
 
@@ -184,11 +189,12 @@ class DaemonConfig(BaseModel):
 
 
 def load_config(path: str | Path | None = None, **overrides: Any) -> DaemonConfig:
-    """Read a configuration file and apply flags to it.
+    """Read a configuration file and apply options to it.
 
     Args:
-        path: a TOML file; None for defaults and flags alone.
-        **overrides: values by flag that win over the file's; None means "not given".
+        path: a TOML file; None for defaults and options alone.
+        **overrides: values that win over the file's; None means "not given". A key of a table is
+            written with a dot: ``recording.file``.
 
     Raises:
         ConfigError: the file cannot be read or is not TOML, or a key is unknown, missing or
@@ -197,11 +203,15 @@ def load_config(path: str | Path | None = None, **overrides: Any) -> DaemonConfi
     """
     given = {key: value for key, value in overrides.items() if value is not None}
     values = {} if path is None else _read_toml(Path(path))
+    for old, new in _RENAMED.items():
+        if old in values or old in given:
+            where = "command line" if old in given else path
+            raise ConfigError(f"{where}: {old} is called {new} now", f"write {new} for {old}")
     try:
         return DaemonConfig.model_validate(_override(values, given))
     except ValidationError as error:
-        complaints = [f"{_source(item, path, given)}: {explain(item)}" for item in error.errors()]
-        raise ConfigError("\n".join(complaints), _known_keys(error.errors())) from error
+        issues = [f"{_source(item, path, given)}: {explain(item)}" for item in error.errors()]
+        raise ConfigError("\n".join(issues), _known_keys(error.errors())) from error
 
 
 def _known_keys(items: Sequence[ErrorDetails]) -> str:
@@ -238,19 +248,18 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 
 def _override(values: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the file's values with those of the flags in their places."""
+    """Return the file's values with those of the options in their places."""
     merged = dict(values)
-    for flag, value in given.items():
-        table, key = _IN_TABLES.get(flag, (None, flag))
-        if table is None:
+    for path, value in given.items():
+        table, _, key = path.rpartition(".")
+        if not table:
             merged[key] = value
-        elif isinstance(merged.setdefault(table, {}), dict):  # else it is complained about
+        elif isinstance(merged.setdefault(table, {}), dict):  # else the table is an error
             merged[table] = {**merged[table], key: value}
     return merged
 
 
 def _source(item: ErrorDetails, path: str | Path | None, given: Mapping[str, Any]) -> str:
-    flags = {_IN_TABLES.get(flag, (flag,)) for flag in given}
-    loc = tuple(item["loc"])
-    is_flag = path is None or loc[:1] in flags or loc[:2] in flags
-    return "command line" if is_flag else str(path)
+    loc = [str(part) for part in item["loc"]]
+    is_given = any(".".join(loc[:depth]) in given for depth in (1, 2))
+    return "command line" if path is None or is_given else str(path)

@@ -2,7 +2,8 @@
 
 Without keys an address must be one that no other computer can reach. An ``ipc://`` file may be
 connected to by its owner and group alone; what a killed daemon left of it is replaced. With keys
-(`tactomo.doorkeeper`) every ``tcp://`` address is encrypted and lets in the allowed clients only.
+(`tactomo.stream.access_control`) every ``tcp://`` address is encrypted and lets in the allowed
+clients only.
 """
 
 from __future__ import annotations
@@ -99,7 +100,7 @@ def bind(
     Args:
         socket: a socket that has not been bound.
         endpoint: where to.
-        purpose: what it is for, also the domain under which a `Doorkeeper` knows it.
+        purpose: what it is for, also the domain under which a `AccessControl` knows it.
         secret: the server's secret CURVE key; None where the address needs none.
         option: the command line's option for another address; by default named as the purpose.
 

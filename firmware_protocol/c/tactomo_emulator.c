@@ -24,9 +24,9 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { MOST_BOARDS = 2, TRANSMIT_BYTES = 12288, CONVERTER_LIMIT = 8388607 };
+enum { MAX_BOARDS = 2, TRANSMIT_BYTES = 12288, CONVERTER_LIMIT = 8388607 };
 enum { FASTEST_PERIOD_US = 1000, POLL_MS = 1, LONGEST_PATH = 4096 };
-enum { BAD_USAGE = 2, MOST_SCENES = 16 };
+enum { BAD_USAGE = 2, MAX_SCENES = 16 };
 
 static const char help[] =
     "Usage: tactomo_emulator [OPTIONS] [VOLTAGES.csv ...]\n"
@@ -106,7 +106,7 @@ typedef struct {
     uint8_t frame[TACTOMO_SCAN_BOUND(TACTOMO_MOST_SAMPLES, 4)];
 } board;
 
-static board boards[MOST_BOARDS];
+static board boards[MAX_BOARDS];
 static int32_t samples[TACTOMO_MOST_SAMPLES];
 static uint64_t random_state = 0x9E3779B97F4A7C15u;
 
@@ -360,7 +360,7 @@ static scene load_scene(const char *path, const options *asked)
 static size_t load_scenes(const options *asked, scene *into)
 {
     size_t n = 0;
-    for (; asked->files[n] != NULL && n < MOST_SCENES; n++) {
+    for (; asked->files[n] != NULL && n < MAX_SCENES; n++) {
         into[n] = load_scene(asked->files[n], asked);
         if (into[n].channels < (size_t)asked->ports)
             refuse("two ports need both channels, and one alone is in", asked->files[n]);
@@ -518,7 +518,7 @@ static bool may_read_terminal(void)
 static bool wait_for_bytes(const options *asked)
 {
     static int input = STDIN_FILENO;
-    struct pollfd lines[MOST_BOARDS + 1];
+    struct pollfd lines[MAX_BOARDS + 1];
     char typed[64];
     ssize_t got;
     for (int i = 0; i < asked->ports; i++)
@@ -622,7 +622,7 @@ static void listen_to_signals(void)
 int main(int argc, char **argv)
 {
     options asked = read_options(argc, argv);
-    scene scenes[MOST_SCENES];
+    scene scenes[MAX_SCENES];
     size_t scene_count = load_scenes(&asked, scenes);
     listen_to_signals();
     for (int i = 0; i < asked.ports; i++) {

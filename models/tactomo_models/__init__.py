@@ -6,27 +6,38 @@
     frame = reconstructor.reconstruct(magnitude, structure)
 
 Nothing here opens a port or a socket; what the daemon does live and what a researcher does
-offline run this same code. Its modules, in the order in which each builds on those before:
+offline run this same code. Its folders, in the order in which each builds on those before:
 
 ===============  =================================================================================
-a skin           pattern, sheet, response, section, description, description_file, symmetry
-its physics      mesh, condensation, greens, bare_sheet, forward, artifact, visibility
-a scan           plausibility, signs, reference, changes
-linear images    tikhonov
-networks         prefilter, network
-shapes           shape_fit, outlines, levelset, search, following, objects, paper_level_set
-contacts         areas, magnitudes, pressure, contacts, drawing, redrawing
-a frame          tier, reconstruct, batch, machine_speed
-drift            drift, press_memory, channel_baseline, baseline
-health           lead_order, examination, findings, diagnosis
-pressure         calibration, odd_readings, calibration_file, load_cell
-simulated skins  scene, simulator, skin_drift
-apart            evaluation, training: what is measured and learnt on scenes whose truth is known
-for all          errors, archive, toml_file
+sensor           what a skin is: pattern, sheet, response, its description and the file of it
+physics          mesh, forward model, artifacts, sensitivity, linear reconstruction matrices
+scans            from volts to changes: polarity, plausibility, reference
+scene            what presses: shapes, areas, contacts, pressure
+methods          how a frame is solved: one protocol, a registry, and a file for each method
+simulation       skins whose truth is known, and how they drift
+calibration      pressure curves from a load cell
+health           what is wrong with a skin or its leads
+drift            a reference that follows the skin
 ===============  =================================================================================
+
+Above them: `reconstruct` turns scans into frames, `batch` does so for a file, `machine_speed` says
+what a budget of time buys.
 """
 
-from tactomo_models.artifact import (
+from tactomo_protocol import Channel
+
+from tactomo_models.drift.baseline import BaselineTracker
+from tactomo_models.errors import (
+    ArtifactError,
+    CalibrationError,
+    DataError,
+    DescriptionError,
+    MethodError,
+    ModelError,
+)
+from tactomo_models.methods.method import Estimate, Method, Skin, UnsolvableError
+from tactomo_models.methods.registry import METHODS, available_methods
+from tactomo_models.physics.artifact import (
     Artifact,
     build_artifact,
     default_path,
@@ -34,24 +45,17 @@ from tactomo_models.artifact import (
     load_or_build_artifact,
     save_artifact,
 )
-from tactomo_models.baseline import BaselineTracker
-from tactomo_models.contacts import Contact
-from tactomo_models.description import Modality, SensorDescription
-from tactomo_models.description_file import load_description, shipped_descriptions
-from tactomo_models.errors import (
-    ArtifactError,
-    CalibrationError,
-    DataError,
-    DescriptionError,
-    ModelError,
-)
-from tactomo_models.plausibility import Flag
-from tactomo_models.pressure import PressureCurve, PressureRange
-from tactomo_models.reconstruct import Reconstruction, Reconstructor
-from tactomo_models.reference import Reference
-from tactomo_models.scene import Press
-from tactomo_models.simulator import SkinSimulator
-from tactomo_models.tier import METHODS, Tier
+from tactomo_models.reconstruct import Reconstructor
+from tactomo_models.scans.measurement import Measurement
+from tactomo_models.scans.plausibility import Flag
+from tactomo_models.scans.reference import Reference
+from tactomo_models.scene.contacts import Contact
+from tactomo_models.scene.press import Press
+from tactomo_models.scene.pressure import PressureCurve, PressureRange
+from tactomo_models.scene.reconstruction import Reconstruction
+from tactomo_models.sensor.description import SensorDescription
+from tactomo_models.sensor.description_file import load_description, shipped_descriptions
+from tactomo_models.simulation.simulator import SkinSimulator
 
 __all__ = [
     "METHODS",
@@ -59,11 +63,15 @@ __all__ = [
     "ArtifactError",
     "BaselineTracker",
     "CalibrationError",
+    "Channel",
     "Contact",
     "DataError",
     "DescriptionError",
+    "Estimate",
     "Flag",
-    "Modality",
+    "Measurement",
+    "Method",
+    "MethodError",
     "ModelError",
     "Press",
     "PressureCurve",
@@ -72,8 +80,10 @@ __all__ = [
     "Reconstructor",
     "Reference",
     "SensorDescription",
+    "Skin",
     "SkinSimulator",
-    "Tier",
+    "UnsolvableError",
+    "available_methods",
     "build_artifact",
     "default_path",
     "load_artifact",

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from tactomo_models.archive import read_arrays
-from tactomo_models.description import SensorDescription
+from tactomo_models.arrays import FloatArray
 from tactomo_models.errors import DataError
-from tactomo_models.pressure import PressureCurve
-from tactomo_models.reconstruct import Reconstruction, Reconstructor
-from tactomo_models.reference import Reference, noise_of_reciprocity
-from tactomo_models.tier import METHODS, Tier
+from tactomo_models.reconstruct import Reconstructor
+from tactomo_models.scans.reference import Reference
+from tactomo_models.scene.pressure import PressureCurve
+from tactomo_models.scene.reconstruction import Reconstruction
+from tactomo_models.sensor.description import SensorDescription
 
-FloatArray = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 BUDGET_S = 2.0  # a file has no deadline: enough for any scene to converge within its frame
@@ -30,11 +30,11 @@ def reconstruct_file(
     target: Path,
     *,
     description: SensorDescription,
-    method: str = Tier.AUTO,
+    method: str = "auto",
     curve: PressureCurve | None = None,
     progress: Progress | None = None,
-) -> int:
-    """Reconstruct every frame of `source` into `target`; returns how many there were.
+) -> list[Reconstruction]:
+    """Reconstruct every frame of `source` into `target`, and return the frames.
 
     Args:
         source: .npz with `magnitude` (T, M), `structure` (T, M), `magnitude_reference` (M,) and
@@ -42,24 +42,21 @@ def reconstruct_file(
             all NaN is taken as absent.
         target: .npz that is written; docs/files.md says what is in it.
         description: the sensor.
-        method: one of `METHODS`.
+        method: its name, see `methods.registry`.
         curve: of a pressure calibration; the description's if None.
         progress: called with frames done and frames in all.
 
     Raises:
         DataError: the input cannot be read, has the wrong shape, or no channel of the sensor;
-            the method is unknown; or the output cannot be written.
+            or the output cannot be written.
+        ModelError: the method is unknown, or lacks what it needs.
     """
-    if method not in METHODS:
-        raise DataError(f"unknown method {method!r}; choose one of: {', '.join(METHODS)}")
     scans, reference = read_scans(source, description)
     total = max(len(channel) for channel in scans.values())
     frames: list[Reconstruction] = []
     seconds = np.zeros(total)
     with threadpool_limits(1):  # as the daemon runs, so that `seconds` are what a robot would see
-        reconstructor = Reconstructor(
-            description, tier=Tier(method), budget_s=BUDGET_S, curve=curve
-        )
+        reconstructor = Reconstructor(description, method=method, budget_s=BUDGET_S, curve=curve)
         reconstructor.set_reference(reference)
         for index in range(total):
             magnitude, structure = (_scan(scans, n, index) for n in ("magnitude", "structure"))
@@ -76,7 +73,7 @@ def reconstruct_file(
         raise DataError(
             f"cannot write {target}: {error.strerror}; name a file in a folder that you may write"
         ) from error
-    return total
+    return frames
 
 
 def _scan(scans: dict[str, FloatArray], name: str, index: int) -> FloatArray | None:
@@ -110,15 +107,8 @@ def read_scans(
                 f"{source}: {name}_reference holds no voltage; take the unpressed scan again"
             )
     # The file does not say how noisy the scans are, nor of how many the reference is the mean.
-    noise = {name: noise_of_reciprocity(description, channel) for name, channel in scans.items()}
-    rest = {name: noise_of_reciprocity(description, scan) for name, scan in references.items()}
-    return scans, Reference(
-        magnitude=references.get("magnitude"),
-        structure=references.get("structure"),
-        magnitude_noise=noise.get("magnitude"),
-        structure_noise=noise.get("structure"),
-        scans=min(_averaged(noise[name], rest[name]) for name in scans),
-    )
+    rest = Reference(references.get("magnitude"), references.get("structure"))
+    return scans, rest.with_noise_of(description, scans.get("magnitude"), scans.get("structure"))
 
 
 def scans_of(
@@ -136,7 +126,7 @@ def scans_of(
     """
     scans: dict[str, FloatArray] = {}
     references: dict[str, FloatArray] = {}
-    for name in description.modalities:
+    for name in description.channels:
         if name in arrays and not all_nan(arrays[name]):
             scans[name] = _checked(source, name, arrays[name], (None, description.measurements))
             key = f"{name}_reference"
@@ -145,19 +135,12 @@ def scans_of(
     if not scans:
         raise DataError(
             f"{source} holds none of the channels of {description.name!r} "
-            f"({', '.join(description.modalities)}); it holds: {', '.join(arrays) or 'nothing'}"
+            f"({', '.join(description.channels)}); it holds: {', '.join(arrays) or 'nothing'}"
         )
     lengths = {name: len(channel) for name, channel in scans.items()}
     if len(set(lengths.values())) > 1:
         raise DataError(f"{source}: channels differ in length: {lengths}")
     return scans, references
-
-
-def _averaged(noise: FloatArray | None, rest: FloatArray | None) -> int:
-    """Scans that a reference of this noise must be the mean of, by the noise of one scan."""
-    if noise is None or rest is None:
-        return 1
-    return int(np.clip((noise.max() / max(rest.max(), 1e-30)) ** 2, 1, 1e6))
 
 
 def all_nan(array: Any) -> bool:

@@ -5,7 +5,9 @@ ModelError
  │                      ("paper.toml: electrodes.length_m = 0.08: must be below the pitch, 0.036")
  ├── ArtifactError      a built artifact that is missing, damaged or made for another sensor
  ├── CalibrationError   load-cell readings that make no curve, or a calibration of another sensor
- └── DataError          voltages of the wrong shape or kind
+ ├── DataError          voltages of the wrong shape or kind
+ └── MethodError        a reconstruction method that there is not, or that is none
+                        ("unknown method 'tikonov'; use one of: auto, tikhonov, ...")
 """
 
 from typing import TYPE_CHECKING
@@ -32,6 +34,10 @@ class CalibrationError(ModelError):
 
 class DataError(ModelError):
     """Voltages of the wrong shape or kind."""
+
+
+class MethodError(ModelError):
+    """A reconstruction method that there is not, or that is none."""
 
 
 def explain(item: "ErrorDetails") -> str:

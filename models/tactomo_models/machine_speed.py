@@ -20,25 +20,19 @@ from pathlib import Path
 from typing import Annotated, Final, Literal, NamedTuple
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scipy.optimize import nnls
 
 from tactomo_models.archive import write_whole
-from tactomo_models.artifact import default_path
-from tactomo_models.description import SensorDescription
-from tactomo_models.errors import ArtifactError, explain
-from tactomo_models.tier import METHODS, Tier, check_tier
+from tactomo_models.errors import ArtifactError, ModelError, explain
+from tactomo_models.methods.registry import check_method
+from tactomo_models.physics.artifact import default_path
+from tactomo_models.sensor.description import SensorDescription
 
 SHIPPED: Final = "shipped_machine_speed.json"
 AGAIN: Final = "run: tactomo bench --machine-speed"
 CLEARLY: Final = 0.02  # of ICC: by more than this another method must be better than auto's own
-LEAST_BUDGET_S: Final = 0.001  # a frame does one thing at least, whatever it may take
-
-
-def _known(method: str) -> str:
-    if method not in METHODS:
-        raise ValueError(f"use one of: {', '.join(METHODS)}")
-    return method
+MIN_BUDGET_S: Final = 0.001  # a frame does one thing at least, whatever it may take
 
 
 class _Table(BaseModel):
@@ -49,13 +43,14 @@ class Row(_Table):
     """How fast and how right a method is on moving scenes, frame after frame.
 
     Attributes:
-        method: one of METHODS.
+        method: its name.
         budget_s: modelled work that a frame might take; None where a method takes what it takes.
         p50_s, p99_s: time of a frame.
-        icc: of the magnitude map, mean.
+        icc: of the magnitude map, mean, on the laboratory's moving scenes of the shipped sensor: no
+            matter of the machine, and the order of methods on other sensors, too.
     """
 
-    method: Annotated[str, AfterValidator(_known)]
+    method: str
     budget_s: Annotated[float, Field(gt=0)] | None
     p50_s: Annotated[float, Field(gt=0)]
     p99_s: Annotated[float, Field(gt=0)]
@@ -63,9 +58,9 @@ class Row(_Table):
 
 
 class Plan(NamedTuple):
-    """What a reconstructor is given for the tier and the time that were asked for."""
+    """What a reconstructor is given for the method and the time that were asked for."""
 
-    tier: Tier
+    method: str
     budget_s: float | None
 
 
@@ -107,7 +102,7 @@ class MachineSpeed(_Table):
             taken: the day.
             rows: some of them of `auto`, under different budgets.
         """
-        overhead_s, speed = _law([row for row in rows if row.method == Tier.AUTO])
+        overhead_s, speed = _law([row for row in rows if row.method == "auto"])
         return cls(
             tactomo=version("tactomo"),
             machine=processor(),
@@ -119,19 +114,19 @@ class MachineSpeed(_Table):
             rows=tuple(rows),
         )
 
-    def plan(self, tier: Tier, time_s: float | None) -> Plan:
+    def plan(self, method: str, time_s: float | None) -> Plan:
         """Return what to give a reconstructor, so that 99 frames of 100 keep to a time.
 
         Args:
-            tier: that is asked for. `auto` becomes another method where that one is more right
+            method: that is asked for. `auto` becomes another method where that one is more right
                 within so little time.
-            time_s: that a frame may take; None leaves it to the tier.
+            time_s: that a frame may take; None leaves it to the method.
         """
         if time_s is None:
-            return Plan(tier, None)
-        best = self.best_within(time_s) if tier is Tier.AUTO else None
-        budget_s = max(LEAST_BUDGET_S, (time_s - self.overhead_s) / self.speed)
-        return Plan(tier if best is None else Tier(best.method), budget_s)
+            return Plan(method, None)
+        best = self.best_within(time_s) if method == "auto" else None
+        budget_s = max(MIN_BUDGET_S, (time_s - self.overhead_s) / self.speed)
+        return Plan(method if best is None else best.method, budget_s)
 
     def best_within(self, time_s: float) -> Row | None:
         """Return the most accurate row that keeps to a time, or else the fastest one.
@@ -141,7 +136,7 @@ class MachineSpeed(_Table):
         """
         fitting = [row for row in self.rows if row.p99_s <= time_s]
         if fitting:
-            return max(fitting, key=lambda row: row.icc + CLEARLY * (row.method == Tier.AUTO))
+            return max(fitting, key=lambda row: row.icc + CLEARLY * (row.method == "auto"))
         return min(self.rows, key=lambda row: row.p99_s, default=None)
 
     @property
@@ -223,14 +218,19 @@ def machine_speed_for(description: SensorDescription, warn: Callable[[str], None
         found = _shipped()
     # Which method is best is another sensor's, and a network may be gone that was there.
     of_this = found.sha256 == description.sha256
-    rows = [row for row in found.rows if of_this and _is_to_be_had(description, row.method)]
+    rows = [row for row in found.rows if of_this and _is_available(description, row.method)]
     return found.model_copy(update={"rows": tuple(rows)})
 
 
-def _is_to_be_had(description: SensorDescription, method: str) -> bool:
+def shipped_rows(description: SensorDescription) -> list[Row]:
+    """Rows of the shipped table whose methods a sensor can be reconstructed by."""
+    return [row for row in _shipped().rows if _is_available(description, row.method)]
+
+
+def _is_available(description: SensorDescription, method: str) -> bool:
     try:
-        check_tier(description, Tier(method))
-    except ArtifactError:
+        check_method(method, description)
+    except ModelError:
         return False
     return True
 

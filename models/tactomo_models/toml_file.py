@@ -6,7 +6,7 @@ import tomllib
 from pathlib import Path
 from typing import Any, Final
 
-MAX_TOML_BYTES: Final = 1 << 20
+MAX_TOML_BYTES: Final = 1 << 20  # a description has some thousand
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -51,20 +51,14 @@ def test_options_that_do_not_go_together(tactomo: Run, options: list[str]) -> No
     assert tactomo("bench", *options).returncode == 2
 
 
-def test_a_sensor_without_scenes_cannot_be_measured(tactomo: Run) -> None:
-    result = tactomo("bench", "--machine-speed", "-d", "tank_disc")
-    assert result.returncode == 1
-    assert "has one channel" in result.stderr
-
-
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(600)
 def test_a_machine_is_measured(
     tactomo: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """On a coarse map, so that the scene is simulated in seconds."""
     monkeypatch.setenv("CACHE_DIRECTORY", str(tmp_path))
-    shipped = resources.files("tactomo_models.sensors").joinpath("paper_square.toml")
+    shipped = resources.files("tactomo_models.sensor.shipped").joinpath("paper_square.toml")
     sensor = tmp_path / "coarse.toml"
     sensor.write_text(shipped.read_text("utf-8") + "[map]\nnodes_x = 21\nnodes_y = 21\n")
     result = tactomo("bench", "--machine-speed", "--json", "-d", sensor)

@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from tactomo.recording_writer import write_recording
+from tactomo.recordings.recording_writer import write_recording
 from tactomo_client import request
 from tactomo_models import SensorDescription, load_description, load_or_build_artifact
-from tactomo_models.bare_sheet import scan_voltages
-from tactomo_models.pattern import reciprocal_pairs, scan_pairs
+from tactomo_models.arrays import FloatArray
+from tactomo_models.physics.bare_sheet import scan_voltages
+from tactomo_models.sensor.pattern import reciprocal_pairs, scan_pairs
 from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag
 from whole_system import SENSOR, Demo, repository, running_demo
 
 Run = Callable[..., Any]
-FloatArray = NDArray[np.float64]
 
 SHARED = repository().parent / "shared/data"
 measured = pytest.mark.skipif(not SHARED.is_dir(), reason="measured data are not here")
@@ -71,17 +69,16 @@ def test_a_healthy_batch(tactomo: Run, rest: FloatArray) -> None:
     assert found["stream"] == []
 
 
-def test_a_table_names_the_electrode_and_the_picture_is_drawn(
+def test_a_table_names_the_electrode(
     tactomo: Run, rest: FloatArray, paper: SensorDescription
 ) -> None:
     ends = np.hstack([paper.pairs.drive, paper.pairs.measure])
     np.savez("in.npz", structure=noisy(np.where((ends == 3).any(axis=1), 1e-6, 1.0) * rest))
-    outcome = tactomo("doctor", "in.npz", "--picture", "in.png")
+    outcome = tactomo("doctor", "in.npz")
     assert outcome.returncode == 1
     assert "electrode 3 reads next to nothing" in outcome.stdout
     assert "check its lead" in outcome.stdout
     assert "ill: see what is marked" in outcome.stdout
-    assert Path("in.png").read_bytes().startswith(b"\x89PNG")
 
 
 def every_pair(electrodes: int, volts: FloatArray) -> FloatArray:
@@ -252,7 +249,7 @@ def test_nobody_there(tactomo: Run) -> None:
 def test_the_broken_device_is_called_broken(tactomo: Run) -> None:
     outcome = tactomo("doctor", SHARED / "skin_bad_device_32el.npz")
     assert outcome.returncode == 1
-    assert "broken: nothing that comes from this device can be trusted" in outcome.stdout
+    assert "broken" in outcome.stdout
     assert "67.8%" in outcome.stdout
 
 

@@ -1,53 +1,141 @@
-"""The command line's surface: help, usage errors, and that it starts quickly."""
+"""The command line's surface: help, completion, usage errors, and that it starts quickly."""
 
 from __future__ import annotations
 
-import re
+import os
 import subprocess
 import sys
 from collections.abc import Callable
+from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import pytest
-from tactomo.cli import app
-from tactomo.cli.app import DEFAULT_CONTROL, DEFAULT_STREAM, DEFAULT_TWIN_CONTROL, ORDER, Method
+from tactomo.cli import app, commands
+from tactomo.cli.options import (
+    DEFAULT_CONTROL,
+    DEFAULT_STREAM,
+    DEFAULT_TWIN_CONTROL,
+    METHODS,
+    description_names,
+)
 from tactomo.config import DaemonConfig
 from tactomo_client import messages
-from tactomo_models import METHODS
+from tactomo_models import METHODS as METHODS_THERE
+from tactomo_models import shipped_descriptions
 from typer.main import get_command
 from typer.testing import CliRunner
 
 Run = Callable[..., Any]
+TOP: Any = get_command(app)
+HEAVY = {"numpy", "scipy", "zmq", "pydantic", "aiohttp", "serial", "skfem", "matplotlib", "rich"}
 
-TABLES = {"baseline", "curve", "recording"}
-"""Keys of the configuration that hold others, which have flags only where one is often wanted."""
+
+def leaves(group: Any, path: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+    """Every command that is no group, as the words that call it."""
+    found: list[tuple[str, ...]] = []
+    for name in group.commands:
+        command = group.commands[name]
+        below = hasattr(command, "commands")
+        found += leaves(command, (*path, name)) if below else [(*path, name)]
+    return found
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        *ORDER,
-        *("models build", "models draw", "models list"),
-        *("evaluate scenes", "evaluate moving", "evaluate tanks", "evaluate skin"),
-        "evaluate stability",
-    ],
-)
-def test_every_command_explains_itself(command: str) -> None:
-    result = CliRunner().invoke(app, [*command.split(), "--help"], prog_name="tactomo")
+@pytest.mark.parametrize("words", leaves(TOP), ids=" ".join)
+def test_every_command_explains_itself(words: tuple[str, ...]) -> None:
+    result = CliRunner().invoke(app, [*words, "--help"], prog_name="tactomo")
     assert result.exit_code == 0
-    assert f"Usage: tactomo {command}" in result.output
-    if command not in ("models", "models list", "evaluate"):
+    assert f"Usage: tactomo {' '.join(words)}" in result.output
+    if words != ("models", "list"):
         assert "Examples" in result.output
 
 
+def test_every_option_has_one_name_and_one_meaning() -> None:
+    meanings: dict[str, set[str]] = {}
+    for words in leaves(TOP):
+        command = TOP
+        for word in words:
+            command = command.commands[word]
+        for option in command.params:
+            for flag in option.opts:
+                meanings.setdefault(flag, set()).add(max(option.opts, key=len))
+    assert meanings["--sensor"] == meanings["-s"] == {"--sensor"}
+    assert meanings["--description"] == meanings["-d"] == {"--description"}
+    assert meanings["--port"] == meanings["-p"] == {"--port"}
+    assert meanings.keys() & {"--tier", "--name", "--twin", "--ask-for"} == set()
+
+
+def test_the_daemon_has_no_more_options_than_a_person_types() -> None:
+    assert len(TOP.commands["daemon"].params) <= 10
+
+
 def test_nothing_heavy_is_imported_to_show_the_help() -> None:
-    heavy = {"numpy", "scipy", "zmq", "pydantic", "aiohttp", "serial", "skfem", "matplotlib"}
-    program = f"import sys, tactomo.cli; print(sorted({heavy!r} & set(sys.modules)))"
+    program = (
+        "import sys; sys.argv = ['tactomo', '--help']\n"
+        "from tactomo.cli import main\n"
+        "try: main()\n"
+        f"finally: print(sorted({HEAVY!r} & set(sys.modules)))"
+    )
     result = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=False
     )
-    assert result.stdout.strip() == "[]", result.stderr
+    assert result.stdout.strip().endswith("[]"), result.stdout + result.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        (["ta"], {"tare"}),
+        (["reconstruct", "a", "b", "--method", "t"], {"tikhonov"}),
+        (["daemon", "--protocol", "op"], {"openeit"}),
+        (["replay", "-d", "paper"], {"paper_square"}),
+        (["method", "le"], {"levelset"}),
+    ],
+)
+def test_the_shell_completes(words: list[str], offered: set[str]) -> None:
+    line = " ".join(["tactomo", *words])
+    result = subprocess.run(
+        [sys.executable, "-m", "tactomo.cli"],
+        env={
+            **os.environ,
+            "_TACTOMO_COMPLETE": "complete_bash",
+            "COMP_WORDS": line,
+            "COMP_CWORD": str(len(words)),
+        },
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert offered == set(result.stdout.split()), result.stderr
+
+
+def test_what_is_completed_is_what_there_is() -> None:
+    assert set(METHODS) <= set(METHODS_THERE)
+    assert set(description_names()) == set(shipped_descriptions())
+
+
+def test_a_distribution_adds_commands(monkeypatch: pytest.MonkeyPatch) -> None:
+    added = {
+        name: EntryPoint(name, "tactomo.cli.files.recover:app", commands.ENTRY_POINTS)
+        for name in ("mend", "models.mend")
+    }
+    monkeypatch.setattr(commands, "_entry_points", lambda: added)
+    shown = CliRunner().invoke(app, ["--help"]).output
+    assert "mend" in shown.split(commands.OTHERS)[1]
+    assert "Usage: tactomo mend" in CliRunner().invoke(app, ["mend", "--help"]).output
+    assert "mend" in CliRunner().invoke(app, ["models", "--help"]).output
+
+
+def test_without_the_laboratory_it_says_how_to_get_it(
+    tactomo: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(commands, "_entry_points", dict)
+    for words in (["evaluate", "scenes"], ["models", "train"]):
+        result = tactomo(*words)
+        assert result.returncode == 1
+        assert "is part of the laboratory, which is not installed" in result.stderr
+        assert "pip install tactomo-lab" in result.stderr
+    assert "evaluate" not in tactomo("--help").stdout
 
 
 def test_without_a_command_it_shows_the_help(tactomo: Run) -> None:
@@ -67,7 +155,9 @@ def test_version(tactomo: Run) -> None:
     [
         ["dance"],
         ["twin", "--ports", "3"],
-        ["daemon", "--tier", "best"],
+        ["daemon", "--method", "best"],
+        ["daemon", "--set", "lossless"],
+        ["reconstruct", "in.npz", "out.npz", "--method", "best"],
         ["replay"],
         ["record", "stop", "here.mcap"],
         ["record", "start", "--seconds", "3"],
@@ -87,33 +177,11 @@ def test_the_default_addresses_are_the_clients() -> None:
     assert messages.DEFAULT_TWIN_CONTROL == DEFAULT_TWIN_CONTROL
 
 
-def test_the_methods_are_the_models() -> None:
-    assert get_args(Method) == METHODS
-    root = Path(__file__).parents[2]
-    page = (root / "clients/viewer/tactomo_viewer/page/index.html").read_text("utf-8")
-    assert tuple(re.findall(r"<option>(.*?)</option>", page)) == METHODS
-    example = (root / "deploy/daemon.example.toml").read_text("utf-8")
-    assert all(f'"{method}"' in example for method in METHODS)
-    for command in ("reconstruct", "daemon", "tier"):
-        shown = CliRunner().invoke(app, [command, "--help"], env={"COLUMNS": "240"})
-        assert all(method in shown.output for method in METHODS)
-        if command == "reconstruct":
-            assert "noise figure" in " ".join(shown.output.split()), "the rule is stated"
-
-
-def test_every_key_of_the_configuration_has_a_flag_with_its_default() -> None:
-    daemon = get_command(app).commands["daemon"]  # type: ignore[attr-defined]
-    flags = {option.opts[0].lstrip("-"): option for option in daemon.params}
-    renamed = {"name": "sensor", "ports": "port", "device_ids": "device-id"}
-    for key, field in DaemonConfig.model_fields.items():
-        if key in TABLES:
-            continue
-        flag = flags[renamed.get(key, key.replace("_", "-"))]
-        # A flag that is not given must not win over the file, so defaults stand in the help.
-        assert not flag.default
-        if field.default not in (None, False, ()) and not field.is_required():
-            shown = f"{field.default:g}" if isinstance(field.default, float) else field.default
-            assert f"[{shown}" in flag.help
+def test_every_key_of_the_configuration_can_be_set(tactomo: Run, tmp_path: Path) -> None:
+    for key in DaemonConfig.model_fields.keys() - {"baseline", "curve", "recording"}:
+        result = tactomo("daemon", "--set", f"{key}=-1", "--set", "recording.maps=3")
+        assert result.returncode == 1
+        assert "command line: recording.maps = 3" in result.stderr, key
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from tactomo.recording import Recording, open_recording
+from tactomo.recordings.recording import Recording, open_recording
 from tactomo_models import load_description
+from tactomo_models.arrays import FloatArray
 from tactomo_protocol import Channel, Decoder, Scan
 
 Run = Callable[..., Any]
@@ -29,12 +30,12 @@ def scans(recording: Recording) -> list[tuple[float, Scan]]:
     return [((clock_ns - found[0][0]) * 1e-9, scan) for clock_ns, scan in found]
 
 
-def potentials(frames: int, seed: int = 0) -> NDArray[np.float64]:
+def potentials(frames: int, seed: int = 0) -> FloatArray:
     """Volts of every electrode against ground for every injection, (T, 16, 16)."""
     return np.random.default_rng(seed).normal(size=(frames, ELECTRODES, ELECTRODES))
 
 
-def expected(volts: NDArray[np.float64]) -> NDArray[np.float64]:
+def expected(volts: FloatArray) -> FloatArray:
     """The 208 differences by their definition, independent of the code's pair tables."""
     rows = []
     for k in range(ELECTRODES):
@@ -54,7 +55,7 @@ def test_single_ended_volts_become_differences_in_order(tactomo: Run, tmp_path: 
     complex_volts = volts * (1 + 0.1j)
     np.savez(tmp_path / "in.npz", t=times, injection=INJECTION, volts=complex_volts)
     result = tactomo(
-        *("import", "in.npz", "out.mcap", "--sensor", "tank_disc", "--reference-frames", "0:2")
+        *("import", "in.npz", "out.mcap", "--description", "tank_disc", "--reference-frames", "0:2")
     )
     assert result.returncode == 0, result.stderr
     assert "10% is quadrature" in result.stdout
@@ -79,7 +80,7 @@ def test_a_reversed_and_shuffled_injection_is_put_right(tactomo: Run, tmp_path: 
     injection, turned = INJECTION[shuffled], volts[:, shuffled]
     injection[::2], turned[:, ::2] = injection[::2, ::-1].copy(), -turned[:, ::2]
     np.savez(tmp_path / "in.npz", injection=injection, volts=turned)
-    result = tactomo("import", "in.npz", "out.mcap", "--sensor", "tank_disc", "--rate", "10")
+    result = tactomo("import", "in.npz", "out.mcap", "--description", "tank_disc", "--rate", "10")
     assert result.returncode == 0, result.stderr
     read = scans(open_recording(tmp_path / "out.mcap"))
     got = np.array([scan.samples for _, scan in read])
@@ -91,7 +92,7 @@ def test_a_converters_counts_are_taken_as_they_are(tactomo: Run, tmp_path: Path)
     """Also unsigned ones, whose differences may be below zero."""
     counts = np.random.default_rng(2).integers(0, 1 << 16, (2, ELECTRODES, ELECTRODES), np.uint16)
     np.savez(tmp_path / "in.npz", injection=INJECTION, volts=counts)
-    result = tactomo("import", "in.npz", "out.mcap", "--sensor", "tank_disc", "--rate", "10")
+    result = tactomo("import", "in.npz", "out.mcap", "--description", "tank_disc", "--rate", "10")
     assert result.returncode == 0, result.stderr
     got = np.array([scan.samples for _, scan in scans(open_recording(tmp_path / "out.mcap"))])
     assert np.array_equal(got, expected(counts.astype(float)))
@@ -106,7 +107,7 @@ def test_the_batch_layout_keeps_channels_reference_and_gaps(tactomo: Run, tmp_pa
     }
     arrays["structure"][2] = np.nan  # that scan did not arrive
     np.savez(tmp_path / "in.npz", **arrays)
-    result = tactomo("import", "in.npz", "out.mcap", "--rate", "20", "--name", "left_forearm")
+    result = tactomo("import", "in.npz", "out.mcap", "--rate", "20", "--sensor", "left_forearm")
     assert result.returncode == 0, result.stderr
     recording = open_recording(tmp_path / "out.mcap")
     read = [scan for _, scan in scans(recording)]
@@ -136,38 +137,38 @@ def test_the_batch_layout_keeps_channels_reference_and_gaps(tactomo: Run, tmp_pa
         ({"magnitude": np.zeros((4, 208)), "t": [0, 1, 2, 1e13]}, [], "t holds what is out of"),
         (
             {"structure": np.zeros((4, 208)), "magnitude": np.array(["a"])},
-            ["--rate", "1", "--sensor", "tank_disc"],
+            ["--rate", "1", "--description", "tank_disc"],
             "a channel that tank_disc does not have",
         ),
         (
             {"injection": INJECTION, "volts": potentials(2)[:0]},
-            ["--rate", "1", "--sensor", "tank_disc"],
+            ["--rate", "1", "--description", "tank_disc"],
             "volts is float64 (0, 16, 16)",
         ),
         (
             {"magnitude": np.zeros((4, 208))},
-            ["--rate", "1", "--sensor", "tank_disc"],
+            ["--rate", "1", "--description", "tank_disc"],
             "a channel that tank_disc does not have",
         ),
         ({"injection": INJECTION, "volts": potentials(2)}, ["--rate", "1"], "give --channel"),
         (
             {"injection": INJECTION[:15], "volts": potentials(2)[:, :15]},
-            ["--rate", "1", "--sensor", "tank_disc"],
+            ["--rate", "1", "--description", "tank_disc"],
             "no injection (15, 0)",
         ),
         (
             {"injection": INJECTION, "volts": potentials(2)[:, :, :12]},
-            ["--rate", "1", "--sensor", "tank_disc"],
+            ["--rate", "1", "--description", "tank_disc"],
             "(T, 16, 16)",
         ),
         (
             {"injection": INJECTION, "volts": potentials(2) * np.exp(1j)},
-            ["--rate", "1", "--sensor", "tank_disc"],
+            ["--rate", "1", "--description", "tank_disc"],
             "out of phase with the current",
         ),
         (
             {"injection": INJECTION, "volts": potentials(2)},
-            ["--rate", "1", "--sensor", "tank_disc", "--reference-frames", "5:9"],
+            ["--rate", "1", "--description", "tank_disc", "--reference-frames", "5:9"],
             "the reference frames are 0 of the 2 scans",
         ),
     ],
@@ -198,7 +199,7 @@ def eit_text(volts: NDArray[np.complex128], date: str, frequencies: int = 1) -> 
     return "\n".join(lines) + "\n"
 
 
-def save_eit(folder: Path, volts: NDArray[np.float64]) -> list[Path]:
+def save_eit(folder: Path, volts: FloatArray) -> list[Path]:
     """Frames a twentieth of a second apart, with names that are not in the order of time."""
     folder.mkdir()
     paths = [folder / f"frame_{len(volts) - number}.eit" for number in range(len(volts))]
@@ -215,7 +216,7 @@ def test_sciospecs_files_are_read_in_the_order_of_their_dates(
     volts = potentials(4)
     paths = save_eit(tmp_path / "scan", volts)
     given = [tmp_path / "scan"] if how == "folder" else paths
-    result = tactomo("import", *given, "out.mcap", "--sensor", "tank_disc")
+    result = tactomo("import", *given, "out.mcap", "--description", "tank_disc")
     assert result.returncode == 0, result.stderr
     read = scans(open_recording(tmp_path / "out.mcap"))
     assert [time_s for time_s, _ in read] == pytest.approx([0, 0.05, 0.1, 0.15], abs=1e-6)
@@ -247,7 +248,7 @@ def test_a_line_that_is_wrong_is_named(
     lines = path.read_text().splitlines()
     lines[line - 1 :] = [] if text is None else [text, *lines[line:]]
     path.write_text("\n".join(lines))
-    result = tactomo("import", path, "out.mcap", "--sensor", "tank_disc")
+    result = tactomo("import", path, "out.mcap", "--description", "tank_disc")
     assert result.returncode == 1
     assert f"{path}, {says}" in result.stderr
     assert not (tmp_path / "out.mcap").exists()
@@ -256,7 +257,7 @@ def test_a_line_that_is_wrong_is_named(
 def test_sciospecs_files_must_belong_together(tactomo: Run, tmp_path: Path) -> None:
     first, second = save_eit(tmp_path / "scan", potentials(2))
     second.write_text(second.read_text().replace("\n1 2\n", "\n1 3\n"))
-    result = tactomo("import", first, second, "out.mcap", "--sensor", "tank_disc")
+    result = tactomo("import", first, second, "out.mcap", "--description", "tank_disc")
     assert "different injections" in result.stderr
     (tmp_path / "empty").mkdir()
     assert "holds no .eit file" in tactomo("import", "empty", "out.mcap").stderr
@@ -285,7 +286,15 @@ def test_info_of_an_imported_recording(tactomo: Run, tmp_path: Path) -> None:
 @pytest.mark.skipif(not SCIOSPEC.exists(), reason="the measured tank is not on this machine")
 def test_a_measured_tank(tactomo: Run, tmp_path: Path) -> None:
     result = tactomo(
-        *("import", SCIOSPEC, "tank.mcap", "--sensor", "tank_disc", "--reference-frames", "0:20")
+        *(
+            "import",
+            SCIOSPEC,
+            "tank.mcap",
+            "--description",
+            "tank_disc",
+            "--reference-frames",
+            "0:20",
+        )
     )
     assert result.returncode == 0, result.stderr
     read = scans(open_recording(tmp_path / "tank.mcap"))

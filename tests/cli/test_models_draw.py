@@ -7,18 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from matplotlib.image import imread
 from small_sensor import SMALL
 
 Run = Callable[..., Any]
 DOTS_PER_MM = 150 / 25.4
-
-
-@pytest.fixture(autouse=True)
-def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.delenv("CACHE_DIRECTORY", raising=False)
 
 
 def rims_apart(picture: Path, width_mm: float) -> int:

@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 from fake_machine import FakeMachine
 from rich.console import Console
-from tactomo.cli.ports import question, survey, table
-from tactomo.identify import identify
+from tactomo.acquisition.identify import identify
+from tactomo.cli.run.ports import question, survey, table
 from tactomo_protocol import Channel, Command, Decoder, Hello, SampleFormat, encode
 
 Run = Callable[..., Any]

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -22,9 +21,9 @@ from tactomo_client import request
 from tactomo_models import load_description
 from tactomo_protocol import Command, CommandCode, Decoder, Scan, encode
 from typer.main import get_command
+from waiting import PATIENCE_S, wait_until
 
 Run = Callable[..., Any]
-PATIENCE_S = 90.0
 
 linux = pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks processes up in /proc")
 
@@ -64,18 +63,10 @@ def announced(stream: IO[str] | None) -> dict[str, Any]:
     raise AssertionError("".join(seen))
 
 
-def wait_for(condition: Callable[[], Any]) -> Any:
-    end_s = time.monotonic() + PATIENCE_S
-    while time.monotonic() < end_s:
-        if value := condition():
-            return value
-        time.sleep(0.05)
-    raise AssertionError(f"did not happen within {PATIENCE_S} s")
-
-
 def test_a_twin_of_the_papers_sensor(start: Run, tmp_path: Path) -> None:
     twin = start(
-        *("twin", "--ports", 1, "--link", "dev", "--control", "tcp://127.0.0.1:0"), "--announce"
+        *("twin", "--ports", 1, "--link", "dev", "--twin-control", "tcp://127.0.0.1:0"),
+        "--announce",
     )
     ready = announced(twin.stdout)
     assert ready["ports"] == ["dev/skin"]
@@ -87,7 +78,7 @@ def test_a_twin_of_the_papers_sensor(start: Run, tmp_path: Path) -> None:
             scans.extend(p for p in decoder.feed(port.read(4096)) if isinstance(p, Scan))
             return len(scans) >= 6
 
-        wait_for(six_scans)
+        wait_until(six_scans)
     assert {len(scan.samples) for scan in scans} == {208}
     assert request("status", ready["control"])["sensor"] == "paper_square"
     twin.send_signal(signal.SIGTERM)
@@ -96,13 +87,14 @@ def test_a_twin_of_the_papers_sensor(start: Run, tmp_path: Path) -> None:
 
 
 def test_a_twin_whose_control_address_is_taken_says_what_to_do(tactomo: Run, control: Any) -> None:
-    result = tactomo("twin", "--link", "dev", "--control", control.address)
+    result = tactomo("twin", "--link", "dev", "--twin-control", control.address)
     assert result.returncode == 1
     assert "is in use; stop the twin or demo that runs already" in result.stderr
 
 
+@pytest.mark.slow
 def test_a_link_is_one_twins_as_long_as_it_lives(start: Run, tactomo: Run, tmp_path: Path) -> None:
-    command = ("twin", "--ports", 1, "--link", "dev", "--control", "tcp://127.0.0.1:0")
+    command = ("twin", "--ports", 1, "--link", "dev", "--twin-control", "tcp://127.0.0.1:0")
     first = start(*command, "--announce")
     announced(first.stdout)
     device = os.readlink(tmp_path / "dev" / "skin")
@@ -126,7 +118,7 @@ def test_the_twins_defaults_are_those_of_its_configuration() -> None:
     assert options["rate"] == usual.rate_hz
     assert (options["drift"], options["creep"]) == (usual.drift.walk, usual.drift.creep)
     assert (options["unevenness"], options["seed"]) == (usual.unevenness, usual.seed)
-    assert options["control"] == usual.control
+    assert options["twin_control"] == usual.control
 
 
 def twin_command() -> Any:
@@ -140,14 +132,13 @@ def twin_command() -> Any:
         (["twin", "--scene", "none.toml"], "cannot read the scene none.toml"),
         (["twin", "--description", "tank_disc", "--ports", "2"], "1 channel"),
         (["twin", "--rate", "0"], "a rate of 0 Hz"),
-        (["twin", "--control", "tcp://0.0.0.0:5562"], "other computers"),
+        (["twin", "--twin-control", "tcp://0.0.0.0:5562"], "other computers"),
         (["daemon"], "ports is missing"),
         (["daemon", "none.toml"], "cannot read none.toml"),
-        (["daemon", "--port", "/dev/null", "--tare-scans", "1"], "tare_scans = 1"),
+        (["daemon", "--port", "/dev/null", "--set", "tare_scans=1"], "tare_scans = 1"),
         (["replay", "none.mcap"], "cannot open the recording none.mcap"),
         (["replay", "none.mcap", "--viewer"], "cannot open the recording none.mcap"),
-        (["demo", "--replay", "none.mcap"], "cannot open the recording none.mcap"),
-        (["viewer", "--stream", "nowhere", "--port", "0"], "nowhere"),
+        (["viewer", "--stream", "nowhere", "--viewer-port", "0"], "nowhere"),
         (["reconstruct", "none.npz", "out.npz"], "none.npz"),
         (["plot", "none.mcap"], "cannot open the recording none.mcap"),
     ],
@@ -167,34 +158,45 @@ def test_a_speed_that_is_none_is_a_usage_error(tactomo: Run, tmp_path: Path) -> 
 
 
 def test_a_child_that_fails_takes_the_demo_down_and_its_words_are_shown(tactomo: Run) -> None:
-    result = tactomo("demo", "--description", "nosuch", "--port", "0")
+    result = tactomo("demo", "--description", "nosuch", "--viewer-port", "0")
     assert result.returncode == 1
     assert "stopped (exit status 1)" in result.stderr
     assert "cannot read the sensor description nosuch" in result.stderr
 
 
 @linux
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "number",
+    [
+        signal.SIGTERM,
+        pytest.param(signal.SIGINT, marks=pytest.mark.slow),
+        pytest.param(signal.SIGKILL, marks=pytest.mark.slow),
+    ],
+)
 def test_a_demo_leaves_no_process_behind(start: Run, number: signal.Signals) -> None:
     free = "tcp://127.0.0.1:0"
     demo = start(
-        *("demo", "--port", 0, "--stream", free, "--control", free, "--twin-control", free)
+        *("demo", "--viewer-port", 0, "--stream", free, "--control", free, "--twin-control", free)
     )
-    children = wait_for(lambda: children_of(demo.pid) if len(children_of(demo.pid)) == 2 else None)
-    time.sleep(0.5)  # far enough to have begun, not far enough to be ready
+    wait_until(lambda: len(children_of(demo.pid)) == 2)  # begun, and not ready yet
+    children = children_of(demo.pid)
     demo.send_signal(number)
     demo.wait(PATIENCE_S)
-    wait_for(lambda: not any(is_running(child) for child in children))
+    wait_until(lambda: not any(is_running(child) for child in children))
 
 
 def test_a_family_notices_whoever_ends_and_tells_its_last_words() -> None:
     with Family() as family:
-        viewer = family.start("page", "viewer", "--port", "0", "--stream", "ipc:///nowhere/at/all")
+        viewer = family.start(
+            "page", "viewer", "--viewer-port", "0", "--stream", "ipc:///nowhere/at/all"
+        )
         url = viewer.wait_ready()["url"]
         assert url.startswith("http://127.0.0.1:")
         family.start("list", "models", "list").wait_done()  # has done its work: no reason to stop
         taken = url.rstrip("/").rpartition(":")[2]
-        late = family.start("second", "viewer", "--port", taken, "--stream", "ipc:///nowhere/at")
+        late = family.start(
+            "second", "viewer", "--viewer-port", taken, "--stream", "ipc:///nowhere/at"
+        )
         assert family.wait_for_an_end() is late
         assert viewer.is_running
         with pytest.raises(ChildError, match=r"(?s)second stopped.*cannot listen"):
@@ -204,24 +206,26 @@ def test_a_family_notices_whoever_ends_and_tells_its_last_words() -> None:
 
 
 PARENT = """
-import time
+import sys
 from tactomo.cli.children import Family
 with Family() as family:
-    viewer = family.start("viewer", "viewer", "--port", "0", "--stream", "ipc:///nowhere/at/all")
+    viewer = family.start("viewer", "viewer", "--viewer-port", "0", "--stream", "ipc:///nowhere/at/all")
     viewer.wait_ready()
     print(viewer.pid, flush=True)
-    time.sleep(600)
+    sys.stdin.read()
 """
 
 
 @linux
 def test_a_child_that_is_ready_ends_with_a_parent_that_is_killed() -> None:
-    with subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE) as parent:
+    with subprocess.Popen(
+        [sys.executable, "-c", PARENT], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as parent:
         assert parent.stdout is not None
         child = int(parent.stdout.readline())
         assert is_running(child)
         parent.kill()
-    wait_for(lambda: not is_running(child))
+    wait_until(lambda: not is_running(child))
 
 
 def test_a_verbose_family_passes_on_what_is_said(capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tactomo.cli.complaints import FLAG_ADVICE
+from tactomo.cli.health_issues import FLAG_ADVICE
 from tactomo_client.fake import FakeSensor
 from tactomo_models import Flag
 
@@ -65,7 +65,7 @@ def test_status_shows_what_matters(tactomo: Run, control: Any) -> None:
     for words in (
         *("left_forearm: running", "/dev/ttyACM0 (open)", "3 corrupt", "(not open)"),
         *("p50 4.25 ms", "structure_missing", "19.96 frames/s", "2 dual scans dropped"),
-        *("20 dual scans", "/tmp/a.mcap (2.5 MB)", "levelset (asked for: auto)"),
+        *("20 dual scans", "/tmp/a.mcap (2.5 MB)", "auto; the newest frame by levelset"),
         *("refused: [neither] contact nor drift", "magnitude -1.23%, unevenly 0.09%"),
         "12 ms: fit, 4.50 modelled ms; machine speed: measured here",
     ):
@@ -201,9 +201,9 @@ def test_a_refusal_is_one_line_with_cause_and_next_step(tactomo: Run, control: A
     assert result.stderr == "tactomo: somebody presses; let go and tare again\n"
 
 
-@pytest.mark.parametrize("command", [["status"], ["poke", "clear"]])
+@pytest.mark.parametrize("command", [["status", "--control"], ["poke", "clear", "--twin-control"]])
 def test_nobody_there(tactomo: Run, command: list[str]) -> None:
-    result = tactomo(*command, "--control", "ipc:///nowhere/at/all")
+    result = tactomo(*command, "ipc:///nowhere/at/all")
     assert result.returncode == 1
     assert "nothing answered at ipc:///nowhere/at/all" in result.stderr
 
@@ -238,7 +238,7 @@ def test_record_a_file_for_some_seconds(tactomo: Run, control: Any) -> None:
 def test_tier_and_budget(tactomo: Run, control: Any) -> None:
     control.answers["set_tier"] = {"tier": "tikhonov"}
     control.answers["set_budget"] = {"budget_ms": 20.0}
-    result = tactomo("tier", "tikhonov", "--budget-ms", "20", "--control", control.address)
+    result = tactomo("method", "tikhonov", "--budget-ms", "20", "--control", control.address)
     assert result.returncode == 0
     assert control.requests == [
         ("set_tier", {"tier": "tikhonov"}),
@@ -249,7 +249,13 @@ def test_tier_and_budget(tactomo: Run, control: Any) -> None:
 def test_poke_sends_numbers_as_numbers(tactomo: Run, control: Any) -> None:
     control.answers["mute"] = {"done": True}
     result = tactomo(
-        "poke", "mute", "channel=structure", "seconds=2.5", "port=1", "--control", control.address
+        "poke",
+        "mute",
+        "channel=structure",
+        "seconds=2.5",
+        "port=1",
+        "--twin-control",
+        control.address,
     )
     assert json.loads(result.stdout) == {"done": True}
     assert control.requests == [("mute", {"channel": "structure", "seconds": 2.5, "port": 1})]

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tactomo.cli.watch import frame_line, map_text
+from tactomo.cli.steer.watch import frame_line, map_text
 from tactomo_client import Contact, subscribe
 from tactomo_client.appearance import PRESSED_COLOUR
 from tactomo_client.fake import FakeSensor

@@ -146,7 +146,7 @@ def test_closing_ends_the_iteration_of_another_task(run: Run, sensor: FakeSensor
         skin = aio.subscribe("left", address=sensor.address)
         counting = asyncio.create_task(count(skin))
         await asyncio.to_thread(sensor.wait_for_subscriber)
-        await asyncio.sleep(0.05)
+        await asyncio.sleep(0)  # the other task waits now
         skin.close()
         skin.close()
         assert await counting == 0

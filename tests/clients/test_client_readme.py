@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 import tactomo_client
-from tactomo.recording import Origin
-from tactomo.recording_writer import RecordingWriter, message_entry
+from tactomo.recordings.recording import Origin
+from tactomo.recordings.recording_writer import RecordingWriter, message_entry
 from tactomo_client import Contact, ControlError, aio
 from tactomo_client.fake import FakeControl, FakeSensor
 from tactomo_client.messages import MAP, encode_message
@@ -106,7 +106,6 @@ def test_in_a_control_loop() -> None:
     deadline = time.monotonic() + PATIENCE_S
 
     def is_running() -> bool:
-        time.sleep(0.01)
         return "retreat" not in done and time.monotonic() < deadline
 
     robot = SimpleNamespace(

@@ -31,13 +31,14 @@ from cpp_client import (
     need_headers,
     run,
 )
-from daemon_process import SENSOR, DaemonProcess, wait_until
+from daemon_process import SENSOR, DaemonProcess
 from fuzz_targets import CONTACT, HEADER
-from tactomo import keys as key_files
+from tactomo.stream import keys as key_files
 from tactomo_client import ClientError, Contact, ControlError, Frame, request, subscribe
 from tactomo_client.fake import FakeControl, FakeSensor
 from tactomo_client.frame import frame_from_message
 from tactomo_client.messages import CONTACTS, MAP, decode_message, encode_message
+from waiting import wait_until
 
 PATIENCE_S = 60.0
 
@@ -47,28 +48,20 @@ ANYWHERE = "tcp://127.0.0.1:0"
 
 
 @pytest.fixture(scope="session")
-def programs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """`probe` as it is, and `checked` with sanitizers where there are some; built side by side."""
+def probe(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The probe as it is."""
     need_headers()
-    folder = tmp_path_factory.mktemp("cpp")
+    return compile_probe(tmp_path_factory.mktemp("plain"), "c++", "-O1")
+
+
+@pytest.fixture(scope="session")
+def checked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The probe with sanitizers, where there are some."""
+    need_headers()
+    folder = tmp_path_factory.mktemp("checked")
     clang = "clang++" if shutil.which("clang++") else "c++"
     flags = SANITIZED if can_sanitize(folder, clang) else "-O1"
-    with ThreadPoolExecutor() as both:
-        checked = both.submit(compile_probe, folder, clang, f"{flags} -DMSGPACK_NO_BOOST")
-        plain = folder / "plain"
-        plain.mkdir()
-        probe = both.submit(compile_probe, plain, "c++", "-O1")
-        return {"probe": probe.result(), "checked": checked.result()}
-
-
-@pytest.fixture
-def probe(programs: dict[str, Path]) -> Path:
-    return programs["probe"]
-
-
-@pytest.fixture
-def checked(programs: dict[str, Path]) -> Path:
-    return programs["checked"]
+    return compile_probe(folder, clang, f"{flags} -DMSGPACK_NO_BOOST")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +74,7 @@ class Twin:
 
 @pytest.fixture(scope="module")
 def twin() -> Iterator[Twin]:
-    command = ["-m", "tactomo.cli", "twin", "--announce", "--control", ANYWHERE]
+    command = ["-m", "tactomo.cli", "twin", "--announce", "--twin-control", ANYWHERE]
     with subprocess.Popen([sys.executable, *command], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         said = json.loads(next(line for line in process.stdout if line.startswith("{")))
@@ -107,7 +100,7 @@ def start(
             return running[-1][1]
         for _, old in running:
             old.kill()
-        daemon = DaemonProcess(folder, twin.ports, tier="fit", **config)
+        daemon = DaemonProcess(folder, twin.ports, method="fit", **config)
         running.append((config, daemon))
         wait_until(lambda: daemon.told("tared"), "its reference")
         return daemon
@@ -275,14 +268,15 @@ LEAST, MOST = -(2**63), 2**63 - 1
     ],
 )
 def test_what_makes_no_sense_is_refused_at_once(
-    checked: Path, option: str, value: int, says: str
+    probe: Path, option: str, value: int, says: str
 ) -> None:
-    status, said = give(checked, option, value, "ipc:///nowhere/at/all")
+    status, said = give(probe, option, value, "ipc:///nowhere/at/all")
     assert status == 1
     assert said.startswith("invalid_argument: ")
     assert says in said
 
 
+@pytest.mark.slow
 def test_the_longest_times_serve(checked: Path) -> None:
     with FakeControl({"tare": {"scans": 3}}) as control, FakeSensor("left") as sensor:
         assert give(checked, "timeout", MOST, control.address) == (0, "")
@@ -293,9 +287,7 @@ def test_the_longest_times_serve(checked: Path) -> None:
         assert give(checked, "wait", LEAST, sensor.address) == (0, "no frame\n")
         with ThreadPoolExecutor() as beside:
             waiting = beside.submit(give, checked, "wait", MOST, sensor.address)
-            while not waiting.done():
-                sensor.publish()
-                time.sleep(0.05)
+            wait_until(waiting.done, "a frame", step_s=0.05, meanwhile=sensor.publish)
             assert waiting.result() == (0, "a frame\n")
 
 
@@ -524,6 +516,7 @@ def expected(message: bytes) -> dict[str, Any] | None:
     return None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [CONTACTS, MAP])
 def test_both_clients_agree_on_what_is_a_frame(checked: Path, kind: str) -> None:
     dice = random.Random(f"agree on {kind}")
@@ -546,6 +539,7 @@ def test_both_clients_agree_on_what_is_a_frame(checked: Path, kind: str) -> None
     assert 300 < accepted < 2700
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [CONTACTS, MAP])
 def test_no_bytes_crash_it(checked: Path, kind: str) -> None:
     dice = random.Random(f"crash {kind}")
@@ -558,6 +552,7 @@ def test_no_bytes_crash_it(checked: Path, kind: str) -> None:
     assert "problem" not in outcomes[-1]
 
 
+@pytest.mark.slow
 def test_garbage_over_a_socket_is_skipped(sensor: FakeSensor, checked: Path) -> None:
     dice = random.Random(5)
     whole = encode_message("left", MAP, examples()[MAP])
@@ -570,6 +565,7 @@ def test_garbage_over_a_socket_is_skipped(sensor: FakeSensor, checked: Path) -> 
     assert seen["malformed"] > 100
 
 
+@pytest.mark.slow
 def test_no_reply_crashes_it(checked: Path) -> None:
     dice = random.Random(8)
     port = {"url": "/dev/x", "connected": True, "state": "running", "problem": None}

@@ -115,7 +115,7 @@ FetchContent_Declare(tactomo SOURCE_DIR {root} SOURCE_SUBDIR clients/cpp)
 FetchContent_MakeAvailable(tactomo)"""
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("way", [HERE, FETCHED], ids=["add_subdirectory", "FetchContent"])
 def test_without_an_installation(checkout: Checkout, way: str, pressed: str) -> None:
     folder = checkout.folder.parent / "other"

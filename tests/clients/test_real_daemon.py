@@ -55,6 +55,7 @@ def config(tmp_path: Path, description_path: Path) -> Iterator[dict[str, Any]]:
     skin.close()
 
 
+@pytest.mark.slow
 def test_both_clients_go_on_by_themselves_after_the_daemon_was_killed(
     tmp_path: Path, config: dict[str, Any]
 ) -> None:

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tactomo.recording import Origin
-from tactomo.recording_writer import Entry, RecordingWriter, port_entry
+from tactomo.recordings.recording import Origin
+from tactomo.recordings.recording_writer import Entry, RecordingWriter, port_entry
 from tactomo_client import Contact, Frame, MessageError, RecordingError, subscribe
 from tactomo_client.fake import FakeSensor
 from tactomo_client.messages import clock_id, encode_message

@@ -14,8 +14,7 @@ from typer.main import get_command
 ROOT = Path(__file__).parents[2]
 PAGES = [
     *(ROOT / "README.md", ROOT / "deploy" / "README.md"),
-    # The decisions tell of commands that were, too.
-    *(page for page in sorted((ROOT / "docs").glob("*.md")) if page.name != "decisions.md"),
+    *sorted((ROOT / "docs").glob("*.md")),
 ]
 
 

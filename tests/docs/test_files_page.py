@@ -12,18 +12,20 @@ import pytest
 from mcap.reader import make_reader
 from small_sensor import SMALL
 from tables import table
-from tactomo.recording import Mark, Origin
-from tactomo.recording_writer import (
+from tactomo.recordings.recording import Origin
+from tactomo.recordings.recording_writer import (
     RecordingWriter,
     calibration_entry,
     pack_mark,
     reference_entry,
 )
+from tactomo.scans import Mark
 from tactomo_client.recording_file import CHANNELS, PROFILE
-from tactomo_models import Flag, Press, Reference, SkinSimulator, load_cell, load_description
+from tactomo_models import Flag, Press, Reference, SkinSimulator, load_description
 from tactomo_models.batch import reconstruct_file
-from tactomo_models.calibration_file import PressureCalibration
-from tactomo_models.load_cell import read_load_cell
+from tactomo_models.calibration import load_cell
+from tactomo_models.calibration.calibration_file import PressureCalibration
+from tactomo_models.calibration.load_cell import read_load_cell
 
 PAGE = "docs/files.md"
 

@@ -8,7 +8,11 @@ import pytest
 from whole_system import Demo, running_demo
 
 
-@pytest.fixture(scope="module", params=[1, 2], ids=["one port", "two ports"])
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(1, marks=pytest.mark.slow), 2],
+    ids=["one port", "two ports"],
+)
 def any_demo(request: pytest.FixtureRequest) -> Iterator[Demo]:
     """A demo with one port for both channels, and one with a port for each."""
     with running_demo("--ports", str(request.param)) as demo:

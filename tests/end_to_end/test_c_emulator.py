@@ -12,11 +12,12 @@ from typing import Any
 
 import pytest
 from c_firmware import C_FOLDER, SANITIZED, build, need, runs
-from daemon_process import DaemonProcess, wait_until
+from daemon_process import DaemonProcess
 from ears import Ears, Heard
 from page import Page
+from waiting import wait_until
 
-QUICK = {"tier": "tikhonov"}  # what the map is worth is tried elsewhere
+QUICK = {"method": "tikhonov"}  # what the map is worth is tried elsewhere
 
 
 class Emulator:
@@ -142,7 +143,7 @@ def rigs() -> Iterator[list[Rig]]:
         rig.daemon.kill()
 
 
-@pytest.mark.parametrize("ports", [1, 2])
+@pytest.mark.parametrize("ports", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_a_press_on_the_emulator_is_found_where_it_was(
     rigs: list[Rig], program: Path, presses: tuple[Path, Path], tmp_path: Path, ports: int
 ) -> None:
@@ -163,6 +164,7 @@ def test_a_press_on_the_emulator_is_found_where_it_was(
     rig.stop()
 
 
+@pytest.mark.slow
 def test_resets_silence_and_unplugging_pass(rigs: list[Rig], program: Path, tmp_path: Path) -> None:
     rig = Rig(program, tmp_path, "--ports", 2, "--away", 0.5, **QUICK)
     rigs.append(rig)
@@ -180,7 +182,7 @@ def test_resets_silence_and_unplugging_pass(rigs: list[Rig], program: Path, tmp_
     rig.stop()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_damage_and_gaps_are_counted_and_survived(
     rigs: list[Rig], program: Path, tmp_path: Path
 ) -> None:

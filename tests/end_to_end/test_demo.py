@@ -15,17 +15,18 @@ from processes import children_of, is_running
 from selenium.webdriver import ActionChains, Chrome
 from selenium.webdriver.common.by import By
 from small_sensor import SMALL
-from whole_system import PATIENCE_S, SENSOR, Demo, running_demo, wait_for
+from waiting import PATIENCE_S, wait_until
+from whole_system import SENSOR, Demo, running_demo
 
 
 @pytest.mark.browser
 def test_a_press_by_mouse_becomes_a_contact_at_that_place(demo: Demo, browser: Chrome) -> None:
     demo.clear()
     browser.get(demo.page)
-    wait_for(lambda: "kPa" in browser.page_source, "the page")
+    wait_until(lambda: "kPa" in browser.page_source, "the page")
     canvas = browser.find_element(By.ID, "map")
     # The page takes presses once it knows that a twin answers.
-    wait_for(lambda: browser.find_elements(By.CSS_SELECTOR, "#map.pressable"), "the twin")
+    wait_until(lambda: browser.find_elements(By.CSS_SELECTOR, "#map.pressable"), "the twin")
     x, y = browser.execute_script("return window.tactomo.mmToPixel(30, -25)")
     size = canvas.size
     mouse = ActionChains(browser)
@@ -35,21 +36,22 @@ def test_a_press_by_mouse_becomes_a_contact_at_that_place(demo: Demo, browser: C
     ).click_and_hold().perform()
 
     def found() -> tuple[float, float] | None:
-        rows = browser.find_elements(By.CSS_SELECTOR, "#contacts [data-id]")
-        if len(rows) != 1:
-            return None
-        place = (rows[0].get_attribute("data-x-mm"), rows[0].get_attribute("data-y-mm"))
-        return None if None in place else (float(place[0] or 0), float(place[1] or 0))
+        # At once: the page may draw its rows anew between two questions.
+        rows = browser.execute_script(
+            "return [...document.querySelectorAll('#contacts [data-id]')]"
+            ".map(({dataset}) => [Number(dataset.xMm), Number(dataset.yMm)])"
+        )
+        return tuple(rows[0]) if len(rows) == 1 else None
 
     def is_near() -> bool:
         place = found()
         return place is not None and abs(place[0] - 30) < 3 and abs(place[1] + 25) < 3
 
     try:
-        wait_for(is_near, f"a contact at (30, -25) mm; there is {found()}")
+        wait_until(is_near, f"a contact at (30, -25) mm; there is {found()}")
     finally:
         mouse.release().perform()
-    wait_for(
+    wait_until(
         lambda: not browser.find_elements(By.CSS_SELECTOR, "#contacts [data-id]"), "the release"
     )
 
@@ -99,6 +101,7 @@ def test_the_readme_subscribes_in_six_lines(demo: Demo, tmp_path: Path) -> None:
     assert "kPa" in line
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_a_demo_that_ends_leaves_no_process_behind(number: signal.Signals, tmp_path: Path) -> None:
     sensor = tmp_path / "small.toml"
@@ -107,7 +110,7 @@ def test_a_demo_that_ends_leaves_no_process_behind(number: signal.Signals, tmp_p
         children = children_of(demo.process.pid)
         assert len(children) == 3
         os.kill(demo.process.pid, number)
-        wait_for(lambda: not any(is_running(pid) for pid in children), "the children to end")
-        wait_for(lambda: demo.process.poll() is not None, "the demo to end")
+        wait_until(lambda: not any(is_running(pid) for pid in children), "the children to end")
+        wait_until(lambda: demo.process.poll() is not None, "the demo to end")
     if number != signal.SIGKILL:
         assert demo.process.returncode in (0, 130)

@@ -17,22 +17,21 @@ from typing import Any
 import numpy as np
 import pytest
 from daemon_process import SENSOR, DaemonProcess
-from numpy.typing import NDArray
 from tactomo.twin import Twin, TwinConfig
 from tactomo_client import Frame, subscribe
-from tactomo_models import Artifact, SensorDescription, build_artifact, load_description
-from tactomo_models.evaluation.skin_presses import read_presses
-from tactomo_models.evaluation.tanks import (
+from tactomo_lab.evaluation.skin_presses import read_presses
+from tactomo_lab.evaluation.tanks import (
     TankImager,
     correlation,
     on_pixels,
     read_tanks,
 )
-from tactomo_models.forward import ForwardModel
-from tactomo_models.reference import noise_of_reciprocity
-from tactomo_models.sensors import __path__ as sensors_path
+from tactomo_models import Artifact, SensorDescription, build_artifact, load_description
+from tactomo_models.arrays import BoolArray, FloatArray
+from tactomo_models.physics.forward import ForwardModel
+from tactomo_models.scans.reference import noise_of_reciprocity
+from tactomo_models.sensor.shipped import __path__ as sensors_path
 
-FloatArray = NDArray[np.float64]
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 REST = 100
 """Scans at rest that come first: a daemon tares by twenty, and a controller subscribes."""
@@ -108,7 +107,7 @@ def frames_of(daemon: DaemonProcess, last: int, missed: int = 0) -> dict[int, Fr
     raise AssertionError("the stream ended")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(300)
 def test_presses_on_a_round_skin_are_located_through_an_openeit_board(tmp_path: Path) -> None:
     """As near as by `tactomo evaluate skin`, whose NOSER image comes to 5.7 mm."""
@@ -123,7 +122,7 @@ def test_presses_on_a_round_skin_are_located_through_an_openeit_board(tmp_path: 
     at_rest = bare + noise * np.random.default_rng(0).standard_normal((REST, len(bare)))
     last = REST + len(presses.changes) - 1
     scans = np.vstack([at_rest, bare + presses.changes, at_rest])
-    with playing(tmp_path, scans, path, "openeit", 40.0, tier="noser") as daemon:
+    with playing(tmp_path, scans, path, "openeit", 40.0, method="noser") as daemon:
         frames = frames_of(daemon, last)
     came = [n for n in range(REST, last + 1) if n in frames]
     found = [frames[n].contacts for n in came]
@@ -140,13 +139,13 @@ def test_presses_on_a_round_skin_are_located_through_an_openeit_board(tmp_path: 
     assert np.median(errors) < 6.5
 
 
-def off(seen: FloatArray, true_mm: FloatArray, test: NDArray[np.bool_]) -> FloatArray:
+def off(seen: FloatArray, true_mm: FloatArray, test: BoolArray) -> FloatArray:
     """Errors of some presses, by an affine map into the robot's frame that is fitted to others."""
     into = np.linalg.lstsq(seen[~test], true_mm[~test], rcond=None)[0]
     return np.asarray(np.linalg.norm(seen[test] @ into - true_mm[test], axis=1))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(300)
 def test_tanks_come_as_well_through_a_board_that_prints_tables(tmp_path: Path) -> None:
     """Near what `tactomo evaluate tanks` makes of the same set: 0.86 on average."""
@@ -180,7 +179,7 @@ def test_tanks_come_as_well_through_a_board_that_prints_tables(tmp_path: Path) -
     assert np.mean(found) > 0.82
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_broken_device_is_flagged_in_every_frame_and_called_broken(tmp_path: Path) -> None:
     with np.load(measured("skin_bad_device_32el.npz")) as arrays:
         baseline, changes = arrays["baseline"].astype(float), arrays["dv"].astype(float)

@@ -5,20 +5,20 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import pytest
 from newcomer import Newcomer
 from page import Page
-from tactomo.cli.app import Protocol
 from tactomo.config import load_config
-from tactomo.protocols import FOREIGN, PROTOCOLS
-from tactomo.twin.sciospec import SciospecSpeaker
+from tactomo.protocols import NATIVE, available_protocols, protocol_named
+from tactomo.twin.sciospec import SciospecEmulator
 from tactomo_client import request
 from tactomo_models import Press as Cup
 from tactomo_models import SkinSimulator, load_description
-from whole_system import repository, wait_for
+from tactomo_protocol import Channel
+from waiting import wait_until
+from whole_system import repository
 
 PAGE = Page("docs/other_hardware.md")
 
@@ -31,10 +31,10 @@ def newcomer(tmp_path: Path) -> Iterator[Newcomer]:
 
 def wait_for_a_reference(newcomer: Newcomer) -> None:
     control = newcomer.addresses["control"]
-    wait_for(lambda: request("status", control)["reference"], "a reference")
+    wait_until(lambda: request("status", control)["reference"], "a reference")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(400)
 def test_a_researcher_with_a_sciospec_and_no_instrument_yet(newcomer: Newcomer) -> None:
     twin, daemon, *then = PAGE.commands("Sciospec, emulated")
@@ -48,6 +48,7 @@ def test_a_researcher_with_a_sciospec_and_no_instrument_yet(newcomer: Newcomer) 
     assert (port["state"], port["protocol"]) == ("running", "sciospec")
 
 
+@pytest.mark.slow
 def test_what_is_done_with_an_instrument(newcomer: Newcomer) -> None:
     _, copied, _ = newcomer.follow(PAGE.commands("Sciospec, the instrument"))
     assert "wrote tank.toml" in copied
@@ -59,10 +60,10 @@ def save_eit_files(folder: Path) -> None:
     sensor = load_description("sciospec_disc")
     skin = SkinSimulator(sensor, 8e-3)
     empty, full = (
-        skin.voltages(cups)["structure"] for cups in ([], [Cup(0.04, 0.02, 100.0, 0.015)])
+        skin.voltages(cups)[Channel.STRUCTURE] for cups in ([], [Cup(0.04, 0.02, 100.0, 0.015)])
     )
     noise = np.random.default_rng(0).normal(scale=1e-3, size=(30, sensor.measurements))
-    spread = SciospecSpeaker(sensor, 20.0)
+    spread = SciospecEmulator(sensor, 20.0)
     folder.mkdir()
     for number in range(30):
         volts = (empty if number < 20 else full) * (1 + noise[number])
@@ -75,6 +76,7 @@ def save_eit_files(folder: Path) -> None:
         (folder / f"setup_00001_{number:05d}.eit").write_text("\n".join(lines) + "\n")
 
 
+@pytest.mark.slow
 def test_its_files_become_a_recording(newcomer: Newcomer) -> None:
     save_eit_files(newcomer.folder / "setup_00001")
     imported, _, examined = newcomer.follow(PAGE.commands("Sciospec, its files"))
@@ -82,7 +84,7 @@ def test_its_files_become_a_recording(newcomer: Newcomer) -> None:
     assert "reciprocity" in examined
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("board", "x_mm", "y_mm"), [("OpenEIT", 30, -20), ("Tables", 25, 10)])
 def test_a_researcher_with_a_board_that_prints(
     newcomer: Newcomer, board: str, x_mm: float, y_mm: float
@@ -100,6 +102,7 @@ def test_a_researcher_with_a_board_that_prints(
     assert [float(mm) for mm in place.groups()] == pytest.approx([x_mm, y_mm], abs=3)
 
 
+@pytest.mark.slow
 def test_a_board_that_prints_is_described(newcomer: Newcomer) -> None:
     for command in PAGE.commands("OpenEIT, the board") + PAGE.commands("Tables, the board"):
         newcomer.run(command)
@@ -107,16 +110,15 @@ def test_a_board_that_prints_is_described(newcomer: Newcomer) -> None:
         assert load_description(newcomer.folder / copied) == load_description(name)
 
 
-@pytest.mark.parametrize("name", FOREIGN)
+@pytest.mark.parametrize("name", [name for name in available_protocols() if name != NATIVE])
 def test_each_protocol_has_an_example_of_a_configuration(name: str) -> None:
     config = load_config(repository() / "deploy" / "examples" / f"{name}.toml")
     assert config.protocol == name
-    FOREIGN[name](load_description(config.description))
+    protocol_named(name, load_description(config.description))
 
 
 def test_every_protocol_is_on_the_page() -> None:
-    assert get_args(Protocol) == PROTOCOLS
-    for name in PROTOCOLS:
+    for name in available_protocols():
         assert f"`{name}`" in PAGE.text
     for description in re.findall(r"`(\w+_(?:disc|square))`", PAGE.text):
         load_description(description)

@@ -8,7 +8,8 @@ from itertools import islice
 
 import pytest
 from tactomo_client import Frame, request, subscribe
-from whole_system import PATIENCE_S, SENSOR, Demo
+from waiting import PATIENCE_S
+from whole_system import SENSOR, Demo
 
 Places = list[tuple[float, float]]
 
@@ -71,10 +72,10 @@ def test_a_contact_keeps_its_identity_while_it_slides(any_demo: Demo) -> None:
     settled_frame(any_demo, [])
     any_demo.press(-20.0, 10.0, id="finger")
     first = settled_frame(any_demo, [(-20.0, 10.0)]).contacts[0]
-    for x_mm in range(-20, 21, 2):
-        any_demo.press(float(x_mm), 10.0, id="finger")
-        time.sleep(0.05)
     with subscribe(SENSOR, address=any_demo.stream, timeout_s=PATIENCE_S) as frames:
+        for x_mm in range(-20, 21, 2):
+            any_demo.press(float(x_mm), 10.0, id="finger")
+            next(frames)
         for frame in islice(frames, 400):
             if is_settled(frame, [(20.0, 10.0)]) and distance_mm(frame, (20.0, 10.0)) < 3:
                 break

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from daemon_process import SENSOR, DaemonProcess, wait_until
+from daemon_process import SENSOR, DaemonProcess
 from tactomo.twin import Twin, TwinConfig
 from tactomo_client import Frame, request, subscribe
 from tactomo_models import load_description
-from tactomo_models.sensors import __path__ as sensors_path
+from tactomo_models.sensor.shipped import __path__ as sensors_path
+from waiting import wait_until
 
 COARSE = "[map]\nnodes_x = 25\nnodes_y = 25\n\n[structure]"
 SINGLE_ENDED = (('"unsigned"', '"signed"'), ('= "pairs"', '= "single_ended"'))
@@ -104,7 +105,7 @@ def test_a_press_on_an_emulated_board_is_where_it_is(
     assert port["corrupt"] == 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_board_of_another_kind_is_refused_by_name(start: Start, tmp_path: Path) -> None:
     board, sensor = changed(tmp_path, "openeit_disc"), changed(tmp_path, "matrix_disc")
     _, daemon = start("openeit", board, sensor, as_if="matrix")
@@ -117,6 +118,7 @@ def test_a_board_of_another_kind_is_refused_by_name(start: Start, tmp_path: Path
     assert said in port["problem"]
 
 
+@pytest.mark.slow
 def test_it_stands_what_happens_to_a_cable(start: Start, tmp_path: Path) -> None:
     board = changed(tmp_path, "openeit_disc")
     twin, daemon = start("openeit", board, link_folder=tmp_path / "links")

@@ -14,7 +14,8 @@ import pytest
 from mcap.reader import make_reader
 from tactomo_client import Frame, request, subscribe
 from tactomo_client.messages import MAP, decode_message
-from whole_system import ANYWHERE, PATIENCE_S, SENSOR, Demo, repository, wait_for
+from waiting import PATIENCE_S, wait_until
+from whole_system import ANYWHERE, SENSOR, Demo, repository
 
 TANK = repository().parent / "shared" / "data" / "tank_sciospec_20fps.npz"
 
@@ -47,7 +48,7 @@ class Listener(threading.Thread):
 
     def __enter__(self) -> Self:
         self.start()
-        wait_for(lambda: self.frames, "the first frame")
+        wait_until(lambda: self.frames, "the first frame")
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -58,7 +59,7 @@ class Listener(threading.Thread):
     def hear_more(self, count: int) -> None:
         """Wait for so many more frames than there are now."""
         heard = len(self.frames)
-        wait_for(lambda: len(self.frames) >= heard + count, f"{count} frames")
+        wait_until(lambda: len(self.frames) >= heard + count, f"{count} frames")
 
     def run(self) -> None:
         for frame in self._subscription:
@@ -67,10 +68,11 @@ class Listener(threading.Thread):
                 break
 
 
+@pytest.mark.slow
 def test_a_replay_gives_the_maps_of_the_live_run(demo: Demo, tmp_path: Path) -> None:
     live, again = tmp_path / "live.mcap", tmp_path / "again.mcap"
     demo.press(15.0, 20.0, id="a")  # begun under load: the reference must come along
-    wait_for(lambda: request("status", demo.control)["tier"] == "hybrid", "a contact")
+    wait_until(lambda: request("status", demo.control)["tier"] == "hybrid", "a contact")
     with Listener(demo) as listener:
         request("record_start", demo.control, path=str(live))
         for x_mm, y_mm in ((15.0, 20.0), (0.0, 0.0), (-40.0, -35.0)):
@@ -82,11 +84,20 @@ def test_a_replay_gives_the_maps_of_the_live_run(demo: Demo, tmp_path: Path) -> 
         listener.hear_more(8)
         request("record_stop", demo.control)
         last = request("status", demo.twin)["counter"]
-        wait_for(lambda: max(listener.frames) > last, "all that was recorded")
+        wait_until(lambda: max(listener.frames) > last, "all that was recorded")
     replayed = tactomo(
         *("daemon", "--port", f"replay://{live}?port=0&speed=0"),
-        *("--port", f"replay://{live}?port=1&speed=0", "--record", again, "--record-maps"),
-        *("--exit-at-end", "--stream", ANYWHERE, "--control", ANYWHERE),
+        *("--port", f"replay://{live}?port=1&speed=0", "--set", f"recording.file={again}"),
+        *(
+            "--set",
+            "recording.maps=true",
+            "--set",
+            "exit_at_end=true",
+            "--stream",
+            ANYWHERE,
+            "--control",
+            ANYWHERE,
+        ),
     )
     assert replayed.returncode == 0, replayed.stderr
     replays = maps_in(again)
@@ -112,7 +123,7 @@ def array(wire: Any) -> Any:
 def test_a_measured_stream_is_imported_replayed_and_located(tmp_path: Path) -> None:
     recording, again = tmp_path / "tank.mcap", tmp_path / "again.mcap"
     imported = tactomo(
-        *("import", TANK, recording, "--sensor", "tank_disc", "--reference-frames", "0:20")
+        *("import", TANK, recording, "--description", "tank_disc", "--reference-frames", "0:20")
     )
     assert imported.returncode == 0, imported.stderr
     replayed = tactomo(
@@ -123,7 +134,8 @@ def test_a_measured_stream_is_imported_replayed_and_located(tmp_path: Path) -> N
             "--port",
             f"replay://{recording}?port=0&speed=0",
         ),
-        *("--record", again, "--record-maps", "--exit-at-end"),
+        *("--set", f"recording.file={again}", "--set", "recording.maps=true"),
+        *("--set", "exit_at_end=true"),
         *("--stream", ANYWHERE, "--control", ANYWHERE),
     )
     assert replayed.returncode == 0, replayed.stderr

@@ -14,14 +14,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from daemon_process import SENSOR, DaemonProcess, wait_until
-from tactomo.recording import open_recording
+from daemon_process import SENSOR, DaemonProcess
+from tactomo.recordings.recording import open_recording
 from tactomo.twin import Twin, TwinConfig
 from tactomo_client import Frame, request, subscribe
 from tactomo_client.recording import open_recording as open_frames
 from tactomo_models import load_description
-from tactomo_models.sensors import __path__ as sensors_path
+from tactomo_models.sensor.shipped import __path__ as sensors_path
 from tactomo_protocol import Scan
+from waiting import wait_until
 from whole_system import repository
 
 DATA = repository().parent / "shared" / "data"
@@ -123,7 +124,7 @@ def test_an_instrument_is_configured_believed_and_stopped(start: Start, tmp_path
     assert summary.corrupt > 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_daemon_that_was_killed_leaves_it_measuring_and_the_next_takes_over(
     start: Start, tmp_path: Path
 ) -> None:
@@ -144,6 +145,7 @@ def test_a_daemon_that_was_killed_leaves_it_measuring_and_the_next_takes_over(
         again.kill()
 
 
+@pytest.mark.slow
 def test_what_the_instrument_refuses_is_named(start: Start, tmp_path: Path) -> None:
     _, daemon = start(sensor(tmp_path, COARSE, ("scan_rate_hz = 20.0", "scan_rate_hz = 500.0")))
     [told] = wait_until(lambda: daemon.told("device_refused"), "a refusal")
@@ -152,7 +154,7 @@ def test_what_the_instrument_refuses_is_named(start: Start, tmp_path: Path) -> N
     assert daemon.status()["ports"][0]["state"] == "refused"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_ports_tells_what_speaks_sciospec(tmp_path: Path) -> None:
     config = TwinConfig(
         load_description(sensor(tmp_path, COARSE)),
@@ -168,7 +170,7 @@ def test_ports_tells_what_speaks_sciospec(tmp_path: Path) -> None:
 
 
 @measured
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(600)
 def test_a_played_stream_gives_what_its_import_gives(start: Start, tmp_path: Path) -> None:
     """The measured cup, said by the emulator and read from its file: equal scans and contacts."""
@@ -181,7 +183,9 @@ def test_a_played_stream_gives_what_its_import_gives(start: Start, tmp_path: Pat
     daemon.stop()
     # The first frame goes for reading the instrument's clock, the next 20 for the reference.
     said = scans(live)
-    tactomo(*("import", path, tmp_path / imported, "--sensor", tank, "--reference-frames", "1:21"))
+    tactomo(
+        *("import", path, tmp_path / imported, "--description", tank, "--reference-frames", "1:21")
+    )
     read = scans(tmp_path / imported)
     assert len(said) == 254
     for scan, other in zip(said, read[1:], strict=True):
@@ -189,7 +193,8 @@ def test_a_played_stream_gives_what_its_import_gives(start: Start, tmp_path: Pat
     again = tmp_path / "again.mcap"
     tactomo(
         *("daemon", "--description", tank, "--port", f"replay://{tmp_path / imported}?speed=0"),
-        *("--record", again, "--record-maps", "--exit-at-end"),
+        *("--set", f"recording.file={again}", "--set", "recording.maps=true"),
+        *("--set", "exit_at_end=true"),
         *("--stream", "tcp://127.0.0.1:0", "--control", "tcp://127.0.0.1:0"),
     )
     ours, theirs = list(open_frames(live)), list(open_frames(again))
@@ -204,7 +209,7 @@ def test_a_played_stream_gives_what_its_import_gives(start: Start, tmp_path: Pat
 
 
 @measured
-@pytest.mark.slow
+@pytest.mark.long
 def test_each_labelled_object_lies_beside_its_electrode(start: Start, tmp_path: Path) -> None:
     """Metal and plastic that stood beside electrodes 1, 5, 9 and 13 of a tank."""
     tank = sensor(

@@ -10,8 +10,8 @@ from foxglove_client import FoxgloveClient
 from newcomer import Newcomer
 from page import Page
 from recorded_grasp import LAST_PRESSED, contacts_of, write_grasp
-from tactomo.cli.export_csv import CONTACT_COLUMNS, FRAME_COLUMNS
-from tactomo.cli.export_npz import CONTACT_TYPES, FRAME_TYPES, IMAGES
+from tactomo.cli.files.csv import CONTACT_COLUMNS, FRAME_COLUMNS
+from tactomo.cli.files.npz import CONTACT_TYPES, FRAME_TYPES, IMAGES
 from tactomo_foxglove.topics import FRAME_SCHEMA, HEALTH_SCHEMA
 from whole_system import repository
 
@@ -31,13 +31,14 @@ def force_n(newcomer: Newcomer) -> float:
     return float(newcomer.python(program).split()[0])
 
 
+@pytest.mark.slow
 def test_what_is_done_with_a_recording(newcomer: Newcomer) -> None:
     write_grasp(newcomer.folder / "grasp.mcap")
     newcomer.follow(PAGE.commands()[4:])
     assert force_n(newcomer) == pytest.approx(contacts_of(LAST_PRESSED - 1)[0].force_n, abs=1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(400)
 def test_the_whole_path(newcomer: Newcomer) -> None:
     install, demo, foxglove, record, plot, *exports = PAGE.commands()

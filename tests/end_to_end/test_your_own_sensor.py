@@ -13,7 +13,7 @@ import pytest
 from faulty_skin import rewired
 from newcomer import Newcomer
 from page import Page
-from tactomo.port import contradiction
+from tactomo.acquisition.port import contradiction
 from tactomo_models import (
     DescriptionError,
     Flag,
@@ -23,7 +23,6 @@ from tactomo_models import (
     Reference,
     SensorDescription,
     SkinSimulator,
-    Tier,
     load_description,
 )
 from tactomo_protocol import Channel, Hello, SampleFormat
@@ -44,6 +43,7 @@ def newcomer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Newcomer:
     return Newcomer(tmp_path, SMALLER | SHORTER)
 
 
+@pytest.mark.slow
 def test_a_description_is_drawn_built_pressed_and_judged(newcomer: Newcomer) -> None:
     with newcomer:
         drawn, built, info = newcomer.follow(PAGE.commands("2") + PAGE.commands("3"))
@@ -57,7 +57,7 @@ def test_a_description_is_drawn_built_pressed_and_judged(newcomer: Newcomer) -> 
         seen = newcomer.wait_for(watch, " mm ")
         x_mm, y_mm = re.findall(r"\(([+-][\d.]+), ([+-][\d.]+)\) mm", seen)[-1]
         assert (float(x_mm), float(y_mm)) == pytest.approx((30, 20), abs=2)
-        assert " fit (asked for: auto)" in newcomer.wait_for(status, "fit (asked")
+        assert "auto; the newest frame by fit" in newcomer.wait_for(status, "newest frame by fit")
         newcomer.run(release)
         newcomer.stop()
         (judged,) = newcomer.follow(PAGE.commands("5"))
@@ -65,6 +65,7 @@ def test_a_description_is_drawn_built_pressed_and_judged(newcomer: Newcomer) -> 
         assert (newcomer.folder / "fit.png").exists()
 
 
+@pytest.mark.slow
 def test_a_device_is_found_examined_tared_and_recorded(newcomer: Newcomer) -> None:
     with newcomer:
         newcomer.follow(PAGE.commands("7"))
@@ -128,10 +129,12 @@ def _pressed(sensor: SensorDescription, skin: SkinSimulator) -> Reconstruction:
     rest, pressed = dict(skin.voltages([])), skin.voltages([Press(0.03, 0.02, 250.0, 0.01)])
     noise_v = 2.5e-4 * max(float(np.abs(volts).max()) for volts in rest.values())
     noise = np.full(sensor.measurements, noise_v)
-    reconstructor = Reconstructor(sensor, tier=Tier.FIT)
-    reconstructor.set_reference(Reference(rest["magnitude"], rest["structure"], noise, noise, 20))
+    reconstructor = Reconstructor(sensor, method="fit")
+    reconstructor.set_reference(
+        Reference(rest[Channel.MAGNITUDE], rest[Channel.STRUCTURE], noise, noise, 20)
+    )
     rng = np.random.default_rng(0)
     noisy = {
         name: volts + noise * rng.standard_normal(len(volts)) for name, volts in pressed.items()
     }
-    return reconstructor.reconstruct(noisy["magnitude"], noisy["structure"])
+    return reconstructor.reconstruct(noisy[Channel.MAGNITUDE], noisy[Channel.STRUCTURE])

@@ -15,11 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from daemon_process import DaemonProcess, wait_until
+from daemon_process import DaemonProcess
 from ears import Ears
 from pty_skin import Playing, PtySkin, Scenes, Volts, still
 from reliability import FIGURE, Row, row_of, write_page
 from tactomo_models import SensorDescription, load_description, load_or_build_artifact
+from waiting import wait_until
 
 ROWS = pytest.StashKey[list[Row]]()
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from daemon_process import DaemonProcess, wait_until
+from daemon_process import DaemonProcess
 from ears import Ears
 from pty_skin import Playing, PtySkin, Scenes, still
 from tactomo.twin import Twin, TwinConfig
@@ -17,6 +17,7 @@ from tactomo_client import request
 from tactomo_client.messages import array_from_wire
 from tactomo_models import SensorDescription, SkinSimulator
 from tactomo_protocol import Channel, encode
+from waiting import wait_until
 
 Start = Callable[..., DaemonProcess]
 Play = Callable[..., Playing]
@@ -124,7 +125,7 @@ class Corrupter:
     [
         pytest.param(0.01, 50, "in runs of 50", marks=pytest.mark.faults),
         pytest.param(0.01, 1, "one here, one there", marks=pytest.mark.faults),
-        (0.5, 100, "in runs of 100"),
+        pytest.param(0.5, 100, "in runs of 100", marks=pytest.mark.slow),
     ],
 )
 @pytest.mark.fault(
@@ -184,7 +185,7 @@ def test_corrupted_bytes(
         (heard.fields["scan_counter"], channel)
         for heard in published
         for channel in Channel
-        if heard.fields[channel.name.lower()] is not None
+        if heard.fields[channel] is not None
     }
     corrupt = sum(port["corrupt"] for port in status["ports"])
     dropped = status["dropped_scans"] - before["dropped_scans"]
@@ -195,7 +196,7 @@ def test_corrupted_bytes(
     )
     for heard in published:
         for channel in Channel:
-            volts = heard.fields[channel.name.lower()]
+            volts = heard.fields[channel]
             if volts is not None:
                 expected = sent[heard.fields["scan_counter"], channel]
                 assert np.array_equal(array_from_wire(volts), expected)
@@ -333,6 +334,7 @@ def test_the_device_restarts(
     assert len(daemon.told("tared")) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.fault(
     "The two boards plugged into each other's place",
     "each channel is known by what its board says of itself: frames go on without a flag",

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from daemon_process import DaemonProcess, wait_until
+from daemon_process import DaemonProcess
 from ears import Ears, percentiles
 from pty_skin import Playing, PtySkin, Scenes, moving, still
-from tactomo.recording import open_recording
+from tactomo.recordings.recording import open_recording
+from waiting import wait_until
 
 Start = Callable[..., DaemonProcess]
 Play = Callable[..., Playing]
@@ -113,6 +114,7 @@ def test_the_daemon_is_stopped_for_a_while(
     assert fresh.arrived_ns * 1e-9 - continued_s < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.fault(
     "SIGTERM under full load",
     "ends within 2 s, with exit status 0 and the recording complete",

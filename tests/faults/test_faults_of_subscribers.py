@@ -15,11 +15,12 @@ import msgpack  # type: ignore[import-untyped]
 import numpy as np
 import pytest
 import zmq
-from daemon_process import SENSOR, DaemonProcess, wait_until
+from daemon_process import SENSOR, DaemonProcess
 from ears import Ears, percentiles
 from pty_skin import Playing, Scenes, still
 from tactomo_client import request
 from tactomo_client.messages import decode_message, topic
+from waiting import wait_until
 
 Start = Callable[..., DaemonProcess]
 Play = Callable[..., Playing]
@@ -213,6 +214,7 @@ def rubbish(rng: np.random.Generator) -> Iterator[list[bytes]]:
         yield [rng.bytes(int(rng.integers(0, 2000))) for _ in range(int(rng.integers(1, 5)))]
 
 
+@pytest.mark.slow
 @pytest.mark.fault(
     "The control socket and the stream fed garbage",
     "frames go on; requests are answered; memory flat",

@@ -13,11 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tactomo_models
-from daemon_process import DaemonProcess, wait_until
+from daemon_process import DaemonProcess
 from ears import Ears, Heard
 from pty_skin import Playing, PtySkin, Scenes, moving, still
-from tactomo.recording import open_recording
+from tactomo.recordings.recording import open_recording
 from tactomo_protocol import Decoder, Scan
+from waiting import wait_until
 
 Start = Callable[..., DaemonProcess]
 Play = Callable[..., Playing]
@@ -34,12 +35,12 @@ INJECTED = """
 import sys, time
 from pathlib import Path
 from tactomo.config import load_config
-from tactomo.daemon import Daemon
+from tactomo.service.daemon import Daemon
 from tactomo.log import configure_logging
 from tactomo_models import Reconstructor, load_description, load_or_build_artifact
 
 class Injected(Reconstructor):
-    def look(self, *arguments, **options):
+    def compare(self, *arguments, **options):
         trigger = Path(sys.argv[1]).with_name("raise")
         if trigger.exists():
             if trigger.is_file():
@@ -47,7 +48,7 @@ class Injected(Reconstructor):
             raise ZeroDivisionError("made to fail")
         while Path(sys.argv[1]).with_name("hang").exists():
             time.sleep(0.01)
-        return super().look(*arguments, **options)
+        return super().compare(*arguments, **options)
 
 configure_logging("info", "json")
 description = load_description("paper_square")

@@ -9,10 +9,11 @@ from collections.abc import Callable, Iterator
 
 import pytest
 import zmq
-from daemon_process import SENSOR, DaemonProcess, wait_until
+from daemon_process import SENSOR, DaemonProcess
 from ears import Ears, percentiles
 from pty_skin import Playing, PtySkin, Scenes, Volts, moving, still
 from tactomo_client.messages import decode_message, topic
+from waiting import wait_until
 
 Start = Callable[..., DaemonProcess]
 Play = Callable[..., Playing]

@@ -10,13 +10,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import protocol_vectors as vectors
 import pytest
 from any_packets import PACKETS, SMALL_PACKETS
 from c_firmware import C_FOLDER, Speaker, answered, build, f64_bits, need, text_bytes
 from cobs import cobs
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from tactomo_protocol import Command, Decoder, DecoderCounts, Packet, encode, vectors
+from tactomo_protocol import Command, Decoder, DecoderCounts, Packet, encode
 
 VECTORS = C_FOLDER.parent / "vectors"
 COMMAND_TYPE = 0x81
@@ -217,6 +218,7 @@ def test_the_library_compiles_without_a_warning(tmp_path: Path, compiler: str) -
         assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fuzzer", ["fuzz_parser", "fuzz_encoder", "fuzz_device"])
 def test_a_fuzzer_finds_nothing_in_a_moment(tmp_path: Path, fuzzer: str) -> None:
     """Always the same inputs; `make fuzz` goes on for as long as one likes."""

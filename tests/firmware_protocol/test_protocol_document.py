@@ -47,12 +47,13 @@ PACKETS: list[tuple[str, Packet]] = [
 def value_of(packet: Packet, name: str) -> Any:
     """Return what a row of this name is to hold."""
     if name == "channels":
-        return sum(1 << channel for channel in BOTH)
+        return sum(1 << channel.number for channel in BOTH)
     if name == "count":
         return 3
     if name == "sample_format":
         return SampleFormat.INT32
-    return getattr(packet, name)
+    value = getattr(packet, name)
+    return value.number if isinstance(value, Channel) else value
 
 
 @pytest.mark.parametrize(("heading", "packet"), PACKETS)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from any_packets import PACKETS, SMALL_PACKETS
 from cobs import cobs
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from tactomo_protocol import (
     MAX_FRAME_BYTES,
@@ -86,7 +86,6 @@ ANY_STREAM = st.lists(
 ).map(b"".join)
 
 
-@settings(max_examples=300)
 @given(st.data(), ANY_STREAM)
 def test_any_bytes_decode_without_an_exception_and_alike_in_any_chunks(
     data: st.DataObject, stream: bytes
@@ -110,7 +109,6 @@ def is_for_the_device_to_refuse(packet: Packet) -> bool:
     )
 
 
-@settings(max_examples=300)
 @given(contents())
 def test_whatever_decodes_is_a_packet_that_can_be_sent(content: bytes) -> None:
     decoder = Decoder()
@@ -187,7 +185,6 @@ def is_subsequence(part: Iterable[Packet], whole: Iterable[Packet]) -> bool:
     return all(any(candidate == packet for candidate in rest) for packet in part)
 
 
-@settings(max_examples=400)
 @given(st.data(), st.lists(SMALL_PACKETS, min_size=1, max_size=6), st.integers(1, 4))
 def test_damage_loses_only_what_it_touches_and_invents_nothing(
     data: st.DataObject, sent: list[Packet], times: int

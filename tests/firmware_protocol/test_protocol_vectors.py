@@ -14,10 +14,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import protocol_vectors as vectors
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tactomo_protocol import Decoder, Packet, encode, vectors
+from tactomo_protocol import Decoder, Packet, encode
 
 FOLDER = Path(__file__).parents[2] / "firmware_protocol"
 JsonMap = dict[str, Any]
@@ -175,15 +176,17 @@ def read_stream(stream: bytes) -> tuple[list[JsonMap], dict[str, int]]:
 
 
 def test_the_documented_command_writes_the_files_that_are_there(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "tactomo_protocol.vectors", str(tmp_path)]
+    command = [sys.executable, vectors.__file__, str(tmp_path)]
     subprocess.run(command, check=True, capture_output=True, timeout=60)
     written = {path.name: path.read_text("utf-8") for path in tmp_path.iterdir()}
     present = {path.name: path.read_text("utf-8") for path in (FOLDER / "vectors").iterdir()}
-    assert written == present, "run: python -m tactomo_protocol.vectors firmware_protocol/vectors"
+    assert written == present, (
+        "run: python tests/support/protocol_vectors.py firmware_protocol/vectors"
+    )
 
 
 def test_the_command_says_when_there_is_no_such_folder(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "tactomo_protocol.vectors", str(tmp_path / "missing")]
+    command = [sys.executable, vectors.__file__, str(tmp_path / "missing")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert done.returncode == 2
     assert "missing is not a folder" in done.stderr

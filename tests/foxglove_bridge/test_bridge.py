@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from foxglove_client import FoxgloveClient
 from recorded_grasp import contacts_of, images_of
-from tactomo.frames import description_fields
+from tactomo.imaging.frames import description_fields
 from tactomo_client import MessageError
 from tactomo_client.fake import FakeSensor
 from tactomo_client.messages import encode_message
@@ -274,7 +274,7 @@ def test_an_address_that_is_taken(sensor: FakeSensor) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        with pytest.raises(BridgeError, match=r"Address already in use.*--port"):
+        with pytest.raises(BridgeError, match=r"Address already in use.*--foxglove-port"):
             Bridge(["left"], sensor.address, port=taken.getsockname()[1])
     with pytest.raises(BridgeError, match="cannot listen on nowhere"):
         Bridge(["left"], sensor.address, host="nowhere.invalid", port=0)
@@ -289,7 +289,7 @@ def test_the_command_serves_until_it_is_stopped(
     layout = tmp_path / "left.json"
     command = [
         *(sys.executable, "-m", "tactomo.cli", "foxglove", "left", "--stream", sensor.address),
-        *("--port", "0", "--layout", str(layout), "--announce"),
+        *("--foxglove-port", "0", "--layout", str(layout), "--announce"),
     ]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None

@@ -10,16 +10,15 @@ import msgpack  # type: ignore[import-untyped]
 import numpy as np
 import pytest
 from fuzz_targets import HEADER, TANK, TARGETS, import_anything
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from tactomo_client import MessageError
 from tactomo_client.messages import MAX_DEPTH, MAX_ENTRIES, decode_message, encode_message
 from tactomo_models import load_description
 from tactomo_models.errors import DescriptionError
-from tactomo_models.sensors import __path__ as sensors_path
+from tactomo_models.sensor.shipped import __path__ as sensors_path
 
-QUICK = settings(max_examples=150)
 POSITION = st.integers(0, 2**16)
 
 
@@ -57,7 +56,6 @@ def test_no_mutation_breaks_a_parser(name: str) -> None:
     target = TARGETS[name]
     examples = target.examples()
 
-    @QUICK
     @given(data=st.one_of(mutations(examples), st.binary(max_size=200)))
     def try_it(data: bytes) -> None:
         target.parse(data)
@@ -87,7 +85,6 @@ def archives(draw: st.DrawFn) -> dict[str, NDArray[Any]]:
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-@settings(max_examples=200)
 @given(arrays=archives())
 def test_any_arrays_are_scans_or_refused(
     tmp_path_factory: pytest.TempPathFactory, arrays: dict[str, NDArray[Any]]

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from noisy_skin import Skin
-from tactomo_models import DataError, Flag, Press, SensorDescription, SkinSimulator
+from tactomo_models import DataError, Flag, MethodError, Press, SensorDescription, SkinSimulator
 from tactomo_models.batch import read_scans, reconstruct_file
 
 PRESSES = [(), (Press(0.02, 0.01, 180.0),), (Press(-0.03, 0.0, 160.0), Press(0.035, 0.03, 190.0))]
@@ -36,19 +36,19 @@ def arrays(skin: Skin) -> dict[str, Any]:
 def _artifact_at_hand(
     paper: SensorDescription, artifact: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tactomo_models.reconstruct.load_or_build_artifact", lambda _: artifact)
+    monkeypatch.setattr("tactomo_models.methods.method.load_or_build_artifact", lambda _: artifact)
 
 
 def run(
     tmp_path: Path, paper: SensorDescription, arrays: dict[str, Any], method: str = "auto"
 ) -> dict[str, Any]:
     np.savez(tmp_path / "in.npz", **arrays)
-    count = reconstruct_file(
+    frames = reconstruct_file(
         tmp_path / "in.npz", tmp_path / "out.npz", description=paper, method=method
     )
     with np.load(tmp_path / "out.npz") as stored:
         out = dict(stored)
-    assert count == len(out["map"])
+    assert len(frames) == len(out["map"])
     return out
 
 
@@ -103,7 +103,7 @@ def test_bad_input_is_refused_with_what_is_needed(
     for content, said in bad:
         with pytest.raises(DataError, match=said):
             run(tmp_path, paper, content)
-    with pytest.raises(DataError, match="unknown method"):
+    with pytest.raises(MethodError, match="unknown method"):
         run(tmp_path, paper, arrays, "magic")
     with pytest.raises(DataError, match=r"cannot write.*no folder"):
         reconstruct_file(tmp_path / "in.npz", tmp_path / "no folder" / "x", description=paper)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from tactomo_models import ArtifactError, SensorDescription, Tier, machine_speed
+from tactomo_models import ArtifactError, SensorDescription, machine_speed
 from tactomo_models.machine_speed import (
     CLEARLY,
     MachineSpeed,
@@ -37,9 +37,9 @@ def measured(small: SensorDescription) -> MachineSpeed:
 def test_a_time_buys_the_work_that_frames_took_so_long_for(measured: MachineSpeed) -> None:
     assert measured.overhead_s == pytest.approx(4e-3)
     assert measured.speed == pytest.approx(2.0)
-    for tier in (Tier.AUTO, Tier.LEVELSET):
+    for tier in ("auto", "levelset"):
         plan = measured.plan(tier, 0.03)
-        assert plan.tier is tier
+        assert plan.method is tier
         assert plan.budget_s == pytest.approx(0.013)
 
 
@@ -50,22 +50,22 @@ def test_a_time_buys_the_work_that_frames_took_so_long_for(measured: MachineSpee
 def test_auto_takes_the_most_accurate_method_that_keeps_to_the_time(
     measured: MachineSpeed, time_ms: float, tier: str
 ) -> None:
-    assert measured.plan(Tier.AUTO, time_ms / 1e3).tier == tier
+    assert measured.plan("auto", time_ms / 1e3).method == tier
 
 
 def test_auto_yields_only_to_what_is_clearly_better(small: SensorDescription) -> None:
     for icc, tier in ((0.91, "auto"), (0.93, "noser")):
         made = MachineSpeed.of_rows(small, "2026-01-31", [AUTO[1], row("noser", None, 2.0, icc)])
-        assert made.plan(Tier.AUTO, 1.0).tier == tier
+        assert made.plan("auto", 1.0).method == tier
 
 
 def test_what_was_asked_for_by_name_is_given_and_no_time_leaves_all_as_it_is(
     measured: MachineSpeed,
 ) -> None:
-    plan = measured.plan(Tier.FIT, 1e-4)
-    assert plan.tier is Tier.FIT
+    plan = measured.plan("fit", 1e-4)
+    assert plan.method == "fit"
     assert plan.budget_s  # 0 would stand for "as ever"
-    assert measured.plan(Tier.AUTO, None) == (Tier.AUTO, None)
+    assert measured.plan("auto", None) == ("auto", None)
 
 
 TIMES = st.floats(1e-4, 10)
@@ -95,7 +95,7 @@ def test_more_time_never_buys_less(
     assert more is not None
     if less.p99_s <= time_s:
         assert more.icc >= less.icc - CLEARLY
-    budgets = [made.plan(Tier.FIT, t).budget_s for t in (time_s, time_s + more_s)]
+    budgets = [made.plan("fit", t).budget_s for t in (time_s, time_s + more_s)]
     assert budgets == sorted(budgets)  # type: ignore[type-var]
 
 
@@ -110,7 +110,7 @@ def test_what_is_kept_is_found_again(
     before = machine_speed_for(small, told.append)
     assert (before.rows, told) == ((), [])  # no measurement of another sensor tells what is best
     assert "tactomo bench --machine-speed" in before.source
-    assert before.plan(Tier.AUTO, 0.05).tier is Tier.AUTO
+    assert before.plan("auto", 0.05).method == "auto"
     save_machine_speed(measured, machine_speed_path(small))
     after = machine_speed_for(small, told.append)
     assert (after, told) == (measured, [])
@@ -124,7 +124,7 @@ def test_the_shipped_one_is_of_the_shipped_sensor(
     shipped = machine_speed_for(paper, pytest.fail)
     assert {"auto", "tikhonov"} <= {row.method for row in shipped.rows}
     assert "shipped" in shipped.source
-    assert shipped.plan(Tier.AUTO, 0.05).tier is Tier.AUTO
+    assert shipped.plan("auto", 0.05).method == "auto"
 
 
 @pytest.mark.parametrize(
@@ -136,7 +136,7 @@ def test_the_shipped_one_is_of_the_shipped_sensor(
         ({"format": 2}, "is damaged (format = 2"),
         ({"speed": 0}, "is damaged (speed = 0"),
         ({"further": 1}, "is damaged (unknown key further)"),
-        ({"rows": [{"method": "magic"}]}, "is damaged (rows.0.method = 'magic'"),
+        ({"rows": [{"method": "magic"}]}, "is damaged (rows.0.budget_s is missing"),
         (None, "is damaged (Invalid JSON"),
     ],
 )

@@ -20,7 +20,6 @@ from tactomo_models import (
     Reference,
     SensorDescription,
     SkinSimulator,
-    Tier,
     load_description,
 )
 
@@ -55,7 +54,7 @@ def test_one_press_is_found_with_its_pressure(
 ) -> None:
     press = press_mm(*place)
     frame = settle(reconstructor, skin, press)
-    assert frame.tier is Tier.HYBRID
+    assert frame.tier == "hybrid"
     assert frame.flags == Flag(0)
     assert frame.misfit < 1.5
     (contact,) = frame.contacts
@@ -84,7 +83,7 @@ def test_a_suspect_shape_is_challenged_by_a_cold_start(
     reconstructor: Reconstructor, skin: Skin
 ) -> None:
     """A level set has no derivative where nothing presses: alone it never finds what lands."""
-    reconstructor.tier = Tier.LEVELSET
+    reconstructor.method = "levelset"
     held, lands = press_mm(-30, 25), press_mm(35, -30)
     assert len(settle(reconstructor, skin, held).contacts) == 1
     frames = [reconstructor.reconstruct(**skin.scan(held, lands)) for _ in range(12)]
@@ -97,7 +96,7 @@ def test_nothing_pressed_takes_a_test_and_no_solve(
     reconstructor: Reconstructor, skin: Skin, solves: list[int]
 ) -> None:
     frames = [reconstructor.reconstruct(**skin.scan()) for _ in range(300)]
-    assert {frame.tier for frame in frames} == {Tier.QUIET}
+    assert {frame.tier for frame in frames} == {"quiet"}
     assert not solves
     assert all(frame.map is not None and not frame.map.any() for frame in frames)
 
@@ -131,7 +130,7 @@ def test_contacts_land_slide_jump_and_lift(reconstructor: Reconstructor, skin: S
     assert nearest(frame, stays).id == first.id
     (left,) = settle(reconstructor, skin, stays).contacts
     assert left.id == first.id
-    assert settle(reconstructor, skin, frames=1).tier is Tier.QUIET
+    assert settle(reconstructor, skin, frames=1).tier == "quiet"
 
 
 def test_a_press_below_the_onset_is_touched_with_unknown_pressure(
@@ -158,7 +157,7 @@ def test_without_structure_the_linear_image_goes_on_flagged(
     frame = reconstructor.reconstruct(skin.scan(press)["magnitude"], None)
     assert frame.flags == Flag.STRUCTURE_MISSING
     assert frame.flags.names() == ["structure_missing"]
-    assert frame.tier is Tier.NETWORK
+    assert frame.tier == "network"
     assert frame.structure is None
     assert frame.map is not None
     assert error_mm(nearest(frame, press), press) < 12
@@ -172,13 +171,13 @@ def test_a_lost_structure_scan_is_bridged_by_the_last_shape(
     weaker = press_mm(-30, 20, 160)
     frame = reconstructor.reconstruct(skin.scan(weaker)["magnitude"], None)
     (contact,) = frame.contacts
-    assert frame.tier is Tier.FIT
+    assert frame.tier == "fit"
     assert frame.flags == Flag.STRUCTURE_MISSING
     assert frame.structure is None
     assert contact.id == before.id
     assert contact.pressure_kpa == pytest.approx(160, abs=8)
     elsewhere = skin.scan(press_mm(40, -40, 190))["magnitude"]
-    assert reconstructor.reconstruct(elsewhere, None).tier is Tier.NETWORK
+    assert reconstructor.reconstruct(elsewhere, None).tier == "network"
 
 
 def test_a_last_shape_without_contacts_stands_in_for_nothing(
@@ -189,9 +188,9 @@ def test_a_last_shape_without_contacts_stands_in_for_nothing(
     reconstructor.set_reference(noisy.reference())
     press = replace(CENTRE, pressure_kpa=195, radius_m=0.04)
     frame = reconstructor.reconstruct(noisy.scan(press)["magnitude"], noisy.scan()["structure"])
-    assert (frame.tier, frame.contacts) == (Tier.FIT, ())
+    assert (frame.tier, frame.contacts) == ("fit", ())
     frame = reconstructor.reconstruct(noisy.scan(press)["magnitude"], None)
-    assert frame.tier is Tier.NETWORK
+    assert frame.tier == "network"
     assert Flag.STRUCTURE_MISSING in frame.flags
 
 
@@ -200,8 +199,8 @@ def test_the_last_shape_is_not_held_for_ever(reconstructor: Reconstructor, skin:
     tiers = [
         reconstructor.reconstruct(skin.scan(CENTRE)["magnitude"], None).tier for _ in range(30)
     ]
-    assert tiers[0] is Tier.FIT
-    assert tiers[-1] is Tier.NETWORK
+    assert tiers[0] == "fit"
+    assert tiers[-1] == "network"
 
 
 def test_without_magnitude_the_outline_goes_on_flagged(

@@ -117,12 +117,12 @@ def request_for(packet: Packet) -> tuple[object, ...]:
         case Scan():
             samples = packet.samples
             return (
-                *("scan", int(packet.channel), int(packet.flags), packet.counter),
+                *("scan", packet.channel.number, int(packet.flags), packet.counter),
                 *(packet.device_us, format_of(samples), len(samples), samples.tobytes().hex()),
             )
         case Hello():
             return (
-                *("hello", sum(1 << channel for channel in packet.channels)),
+                *("hello", sum(1 << channel.number for channel in packet.channels)),
                 *(int(packet.sample_format), packet.samples_per_scan, packet.electrodes),
                 *(packet.drive_offset, packet.measure_offset),
                 *(f64_bits(packet.volts_per_count), f64_bits(packet.scan_rate_hz)),
@@ -219,11 +219,11 @@ class SimulatedDevice:
         return self._number("zero_counter")
 
     def send(
-        self, counter: int, channel: int = Channel.MAGNITUDE, started_us: int | None = None
+        self, counter: int, channel: Channel = Channel.MAGNITUDE, started_us: int | None = None
     ) -> Scan | None:
         """Send a scan and return it as the host reads it; None where it was dropped."""
         started_us = self.timer_us if started_us is None else started_us
-        was_sent = self._number("send", counter, int(channel), started_us, 0)
+        was_sent = self._number("send", counter, channel.number, started_us, 0)
         scans = [packet for packet in self.said() if isinstance(packet, Scan)]
         assert len(scans) == was_sent
         return scans[0] if scans else None

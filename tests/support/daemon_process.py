@@ -8,28 +8,18 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from tactomo_client import ControlError, request
+from waiting import PATIENCE_S, wait_until
 
 SENSOR = "skin"
 ANYWHERE = "tcp://127.0.0.1:0"
-PATIENCE_S = 60.0
+SUPPORT = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
-
-
-def wait_until(
-    condition: Callable[[], Any], what: str, patience_s: float = PATIENCE_S, step_s: float = 0.005
-) -> Any:
-    """Wait for the condition and return its value."""
-    deadline = time.monotonic() + patience_s
-    while not (value := condition()):
-        assert time.monotonic() < deadline, f"waited {patience_s:g} s in vain for {what}"
-        time.sleep(step_s)
-    return value
 
 
 class DaemonProcess:
@@ -39,7 +29,8 @@ class DaemonProcess:
         folder: where its configuration and its log are kept.
         ports: what it reads.
         program: Python source that runs a daemon of another make, given the configuration's path
-            as its argument; None for the command that users start.
+            as its argument, and able to import from this folder; None for the command that users
+            start.
         environment: what its environment has beyond this one's.
         ready: wait until it is ready.
         under: the command that it is run under, such as ("nice", "-n", "-5").
@@ -70,7 +61,7 @@ class DaemonProcess:
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
-                env={**os.environ, **(environment or {})},
+                env={**os.environ, "PYTHONPATH": SUPPORT, **(environment or {})},
             )
         self.stream = self.control = ""
         if ready:

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import zmq
 from tactomo_client.messages import decode_message, topic
-
-PATIENCE_S = 60.0
+from waiting import PATIENCE_S, wait_until
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,14 +60,16 @@ class Ears:
         patience_s: float = PATIENCE_S,
     ) -> Heard:
         """Wait for a message from number `since` on that satisfies the condition."""
-        deadline = time.monotonic() + patience_s
-        while True:
+
+        def found() -> list[Heard]:
+            nonlocal since
             while since < len(self.heard):
-                if condition(self.heard[since]):
-                    return self.heard[since]
                 since += 1
-            assert time.monotonic() < deadline, f"waited {patience_s:g} s in vain for {what}"
-            time.sleep(0.002)
+                if condition(self.heard[since - 1]):
+                    return [self.heard[since - 1]]
+            return []
+
+        return wait_until(found, what, patience_s, step_s=0.002)[0]
 
     def close(self) -> None:
         """Stop listening."""

@@ -6,16 +6,14 @@ import copy
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from tactomo_models import SensorDescription, SkinSimulator
-from tactomo_models.bare_sheet import exchanged
-from tactomo_models.forward import ForwardModel
-from tactomo_models.greens import GreensFunction
+from tactomo_models.arrays import BoolArray
+from tactomo_models.physics.bare_sheet import exchanged
+from tactomo_models.physics.forward import ForwardModel
+from tactomo_models.physics.greens import GreensFunction
 
-FloatArray = NDArray[np.float64]
 
-
-def touches(description: SensorDescription, electrode: int) -> NDArray[np.bool_]:
+def touches(description: SensorDescription, electrode: int) -> BoolArray:
     """Voltages (M,) that are driven or read by an electrode."""
     pairs = description.pairs
     return np.asarray((np.hstack([pairs.drive, pairs.measure]) == electrode).any(axis=1))

@@ -7,14 +7,13 @@ import base64
 import json
 import struct
 import threading
-import time
 from typing import Any
 
 import aiohttp
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from waiting import PATIENCE_S, wait_until
 
 PROTOCOL = "foxglove.sdk.v1"
-PATIENCE_S = 30.0
 MESSAGE_DATA = 1
 
 
@@ -47,25 +46,24 @@ class FoxgloveClient:
         `anew` looks only at what comes from now on.
         """
         seen = len(self._messages) if anew else 0
-        deadline = time.monotonic() + PATIENCE_S
-        while time.monotonic() < deadline:
+
+        def found() -> list[Any]:
+            nonlocal seen
             while seen < len(self._messages):
-                found, data = self._messages[seen]
+                on, data = self._messages[seen]
                 seen += 1
-                if found == topic and condition(message := self.decode(topic, data)):
-                    return message
-            time.sleep(0.01)
-        raise AssertionError(f"nothing of that kind on {topic}; there was {self.counts()}")
+                if on == topic and condition(message := self.decode(topic, data)):
+                    return [message]
+            return []
+
+        return wait_until(found, f"such a message on {topic}")[0]
 
     def wait_said(self, condition: Any) -> dict[str, Any]:
         """Wait for another message in JSON."""
-        deadline = time.monotonic() + PATIENCE_S
-        while time.monotonic() < deadline:
-            for said in list(self.said):
-                if condition(said):
-                    return said
-            time.sleep(0.01)
-        raise AssertionError(f"not said; there was {self.said}")
+        return wait_until(
+            lambda: next((said for said in list(self.said) if condition(said)), {}),
+            "such a message in JSON",
+        )
 
     def counts(self) -> dict[str, int]:
         """Return how many messages came on each topic."""

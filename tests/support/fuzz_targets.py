@@ -21,13 +21,12 @@ import numpy as np
 import sciospec_stream
 from pydantic import ValidationError
 from tactomo.config import load_config
-from tactomo.control import COMMANDS
 from tactomo.errors import ConfigError, RecordingError, TactomoError
-from tactomo.imported import read_scans
 from tactomo.protocols import protocol_named
 from tactomo.protocols.sciospec import Sciospec
-from tactomo.recording import Mark, Origin, ScanKey, open_recording
-from tactomo.recording_writer import (
+from tactomo.recordings.imported_scans import read_scans
+from tactomo.recordings.recording import Origin, open_recording
+from tactomo.recordings.recording_writer import (
     RecordingWriter,
     mark_entry,
     message_entry,
@@ -35,10 +34,12 @@ from tactomo.recording_writer import (
     preamble_entry,
     reference_entry,
 )
+from tactomo.scans import Mark, ScanKey
+from tactomo.stream.control import COMMANDS
 from tactomo.twin import control as twin_control
 from tactomo.twin.scene import load_scene
 from tactomo_client import ClientError, ControlError, MessageError
-from tactomo_client.event import event_from_message
+from tactomo_client.event import Event
 from tactomo_client.frame import frame_from_message
 from tactomo_client.messages import (
     CONTACTS,
@@ -55,14 +56,23 @@ from tactomo_client.messages import (
 )
 from tactomo_client.recording import RecordingWarning
 from tactomo_client.recording import open_recording as open_frames
-from tactomo_client.status import status_from_message
+from tactomo_client.status import Status
 from tactomo_models import Reference, SensorDescription, load_description, shipped_descriptions
-from tactomo_models.calibration import Reading
-from tactomo_models.calibration_file import PressureCalibration, parse_calibration, subject_of
+from tactomo_models.calibration.calibration_file import (
+    PressureCalibration,
+    parse_calibration,
+    subject_of,
+)
+from tactomo_models.calibration.curve import Reading
+from tactomo_models.calibration.load_cell import (
+    Seen,
+    direct_readings,
+    joined_readings,
+    read_load_cell,
+)
 from tactomo_models.errors import CalibrationError, DataError, DescriptionError
-from tactomo_models.load_cell import Seen, direct_readings, joined_readings, read_load_cell
-from tactomo_models.pressure import pressures_of
-from tactomo_models.sensors import __path__ as sensors_path
+from tactomo_models.scene.pressure import pressures_of
+from tactomo_models.sensor.shipped import __path__ as sensors_path
 from tactomo_protocol import (
     Acknowledge,
     AckStatus,
@@ -182,9 +192,12 @@ def _message_examples() -> list[bytes]:
 
 def _parse_message(data: bytes) -> bool:
     taken = False
-    for read in (frame_from_message, status_from_message, event_from_message):
+    with suppress(ClientError):
+        frame_from_message(decode_message(data), time.monotonic_ns(), 0.5)
+        taken = True
+    for kind in (Status, Event):
         with suppress(ClientError):
-            read(decode_message(data), time.monotonic_ns(), 0.5)
+            kind.from_fields(decode_message(data).fields, time.monotonic_ns(), 0.5)
             taken = True
     with suppress(MessageError):
         with suppress(ControlError):  # a refusal is a reply, too

@@ -12,13 +12,13 @@ import shlex
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from whole_system import ANYWHERE, PATIENCE_S
+from waiting import PATIENCE_S, wait_until
+from whole_system import ANYWHERE
 
 KEEP_RUNNING = ("demo", "twin", "daemon", "foxglove")
 
@@ -62,7 +62,8 @@ class Newcomer:
             command = command.replace(words, others)
         program, name, *rest = shlex.split(command)
         assert program == "tactomo"
-        line = [sys.executable, "-m", "tactomo.cli", name, *rest, *self._at(name)]
+        script = Path(sys.executable).with_name("tactomo")  # does not search the working folder
+        line = [str(script), name, *rest, *self._at(name)]
         if name in KEEP_RUNNING:
             return self._start(name, line)
         return self._finish(line)
@@ -81,7 +82,7 @@ class Newcomer:
 
     def _finish(self, line: list[str]) -> str:
         done = subprocess.run(
-            line, cwd=self.folder, capture_output=True, text=True, timeout=300, check=False
+            line, cwd=self.folder, capture_output=True, text=True, timeout=900, check=False
         )
         assert done.returncode == 0, f"{shlex.join(line)}: {done.stdout}{done.stderr}"
         return done.stdout + done.stderr
@@ -89,15 +90,22 @@ class Newcomer:
     def _at(self, name: str) -> list[str]:
         """Options by which a program is given free addresses, or finds those that it asks."""
         served = ["--stream", ANYWHERE, "--control", ANYWHERE]
-        page = ["--port", "0", "--announce"]
         here = {
-            "demo": [*served, "--twin-control", ANYWHERE, "--no-browser", *page],
-            "twin": ["--control", ANYWHERE, "--announce"],
-            "foxglove": [*page, *self._known("stream")],
-            "poke": self._known("control", "twin"),
+            "demo": [
+                *served,
+                "--twin-control",
+                ANYWHERE,
+                "--no-browser",
+                "--viewer-port",
+                "0",
+                "--announce",
+            ],
+            "twin": ["--twin-control", ANYWHERE, "--announce"],
+            "foxglove": ["--foxglove-port", "0", "--announce", *self._known("stream")],
+            "poke": self._known("twin-control", "twin"),
             **dict.fromkeys(("daemon", "replay"), served),
             **dict.fromkeys(("watch", "doctor"), self._known("stream")),
-            **dict.fromkeys(("status", "tare", "record", "tier"), self._known("control")),
+            **dict.fromkeys(("status", "tare", "record", "method"), self._known("control")),
         }
         return here.get(name, [])
 
@@ -133,8 +141,10 @@ class Newcomer:
 
     def wait_for(self, command: str, words: str) -> str:
         """Repeat a command until it prints something; return all that it printed then."""
-        deadline = time.monotonic() + PATIENCE_S
-        while words not in (said := self.run(command)):
-            assert time.monotonic() < deadline, f"{command}: no {words!r} in {said}"
-            time.sleep(0.2)
-        return said
+        told: list[str] = []
+        wait_until(
+            lambda: words in told[-1],
+            f"{words!r} of: {command}",
+            meanwhile=lambda: told.append(self.run(command)),
+        )
+        return told[-1]

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from tactomo_models import Press, Reference, SkinSimulator
-
-FloatArray = NDArray[np.float64]
+from tactomo_models.arrays import FloatArray
 
 
 class Skin:

@@ -15,9 +15,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from tactomo.twin.line import SerialLine
 from tactomo_models import Press, SensorDescription, SkinSimulator
+from tactomo_models.arrays import FloatArray
 from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag, encode
 
 HELLO_PERIOD_S = 1.0
@@ -27,7 +27,7 @@ NOISE_COUNTS = 60.0
 PATH_STEPS = 60
 PATIENCE_S = 60.0
 
-Volts = Mapping[Channel, NDArray[np.float64]]
+Volts = Mapping[Channel, FloatArray]
 
 
 class Scenes:
@@ -62,7 +62,7 @@ class PtySkin:
     """
 
     def __init__(self, folder: Path, description: SensorDescription, ports: int = 2) -> None:
-        names = [channel.name.lower() if ports == 2 else "skin" for channel in Channel]
+        names = [channel if ports == 2 else "skin" for channel in Channel]
         made = {name: SerialLine(name, folder) for name in dict.fromkeys(names)}
         self.lines = {channel: made[name] for channel, name in zip(Channel, names, strict=True)}
         self.paths = [line.path for line in made.values()]
@@ -94,7 +94,7 @@ class PtySkin:
             scan_rate_hz=20.0,
         )
 
-    def scan(self, channel: Channel, counter: int, volts: NDArray[np.float64]) -> Scan:
+    def scan(self, channel: Channel, counter: int, volts: FloatArray) -> Scan:
         """Return the scan as the converter would give it, noise included."""
         noise = self._noise.normal(0, NOISE_COUNTS, len(volts))
         counts = np.rint(volts / VOLTS_PER_COUNT + noise).astype(np.int32)

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from tactomo.recording import Origin
-from tactomo.recording_writer import RecordingWriter
+from tactomo.recordings.recording import Origin
+from tactomo.recordings.recording_writer import RecordingWriter
 from tactomo_client import Contact
 from tactomo_client.messages import array_to_wire, encode_message
+from tactomo_models.arrays import Image
 
 SENSOR = "left"
 START_NS = 1_700_000_000_000_000_000
@@ -52,7 +52,7 @@ def contacts_of(number: int) -> list[Contact]:
     return found
 
 
-def images_of(number: int) -> dict[str, NDArray[np.float32] | None]:
+def images_of(number: int) -> dict[str, Image | None]:
     """Return the images of a frame; the first ones have none, as before the tare."""
     if number < 5:
         return {"map": None, "pressure_kpa": None, "structure": None}

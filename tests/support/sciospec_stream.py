@@ -4,32 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-import numpy as np
-from numpy.typing import NDArray
 from tactomo.protocols.sciospec import requests
 from tactomo.twin.foreign import Frame
-from tactomo.twin.sciospec import SciospecSpeaker
+from tactomo.twin.sciospec import SciospecEmulator
 from tactomo_models import SensorDescription
+from tactomo_models.arrays import FloatArray
 
 PERIOD_S = 0.05
 
 
-def started(description: SensorDescription) -> SciospecSpeaker:
+def started(description: SensorDescription) -> SciospecEmulator:
     """Return an instrument that was asked for all that is wanted, and measures."""
-    speaker = SciospecSpeaker(description, 1 / PERIOD_S)
+    emulator = SciospecEmulator(description, 1 / PERIOD_S)
     for request in requests(description):
-        assert speaker.hear(request.message) == [b"\x18\x01\x83\x18"], request.what
-    assert speaker.is_streaming
-    return speaker
+        assert emulator.hear(request.message) == [b"\x18\x01\x83\x18"], request.what
+    assert emulator.is_streaming
+    return emulator
 
 
 def frames(
-    description: SensorDescription, scans: Iterable[NDArray[np.float64]], begin_s: float = 1.0
+    description: SensorDescription, scans: Iterable[FloatArray], begin_s: float = 1.0
 ) -> list[list[bytes]]:
     """Return the messages of each scan's frame; scans are (M,) volts."""
-    speaker = started(description)
+    emulator = started(description)
     return [
-        speaker.frame(Frame(volts, None, begin_s + PERIOD_S * number))
+        emulator.frame(Frame(volts, None, begin_s + PERIOD_S * number))
         for number, volts in enumerate(scans)
     ]
 

@@ -6,8 +6,7 @@ import json
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +14,9 @@ from typing import Any
 
 import pytest
 from tactomo_client import request
+from waiting import PATIENCE_S
 
 SENSOR = "left_forearm"
-PATIENCE_S = 60.0
 ANYWHERE = "tcp://127.0.0.1:0"
 
 
@@ -45,7 +44,7 @@ def running_demo(*options: str) -> Iterator[Demo]:
     """Start `tactomo demo` on free ports and stop it as Ctrl-C would."""
     command = [
         *(sys.executable, "-m", "tactomo.cli", "demo", "--announce", "--no-browser"),
-        *("--sensor", SENSOR, "--port", "0", "--stream", ANYWHERE, "--control", ANYWHERE),
+        *("--sensor", SENSOR, "--viewer-port", "0", "--stream", ANYWHERE, "--control", ANYWHERE),
         *("--twin-control", ANYWHERE, *options),
     ]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
@@ -61,15 +60,6 @@ def running_demo(*options: str) -> Iterator[Demo]:
         finally:
             process.send_signal(signal.SIGINT)
             process.wait(PATIENCE_S)
-
-
-def wait_for(condition: Callable[[], Any], what: str) -> Any:
-    """Wait until the condition gives something and return it."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not (value := condition()):
-        assert time.monotonic() < deadline, f"waited {PATIENCE_S:g} s in vain for {what}"
-        time.sleep(0.02)
-    return value
 
 
 def repository() -> Path:

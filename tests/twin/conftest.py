@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 import serial
-from numpy.typing import NDArray
 from tactomo.twin import SkinModel, Twin, TwinConfig
 from tactomo_client import request
-from tactomo_models import Modality, Press, load_description
-from tactomo_protocol import Command, CommandCode, Decoder, Packet, Scan, encode
+from tactomo_models import Press, load_description
+from tactomo_models.arrays import FloatArray
+from tactomo_protocol import Channel, Command, CommandCode, Decoder, Packet, Scan, encode
+from waiting import PATIENCE_S, wait_until
 
 MEASUREMENTS = 208
-PATIENCE_S = 30.0
 
 
 class FlatSkin:
@@ -28,12 +28,12 @@ class FlatSkin:
     def __init__(self, seconds: float = 0.0) -> None:
         self.seconds = seconds
 
-    def voltages(self, presses: Sequence[Press]) -> dict[Modality, NDArray[np.float64]]:
+    def voltages(self, presses: Sequence[Press]) -> dict[Channel, FloatArray]:
         time.sleep(self.seconds)
         kpa = sum(press.pressure_kpa for press in presses)
         return {
-            "magnitude": np.full(MEASUREMENTS, 0.1 + 1e-3 * kpa),
-            "structure": np.full(MEASUREMENTS, 0.1 + 2e-3 * kpa),
+            Channel.MAGNITUDE: np.full(MEASUREMENTS, 0.1 + 1e-3 * kpa),
+            Channel.STRUCTURE: np.full(MEASUREMENTS, 0.1 + 2e-3 * kpa),
         }
 
 
@@ -58,7 +58,7 @@ class Host:
 
     def wait_for(self, condition: Callable[[], Any]) -> Any:
         """Read until the condition holds and return its value."""
-        return wait_for(condition, self.read)
+        return wait_until(condition, meanwhile=self.read)
 
     def kind(self, kind: type[Any], port: int = 0) -> list[Any]:
         return [packet for packet in self.packets[port] if isinstance(packet, kind)]
@@ -69,17 +69,6 @@ class Host:
     def close(self) -> None:
         for port in self.ports:
             port.close()
-
-
-def wait_for(condition: Callable[[], Any], meanwhile: Callable[[], object] = lambda: None) -> Any:
-    end = time.monotonic() + PATIENCE_S
-    while time.monotonic() < end:
-        meanwhile()
-        value = condition()
-        if value:
-            return value
-        time.sleep(0.002)
-    raise AssertionError(f"did not happen within {PATIENCE_S} s")
 
 
 class Bench:
@@ -95,12 +84,6 @@ class Bench:
 
     def ask(self, command: str, **arguments: Any) -> dict[str, Any]:
         return request(command, self.twin.control, timeout_s=PATIENCE_S, **arguments)
-
-
-@pytest.fixture(name="wait_for")
-def _wait_for() -> Callable[..., Any]:
-    """Wait for a condition and return its value."""
-    return wait_for
 
 
 @pytest.fixture

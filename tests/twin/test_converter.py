@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from tactomo.twin.converter import Converter, Drift
+from tactomo_models.arrays import FloatArray
+from tactomo_protocol import Channel
 
 STILL = Drift(walk=0.0, creep=0.0)
 VOLTS = np.linspace(-0.5, 0.5, 208)
 
 
 def volts_of(
-    converter: Converter, counter: int = 0, time_s: float = 0.0, channel: int = 0
-) -> NDArray[np.float64]:
+    converter: Converter,
+    counter: int = 0,
+    time_s: float = 0.0,
+    channel: Channel = Channel.MAGNITUDE,
+) -> FloatArray:
     counts, _ = converter.convert(VOLTS, channel=channel, counter=counter, time_s=time_s)
     return np.asarray(counts * converter.volts_per_count)
 
@@ -42,9 +46,9 @@ def test_equal_seeds_give_equal_scans_in_any_order() -> None:
 
 def test_the_channels_have_noise_and_drift_of_their_own() -> None:
     converter = Converter(1.0, 1e-3, Drift(walk=1e-3, creep=0.0))
-    assert not np.array_equal(volts_of(converter), volts_of(converter, channel=1))
+    assert not np.array_equal(volts_of(converter), volts_of(converter, channel=Channel.STRUCTURE))
     converter.noise_v = 0.0
-    gains = [float(np.mean(volts_of(converter, 0, 500.0, c) / VOLTS)) for c in (0, 1)]
+    gains = [float(np.mean(volts_of(converter, 0, 500.0, c) / VOLTS)) for c in Channel]
     assert abs(gains[0] - gains[1]) > 1e-4
 
 
@@ -68,8 +72,8 @@ def test_the_walk_is_continuous_and_grows_with_the_root_of_time() -> None:
 
 def test_what_is_beyond_the_range_is_clipped_and_said() -> None:
     converter = Converter(0.4, 0.0, STILL)
-    counts, saturated = converter.convert(VOLTS, channel=0, counter=0, time_s=0.0)
+    counts, saturated = converter.convert(VOLTS, channel=Channel.MAGNITUDE, counter=0, time_s=0.0)
     assert saturated
     assert counts.max() == -counts.min() == 2**23 - 1
-    _, saturated = converter.convert(VOLTS * 0.7, channel=0, counter=0, time_s=0.0)
+    _, saturated = converter.convert(VOLTS * 0.7, channel=Channel.MAGNITUDE, counter=0, time_s=0.0)
     assert not saturated

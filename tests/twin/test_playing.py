@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from tactomo.errors import TactomoError
-from tactomo.imported import ImportFileError
+from tactomo.recordings.imported_scans import ImportFileError
 from tactomo_models import DataError, load_description
 from tactomo_protocol import CommandCode, Hello
+from waiting import wait_until
 
 TANK = load_description("tank_disc")
 ELECTRODES = 16
@@ -37,9 +38,7 @@ def test_single_ended_frames_are_played_as_differences_again_and_again(
         assert got == pytest.approx(want[scan.counter % 3], abs=hello.volts_per_count)
 
 
-def test_a_file_played_once_ends_the_twin(
-    bench: Callable[..., Any], tmp_path: Path, wait_for: Callable[..., Any]
-) -> None:
+def test_a_file_played_once_ends_the_twin(bench: Callable[..., Any], tmp_path: Path) -> None:
     path = tmp_path / "in.npz"
     frames = np.arange(1.0, 6.0)[:, None] * np.ones(TANK.measurements)
     rest = np.full(TANK.measurements, 0.5)
@@ -51,7 +50,7 @@ def test_a_file_played_once_ends_the_twin(
     host.wait_for(lambda: len(host.scans()) == 45)
     volts = [scan.volts(host.kind(Hello)[0].volts_per_count)[0] for scan in host.scans()]
     assert volts == pytest.approx([0.5] * 40 + [1.0, 2.0, 3.0, 4.0, 5.0], rel=1e-5)
-    assert wait_for(lambda: started.twin.wait(0.0))
+    assert wait_until(lambda: started.twin.wait(0.0))
     assert len(host.scans()) == 45
 
 
@@ -64,5 +63,5 @@ def test_what_cannot_be_played_is_refused_at_once(
     np.savez(path, structure=np.ones((3, 192)))
     with pytest.raises(DataError, match="192"):
         bench(sensor="tank_disc", play=path)
-    with pytest.raises(TactomoError, match="does not speak"):
+    with pytest.raises(TactomoError, match="there is no protocol"):
         bench(sensor="tank_disc", protocol="morse")

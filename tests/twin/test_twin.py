@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 import serial
-from numpy.typing import NDArray
 from small_sensor import SMALL
 from tactomo.errors import AddressError, ConfigError, TactomoError
 from tactomo.twin import Drift, Scene, TwinConfig
 from tactomo_client import ControlError
-from tactomo_models import Modality, Press, SkinSimulator, load_description
+from tactomo_models import Press, SkinSimulator, load_description
+from tactomo_models.arrays import FloatArray
 from tactomo_protocol import (
     Acknowledge,
     AckStatus,
@@ -28,6 +28,7 @@ from tactomo_protocol import (
     Scan,
     ScanFlag,
 )
+from waiting import wait_until
 
 Start = Callable[..., Any]
 
@@ -154,11 +155,11 @@ class StallingSkin:
     def __init__(self) -> None:
         self.solves = 0
 
-    def voltages(self, presses: Sequence[Press]) -> dict[Modality, NDArray[np.float64]]:
+    def voltages(self, presses: Sequence[Press]) -> dict[Channel, FloatArray]:
         self.solves += 1
         if self.solves == 2:
             time.sleep(0.5)
-        return {"magnitude": np.full(208, 0.1), "structure": np.full(208, 0.1)}
+        return {Channel.MAGNITUDE: np.full(208, 0.1), Channel.STRUCTURE: np.full(208, 0.1)}
 
 
 def test_scans_missed_in_a_stall_are_not_made_up(bench: Start) -> None:
@@ -243,7 +244,8 @@ def test_a_script_starts_with_the_first_scan_that_a_host_receives(bench: Start) 
         {"press": [{"at_s": 0.5, "duration_s": 0.5, "x_mm": 0, "y_mm": 0, "pressure_kpa": 100}]}
     )
     started = bench(scene=script, rate_hz=20.0)
-    time.sleep(0.7)  # past the press, if the clock had started with power-up
+    # Past the press, if the script's clock had started with power-up.
+    wait_until(lambda: started.ask("status")["uptime_s"] > 0.6)
     host = started.host()
     host.start()
     host.wait_for(lambda: len(host.scans()) >= 50 and host.kind(Hello))
@@ -310,25 +312,25 @@ def test_a_skin_that_is_not_simulated_does_not_drift(bench: Start) -> None:
         bench().ask("drift", swing_k=10.0)
 
 
-def test_nobody_gets_old_scans_and_nobody_blocks_the_twin(bench: Start, wait_for: Start) -> None:
+def test_nobody_gets_old_scans_and_nobody_blocks_the_twin(bench: Start) -> None:
     started = bench()
     early = started.host()
     early.start()
     early.wait_for(lambda: early.scans())
     early.close()
     before = started.ask("status")["ports"][0]["unheard"]
-    wait_for(lambda: started.ask("status")["ports"][0]["unheard"] > before + 50)
+    wait_until(lambda: started.ask("status")["ports"][0]["unheard"] > before + 50)
     now = started.ask("status")["counter"]
     late = started.host()
     late.wait_for(lambda: late.scans())
     assert late.scans()[0].counter >= now - 1
 
 
-def test_a_host_that_does_not_read_loses_whole_frames(bench: Start, wait_for: Start) -> None:
+def test_a_host_that_does_not_read_loses_whole_frames(bench: Start) -> None:
     started = bench(rate_hz=500.0)
     host = started.host()
     host.start()
-    wait_for(lambda: started.ask("status")["ports"][0]["dropped"] > 50)
+    wait_until(lambda: started.ask("status")["ports"][0]["dropped"] > 50)
     host.wait_for(lambda: host.scans() and host.scans()[-1].counter > 60)
     assert host.decoders[0].counts.corrupt == 0
     counters = [scan.counter for scan in host.scans()]
@@ -424,10 +426,10 @@ def test_a_busy_control_address_is_named(bench: Start) -> None:
 class BreakingSkin:
     """Solves for an unloaded skin only."""
 
-    def voltages(self, presses: Sequence[Press]) -> dict[Modality, NDArray[np.float64]]:
+    def voltages(self, presses: Sequence[Press]) -> dict[Channel, FloatArray]:
         if presses:
             raise ArithmeticError("singular")
-        return {"magnitude": np.full(208, 0.1), "structure": np.full(208, 0.1)}
+        return {Channel.MAGNITUDE: np.full(208, 0.1), Channel.STRUCTURE: np.full(208, 0.1)}
 
 
 def test_a_skin_that_fails_stops_the_twin_with_its_error(bench: Start) -> None:

@@ -10,7 +10,6 @@ import re
 import signal
 import socket
 import subprocess
-import sys
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from importlib import resources
@@ -19,10 +18,12 @@ from typing import Any, ParamSpec
 import aiohttp
 import numpy as np
 import pytest
+import tactomo_viewer
 from aiohttp.test_utils import TestClient, TestServer
 from tactomo_client import ClientError, Contact, ControlError
 from tactomo_client.fake import FakeControl, FakeSensor
-from tactomo_viewer import ViewerError, make_app, serve
+from tactomo_viewer import ViewerError
+from viewer_process import viewer_process
 
 CONTACT = Contact(2, 12.0, -30.0, 707.0, 0.18, 0.01, None)
 RAMP = np.tile(np.linspace(0, 1, 51, dtype=np.float32), (51, 1))
@@ -114,7 +115,7 @@ class Viewer:
 async def viewer_of(
     sensor: FakeSensor, control: str = NOBODY, twin: str | None = None, host: str = "127.0.0.1"
 ) -> AsyncIterator[Viewer]:
-    app = make_app("left", sensor.address, control, twin, host)
+    app = tactomo_viewer.Viewer("left", sensor.address, control, twin, host).app()
     async with TestClient(TestServer(app)) as client:
         topics = {await asyncio.to_thread(sensor.wait_for_subscriber) for _ in range(3)}
         assert topics == {b"left/map\0", b"left/status\0", b"left/event\0"}
@@ -162,9 +163,11 @@ async def test_a_frame_comes_whole(sensor: FakeSensor) -> None:
 async def test_the_age_is_the_one_at_sending(sensor: FakeSensor) -> None:
     async with viewer_of(sensor) as viewer:
         sensor.publish(clock_id="elsewhere", age_ns=2_000_000_000)
-        await asyncio.sleep(0.3)
-        async with viewer.page() as page:
-            assert (await page.frame(1))["age_ms"] >= 2200
+        ages_ms = [2000.0]
+        while ages_ms[-1] < 2200:
+            async with viewer.page() as page:
+                ages_ms.append((await page.frame(1))["age_ms"])
+        assert ages_ms == sorted(ages_ms)
 
 
 @on_loop
@@ -417,18 +420,9 @@ async def test_the_page_brings_everything_itself(sensor: FakeSensor) -> None:
 # Starting and stopping
 
 
-def start(*arguments: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-m", "tactomo_viewer", "left", *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_it_prints_its_address_and_stops_when_told(number: signal.Signals) -> None:
-    viewer = start("--stream", NOBODY, "--port", "0")
+    viewer = viewer_process(stream=NOBODY, stderr=subprocess.PIPE)
     assert viewer.stdout is not None
     try:
         line = viewer.stdout.readline()
@@ -442,7 +436,7 @@ def test_it_prints_its_address_and_stops_when_told(number: signal.Signals) -> No
 
 
 def test_open_pages_do_not_hold_up_the_end(sensor: FakeSensor) -> None:
-    viewer = start("--stream", sensor.address, "--port", "0")
+    viewer = viewer_process(stream=sensor.address)
     assert viewer.stdout is not None
     try:
         url = viewer.stdout.readline().split()[-1]
@@ -470,27 +464,24 @@ def test_a_port_in_use_says_what_to_do() -> None:
         holder.bind(("127.0.0.1", 0))
         holder.listen()
         port = holder.getsockname()[1]
-        with pytest.raises(ViewerError, match=rf"cannot listen on 127.0.0.1 port {port}.*--port"):
-            serve("left", NOBODY, port=port)
+        with pytest.raises(
+            ViewerError, match=rf"cannot listen on 127.0.0.1 port {port}.*--viewer-port"
+        ):
+            tactomo_viewer.Viewer("left", NOBODY).serve(port)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("given", "message"),
     [
-        (("--stream", "nonsense"), "cannot connect to 'nonsense'"),
-        (("--host", "203.0.113.1"), "cannot listen on 203.0.113.1"),
+        ({"stream": "nonsense"}, "cannot connect to 'nonsense'"),
+        ({"host": "203.0.113.1"}, "cannot listen on 203.0.113.1"),
     ],
 )
-def test_a_mistake_is_explained_without_a_traceback(
-    arguments: tuple[str, ...], message: str
-) -> None:
-    viewer = start("--port", "0", *arguments)
-    _, errors = viewer.communicate(timeout=60)
-    assert viewer.returncode == 1
-    assert message in errors
-    assert "Traceback" not in errors
+def test_a_mistake_is_explained(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ClientError, match=message):
+        tactomo_viewer.Viewer("left", **{"stream": NOBODY, **given}).serve(0)
 
 
 def test_a_wrong_sensor_name_is_named() -> None:
     with pytest.raises(ClientError, match="'left arm' is not a sensor name"):
-        serve("left arm", NOBODY, port=0)
+        tactomo_viewer.Viewer("left arm", NOBODY).serve(0)

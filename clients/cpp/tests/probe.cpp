@@ -288,7 +288,7 @@ int control(tactomo::Control daemon, const std::string& command, const std::stri
         print_text(recording.path);
         std::printf(", \"bytes\": %" PRIu64 "}", recording.bytes);
     } else if (command == "set_tier") {
-        print_text(daemon.set_tier(argument));
+        print_text(daemon.set_method(argument));
     } else if (command == "set_budget") {
         print_value(daemon.set_budget(
             argument.empty() ? std::nullopt : std::optional(std::atof(argument.c_str()))));

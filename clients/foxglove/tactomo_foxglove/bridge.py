@@ -52,7 +52,6 @@ class Bridge:
     Raises:
         BridgeError: the address cannot be listened on.
         ClientError: a name is no sensor's, or `stream` no address.
-
     """
 
     def __init__(
@@ -98,7 +97,6 @@ class Bridge:
 
         Raises:
             KeysError: the daemon does not let us in.
-
         """
         next_health_s = time.monotonic()
         while not stop.is_set():
@@ -223,6 +221,6 @@ def _serve(
     except RuntimeError as error:
         raise BridgeError(
             f"cannot listen on {host} port {port}: {str(error).rpartition(': ')[2]}",
-            "stop the program that uses it, or choose another with --port (0: any free one)",
+            "stop the program that uses it, or give another with --foxglove-port (0: a free one)",
             name="cannot_listen",
         ) from error

@@ -94,28 +94,28 @@ def transforms(sensor: str, placement: Placement, time_ns: int) -> FrameTransfor
     )
 
 
-def grid(frame: Frame, description: Mapping[str, Any], time_ns: int, stale: bool) -> Grid | None:
+def grid(frame: Frame, description: Mapping[str, Any], time_ns: int, stale: str) -> Grid | None:
     """Return the map as a grid: its colours, and the numbers behind them as fields of their own.
 
     The fields are `pressure_kpa`, `magnitude` (|Δσ|/σ₀) and `structure`, as far as the frame has
     them; NaN where there is no value. None for a frame without images.
     """
-    pixels = map_pixels(frame, description)
-    images = {
-        "pressure_kpa": frame.pressure_kpa,
-        "magnitude": frame.map,
-        "structure": frame.structure,
-    }
-    known = {name: image for name, image in images.items() if image is not None}
-    if pixels is None or frame.x_mm is None or frame.y_mm is None:
+    pixels, shown = map_pixels(frame, description), shown_image(frame, description)
+    if pixels is None or shown is None or frame.x_mm is None or frame.y_mm is None:
         return None
+    images = [
+        ("pressure_kpa", frame.pressure_kpa),
+        ("magnitude", frame.map),
+        ("structure", frame.structure),
+    ]
+    values = known(images)
     rows, columns, _ = pixels.shape
     colours = ("red", "green", "blue", "alpha")
-    cells = np.zeros((rows, columns), [(n, "u1") for n in colours] + [(n, "<f4") for n in known])
+    cells = np.zeros((rows, columns), [(n, "u1") for n in colours] + [(n, "<f4") for n in values])
     for number, name in enumerate(colours[:3]):
         cells[name] = _faded(pixels, stale)[..., number]
-    cells["alpha"] = np.where(_on_sheet(frame, description), 255, 0)
-    for name, image in known.items():
+    cells["alpha"] = np.where(known_nodes(frame, shown[0]), 255, 0)
+    for name, image in values.items():
         cells[name] = image
     (left, right), (bottom, top) = frame.x_mm, frame.y_mm
     dx, dy = (right - left) * 1e-3 / (columns - 1), (top - bottom) * 1e-3 / (rows - 1)
@@ -134,16 +134,13 @@ def grid(frame: Frame, description: Mapping[str, Any], time_ns: int, stale: bool
 
 
 def _fields(cells: np.dtype[Any]) -> list[PackedElementField]:
-    offsets = {name: field[1] for name, field in (cells.fields or {}).items()}
     return [
-        PackedElementField(
-            name=name, offset=offset, type=_BYTE if cells[name].itemsize == 1 else _FLOAT
-        )
-        for name, offset in offsets.items()
+        PackedElementField(name=name, offset=offset, type=_BYTE if kind == np.uint8 else _FLOAT)
+        for name, (kind, offset, *_) in (cells.fields or {}).items()
     ]
 
 
-def image(frame: Frame, description: Mapping[str, Any], time_ns: int, stale: bool) -> Any:
+def image(frame: Frame, description: Mapping[str, Any], time_ns: int, stale: str) -> Any:
     """Return the map as a picture for the Image panel, y up; None for a frame without images."""
     pixels = map_pixels(frame, description)
     if pixels is None:
@@ -161,7 +158,7 @@ def image(frame: Frame, description: Mapping[str, Any], time_ns: int, stale: boo
 
 
 def image_annotations(
-    frame: Frame, description: Mapping[str, Any], time_ns: int, stale: bool
+    frame: Frame, description: Mapping[str, Any], time_ns: int, stale: str
 ) -> ImageAnnotations | None:
     """Return the contacts as circles and labels on that picture."""
     shown = shown_image(frame, description)
@@ -213,34 +210,24 @@ def contacts_scene(
             frame_id=frame.sensor,
             id=f"contact {contact.id}",
             metadata=_metadata(contact),
-            cylinders=[_disc(contact, description, bool(stale))],
-            texts=[_floating_label(contact, description, bool(stale))],
+            cylinders=[_disc(contact, description, stale)],
+            texts=[_floating_label(contact, description, stale)],
         )
         for contact in frame.contacts
     ]
     if stale:
-        entities.append(_warning(frame.sensor, description, stale, at))
+        above = _pose(0.0, 0.6 * float(description.get("height_mm") or 150.0), 0.02)
+        red = Color(r=1.0, g=0.35, b=0.3, a=1.0)
+        words = _text(stale.replace("; ", "\n"), above, red, 16.0)
+        entities.append(SceneEntity(timestamp=at, frame_id=frame.sensor, id="stale", texts=[words]))
     return SceneUpdate(deletions=[everything], entities=entities)
 
 
-def _warning(sensor: str, description: Mapping[str, Any], text: str, at: Timestamp) -> SceneEntity:
-    above = Vector3(x=0.0, y=0.6 * _height_mm(description) * 1e-3, z=0.02)
-    return SceneEntity(
-        timestamp=at,
-        frame_id=sensor,
-        id="stale",
-        texts=[_text(text.replace("; ", "\n"), above, Color(r=1.0, g=0.35, b=0.3, a=1.0), 16.0)],
-    )
-
-
-def _disc(contact: Contact, description: Mapping[str, Any], stale: bool) -> CylinderPrimitive:
+def _disc(contact: Contact, description: Mapping[str, Any], stale: str) -> CylinderPrimitive:
     diameter_m = contact_diameter_mm(contact) * 1e-3
     height_m = disc_height_m(contact, description)
     return CylinderPrimitive(
-        pose=Pose(
-            position=Vector3(x=contact.x_mm * 1e-3, y=contact.y_mm * 1e-3, z=height_m / 2),
-            orientation=_UPRIGHT,
-        ),
+        pose=_pose(contact.x_mm, contact.y_mm, height_m / 2),
         size=Vector3(x=diameter_m, y=diameter_m, z=height_m),
         bottom_scale=1.0,
         top_scale=1.0,
@@ -248,15 +235,18 @@ def _disc(contact: Contact, description: Mapping[str, Any], stale: bool) -> Cyli
     )
 
 
-def _floating_label(contact: Contact, description: Mapping[str, Any], stale: bool) -> TextPrimitive:
-    top = disc_height_m(contact, description) + 0.006
-    position = Vector3(x=contact.x_mm * 1e-3, y=contact.y_mm * 1e-3, z=top)
-    return _text(label(contact), position, GREY if stale else WHITE, 12.0)
+def _floating_label(contact: Contact, description: Mapping[str, Any], stale: str) -> TextPrimitive:
+    above = _pose(contact.x_mm, contact.y_mm, disc_height_m(contact, description) + 0.006)
+    return _text(label(contact), above, GREY if stale else WHITE, 12.0)
 
 
-def _text(text: str, position: Vector3, colour: Color, pixels: float) -> TextPrimitive:
+def _pose(x_mm: float, y_mm: float, z_m: float) -> Pose:
+    return Pose(position=Vector3(x=x_mm * 1e-3, y=y_mm * 1e-3, z=z_m), orientation=_UPRIGHT)
+
+
+def _text(text: str, pose: Pose, colour: Color, pixels: float) -> TextPrimitive:
     return TextPrimitive(
-        pose=Pose(position=position, orientation=_UPRIGHT),
+        pose=pose,
         billboard=True,
         font_size=pixels,
         scale_invariant=True,
@@ -286,7 +276,7 @@ def _level(contact: Contact, description: Mapping[str, Any]) -> float | None:
     return None
 
 
-def _disc_colour(contact: Contact, description: Mapping[str, Any], stale: bool) -> Color:
+def _disc_colour(contact: Contact, description: Mapping[str, Any], stale: str) -> Color:
     if stale:
         return Color(r=0.5, g=0.5, b=0.5, a=STALE_ALPHA)
     level = _level(contact, description)
@@ -309,8 +299,7 @@ def sheet_scene(sensor: str, description: Mapping[str, Any], time_ns: int) -> Sc
     cubes, texts = [], []
     for number, (x, y) in enumerate(description.get("electrodes_mm") or []):
         cubes.append(_electrode(x, y, width))
-        outside = Vector3(x=x * 1.07e-3, y=y * 1.07e-3, z=0.0)
-        texts.append(_text(str(number), outside, thin, 11.0))
+        texts.append(_text(str(number), _pose(1.07 * x, 1.07 * y, 0.0), thin, 11.0))
     entity = SceneEntity(
         timestamp=to_timestamp(time_ns),
         frame_id=sensor,
@@ -345,7 +334,7 @@ def _outline(
 def _electrode(x_mm: float, y_mm: float, width_mm: float) -> CubePrimitive:
     side = 0.02 * width_mm * 1e-3
     return CubePrimitive(
-        pose=Pose(position=Vector3(x=x_mm * 1e-3, y=y_mm * 1e-3, z=0.0), orientation=_UPRIGHT),
+        pose=_pose(x_mm, y_mm, 0.0),
         size=Vector3(x=side, y=side, z=side / 2),
         color=Color(r=0.85, g=0.65, b=0.3, a=1.0),
     )
@@ -384,22 +373,12 @@ def contact_numbers(contact: Contact) -> dict[str, Any]:
     return known((field.name, getattr(contact, field.name)) for field in fields(Contact))
 
 
-def _on_sheet(frame: Frame, description: Mapping[str, Any]) -> NDArray[np.bool_]:
-    shown = shown_image(frame, description)
-    assert shown is not None
-    return known_nodes(frame, shown[0])
-
-
-def _faded(pixels: Pixels, stale: bool) -> Pixels:
+def _faded(pixels: Pixels, stale: str) -> Pixels:
     """Return the colours, or greys of half their brightness for what is old."""
     if not stale:
         return pixels
     grey = pixels.mean(axis=-1, keepdims=True) * 0.5 + 40
     return np.repeat(grey, 3, axis=-1).astype(np.uint8)
-
-
-def _height_mm(description: Mapping[str, Any]) -> float:
-    return float(description.get("height_mm") or 150.0)
 
 
 def known(fields: Iterable[tuple[str, Any]]) -> dict[str, Any]:

@@ -31,7 +31,6 @@ class Placement:
 
         Raises:
             ValueError: it is neither.
-
         """
         numbers = [float(number) for number in pose.split(",")]
         if len(numbers) not in (3, 6) or not all(math.isfinite(number) for number in numbers):

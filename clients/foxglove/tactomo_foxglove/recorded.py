@@ -32,7 +32,6 @@ def write_mcap(
         sensor: the sensor's name.
         description: the sensor, as `status` has it; empty where it is not known.
         placement: where the sensor hangs.
-
     """
     context = foxglove.Context()
     transforms = FrameTransformsChannel("/tf", context=context)

@@ -22,7 +22,7 @@ lifts.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any, Final
 
@@ -106,7 +106,6 @@ class SensorTopics:
 
     Attributes:
         description: the sensor, as `status` has it; empty until `sheet` has said it.
-
     """
 
     def __init__(
@@ -169,20 +168,15 @@ class SensorTopics:
 
     def _show(self, frame: Frame, time_ns: int, stale: str) -> None:
         """Draw a frame, as far as anybody looks."""
-        about = self.description
-        if self._contacts.has_sinks():
-            scene = messages.contacts_scene(frame, about, time_ns, stale)
-            self._contacts.log(scene, log_time=time_ns)
-        if self._grid.has_sinks() and (grid := messages.grid(frame, about, time_ns, bool(stale))):
-            self._grid.log(grid, log_time=time_ns)
-        if self._image.has_sinks() and (
-            image := messages.image(frame, about, time_ns, bool(stale))
-        ):
-            self._image.log(image, log_time=time_ns)
-        if self._annotations.has_sinks() and (
-            marks := messages.image_annotations(frame, about, time_ns, bool(stale))
-        ):
-            self._annotations.log(marks, log_time=time_ns)
+        drawings: tuple[tuple[Any, Callable[..., Any]], ...] = (
+            (self._contacts, messages.contacts_scene),
+            (self._grid, messages.grid),
+            (self._image, messages.image),
+            (self._annotations, messages.image_annotations),
+        )
+        for channel, draw in drawings:
+            if channel.has_sinks() and (drawn := draw(frame, self.description, time_ns, stale)):
+                channel.log(drawn, log_time=time_ns)
 
 
 class _Traces:

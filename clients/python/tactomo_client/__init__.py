@@ -19,11 +19,11 @@ from tactomo_client.control import (
     CalibrationInForce,
     Control,
     Daemon,
+    MethodInForce,
     RecordedFile,
     RecordingStarted,
     RunningRecording,
     Tare,
-    TierInForce,
     request,
 )
 from tactomo_client.errors import (
@@ -74,6 +74,7 @@ __all__ = [
     "Keys",
     "KeysError",
     "MessageError",
+    "MethodInForce",
     "NoAnswer",
     "NoData",
     "NoNetwork",
@@ -87,7 +88,6 @@ __all__ = [
     "Subscription",
     "Tare",
     "TareRefused",
-    "TierInForce",
     "request",
     "subscribe",
 ]

@@ -22,8 +22,8 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
+from functools import cached_property
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal, Self, TypeVar, Unpack, cast, overload
 
 import zmq
@@ -32,7 +32,6 @@ import zmq.asyncio
 from tactomo_client.arguments import checked_seconds
 from tactomo_client.connection import Owner, Waiting
 from tactomo_client.control import (
-    CONNECT_TIMEOUT_S,
     RECORD_TIMEOUT_S,
     RELOAD_TIMEOUT_S,
     TARE_TIMEOUT_S,
@@ -40,11 +39,11 @@ from tactomo_client.control import (
     BudgetInForce,
     CalibrationInForce,
     ControlLine,
+    MethodInForce,
     RecordedFile,
     RecordingStarted,
     RunningRecording,
     Tare,
-    TierInForce,
     record_arguments,
     to_status,
 )
@@ -52,8 +51,8 @@ from tactomo_client.errors import ClientError
 from tactomo_client.event import Event
 from tactomo_client.filled import filled
 from tactomo_client.frame import Frame
-from tactomo_client.keys import Keys, as_keys
-from tactomo_client.messages import DEFAULT_CONTROL, DEFAULT_STREAM
+from tactomo_client.keys import Keys
+from tactomo_client.messages import DEFAULT_CONTROL
 from tactomo_client.reception import Item, Kind, Options, Reception, T_co
 from tactomo_client.status import Status
 
@@ -84,11 +83,7 @@ def subscribe(
     sensor: str,
     *,
     kind: Kind | tuple[Kind, ...] = "map",
-    address: str = DEFAULT_STREAM,
-    latest_only: bool = False,
-    stale_after_s: float | None = None,
-    timeout_s: float | None = None,
-    keys: Keys | str | Path | None = None,
+    **options: Unpack[Options],
 ) -> Subscription[Any]:
     """Subscribe to one sensor's frames, as `tactomo_client.subscribe` does, within an event loop.
 
@@ -100,24 +95,17 @@ def subscribe(
             async for frame in skin:
                 ...
     """
-    return Subscription(
-        _open_subscriber,
-        sensor,
-        address,
-        kind,
-        latest_only,
-        stale_after_s,
-        timeout_s,
-        as_keys(keys),
-    )
+    return Subscription(sensor, kind, **options)
 
 
 class Subscription(Reception[T_co], AsyncIterator[T_co]):
     """An open subscription of an event loop. Close it, or use it in an `async with` block.
 
     Belongs to the event loop in which it is first awaited. `subscribe` makes one.
-
     """
+
+    def _open(self) -> Owner:
+        return _open(zmq.SUB)
 
     async def __anext__(self) -> T_co:
         """Wait for the next frame, in an `async for` or with `anext`.
@@ -125,7 +113,6 @@ class Subscription(Reception[T_co], AsyncIterator[T_co]):
         Raises:
             StreamTimeout: it does not come within `timeout_s`.
             KeysError: the server does not let this client in. The next call knocks once more.
-
         """
         item = await _wait(self._arrival(self.timeout_s))
         if item is not None:
@@ -139,7 +126,6 @@ class Subscription(Reception[T_co], AsyncIterator[T_co]):
 
         Raises:
             KeysError: the server does not let this client in. The next call knocks once more.
-
         """
         return await _wait(self._arrival(checked_seconds("timeout_s", timeout_s, past=True)))
 
@@ -155,12 +141,7 @@ class Subscription(Reception[T_co], AsyncIterator[T_co]):
     async def __aenter__(self) -> Self:
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         self.close()
 
 
@@ -177,60 +158,38 @@ async def request(
         return await control.request(command, timeout_s, **arguments)
 
 
-class Control:
+class Control(ControlLine):
     """A control socket, the daemon's or the twin's: `tactomo_client.Control` for asyncio.
 
     Several tasks may use it at once; their commands are carried out in the order of the calls.
-
-    Args:
-        address: where it is.
-        keys: keys, or the folder that holds them, for a daemon beyond this computer.
-        timeout_s: how long to wait for replies, seconds, where nothing else is said.
-        connect_timeout_s: how long, of that, while nothing listens at the address.
-
+    Arguments are those of `tactomo_client.Control`.
     """
 
-    def __init__(
-        self,
-        address: str = DEFAULT_CONTROL,
-        *,
-        keys: Keys | str | Path | None = None,
-        timeout_s: float = TIMEOUT_S,
-        connect_timeout_s: float = CONNECT_TIMEOUT_S,
-    ) -> None:
-        self.address = address
-        self.timeout_s = checked_seconds("timeout_s", timeout_s, zero=False)
-        self._line = ControlLine(_open_requester, address, as_keys(keys), connect_timeout_s)
-        self._turn = asyncio.Lock()
+    @cached_property
+    def _turn(self) -> asyncio.Lock:
+        return asyncio.Lock()
 
     async def request(
         self, command: str, timeout_s: float | None = None, /, **arguments: Any
     ) -> dict[str, Any]:
         """Send any command and return its result as it came; errors are those of `request`."""
-        patience_s = self.timeout_s if timeout_s is None else timeout_s
         async with self._turn:
-            return await _wait(self._line.exchange(command, arguments, patience_s))
+            return await _wait(self._exchange(command, arguments, timeout_s))
 
-    def close(self) -> None:
-        """Close the connection; the next command opens another. Closing twice is fine."""
-        self._line.close()
+    def _open(self) -> Owner:
+        return _open(zmq.REQ)
 
     async def __aenter__(self) -> Self:
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         self.close()
 
 
 class Daemon(Control):
     """A running daemon, to be given commands: `tactomo_client.Daemon` for asyncio.
 
-    Commands, results and errors are the same.
+    Commands, arguments, results and errors are the same.
 
     Example::
 
@@ -238,7 +197,6 @@ class Daemon(Control):
             await daemon.tare()
             async with daemon.record("/data/grasp.mcap", maps=True):
                 await grasp()
-
     """
 
     async def status(self) -> Status:
@@ -246,44 +204,26 @@ class Daemon(Control):
         return to_status(await self.request("status"))
 
     async def tare(self, timeout_s: float = TARE_TIMEOUT_S) -> Tare:
-        """Take a new reference: the next scans of the *unloaded* skin count as nothing pressed.
-
-        Raises:
-            TareRefused: somebody presses.
-            NoData: no scans come.
-
-        """
+        """Take a new reference: the next scans of the *unloaded* skin count as nothing pressed."""
         return filled(Tare, await self.request("tare", timeout_s))
 
     async def record_start(
         self, path: str | Path | None = None, *, maps: bool | None = None
     ) -> RecordingStarted:
-        """Start a recording, as `tactomo_client.Daemon.record_start` does.
-
-        Raises:
-            AlreadyRecording: one runs.
-            CannotWrite: the file exists, or cannot be created, or the disk is full.
-
-        """
+        """Start a recording of what the ports say, which goes on until `record_stop`."""
         arguments = record_arguments(path, maps)
         result = await self.request("record_start", RECORD_TIMEOUT_S, **arguments)
         return filled(RecordingStarted, result)
 
     async def record_stop(self) -> RecordedFile:
-        """Stop the recording.
-
-        Raises:
-            NotRecording: none runs.
-            CannotWrite: it could not be written to its end.
-
-        """
+        """Stop the recording."""
         return filled(RecordedFile, await self.request("record_stop", RECORD_TIMEOUT_S))
 
     @asynccontextmanager
     async def record(
         self, path: str | Path | None = None, *, maps: bool | None = None
     ) -> AsyncIterator[RunningRecording]:
-        """Record during an `async with` block; as `tactomo_client.Daemon.record`."""
+        """Record during an `async with` block."""
         recording = RunningRecording((await self.record_start(path, maps=maps)).path)
         try:
             yield recording
@@ -293,33 +233,18 @@ class Daemon(Control):
             raise
         recording.file = await self.record_stop()
 
-    async def set_tier(self, tier: str) -> TierInForce:
-        """Choose how much model frames are given, such as ``auto`` or ``levelset``.
+    async def set_method(self, method: str) -> MethodInForce:
+        """Choose what solves frames."""
+        return filled(MethodInForce, await self.request("set_tier", tier=method))
 
-        Raises:
-            BadArgument: there is no such tier.
-            NoNetwork: the sensor has no network for it.
-
-        """
-        return filled(TierInForce, await self.request("set_tier", tier=tier))
+    set_tier = set_method  # as the stream calls it
 
     async def set_budget(self, budget_ms: float | None) -> BudgetInForce:
-        """Choose how long a frame may take, ms; None leaves it to the tier.
-
-        Raises:
-            BadArgument: not more than 0.
-
-        """
+        """Choose how long a frame may take, ms; None leaves it to the method."""
         return filled(BudgetInForce, await self.request("set_budget", budget_ms=budget_ms))
 
     async def reload_calibration(self) -> CalibrationInForce:
-        """Have the sensor's pressure calibration read again: a new one is in force at once.
-
-        Raises:
-            CalibrationRefused: it is damaged, or of another sensor or device; what was in force
-                stays so.
-
-        """
+        """Have the sensor's pressure calibration read again: a new one is in force at once."""
         result = await self.request("reload_calibration", RELOAD_TIMEOUT_S)
         return filled(CalibrationInForce, result)
 
@@ -345,14 +270,6 @@ async def _is_readable(socket: Owner, wait_ms: int) -> bool:
         if socket.closed and task is not None and not task.cancelling():
             return False  # it was closed under us; nobody cancelled this task
         raise
-
-
-def _open_subscriber() -> Owner:
-    return _open(zmq.SUB)
-
-
-def _open_requester() -> Owner:
-    return _open(zmq.REQ)
 
 
 def _open(kind: int) -> Owner:

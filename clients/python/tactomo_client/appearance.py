@@ -31,7 +31,6 @@ def map_pixels(frame: Frame, description: Mapping[str, Any]) -> NDArray[np.uint8
     Args:
         frame: a frame with images.
         description: the sensor, as `status` has it; may be empty.
-
     """
     shown = shown_image(frame, description)
     if shown is None:

@@ -21,7 +21,6 @@ def checked_seconds(
     Raises:
         TypeError: it is no number.
         ValueError: it is NaN, or makes no sense.
-
     """
     if not isinstance(value, Real) or isinstance(value, bool):
         raise TypeError(f"{name} = {value!r} is no number: give seconds, such as 0.5")

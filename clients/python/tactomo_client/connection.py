@@ -15,7 +15,7 @@ from typing import Any, Final, TypeVar
 
 import zmq
 
-from tactomo_client.errors import ControlError, KeysError, control_error
+from tactomo_client.errors import ControlError, KeysError
 from tactomo_client.keys import Handshakes, Keys, secure
 from tactomo_client.messages import MAX_MESSAGE_BYTES
 
@@ -60,10 +60,7 @@ class Connection:
     Attributes:
         socket: what to send and receive by, without waiting.
         owner: what to wait for.
-
-    Raises:
-        ControlError: `address` is not an address.
-
+        handshakes: what became of them when `refusal` last looked.
     """
 
     def __init__(self, owner: Owner, address: str, keys: Keys | None) -> None:
@@ -72,8 +69,8 @@ class Connection:
         self.socket: zmq.Socket[bytes] = zmq.Socket.shadow(owner.underlying)
         self._keys = keys
         self._knock_at_s = 0.0
-        self._handshakes = Handshakes(owner)
-        self._closed = weakref.finalize(self, _close, self._handshakes, owner)
+        self.handshakes = Handshakes(owner)
+        self._closed = weakref.finalize(self, _close, self.handshakes, owner)
         try:
             secure(self.socket, address, keys)
             self.socket.setsockopt(zmq.LINGER, 0)
@@ -83,12 +80,21 @@ class Connection:
             raise
 
     def connect(self) -> None:
-        """Connect, when all options are set."""
+        """Connect, when all options are set.
+
+        Raises:
+            ControlError: the address is none.
+        """
         try:
             self.socket.connect(self.address)
         except zmq.ZMQError as error:
             self.close()
-            raise bad_address(self.address, error) from error
+            raise ControlError(
+                f"cannot connect to {self.address!r}: {error.strerror}",
+                "an address looks like tcp://127.0.0.1:5560 (the stream), tcp://127.0.0.1:5561 "
+                "(the control socket) or ipc:///run/tactomo/stream",
+                "bad_address",
+            ) from error
 
     @property
     def is_open(self) -> bool:
@@ -98,16 +104,6 @@ class Connection:
     def close(self) -> None:
         """Close it; closing twice is fine."""
         self._closed()
-
-    @property
-    def has_been_let_in(self) -> bool:
-        """Whether the server has ever taken this client in, as far as `refusal` has looked."""
-        return self._handshakes.have_succeeded
-
-    @property
-    def is_connected(self) -> bool:
-        """Whether something listened at the address when `refusal` last looked."""
-        return self._handshakes.is_connected
 
     def send(self, message: bytes) -> bool:
         """Send a message, if that can be done now: not while the server lets nobody in."""
@@ -126,7 +122,7 @@ class Connection:
 
     def refusal(self) -> KeysError | None:
         """Return why the server lets nobody in by these keys; None as long as it may do so."""
-        return self._handshakes.refusal(self.address, self._keys)
+        return self.handshakes.refusal(self.address, self._keys)
 
     def knock_again(self) -> KeysError | None:
         """Return why the server does not let us in, if so, and try again from time to time.
@@ -136,7 +132,9 @@ class Connection:
         refusal = self.refusal()
         if refusal and time.monotonic() >= self._knock_at_s:
             self._knock_at_s = time.monotonic() + KNOCK_PERIOD_S
-            reconnect(self.socket, self.address)
+            with contextlib.suppress(zmq.ZMQError):  # the connection may be gone altogether
+                self.socket.disconnect(self.address)
+            self.socket.connect(self.address)
         return refusal
 
 
@@ -157,7 +155,6 @@ def connect_subscriber(
 
     Raises:
         ControlError: `address` is not an address; the socket is closed then.
-
     """
     connection = Connection(owner, address, keys)
     # A computer that lost power never closes its connections; heartbeats notice.
@@ -169,20 +166,3 @@ def connect_subscriber(
         connection.socket.setsockopt(zmq.SUBSCRIBE, prefix)
     connection.connect()
     return connection
-
-
-def reconnect(socket: zmq.Socket[Any], address: str) -> None:
-    """Drop a connection and make it anew; what is subscribed to stays so."""
-    with contextlib.suppress(zmq.ZMQError):  # it may be gone altogether
-        socket.disconnect(address)
-    socket.connect(address)
-
-
-def bad_address(address: str, error: zmq.ZMQError) -> ControlError:
-    """Return the error for an address that ZeroMQ cannot connect to."""
-    return control_error(
-        f"cannot connect to {address!r}: {error.strerror}",
-        "an address looks like tcp://127.0.0.1:5560 (the stream), tcp://127.0.0.1:5561 (the "
-        "control socket) or ipc:///run/tactomo/stream",
-        "bad_address",
-    )

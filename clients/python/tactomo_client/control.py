@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, Self
 
 import zmq
@@ -18,7 +17,7 @@ from tactomo_client.errors import ClientError, ControlError, control_error
 from tactomo_client.filled import filled
 from tactomo_client.keys import Keys, as_keys
 from tactomo_client.messages import DEFAULT_CONTROL, decode_reply, encode_request
-from tactomo_client.status import Calibration, Status, status_from_fields
+from tactomo_client.status import STALE_AFTER_S, Calibration, Status
 
 TIMEOUT_S: Final = 2.0
 TARE_TIMEOUT_S: Final = 30.0
@@ -48,7 +47,7 @@ def request(
         timeout_s: how long to wait for the reply, seconds; but no longer than 5 s where nothing
             listens at the address (see `Control`).
         keys: keys, or the folder that holds them, for a daemon beyond this computer.
-        **arguments: the command's arguments, for example ``tier="quiet"``.
+        **arguments: the command's arguments, for example ``tier="fit"``.
 
     Raises:
         ControlError: the command was refused, or nothing answered (`NoAnswer`).
@@ -59,7 +58,6 @@ def request(
     Example::
 
         request("press", DEFAULT_TWIN_CONTROL, x_mm=10.0, y_mm=0.0)
-
     """
     with Control(address, keys=keys) as control:
         return control.request(command, timeout_s, **arguments)
@@ -70,32 +68,44 @@ class ControlLine:
 
     The socket is kept from command to command, and left for another after one that was not
     answered: a REQ socket cannot send again then.
+
+    Args:
+        address: where the control socket is.
+        keys: keys, or the folder that holds them, for a daemon beyond this computer.
+        timeout_s: how long to wait for replies, seconds, where nothing else is said.
+        connect_timeout_s: how long, of that, while nothing listens at the address. A program that
+            starts a daemon and gives it a command at once may need more, as where the sensor's
+            models are to be built first.
+
+    Raises:
+        TypeError, ValueError: a time is no number, or is not above 0.
     """
 
     def __init__(
         self,
-        owner: Callable[[], Owner],
-        address: str,
-        keys: Keys | None,
-        connect_timeout_s: float,
+        address: str = DEFAULT_CONTROL,
+        *,
+        keys: Keys | str | Path | None = None,
+        timeout_s: float = TIMEOUT_S,
+        connect_timeout_s: float = CONNECT_TIMEOUT_S,
     ) -> None:
         self.address = address
-        self._owner = owner
-        self._keys = keys
+        self.timeout_s = checked_seconds("timeout_s", timeout_s, zero=False)
         self._connect_timeout_s = checked_seconds(
             "connect_timeout_s", connect_timeout_s, zero=False
         )
+        self._keys = as_keys(keys)
         self._connection: Connection | None = None
 
-    def exchange(
-        self, command: str, arguments: Mapping[str, Any], timeout_s: float
+    def _open(self) -> Owner:
+        """Return a new REQ socket."""
+        raise NotImplementedError
+
+    def _exchange(
+        self, command: str, arguments: Mapping[str, Any], given_timeout_s: float | None
     ) -> Waiting[dict[str, Any]]:
-        """Send one command; the outcome is its result.
-
-        Raises:
-            ControlError, KeysError, MessageError: as `request`.
-
-        """
+        """Send one command; the outcome is its result, errors are those of `request`."""
+        timeout_s = self.timeout_s if given_timeout_s is None else given_timeout_s
         checked_seconds("timeout_s", timeout_s, zero=False)
         message = encode_request(command, arguments)
         connection = self._connection or self._connect()
@@ -112,7 +122,7 @@ class ControlLine:
                 if refusal := connection.refusal():
                     raise refusal
                 now_s = time.monotonic()
-                if connection.is_connected:
+                if connection.handshakes.is_connected:
                     connected_by_s = now_s + self._connect_timeout_s
                 if now_s >= min(replied_by_s, connected_by_s) or not connection.is_open:
                     raise _no_answer(connection, min(timeout_s, now_s - begin_s))
@@ -122,13 +132,13 @@ class ControlLine:
         return decode_reply(reply)
 
     def close(self) -> None:
-        """Close the socket; the next command opens another."""
+        """Close the connection; the next command opens another. Closing twice is fine."""
         if self._connection is not None:
             self._connection.close()
             self._connection = None
 
     def _connect(self) -> Connection:
-        self._connection = Connection(self._owner(), self.address, self._keys)
+        self._connection = Connection(self._open(), self.address, self._keys)
         self._connection.connect()
         return self._connection
 
@@ -161,10 +171,11 @@ class RecordedFile:
 
 
 @dataclass(frozen=True, slots=True)
-class TierInForce:
-    """How much model frames are given from now on."""
+class MethodInForce:
+    """What solves frames from now on."""
 
     tier: str
+    """The method's name; the stream calls it a tier."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +183,7 @@ class BudgetInForce:
     """How long a frame may take from now on."""
 
     budget_ms: float | None
-    """None: the tier's own."""
+    """None: the method's own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,62 +204,32 @@ class RunningRecording:
     """What was recorded; None as long as it runs."""
 
 
-class Control:
+class Control(ControlLine):
     """A control socket, the daemon's or the twin's. Close it, or use it in a `with` block.
 
     Connects with the first command, and again by itself after the other side was restarted. Belongs
-    to the thread that uses it; `tactomo_client.aio` has the same for asyncio.
-
-    Args:
-        address: where it is.
-        keys: keys, or the folder that holds them, for a daemon beyond this computer.
-        timeout_s: how long to wait for replies, seconds, where nothing else is said.
-        connect_timeout_s: how long, of that, while nothing listens at the address. A program that
-            starts a daemon and gives it a command at once may need more, as where the sensor's
-            models are to be built first.
-
-    Raises:
-        TypeError, ValueError: a time is no number, or is not above 0.
+    to the thread that uses it; `tactomo_client.aio` has the same for asyncio. Arguments are those
+    of `ControlLine`.
 
     Example::
 
         with Control(DEFAULT_TWIN_CONTROL) as twin:
             twin.request("press", x_mm=10.0, y_mm=0.0)
-
     """
-
-    def __init__(
-        self,
-        address: str = DEFAULT_CONTROL,
-        *,
-        keys: Keys | str | Path | None = None,
-        timeout_s: float = TIMEOUT_S,
-        connect_timeout_s: float = CONNECT_TIMEOUT_S,
-    ) -> None:
-        self.address = address
-        self.timeout_s = checked_seconds("timeout_s", timeout_s, zero=False)
-        self._line = ControlLine(_open, address, as_keys(keys), connect_timeout_s)
 
     def request(
         self, command: str, timeout_s: float | None = None, /, **arguments: Any
     ) -> dict[str, Any]:
         """Send any command and return its result as it came; errors are those of `request`."""
-        patience_s = self.timeout_s if timeout_s is None else timeout_s
-        return wait(self._line.exchange(command, arguments, patience_s))
+        return wait(self._exchange(command, arguments, timeout_s))
 
-    def close(self) -> None:
-        """Close the connection; closing twice is fine."""
-        self._line.close()
+    def _open(self) -> Owner:
+        return zmq.Context.instance().socket(zmq.REQ)
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -265,7 +246,6 @@ class Daemon(Control):
             daemon.tare()
             with daemon.record("/data/grasp.mcap", maps=True):
                 grasp()
-
     """
 
     def status(self) -> Status:
@@ -284,7 +264,6 @@ class Daemon(Control):
         Raises:
             TareRefused: somebody presses.
             NoData: no scans come.
-
         """
         return filled(Tare, self.request("tare", timeout_s))
 
@@ -301,7 +280,6 @@ class Daemon(Control):
         Raises:
             AlreadyRecording: one runs.
             CannotWrite: the file exists, or cannot be created, or the disk is full.
-
         """
         arguments = record_arguments(path, maps)
         return filled(RecordingStarted, self.request("record_start", RECORD_TIMEOUT_S, **arguments))
@@ -312,7 +290,6 @@ class Daemon(Control):
         Raises:
             NotRecording: none runs.
             CannotWrite: it could not be written to its end.
-
         """
         return filled(RecordedFile, self.request("record_stop", RECORD_TIMEOUT_S))
 
@@ -327,7 +304,6 @@ class Daemon(Control):
             with daemon.record("/data/grasp.mcap", maps=True) as recording:
                 grasp()
             print(recording.file.bytes)
-
         """
         recording = RunningRecording(self.record_start(path, maps=maps).path)
         try:
@@ -338,22 +314,22 @@ class Daemon(Control):
             raise
         recording.file = self.record_stop()
 
-    def set_tier(self, tier: str) -> TierInForce:
-        """Choose how much model frames are given, such as ``auto`` or ``levelset``.
+    def set_method(self, method: str) -> MethodInForce:
+        """Choose what solves frames: one of `Status.methods`, such as ``auto`` or ``fit``.
 
         Raises:
-            BadArgument: there is no such tier.
+            BadArgument: there is no such method.
             NoNetwork: the sensor has no network for it.
-
         """
-        return filled(TierInForce, self.request("set_tier", tier=tier))
+        return filled(MethodInForce, self.request("set_tier", tier=method))
+
+    set_tier = set_method  # as the stream calls it
 
     def set_budget(self, budget_ms: float | None) -> BudgetInForce:
-        """Choose how long a frame may take, ms; None leaves it to the tier.
+        """Choose how long a frame may take, ms; None leaves it to the method.
 
         Raises:
             BadArgument: not more than 0.
-
         """
         return filled(BudgetInForce, self.request("set_budget", budget_ms=budget_ms))
 
@@ -365,14 +341,13 @@ class Daemon(Control):
         Raises:
             CalibrationRefused: it is damaged, or of another sensor or device; what was in force
                 stays so.
-
         """
         return filled(CalibrationInForce, self.request("reload_calibration", RELOAD_TIMEOUT_S))
 
 
 def to_status(result: Mapping[str, Any]) -> Status:
     """Return the status in the reply to the command of that name, which has just come."""
-    return status_from_fields(result, time.monotonic_ns())
+    return Status.from_fields(result, time.monotonic_ns(), STALE_AFTER_S)
 
 
 def record_arguments(path: str | Path | None, maps: bool | None) -> dict[str, Any]:
@@ -381,13 +356,9 @@ def record_arguments(path: str | Path | None, maps: bool | None) -> dict[str, An
     return where if maps is None else {**where, "maps": maps}
 
 
-def _open() -> Owner:
-    return zmq.Context.instance().socket(zmq.REQ)
-
-
 def _no_answer(connection: Connection, waited_s: float) -> ControlError:
     silence = f"nothing answered at {connection.address} within {waited_s:.2g} s"
-    if connection.is_connected:
+    if connection.handshakes.is_connected:
         return control_error(
             f"{silence}, though something listens there",
             "if it is the daemon's control socket, its log says what it is busy with",
@@ -395,7 +366,7 @@ def _no_answer(connection: Connection, waited_s: float) -> ControlError:
         )
     return control_error(
         f"{silence}: nothing listens there",
-        "start the daemon with `tactomo daemon` (a simulated skin: `tactomo twin`), or give the "
-        "address of the one that runs",
+        "start the daemon with `tactomo daemon` (simulated skin and all: `tactomo demo`), or give "
+        "the address of the one that runs",
         "no_answer",
     )

@@ -11,7 +11,7 @@ ClientError
 │   ├── AlreadyRecording  a recording runs already
 │   ├── NotRecording      none runs that could be stopped
 │   ├── CannotWrite       the recording's file exists, may not be written, or the disk is full
-│   ├── NoNetwork         the sensor has no network for the tier that was asked for
+│   ├── NoNetwork         the sensor has no network for that method
 │   └── CalibrationRefused  the pressure calibration is damaged, another sensor's or device's
 ├── StreamTimeout   no frame came within `timeout_s`: the cable is out, the name is misspelt
 ├── KeysError       keys cannot be used (the file is missing, others may read it), or the server
@@ -22,6 +22,8 @@ ClientError
 
 from __future__ import annotations
 
+import re
+
 
 class ClientError(Exception):
     """Anything this package raises on purpose.
@@ -30,7 +32,6 @@ class ClientError(Exception):
         name: a short stable identifier such as ``no_answer``, for programs.
         cause: what went wrong, for people.
         next_step: what to do about it, for people; may be empty.
-
     """
 
     def __init__(self, cause: str, next_step: str = "", name: str = "client_error") -> None:
@@ -56,7 +57,6 @@ class ControlError(ClientError):
             scans = daemon.tare().scans
         except TareRefused as error:
             print(error.cause, error.next_step)
-
     """
 
 
@@ -89,7 +89,7 @@ class CannotWrite(ControlError):  # noqa: N818
 
 
 class NoNetwork(ControlError):  # noqa: N818
-    """``no_network``: the sensor has no network for the tier that was asked for."""
+    """``no_network``: the sensor has no network for that method."""
 
 
 class CalibrationRefused(ControlError):  # noqa: N818
@@ -97,15 +97,8 @@ class CalibrationRefused(ControlError):  # noqa: N818
 
 
 _OF_NAME = {
-    "no_answer": NoAnswer,
-    "bad_argument": BadArgument,
-    "tare_refused": TareRefused,
-    "no_data": NoData,
-    "already_recording": AlreadyRecording,
-    "not_recording": NotRecording,
-    "cannot_write": CannotWrite,
-    "no_network": NoNetwork,
-    "calibration_refused": CalibrationRefused,
+    "_".join(re.findall("[A-Z][a-z]+", each.__name__)).lower(): each
+    for each in ControlError.__subclasses__()
 }
 
 

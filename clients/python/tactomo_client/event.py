@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import math
-import time
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
-from tactomo_client.filled import filled
-from tactomo_client.messages import Message
+from tactomo_client.filled import Received
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class Event(Received):
     """Something that happened, such as ``port_lost``; STREAM.md lists them all.
 
     Example::
@@ -21,7 +16,6 @@ class Event:
         for event in subscribe("left_forearm", kind="event"):
             if event.severity == "error":
                 print(event.name, event.detail, event.next_step)
-
     """
 
     sensor: str
@@ -36,33 +30,3 @@ class Event:
     """What happened, in words."""
     next_step: str = ""
     """What to do about it, in words; may be empty."""
-    fields: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
-    """The whole message, as in STREAM.md."""
-    _received_ns: int = field(default=0, repr=False, compare=False)
-    _stale_after_s: float = field(default=math.inf, repr=False, compare=False)
-
-    @property
-    def age_s(self) -> float:
-        """Seconds since it came."""
-        return (time.monotonic_ns() - self._received_ns) * 1e-9
-
-    @property
-    def is_stale(self) -> bool:
-        """Whether it came longer ago than the subscription's `stale_after_s`, if it has one."""
-        return self.age_s > self._stale_after_s
-
-
-def event_from_message(message: Message, received_ns: int, stale_after_s: float) -> Event:
-    """Return the event in a message that came at `received_ns`, by the monotonic clock.
-
-    Raises:
-        MessageError: a field is missing or of the wrong type.
-
-    """
-    return filled(
-        Event,
-        message.fields,
-        fields=message.fields,
-        _received_ns=received_ns,
-        _stale_after_s=stale_after_s,
-    )

@@ -20,7 +20,6 @@ import time
 import uuid
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from types import TracebackType
 from typing import Any, Self
 
 import zmq
@@ -86,7 +85,6 @@ class FakeSensor:
             y_mm: positions of the images' first and last row.
             **changes: fields to send otherwise than they would be, for example
                 ``flags=["magnitude_missing"]`` or an old ``acquired_monotonic_ns``.
-
         """
         wire = [dataclasses.asdict(contact) for contact in contacts]
         images = {"map": map, "pressure_kpa": pressure_kpa, "structure": structure}
@@ -124,12 +122,7 @@ class FakeSensor:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -143,7 +136,6 @@ class FakeControl:
 
     Attributes:
         requests: the commands and arguments that came, in order.
-
     """
 
     def __init__(
@@ -168,12 +160,7 @@ class FakeControl:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _run(self) -> None:

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
+import time
 import types
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Self, TypeVar, get_args, get_origin, get_type_hints
 
 from tactomo_client.errors import MessageError
 
@@ -18,12 +20,42 @@ T = TypeVar("T")
 Reader = Callable[[str, object], Any]
 
 
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Received:
+    """A message that has come, by its fields."""
+
+    fields: Mapping[str, Any] = dataclasses.field(default_factory=dict, repr=False, compare=False)
+    """The whole message, as in STREAM.md."""
+    _received_ns: int = dataclasses.field(default=0, repr=False, compare=False)
+    _stale_after_s: float = dataclasses.field(default=math.inf, repr=False, compare=False)
+
+    @classmethod
+    def from_fields(cls, fields: Mapping[str, Any], received_ns: int, stale_after_s: float) -> Self:
+        """Return the message of these fields that came at `received_ns` by the monotonic clock.
+
+        Raises:
+            MessageError: a field is missing or of the wrong type.
+        """
+        return filled(
+            cls, fields, fields=fields, _received_ns=received_ns, _stale_after_s=stale_after_s
+        )
+
+    @property
+    def age_s(self) -> float:
+        """Seconds since the message came."""
+        return (time.monotonic_ns() - self._received_ns) * 1e-9
+
+    @property
+    def is_stale(self) -> bool:
+        """Whether the message came longer ago than the subscription's `stale_after_s`."""
+        return self.age_s > self._stale_after_s
+
+
 def filled(cls: type[T], fields: Mapping[str, Any], /, **own: Any) -> T:
     """Return a dataclass with the values of a map, and those of its `own` that no message has.
 
     Raises:
         MessageError: a field is missing that has no default, or is of the wrong type.
-
     """
     kind: Any = cls
     readers, required = _readers(kind)

@@ -10,15 +10,16 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from tactomo_client.errors import MessageError
 from tactomo_client.messages import MAP, Message, array_from_wire, clock_id, is_integer
 
-Image = NDArray[np.float32]
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+Image: TypeAlias = "NDArray[np.float32]"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +54,9 @@ class Contact:
     ``above``: `pressure_kpa` is the least that it can be; ``unknown``."""
 
 
+_MAY_BE_UNKNOWN = [name for name, kind in Contact.__annotations__.items() if "None" in kind]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
     """What the skin felt at one instant, and how far to trust it.
@@ -80,7 +84,7 @@ class Frame:
     skew_ms: float | None
     """The magnitude scan's time less the structure scan's; None where that is not known."""
     tier: str | None
-    """How much model the frame was given: quiet, tikhonov, fit, hybrid, ..."""
+    """What made the frame: ``quiet``, ``fit``, ``hybrid``, ..., or an own method's name."""
     tier_reason: str | None
     flags: frozenset[str]
     """What to be wary of, such as ``misfit_high``; empty when all is well. See STREAM.md."""
@@ -128,7 +132,6 @@ def frame_from_message(message: Message, received_ns: int | None, stale_after_s:
 
     Raises:
         MessageError: a field is missing or of the wrong type.
-
     """
     fields = message.fields
     has_images = message.kind == MAP
@@ -184,21 +187,16 @@ def is_our_clock(fields: Mapping[str, Any]) -> bool:
 def _contact(value: object) -> Contact:
     if not isinstance(value, dict):
         raise MessageError("a contact is not a map")
+    pressure_range = value.get("pressure_range", "unknown")
+    if not isinstance(pressure_range, str):
+        raise MessageError("field 'pressure_range' is not text")
     return Contact(
         id=_integer(value, "id"),
         x_mm=_number(value, "x_mm"),
         y_mm=_number(value, "y_mm"),
         area_mm2=_number(value, "area_mm2"),
-        magnitude=_number_or_none(value, "magnitude"),
-        magnitude_sigma=_number_or_none(value, "magnitude_sigma"),
-        pressure_kpa=_number_or_none(value, "pressure_kpa"),
-        x_sigma_mm=_number_or_none(value, "x_sigma_mm"),
-        y_sigma_mm=_number_or_none(value, "y_sigma_mm"),
-        area_sigma_mm2=_number_or_none(value, "area_sigma_mm2"),
-        pressure_sigma_kpa=_number_or_none(value, "pressure_sigma_kpa"),
-        force_n=_number_or_none(value, "force_n"),
-        force_sigma_n=_number_or_none(value, "force_sigma_n"),
-        pressure_range=_word(value, "pressure_range", "unknown"),
+        pressure_range=pressure_range,
+        **{name: _number_or_none(value, name) for name in _MAY_BE_UNKNOWN},
     )
 
 
@@ -206,7 +204,7 @@ def _image(fields: dict[str, Any], name: str) -> Image | None:
     if fields.get(name) is None:
         return None
     image = array_from_wire(fields[name])
-    if image.ndim != 2 or image.dtype != np.float32:
+    if image.ndim != 2 or image.dtype.name != "float32":
         raise MessageError(f"field {name!r} is not a two-dimensional array of float32")
     return image
 
@@ -217,13 +215,6 @@ def _extent(fields: dict[str, Any], name: str) -> tuple[float, float]:
         raise MessageError(f"field {name!r} is not [first, last]")
     ends = {"first": value[0], "last": value[1]}
     return _number(ends, "first"), _number(ends, "last")
-
-
-def _word(fields: Mapping[str, object], name: str, absent: str) -> str:
-    value = fields.get(name, absent)
-    if not isinstance(value, str):
-        raise MessageError(f"field {name!r} is not text")
-    return value
 
 
 def _integer(fields: Mapping[str, object], name: str) -> int:

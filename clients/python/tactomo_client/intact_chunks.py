@@ -43,7 +43,6 @@ def intact_chunks(file: IO[bytes], start: int = 0) -> Iterator[IntactChunk]:
 
     Raises:
         OSError: the disk cannot read it.
-
     """
     while (mark := _find_mark(file, start)) is not None:
         found = _read_chunk(file, mark - _BEFORE_MARK)

@@ -10,13 +10,12 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import struct
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Self
 
 import zmq
-from zmq.auth import load_certificate
-from zmq.utils.monitor import recv_monitor_message
 
 from tactomo_client.errors import KeysError
 
@@ -57,7 +56,6 @@ class Keys:
         Raises:
             KeysError: one of them is missing, there are several, a file holds no key, or others
                 may read the secret one.
-
         """
         where = Path(folder).expanduser()
         mine = _only(where, sorted(where.glob(f"*{SECRET_SUFFIX}")), "secret key of your own")
@@ -82,7 +80,6 @@ def read_secret(path: Path) -> tuple[bytes, bytes]:
 
     Raises:
         KeysError: it cannot be read, holds no secret key, or others may read it.
-
     """
     public, secret = _read(path)
     if secret is None:
@@ -117,6 +114,8 @@ def _only(folder: Path, paths: list[Path], what: str) -> Path:
 
 
 def _read(path: Path) -> tuple[bytes, bytes | None]:
+    from zmq.auth import load_certificate
+
     try:
         if path.stat().st_size > _MAX_FILE_BYTES:
             raise ValueError("it is too large")
@@ -150,7 +149,6 @@ class Handshakes:
     Attributes:
         have_succeeded: whether a server has ever taken this client in.
         is_connected: whether something listens at the other end, busy or not.
-
     """
 
     def __init__(self, socket: zmq.Socket[bytes]) -> None:
@@ -163,7 +161,8 @@ class Handshakes:
     def refusal(self, address: str, keys: Keys | None) -> KeysError | None:
         """Return why the server lets nobody in by these keys; None as long as it may do so."""
         while self._monitor.poll(0):
-            event = recv_monitor_message(self._monitor)["event"]
+            # As `zmq.utils.monitor` reads it, which imports asyncio.
+            (event,) = struct.unpack_from("=H", self._monitor.recv_multipart()[0])
             if event in (zmq.Event.CONNECTED, zmq.Event.DISCONNECTED):
                 self.is_connected = event == zmq.Event.CONNECTED
                 continue

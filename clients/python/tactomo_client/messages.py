@@ -6,6 +6,8 @@ arrive, decoding either returns a message that keeps the rules checked here or r
 `MessageError`, and nothing else.
 
 A stream message is one ZeroMQ part: topic ``<sensor>/<kind>``, a NUL byte, one MessagePack map.
+
+NumPy is imported with the first array: a command that only asks for a status does without it.
 """
 
 from __future__ import annotations
@@ -15,13 +17,14 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TypeGuard
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeGuard
 
 import msgpack  # type: ignore[import-untyped]
-import numpy as np
-from numpy.typing import NDArray
 
 from tactomo_client.errors import MessageError, control_error
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 SCHEMA: Final = 1
 DEFAULT_STREAM: Final = "tcp://127.0.0.1:5560"
@@ -109,7 +112,6 @@ def encode_message(sensor: str, kind: str, fields: Mapping[str, Any]) -> bytes:
 
     Raises:
         MessageError: a header field is missing or of the wrong type, or a value has no wire form.
-
     """
     head = topic(sensor, kind)
     _check_header(fields)
@@ -136,6 +138,8 @@ def decode_message(data: bytes) -> Message:
 
 def array_to_wire(array: NDArray[Any]) -> dict[str, Any]:
     """Return `array` (any shape of up to 4 dimensions, real numbers) as its wire map."""
+    import numpy as np
+
     dtype = array.dtype.newbyteorder("<")
     if dtype.str not in ARRAY_DTYPES:
         raise MessageError(f"arrays of {array.dtype} have no wire form", f"use {ARRAY_DTYPES}")
@@ -147,6 +151,8 @@ def array_to_wire(array: NDArray[Any]) -> dict[str, Any]:
 
 def array_from_wire(value: object) -> NDArray[Any]:
     """Return the array of a wire map, read-only and without copying; raise MessageError if bad."""
+    import numpy as np
+
     if not isinstance(value, dict):
         raise MessageError("an array is not a map of shape, dtype and data")
     shape, dtype_name, data = value.get("shape"), value.get("dtype"), value.get("data")
@@ -211,7 +217,6 @@ def decode_reply(data: bytes) -> dict[str, Any]:
     Raises:
         ControlError: the command was refused; name, cause and next step are the server's.
         MessageError: the bytes are no reply.
-
     """
     fields = _unpack_map(data)
     result, error = fields.get("result"), fields.get("error")
@@ -237,6 +242,8 @@ def _pack(fields: Mapping[str, Any]) -> bytes:
 
 
 def _numpy_to_wire(value: object) -> object:
+    import numpy as np
+
     if isinstance(value, np.ndarray):
         return array_to_wire(value)
     if isinstance(value, np.generic):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Final, Generic, Literal, NamedTuple, TypedDict, TypeVar, cast
+from typing import Final, Generic, Literal, TypedDict, TypeVar, cast
 
 from tactomo_client.arguments import checked_seconds
 from tactomo_client.connection import (
@@ -17,11 +17,20 @@ from tactomo_client.connection import (
     whole_ms,
 )
 from tactomo_client.errors import MessageError, StreamTimeout
-from tactomo_client.event import Event, event_from_message
+from tactomo_client.event import Event
 from tactomo_client.frame import Frame, frame_from_message
-from tactomo_client.keys import Keys
-from tactomo_client.messages import CONTACTS, EVENT, MAP, STATUS, Message, decode_message, topic
-from tactomo_client.status import Status, status_from_message
+from tactomo_client.keys import Keys, as_keys
+from tactomo_client.messages import (
+    CONTACTS,
+    DEFAULT_STREAM,
+    EVENT,
+    MAP,
+    STATUS,
+    Message,
+    decode_message,
+    topic,
+)
+from tactomo_client.status import STALE_AFTER_S, Status
 
 Kind = Literal["map", "contacts", "status", "event"]
 Item = Frame | Status | Event
@@ -37,16 +46,11 @@ class Options(TypedDict, total=False):
     keys: Keys | str | Path | None
 
 
-class _KindOfItem(NamedTuple):
-    read: Callable[[Message, int, float], Item]
-    stale_after_s: float
-
-
-_KINDS: Final[Mapping[str, _KindOfItem]] = {
-    MAP: _KindOfItem(frame_from_message, 0.5),
-    CONTACTS: _KindOfItem(frame_from_message, 0.5),
-    STATUS: _KindOfItem(status_from_message, 3.0),
-    EVENT: _KindOfItem(event_from_message, math.inf),
+_STALE_AFTER_S: Final[Mapping[str, float]] = {
+    MAP: 0.5,
+    CONTACTS: 0.5,
+    STATUS: STALE_AFTER_S,
+    EVENT: math.inf,
 }
 
 T_co = TypeVar("T_co", bound=Frame | Status | Event, covariant=True)
@@ -62,19 +66,18 @@ class Reception(Generic[T_co]):
         timeout_s: how long the iteration waits before it raises StreamTimeout; None: for ever.
         missed: how many messages were published but never seen here, by gaps in `sequence`.
         malformed: how many messages were skipped because they broke the rules of STREAM.md.
-
     """
 
     def __init__(
         self,
-        owner: Callable[[], Owner],
         sensor: str,
-        address: str,
         kind: Kind | tuple[Kind, ...],
-        latest_only: bool,
-        stale_after_s: float | None,
-        timeout_s: float | None,
-        keys: Keys | None,
+        *,
+        address: str = DEFAULT_STREAM,
+        latest_only: bool = False,
+        stale_after_s: float | None = None,
+        timeout_s: float | None = None,
+        keys: Keys | str | Path | None = None,
     ) -> None:
         self.sensor = sensor
         self.address = address
@@ -88,9 +91,14 @@ class Reception(Generic[T_co]):
         self._newest: T_co | None = None
         self._last: dict[str, tuple[str, int]] = {}  # of each kind, session and sequence
         topics = [topic(sensor, each) for each in self.kinds]
+        found = as_keys(keys)
         self._connection = connect_subscriber(
-            owner(), address, topics, latest_only=latest_only, keys=keys
+            self._open(), address, topics, latest_only=latest_only, keys=found
         )
+
+    def _open(self) -> Owner:
+        """Return a new SUB socket."""
+        raise NotImplementedError
 
     @property
     def is_stale(self) -> bool:
@@ -106,7 +114,6 @@ class Reception(Generic[T_co]):
 
         Raises:
             KeysError: the server does not let this client in. The next call knocks once more.
-
         """
         connection = self._connection
         deadline_s = math.inf if timeout_s is None else time.monotonic() + timeout_s
@@ -164,9 +171,12 @@ class Reception(Generic[T_co]):
         return self._newest
 
     def _read(self, message: Message, received_ns: int) -> Item:
-        kind = _KINDS[message.kind]
         own = self._stale_after_s
-        return kind.read(message, received_ns, kind.stale_after_s if own is None else own)
+        stale_after_s = _STALE_AFTER_S[message.kind] if own is None else own
+        if message.kind in (MAP, CONTACTS):
+            return frame_from_message(message, received_ns, stale_after_s)
+        kind = Status if message.kind == STATUS else Event
+        return kind.from_fields(message.fields, received_ns, stale_after_s)
 
     def _count(self, kind: str, item: Item) -> None:
         session, sequence = self._last.get(kind, ("", 0))
@@ -177,7 +187,7 @@ class Reception(Generic[T_co]):
 
 def _checked(kind: Kind | tuple[Kind, ...], latest_only: bool) -> tuple[Kind, ...]:
     kinds = kind if isinstance(kind, tuple) else (kind,)
-    if not kinds or not all(each in list(_KINDS) for each in kinds):
+    if not kinds or not all(each in list(_STALE_AFTER_S) for each in kinds):
         raise MessageError(
             f"cannot subscribe to {kind!r}",
             "use kind='map', 'contacts', 'status' or 'event', or a tuple of some of them",

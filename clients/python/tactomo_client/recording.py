@@ -56,7 +56,6 @@ def open_recording(path: str | Path, *, sensor: str | None = None) -> Recording:
     Raises:
         RecordingError: there is no such file, it is no recording of tactomo's, or the folder
             holds none. A file that is cut off or damaged is no error: see `Recording.damage`.
-
     """
     where = Path(path).expanduser()
     files = _files_in(where, sensor) if where.is_dir() else (where,)
@@ -74,7 +73,6 @@ class Recording:
             computer that recorded.
         description_sha256: that description's hash.
         version: the version of the daemon that recorded.
-
     """
 
     def __init__(self, path: Path, files: tuple[Path, ...]) -> None:
@@ -141,7 +139,6 @@ class Recording:
             recording = open_recording("grasp.mcap")
             for frame in recording.frames("contacts", start_s=2.0, end_s=5.0):
                 ...
-
         """
         if kind not in ("map", "contacts"):
             raise MessageError(f"there are no frames of {kind!r}", "use 'map' or 'contacts'")

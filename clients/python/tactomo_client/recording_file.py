@@ -1,7 +1,8 @@
 """A recording's file: what is in it by name, and reading it record by record, damaged or not.
 
 The layout is that of the daemon, which writes and replays recordings through the names here; its
-module `tactomo.recording` says what each topic holds. For frames, see `tactomo_client.recording`.
+module `tactomo.recordings.recording` says what each topic holds. For frames, see
+`tactomo_client.recording`.
 """
 
 from __future__ import annotations
@@ -77,7 +78,6 @@ def records(
 
     Raises:
         RecordingError: the file cannot be opened, or is no MCAP file.
-
     """
     topics: dict[int, str] = {}
     with open_file(path) as file:
@@ -150,7 +150,6 @@ def read_metadata(path: Path) -> Mapping[str, str]:
 
     Raises:
         RecordingError: the file cannot be opened, or is no recording of tactomo's.
-
     """
     header = None
     for _, record in records(path):

@@ -6,13 +6,14 @@ the default; what it sends beyond these names is in `Status.fields`.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Final
 
-from tactomo_client.filled import filled
-from tactomo_client.messages import Message
+from tactomo_client.filled import Received
+
+STALE_AFTER_S: Final = 3.0
+"""A daemon sends its status every second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,7 +204,7 @@ class Baseline:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What frames are given for the tier and the budget that were asked for."""
+    """What frames are given for the method and the budget that were asked for."""
 
     tier: str = ""
     modelled_ms: float | None = None
@@ -270,14 +271,15 @@ class Process:
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
+class Status(Received):
     """How a daemon is; one comes every second, whether or not data do.
+
+    A stale one: the daemon is gone, hangs, or cannot be reached.
 
     Example::
 
         status = Daemon().status()
         print(status.state, [port.problem for port in status.ports])
-
     """
 
     session: str = ""
@@ -311,10 +313,12 @@ class Status:
     """For each stage of the pipeline."""
     latency_ms: Percentiles | None = None
     """From the last byte read to publication."""
+    methods: tuple[str, ...] = ()
+    """Those that `Daemon.set_method` takes."""
     tier_requested: str = ""
-    """``auto``, or the tier that was asked for."""
+    """The method that was asked for."""
     budget_ms: float | None = None
-    """Time that a frame may take; None: the tier's own."""
+    """Time that a frame may take; None: the method's own."""
     plan: Plan = field(default_factory=Plan)
     recording: RecordingProgress | None = None
     recorder: Recorder = field(default_factory=Recorder)
@@ -326,41 +330,3 @@ class Status:
     """Frames published since the start."""
     events: EventCounts = field(default_factory=EventCounts)
     process: Process | None = None
-    fields: Mapping[str, Any] = field(default_factory=dict, repr=False, compare=False)
-    """The whole message, as in STREAM.md."""
-    _received_ns: int = field(default=0, repr=False, compare=False)
-    _stale_after_s: float = field(default=3.0, repr=False, compare=False)
-
-    @property
-    def age_s(self) -> float:
-        """Seconds since it came."""
-        return (time.monotonic_ns() - self._received_ns) * 1e-9
-
-    @property
-    def is_stale(self) -> bool:
-        """Whether it is too old to be true: the daemon is gone, hangs, or cannot be reached."""
-        return self.age_s > self._stale_after_s
-
-
-def status_from_message(message: Message, received_ns: int, stale_after_s: float) -> Status:
-    """Return the status in a message that came at `received_ns`, by the monotonic clock.
-
-    Raises:
-        MessageError: a field is missing or of the wrong type.
-
-    """
-    return status_from_fields(message.fields, received_ns, stale_after_s)
-
-
-def status_from_fields(
-    fields: Mapping[str, Any], received_ns: int, stale_after_s: float = 3.0
-) -> Status:
-    """Return the status in the fields of a message, or of the reply to the command `status`.
-
-    Raises:
-        MessageError: a field is missing or of the wrong type.
-
-    """
-    return filled(
-        Status, fields, fields=fields, _received_ns=received_ns, _stale_after_s=stale_after_s
-    )

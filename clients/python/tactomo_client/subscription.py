@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal, Self, Unpack, overload
 
 import zmq
@@ -13,8 +11,6 @@ from tactomo_client.arguments import checked_seconds
 from tactomo_client.connection import Owner, wait
 from tactomo_client.event import Event
 from tactomo_client.frame import Frame
-from tactomo_client.keys import Keys, as_keys
-from tactomo_client.messages import DEFAULT_STREAM
 from tactomo_client.reception import Item, Kind, Options, Reception, T_co
 from tactomo_client.status import Status
 
@@ -41,11 +37,7 @@ def subscribe(
     sensor: str,
     *,
     kind: Kind | tuple[Kind, ...] = "map",
-    address: str = DEFAULT_STREAM,
-    latest_only: bool = False,
-    stale_after_s: float | None = None,
-    timeout_s: float | None = None,
-    keys: Keys | str | Path | None = None,
+    **options: Unpack[Options],
 ) -> Subscription[Any]:
     """Subscribe to one sensor's frames, or to what its daemon says of itself.
 
@@ -77,19 +69,18 @@ def subscribe(
         for frame in subscribe("left_forearm"):
             for contact in frame.contacts:
                 print(contact.id, contact.x_mm, contact.y_mm, contact.pressure_kpa)
-
     """
-    return Subscription(
-        _open, sensor, address, kind, latest_only, stale_after_s, timeout_s, as_keys(keys)
-    )
+    return Subscription(sensor, kind, **options)
 
 
 class Subscription(Reception[T_co], Iterator[T_co]):
     """An open subscription. Close it, use it in a `with` block, or let it go out of use.
 
     Belongs to the thread that uses it, as ZeroMQ's sockets do. `subscribe` makes one.
-
     """
+
+    def _open(self) -> Owner:
+        return zmq.Context.instance().socket(zmq.SUB)
 
     def __next__(self) -> T_co:
         """Wait for the next frame.
@@ -97,7 +88,6 @@ class Subscription(Reception[T_co], Iterator[T_co]):
         Raises:
             StreamTimeout: it does not come within `timeout_s`.
             KeysError: the server does not let this client in. The next call knocks once more.
-
         """
         item = wait(self._arrival(self.timeout_s))
         if item is not None:
@@ -115,7 +105,6 @@ class Subscription(Reception[T_co], Iterator[T_co]):
         Example::
 
             frame = skin.wait(0.02)  # 50 times a second, or as soon as there is a frame
-
         """
         return wait(self._arrival(checked_seconds("timeout_s", timeout_s, past=True)))
 
@@ -129,14 +118,5 @@ class Subscription(Reception[T_co], Iterator[T_co]):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _open() -> Owner:
-    return zmq.Context.instance().socket(zmq.SUB)

@@ -181,7 +181,7 @@ class Browser:
         if self._twin is None:
             raise ControlError(
                 "there is no simulated skin to press",
-                "give the viewer a twin's control socket with --twin",
+                "give the viewer a twin's control socket with --twin-control",
                 name="no_twin",
             )
         return await self._twin.request(command, PRESS_TIMEOUT_S, **arguments)

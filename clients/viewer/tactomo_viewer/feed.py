@@ -21,7 +21,6 @@ class Feed:
     Raises:
         MessageError: `sensor` cannot be a sensor's name.
         ControlError: `address` is not an address.
-
     """
 
     def __init__(

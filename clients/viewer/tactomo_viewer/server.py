@@ -45,16 +45,8 @@ class ViewerError(ClientError):
     """The viewer cannot be served as asked."""
 
 
-def serve(
-    sensor: str,
-    stream: str = DEFAULT_STREAM,
-    control: str = DEFAULT_CONTROL,
-    twin: str | None = None,
-    host: str = DEFAULT_HOST,
-    port: int = DEFAULT_PORT,
-    keys: Keys | None = None,
-) -> None:
-    """Serve the viewer until SIGINT or SIGTERM; prints its URL on stdout once it can be opened.
+class Viewer:
+    """One sensor's web page: what all open pages share, one feed, one link to daemon and twin.
 
     Args:
         sensor: the sensor's name in the daemon's configuration.
@@ -62,76 +54,17 @@ def serve(
         control: the daemon's control socket.
         twin: the twin's control socket, where there is a twin.
         host: the address to listen on; on any but a loopback one the viewer only shows.
-        port: the port to listen on; 0 takes a free one.
         keys: for a daemon beyond this computer.
-
-    Raises:
-        ViewerError: the address cannot be listened on.
-        ClientError: `sensor` is no sensor's name, or `stream` no address.
-
     """
-    asyncio.run(_serve(make_app(sensor, stream, control, twin, host, keys), host, port))
-
-
-async def _serve(app: web.Application, host: str, port: int) -> None:
-    stop = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
-    await runner.setup()
-    try:
-        try:
-            await web.TCPSite(runner, host, port).start()
-        except (OSError, OverflowError) as error:
-            raise ViewerError(
-                f"cannot listen on {host} port {port}: {getattr(error, 'strerror', None) or error}",
-                "stop the program that uses it, or choose another with --port (0: any free one)",
-                name="cannot_listen",
-            ) from error
-        print(f"viewer: {_url(runner)}", flush=True)
-        await stop.wait()
-    finally:
-        await runner.cleanup()
-
-
-def _url(runner: web.AppRunner) -> str:
-    host, port = runner.addresses[0][:2]
-    return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
-
-
-def make_app(
-    sensor: str,
-    stream: str = DEFAULT_STREAM,
-    control: str = DEFAULT_CONTROL,
-    twin: str | None = None,
-    host: str = DEFAULT_HOST,
-    keys: Keys | None = None,
-) -> web.Application:
-    """Return the viewer as an aiohttp application; arguments as for `serve`."""
-    viewer = _Viewer(sensor, stream, control, twin, host, keys)
-    app = web.Application(middlewares=[_only_for(host)])
-    app.cleanup_ctx.append(viewer.running)
-    app.on_shutdown.append(viewer.say_goodbye)
-    app.router.add_get("/socket", viewer.socket)
-    for file in (resources.files("tactomo_viewer") / "page").iterdir():
-        path = "/" if file.name == "index.html" else f"/{file.name}"
-        app.router.add_get(
-            path, _file(file.read_bytes(), PAGE_TYPES["." + file.name.split(".")[-1]])
-        )
-    return app
-
-
-class _Viewer:
-    """What all open pages share: one feed, one link to the daemon and one to the twin."""
 
     def __init__(
         self,
         sensor: str,
-        stream: str,
-        control: str,
-        twin: str | None,
-        host: str,
-        keys: Keys | None,
+        stream: str = DEFAULT_STREAM,
+        control: str = DEFAULT_CONTROL,
+        twin: str | None = None,
+        host: str = DEFAULT_HOST,
+        keys: Keys | None = None,
     ) -> None:
         may_command = is_loopback(host)
         self._about = {"sensor": sensor, "stream": stream, "read_only": not may_command}
@@ -140,10 +73,56 @@ class _Viewer:
         self._daemon = aio.Control(control, keys=keys) if may_command else None
         self._twin = aio.Control(twin) if may_command and twin else None
         self._twin_answers = False
-        self._sensor, self._stream, self._keys = sensor, stream, keys
+        self._sensor, self._stream, self._host, self._keys = sensor, stream, host, keys
         self._feed: Feed
 
-    async def running(self, _: web.Application) -> AsyncIterator[None]:
+    def serve(self, port: int = DEFAULT_PORT) -> None:
+        """Serve until SIGINT or SIGTERM; print the page's URL on stdout once it can be opened.
+
+        Args:
+            port: the port to listen on; 0 takes a free one.
+
+        Raises:
+            ViewerError: the address cannot be listened on.
+            ClientError: the sensor's name is none, or the stream's address.
+        """
+        asyncio.run(self._serve(port))
+
+    async def _serve(self, port: int) -> None:
+        stop = asyncio.Event()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().add_signal_handler(number, stop.set)
+        runner = web.AppRunner(self.app(), access_log=None, shutdown_timeout=1.0)
+        await runner.setup()
+        try:
+            try:
+                await web.TCPSite(runner, self._host, port).start()
+            except (OSError, OverflowError) as error:
+                reason = getattr(error, "strerror", None) or error
+                raise ViewerError(
+                    f"cannot listen on {self._host} port {port}: {reason}",
+                    "stop the program that uses it, or choose another with --viewer-port (0: any "
+                    "free one)",
+                    name="cannot_listen",
+                ) from error
+            print(f"viewer: {_url(runner)}", flush=True)
+            await stop.wait()
+        finally:
+            await runner.cleanup()
+
+    def app(self) -> web.Application:
+        """Return the viewer as an aiohttp application."""
+        app = web.Application(middlewares=[_only_for(self._host)])
+        app.cleanup_ctx.append(self._running)
+        app.on_shutdown.append(self._say_goodbye)
+        app.router.add_get("/socket", self._socket)
+        for file in (resources.files("tactomo_viewer") / "page").iterdir():
+            path = "/" if file.name == "index.html" else f"/{file.name}"
+            kind = PAGE_TYPES["." + file.name.split(".")[-1]]
+            app.router.add_get(path, _file(file.read_bytes(), kind))
+        return app
+
+    async def _running(self, _: web.Application) -> AsyncIterator[None]:
         self._feed = Feed(self._sensor, self._stream, self._keys, self._wake)
         tasks = [asyncio.create_task(self._feed.run()), asyncio.create_task(self._watch_twin())]
         yield
@@ -154,7 +133,7 @@ class _Viewer:
             if link is not None:
                 link.close()
 
-    async def socket(self, request: web.Request) -> web.StreamResponse:
+    async def _socket(self, request: web.Request) -> web.StreamResponse:
         socket = web.WebSocketResponse(
             heartbeat=10.0, max_msg_size=MAX_QUESTION_BYTES, compress=False
         )
@@ -171,7 +150,7 @@ class _Viewer:
             self._sockets.discard(socket)
         return socket
 
-    async def say_goodbye(self, _: web.Application) -> None:
+    async def _say_goodbye(self, _: web.Application) -> None:
         closing = [s.close(code=WSCloseCode.GOING_AWAY) for s in self._sockets]
         await asyncio.gather(*closing, return_exceptions=True)
 
@@ -192,6 +171,11 @@ class _Viewer:
                     browser.twin_answers = answers
                 self._wake()
             await asyncio.sleep(TWIN_POLL_S)
+
+
+def _url(runner: web.AppRunner) -> str:
+    host, port = runner.addresses[0][:2]
+    return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
 
 
 def is_loopback(host: str) -> bool:

@@ -1,7 +1,7 @@
-"""The `tactomo` command: one module a group of commands, and the door they share.
+"""The `tactomo` command: what runs it, and how its errors are printed.
 
-Everything heavy is imported inside the commands that need it, so that `tactomo --help` and
-`tactomo status` answer at once.
+`tactomo.cli.commands` lists the commands. Everything heavy is imported inside the command that
+needs it, so that `tactomo --help` and `tactomo status` answer at once.
 """
 
 from __future__ import annotations
@@ -9,79 +9,25 @@ from __future__ import annotations
 import sys
 import traceback
 
-from tactomo.cli import (
-    bench,
-    bench_solves,
-    calibrate,
-    demo,
-    doctor,
-    evaluate,
-    evaluate_drift,
-    evaluate_measured,
-    evaluate_paper,
-    evaluate_stability,
-    export,
-    files,
-    foxglove,
-    keys,
-    models,
-    models_drawing,
-    models_training,
-    plot,
-    ports,
-    programs,
-    recover,
-    steer,
-    systemd,
-    watch,
-)
-from tactomo.cli.app import app
+from tactomo.cli.commands import app
 from tactomo.cli.failure import explain
-from tactomo.cli.lifeline import hold_lifeline
+from tactomo.cli.parent_watch import watch_parent
 
 __all__ = ["app", "main"]
-
-# Importing a module registers its commands.
-COMMANDS = (
-    bench,
-    bench_solves,
-    calibrate,
-    demo,
-    doctor,
-    evaluate,
-    evaluate_drift,
-    evaluate_measured,
-    evaluate_paper,
-    evaluate_stability,
-    export,
-    files,
-    foxglove,
-    keys,
-    models,
-    models_drawing,
-    models_training,
-    plot,
-    ports,
-    programs,
-    recover,
-    steer,
-    systemd,
-    watch,
-)
 
 
 def main() -> None:
     """Run the command line; exits with 0 (good), 1 (failure), 2 (usage) or 130 (Ctrl-C)."""
-    hold_lifeline()
+    watch_parent()
     try:
         app(prog_name="tactomo")
     except Exception as error:
-        told = explain(error)
-        _tell(error if told is None else f"tactomo: {told}")
+        words = explain(error)
+        _print_error(error if words is None else f"tactomo: {words}")
         sys.exit(1)
 
 
-def _tell(what: Exception | str) -> None:
+def _print_error(what: Exception | str) -> None:
     """Print an error, or the traceback of a mistake of ours; as an error, where journald reads."""
     from tactomo.log import is_journal, with_priority
 

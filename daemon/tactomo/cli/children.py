@@ -1,8 +1,8 @@
-"""Programs of ours that one command starts, watches and stops together.
+"""Commands of ours that one command starts, watches and stops together.
 
 Each child is a `tactomo` command of its own process. It says on one line when it is ready, the last
 of what else it prints is kept for the case that it fails, and it ends when this process does (see
-`lifeline`).
+`parent_watch`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from collections.abc import Mapping
 from types import TracebackType
 from typing import Any, Self
 
-from tactomo.cli.lifeline import VARIABLE
+from tactomo.cli.parent_watch import VARIABLE
 from tactomo.errors import TactomoError
 
 VIEWER_SAYS = "viewer: "
@@ -57,7 +57,7 @@ class Child:
         self._ended = ended
         self._process = subprocess.Popen(
             [sys.executable, "-m", "tactomo.cli", *arguments],
-            stdin=subprocess.PIPE,  # the lifeline
+            stdin=subprocess.PIPE,  # of the parent watch
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -96,7 +96,9 @@ class Child:
 
         """
         if not self._changed.wait(START_S):
-            raise ChildError(f"the {self.name} was not ready after {START_S:g} s", self._told())
+            raise ChildError(
+                f"the {self.name} was not ready after {START_S:g} s", self._last_lines()
+            )
         if self._ready is None:
             raise self.failure()
         return self._ready
@@ -114,7 +116,9 @@ class Child:
 
     def failure(self) -> ChildError:
         """Return the error that says how the child ended and what it said last."""
-        return ChildError(f"the {self.name} stopped (exit status {self.status})", self._told())
+        return ChildError(
+            f"the {self.name} stopped (exit status {self.status})", self._last_lines()
+        )
 
     def stop(self, patience_s: float) -> None:
         """Send SIGTERM and wait for the end; after `patience_s` seconds, kill."""
@@ -130,7 +134,7 @@ class Child:
             if pipe is not None:
                 pipe.close()
 
-    def _told(self) -> str:
+    def _last_lines(self) -> str:
         return "it said last:\n  " + "\n  ".join(self._lines or ["(nothing)"])
 
     def _read(self) -> None:
@@ -138,7 +142,7 @@ class Child:
         for line in self._process.stdout:
             ready = _announcement(line)
             if ready is None:
-                self._tell(_readable(line))
+                self._keep_line(_readable(line))
             else:
                 self._ready = ready
                 self._changed.set()
@@ -146,7 +150,7 @@ class Child:
         self._changed.set()
         self._ended.put(self)
 
-    def _tell(self, line: str) -> None:
+    def _keep_line(self, line: str) -> None:
         self._lines.append(line)
         if self._verbose:
             print(f"{self.name}: {line}", file=sys.stderr, flush=True)
@@ -216,8 +220,8 @@ def interrupt_on_sigterm() -> None:
     signal.signal(signal.SIGTERM, interrupt)
 
 
-def announce(addresses: Mapping[str, object]) -> None:
-    """Print the one line that tells other programs that this one is ready."""
+def print_ready(addresses: Mapping[str, object]) -> None:
+    """Print the one line of JSON by which other programs know that this one is ready."""
     print(json.dumps({"ready": True, **addresses}), flush=True)
 
 

@@ -1,4 +1,4 @@
-"""Which errors are the user's to mend, and how they are told: cause and next step, no traceback."""
+"""Which errors are the user's to mend, printed as cause and next step, no traceback."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import sys
 
 
 def explain(error: BaseException) -> str | None:
-    """Return what to tell the user about an error, or None if it is a mistake of ours.
+    """Return what to print for the user about an error, or None if it is a mistake of ours.
 
     Every package of ours has one class from which its deliberate errors derive. Only packages that
     are loaded already can have raised one, so none is imported to find out.

@@ -10,15 +10,14 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar, Final, NamedTuple, Protocol
+from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from tactomo_models import SensorDescription
+from tactomo_models.arrays import FloatArray
 from tactomo_protocol import (
     MAX_SAMPLES,
     SCAN_COUNTERS,
-    Channel,
     Decoder,
     DecoderCounts,
     Hello,
@@ -40,55 +39,57 @@ class Trouble(NamedTuple):
     next_step: str
 
 
-class PortProtocol(Protocol):
-    """A language of devices, as one port speaks it."""
+class PortProtocol:
+    """A language of devices, as one port speaks it; a subclass decodes with `feed`.
 
-    @property
-    def name(self) -> str:
-        """As in the configuration."""
+    Attributes:
+        name: in configurations, recordings and `status`.
+        baud: of a real UART, where the configuration names none.
+        emulator: ``my_module:MyBoard``, what the twin speaks the protocol with; may be empty.
+        patience_s: how long a device may send no scan before it is introduced to us again.
+        preamble_period_s: how often a recording is given a preamble, for what comes after damage;
+            may be inf.
+        says_hello: whether a device says hello every second, scans or not.
+        has_clock: whether scans say by the device's own clock when they were taken.
+        counts: what was understood and what was not, over all connections.
+        trouble: why scans cannot be used at present; None where they can, or none came yet.
 
-    @property
-    def baud(self) -> int:
-        """Of a real UART, where the configuration names none."""
+    """
 
-    @property
-    def patience_s(self) -> float:
-        """How long a device may send no scan before it is introduced to us again."""
+    name: ClassVar[str]
+    baud: ClassVar[int] = 115_200
+    emulator: ClassVar[str] = ""
+    patience_s: float = 4.0
+    preamble_period_s: float = 1.0
+    says_hello: bool = False
+    has_clock: bool = False
+    counts: DecoderCounts
+    trouble: Trouble | None = None
 
-    @property
-    def preamble_period_s(self) -> float:
-        """How often a recording is given a preamble, for what comes after damage; may be inf."""
-
-    @property
-    def says_hello(self) -> bool:
-        """Whether it says hello every second, scans or not."""
-
-    @property
-    def has_clock(self) -> bool:
-        """Whether its scans say by the device's own clock when they were taken."""
-
-    @property
-    def counts(self) -> DecoderCounts:
-        """What was understood and what was not, over all connections."""
-
-    @property
-    def trouble(self) -> Trouble | None:
-        """Why its scans cannot be used at present; None where they can, or none came yet."""
+    @classmethod
+    def recognises(cls, data: bytes) -> bool:
+        """Tell whether these bytes, from anywhere in a stream, are likely of this protocol."""
+        return False
 
     def feed(self, data: bytes) -> list[Packet]:
         """Return the packets completed by `data`; any bytes in any chunking, never raises."""
+        raise NotImplementedError
 
     def replies(self) -> list[bytes]:
         """Return what is to be written now, after what was fed; each message is returned once."""
+        return []
 
     def introduction(self) -> list[bytes]:
         """Return what is written to a newcomer, or one that is silent: who are you, and start."""
+        return []
 
     def zero_counters(self) -> list[bytes]:
         """Return what has a device count from 0 again; nothing where there is no such thing."""
+        return []
 
     def stop(self) -> list[bytes]:
-        """Return what keeps a device from going on sending to nobody; nothing for ours."""
+        """Return what keeps a device from going on sending to nobody; nothing if it may go on."""
+        return []
 
     def restart(self) -> None:
         """Take note that the port was opened anew: what had begun to come is not finished."""
@@ -99,12 +100,13 @@ class PortProtocol(Protocol):
         Fed to a new object before the bytes to come, it makes the same scans of them; fed to one
         that has lost bytes, too.
         """
+        raise NotImplementedError
 
 
 class Reading(NamedTuple):
     """One scan of a foreign device."""
 
-    volts: NDArray[np.float64]
+    volts: FloatArray
     """(M,) in the description's order."""
     device_us: int = 0
     """By its clock; 0 where it has none."""
@@ -123,7 +125,7 @@ class _Position:
     clock_format: int
 
 
-class ForeignProtocol:
+class ForeignProtocol(PortProtocol):
     """What the protocols of other people's devices have in common; a subclass parses.
 
     It makes up what such a device does not say: the hello, from the sensor's description, before
@@ -138,21 +140,21 @@ class ForeignProtocol:
         ConfigError: the description has two channels, or more voltages than a scan can have.
 
     Attributes:
+        device_id: what the device is called in `status`.
         device_us: the newest reading's time, to go on from.
         clock_format: of several that a device's clock may have, a number that `parse` understands.
 
     """
 
-    name: ClassVar[str]
-    baud: ClassVar[int]
     device_id: ClassVar[str]
-    patience_s: float = 4.0
-    preamble_period_s: float = 1.0
-    says_hello: bool = False
-    has_clock: bool = False
 
-    def __init__(self, description: SensorDescription, rate_hz: float = 0.0) -> None:
-        if len(description.modalities) != 1:
+    def __init__(self, description: SensorDescription | None, rate_hz: float = 0.0) -> None:
+        if description is None:
+            raise ConfigError(
+                f"a device of protocol {self.name} does not say what it measures",
+                "give the sensor's description",
+            )
+        if len(description.channels) != 1:
             raise ConfigError(
                 f"{description.name} has two channels, and a device of protocol {self.name} "
                 "carries one",
@@ -166,10 +168,10 @@ class ForeignProtocol:
             )
         self.description = description
         self.counts = DecoderCounts()
-        self.trouble: Trouble | None = None
+        self._failure: Trouble | None = None  # a mistake of the subclass, the last one
         self.device_us = 0
         self.clock_format = 0
-        self._channel = Channel[description.modalities[0].upper()]
+        [self._channel] = description.channels
         self._rate_hz = rate_hz
         self._counter = 0
         self._has_greeted = False
@@ -180,45 +182,37 @@ class ForeignProtocol:
         packets: list[Packet] = []
         if data.startswith(b"\0"):
             data = self._resume(data, packets)
-        for reading in self.parse(data):
-            if self._is_hello_due:
-                packets.append(self.hello())
-                self._has_greeted, self._is_hello_due = True, False
-            packets.append(self._scan(reading))
+        try:
+            for reading in self.parse(data):
+                scan = self._scan(reading)
+                if self._is_hello_due:
+                    packets.append(self.hello())
+                    self._has_greeted, self._is_hello_due = True, False
+                packets.append(scan)
+                if self.trouble is self._failure:
+                    self.trouble = None
+        except Exception as error:  # a mistake in somebody's protocol: the port reads on
+            self.counts.malformed += 1
+            self.trouble = self._failure = Trouble(
+                f"protocol {self.name} failed: {type(error).__name__}: {error}",
+                "correct its `parse`, then start the daemon again",
+            )
         return packets
 
     def parse(self, data: bytes) -> Iterator[Reading]:
-        """Yield the readings that `data` completes; counts, and never raises."""
-        raise NotImplementedError
-
-    @classmethod
-    def recognises(cls, data: bytes) -> bool:
-        """Tell whether these bytes, from anywhere in a stream, are of this protocol, likely."""
+        """Yield the readings that `data` completes, and count what was understood in `counts`."""
         raise NotImplementedError
 
     def begun(self) -> bytes:
-        """Return the bytes of what has begun to come and is not complete, a few scans' at most."""
-        raise NotImplementedError
+        """Return the bytes of what has begun to come and is not complete, a few scans' at most.
+
+        A recording begins with them; without them it begins with the next whole reading.
+        """
+        return b""
 
     def restart(self) -> None:
         """See `PortProtocol`: a hello is due again; a subclass forgets what has begun."""
         self._is_hello_due = True
-
-    def replies(self) -> list[bytes]:
-        """See `PortProtocol`."""
-        return []
-
-    def introduction(self) -> list[bytes]:
-        """See `PortProtocol`."""
-        return []
-
-    def zero_counters(self) -> list[bytes]:
-        """See `PortProtocol`."""
-        return []
-
-    def stop(self) -> list[bytes]:
-        """See `PortProtocol`."""
-        return []
 
     def preamble(self) -> bytes:
         """See `PortProtocol`: the hello, where in its scans this port is, and what has begun."""
@@ -245,9 +239,13 @@ class ForeignProtocol:
         )
 
     def _scan(self, reading: Reading) -> Scan:
+        samples = np.asarray(reading.volts, dtype=np.float32)
+        if samples.shape != (self.description.measurements,):
+            raise ValueError(
+                f"volts of shape {samples.shape}, not ({self.description.measurements},)"
+            )
         self.device_us = reading.device_us
         counter, self._counter = self._counter, (self._counter + 1) % SCAN_COUNTERS
-        samples = reading.volts.astype(np.float32)
         return Scan(self._channel, counter, reading.device_us, ScanFlag(0), samples)
 
     def _resume(self, data: bytes, packets: list[Packet]) -> bytes:

@@ -12,8 +12,8 @@ from itertools import chain
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from tactomo_models import SensorDescription
+from tactomo_models.arrays import FloatArray
 
 from tactomo.protocols.interface import ForeignProtocol, Reading, Trouble
 
@@ -28,8 +28,6 @@ _PREFIX: Final = re.compile(rb"[A-Za-z][\w .-]*[:=]")
 
 class LineProtocol(ForeignProtocol):
     """A board that prints; a subclass says what a line means."""
-
-    baud = 115_200
 
     def __init__(self, description: SensorDescription) -> None:
         super().__init__(description)
@@ -69,7 +67,7 @@ class LineProtocol(ForeignProtocol):
         super().restart()
         self._drop()
 
-    def understood(self, volts: NDArray[np.float64]) -> Reading:
+    def understood(self, volts: FloatArray) -> Reading:
         """Return a reading of what fits."""
         self.counts.packets += 1
         self.trouble, self._misfits = None, (None, 0)
@@ -105,7 +103,7 @@ class LineProtocol(ForeignProtocol):
         self._is_dropping = True
 
 
-def numbers(line: bytes) -> NDArray[np.float64] | None:
+def numbers(line: bytes) -> FloatArray | None:
     """Return the numbers of a line, after a prefix such as `magnitudes:`; None for other lines.
 
     They are separated by commas, semicolons or white space, also at the end.

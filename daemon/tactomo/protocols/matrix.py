@@ -22,12 +22,13 @@ from collections import Counter
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from tactomo_models import SensorDescription
-from tactomo_models.pattern import touching
+from tactomo_models.arrays import FloatArray
+from tactomo_models.sensor.pattern import touching
 
 from tactomo.protocols.interface import Reading
 from tactomo.protocols.lines import LineProtocol, electrodes_of, numbers
+from tactomo.protocols.openeit import OpenEit
 
 BEGINNINGS: Final = (b"", b"A")
 ANOTHER_BOARD: Final = "give the description of the board that is connected"
@@ -40,6 +41,7 @@ class Matrix(LineProtocol):
 
     name = "matrix"
     device_id = "matrix"
+    emulator = "tactomo.twin.boards:MatrixBoard"
 
     def __init__(self, description: SensorDescription) -> None:
         super().__init__(description)
@@ -102,7 +104,7 @@ class Matrix(LineProtocol):
         table = np.array([numbers(row) for row in rows])
         return self.understood(self._of_table(table))
 
-    def _of_table(self, table: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _of_table(self, table: FloatArray) -> FloatArray:
         """Voltages (M,) of a table (drives, pairs), or (drives, electrodes) where single-ended."""
         if self._is_single_ended:
             return np.asarray(table[self._drive, self._plus] - table[self._drive, self._minus])
@@ -119,7 +121,9 @@ class Matrix(LineProtocol):
 
     @classmethod
     def recognises(cls, data: bytes) -> bool:
-        """See `ForeignProtocol`: two whole lines of as many numbers."""
+        """See `ForeignProtocol`: two whole lines of as many numbers, and not an OpenEIT board's."""
+        if OpenEit.recognises(data):
+            return False
         found = Counter(
             len(values)
             for line in data.split(b"\n")[1:-1]

@@ -23,7 +23,7 @@ from typing import Final
 
 import numpy as np
 from tactomo_models import SensorDescription
-from tactomo_models.pattern import ring_pairs
+from tactomo_models.sensor.pattern import ring_pairs
 
 from tactomo.errors import ConfigError
 from tactomo.protocols.interface import Reading
@@ -44,6 +44,7 @@ class OpenEit(LineProtocol):
 
     name = "openeit"
     device_id = "openeit"
+    emulator = "tactomo.twin.boards:OpenEitBoard"
     patience_s = 10.0  # a frame of 32 electrodes takes seconds, and a key begins it anew
 
     def __init__(self, description: SensorDescription) -> None:

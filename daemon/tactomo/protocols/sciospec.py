@@ -51,8 +51,8 @@ from numpy.typing import NDArray
 from tactomo_models import SensorDescription
 
 from tactomo.errors import ConfigError
-from tactomo.imported import MAX_QUADRATURE
 from tactomo.protocols.interface import ForeignProtocol, Reading, Trouble
+from tactomo.scans import MAX_QUADRATURE
 
 AMPLITUDE_A: Final = (100e-9, 10e-3)
 CHANNELS: Final = 16
@@ -139,6 +139,7 @@ class Sciospec(ForeignProtocol):
     name = "sciospec"
     baud = 9600
     device_id = "sciospec"
+    emulator = "tactomo.twin.sciospec:SciospecEmulator"
 
     def __init__(self, description: SensorDescription) -> None:
         super().__init__(description, description.instrument.scan_rate_hz)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal
 
 import zmq
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field
 from tactomo_client.errors import MessageError
 from tactomo_client.messages import (
     MAX_MESSAGE_BYTES,
@@ -23,25 +23,16 @@ from tactomo_client.messages import (
 
 from tactomo.endpoint import bind
 from tactomo.errors import AddressError, CommandError
-from tactomo.twin.scene import Indenter, Scene, SkinDriftSettings, complaints
+from tactomo.stream.commands import Arguments, Nothing, obey
+from tactomo.twin.scene import Indenter, Scene, SkinDriftSettings
 
 Handler = Callable[[Any], Mapping[str, Any]]
 PressId = Annotated[str, Field(min_length=1, max_length=64, coerce_numbers_to_str=True)]
 
 ANOTHER_ADDRESS = (
     "stop the twin or demo that runs already, or give another address: "
-    "`tactomo twin --control`, `tactomo demo --twin-control`"
+    "`tactomo twin` and `tactomo demo`: --twin-control"
 )
-
-
-class Arguments(BaseModel):
-    """Arguments of a command; what is not listed is refused."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Nothing(Arguments):
-    """No arguments."""
 
 
 class PressArguments(Indenter):
@@ -150,32 +141,6 @@ class ControlSocket:
     def _reply(self, data: bytes) -> bytes:
         try:
             command, arguments = decode_request(data)
-            return encode_reply(self._obey(command, arguments))
+            return encode_reply(obey(command, arguments, COMMANDS, self._handlers))
         except (MessageError, CommandError) as error:
             return encode_error(error.name, error.cause, error.next_step)
-
-    def _obey(self, command: str, arguments: dict[str, Any]) -> Mapping[str, Any]:
-        if command not in COMMANDS:
-            raise CommandError(
-                f"the twin does not know the command {command!r}",
-                f"known commands: {', '.join(COMMANDS)}",
-                name="unknown_command",
-            )
-        try:
-            checked = COMMANDS[command].model_validate(arguments)
-        except ValidationError as error:
-            raise CommandError(
-                f"{command}: {complaints(error)}", describe_arguments(command), name="bad_argument"
-            ) from error
-        return self._handlers[command](checked)
-
-
-def describe_arguments(command: str) -> str:
-    """Return the arguments of a command with their defaults, as people read it."""
-    fields = COMMANDS[command].model_fields
-    if not fields:
-        return f"{command} takes no arguments"
-    named = [
-        name if field.is_required() else f"{name}={field.default}" for name, field in fields.items()
-    ]
-    return f"{command} takes {', '.join(named)}"

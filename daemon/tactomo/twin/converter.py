@@ -14,6 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from tactomo_models.arrays import FloatArray
+from tactomo_protocol import Channel
 
 ADC_BITS = 24
 
@@ -38,8 +40,8 @@ class Drift:
 class DriftingGain:
     """One channel's gain as a function of device time."""
 
-    def __init__(self, seed: int, channel: int) -> None:
-        self._steps = np.random.default_rng([seed, channel])
+    def __init__(self, seed: int, channel: Channel) -> None:
+        self._steps = np.random.default_rng([seed, channel.number])
         self._walk = np.zeros(1)
 
     def at(self, time_s: float, drift: Drift) -> float:
@@ -75,7 +77,7 @@ class Converter:
         self.noise_v = noise_v
         self.drift = drift or Drift()
         self._seed = seed
-        self._gains: dict[int, DriftingGain] = {}
+        self._gains: dict[Channel, DriftingGain] = {}
 
     @property
     def volts_per_count(self) -> float:
@@ -83,19 +85,19 @@ class Converter:
         return float(self.full_scale_v / 2 ** (ADC_BITS - 1))
 
     def convert(
-        self, volts: NDArray[np.float64], *, channel: int, counter: int, time_s: float
+        self, volts: FloatArray, *, channel: Channel, counter: int, time_s: float
     ) -> tuple[NDArray[np.int32], bool]:
         """Return the counts of one scan, (M,), and whether any of them hit the end of the range.
 
         Args:
             volts: what the skin puts out, (M,) volts.
-            channel: the channel's number on the wire.
+            channel: the channel.
             counter: the scan's counter.
             time_s: device time of the scan, in seconds.
 
         """
         gain = self._gains.setdefault(channel, DriftingGain(self._seed, channel))
-        noise = np.random.default_rng([self._seed, channel, counter, 1])
+        noise = np.random.default_rng([self._seed, channel.number, counter, 1])
         seen_v = volts * gain.at(time_s, self.drift)
         seen_v = seen_v + self.noise_v * noise.standard_normal(len(volts))
         top = 2 ** (ADC_BITS - 1) - 1

@@ -26,14 +26,15 @@ import zmq
 from pydantic import TypeAdapter, ValidationError
 from tactomo_client.messages import DEFAULT_TWIN_CONTROL
 from tactomo_models import Press, SensorDescription, SkinSimulator
-from tactomo_models.skin_drift import DriftingSkin, SkinDrift
+from tactomo_models.simulation.skin_drift import DriftingSkin, SkinDrift
 from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
 
 from tactomo.config import Endpoint
 from tactomo.endpoint import is_local
 from tactomo.errors import CommandError, ConfigError
-from tactomo.protocols import OURS
+from tactomo.protocols import NATIVE, emulator_of, find_protocol
+from tactomo.stream.commands import Nothing, explained
 from tactomo.twin.control import (
     ControlSocket,
     DriftArguments,
@@ -41,7 +42,6 @@ from tactomo.twin.control import (
     Handler,
     MuteArguments,
     NoiseArguments,
-    Nothing,
     PlayArguments,
     PortArguments,
     PressArguments,
@@ -56,11 +56,10 @@ from tactomo.twin.firmware import (
     Port,
     Voltages,
 )
-from tactomo.twin.foreign import ForeignFirmware
+from tactomo.twin.foreign import Emulator, ForeignFirmware
 from tactomo.twin.line import SerialLine
 from tactomo.twin.playing import Player
-from tactomo.twin.scene import Scene, SkinDriftSettings, complaints
-from tactomo.twin.speakers import SPEAKERS
+from tactomo.twin.scene import Scene, SkinDriftSettings
 from tactomo.twin.surface import Surface
 
 # How often a line that nobody has open is looked at; its hang-up cannot be waited on.
@@ -127,7 +126,7 @@ class TwinConfig:
     unevenness: float = UNEVENNESS
     seed: int = 0
     scene: Scene | None = None
-    protocol: str = OURS
+    protocol: str = NATIVE
     play: Path | None = None
     play_once: bool = False
     control: str = DEFAULT_TWIN_CONTROL
@@ -137,25 +136,22 @@ class TwinConfig:
         try:
             TypeAdapter(Endpoint).validate_python(self.control)
         except ValidationError as error:
-            raise ConfigError(f"control = {self.control!r}", complaints(error)) from error
+            raise ConfigError(f"control = {self.control!r}", explained(error)) from error
         if not is_local(self.control):
             raise ConfigError(
                 f"control = {self.control!r} can be reached from other computers, and anybody "
                 "there could press the twin",
                 "use tcp://127.0.0.1:PORT or ipc://PATH",
             )
-        channels = len(self.description.modalities)
+        channels = len(self.description.channels)
         if self.ports not in (1, 2) or self.ports > channels:
             raise ConfigError(
                 f"{self.description.name} has {channels} channel(s), so not {self.ports} ports",
                 "give 1 port, or 2 for a sensor of two channels",
             )
-        if self.protocol != OURS and self.protocol not in SPEAKERS:
-            raise ConfigError(
-                f"the twin does not speak the protocol {self.protocol!r}",
-                f"use one of: {', '.join((OURS, *SPEAKERS))}",
-            )
-        if self.protocol != OURS and channels > 1:
+        if self.protocol != NATIVE:
+            emulator_of(find_protocol(self.protocol).name)
+        if self.protocol != NATIVE and channels > 1:
             raise ConfigError(
                 f"{self.description.name} has two channels, and a device of protocol "
                 f"{self.protocol} carries one",
@@ -328,10 +324,11 @@ class Twin:
         identity = _identity(config.description, config.protocol)
         own_rate_hz = None if self._player is None else self._player.rate_hz
         rate_hz = config.rate_hz or own_rate_hz or RATE_HZ
-        if config.protocol != OURS:
-            speaker = SPEAKERS[config.protocol](config.description, rate_hz)
+        if config.protocol != NATIVE:
+            make = emulator_of(find_protocol(config.protocol).name)
+            emulator: Emulator = make(config.description, rate_hz)
             return ForeignFirmware(
-                speaker, identity, ports[0], self._sample, self._converter, self._clock
+                emulator, identity, ports[0], self._sample, self._converter, self._clock
             )
         return Firmware(identity, ports, self._sample, self._converter, rate_hz, self._clock)
 
@@ -438,7 +435,7 @@ class Twin:
         return {}
 
     def _mute(self, arguments: MuteArguments) -> dict[str, Any]:
-        self._firmware.mute(Channel[arguments.channel.upper()], arguments.seconds)
+        self._firmware.mute(Channel(arguments.channel), arguments.seconds)
         return {}
 
     def _garbage(self, arguments: GarbageArguments) -> dict[str, Any]:
@@ -467,7 +464,9 @@ class Twin:
 
 def _identity(description: SensorDescription, protocol: str) -> Identity:
     drive_offset, measure_offset = description.offsets
-    device = description.name if protocol == OURS else f"{protocol}-{description.name}"
+    device = description.name
+    if protocol != NATIVE:
+        device = f"{find_protocol(protocol).name}-{device}"
     return Identity(
         device_id=f"twin-{device}"[:64],
         firmware=f"tactomo-twin {version('tactomo')}",
@@ -480,8 +479,8 @@ def _identity(description: SensorDescription, protocol: str) -> Identity:
 
 def _wiring(config: TwinConfig) -> dict[str, tuple[Channel, ...]]:
     """Return the channels that each line carries, by the line's name."""
-    channels = tuple(Channel[name.upper()] for name in config.description.modalities)
-    return {"skin": channels} if config.ports == 1 else {c.name.lower(): (c,) for c in channels}
+    channels = config.description.channels
+    return {"skin": channels} if config.ports == 1 else {c: (c,) for c in channels}
 
 
 def _describe_port(port: Port) -> dict[str, Any]:
@@ -489,7 +488,7 @@ def _describe_port(port: Port) -> dict[str, Any]:
     return {
         "name": line.name,
         "path": line.path,
-        "channels": [channel.name.lower() for channel in port.channels],
+        "channels": list(port.channels),
         "plugged": line.is_plugged,
         "open": line.is_open,
         "streaming": port.is_streaming,

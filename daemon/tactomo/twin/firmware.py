@@ -17,9 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-from tactomo_models import Modality
+from tactomo_models.arrays import FloatArray
 from tactomo_protocol import (
     Acknowledge,
     AckStatus,
@@ -40,11 +38,7 @@ from tactomo.twin.line import SerialLine
 HELLO_PERIOD_S = 1.0
 RATE_HZ_MIN, RATE_HZ_MAX = 0.1, 500.0
 
-Voltages = Mapping[Modality, NDArray[np.float64]]
-MODALITIES: Mapping[Channel, Modality] = {
-    Channel.MAGNITUDE: "magnitude",
-    Channel.STRUCTURE: "structure",
-}
+Voltages = Mapping[Channel, FloatArray]
 
 
 @dataclass(slots=True)
@@ -181,7 +175,7 @@ class Firmware:
 
     def _scan(self, channel: Channel, time_s: float, flags: ScanFlag, voltages: Voltages) -> Scan:
         counts, saturated = self._converter.convert(
-            voltages[MODALITIES[channel]], channel=channel, counter=self.counter, time_s=time_s
+            voltages[channel], channel=channel, counter=self.counter, time_s=time_s
         )
         return Scan(
             channel=channel,

@@ -1,7 +1,7 @@
 """Other people's instruments, emulated: the twin's skin behind another language than ours.
 
 `ForeignFirmware` does what they have in common: sampling, a line that may be slow, faults. Each
-language is a `Speaker`, which turns frames into bytes and obeys the host.
+language is an `Emulator`, which turns frames into bytes and obeys the host.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 from tactomo_models import SensorDescription
+from tactomo_models.arrays import FloatArray
 from tactomo_protocol import Channel, ScanFlag
 
 from tactomo.twin.converter import Converter
-from tactomo.twin.firmware import MODALITIES, Firmware, Identity, Port, Voltages
+from tactomo.twin.firmware import Firmware, Identity, Port, Voltages
 from tactomo.twin.playing import PlayedFrame
 
 MAX_WAITING_BYTES = 1 << 17
@@ -31,7 +32,7 @@ PUMP_S = 0.001
 class Frame:
     """What an instrument has measured in one go round the electrodes."""
 
-    volts: NDArray[np.float64]
+    volts: FloatArray
     """(M,) in the description's order."""
     potentials: NDArray[np.complexfloating] | None
     """(injections, electrodes) volts against ground, where measured ones are played."""
@@ -39,8 +40,10 @@ class Frame:
     """When it began, by the instrument's clock."""
 
 
-class Speaker(Protocol):
-    """One instrument's side of its language. For use by one thread.
+class Emulator(Protocol):
+    """One instrument's side of its language, made of the sensor and the frames a second at first.
+
+    A protocol's class names it as its `emulator`. For use by one thread.
 
     Attributes:
         rate_hz: frames a second; the host may have changed it.
@@ -77,20 +80,16 @@ class Grounded:
         of_drives = [(pairs.drive == drive).all(axis=1) for drive in description.drive_pairs]
         self._least = [(here, np.linalg.pinv(differences[here])) for here in of_drives]
 
-    def potentials(self, volts: NDArray[np.float64]) -> NDArray[np.float64]:
+    def potentials(self, volts: FloatArray) -> FloatArray:
         """Return potentials (drives, electrodes) that have a scan's voltages (M,)."""
         return np.array([least @ volts[here] for here, least in self._least])
-
-
-MakeSpeaker = Callable[[SensorDescription, float], Speaker]
-"""Of the sensor and the frames a second that it starts with."""
 
 
 class ForeignFirmware(Firmware):
     """An instrument behind its one line. For use by one thread.
 
     Args:
-        speaker: its language.
+        emulator: its language.
         identity: what the twin's status says of it.
         port: its line.
         sample: starts computing the skin's voltages at a device time in seconds.
@@ -101,15 +100,15 @@ class ForeignFirmware(Firmware):
 
     def __init__(
         self,
-        speaker: Speaker,
+        emulator: Emulator,
         identity: Identity,
         port: Port,
         sample: Callable[[float], Future[Voltages]],
         converter: Converter,
         clock: Callable[[], float],
     ) -> None:
-        super().__init__(identity, [port], sample, converter, speaker.rate_hz, clock)
-        self._speaker = speaker
+        super().__init__(identity, [port], sample, converter, emulator.rate_hz, clock)
+        self._emulator = emulator
         self._port = port
         self._waiting: deque[bytes] = deque()
         self._waiting_bytes = 0
@@ -132,15 +131,15 @@ class ForeignFirmware(Firmware):
     def _listen(self) -> None:
         is_open = self._port.line.is_open
         if is_open and not self._was_open:
-            self._put(self._speaker.greeting())
+            self._put(self._emulator.greeting())
         self._was_open = is_open
         data = self._port.line.receive()
         if data:
-            self._put(self._speaker.hear(data))
-        if self._speaker.is_streaming and not self._port.is_streaming:
+            self._put(self._emulator.hear(data))
+        if self._emulator.is_streaming and not self._port.is_streaming:
             self._next_sample_s = self._clock()
-        self._port.is_streaming = self._speaker.is_streaming
-        self.rate_hz = self._speaker.rate_hz
+        self._port.is_streaming = self._emulator.is_streaming
+        self.rate_hz = self._emulator.rate_hz
 
     def _greet_when_due(self) -> None:
         self._next_hello_s = self._clock() + 1.0  # it says no hello
@@ -149,7 +148,7 @@ class ForeignFirmware(Firmware):
         self, port: Port, channel: Channel, time_s: float, flags: ScanFlag, voltages: Voltages
     ) -> None:
         if isinstance(voltages, PlayedFrame):
-            frame = Frame(voltages[MODALITIES[channel]], voltages.potentials, time_s)
+            frame = Frame(voltages[channel], voltages.potentials, time_s)
         else:
             scan = self._scan(channel, time_s, flags, voltages)
             frame = Frame(scan.volts(self._converter.volts_per_count), None, time_s)
@@ -157,10 +156,10 @@ class ForeignFirmware(Firmware):
             port.line.unheard += 1
         elif self._waiting_bytes > MAX_WAITING_BYTES:
             port.line.dropped += 1
-            self._put(self._speaker.held_up())
+            self._put(self._emulator.held_up())
         else:
             port.line.sent += 1
-            self._put(self._speaker.frame(frame))
+            self._put(self._emulator.frame(frame))
 
     def _put(self, messages: list[bytes]) -> None:
         self._waiting.extend(messages)

@@ -11,15 +11,22 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from tactomo_models import Modality, Press, SensorDescription
+from tactomo_models import Press, SensorDescription
+from tactomo_models.arrays import FloatArray
+from tactomo_protocol import Channel
 
-from tactomo.imported import electrode_potentials, is_single_ended, load_arrays, read_scans
+from tactomo.recordings.imported_scans import (
+    electrode_potentials,
+    is_single_ended,
+    load_arrays,
+    read_scans,
+)
 
 REST_FRAMES = 40
 """How often a file's reference is said first, so that a daemon can tare by it."""
 
 
-class PlayedFrame(Mapping[Modality, NDArray[np.float64]]):
+class PlayedFrame(Mapping[Channel, FloatArray]):
     """One frame: volts of each channel in the description's order.
 
     Attributes:
@@ -30,16 +37,16 @@ class PlayedFrame(Mapping[Modality, NDArray[np.float64]]):
 
     def __init__(
         self,
-        volts: Mapping[Modality, NDArray[np.float64]],
+        volts: Mapping[Channel, FloatArray],
         potentials: NDArray[np.complexfloating] | None,
     ) -> None:
         self.potentials = potentials
         self._volts = volts
 
-    def __getitem__(self, name: Modality) -> NDArray[np.float64]:
+    def __getitem__(self, name: Channel) -> FloatArray:
         return self._volts[name]
 
-    def __iter__(self) -> Iterator[Modality]:
+    def __iter__(self) -> Iterator[Channel]:
         return iter(self._volts)
 
     def __len__(self) -> int:
@@ -71,14 +78,11 @@ class Player:
         self._potentials = (
             electrode_potentials(path, arrays, description) if is_single_ended(arrays) else None
         )
-        self._volts: dict[Modality, NDArray[np.float64]] = {
-            _modality(channel.name.lower()): volts for channel, volts in scans.volts.items()
-        }
+        self._volts = dict(scans.volts)
         self._order = list(range(scans.count))
         if scans.reference:  # the row after the last
             for channel, volts in scans.reference.items():
-                name = _modality(channel.name.lower())
-                self._volts[name] = np.vstack([self._volts[name], volts])
+                self._volts[channel] = np.vstack([self._volts[channel], volts])
             self._order = [scans.count] * REST_FRAMES + self._order
         seconds = 0.0 if scans.time_s is None else float(scans.time_s[-1])
         self.rate_hz = (scans.count - 1) / seconds if seconds else None
@@ -98,7 +102,3 @@ class Player:
         self.is_over = self._once and self._next == 0
         potentials = None if self._potentials is None else self._potentials[row]
         return PlayedFrame({name: volts[row] for name, volts in self._volts.items()}, potentials)
-
-
-def _modality(name: str) -> Modality:
-    return "magnitude" if name == "magnitude" else "structure"

@@ -28,11 +28,11 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from tactomo_models import Press
-from tactomo_models.errors import explain
-from tactomo_models.skin_drift import SkinDrift
+from tactomo_models.simulation.skin_drift import SkinDrift
 from tactomo_models.toml_file import read_toml
 
 from tactomo.errors import ConfigError
+from tactomo.stream.commands import explained
 
 Millimetres = Annotated[float, Field(ge=-1000.0, le=1000.0, allow_inf_nan=False)]
 RadiusMm = Annotated[float, Field(gt=0.0, le=1000.0, allow_inf_nan=False)]
@@ -209,11 +209,6 @@ def load_scene(path: str | Path) -> Scene:
             "give the path of a TOML file, such as those in deploy/scenes",
         ) from error
     except ValidationError as error:
-        raise ConfigError(f"{path}: {complaints(error)}", "correct the file") from error
+        raise ConfigError(f"{path}: {explained(error)}", "correct the file") from error
     except ValueError as error:
         raise ConfigError(f"{path} is not valid TOML: {error}", "correct the file") from error
-
-
-def complaints(error: ValidationError) -> str:
-    """Return what a validation complains of, each as "key = value: what is allowed"."""
-    return "; ".join(explain(item) for item in error.errors())

@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 from tactomo_models import SensorDescription
+from tactomo_models.arrays import FloatArray
 
 from tactomo.protocols.sciospec import (
     ACK_TAG,
@@ -36,8 +37,8 @@ TIMEOUT_S: Final = 0.2
 """How long it waits for the rest of a message."""
 
 
-class SciospecSpeaker:
-    """See `Speaker`."""
+class SciospecEmulator:
+    """See `Emulator`."""
 
     def __init__(self, description: SensorDescription, rate_hz: float) -> None:
         self.rate_hz = rate_hz
@@ -115,7 +116,7 @@ class SciospecSpeaker:
         scale = self._amplitude_a / self._description.pattern.current_a
         return scale * self.potentials_of(frame.volts)
 
-    def potentials_of(self, volts: NDArray[np.float64]) -> NDArray[np.complex128]:
+    def potentials_of(self, volts: FloatArray) -> NDArray[np.complex128]:
         """Return potentials (drives, electrodes) that have a scan's voltages (M,), the least."""
         return self._grounded.potentials(volts).astype(np.complex128)
 

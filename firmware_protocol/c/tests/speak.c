@@ -23,9 +23,9 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { MOST_BYTES = 1 << 20, DEVICE_SAMPLES = 4 };
+enum { MAX_BYTES = 1 << 20, DEVICE_SAMPLES = 4 };
 
-static uint8_t bytes[MOST_BYTES];
+static uint8_t bytes[MAX_BYTES];
 static uint8_t out[TACTOMO_SCAN_BOUND(TACTOMO_MOST_SAMPLES, 4)];
 
 /* --- Words of a line -------------------------------------------------------------------------- */
@@ -177,7 +177,7 @@ static void parse(void)
 static tactomo_device device;
 static uint32_t timer_us;
 static size_t room_left, received_at, received_end, sent_bytes;
-static uint8_t received[65536], sent[MOST_BYTES], frame[TACTOMO_HELLO_BOUND];
+static uint8_t received[65536], sent[MAX_BYTES], frame[TACTOMO_HELLO_BOUND];
 
 static uint32_t microseconds(void *board)
 {
@@ -287,7 +287,7 @@ int main(void)
     } known[] = {{"scan", scan},   {"hello", hello}, {"acknowledge", acknowledge},
                  {"packet", packet}, {"parse", parse}, {"begin", begin},
                  {"send", send_scan}, {"sent", take_sent}, {"state", print_state}};
-    static char line[2 * MOST_BYTES];
+    static char line[2 * MAX_BYTES];
     while (fgets(line, sizeof line, stdin) != NULL) {
         const char *request = strtok(line, " \n");
         size_t i = 0;

@@ -195,7 +195,7 @@ def _pack_scan(scan: Scan) -> bytes:
     head = _SCAN_HEAD.pack(
         PROTOCOL_VERSION,
         _SCAN,
-        _member("Scan.channel", scan.channel, Channel),
+        _channel("Scan.channel", scan.channel).number,
         _integer("Scan.flags", scan.flags, 0, _U8),
         _integer("Scan.counter", scan.counter, 0, _U32),
         _integer("Scan.device_us", scan.device_us, 0, _U64),
@@ -214,7 +214,11 @@ def _unpack_scan(content: bytes) -> Scan:
     _require(len(content) == _SCAN_HEAD.size + count * dtype.itemsize)
     samples = np.frombuffer(content, dtype.newbyteorder("<"), count, _SCAN_HEAD.size)
     return Scan(
-        Channel(channel), counter, device_us, ScanFlag(flags), samples.astype(dtype, copy=False)
+        Channel.of_number(channel),
+        counter,
+        device_us,
+        ScanFlag(flags),
+        samples.astype(dtype, copy=False),
     )
 
 
@@ -223,7 +227,7 @@ def _pack_hello(hello: Hello) -> bytes:
     head = _HELLO_HEAD.pack(
         PROTOCOL_VERSION,
         _HELLO,
-        sum(1 << channel for channel in hello.channels),
+        sum(1 << Channel(channel).number for channel in hello.channels),
         hello.sample_format,
         hello.samples_per_scan,
         hello.electrodes,
@@ -246,7 +250,7 @@ def _unpack_hello(content: bytes) -> Hello:
     hello = Hello(
         device_id=device_id,
         firmware=firmware,
-        channels=tuple(Channel(bit) for bit in range(8) if mask >> bit & 1),
+        channels=tuple(Channel.of_number(bit) for bit in range(8) if mask >> bit & 1),
         electrodes=electrodes,
         drive_offset=drive,
         measure_offset=measure,
@@ -263,8 +267,9 @@ def _check_hello(hello: Hello) -> None:
     _check_string("Hello.device_id", hello.device_id)
     _check_string("Hello.firmware", hello.firmware)
     for channel in hello.channels:
-        _member("Hello.channels", channel, Channel)
-    if not hello.channels or list(hello.channels) != sorted(set(hello.channels)):
+        _channel("Hello.channels", channel)
+    ordered = [channel for channel in Channel if channel in hello.channels]
+    if not hello.channels or list(hello.channels) != ordered:
         raise FieldError("Hello.channels", hello.channels, "one or more, ascending, none twice")
     _integer("Hello.electrodes", hello.electrodes, 2, _U8)
     _integer("Hello.drive_offset", hello.drive_offset, 1, hello.electrodes - 1)
@@ -375,9 +380,14 @@ def _integer(field: str, value: int, low: int, high: int) -> int:
     return number
 
 
-def _member(
-    field: str, value: int, kind: type[Channel] | type[SampleFormat] | type[AckStatus]
-) -> int:
+def _channel(field: str, value: Channel) -> Channel:
+    try:
+        return Channel(value)
+    except ValueError:
+        raise FieldError(field, value, f"one of {', '.join(Channel)}") from None
+
+
+def _member(field: str, value: int, kind: type[SampleFormat] | type[AckStatus]) -> int:
     try:
         return int(kind(value))
     except ValueError:

@@ -7,7 +7,7 @@ and timing are specified in `firmware_protocol/PROTOCOL.md`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum, IntFlag
+from enum import IntEnum, IntFlag, StrEnum, auto
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -16,11 +16,30 @@ from numpy.typing import NDArray
 Samples: TypeAlias = NDArray[np.int16] | NDArray[np.int32] | NDArray[np.float32]
 
 
-class Channel(IntEnum):
-    """One of the two stacked skins."""
+class Channel(StrEnum):
+    """One of the two stacked skins, by its name; on the wire it is a number."""
 
-    MAGNITUDE = 0
-    STRUCTURE = 1
+    MAGNITUDE = auto()
+    STRUCTURE = auto()
+
+    @property
+    def number(self) -> int:
+        """The channel on the wire."""
+        return _CHANNELS.index(self)
+
+    @classmethod
+    def of_number(cls, number: int) -> Channel:
+        """Return the channel that a number on the wire means.
+
+        Raises:
+            ValueError: none has that number.
+        """
+        if number not in range(len(_CHANNELS)):
+            raise ValueError(f"no channel has the number {number}")
+        return _CHANNELS[number]
+
+
+_CHANNELS = tuple(Channel)
 
 
 class SampleFormat(IntEnum):
@@ -93,7 +112,7 @@ class Scan:
         """The samples in volts, given the scale that the device's `Hello` states."""
         return self.samples.astype(np.float64) * volts_per_count
 
-    def _header(self) -> tuple[int, ...]:
+    def _header(self) -> tuple[str | int, ...]:
         return (self.channel, self.counter, self.device_us, self.flags)
 
     def __eq__(self, other: object) -> bool:

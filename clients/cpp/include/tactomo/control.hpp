@@ -198,12 +198,12 @@ public:
         return {reply.get<std::string>("path"), reply.get<std::uint64_t>("bytes")};
     }
 
-    /// How much model frames get from now on: "auto", "fit", ...
-    std::string set_tier(const std::string& tier) {
-        return request("set_tier", patience, std::pair("tier", tier)).get<std::string>("tier");
+    /// What solves frames from now on: "auto", "fit", ...
+    std::string set_method(const std::string& method) {
+        return request("set_tier", patience, std::pair("tier", method)).get<std::string>("tier");
     }
 
-    /// How long a frame may take from now on; nothing leaves it to the tier.
+    /// How long a frame may take from now on; nothing leaves it to the method.
     std::optional<double> set_budget(std::optional<double> budget_ms) {
         return request("set_budget", patience, std::pair("budget_ms", budget_ms))
             .get_or_nil<double>("budget_ms");

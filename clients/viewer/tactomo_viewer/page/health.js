@@ -13,7 +13,7 @@ const FLAGS = {
   not_converged: ["Not converged", "The reconstruction ran out of its time; this map is the best so far."],
   invalid_voltage: ["Invalid voltage", "Some voltages were not numbers, or cannot be right, and were left out. Is a wire loose?"],
   saturated: ["Converter saturated", "The converter clipped; those voltages were left out. Lower the gain or the current."],
-  electrode_fault: ["Electrode fault", "An electrode reads nonsense and was left out; the reason beside the tier names it. Check its lead and contact, then tare."],
+  electrode_fault: ["Electrode fault", "An electrode reads nonsense and was left out; the reason beside the method names it. Check its lead and contact, then tare."],
   noise_high: ["Noise high", "Voltages that should be equal differ widely. Look for interference, a loose ground or a broken device."],
   low_confidence: ["Low confidence", "The network expects this map to be wrong. Do not act on it; tare, and check the leads if it stays."],
   channels_swapped: ["Channels swapped?", "The magnitude channel answers more than the structure channel: exchange their plugs, then tare. Or is the structure channel dead?"],

@@ -53,8 +53,8 @@ export function showState(name, text = STATES[name] ?? String(name)) {
 export function showQuality(frame, trusted) {
   setText(byId("misfit"), frame.misfit === null ? "–" : `${fixed(frame.misfit, 1)} σ`);
   setText(byId("confidence"), frame.confidence === null ? "–" : `${fixed(100 * frame.confidence, 0)} %`);
-  setText(byId("tier"), frame.tier ?? "–");
-  setText(byId("tier-reason"), frame.tier_reason ?? "");
+  setText(byId("made-by"), frame.tier ?? "–");
+  setText(byId("made-by-reason"), frame.tier_reason ?? "");
   const list = byId("quality");
   const key = trusted ? frame.flags.join() : "not known";
   if (list.dataset.flags === key) return;
@@ -90,8 +90,17 @@ export function showStatus(status) {
   const waits = byId("recorder-waits");
   waits.hidden = !recorder?.waits_for;
   setText(waits, waits.hidden ? "" : `Recording waits: ${recorder.waits_for}.`);
-  const choice = byId("tier-choice");
-  if (document.activeElement !== choice && status.tier_requested) choice.value = status.tier_requested;
+  showMethods(status);
+}
+
+// The daemon says which methods it has, a user's own ones among them.
+function showMethods({ methods = [], tier_requested: requested }) {
+  const choice = byId("method");
+  const names = methods.includes(requested) || !requested ? methods : [requested, ...methods];
+  if (names.join() !== [...choice.options].map(({ value }) => value).join()) {
+    choice.replaceChildren(...names.map((name) => element("option", name)));
+  }
+  if (document.activeElement !== choice && requested) choice.value = requested;
 }
 
 function showStages(stages) {

@@ -203,7 +203,7 @@ function refresh() {
   if (!linked) showState("gone", found ? "disconnected" : "connecting");
   else if (found?.name === "stale") showState("stale");
   else showState(state.status.fields.state);
-  for (const id of ["tare", "record", "tier-choice"]) {
+  for (const id of ["tare", "record", "method"]) {
     byId(id).disabled = !linked || Boolean(state.hello?.read_only);
   }
   const canPress = link.isOpen && state.twinAnswers && state.status?.fields.source?.kind === "twin";
@@ -314,8 +314,8 @@ byId("record").onclick = () =>
   state.status?.fields.recording
     ? command("record_stop", {}, ({ path }) => `Recorded to ${path}`)
     : command("record_start", {}, ({ path }) => `Recording to ${path}`);
-byId("tier-choice").onchange = ({ target }) =>
-  command("set_tier", { tier: target.value }, ({ tier }) => `Tier: ${tier}`);
+byId("method").onchange = ({ target }) =>
+  command("set_tier", { tier: target.value }, ({ tier }) => `Method: ${tier}`);
 byId("clear").onclick = () => touch.clear();
 byId("hold").onchange = ({ target }) => { touch.hold = target.checked; };
 for (const id of ["pressure", "size", "shape"]) byId(id).oninput = showIndenter;

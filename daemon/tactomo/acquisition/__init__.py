@@ -1,0 +1,1 @@
+"""From serial bytes to dual scans: ports, clocks, pairing."""

@@ -1,0 +1,140 @@
+"""A serial port that is kept open: lost with its device, tried again until it is back.
+
+All of it is used by one thread, but what others may read (`is_open`, `problem`,
+`latency_timer_ms`), which that thread alone writes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from pathlib import Path
+from typing import Final
+
+import serial
+
+from tactomo.acquisition.adapters import LOW_LATENCY_MS, ROOT, device_of
+from tactomo.acquisition.open_serial import DEVICE_GONE, is_path, lower_latency, open_serial
+from tactomo.acquisition.replay_port import ReplayEnded
+from tactomo.errors import PortAbsentError, TactomoError
+from tactomo.events import OnEvent, RateLimit
+
+MAX_READ_BYTES: Final = 65_536
+"""Taken at once at most, so that a flood of noise cannot keep the thread from its other duties."""
+
+
+class Connection:
+    """One port, open or waited for.
+
+    Attributes:
+        is_open: whether the device is there at present.
+        problem: why it is not open, for people; empty while it is.
+        latency_timer_ms: an FTDI adapter's, as of the last opening; None for others.
+
+    """
+
+    def __init__(self, url: str, baud: int, on_event: OnEvent, root: Path = ROOT) -> None:
+        self.url = url
+        self.is_open = False
+        self.problem = ""
+        self.latency_timer_ms: int | None = None
+        self._baud = baud
+        self._root = root
+        self._on_event = on_event
+        self._told = ""  # the problem that was told last
+        self._told_limit = RateLimit()
+        self._serial: serial.Serial | None = None
+
+    def open(self) -> None:
+        """Open the port; raise PortError or RecordingError where that cannot be done."""
+        self._serial = open_serial(self.url, self._baud)
+        self.latency_timer_ms = lower_latency(self._serial, self._root)
+        self.problem, self._told, self.is_open = "", "", True
+        self._tell_slow_adapter()
+
+    def try_open(self) -> bool:
+        """Open the port, if that can be done; otherwise say why not, once for each reason."""
+        try:
+            self.open()
+        except TactomoError as error:
+            self._note(error)
+        return self.is_open
+
+    def read(self) -> bytes:
+        """Wait for bytes for a bounded time; none come of a device that has gone.
+
+        Raises:
+            ReplayEnded: the recording that is replayed is at its end.
+
+        """
+        try:
+            port = self._port
+            data = port.read(1)
+            if data:
+                data += port.read(min(port.in_waiting, MAX_READ_BYTES))
+            return data
+        except ReplayEnded:
+            raise
+        except DEVICE_GONE as error:
+            self._lose(error)
+            return b""
+
+    def clock_ns(self, monotonic_ns: int) -> int:
+        """Return when the bytes just read came: `monotonic_ns`, or the recording's time."""
+        return getattr(self._serial, "clock_ns", monotonic_ns)
+
+    def write(self, data: bytes) -> bool:
+        """Send bytes, if the device takes them within a short time; returns whether it did."""
+        try:
+            self._port.write(data)
+        except serial.SerialTimeoutException:
+            return False  # it does not listen; it may still speak
+        except DEVICE_GONE as error:
+            self._lose(error)
+            return False
+        return True
+
+    def close(self) -> None:
+        """Close the port; may be called twice."""
+        self.is_open = False
+        port, self._serial = self._serial, None
+        if port is not None:
+            with contextlib.suppress(*DEVICE_GONE):  # it is gone: nothing is left to close
+                port.close()
+
+    @property
+    def _port(self) -> serial.Serial:
+        if self._serial is None:
+            raise serial.PortNotOpenError
+        return self._serial
+
+    def _lose(self, error: Exception) -> None:
+        self.close()
+        # pyserial's words for it are a guess, and the same for several causes.
+        has_gone = is_path(self.url) and not os.path.exists(self.url)
+        self.problem = "the device has gone" if has_gone else str(error)
+        self._tell_closed("check the cable; the port is tried again until it is back")
+
+    def _note(self, error: TactomoError) -> None:
+        """Take note of why the port cannot be opened, and tell it where it is news."""
+        self.problem = error.cause
+        # That it is not there says no more than that it was lost.
+        is_news = not (isinstance(error, PortAbsentError) and self._told)
+        if is_news and error.cause != self._told and self._told_limit.allows():
+            self._tell_closed(error.next_step)
+
+    def _tell_closed(self, next_step: str) -> None:
+        self._told = self.problem
+        detail = self.problem if self.url in self.problem else f"{self.url}: {self.problem}"
+        self._on_event("port_lost", "error", detail, next_step)
+
+    def _tell_slow_adapter(self) -> None:
+        timer_ms, name = self.latency_timer_ms, os.path.basename(device_of(self.url))
+        if timer_ms is not None and timer_ms > LOW_LATENCY_MS:
+            self._on_event(
+                "latency_timer",
+                "warning",
+                f"{self.url}: the adapter holds bytes back for up to {timer_ms} ms",
+                "install tactomo's udev rules, or as root: "
+                f"`echo 1 > /sys/bus/usb-serial/devices/{name}/latency_timer`",
+            )

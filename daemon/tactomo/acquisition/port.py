@@ -1,0 +1,523 @@
+"""A serial port and the thread that reads it: bytes to packets to scans, stamped on arrival.
+
+The thread outlives its device. When the cable is pulled it says so, tries the port again several
+times a second, and starts the device anew once it is back. A device that does not speak is asked
+again, then the port is closed and opened in case its adapter hangs. Whatever bytes come, they are
+counted; none of them raises.
+
+Once the thread has started, only it touches the connection.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Final
+
+from tactomo_models import SensorDescription
+from tactomo_models.arrays import FloatArray
+from tactomo_protocol import (
+    Acknowledge,
+    AckStatus,
+    CommandCode,
+    DecoderCounts,
+    Hello,
+    Packet,
+    Scan,
+)
+
+from tactomo.acquisition.adapters import ROOT
+from tactomo.acquisition.connection import Connection
+from tactomo.acquisition.device_clock import MAX_RATE, ClockState, DeviceClock
+from tactomo.acquisition.liveness import DeviceState, Liveness
+from tactomo.acquisition.open_serial import other_holders
+from tactomo.acquisition.replay_port import ReplayEnded
+from tactomo.events import OnEvent, RateLimit
+from tactomo.protocols import PortProtocol, Trouble
+from tactomo.recordings.active_recording import ActiveRecording
+from tactomo.recordings.recorder import Recorder
+from tactomo.recordings.recording import REPLAY_SCHEME
+from tactomo.recordings.recording_writer import port_entry, preamble_entry
+from tactomo.scans import ChannelScan, Delivery
+from tactomo.worker import Worker
+
+RETRY_S: Final = 0.25
+TROUBLE_PERIOD_S: Final = 30.0
+"""How often at most a device is said to be in trouble: some come and go for hours."""
+
+
+class PortReader(Worker):
+    """One port. `open` it, `start` its thread, `stop` it.
+
+    Args:
+        index: its number among the sensor's ports.
+        url: a device's path or a pyserial URL.
+        baud: of a real UART.
+        protocol: what its device speaks; it belongs to the thread from `start` on.
+        description: the sensor that the device must fit.
+        device_ids: those that may speak here; any where it is empty.
+        recorder: gets every byte while it records.
+        deliver: called by the thread with what each read brought.
+        on_event: told what happens.
+        root: the folder of `/sys` and `/dev`.
+
+    Attributes:
+        bytes_read: since the start, over all connections.
+        counts: the decoder's counts, likewise.
+        unused: scans that cannot be used: before the first hello, of a device that does not fit
+            the sensor, of another length or of a channel that the sensor does not have.
+        hello: the newest one; None before the first.
+        refusal: why this device's scans are not used; empty when they are.
+        reopened: how often the port was opened again because the device did not speak.
+        clock: the device's, by which its scans are dated.
+        has_ended: whether the replay behind the port is at its end.
+
+    """
+
+    def __init__(
+        self,
+        index: int,
+        url: str,
+        baud: int,
+        protocol: PortProtocol,
+        description: SensorDescription,
+        device_ids: Collection[str],
+        recorder: Recorder,
+        deliver: Callable[[Delivery], None],
+        on_event: OnEvent,
+        root: Path = ROOT,
+    ) -> None:
+        super().__init__(f"port-{index}")
+        self.index = index
+        self.url = url
+        self.bytes_read = 0
+        self.unused = 0
+        self.hello: Hello | None = None
+        self.refusal = ""
+        self.reopened = 0
+        self.clock = DeviceClock()
+        self.has_ended = False
+        self._baud = baud
+        self._description = description
+        self._device_ids = device_ids
+        self._recorder = recorder
+        self._deliver = deliver
+        self._on_event = on_event
+        self._connection = Connection(url, baud, on_event, root)
+        self._is_replay = url.startswith(f"{REPLAY_SCHEME}://")
+        self._liveness = Liveness(protocol.says_hello, protocol.patience_s)
+        self._protocol = protocol
+        self._recording = 0  # number of the recording that has the last chunk
+        self._preamble_s = 0.0  # when a recording was last given one
+        self._is_known = False  # the device that is plugged in has said hello
+        self._asked_s = 0.0  # when the device was last asked, or last sent a scan
+        self._trouble_of_protocol: Trouble | None = None
+        self._corrupt_told = 0
+        self._corrupt_limit = RateLimit()
+        self._trouble_told: DeviceState | None = None
+        self._trouble_limit = RateLimit(TROUBLE_PERIOD_S)
+        self._clock_told = (self.clock.state, 0)
+        self._clock_limit = RateLimit()
+        self._is_zeroing = threading.Event()
+
+    @property
+    def counts(self) -> DecoderCounts:
+        """What the protocol has understood so far, and what not."""
+        return self._protocol.counts
+
+    @property
+    def has_clock(self) -> bool:
+        """Whether the device says when its scans were taken."""
+        return self._protocol.has_clock
+
+    @property
+    def protocol(self) -> str:
+        """What its device speaks."""
+        return self._protocol.name
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the device is there at present."""
+        return self._connection.is_open
+
+    @property
+    def latency_timer_ms(self) -> int | None:
+        """How long an FTDI adapter holds bytes back; None for other ports."""
+        return self._connection.latency_timer_ms
+
+    @property
+    def state(self) -> str:
+        """How the port does, in one word of STREAM.md."""
+        if self.has_ended:
+            return "ended"
+        if not self.is_open:
+            return "closed"
+        return "refused" if self.refusal else str(self._liveness.state)
+
+    @property
+    def problem(self) -> str:
+        """Why the port is closed or of no use, for people; empty where all is well."""
+        return self._connection.problem or self.refusal or self._trouble(self._liveness.state)
+
+    def open(self, or_wait: bool = False) -> None:
+        """Open the port.
+
+        Args:
+            or_wait: where that cannot be done yet, say why and let the thread try again.
+
+        Raises:
+            PortError, RecordingError: the port cannot be opened, and nobody is to wait for it.
+
+        """
+        if or_wait:
+            self._connection.try_open()
+        else:
+            self._connection.open()
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the thread runs, or has come to the end that a replay has."""
+        return super().is_alive or self.has_ended
+
+    def zero_counters(self) -> None:
+        """Ask the device to count from 0 again and to scan; for any thread."""
+        self._is_zeroing.set()
+
+    def _close(self) -> None:
+        self._connection.close()
+
+    def _run(self) -> None:
+        if self._connection.is_open:
+            self._greet_newcomer()
+        try:
+            while not self._stopping.is_set():
+                self.turns += 1
+                if self._connection.is_open:
+                    self._read_once()
+                else:
+                    self._wait_for_device()
+            self._send(self._protocol.stop())
+        except ReplayEnded as end:
+            self._end(str(end))
+
+    def _read_once(self) -> None:
+        """Wait for bytes, for a bounded time, and pass on what they hold."""
+        data = self._connection.read()
+        # The clocks are read here, before anything else is done with the bytes.
+        realtime_ns, monotonic_ns = time.time_ns(), time.monotonic_ns()
+        if data:
+            clock_ns = self._connection.clock_ns(monotonic_ns)
+            self._take(data, realtime_ns, monotonic_ns, clock_ns)
+        if not self._is_replay and self._connection.is_open:
+            self._attend(monotonic_ns * 1e-9)
+
+    def _wait_for_device(self) -> None:
+        """Try the port once more, after a while."""
+        self._trouble_told = None
+        if not self._stopping.wait(RETRY_S) and self._connection.try_open():
+            self._on_event("port_back", "info", self.url)
+            self._greet_newcomer()
+
+    def _greet_newcomer(self) -> None:
+        """Make a new start with whichever device is at the port now."""
+        self._is_known = False
+        self._protocol.restart()
+        self._liveness.opened(time.monotonic())
+        self._ask()
+
+    def _attend(self, now_s: float) -> None:
+        """See to a device that does not do as it should."""
+        if now_s - self._asked_s > self._ask_after_s:
+            self._ask()
+        if self._is_zeroing.is_set():
+            self._is_zeroing.clear()
+            self._send(self._protocol.zero_counters())
+        self._tell_trouble(self._liveness.judge(now_s))
+        if self._liveness.is_reopening_due(now_s):
+            self._reopen()
+
+    @property
+    def _ask_after_s(self) -> float:
+        """Asking begins some foreign devices' scans anew: those that are slow get their time."""
+        least_s = self._protocol.patience_s
+        return least_s if self._protocol.says_hello else max(least_s, self._liveness.patience_s)
+
+    def _reopen(self) -> None:
+        """Close and open the port: what a USB bridge that hangs often needs."""
+        self._connection.close()
+        self._protocol.restart()
+        if self._connection.try_open():
+            self.reopened += 1
+            self._liveness.reopened(time.monotonic())
+            self._ask()
+
+    def _take(self, data: bytes, realtime_ns: int, monotonic_ns: int, clock_ns: int) -> None:
+        self.bytes_read += len(data)
+        recording = self._record(data, realtime_ns, monotonic_ns)
+        scans = []
+        understood = self.counts.packets
+        packets = self._protocol.feed(data)
+        for packet in packets:
+            volts = self._handle(packet)
+            if volts is not None and isinstance(packet, Scan):
+                scans.append(
+                    ChannelScan(
+                        packet.channel,
+                        packet.counter,
+                        packet.device_us,
+                        packet.flags,
+                        volts,
+                        realtime_ns,
+                        monotonic_ns,
+                        clock_ns,
+                        recording,
+                        self.index,
+                        self.clock.date(packet.channel, packet.device_us, clock_ns)
+                        if self.has_clock
+                        else None,
+                    )
+                )
+        now_s = monotonic_ns * 1e-9
+        found = sum(isinstance(packet, Scan) for packet in packets)
+        self._liveness.heard(now_s, self.counts.packets - understood, found)
+        if packets:
+            self._deliver(Delivery(self.index, clock_ns, tuple(scans), self.hello))
+        if not self._is_replay:
+            self._send(self._protocol.replies())
+        self._tell_corrupt()
+        self._tell_clock()
+        self._tell_protocols_trouble()
+
+    def _record(self, data: bytes, realtime_ns: int, monotonic_ns: int) -> int:
+        """Give the bytes to the recording that runs, if any; returns its number or 0."""
+        times = (monotonic_ns, realtime_ns)
+        active = self._recorder.active
+        is_taken = active is not None and self._record_to(active, data, times)
+        if not is_taken and self._recorder.active is not active:  # it has just given way to it
+            active = self._recorder.active
+            is_taken = active is not None and self._record_to(active, data, times)
+        self._recording = active.number if active is not None and is_taken else 0
+        return self._recording
+
+    def _record_to(self, active: ActiveRecording, data: bytes, times: tuple[int, int]) -> bool:
+        entries = [port_entry(self.index, data, *times)]
+        age_s = times[0] * 1e-9 - self._preamble_s
+        if active.number != self._recording or age_s >= self._protocol.preamble_period_s:
+            # So that its first scan is whole and what it means is known.
+            preamble = self._protocol.preamble()
+            self._preamble_s = times[0] * 1e-9
+            if preamble:
+                entries.insert(0, preamble_entry(self.index, preamble, *times))
+        previous = active.previous
+        if previous is not None and self._recording in (previous.number, active.number):
+            previous.add(entries[-1])
+        return active.add(*entries)
+
+    def _handle(self, packet: Packet) -> FloatArray | None:
+        """Take note of a packet; returns a scan's volts if they may be used."""
+        if isinstance(packet, Hello):
+            self._greet(packet)
+        elif isinstance(packet, Acknowledge) and _is_refusal(packet):
+            self._on_event(
+                "command_refused",
+                "warning",
+                f"{self.url}: the device answered command {packet.command} with "
+                f"{packet.status.name}",
+            )
+        elif isinstance(packet, Scan):
+            self._asked_s = time.monotonic()
+            hello = self.hello
+            is_usable = self._is_known and not self.refusal
+            if hello is not None and is_usable and self._fits(packet, hello):
+                return packet.volts(hello.volts_per_count)
+            self.unused += 1
+        return None
+
+    def _fits(self, scan: Scan, hello: Hello) -> bool:
+        is_known = scan.channel in self._description.channels
+        return is_known and len(scan.samples) == hello.samples_per_scan
+
+    def _greet(self, hello: Hello) -> None:
+        self._is_known = True
+        self._liveness.note_rate(hello.scan_rate_hz)
+        before = self.hello
+        if hello == before:
+            return
+        self.hello = hello
+        self.refusal = self._why_refused(hello)
+        if self.refusal:
+            self._tell_refusal(hello, self._is_foreign(hello))
+        elif before is not None and before.device_id != hello.device_id:
+            self._on_event(
+                "device_changed",
+                "warning",
+                f"{self.url}: {hello.device_id} is where {before.device_id} was",
+                "tare, if another skin was plugged in; `device_ids` keeps foreign ones out",
+            )
+
+    def _why_refused(self, hello: Hello) -> str:
+        if self._is_foreign(hello):
+            ours = ", ".join(self._device_ids)
+            return f"{hello.device_id} is not one of this sensor's devices, {ours}"
+        return contradiction(hello, self._description)
+
+    def _is_foreign(self, hello: Hello) -> bool:
+        return bool(self._device_ids) and hello.device_id not in self._device_ids
+
+    def _tell_refusal(self, hello: Hello, is_foreign: bool) -> None:
+        name = self._description.name
+        why = (
+            self.refusal if is_foreign else f"{hello.device_id} does not fit {name}: {self.refusal}"
+        )
+        self._on_event(
+            "device_refused",
+            "error",
+            f"{self.url}: {why}; its scans are not used",
+            "plug it in elsewhere, or name its port by /dev/serial/by-id or by-path: see "
+            "`tactomo ports`; a device that was replaced belongs into `device_ids`"
+            if is_foreign
+            else "give the daemon the description of the sensor that is connected",
+        )
+
+    def _ask(self) -> None:
+        """Ask the device who it is and to start."""
+        self._asked_s = time.monotonic()
+        self._send(self._protocol.introduction())
+
+    def _send(self, messages: list[bytes]) -> None:
+        """Write to the device what it takes; while it is talked to, it is not asked anew."""
+        for message in messages:
+            self._asked_s = time.monotonic()
+            if not self._connection.is_open or not self._connection.write(message):
+                return
+
+    def _trouble(self, state: DeviceState) -> str:
+        """Return in words what is the matter with a device in this state; empty if nothing is."""
+        hello = self.hello
+        if state is DeviceState.SILENT:
+            return f"nothing came for {self._liveness.silence_s:.3g} s"
+        if state is DeviceState.GARBAGE:
+            return f"bytes come, but no packet of protocol {self.protocol} at {self._baud} baud"
+        if state is DeviceState.IDLE and (hello is None or hello.scan_rate_hz > 0):
+            return "the device speaks, but sends no scans"
+        return ""
+
+    def _tell_trouble(self, state: DeviceState) -> None:
+        """Tell when a device falls into trouble and when it is out of it again."""
+        if state is self._trouble_told or state is DeviceState.STARTING:
+            return
+        trouble = self._trouble(state)
+        if not trouble and self._trouble_told is not None:
+            self._on_event("device_speaks", "info", self.url)
+            self._trouble_told = None
+        elif trouble and self._trouble_limit.allows():
+            self._trouble_told = state
+            detail = f"{self.url}: {trouble}{self._sharers()}"
+            if state is DeviceState.SILENT:
+                self._on_event(
+                    "device_silent",
+                    "warning",
+                    detail,
+                    "check its power; it is asked again, and the port is opened anew",
+                )
+            elif state is DeviceState.GARBAGE:
+                self._on_event(
+                    "device_garbled",
+                    "warning",
+                    detail,
+                    "wrong baud rate, or another device: set `baud` or `protocol` to the device's; "
+                    "`tactomo ports --ask` tells what is where",
+                )
+            else:
+                self._on_event(
+                    "device_idle",
+                    "warning",
+                    detail,
+                    "it is asked to start again and again; check its trigger, or reset it",
+                )
+
+    def _sharers(self) -> str:
+        """Name those who take bytes away, which only root can."""
+        sharers = "; ".join(map(str, other_holders(self.url)))
+        return f"; another process has the port open, too ({sharers})" if sharers else ""
+
+    def _end(self, reason: str) -> None:
+        self._connection.close()
+        self.has_ended = True
+        self._deliver(Delivery(self.index, 0, (), has_ended=True))
+        self._on_event("replay_ended", "info", f"{self.url}: {reason}")
+
+    def _tell_clock(self) -> None:
+        """Tell of a device's clock that jumped or is none; scans are dated by arrival then."""
+        clock, (state, jumps) = self.clock, self._clock_told
+        if clock.jumps > jumps and self._clock_limit.allows():
+            self._on_event(
+                "device_clock_jumped",
+                "warning",
+                f"{self.url}: the device's clock jumped, or the device was reset; "
+                f"{clock.jumps} times since the start",
+                "if it comes again and again, check the device's supply and its timer",
+            )
+            jumps = clock.jumps
+        if clock.state is not state and clock.state is ClockState.UNUSABLE:
+            self._on_event(
+                "device_clock_unusable",
+                "warning",
+                f"{self.url}: the device's clock stands still, or is off by more than "
+                f"{MAX_RATE * 1e6:g} ppm; what buffers hold up is not seen in the ages",
+                "correct the firmware's clock: microseconds, read as the scan begins",
+            )
+        self._clock_told = (clock.state, jumps)
+
+    def _tell_protocols_trouble(self) -> None:
+        """Tell why nothing can be made of what comes, and when it can again."""
+        trouble = self._protocol.trouble
+        if trouble == self._trouble_of_protocol:
+            return
+        if trouble is not None:
+            self.refusal = trouble.cause
+            detail = f"{self.url}: {trouble.cause}"
+            self._on_event("device_refused", "error", detail, trouble.next_step)
+        elif self.hello is not None:
+            self.refusal = self._why_refused(self.hello)
+            self._on_event("device_speaks", "info", self.url)
+        else:
+            self.refusal = ""
+        self._trouble_of_protocol = trouble
+
+    def _tell_corrupt(self) -> None:
+        corrupt = self.counts.corrupt
+        if corrupt > self._corrupt_told and self._corrupt_limit.allows():
+            self._on_event(
+                "corrupt_packets",
+                "warning",
+                f"{self.url}: {corrupt - self._corrupt_told} damaged, {corrupt} since the start",
+                "check the cable, its shield and the baud rate",
+            )
+            self._corrupt_told = corrupt
+
+
+def _is_refusal(answer: Acknowledge) -> bool:
+    """Whether a device did not do what it should; a follower leaves the counters to its leader."""
+    is_leaders = answer.command == CommandCode.ZERO_COUNTERS
+    return answer.status != AckStatus.OK and not (
+        is_leaders and answer.status == AckStatus.UNKNOWN_COMMAND
+    )
+
+
+def contradiction(hello: Hello, description: SensorDescription) -> str:
+    """Return in what a device differs from the sensor's description; empty when in nothing."""
+    drive_offset, measure_offset = description.offsets
+    pairs = {
+        "electrodes": (hello.electrodes, description.electrode_count),
+        "drive_offset": (hello.drive_offset, drive_offset),
+        "measure_offset": (hello.measure_offset, measure_offset),
+        "samples_per_scan": (hello.samples_per_scan, description.measurements),
+    }
+    differ = [f"{key} {has}, not {want}" for key, (has, want) in pairs.items() if has != want]
+    if not any(channel in description.channels for channel in hello.channels):
+        sent = ", ".join(channel for channel in hello.channels)
+        differ.append(f"channels {sent}, not {', '.join(description.channels)}")
+    return "; ".join(differ)

@@ -1,0 +1,1 @@
+"""`tactomo bench`: how fast everything is on this machine."""

@@ -1,0 +1,409 @@
+"""`tactomo bench`: how fast all this is on the machine at hand.
+
+*Live*: a twin and a daemon as processes of their own, and this process as the subscriber; latency
+is from the moment at which the daemon has read the last byte of a dual scan to the arrival of its
+contacts here, by the clock that both processes share. *Machine speed* is
+`tactomo.cli.bench.machine_speed`'s; *methods* and *chart* are the laboratory's, see
+`tactomo.cli.laboratory`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tactomo.cli.laboratory import installed_measurement, measurement, not_installed
+from tactomo.cli.options import (
+    DEFAULT_DESCRIPTION,
+    Description,
+    JsonOutput,
+    examples,
+    methods_option,
+    typer_app,
+)
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+    from tactomo_models import SensorDescription
+
+    from tactomo.cli.children import Family
+
+SENSOR = "bench"
+PAGE_WIDTH = 150
+SETTLE_S = 1.5
+STATUS_S = 13.0  # at 20 dual scans a second: as far back as the stage times in a status go
+START_S = 60.0
+PLACES = ((0.0, 0.1), (-0.45, -0.4), (0.5, -0.35))  # in shares of half the sheet's size
+LIVE, METHODS, CHART, SPEED = "Live", "Methods", "Speed against accuracy", "Machine speed"
+
+
+@dataclass(frozen=True)
+class Phase:
+    """What was measured live while one thing was pressed."""
+
+    scene: str
+    frames: int
+    frames_per_s: float
+    latency_p50_ms: float
+    latency_p99_ms: float
+    stage_ms: dict[str, dict[str, float]]
+    tiers: dict[str, int]
+
+
+@dataclass
+class Results:
+    """Everything that was measured, and on what."""
+
+    machine: str
+    description: str
+    live: list[Phase] = field(default_factory=list)
+    late_scans: int | None = None
+    dropped_scans: int | None = None
+    methods: list[dict[str, Any]] = field(default_factory=list)
+    chart: list[dict[str, Any]] = field(default_factory=list)
+
+
+app = typer_app()
+
+
+@app.command(
+    epilog=examples(
+        "tactomo bench",
+        "tactomo bench --seconds 20 --ports 1",
+        "tactomo bench --json > times.json",
+        "tactomo bench --no-live --method my_module:MyMethod --method auto",
+        "tactomo bench --chart speed_accuracy.png --count 25",
+        "tactomo bench --chart mine.png --method my_module:MyMethod --method auto",
+        "tactomo bench --machine-speed",
+        "tactomo bench --machine-speed --show",
+    ),
+)
+def bench(
+    description: Description = DEFAULT_DESCRIPTION,
+    seconds: Annotated[
+        float,
+        typer.Option(min=1.0, rich_help_panel=LIVE, help="Time of each of the four live scenes."),
+    ] = STATUS_S,
+    ports: Annotated[
+        int, typer.Option(min=1, max=2, rich_help_panel=LIVE, help="Lines of the twin.")
+    ] = 2,
+    rate: Annotated[
+        float, typer.Option(rich_help_panel=LIVE, help="Dual scans a second of the twin.")
+    ] = 20.0,
+    live: Annotated[
+        bool, typer.Option(rich_help_panel=LIVE, help="Measure latency from port to subscriber.")
+    ] = True,
+    method: Annotated[
+        list[str] | None, methods_option(" [every installed one]", rich_help_panel=METHODS)
+    ] = None,
+    chart: Annotated[
+        Path | None,
+        typer.Option(
+            rich_help_panel=CHART,
+            help="Instead, draw every method's accuracy over its time: .png, .svg or "
+            ".pdf, and a .csv beside it. Needs matplotlib.",
+        ),
+    ] = None,
+    count: Annotated[
+        int,
+        typer.Option(min=1, rich_help_panel=CHART, help="Still scenes each of 1 to 4 contacts."),
+    ] = 10,
+    machine_speed: Annotated[
+        bool,
+        typer.Option(
+            "--machine-speed",
+            rich_help_panel=SPEED,
+            help="Instead, measure what a budget of time buys here, and keep it for "
+            "daemons that start from now on.",
+        ),
+    ] = False,
+    show: Annotated[
+        bool,
+        typer.Option(
+            "--show",
+            rich_help_panel=SPEED,
+            help="With --machine-speed: only show what such a daemon would go by.",
+        ),
+    ] = False,
+    as_json: JsonOutput = False,
+) -> None:
+    """Measure latency, rate and time per frame on this machine.
+
+    Starts a twin and a daemon of its own on free addresses, so a running demo is not disturbed
+    (but shares the processor), presses the twin in four ways and measures each. Takes about a
+    minute.
+
+    With the laboratory installed, every method is then timed on simulated scans, on one thread,
+    beside a bare matrix-vector product and pyEIT (`pip install 'tactomo[compare]'`): nothing
+    pressed, cold, still and moving; in ms, and in such products. Takes another one or two minutes.
+
+    With `--chart`, every method reconstructs simulated scenes of the reporting seeds: still ones
+    at 40, 20 and 10 dB, each from a cold start, and moving ones under a daemon's budgets. Takes
+    about ten minutes, the first time some more to simulate them.
+
+    With `--machine-speed`, methods follow one moving scene and what they took is kept in the
+    cache, beside the sensor's models: daemons then keep to a budget of time as this machine does,
+    and `auto` takes the method that is most accurate within it; how accurate each is was measured
+    on the shipped sensor. Takes about half a minute; leave the machine alone meanwhile. A service
+    has a cache of its own: set CACHE_DIRECTORY to it.
+    """
+    if show and not machine_speed:
+        raise typer.BadParameter("--show goes with --machine-speed")
+    if machine_speed and chart is not None:
+        raise typer.BadParameter("--machine-speed and --chart are two runs")
+    if machine_speed and method:
+        raise typer.BadParameter("--machine-speed measures every method, without --method")
+    results = Results(machine(), description)
+    if chart is not None:
+        _chart(results, chart, count, method or [], as_json)
+        return
+    if machine_speed:
+        _machine_speed(results, show, as_json)
+        return
+    from rich.console import Console
+
+    time_methods, table = installed_measurement("methods"), None
+    if time_methods is None and (method or not live):
+        raise not_installed("the table of methods")
+    with Console(stderr=True).status("starting") as line:
+        if live:
+            _measure_twin(results, ports, rate, seconds, line.update)
+        if time_methods is not None:
+            results.methods, table = time_methods(description, method or [], line.update)
+    if as_json:
+        typer.echo(json.dumps(asdict(results), indent=2))
+    else:
+        _print(results, table)
+
+
+def _chart(results: Results, picture: Path, count: int, methods: list[str], as_json: bool) -> None:
+    """Measure and draw speed against accuracy, and print the table."""
+    results.chart, table = measurement("chart")(
+        results.description, picture, count, results.machine, methods
+    )
+    if as_json:
+        typer.echo(json.dumps(asdict(results), indent=2))
+    else:
+        _console(results).print(table)
+
+
+def _machine_speed(results: Results, show: bool, as_json: bool) -> None:
+    """Measure what a time buys on this machine, or show what was measured."""
+    from tactomo.cli.bench import machine_speed as bench_machine_speed
+
+    name = results.description
+    made = bench_machine_speed.in_force(name) if show else bench_machine_speed.measure(name)
+    if as_json:
+        typer.echo(made.model_dump_json(indent=2))
+        return
+    console = _console(results)
+    for table in bench_machine_speed.tables_of(made):
+        console.print(table)
+    console.print(
+        f"This machine's speed: {made.source}. A frame takes {made.overhead_s * 1e3:.1f} ms and "
+        f"{made.speed:.2f} times its modelled budget (p99)."
+    )
+
+
+def _measure_twin(
+    results: Results, ports: int, rate: float, seconds: float, report: Callable[[str], None]
+) -> None:
+    """Press a twin in several ways and measure each."""
+    from tactomo_client import request
+    from tactomo_models import load_description
+
+    with _sockets() as at, _family() as family:
+        size = load_description(results.description)
+        spots = [_spot(size, place) for place in PLACES]
+        options = ("--description", results.description)
+        family.start("models build", "models", "build", *options).wait_done()
+        skin = family.start(
+            *("twin", "twin", *options, "--ports", str(ports), "--rate", str(rate)),
+            *("--twin-control", at("twin"), "--announce"),
+        ).wait_ready()
+        lines = [word for path in skin["ports"] for word in ("--port", path)]
+        family.start(
+            *("daemon", "daemon", "--sensor", SENSOR, *options, *lines),
+            *("--stream", at("stream"), "--control", at("control")),
+        ).wait_ready()
+
+        def press(count: int) -> None:
+            request("clear", skin["control"])
+            for number, (x_mm, y_mm) in enumerate(spots[:count]):
+                request("press", skin["control"], id=str(number), x_mm=x_mm, y_mm=y_mm)
+
+        def slide(share: float) -> None:
+            x_mm, y_mm = _spot(size, (1.2 * share - 0.6, 0.2))
+            request("press", skin["control"], id="0", x_mm=x_mm, y_mm=y_mm)
+
+        with _Stream(at("stream")) as stream:
+            stream.wait_for_reference()
+            for scene, count, moves in (
+                ("nothing pressed", 0, None),
+                ("one contact, still", 1, None),
+                ("one contact, sliding", 1, slide),
+                ("three contacts, still", 3, None),
+            ):
+                report(f"live: {scene}")
+                press(count)
+                stream.skip(SETTLE_S)
+                results.live.append(stream.measure(scene, seconds, at("control"), moves))
+        results.late_scans = request("status", skin["control"])["late_scans"]
+        results.dropped_scans = request("status", at("control"))["dropped_scans"]
+
+
+class _Stream:
+    """A subscriber to contacts that takes the time of every message."""
+
+    def __init__(self, address: str) -> None:
+        from tactomo_client import subscribe
+
+        self._frames = subscribe(SENSOR, address=address, kind="contacts", timeout_s=START_S)
+
+    def __enter__(self) -> _Stream:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._frames.close()
+
+    def wait_for_reference(self) -> None:
+        """Wait for the first frame that has something to be measured against."""
+        for frame in self._frames:
+            if "no_reference" not in frame.flags:
+                return
+
+    def skip(self, seconds: float) -> None:
+        """Let frames pass."""
+        for _ in self._during(seconds):
+            pass
+
+    def measure(
+        self, scene: str, seconds: float, control: str, moves: Callable[[float], None] | None
+    ) -> Phase:
+        """Measure for `seconds`; `moves` gets the share that has passed."""
+        import numpy as np
+        from tactomo_client import request
+
+        ages_ms: list[float] = []
+        tiers: dict[str, int] = {}
+        begin_s = time.monotonic()
+        for frame in self._during(seconds):
+            ages_ms.append(frame.age_s * 1e3 - (frame.delay_ns or 0) * 1e-6)
+            tiers[str(frame.tier)] = tiers.get(str(frame.tier), 0) + 1
+            if moves is not None:
+                moves(min(1.0, (time.monotonic() - begin_s) / seconds))
+        passed_s = time.monotonic() - begin_s
+        p50, p99 = np.percentile(ages_ms, (50, 99)).tolist()
+        stages = request("status", control)["stage_ms"]
+        return Phase(scene, len(ages_ms), len(ages_ms) / passed_s, p50, p99, stages, tiers)
+
+    def _during(self, seconds: float) -> Iterator[Any]:
+        end_s = time.monotonic() + seconds
+        for frame in self._frames:
+            yield frame
+            if time.monotonic() >= end_s:
+                return
+
+
+def _spot(description: SensorDescription, place: tuple[float, float]) -> tuple[float, float]:
+    """Return the millimetres of a place that is given in shares of half the sheet's size."""
+    return place[0] * description.width_m * 500.0, place[1] * description.height_m * 500.0
+
+
+def _print(results: Results, methods: Table | None) -> None:
+    console = _console(results)
+    if results.live:
+        console.print(_live_table(results))
+        console.print(_stage_table(results.live))
+        console.print(
+            f"late scans of the twin: {results.late_scans}; "
+            f"dual scans dropped by the daemon: {results.dropped_scans}"
+        )
+    if methods is not None:
+        console.print(methods)
+
+
+def _console(results: Results) -> Console:
+    """Return where to print, and say there on what everything was measured."""
+    from rich.console import Console
+
+    console = Console()
+    if not console.is_terminal:  # a file has no width of its own, and the table needs one
+        console = Console(width=PAGE_WIDTH)
+    console.print(f"[bold]{results.machine}[/], sensor {results.description}")
+    return console
+
+
+def _live_table(results: Results) -> Table:
+    from rich.table import Table
+
+    table = Table(
+        title="live: last byte read to contacts in another process",
+        min_width=80,
+    )
+    for name in ("scene", "frames/s", "p50 ms", "p99 ms", "frames by tier"):
+        table.add_column(name, justify="left" if name in ("scene", "frames by tier") else "right")
+    for phase in results.live:
+        table.add_row(
+            phase.scene,
+            f"{phase.frames_per_s:.1f}",
+            f"{phase.latency_p50_ms:.1f}",
+            f"{phase.latency_p99_ms:.1f}",
+            ", ".join(f"{tier} {count}" for tier, count in phase.tiers.items()),
+        )
+    return table
+
+
+def _stage_table(phases: list[Phase]) -> Table:
+    """Return the daemon's own account of its newest 256 frames at the end of each scene."""
+    from rich.table import Table
+
+    table = Table(title="stages of the daemon, p50 / p99 ms", min_width=80)
+    table.add_column("stage")
+    for phase in phases:
+        table.add_column(phase.scene, justify="right")
+    for stage in dict.fromkeys(stage for phase in phases for stage in phase.stage_ms):
+        times = (phase.stage_ms.get(stage) for phase in phases)
+        cells = (f"{t['p50']:.1f} / {t['p99']:.1f}" if t else "-" for t in times)
+        table.add_row(stage, *cells)
+    return table
+
+
+def machine() -> str:
+    """Return the processor, its cores that we may use, and the versions that matter."""
+    import numpy as np
+    from tactomo_models.machine_speed import processor
+
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return (
+        f"{processor()}, {cores} cores, Python {platform.python_version()}, NumPy {np.__version__}"
+    )
+
+
+class _sockets:  # noqa: N801 - reads as a statement
+    """A folder for sockets: addresses that nobody else has."""
+
+    def __enter__(self) -> Callable[[str], str]:
+        import tempfile
+
+        self._folder = tempfile.TemporaryDirectory(prefix="tactomo-")
+        return lambda name: f"ipc://{self._folder.name}/{name}"
+
+    def __exit__(self, *_: object) -> None:
+        self._folder.cleanup()
+
+
+def _family() -> Family:
+    from tactomo.cli.children import Family, interrupt_on_sigterm
+
+    interrupt_on_sigterm()
+    return Family()

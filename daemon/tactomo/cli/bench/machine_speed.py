@@ -1,0 +1,150 @@
+"""`tactomo bench --machine-speed`: how much work, and which method, a time buys on this machine.
+
+How right a method is does not depend on the machine: that is the shipped table's.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import Progress
+from tactomo_models import (
+    Press,
+    Reconstructor,
+    Reference,
+    SensorDescription,
+    SkinSimulator,
+    load_description,
+    load_or_build_artifact,
+)
+from tactomo_models.arrays import FloatArray
+from tactomo_models.machine_speed import (
+    MachineSpeed,
+    machine_speed_for,
+    machine_speed_path,
+    save_machine_speed,
+    shipped_rows,
+)
+from tactomo_models.methods.registry import BUDGETED
+from tactomo_protocol import Channel
+from threadpoolctl import threadpool_limits
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+TIMES_MS: Final = (1, 2, 5, 10, 20, 50, 100)  # for which the table shows what they buy
+Scan = tuple[FloatArray | None, ...]  # volts (M,) of each channel, or None
+FRAMES: Final = 120
+PRESSURE_KPA: Final = 170.0
+FRAMES_A_SLIDE: Final = 20  # then both contacts jump, which is what takes longest
+REFERENCE_SCANS: Final = 20
+NOISE: Final = 0.1  # of the changes (root mean square); with less, budgets are not used up
+BUSY: Final = 0.8  # share of a core below which times are those of whatever else ran
+
+
+def measure(name: str) -> MachineSpeed:
+    """Time a sensor's methods on this machine and keep what came out, with a progress bar.
+
+    Raises:
+        ModelError: the models cannot be built, or the file cannot be written.
+    """
+    sensor = load_description(name)
+    artifact = load_or_build_artifact(sensor)
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        reference, scans = _moving_scene(sensor, progress)
+        rows = []
+        with warned_if_busy(), threadpool_limits(1):
+            for row in shipped_rows(sensor):
+                reconstructor = Reconstructor(
+                    sensor, artifact, method=row.method, budget_s=row.budget_s
+                )
+                reconstructor.set_reference(reference)
+                frames = progress.track(scans, description=f"measuring {row.method}")
+                p50_s, p99_s = np.percentile(_seconds(reconstructor, frames), (50, 99)).tolist()
+                rows.append(row.model_copy(update={"p50_s": p50_s, "p99_s": p99_s}))
+    speed = MachineSpeed.of_rows(sensor, datetime.now(UTC).date().isoformat(), rows)
+    save_machine_speed(speed, machine_speed_path(sensor))
+    return speed
+
+
+def _seconds(reconstructor: Reconstructor, scans: Iterable[Scan]) -> list[float]:
+    """Time that each frame takes."""
+    seconds = []
+    for scan in scans:
+        begin_s = time.perf_counter()
+        reconstructor.reconstruct(*scan)
+        seconds.append(time.perf_counter() - begin_s)
+    return seconds
+
+
+def _moving_scene(sensor: SensorDescription, progress: Progress) -> tuple[Reference, list[Scan]]:
+    """Two contacts that slide around the middle, opposite each other, and jump; and their tare."""
+    skin, rng = SkinSimulator(sensor), np.random.default_rng(0)
+    radius_m, pressed = sensor.width_m / 15, []
+    for frame in progress.track(range(FRAMES), description="simulating two contacts"):
+        slide, step = divmod(frame, FRAMES_A_SLIDE)
+        angle_rad = 2.4 * slide + step / FRAMES_A_SLIDE
+        x_m = sensor.width_m / 4 * np.cos(angle_rad)
+        y_m = sensor.height_m / 4 * np.sin(angle_rad)
+        presses = [Press(side * x_m, side * y_m, PRESSURE_KPA, radius_m) for side in (1, -1)]
+        pressed.append(skin.voltages(presses))
+    tare: dict[Channel, FloatArray | None] = dict.fromkeys(Channel)
+    scans: dict[Channel, list[FloatArray | None]] = dict.fromkeys(Channel, [None] * FRAMES)
+    for channel, rest in skin.voltages([]).items():
+        volts = np.array([frame[channel] for frame in pressed])
+        noise_v = NOISE * np.sqrt(np.mean((volts - rest) ** 2))
+        tare[channel] = rest + noise_v * rng.standard_normal((REFERENCE_SCANS, len(rest)))
+        scans[channel] = list(volts + noise_v * rng.standard_normal(volts.shape))
+    return Reference.from_scans(*tare.values()), list(zip(*scans.values(), strict=True))
+
+
+@contextmanager
+def warned_if_busy() -> Iterator[None]:
+    """Say on standard error if this process had to wait for others while it measured times."""
+    wall_s, own_s = time.perf_counter(), time.process_time()
+    yield
+    share = (time.process_time() - own_s) / (time.perf_counter() - wall_s)
+    if share < BUSY:
+        typer.echo(
+            f"the machine was busy: this had {share:.0%} of a core, and its times are too long; "
+            "run it again when nothing else runs",
+            err=True,
+        )
+
+
+def in_force(name: str) -> MachineSpeed:
+    """Return what a daemon would use, and say on standard error why, if need be."""
+    console = Console(stderr=True)
+    return machine_speed_for(load_description(name), lambda why: console.print(why, soft_wrap=True))
+
+
+def tables_of(speed: MachineSpeed) -> Sequence[Table]:
+    """Lay out what was measured, and what each time buys."""
+    from rich.table import Table
+
+    measured = Table(title="one frame of a moving scene (simulated), one thread")
+    for heading in ("method", "modelled budget ms", "p50 ms", "p99 ms", "ICC, as shipped"):
+        measured.add_column(heading, justify="left" if heading == "method" else "right")
+    for row in speed.rows:
+        measured.add_row(
+            row.method,
+            "" if row.budget_s is None else f"{row.budget_s * 1e3:g}",
+            f"{row.p50_s * 1e3:.1f}",
+            f"{row.p99_s * 1e3:.1f}",
+            f"{row.icc:.3f}",
+        )
+    bought = Table(title="what auto does within a time")
+    for heading in ("within ms", "method", "modelled budget ms"):
+        bought.add_column(heading, justify="left" if heading == "method" else "right")
+    for time_ms in TIMES_MS:
+        plan = speed.plan("auto", time_ms * 1e-3)
+        budget = f"{plan.budget_s * 1e3:.1f}" if plan.method in BUDGETED and plan.budget_s else ""
+        bought.add_row(str(time_ms), str(plan.method), budget)
+    return [measured, bought] if speed.rows else [bought]

@@ -1,0 +1,1 @@
+"""`tactomo calibrate`: from magnitude to pressure with a load cell."""

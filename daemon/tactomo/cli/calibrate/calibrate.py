@@ -1,0 +1,292 @@
+"""`tactomo calibrate`: a sensor's pressure scale, from what a load cell says."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tactomo.cli.options import (
+    DEFAULT_CONTROL,
+    DEFAULT_NAME,
+    DEFAULT_STREAM,
+    ControlAddress,
+    GivenDescription,
+    KeysFolder,
+    SensorName,
+    StreamAddress,
+    examples,
+    typer_app,
+)
+from tactomo.cli.plot.plot import prepare_picture
+
+if TYPE_CHECKING:
+    from rich.table import Table
+    from tactomo_models.calibration.calibration_file import PressureCalibration
+
+ROWS = 9  # of the table
+
+app = typer_app(
+    name="calibrate",
+    help=(
+        "Find out what pressure the magnitude channel's change means on this very sensor.\n\n"
+        "Press with a flat indenter of known size on a load cell (or a scale, or weights), from "
+        "lighter than the sensor answers to as hard as it will be pressed, and back again: ten "
+        "presses or more, each held still. A rising curve is fitted to the readings, with its "
+        "uncertainty; below its onset and beyond the last reading contacts say so instead of a "
+        "pressure.\n\n"
+        "The calibration is kept by the sensor's name and devices. The sensor's daemon uses it at "
+        "once if it runs (at --control), else from its next start. A service keeps its own: `sudo "
+        "-u tactomo STATE_DIRECTORY=/var/lib/tactomo/NAME tactomo calibrate ... --sensor NAME`, or "
+        '`calibration = "FILE"` in its configuration.'
+    ),
+    no_args_is_help=True,
+    epilog=examples(
+        "tactomo calibrate live --sensor left_forearm --diameter-mm 30",
+        "tactomo calibrate fit load_cell.csv --sensor left_forearm --recording presses.mcap",
+        "tactomo calibrate show --sensor left_forearm --picture curve.png",
+    ),
+)
+
+DiameterMm = Annotated[
+    float | None,
+    typer.Option("--diameter-mm", min=1.0, max=1e3, help="Of a round, flat indenter."),
+]
+AreaMm2 = Annotated[
+    float | None, typer.Option("--area-mm2", min=1.0, max=1e6, help="Of one of another shape.")
+]
+Output = Annotated[
+    Path | None,
+    typer.Option("--output", "-o", help="Keep it in this file. [where the daemon looks]"),
+]
+Picture = Annotated[Path | None, typer.Option(help="Draw readings and curve: .png, .svg or .pdf.")]
+
+
+@app.command(
+    epilog=examples(
+        "tactomo calibrate live",
+        "tactomo calibrate live --sensor left_forearm --diameter-mm 30",
+    ),
+)
+def live(
+    sensor: SensorName = DEFAULT_NAME,
+    diameter_mm: DiameterMm = None,
+    area_mm2: AreaMm2 = None,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Begin anew, not with what was taken.")
+    ] = False,
+    output: Output = None,
+    stream: StreamAddress = DEFAULT_STREAM,
+    control: ControlAddress = DEFAULT_CONTROL,
+    keys: KeysFolder = None,
+) -> None:
+    """Be guided, press by press, with the running daemon.
+
+    Says what to press, waits until the contact is still, asks for the load cell's reading, and says
+    when there are enough. Ctrl-C keeps what was taken; the same command goes on from there.
+    """
+    from tactomo.cli.calibrate.live import guided
+
+    path = _path(sensor, output)
+    made = guided(sensor, stream, keys, _area_mm2(diameter_mm, area_mm2), path, fresh=fresh)
+    print_calibration(made)
+    _keep(made, path, control, keys)
+
+
+@app.command(
+    epilog=examples(
+        "tactomo calibrate fit load_cell.csv --sensor left_forearm --recording presses.mcap",
+        "tactomo calibrate fit magnitudes.csv --dry-run --picture curve.png",
+    ),
+)
+def fit(
+    readings: Annotated[
+        Path, typer.Argument(metavar="FILE.csv", help="What the load cell said, see above.")
+    ],
+    sensor: SensorName = DEFAULT_NAME,
+    recording: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.mcap", help="What the sensor said meanwhile."),
+    ] = None,
+    diameter_mm: DiameterMm = None,
+    area_mm2: AreaMm2 = None,
+    time_offset: Annotated[
+        float, typer.Option(metavar="SECONDS", help="Added to the load cell's times.")
+    ] = 0.0,
+    description: GivenDescription = None,
+    device_id: Annotated[
+        list[str] | None,
+        typer.Option(help="The device that it was made with, where no recording says; repeat."),
+    ] = None,
+    picture: Picture = None,
+    output: Output = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Keep nothing.")] = False,
+    keep_odd: Annotated[
+        bool, typer.Option("--keep-odd", help="Keep it with lines that the others contradict.")
+    ] = False,
+    control: ControlAddress = DEFAULT_CONTROL,
+    keys: KeysFolder = None,
+) -> None:
+    """Fit a table of readings.
+
+    The table has column names: `pressure_kpa`, or `force_n` with `area_mm2` or `diameter_mm` of the
+    indenter; and `magnitude` (|Δσ|/σ₀), with `magnitude_sigma` if that is known, or, with
+    --recording, the time: `time_s` from the recording's beginning, or `realtime_s` since 1970
+    (UTC). `direction` (up, down) may be given, else it follows from the order. A log of many lines
+    a second will do: it is cut into pieces in which the load was still. Lines that the others
+    contradict are named, and nothing is kept until they are mended (or --keep-odd is given).
+    """
+    if not math.isfinite(time_offset):
+        raise typer.BadParameter(f"--time-offset {time_offset}: give seconds")
+    area = _area_mm2(diameter_mm, area_mm2)
+    if picture is not None:
+        prepare_picture(picture)
+    from tactomo.cli.calibrate.fit import fitted
+
+    path = _path(sensor, output)
+    made, odd = fitted(
+        sensor, readings, recording, area, time_offset, description, tuple(device_id or ())
+    )
+    print_calibration(made)
+    is_refused = bool(odd) and not keep_odd
+    if not (dry_run or is_refused):
+        _keep(made, path, control, keys)
+    _draw(made, picture)
+    if is_refused and not dry_run:
+        from tactomo_models import CalibrationError
+
+        # One slip moves the whole curve, and a running robot would go by it at once.
+        raise CalibrationError(
+            f"nothing is kept, as lines of {readings} disagree: {'; '.join(odd)}. Correct them, or "
+            "leave them out, and run this again; or keep it as it is by --keep-odd"
+        )
+
+
+@app.command(
+    epilog=examples(
+        "tactomo calibrate show --sensor left_forearm",
+        "tactomo calibrate show curve.json --picture curve.png",
+    ),
+)
+def show(
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="[FILE]", help="[the one that the sensor's daemon uses]"),
+    ] = None,
+    sensor: SensorName = DEFAULT_NAME,
+    picture: Picture = None,
+) -> None:
+    """Show the calibration that is kept: its curve, its uncertainty, and what it rests on."""
+    from tactomo_models import CalibrationError
+    from tactomo_models.calibration.calibration_file import read_calibration
+
+    if picture is not None:
+        prepare_picture(picture)
+    path = _path(sensor, file)
+    try:
+        made = read_calibration(path)
+    except FileNotFoundError as error:
+        raise CalibrationError(
+            f"there is no calibration {path}; run: tactomo calibrate live --sensor {sensor}"
+        ) from error
+    print_calibration(made)
+    _draw(made, picture)
+
+
+@app.command(epilog=examples("tactomo calibrate reload --sensor left_forearm"))
+def reload(
+    sensor: SensorName = DEFAULT_NAME,
+    control: ControlAddress = DEFAULT_CONTROL,
+    keys: KeysFolder = None,
+) -> None:
+    """Have the running daemon read again the calibration that it finds."""
+    from tactomo_client.messages import check_sensor_name
+
+    from tactomo.cli.calibrate.reload import reload_kept
+
+    check_sensor_name(sensor)
+    typer.echo(reload_kept(sensor, control, keys))
+
+
+def _path(sensor: str, given: Path | None) -> Path:
+    from tactomo_client.messages import check_sensor_name
+    from tactomo_models.calibration.calibration_file import calibration_path
+
+    check_sensor_name(sensor)
+    return given or calibration_path(sensor)
+
+
+def _area_mm2(diameter_mm: float | None, area_mm2: float | None) -> float | None:
+    if diameter_mm is None:
+        return area_mm2
+    if area_mm2 is not None:
+        raise typer.BadParameter("--diameter-mm and --area-mm2: give one of them")
+    return math.pi / 4 * diameter_mm**2
+
+
+def _keep(made: PressureCalibration, path: Path, control: str, keys: Path | None) -> None:
+    from tactomo_models.calibration.calibration_file import save_calibration
+
+    from tactomo.cli.calibrate.reload import taken_up
+
+    save_calibration(made, path)
+    typer.echo(f"kept in {path}")
+    typer.echo(taken_up(made, path, control, keys))
+
+
+def _draw(made: PressureCalibration, picture: Path | None) -> None:
+    if picture is not None:
+        from tactomo.cli.calibrate.picture import draw_calibration
+
+        draw_calibration(made, picture)
+        typer.echo(f"wrote {picture}")
+
+
+def print_calibration(made: PressureCalibration) -> None:
+    """Print a calibration: what it rests on, and the curve with its uncertainty."""
+    from rich.console import Console
+
+    console = Console()
+    console.print(f"{made.subject.sensor}: {made.words}", soft_wrap=True, highlight=False)
+    console.print(_table(made))
+    console.print("; ".join(_facts(made)) + ".", soft_wrap=True, highlight=False)
+    console.print(_beyond(made), soft_wrap=True, highlight=False)
+
+
+def _table(made: PressureCalibration) -> Table:
+    import numpy as np
+    from rich.table import Table
+
+    curve = made.curve
+    table = Table()
+    for heading in ("|Δσ|/σ₀", "kPa", "± kPa"):
+        table.add_column(heading, justify="right")
+    for kpa in np.linspace(*curve.range_kpa, ROWS):
+        magnitude = np.interp(kpa, curve.pressure_kpa, curve.magnitude)
+        table.add_row(f"{magnitude:.3f}", f"{kpa:.0f}", f"{float(curve.sigma(magnitude)):.1f}")
+    return table
+
+
+def _facts(made: PressureCalibration) -> list[str]:
+    onset = made.onset_kpa
+    hysteresis = made.hysteresis_kpa
+    return [
+        "onset not seen: the lightest reading is answered to"
+        if onset is None
+        else f"answers from {onset:.0f} kPa",
+        f"readings scatter by {made.repeatability_kpa:.1f} kPa beyond their own uncertainty",
+        "hysteresis not measured: loads only rose, or only fell"
+        if hysteresis is None
+        else f"falling loads read {hysteresis:+.1f} kPa against rising ones",
+        f"of {', '.join(made.subject.device_ids) or 'any device'}, as {made.subject.description}",
+    ]
+
+
+def _beyond(made: PressureCalibration) -> str:
+    low, high = made.curve.range_kpa
+    return (
+        f"Below {low:.0f} kPa contacts are `below` (touched, pressure unknown); beyond {high:.0f} "
+        f"kPa they are `above` (at least {high:.0f} kPa)."
+    )

@@ -1,0 +1,397 @@
+"""The guided session of `tactomo calibrate live`: press by press, at the terminal.
+
+Each reading is appended to a CSV file as soon as it is taken, which is also how a session that
+was interrupted goes on: nothing is kept in memory alone.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import statistics
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Literal
+
+from tactomo.cli.steer.watch import View
+from tactomo.errors import TactomoError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from tactomo_client import Frame, Status
+    from tactomo_models.calibration.calibration_file import PressureCalibration, Subject
+    from tactomo_models.calibration.curve import Fit, Reading
+
+STATUS_WAIT_S: Final = 3.0
+STILL_S: Final = 1.0
+"""For how long a press is to be held still, and is averaged."""
+MIN_FRAMES: Final = 5
+STILL_MM: Final = 1.0
+STILL_SHARE: Final = 0.03
+"""Of the magnitude, by which it may change from the first half to the second."""
+SHARES: Final = (-0.3, -0.05, 0.1, 0.25, 0.4, 0.6, 0.8, 1.0)
+"""Of the way from the onset to the top, that are suggested going up; and down again."""
+COLUMNS: Final = (
+    *("realtime_s", "pressure_kpa", "force_n", "area_mm2", "magnitude", "magnitude_sigma"),
+    *("direction", "x_mm", "y_mm"),
+)
+
+
+@dataclass(frozen=True)
+class Held:
+    """A press that was still for a while.
+
+    Attributes:
+        magnitude, magnitude_sigma: means.
+        x_mm, y_mm: its place.
+        frames: how many were averaged.
+        realtime_s: of the last one.
+    """
+
+    magnitude: float
+    magnitude_sigma: float
+    x_mm: float
+    y_mm: float
+    frames: int
+    realtime_s: float
+
+
+def guided(
+    sensor: str, stream: str, keys: Path | None, area_mm2: float | None, path: Path, *, fresh: bool
+) -> PressureCalibration:
+    """Take readings together with the user, and fit them.
+
+    Args:
+        sensor: its name.
+        stream: address of its daemon's stream.
+        keys: folder of keys, for a daemon beyond this computer.
+        area_mm2: of the indenter; requested at the terminal if None.
+        path: where the calibration will be kept; the readings are kept beside it.
+        fresh: begin anew.
+
+    Raises:
+        TactomoError: no daemon answers, or the sensor has no magnitude channel.
+        CalibrationError: what was taken makes no curve yet.
+    """
+    from rich.console import Console
+    from tactomo_models.calibration.calibration_file import PressureCalibration
+
+    console = Console(highlight=False, soft_wrap=True)
+    view = View(sensor, stream, keys)
+    try:
+        status = _first_status(view)
+        session = _Session(view, console, status, area_mm2, _log_path(path), fresh=fresh)
+        session.run()
+    finally:
+        view.close()
+    return PressureCalibration.of_readings(_subject(sensor, status), session.readings)
+
+
+def distrusted(frame: Frame) -> frozenset[str]:
+    """Return those flags of a frame that make it untrustworthy."""
+    from tactomo_models.scans.plausibility import DISTRUST
+
+    return frame.flags & frozenset(DISTRUST.names())
+
+
+def _log_path(path: Path) -> Path:
+    from tactomo_models.calibration.calibration_file import SUFFIX
+
+    return path.with_name(path.name.removesuffix(SUFFIX) + ".readings.csv")
+
+
+def _first_status(view: View) -> Status:
+    """Return the daemon's status; TactomoError where no daemon can measure a magnitude."""
+    end_s = time.monotonic() + STATUS_WAIT_S
+    while view.status is None and time.monotonic() < end_s:
+        view.update(0.1)
+    if view.status is None or view.status.description is None:
+        raise TactomoError(
+            f"no daemon answers at {view.stream} for a sensor {view.sensor!r}",
+            "start it, or give --stream; `tactomo daemon --help`",
+        )
+    if "magnitude" not in view.status.description.modalities:
+        raise TactomoError(
+            f"{view.sensor} has no magnitude channel",
+            "its structure channel tells where it is touched, and never how hard",
+        )
+    return view.status
+
+
+def _subject(sensor: str, status: Status) -> Subject:
+    from tactomo_models.calibration.calibration_file import Subject
+
+    description = status.description
+    assert description is not None
+    devices = {port.device.device_id for port in status.ports if port.device is not None}
+    return Subject(
+        sensor=sensor,
+        description=description.model,
+        sha256=description.sha256,
+        device_ids=tuple(sorted(devices)),
+    )
+
+
+def suggestions_kpa(status: Status) -> list[float]:
+    """Pressures to take, up and down again, by the response that the daemon has now."""
+    assert status.description is not None
+    response = status.description.magnitude_response
+    assert response is not None
+    kpa, change = response.pressure_kpa, response.relative_change
+    onset = max((p for p, c in zip(kpa, change, strict=True) if c == 0), default=kpa[0])
+    up = [onset + share * (kpa[-1] - onset) for share in SHARES]
+    up = [max(p, 0.05 * kpa[-1]) for p in up]
+    return [*up, *reversed(up[:-1])]
+
+
+class _Session:
+    """Asks, waits, averages, and keeps."""
+
+    def __init__(
+        self,
+        view: View,
+        console: Console,
+        status: Status,
+        area_mm2: float | None,
+        log: Path,
+        *,
+        fresh: bool,
+    ) -> None:
+        self._view, self._console, self._log = view, console, log
+        self._area_mm2 = area_mm2
+        self._suggested = suggestions_kpa(status)
+        if fresh and log.exists():
+            log.replace(log.with_suffix(".csv.old"))
+        self.readings: list[Reading] = _read_log(log)
+
+    def run(self) -> None:
+        """Take readings until the user has enough; Ctrl-C ends it, too."""
+        try:
+            self._welcome()
+            while self._take_one():
+                self._print_progress()
+        except (KeyboardInterrupt, EOFError):
+            self._console.print("\nstopped")
+        self._console.print(f"{len(self.readings)} readings are kept in {self._log}")
+
+    def _welcome(self) -> None:
+        say = self._console.print
+        say(f"Calibrating [bold]{self._view.sensor}[/] against a load cell.")
+        say(
+            "Press with one flat indenter, well inside the skin, and go from load to load without "
+            "lifting it.\nAt each: hold still, press Enter, and type what the load cell says in "
+            "newtons. [bold]undo[/] drops\nthe last reading, [bold]done[/] or Ctrl-C ends. What "
+            "was taken is kept at once."
+        )
+        if self._area_mm2 is None:
+            diameter_mm = self._asked("Diameter of the indenter in mm: ", least=1.0, most=1e3)
+            self._area_mm2 = math.pi / 4 * diameter_mm**2
+        if self.readings:
+            say(f"Going on with {len(self.readings)} readings in {self._log}; --fresh begins anew.")
+            self._print_progress()
+
+    def _take_one(self) -> bool:
+        """Take one reading, or undo one; returns whether to go on."""
+        assert self._area_mm2 is not None
+        word = self._console.input(f"\n{self._what_to_press()}\nEnter when it is held: ").strip()
+        if word in ("done", "q", "quit"):
+            return False
+        if word == "undo":
+            self._undo()
+            return True
+        held = self._wait_still()
+        self._console.print(
+            f"still: |Δσ|/σ₀ {held.magnitude:.4f} ± {held.magnitude_sigma:.4f} at "
+            f"({held.x_mm:.1f}, {held.y_mm:.1f}) mm, {held.frames} frames"
+        )
+        force_n = self._asked("Load cell in N: ", least=0.0, most=self._largest_n())
+        self._keep(held, force_n)
+        return True
+
+    def _largest_n(self) -> float:
+        """By what no skin bears: a slip beyond that would spoil the fit of all others."""
+        from tactomo_models.calibration.curve import MAX_KPA
+
+        assert self._area_mm2 is not None
+        return MAX_KPA * 1e-3 * self._area_mm2
+
+    def _what_to_press(self) -> str:
+        assert self._area_mm2 is not None
+        number = len(self.readings)
+        kpa = self._suggested[number % len(self._suggested)]
+        force_n = kpa * 1e-3 * self._area_mm2
+        rises = number == 0 or kpa > self._suggested[(number - 1) % len(self._suggested)]
+        way = "up" if rises else "down"
+        return f"Reading {number + 1}, going {way}: about {force_n:.0f} N ({kpa:.0f} kPa)."
+
+    def _asked(self, question: str, least: float, most: float) -> float:
+        while True:
+            try:
+                value = float(self._console.input(question).strip().removesuffix("N"))
+            except ValueError:
+                value = math.nan
+            if least <= value <= most:
+                return value
+            self._console.print(f"a number from {least:g} to {most:.0f}, please")
+
+    def _wait_still(self) -> Held:
+        """Wait until one contact has been still for a while; says meanwhile what it waits for."""
+        frames: deque[Frame] = deque()
+        begin_s = time.monotonic()
+        with self._console.status("") as line:
+            while True:
+                frame = self._view.frame if self._view.update(0.1) else None
+                # What was acquired before, and waited to be read, may be of another force.
+                if frame is not None and frame.age_s <= time.monotonic() - begin_s:
+                    frames.append(frame)
+                while len(frames) > MIN_FRAMES and _span_s(frames) > STILL_S:
+                    frames.popleft()
+                why = self._why_not(frames)
+                if not why:
+                    return _mean_of(frames)
+                line.update(why)
+
+    def _why_not(self, frames: Sequence[Frame]) -> str:
+        """Why these frames are no reading; empty where they are one."""
+        if self._view.is_gone or (frames and frames[-1].is_stale):
+            return "no data come: is the daemon running, and the skin plugged in?"
+        if not frames:
+            return "waiting for a frame"
+        flags = distrusted(frames[-1])
+        if flags:
+            return f"not to be trusted: {', '.join(sorted(flags))}; `tactomo tare` unpressed"
+        count = len(frames[-1].contacts)
+        if count != 1:
+            return "no contact: press" if not count else f"{count} contacts: press one place only"
+        if frames[-1].contacts[0].magnitude is None:
+            return "the magnitude channel is missing"
+        return "" if _are_still(frames) else "moving: hold it still"
+
+    def _keep(self, held: Held, force_n: float) -> None:
+        from tactomo_models.calibration.curve import Reading
+
+        assert self._area_mm2 is not None
+        kpa = 1e3 * force_n / self._area_mm2
+        before = [reading.pressure_kpa for reading in self.readings]
+        reading = Reading(
+            pressure_kpa=kpa,
+            magnitude=held.magnitude,
+            magnitude_sigma=held.magnitude_sigma,
+            direction=_direction([*before, kpa]),
+        )
+        row = {
+            "realtime_s": f"{held.realtime_s:.3f}",
+            "pressure_kpa": f"{kpa:.6g}",
+            "force_n": f"{force_n:g}",
+            "area_mm2": f"{self._area_mm2:.6g}",
+            "magnitude": f"{held.magnitude:.6g}",
+            "magnitude_sigma": f"{held.magnitude_sigma:.6g}",
+            "direction": reading.direction,
+            "x_mm": f"{held.x_mm:.2f}",
+            "y_mm": f"{held.y_mm:.2f}",
+        }
+        _append(self._log, row)
+        self.readings.append(reading)
+        self._console.print(f"{kpa:.0f} kPa, taken")
+
+    def _undo(self) -> None:
+        if not self.readings:
+            self._console.print("there is nothing to undo")
+            return
+        dropped = self.readings.pop()
+        lines = self._log.read_text("utf-8").splitlines(keepends=True)
+        self._log.write_text("".join(lines[:-1]), "utf-8")
+        self._console.print(f"dropped the reading at {dropped.pressure_kpa:.0f} kPa")
+
+    def _print_progress(self) -> None:
+        from tactomo_models.calibration.curve import still_wanted
+        from tactomo_models.calibration.outliers import find_outliers
+
+        if not self.readings:
+            return
+        fit = _fit_so_far(self.readings)
+        wanted = still_wanted(self.readings)
+        if len(self.readings) - 1 in find_outliers(self.readings):
+            self._console.print("[red]The others contradict that reading[/]: undo drops it.")
+        if fit is not None:
+            sigma_kpa = statistics.median(fit.curve.sigma_kpa.tolist())
+            self._console.print(f"curve: ± {sigma_kpa:.1f} kPa (median of the range)")
+        self._console.print(
+            f"Still wanted: {'; '.join(wanted)}."
+            if wanted
+            else "[green]That is enough[/]: type done, or go on for a better one."
+        )
+
+
+def _fit_so_far(readings: Sequence[Reading]) -> Fit | None:
+    from tactomo_models import CalibrationError
+    from tactomo_models.calibration.curve import fit_curve
+
+    try:
+        return fit_curve(readings)
+    except CalibrationError:
+        return None
+
+
+def _direction(pressures_kpa: list[float]) -> Literal["up", "down", "unknown"]:
+    from tactomo_models.calibration.curve import directions_of
+
+    return directions_of(pressures_kpa)[-1]
+
+
+def _are_still(frames: Sequence[Frame]) -> bool:
+    """Whether these frames show one contact that neither moves nor changes for long enough."""
+    if len(frames) < MIN_FRAMES or _span_s(frames) < 0.8 * STILL_S:
+        return False
+    if any(len(f.contacts) != 1 or f.contacts[0].magnitude is None for f in frames):
+        return False
+    # The means of both halves: single frames are as noisy as they are.
+    half = len(frames) // 2
+    before, after = _mean_of(list(frames)[:half]), _mean_of(list(frames)[half:])
+    allowed = max(STILL_SHARE * after.magnitude, after.magnitude_sigma)
+    moved_mm = math.hypot(after.x_mm - before.x_mm, after.y_mm - before.y_mm)
+    return abs(after.magnitude - before.magnitude) <= allowed and moved_mm <= STILL_MM
+
+
+def _span_s(frames: Sequence[Frame]) -> float:
+    return (frames[-1].acquired_monotonic_ns - frames[0].acquired_monotonic_ns) * 1e-9
+
+
+def _mean_of(frames: Sequence[Frame]) -> Held:
+    contacts = [frame.contacts[0] for frame in frames]
+    return Held(
+        # Errors of the model do not average out: the uncertainty stays one frame's.
+        magnitude=statistics.fmean(c.magnitude or 0.0 for c in contacts),
+        magnitude_sigma=statistics.fmean(c.magnitude_sigma or 0.0 for c in contacts),
+        x_mm=statistics.fmean(c.x_mm for c in contacts),
+        y_mm=statistics.fmean(c.y_mm for c in contacts),
+        frames=len(frames),
+        realtime_s=frames[-1].acquired_realtime_ns * 1e-9,
+    )
+
+
+def _read_log(log: Path) -> list[Reading]:
+    from tactomo_models.calibration.load_cell import direct_readings, read_load_cell
+
+    if not log.exists() or len(log.read_text("utf-8").splitlines()) < 2:
+        return []
+    return list(direct_readings(read_load_cell(log)).readings)
+
+
+def _append(log: Path, row: dict[str, str]) -> None:
+    """Add a line; raise TactomoError where that cannot be done."""
+    try:
+        log.parent.mkdir(parents=True, exist_ok=True)
+        is_new = not log.exists()
+        with log.open("a", encoding="utf-8", newline="") as file:
+            writer = csv.DictWriter(file, COLUMNS)
+            if is_new:
+                writer.writeheader()
+            writer.writerow(row)
+    except OSError as error:
+        raise TactomoError(
+            f"cannot write {log}: {error.strerror}", "give --output in a folder that you may write"
+        ) from error

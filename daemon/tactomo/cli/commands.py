@@ -1,0 +1,202 @@
+"""The `tactomo` command: a table of its commands, each of which is imported when it is called.
+
+A command is a `typer.Typer` in a module, see `tactomo.cli.options.typer_app`. Another distribution
+adds commands by entry points, as the laboratory does::
+
+    [project.entry-points."tactomo.commands"]
+    evaluate = "tactomo_lab.commands.evaluate:app"        # tactomo evaluate ...
+    "models.train" = "tactomo_lab.commands.training:app"  # tactomo models train
+    "evaluate.drift" = "tactomo_lab.commands.drift:app"   # tactomo evaluate drift
+
+The entry point's name is the command's; a dot leads into a group of commands. A Typer that holds
+several commands gives the one of that name; one without it becomes a group of this name.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from typing import Annotated, Any, NamedTuple
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+from typer.main import get_command
+
+from tactomo.cli.laboratory import not_installed
+
+ENTRY_POINTS = "tactomo.commands"
+OTHERS = "Of other distributions"
+
+
+class Line(NamedTuple):
+    """One command in the help of `tactomo`; no module: the laboratory's, by an entry point."""
+
+    panel: str
+    name: str
+    help: str
+    module: str
+
+
+RUN, STEER, FILES = "Run", "Steer a running daemon", "Recordings and files"
+SERVICE, BUILD = "On a robot", "Models and measures"
+COMMANDS = {
+    name: Line(panel, name, help_, f"tactomo.cli.{module}" if module else "")
+    for panel, name, help_, module in (
+        (RUN, "demo", "Start a simulated skin to press in the browser.", "run.demo"),
+        (RUN, "daemon", "Read a skin's ports and publish maps and contacts.", "run.daemon"),
+        (RUN, "ports", "List serial adapters and what is amiss with them.", "run.ports"),
+        (RUN, "proxy", "Pass on the streams of several daemons at one address.", "run.proxy"),
+        (RUN, "twin", "Simulate a skin behind simulated firmware.", "run.twin"),
+        (RUN, "viewer", "Serve a web page with a daemon's maps and contacts.", "run.viewer"),
+        (RUN, "foxglove", "Serve maps, contacts and events to Foxglove.", "run.foxglove"),
+        (STEER, "status", "Show how the daemon is, first what is wrong.", "steer.status"),
+        (STEER, "doctor", "Examine a skin at rest, and what to mend.", "doctor.doctor"),
+        (STEER, "watch", "Show map, contacts and health in the terminal.", "steer.watch"),
+        (STEER, "tare", "Take a new reference of the unloaded skin.", "steer.steer"),
+        (STEER, "calibrate", "Find the pressure scale with a load cell.", "calibrate.calibrate"),
+        (STEER, "record", "Record what the ports say into a file.", "steer.steer"),
+        (STEER, "method", "Choose the reconstruction method.", "steer.steer"),
+        (STEER, "poke", "Press, release and break a running twin.", "steer.steer"),
+        (STEER, "keys", "Manage keys of clients on other computers.", "steer.keys"),
+        (FILES, "info", "Describe a recording, a folder or a sensor.", "files.info"),
+        (FILES, "import", "Turn measured scans into a recording.", "files.import_scans"),
+        (FILES, "replay", "Play a recording through the daemon.", "run.daemon"),
+        (FILES, "recover", "Rewrite a cut or damaged recording whole.", "files.recover"),
+        (FILES, "reconstruct", "Reconstruct a file of scans.", "files.reconstruct"),
+        (FILES, "plot", "Draw a recording on one page.", "plot.plot"),
+        (FILES, "export", "Write a recording's frames for other programs.", "files.export"),
+        (SERVICE, "service", "Let systemd run a skin's daemon.", "service.service"),
+        (BUILD, "models", "Build, list and draw the models of sensors.", "models.models"),
+        (BUILD, "bench", "Measure the speed of everything on this machine.", "bench.bench"),
+        (BUILD, "evaluate", "Measure accuracy where the truth is known.", ""),
+    )
+}
+OF_LABORATORY = {"models.simulate", "models.train"}
+
+
+@functools.cache
+def _entry_points() -> Mapping[str, Any]:
+    from importlib.metadata import entry_points
+
+    return {point.name: point for point in entry_points(group=ENTRY_POINTS)}
+
+
+def _build(name: str, app: typer.Typer) -> Any:
+    command: Any = get_command(app)
+    command = getattr(command, "commands", {}).get(name, command)
+    command.name = name
+    return command
+
+
+class _Commands(Mapping[str, Any]):
+    """The commands of a group by name, each built when it is looked up.
+
+    Args:
+        group: the group's name and a dot; empty for the commands at the top.
+        built: those that its Typer holds.
+    """
+
+    def __init__(self, group: str, built: Mapping[str, Any]) -> None:
+        self._group = group
+        self._built = dict(built)
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self._built:
+            self._built[name] = _build(name, self._load(name))
+        return self._built[name]
+
+    def __iter__(self) -> Iterator[str]:
+        points = [p.removeprefix(self._group) for p in _entry_points() if self._holds(p)]
+        lines = () if self._group else COMMANDS.values()
+        ours = [line.name for line in lines if line.module or line.name in points]
+        return iter(dict.fromkeys([*ours, *self._built, *sorted(points)]))
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+    def _holds(self, point: str) -> bool:
+        return point.startswith(self._group) and "." not in point.removeprefix(self._group)
+
+    def _load(self, name: str) -> Any:
+        path = self._group + name
+        line = COMMANDS.get(path)
+        if line is not None and line.module:
+            return import_module(line.module).app
+        if path in _entry_points():
+            return _entry_points()[path].load()
+        if line is not None or path in OF_LABORATORY:
+            raise not_installed(path.replace(".", " "))
+        raise KeyError(name)
+
+
+class Group(TyperGroup):
+    """A group of commands to which entry points may add some."""
+
+    def __init__(self, **attrs: Any) -> None:
+        super().__init__(**attrs)
+        prefix = "" if self.name == "tactomo" else f"{self.name}."
+        self.commands = _Commands(prefix, self.commands)  # type: ignore[assignment]
+
+    def list_commands(self, ctx: typer.Context) -> list[str]:  # type: ignore[override]
+        """Return the names in the order of the table."""
+        return list(self.commands)
+
+
+class _Top(Group):
+    """The commands at the top: help and completion show the table and import no command."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the help as plain text: drawing boxes takes longer than all else."""
+        super(TyperGroup, self).format_help(ctx, formatter)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write a list of commands for each panel."""
+        lines = [self._line(name) for name in self.list_commands(ctx)]
+        width = max(len(line.name) for line in lines)
+        for panel in dict.fromkeys(line.panel for line in lines):
+            with formatter.section(panel):
+                rows = [(f"{n:{width}}", h) for p, n, h, _ in lines if p == panel]
+                formatter.write_dl(rows)
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> Any:
+        """Complete a command's name."""
+        names = self.list_commands(ctx)
+        shown = {name: TyperCommand(name, help=self._line(name).help) for name in names}
+        ctx.command = TyperGroup(name=self.name, commands=shown, params=self.params)  # type: ignore[arg-type]
+        return ctx.command.shell_complete(ctx, incomplete)
+
+    def _line(self, name: str) -> Line:
+        return COMMANDS.get(name) or Line(
+            OTHERS, name, self.commands[name].get_short_help_str(), ""
+        )
+
+
+app = typer.Typer(
+    name="tactomo",
+    cls=_Top,
+    help=(
+        "Tactile tomography: reads stacked EIT skins, reconstructs what presses on them, and "
+        "streams pressure maps and contacts.\n\n"
+        "New here? `tactomo demo` starts a simulated skin that you can press in the browser."
+    ),
+    epilog="`tactomo COMMAND --help` explains a command with examples.",
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+@app.callback(invoke_without_command=True)
+def _start(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    if version:
+        from importlib.metadata import version as version_of
+
+        typer.echo(f"tactomo {version_of('tactomo')}")
+        raise typer.Exit
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+        raise typer.Exit(2)

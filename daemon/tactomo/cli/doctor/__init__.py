@@ -1,0 +1,1 @@
+"""`tactomo doctor`: whether a skin and its device are well."""

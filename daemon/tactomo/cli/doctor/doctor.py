@@ -1,0 +1,252 @@
+"""`tactomo doctor`: whether a skin and its device are well, and what to do about what is not."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tactomo.cli.options import (
+    DEFAULT_NAME,
+    DEFAULT_STREAM,
+    JsonOutput,
+    KeysFolder,
+    SensorName,
+    StreamAddress,
+    examples,
+    typer_app,
+)
+
+if TYPE_CHECKING:
+    from rich.table import Table
+    from tactomo_models.health.diagnosis import Diagnosis
+    from tactomo_models.health.findings import Finding, Level
+
+    from tactomo.cli.doctor.evidence import Evidence
+
+COLOURS = {"ok": "green", "unknown": "dim", "advice": "yellow", "fault": "red", "broken": "red"}
+MARKS = {"ok": "", "unknown": "? ", "advice": "! ", "fault": "✗ ", "broken": "✗ "}
+VERDICTS = {
+    "ok": "healthy",
+    "advice": "healthy",
+    "fault": "ill",
+    "broken": "broken",
+    "unknown": "unknown",
+}
+
+app = typer_app()
+
+
+@app.command(
+    epilog=examples(
+        "tactomo doctor",
+        "tactomo doctor -s left_forearm --seconds 30",
+        "tactomo doctor grasp.mcap --frames 0:100",
+        "tactomo doctor tank.npz -d tank_disc",
+        "tactomo doctor new_device.npz --array baseline --json",
+    ),
+)
+def doctor(
+    what: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[FILE]",
+            help="A recording (.mcap) or measured scans (.npz); without, a daemon that runs.",
+        ),
+    ] = None,
+    sensor: SensorName = DEFAULT_NAME,
+    stream: StreamAddress = DEFAULT_STREAM,
+    seconds: Annotated[
+        float, typer.Option(min=1.0, help="How long to listen to the daemon.")
+    ] = 10.0,
+    description: Annotated[
+        str | None,
+        typer.Option(
+            "--description",
+            "-d",
+            help="What the sensor is made of: a shipped name or a TOML file. [the daemon's, the "
+            "recording's; of other files the pattern alone]",
+        ),
+    ] = None,
+    frames: Annotated[
+        str | None,
+        typer.Option(metavar="FIRST:END", help="Of a file: the scans at rest. [the stillest]"),
+    ] = None,
+    array: Annotated[
+        str | None, typer.Option(help="Of an .npz file: the array of scans at rest.")
+    ] = None,
+    lookup: Annotated[
+        str, typer.Option(help="Of an .npz file: the array that says how voltages are ordered.")
+    ] = "lookup",
+    as_json: JsonOutput = False,
+    keys: KeysFolder = None,
+) -> None:
+    """Examine a skin at rest: noise, reciprocity, electrodes, clipping, drift, line and latency.
+
+    **Nothing may touch the skin meanwhile.** Exit status 0: healthy (maybe with advice). 1: ill
+    (something is to be mended), broken (nothing can be trusted), or unknown.
+
+    *SNR* is the voltages over their standard deviation: 60 dB is good, below 36 dB is ill, below
+    20 dB broken. *Reciprocity*: V(drive; measure) = V(measure; drive) on any sheet, so a
+    difference is the device's; up to 5 % of all voltages together is usual, above 20 % nothing can
+    be located. Electrodes are counted from 0: *dead* (reads nothing), *loose* (noisier than the
+    others, or jumps), *misread* (breaks laws that any sheet obeys: a break, a short), *swapped*
+    (two leads changed places; needs a description).
+
+    An .npz file is read as what `tactomo import` takes. Otherwise `--array` names scans at rest,
+    (T, voltages), or one called baseline, reference, rest or empty is taken. Its order: an array
+    `lookup` (voltages, 4) of source, sink, v+, v-, counted from 0; or the description's; or, of
+    L (L - 3) voltages, adjacent pairs; or, of L x L, every drive by every measuring pair, the
+    pattern known by where the zeros are. How it was read is part of the report.
+    """
+    from rich.console import Console
+    from tactomo_client.keys import as_keys
+    from tactomo_models.health.findings import worst
+
+    from tactomo.cli.doctor.evidence import of_daemon
+    from tactomo.cli.doctor.stream_findings import stream_findings
+    from tactomo.cli.options import frame_slice
+
+    chosen = frame_slice(frames)
+    with Console(stderr=True).status("examining") as line_shown:
+        if what is None:
+            if chosen is not None or array is not None:
+                raise typer.BadParameter("--frames and --array go with a file")
+            words = "listening to the daemon, {:.0f} of {:g} s: leave the skin alone"
+            evidence = of_daemon(
+                *(sensor, stream, seconds, description, as_keys(keys)),
+                lambda passed_s: line_shown.update(words.format(passed_s, seconds)),
+            )
+        else:
+            evidence = _of_file(what, description, chosen, array, lookup)
+        channels = _diagnose(evidence)
+    line = stream_findings(evidence)
+    levels = [diagnosis.level for diagnosis in channels.values()]
+    levels += [finding.level for finding in line if finding.level != "unknown"]
+    verdict = worst(iter(levels))
+    if as_json:
+        typer.echo(json.dumps(report(evidence, channels, line, verdict), indent=2))
+    else:
+        _print(Console(), evidence, channels, line, verdict)
+    raise typer.Exit(0 if VERDICTS[verdict] == "healthy" else 1)
+
+
+def _of_file(
+    what: Path, description: str | None, frames: slice | None, array: str | None, lookup: str
+) -> Evidence:
+    from tactomo.cli.doctor.evidence import DoctorError, of_arrays, of_recording
+
+    suffix = what.suffix.lower()
+    if suffix == ".mcap":
+        from tactomo.cli.run.daemon import warn_of_damage
+        from tactomo.recordings.recording import open_recording
+
+        recording = open_recording(what)
+        warn_of_damage(recording)
+        return of_recording(recording, description, frames)
+    if suffix == ".npz":
+        return of_arrays(what, description, array, lookup, frames)
+    raise DoctorError(f"{what} is neither .mcap nor .npz", "give a recording, scans, or no file")
+
+
+def _diagnose(evidence: Evidence) -> dict[str, Diagnosis]:
+    from tactomo_models import SensorDescription, load_or_build_artifact
+    from tactomo_models.health.diagnosis import diagnose
+
+    layout = evidence.layout
+    known = layout if isinstance(layout, SensorDescription) else None
+    transfer = None if known is None else load_or_build_artifact(known).bare.transfer
+    found = {}
+    for name, scans in evidence.scans.items():
+        has_channel = known is not None and name in known.channels
+        found[name] = diagnose(
+            layout,
+            scans,
+            times_s=evidence.times_s[name],
+            transfer=transfer,
+            saturated=evidence.saturated.get(name, 0),
+            **({"contrast": known.contrast(name)} if has_channel else {}),  # type: ignore[arg-type, union-attr]
+        )
+    return found
+
+
+def report(
+    evidence: Evidence, channels: dict[str, Diagnosis], line: list[Finding], verdict: Level
+) -> dict[str, Any]:
+    """Return all that was found, for programs; figures that are unknown are null."""
+    return {
+        "examined": evidence.title,
+        "notes": list(evidence.notes),
+        "verdict": VERDICTS[verdict],
+        "channels": {
+            name: {
+                "verdict": VERDICTS[diagnosis.level],
+                "electrodes": list(diagnosis.electrodes),
+                "findings": [_plain(finding) for finding in diagnosis.findings],
+                "snr_db": [None if db != db else round(db, 2) for db in diagnosis.snr_db.tolist()],
+            }
+            for name, diagnosis in channels.items()
+        },
+        "stream": [_plain(finding) for finding in line],
+    }
+
+
+def _plain(finding: Finding) -> dict[str, Any]:
+    return {
+        "about": finding.about,
+        "level": str(finding.level),
+        "detail": finding.detail,
+        "next_step": finding.next_step,
+        **{name: None if value != value else value for name, value in finding.figures.items()},
+    }
+
+
+def _print(
+    console: Any,
+    evidence: Evidence,
+    channels: dict[str, Diagnosis],
+    line: list[Finding],
+    verdict: Level,
+) -> None:
+    from rich.markup import escape
+
+    console.print(f"[bold]{escape(evidence.title)}[/]")
+    for note in evidence.notes:
+        console.print(f"[dim]{escape(note)}[/]")
+    for name, diagnosis in channels.items():
+        console.print(_table(name, list(diagnosis.findings)))
+    if line:
+        console.print(_table("stream", line))
+    word = VERDICTS[verdict]
+    console.print(
+        f"[bold {COLOURS[verdict]}]{word}[/]" + ("" if verdict == "ok" else _why(verdict))
+    )
+
+
+def _why(verdict: Level) -> str:
+    return {
+        "advice": ", with some advice",
+        "fault": ": see what is marked ✗, and what to do about it",
+        "broken": ": nothing that comes from this device can be trusted",
+        "unknown": ": too little is known",
+    }[verdict]
+
+
+def _table(title: str, findings: list[Finding]) -> Table:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left", title_style="bold")
+    for column in ("", "found", "what to do"):
+        table.add_column(column, overflow="fold")
+    for finding in findings:
+        colour = COLOURS[finding.level]
+        about = finding.about.replace("_", " ")
+        table.add_row(
+            f"[{colour}]{MARKS[finding.level]}{about}[/]",
+            f"[{colour}]{escape(finding.detail)}[/]",
+            finding.next_step,
+        )
+    return table

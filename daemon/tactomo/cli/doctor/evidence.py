@@ -1,0 +1,513 @@
+"""What `tactomo doctor` looks at: scans of a skin at rest, and what is known of how they came.
+
+From a daemon that runs, from a recording, or from an .npz file. The report says how a file was
+read, since a wrong order of the voltages looks like a broken device.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from tactomo_client import Keys
+from tactomo_models import DescriptionError, SensorDescription, load_description
+from tactomo_models.arrays import FloatArray
+from tactomo_models.scans.plausibility import Layout
+from tactomo_models.sensor.pattern import (
+    Pairs,
+    PatternLayout,
+    pattern_of_zeros,
+    scan_pairs,
+    without_zeros,
+)
+from tactomo_protocol import SCAN_COUNTERS, Channel, Hello, Scan, ScanFlag
+
+from tactomo.errors import TactomoError
+from tactomo.recordings.imported_scans import is_single_ended, load_arrays, read_scans, single_ended
+from tactomo.recordings.recording import Recording
+
+STATUS_WAIT_S = 3.0  # a daemon sends its status every second
+AT_REST = ("baseline", "reference", "rest", "empty")  # names of arrays of scans at rest
+CHANGES = "dv"
+
+
+class DoctorError(TactomoError):
+    """There is nothing that could be examined."""
+
+    name = "cannot_examine"
+
+
+class Heard(NamedTuple):
+    """How scans came in over the ports while they were examined.
+
+    Attributes:
+        packets: packets that came.
+        corrupt: packets that failed their check.
+        lost: dual scans that the device took and nobody received, by gaps in the counter.
+        delay_ms: (n,) how much later than the promptest each scan came, by the device's clock.
+        period_ms: from scan to scan on the device's clock; None where fewer than two came.
+    """
+
+    packets: int
+    corrupt: int
+    lost: int
+    delay_ms: FloatArray
+    period_ms: float | None
+
+
+@dataclass
+class Evidence:
+    """What was gathered.
+
+    Attributes:
+        title: of what.
+        layout: the sensor's description, or a pattern alone.
+        scans: (T, M) volts of each channel.
+        times_s: (T,) when they were taken, on the device's clock; None where unknown.
+        saturated: scans of each channel of which the device said that it clipped.
+        heard: how they came; None for a file of arrays.
+        before, after: the daemon's status then; empty but for a daemon.
+        ages_ms: (n,) of the frames when they were published.
+        flags: frames by the flags that they had.
+        pressed: frames with a contact.
+        frames: frames that came.
+        notes: how it was read, for people.
+    """
+
+    title: str
+    layout: Layout
+    scans: dict[str, FloatArray]
+    times_s: dict[str, FloatArray | None]
+    saturated: dict[str, int] = field(default_factory=dict)
+    heard: Heard | None = None
+    before: Mapping[str, Any] = field(default_factory=dict)
+    after: Mapping[str, Any] = field(default_factory=dict)
+    ages_ms: FloatArray = field(default_factory=lambda: np.zeros(0))
+    flags: dict[str, int] = field(default_factory=dict)
+    pressed: int = 0
+    frames: int = 0
+    notes: tuple[str, ...] = ()
+
+
+def of_daemon(
+    sensor: str,
+    stream: str,
+    seconds: float,
+    description: str | None,
+    keys: Keys | None,
+    progress: Callable[[float], None],
+) -> Evidence:
+    """Listen to a running daemon.
+
+    Args:
+        sensor: its name in the stream.
+        stream: the stream's address.
+        seconds: how long.
+        description: the sensor's; what the daemon says if None.
+        keys: for a daemon beyond this computer.
+        progress: called with the seconds that have passed.
+
+    Raises:
+        DoctorError: no daemon answers, or it has no scans.
+    """
+    from tactomo_client.messages import MAP, SCAN, STATUS
+
+    listener = _Listener(sensor, stream, keys)
+    try:
+        before = listener.first_status()
+        begin_s = time.monotonic()
+        while (passed_s := time.monotonic() - begin_s) < seconds:
+            progress(passed_s)
+            listener.listen(min(0.2, seconds - passed_s))
+        said = listener.said
+    finally:
+        listener.close()
+    after = said[STATUS][-1]
+    if not said[SCAN]:
+        raise DoctorError(
+            f"the daemon of {sensor} is {after['state']} and has no scans to examine",
+            "`tactomo status` says what is wrong",
+        )
+    layout, notes = _layout_of_status(after, description)
+    scans, times_s = _scans_of_messages(said[SCAN])
+    evidence = Evidence(
+        f"the daemon of {sensor}, for {seconds:g} s", layout, scans, times_s, notes=notes
+    )
+    evidence.before, evidence.after = before, after
+    evidence.heard = _heard_of_messages(said[SCAN], before, after)
+    evidence.frames = len(said[MAP])
+    evidence.pressed = sum(bool(frame["contacts"]) for frame in said[MAP])
+    evidence.ages_ms = np.array([f["age_ns"] * 1e-6 for f in said[MAP] if f["age_ns"] is not None])
+    for frame in said[MAP]:
+        for flag in frame["flags"]:
+            evidence.flags[flag] = evidence.flags.get(flag, 0) + 1
+    return evidence
+
+
+class _Listener:
+    """Keeps what one sensor's daemon says."""
+
+    def __init__(self, sensor: str, stream: str, keys: Keys | None) -> None:
+        import zmq
+        from tactomo_client.connection import connect_subscriber
+        from tactomo_client.messages import MAP, SCAN, STATUS, topic
+
+        self.said: dict[str, list[dict[str, Any]]] = {MAP: [], SCAN: [], STATUS: []}
+        self._where = f"{stream} for a sensor {sensor!r}"
+        topics = [topic(sensor, kind) for kind in self.said]
+        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
+        self._connection = connect_subscriber(self._socket, stream, topics, keys=keys)
+
+    def first_status(self) -> dict[str, Any]:
+        """Wait for a status and forget what came before it; DoctorError where there is none."""
+        end_s = time.monotonic() + STATUS_WAIT_S
+        while not self.said["status"] and (left_s := end_s - time.monotonic()) > 0:
+            self.listen(left_s)
+        if not self.said["status"]:
+            raise DoctorError(
+                f"no daemon answers at {self._where}",
+                "start it with `tactomo daemon`, or give --sensor and --stream of one that runs",
+            )
+        status = self.said["status"][-1]
+        self.said = {kind: [] for kind in self.said} | {"status": [status]}
+        return status
+
+    def listen(self, wait_s: float) -> None:
+        """Take in what comes, waiting for it at most `wait_s`."""
+        from tactomo_client import MessageError
+        from tactomo_client.messages import decode_message
+
+        while self._socket.poll(round(wait_s * 1e3)):
+            wait_s = 0.0
+            try:
+                message = decode_message(self._socket.recv())
+            except MessageError:
+                continue
+            self.said[message.kind].append(message.fields)
+        if refusal := self._connection.refusal():
+            raise refusal
+
+    def close(self) -> None:
+        """Close the subscription."""
+        self._connection.close()
+
+
+def _layout_of_status(
+    status: Mapping[str, Any], description: str | None
+) -> tuple[Layout, tuple[str, ...]]:
+    said = status["description"]
+    try:
+        known = load_description(description or said["model"])
+    except DescriptionError:
+        if description is not None:
+            raise
+        electrodes = len(said["electrodes_mm"])
+        note = f"the description {said['model']} is not here: give --description; adjacent pairs"
+        return PatternLayout(scan_pairs(electrodes), electrodes), (note,)
+    if known.sha256 != said["sha256"]:
+        raise DoctorError(
+            f"the daemon's sensor {said['model']} is not the description {known.name} that is here",
+            "give the daemon's own with --description",
+        )
+    return known, ()
+
+
+def _scans_of_messages(
+    messages: list[dict[str, Any]],
+) -> tuple[dict[str, FloatArray], dict[str, FloatArray | None]]:
+    from tactomo_client.messages import array_from_wire
+
+    scans: dict[str, FloatArray] = {}
+    times_s: dict[str, FloatArray | None] = {}
+    for channel in ("magnitude", "structure"):
+        there = [m for m in messages if m[channel] is not None]
+        if there:
+            scans[channel] = np.array([array_from_wire(m[channel]) for m in there])
+            times_s[channel] = _times(
+                [m["device_us"] for m in there], [m["acquired_monotonic_ns"] for m in there]
+            )
+    return scans, times_s
+
+
+def _times(device_us: list[int], arrived_ns: list[int]) -> FloatArray:
+    """When scans were taken, s from the first: by the device's clock, or ours where it has none."""
+    device = np.array(device_us, dtype=np.float64)
+    if np.ptp(device):
+        return np.asarray((device - device[0]) * 1e-6)
+    return np.asarray((np.array(arrived_ns) - arrived_ns[0]) * 1e-9)
+
+
+def _heard_of_messages(
+    messages: list[dict[str, Any]], before: Mapping[str, Any], after: Mapping[str, Any]
+) -> Heard:
+    def rise(count: str) -> int:
+        was, now = (sum(port[count] for port in each["ports"]) for each in (before, after))
+        return int(now - was)
+
+    dropped = after["dropped_scans"] - before["dropped_scans"]
+    counters = [m["scan_counter"] for m in messages]
+    device_ms = np.array([m["device_us"] for m in messages]) * 1e-3
+    if all(m.get("dated_by") == "device" for m in messages):
+        delays_ms = np.array([m["delay_ns"] for m in messages]) * 1e-6
+    else:  # the daemon does not know the device's clock yet: it is fitted here
+        arrived_ms = np.array([m["acquired_monotonic_ns"] for m in messages]) * 1e-6
+        delays_ms = _delays(arrived_ms, device_ms)
+    return Heard(
+        rise("packets"),
+        rise("corrupt"),
+        max(0, _gaps(counters) - dropped),
+        delays_ms,
+        _period(device_ms, counters),
+    )
+
+
+def _gaps(counters: list[int]) -> int:
+    """Scans missing between the first and the last; a counter that goes back starts anew."""
+    steps = np.mod(np.diff(np.array(counters, dtype=np.int64)), SCAN_COUNTERS)
+    return int((steps[(steps > 0) & (steps < SCAN_COUNTERS // 2)] - 1).sum())
+
+
+def _delays(arrived_ms: FloatArray, device_ms: FloatArray) -> FloatArray:
+    """How much later than the promptest each scan arrived; two clocks may run at unlike rates."""
+    if len(arrived_ms) < 3 or not np.ptp(device_ms):  # of a protocol without a clock
+        return np.zeros(0)
+    device_ms, arrived_ms = device_ms - device_ms[0], arrived_ms - arrived_ms[0]
+    rate = np.polyfit(device_ms, arrived_ms, 1)[0]
+    late = arrived_ms - rate * device_ms
+    return np.asarray(late - late.min())
+
+
+def _period(device_ms: FloatArray, counters: list[int]) -> float | None:
+    steps = np.diff(np.array(counters, dtype=np.int64))
+    spans = np.diff(device_ms)[steps == 1]
+    return float(np.median(spans)) or None if len(spans) else None
+
+
+def of_recording(recording: Recording, description: str | None, frames: slice | None) -> Evidence:
+    """Read a recording's ports; `description` is its own if None.
+
+    Raises:
+        DoctorError: there are no scans in it.
+    """
+    known = load_description(description or recording.origin.description)
+    ports = [_PortScans(recording, n) for n in range(len(recording.origin.ports))]
+    scans: dict[str, FloatArray] = {}
+    times_s: dict[str, FloatArray | None] = {}
+    saturated: dict[str, int] = {}
+    for channel in Channel:
+        taken = [scan for port in ports for scan in port.scans if scan.channel is channel]
+        taken = taken if frames is None else taken[frames]
+        if taken and channel in known.channels:
+            name = channel
+            scans[name] = np.array([scan.volts for scan in taken])
+            times_s[name] = _times([s.device_us for s in taken], [s.arrived_ns for s in taken])
+            saturated[name] = sum(bool(scan.flags & ScanFlag.SATURATED) for scan in taken)
+    if not scans:
+        raise DoctorError(
+            f"there are no scans of {known.name} in {recording.path}",
+            "`tactomo info` shows what is in it; it may need another --description",
+        )
+    evidence = Evidence(str(recording.path), known, scans, times_s, saturated)
+    evidence.heard = _heard_on_ports(ports)
+    if not recording.summary.is_complete:
+        evidence.notes = ("the recording was cut off: what is there was read",)
+    return evidence
+
+
+class _Taken(NamedTuple):
+    """A scan in a recording."""
+
+    channel: Channel
+    counter: int
+    device_us: int
+    flags: ScanFlag
+    volts: FloatArray
+    arrived_ns: int
+
+
+class _PortScans:
+    """All scans that one port of a recording brought."""
+
+    def __init__(self, recording: Recording, port: int) -> None:
+        decoder = recording.origin.new_protocol()
+        hello: Hello | None = None
+        self.scans: list[_Taken] = []
+        for chunk in recording.chunks(port):
+            for packet in decoder.feed(chunk.data):
+                if isinstance(packet, Hello):
+                    hello = packet
+                elif isinstance(packet, Scan) and hello is not None:
+                    volts = packet.volts(hello.volts_per_count)
+                    kept = (packet.channel, packet.counter, packet.device_us, packet.flags)
+                    self.scans.append(_Taken(*kept, volts, chunk.clock_ns))
+        self.counts = decoder.counts
+
+
+def _heard_on_ports(ports: list[_PortScans]) -> Heard:
+    delays, periods, lost = [], [], 0
+    for port in ports:
+        for channel in {scan.channel for scan in port.scans}:
+            scans = [scan for scan in port.scans if scan.channel is channel]
+            device_ms = np.array([scan.device_us for scan in scans]) * 1e-3
+            counters = [scan.counter for scan in scans]
+            lost = max(lost, _gaps(counters))
+            delays.append(_delays(np.array([s.arrived_ns for s in scans]) * 1e-6, device_ms))
+            periods.append(_period(device_ms, counters))
+    known = [period for period in periods if period is not None]
+    return Heard(
+        sum(port.counts.packets for port in ports),
+        sum(port.counts.corrupt for port in ports),
+        lost,
+        np.concatenate(delays) if delays else np.zeros(0),
+        min(known) if known else None,
+    )
+
+
+def of_arrays(
+    path: Path, description: str | None, array: str | None, lookup: str, frames: slice | None
+) -> Evidence:
+    """Read an .npz file; see `tactomo doctor --help` for the layouts.
+
+    Args:
+        path: the file.
+        description: of the sensor that was measured; its pattern alone is worked out if None.
+        array: name of the array of scans at rest, where the layout is neither of import's.
+        lookup: name of the array that says which electrodes each voltage is of.
+        frames: which scans; all if None.
+
+    Raises:
+        DoctorError: it holds nothing that can be examined.
+        ImportFileError: it cannot be read.
+        DataError: the scans fit no pattern.
+    """
+    known = None if description is None else load_description(description)
+    arrays = load_arrays(path)
+    if array is None and is_single_ended(arrays):
+        evidence = _single_ended_evidence(path, arrays, known)
+    elif array is None and arrays.keys() & {"magnitude", "structure"}:
+        evidence = _batch_evidence(path, known or load_description("paper_square"))
+    else:
+        return _plain_evidence(path, arrays, known, array, lookup, frames)
+    if frames is not None:
+        evidence.scans = {n: _cut(path, scans, frames) for n, scans in evidence.scans.items()}
+        times_s = evidence.times_s.items()
+        evidence.times_s = {n: None if t is None else t[frames] for n, t in times_s}
+    return evidence
+
+
+def _cut(path: Path, scans: NDArray[Any], frames: slice) -> NDArray[Any]:
+    if not len(scans[frames]):
+        raise DoctorError(f"{path} has {len(scans)} scans, none of these", "give other --frames")
+    return scans[frames]
+
+
+def _batch_evidence(path: Path, description: SensorDescription) -> Evidence:
+    read = read_scans(path, description, None)
+    scans = {str(channel): volts for channel, volts in read.volts.items()}
+    return Evidence(
+        str(path),
+        description,
+        scans,
+        dict.fromkeys(scans, read.time_s),
+        notes=(f"read as scans of {description.name}", *read.notes),
+    )
+
+
+def _single_ended_evidence(
+    path: Path, arrays: dict[str, NDArray[Any]], description: SensorDescription | None
+) -> Evidence:
+    layout: Layout = description or _pattern_of_injection(arrays)
+    volts, time_s, notes = single_ended(path, arrays, layout)
+    name = "volts" if description is None else description.channels[-1]
+    note = "adjacent measurement; no description of the sheet" if description is None else ""
+    return Evidence(
+        str(path),
+        layout,
+        {name: volts},
+        {name: time_s},
+        notes=tuple(each for each in (*notes, note) if each),
+    )
+
+
+def _pattern_of_injection(arrays: dict[str, NDArray[Any]]) -> PatternLayout:
+    injection, electrodes = arrays["injection"].astype(int), arrays["volts"].shape[-1]
+    offsets = (injection[:, 1] - injection[:, 0]) % electrodes
+    offset = int(np.median(np.minimum(offsets, electrodes - offsets)))
+    return PatternLayout(scan_pairs(electrodes, max(1, offset)), electrodes)
+
+
+def _plain_evidence(
+    path: Path,
+    arrays: dict[str, NDArray[Any]],
+    description: SensorDescription | None,
+    name: str | None,
+    lookup: str,
+    frames: slice | None,
+) -> Evidence:
+    name = name or next((known for known in AT_REST if known in arrays), None)
+    if name is None and CHANGES in arrays:
+        raise DoctorError(
+            f"{path} holds changes of voltages ({CHANGES}) and no scans at rest: noise and "
+            "reciprocity belong to voltages",
+            "name an array of scans of the unpressed sheet with --array",
+        )
+    if name is None or name not in arrays:
+        held = ", ".join(arrays) or "nothing"
+        raise DoctorError(f"{path} holds {held}", "name the array of scans at rest with --array")
+    raw = arrays[name] if arrays[name].ndim > 1 else arrays[name][None]
+    if raw.ndim != 2 or raw.dtype.kind not in "fiuc" or raw.size == 0:
+        raise DoctorError(
+            f"{path}: {name} is {raw.dtype} {raw.shape}", "it must be numbers, (T, voltages)"
+        )
+    scans, note = _real(raw if frames is None else _cut(path, raw, frames))
+    layout, scans, order = _ordered(arrays, scans, description, lookup)
+    notes = (f"scans at rest: {name} {raw.shape}", order, *note)
+    return Evidence(str(path), layout, {name: scans}, {name: None}, notes=notes)
+
+
+def _real(raw: NDArray[Any]) -> tuple[FloatArray, tuple[str, ...]]:
+    """Return complex scans turned by one angle, so that they are as real as can be."""
+    if raw.dtype.kind != "c":
+        return raw.astype(np.float64), ()
+    angle = float(np.angle(np.nansum(raw**2))) / 2
+    turned = raw * np.exp(-1j * angle)
+    left = float(np.linalg.norm(turned.imag) / np.linalg.norm(turned))
+    note = f"turned by {np.degrees(-angle):.0f} degrees; {left:.0%} is out of phase and left out"
+    return np.asarray(turned.real, dtype=np.float64), (note,)
+
+
+def _ordered(
+    arrays: dict[str, NDArray[Any]],
+    scans: FloatArray,
+    description: SensorDescription | None,
+    lookup: str,
+) -> tuple[Layout, FloatArray, str]:
+    """Return which electrodes each voltage is of, the scans so, and how that is known."""
+    count = scans.shape[1]
+    if lookup in arrays:
+        table = arrays[lookup].astype(np.intp)
+        if table.shape != (count, 4):
+            raise DoctorError(
+                f"{lookup} is {table.shape} for {count} voltages",
+                "it must be (voltages, 4): source, sink, v+, v-, counted from 0",
+            )
+        pairs = Pairs(table[:, :2], table[:, 2:])
+        return PatternLayout(pairs, int(table.max()) + 1), scans, f"in the order of {lookup}"
+    if description is not None:
+        return description, scans, f"in the order of {description.name}"
+    electrodes = round((3 + np.sqrt(9 + 4 * count)) / 2)
+    if electrodes * (electrodes - 3) == count:
+        note = f"{electrodes} electrodes, adjacent pairs, those that touch the drive left out"
+        return PatternLayout(scan_pairs(electrodes), electrodes), scans, note
+    layout = pattern_of_zeros(scans)
+    drive, measure = layout.pairs.drive[0], layout.pairs.measure[0]
+    note = (
+        f"{layout.electrode_count} drives by {layout.electrode_count} measuring pairs; by the "
+        f"zeros, drive k to k+{drive[1] - drive[0]}, measure m to m+{measure[1] - measure[0]}"
+    )
+    return layout, without_zeros(layout, scans), note

@@ -1,0 +1,149 @@
+"""What `tactomo doctor` finds about the way of the scans: the line, the latency, the frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from tactomo_models.health.findings import Finding, Level
+
+from tactomo.cli.doctor.evidence import Evidence, Heard
+from tactomo.cli.health_issues import CORRUPT_NOTED, FLAG_ADVICE, health_issues
+
+FLAG_FAULTS = frozenset(
+    {"electrode_fault", "noise_high", "saturated", "channels_swapped", "reference_mismatch"}
+)
+FLAG_SHARE = 0.05  # of the frames: what comes and goes more rarely is advice
+LOST_SHARE = 0.01  # of the dual scans: less is advice
+FEWEST_LOST = 3  # below that it is no rate: one of the first 41 says little of the next thousand
+
+
+def stream_findings(evidence: Evidence) -> list[Finding]:
+    """Return what was found about line, latency and frames; empty for a file of arrays."""
+    found: list[Finding] = []
+    if evidence.heard is not None:
+        found += [_packets_found(evidence.heard), *_lost_found(evidence)]
+    if len(evidence.ages_ms):
+        found.append(_latency_found(evidence))
+    if evidence.frames:
+        found += [_pressed_found(evidence), *_flags_found(evidence)]
+    return [*found, *_issues_found(evidence)]
+
+
+def _packets_found(heard: Heard) -> Finding:
+    total = heard.packets + heard.corrupt
+    figures = {"packets": float(heard.packets), "corrupt": float(heard.corrupt)}
+    if not heard.corrupt:
+        return Finding("packets", Level.OK, f"{heard.packets}, none damaged", "", {**figures})
+    share = heard.corrupt / total
+    return Finding(
+        "packets",
+        Level.FAULT if share > CORRUPT_NOTED else Level.ADVICE,
+        f"{heard.corrupt} of {total} came damaged ({share:.2%})",
+        "check the cable, its shield and the baud rate",
+        {**figures},
+    )
+
+
+def _lost_found(evidence: Evidence) -> Iterator[Finding]:
+    assert evidence.heard is not None
+    count = max(len(scans) for scans in evidence.scans.values())
+    yield _share_found(
+        "lost_scans",
+        evidence.heard.lost,
+        count,
+        "did not arrive",
+        "is the line too slow for the rate, or the computer too busy to read it?",
+    )
+    if evidence.after:
+        for key, what, step in (
+            (
+                "dropped_scans",
+                "were left out because newer ones had come",
+                "give the daemon more of the processor, or choose a faster method or a budget",
+            ),
+            (
+                "incomplete_scans",
+                "lacked a channel",
+                "check that channel's cable; if its scans come late, raise sync_wait_ms",
+            ),
+        ):
+            yield _share_found(key, evidence.after[key] - evidence.before[key], count, what, step)
+
+
+def _share_found(about: str, number: int, count: int, what: str, step: str) -> Finding:
+    figures: dict[str, Any] = {"number": float(number)}
+    if not number:
+        return Finding(about, Level.OK, f"none of {count + number} dual scans", "", figures)
+    share = number / (count + number)
+    is_fault = share > LOST_SHARE and number >= FEWEST_LOST
+    level = Level.FAULT if is_fault else Level.ADVICE
+    detail = f"{number} of {count + number} dual scans ({share:.1%}) {what}"
+    return Finding(about, level, detail, step, figures)
+
+
+def _latency_found(evidence: Evidence) -> Finding:
+    p50, p99 = np.percentile(evidence.ages_ms, (50, 99))
+    heard = evidence.heard
+    period_ms = heard.period_ms if heard is not None else None
+    parts = {name: float(times["p50"]) for name, times in _stages(evidence).items()}
+    if heard is not None and len(heard.delay_ms):
+        # Reading waits for the other channel's scan, too: the later one of the two counts.
+        parts = {"transport and sync": float(np.median(heard.delay_ms)), **parts}
+    where = ", ".join(f"{name} {ms:.1f}" for name, ms in parts.items())
+    detail = f"age when published p50 {p50:.1f} ms, p99 {p99:.1f} ms"
+    if period_ms is not None:
+        detail += f", against {period_ms:.0f} ms from scan to scan"
+    level, step = Level.OK, ""
+    if period_ms is not None and p99 > period_ms:
+        level = Level.FAULT if p50 > period_ms else Level.ADVICE
+        step = "set a budget (`tactomo method auto --budget-ms`), or free the processor"
+    return Finding(
+        "latency",
+        level,
+        f"{detail}; where it goes (p50, ms): {where or 'not known'}",
+        step,
+        {"p50_ms": float(p50), "p99_ms": float(p99), "period_ms": period_ms}
+        | {f"{name.replace(' ', '_')}_ms": ms for name, ms in parts.items()},
+    )
+
+
+def _stages(evidence: Evidence) -> dict[str, Any]:
+    """The times of the daemon's stages that follow one another; others are parts of these."""
+    stages = evidence.after.get("stage_ms") or {}
+    return {name: stages[name] for name in ("reconstruct", "publish") if name in stages}
+
+
+def _pressed_found(evidence: Evidence) -> Finding:
+    figures: dict[str, Any] = {"frames": float(evidence.frames), "pressed": float(evidence.pressed)}
+    if not evidence.pressed:
+        return Finding("frames", Level.OK, f"{evidence.frames}, nothing pressed", "", figures)
+    return Finding(
+        "frames",
+        Level.ADVICE,
+        f"something presses in {evidence.pressed} of {evidence.frames} frames",
+        "leave the skin alone while it is examined; if nothing touches it, run `tactomo tare`",
+        figures,
+    )
+
+
+def _flags_found(evidence: Evidence) -> Iterator[Finding]:
+    for flag, number in sorted(evidence.flags.items()):
+        what, step = FLAG_ADVICE.get(flag, (flag.replace("_", " "), ""))
+        share = number / evidence.frames
+        is_fault = flag in FLAG_FAULTS and share > FLAG_SHARE
+        yield Finding(
+            f"flag_{flag}",
+            Level.FAULT if is_fault else Level.ADVICE,
+            f"{what}: in {share:.0%} of the frames",
+            step,
+            {"frames_percent": 1e2 * share},
+        )
+
+
+def _issues_found(evidence: Evidence) -> Iterator[Finding]:
+    """What the status itself says, but for what was counted while listening."""
+    for issue in health_issues({**evidence.after, "flags": []}) if evidence.after else ():
+        level = Level.FAULT if issue.severity == "error" else Level.ADVICE
+        yield Finding("daemon", level, issue.what, issue.next_step)

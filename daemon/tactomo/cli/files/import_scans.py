@@ -1,0 +1,93 @@
+"""`tactomo import`: measured scans as a recording that replays through the daemon."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from tactomo.cli.options import (
+    DEFAULT_DESCRIPTION,
+    DEFAULT_NAME,
+    Description,
+    SensorName,
+    examples,
+    frame_slice,
+    typer_app,
+)
+
+app = typer_app()
+
+
+@app.command(
+    "import",
+    epilog=examples(
+        "tactomo import tank.npz tank.mcap -d tank_disc --reference-frames 0:20",
+        "tactomo import presses.npz presses.mcap --rate 20",
+        "tactomo import setup_00001/ tank.mcap -d sciospec_disc --reference-frames 0:20",
+    ),
+)
+def import_scans(
+    scans: Annotated[
+        list[Path],
+        typer.Argument(metavar="IN", help="An .npz file; .eit files, or a folder of them."),
+    ],
+    recording: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="The recording to write.")],
+    description: Description = DEFAULT_DESCRIPTION,
+    channel: Annotated[
+        Literal["magnitude", "structure"] | None,
+        typer.Option(help="Which channel single-ended volts are. [the sensor's only one]"),
+    ] = None,
+    reference_frames: Annotated[
+        str | None,
+        typer.Option(metavar="FIRST:END", help="Unloaded frames to be the reference, from 0."),
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option(min=0.01, help="Scans a second. [the file's own times, t]")
+    ] = None,
+    sensor: SensorName = DEFAULT_NAME,
+) -> None:
+    """Turn measured scans (.npz, .eit) into a recording that replays through the daemon.
+
+    Reads the layout of `tactomo reconstruct` (magnitude, structure and their references), and
+    single-ended readings as EIT instruments save them: `volts` (T, injections, electrodes) with
+    `injection` (injections, 2) and `t`. Those become differences of neighbouring electrodes in the
+    description's order; of complex volts the real part counts. So do the .eit files that Sciospec's
+    own program saves, one a frame, in the order of their dates.
+    """
+    from rich.progress import track
+    from tactomo_models import load_description
+    from tactomo_protocol import Channel
+
+    from tactomo.recordings.imported_scans import read_scans
+    from tactomo.recordings.recording_writer import write_recording
+
+    reference = frame_slice(reference_frames)
+    measured = load_description(description)
+    known = None if channel is None else Channel(channel)
+    read = read_scans(scans, measured, known)
+    times_s = read.times(rate)
+    mean_rate_hz = (len(times_s) - 1) / times_s[-1] if times_s[-1] > 0 else 0.0
+    total = read.count * len(read.volts)
+    length = write_recording(
+        recording,
+        read.hello(measured, float(mean_rate_hz)),
+        track(read.packets(times_s), "importing", total, transient=True),
+        sensor=sensor,
+        description=_portable(description),
+        description_sha256=measured.sha256,
+        reference=read.reference_of(reference),
+    )
+    for note in read.notes:
+        typer.echo(note)
+    typer.echo(
+        f"{recording}: {read.count} scans in {times_s[-1]:.1f} s "
+        f"({mean_rate_hz:.1f}/s), {length / 1e6:.2f} MB"
+    )
+
+
+def _portable(description: str) -> str:
+    """Return a description's name as it is, and its path made absolute."""
+    path = Path(description)
+    return str(path.absolute()) if path.exists() else description

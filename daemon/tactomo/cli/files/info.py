@@ -1,0 +1,182 @@
+"""`tactomo info`: what a recording, a folder, an artifact or a sensor description is."""
+
+from __future__ import annotations
+
+import json
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from tactomo.cli.options import JsonOutput, examples, typer_app
+
+if TYPE_CHECKING:
+    from tactomo_models import SensorDescription
+
+    from tactomo.recordings.recording import Recording
+
+app = typer_app()
+
+
+@app.command(
+    epilog=examples(
+        "tactomo info grasp.mcap",
+        "tactomo info ~/.local/share/tactomo/recordings",
+        "tactomo info paper_square",
+        "tactomo info my.toml",
+    ),
+)
+def info(
+    what: Annotated[
+        str,
+        typer.Argument(
+            help="A recording (.mcap), a folder of them, a built artifact (.npz), or a sensor "
+            "description: a shipped name or a TOML file."
+        ),
+    ],
+    as_json: JsonOutput = False,
+) -> None:
+    """Describe a recording, a folder of recordings, a built artifact or a sensor description."""
+    if Path(what).is_dir():
+        _show_folder(Path(what), as_json)
+        return
+    facts = _facts(what)
+    if as_json:
+        typer.echo(json.dumps(facts, indent=2))
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=what, show_header=False)
+    for name, value in facts.items():
+        table.add_row(f"[bold]{name}[/]", _words(value))
+    Console().print(table)
+
+
+def _show_folder(folder: Path, as_json: bool) -> None:
+    """List the recordings in a folder by their names, which is by their age.
+
+    One that is not closed is being written, or was cut off, or is damaged.
+    """
+    rows = [_recording_line(path) for path in sorted(folder.glob("*.mcap"))]
+    if as_json:
+        typer.echo(json.dumps(rows, indent=2))
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=str(folder))
+    for name in ("recording", "sensor", "began", "seconds", "MB", "ends"):
+        justify: Literal["right", "left"] = "right" if name in ("seconds", "MB") else "left"
+        table.add_column(name, justify=justify, no_wrap=name != "recording", overflow="fold")
+    for row in rows:
+        table.add_row(*(str(value) for value in row.values()))
+    Console().print(table)
+
+
+def _recording_line(path: Path) -> dict[str, Any]:
+    from tactomo.errors import RecordingError
+    from tactomo.recordings.recording import open_recording
+
+    line = {"recording": path.name, "sensor": "", "began": "", "seconds": 0.0}
+    line["MB"] = round(path.lstat().st_size / 1e6, 2)
+    try:
+        recording = open_recording(path)
+    except RecordingError:
+        return {**line, "ends": "no recording"}
+    span = recording.span
+    return {
+        **line,
+        "sensor": recording.origin.sensor,
+        "began": _date(span.start_ns),
+        "seconds": round((span.end_ns - span.start_ns) * 1e-9, 1),
+        "ends": "closed" if span.is_complete else "not closed",
+    }
+
+
+def _date(time_ns: int) -> str:
+    return datetime.fromtimestamp(time_ns * 1e-9).isoformat(" ", "seconds") if time_ns else ""
+
+
+def _facts(what: str) -> dict[str, Any]:
+    suffix = Path(what).suffix.lower()
+    if suffix == ".mcap":
+        from tactomo.recordings.recording import open_recording
+
+        return _recording_facts(open_recording(what))
+    if suffix == ".npz":
+        return _array_facts(Path(what))
+    from tactomo_models import load_description
+
+    return _description_facts(load_description(what))
+
+
+def _recording_facts(recording: Recording) -> dict[str, Any]:
+    summary = recording.summary
+    facts: dict[str, Any] = {
+        "sensor": summary.origin.sensor,
+        "description": summary.origin.description,
+        "began": _date(summary.start_ns),
+        "seconds": round(summary.duration_s, 3),
+        "bytes": summary.file_bytes,
+        "complete": summary.is_complete,
+        "ports": {
+            url: f"{summary.port_bytes.get(number, 0)} bytes"
+            for number, url in enumerate(summary.origin.ports)
+        },
+        "scans": dict(summary.scans.items()),
+        "devices": [f"{hello.device_id}, {hello.firmware}" for hello in summary.hellos],
+        "corrupt packets": summary.corrupt,
+        "reconstructed frames": summary.frames,
+        "references": summary.references,
+        "recorded by": f"tactomo {summary.origin.version}",
+    }
+    if summary.ending:
+        facts["ends"] = summary.ending
+    if summary.recovered_gaps is not None:
+        facts["recovered, parts missing"] = summary.recovered_gaps
+    return facts
+
+
+def _array_facts(path: Path) -> dict[str, Any]:
+    """Describe a built artifact, or any other file of arrays, by what is in it."""
+    from tactomo.recordings.imported_scans import load_arrays
+
+    arrays = load_arrays(path)
+    facts = {name: array.item() for name, array in arrays.items() if array.ndim == 0}
+    kind = "artifact" if {"sha256", "sensor", "jacobian"} <= arrays.keys() else "arrays"
+    shapes = {
+        name: f"{array.dtype} {array.shape}" for name, array in arrays.items() if array.ndim > 0
+    }
+    return {"kind": kind, "bytes": path.stat().st_size, **facts, "arrays": shapes}
+
+
+def _description_facts(description: SensorDescription) -> dict[str, Any]:
+    sheet = description.sheet
+    magnitude = description.magnitude
+    return {
+        "name": description.name,
+        "title": description.title,
+        "sheet": f"{sheet.shape}, {sheet.width_m * 1e3:g} x {description.height_m * 1e3:g} mm",
+        "electrodes": description.electrode_count,
+        "voltages a scan": description.measurements,
+        "pattern": str(description.pattern),
+        "instrument": f"{description.instrument.voltages} voltages",
+        "channels": ", ".join(description.channels),
+        "map": f"{description.map.nodes_x} x {description.map.nodes_y} nodes",
+        "answers to": "no pressure calibration"
+        if magnitude is None
+        else f"{magnitude.response.pressure_kpa[-1]:g} kPa at most",
+        "sha256 of its physics": description.sha256,
+    }
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, dict):
+        return "\n".join(f"{name}: {each}" for name, each in value.items()) or "none"
+    if isinstance(value, list):
+        return "\n".join(str(each) for each in value) or "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return str(value)

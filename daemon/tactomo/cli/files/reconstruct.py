@@ -1,0 +1,83 @@
+"""`tactomo reconstruct`: a file of scans to a file of maps, without a daemon."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tactomo.cli.options import DEFAULT_DESCRIPTION, Description, Method, examples, typer_app
+
+app = typer_app()
+
+
+@app.command(
+    epilog=examples(
+        "tactomo reconstruct scans.npz maps.npz",
+        "tactomo reconstruct scans.npz maps.npz --method tikhonov -d my_skin.toml",
+    ),
+)
+def reconstruct(
+    scans: Annotated[Path, typer.Argument(metavar="IN.npz", help="Scans and references.")],
+    maps: Annotated[Path, typer.Argument(metavar="OUT.npz", help="The file to write.")],
+    method: Method = "auto",
+    description: Description = DEFAULT_DESCRIPTION,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(help="Of pressure, by `tactomo calibrate`. [the description's response]"),
+    ] = None,
+) -> None:
+    """Reconstruct a file of scans, without a daemon.
+
+    IN holds `magnitude` and `structure` (T, M) volts and `magnitude_reference`,
+    `structure_reference` (M,); structure may be missing. OUT gets `map` (T, ny, nx), the relative
+    conductivity change; `structure` (T, ny, nx) from 0 to 1; `misfit`, `confidence` (the
+    correlation with the truth that the network expects, where one took part), `flags` and
+    `seconds` (T,); and the contacts as flat arrays `contact_frame`, `contact_x_mm`, `contact_y_mm`,
+    `contact_area_mm2`, `contact_magnitude`, `contact_sigma` (of the magnitude), and the standard
+    uncertainties `contact_x_sigma_mm`, `contact_y_sigma_mm`, `contact_area_sigma_mm2`; and how hard
+    is pressed, `contact_pressure_kpa`, `contact_force_n`, their uncertainties
+    `contact_pressure_sigma_kpa`, `contact_force_sigma_n`, and `contact_pressure_range` (*within*,
+    *below*, *above* or *unknown*). Where the sensor's objects conduct `either_way`, such as metal
+    and plastic in a tank, `structure` is -1 in those that conduct worse.
+
+    Frames follow one another, as in a stream: each one starts from what the last one found. Give
+    scenes that have nothing to do with each other in files of their own.
+
+    `misfit` is what the model left unexplained, in units of the scans' noise: about 1 is good, and
+    above 2 (1.5 over both channels, where networks took part) the frame is flagged.
+
+    `flags` adds up what stands in the way of trusting a frame: 1 structure missing, 2 magnitude
+    missing, 4 invalid voltage, 8 no reference, 16 misfit high, 32 not converged, 64 reference
+    mismatch, 128 electrode fault, 256 noise high, 512 channels swapped, 1024 saturated,
+    2048 low confidence, 4096 channels skewed (live only).
+
+    Methods: *tikhonov* and *noser* are one linear step, regularised so that the image is as noisy,
+    relative to its signal, as the scans are (noise figure 1); *fit* models a few outlines,
+    *levelset* shapes of any form, both nonlinear and down to the scans' noise; *network* is our
+    fusion network alone. *auto* takes what a frame needs: where the sensor has its networks, one
+    proposes, outlines are fitted to the scans, and a second one refines what they show; else *fit*
+    or *levelset*. The laboratory adds *pls-paper*, the level set of the paper that tactomo is
+    compared with, and the paper's networks, *cnn-single* and *cnn-multimodal*.
+    """
+    from rich.progress import Progress
+    from tactomo_models import load_description
+    from tactomo_models.batch import reconstruct_file
+    from tactomo_models.calibration.calibration_file import calibration_of
+
+    sensor = load_description(description)
+    curve = None if calibration is None else calibration_of(sensor, calibration).curve
+    with Progress(transient=True) as progress:
+        task = progress.add_task("reconstructing", total=None)
+
+        def show(done: int, total: int) -> None:
+            progress.update(task, completed=done, total=total)
+
+        frames = reconstruct_file(
+            scans, maps, description=sensor, method=method, progress=show, curve=curve
+        )
+    failures = [frame.failure for frame in frames if frame.failure]
+    if failures:
+        typer.echo(f"{failures[0]}; {len(failures)} frame(s) are tikhonov's instead", err=True)
+    typer.echo(f"wrote {maps}: {len(frames)} frames")

@@ -1,0 +1,262 @@
+"""The frames of a recording, for commands that draw or write them; made first where it has none."""
+
+from __future__ import annotations
+
+import contextlib
+import heapq
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+
+import typer
+
+from tactomo.cli.children import interrupt_on_sigterm
+from tactomo.errors import TactomoError
+
+if TYPE_CHECKING:
+    from tactomo_client import Frame
+    from tactomo_client.recording import Recording
+    from tactomo_models import SensorDescription
+
+MARGIN_S = 30.0
+"""How much earlier or later than it was acquired a frame may have been published."""
+
+
+FromOption = Annotated[
+    float, typer.Option("--from", min=0.0, metavar="SECONDS", help="Leave out what was before.")
+]
+ToOption = Annotated[
+    float | None,
+    typer.Option("--to", min=0.0, metavar="SECONDS", help="Leave out what was after. [the end]"),
+]
+
+
+class Moment(NamedTuple):
+    """A frame and its time in the recording."""
+
+    time_s: float
+    """When it was acquired, seconds from the recording's beginning."""
+    frame: Frame
+    age_s: float | None
+    """How old it was when it was published; None where it was made of the recording just now."""
+
+
+@dataclass(frozen=True)
+class RecordedFrames:
+    """The frames of a recording between two times.
+
+    Attributes:
+        path: the recording that was given.
+        sensor: the sensor's name.
+        description: what the sensor is made of; None where that is not known on this computer.
+        start_ns: when the recording begins, nanoseconds since 1970.
+        start_s: the first frames that are wanted, seconds from there.
+        end_s: where the frames end that are wanted.
+
+    """
+
+    path: Path
+    sensor: str
+    description: SensorDescription | None
+    start_ns: int
+    start_s: float
+    end_s: float
+    _given: Recording
+    _remade: Sequence[Recording]
+    """Of each file, if it had to be made; otherwise none."""
+
+    def moments(self, kind: Literal["map", "contacts"] = "map") -> Iterator[Moment]:
+        """Yield the frames in the order of their times, one at a time."""
+        every = self._made_moments(kind) if self._remade else self._kept_moments(kind)
+        # A frame may have been acquired just before the recording's first message.
+        start_s = self.start_s or -float("inf")
+        return (moment for moment in every if start_s <= moment.time_s < self.end_s)
+
+    def _kept_moments(self, kind: Literal["map", "contacts"]) -> Iterator[Moment]:
+        clock = _Clock(self.start_ns)
+        window = {"start_s": max(0.0, self.start_s - MARGIN_S), "end_s": self.end_s + MARGIN_S}
+        for frame in self._given.frames(kind, **window):
+            yield Moment(clock.time_s(frame), frame, frame.age_s)
+
+    def _made_moments(self, kind: Literal["map", "contacts"]) -> Iterator[Moment]:
+        """Yield frames that were made of a replay, which knows its own times only."""
+        for file, made in zip(self._given.files, self._remade, strict=True):
+            arrivals = _arrivals(file)
+            for frame in made.frames(kind) if made.has_frames else ():
+                found = (
+                    clock_ns for counter, clock_ns in arrivals if counter == frame.scan_counter
+                )
+                clock_ns = next(found, None)
+                if clock_ns is None:
+                    break  # cannot be: a frame is made of scans
+                at_that_time = replace(
+                    frame, acquired_realtime_ns=clock_ns, acquired_monotonic_ns=clock_ns
+                )
+                yield Moment((clock_ns - self.start_ns) * 1e-9, at_that_time, None)
+
+    def with_progress(self, moments: Iterator[Moment], doing: str) -> Iterator[Moment]:
+        """Yield the moments, with a bar on standard error that shows how far this has come."""
+        length_s = min(self.end_s, self._given.duration_s) - self.start_s
+        with _progress_bar(doing) as show:
+            for moment in moments:
+                show(moment.time_s - self.start_s, max(length_s, 1e-9))
+                yield moment
+
+
+class _Clock:
+    """Seconds since the recording's beginning, by the monotonic clock: the wall clock jumps."""
+
+    def __init__(self, start_ns: int) -> None:
+        self._start_ns = start_ns
+        self._session = ""
+        self._zero_ns = 0
+
+    def time_s(self, frame: Frame) -> float:
+        if frame.session != self._session:  # another run of the daemon, maybe after a reboot
+            self._session = frame.session
+            since_start_ns = frame.acquired_realtime_ns - self._start_ns
+            self._zero_ns = frame.acquired_monotonic_ns - since_start_ns
+        return (frame.acquired_monotonic_ns - self._zero_ns) * 1e-9
+
+
+def _arrivals(path: Path) -> Iterator[tuple[int, int]]:
+    """Yield the counter of every scan in a recording, and when it came, on its steady clock."""
+    from tactomo_protocol import Scan
+
+    from tactomo.recordings.recording import open_recording
+
+    recording = open_recording(path)
+
+    def of_port(port: int) -> Iterator[tuple[int, int]]:
+        protocol = recording.origin.new_protocol()
+        for clock_ns, data in recording.chunks(port):
+            for packet in protocol.feed(data):
+                if isinstance(packet, Scan):
+                    yield packet.counter, clock_ns
+
+    ports = [of_port(port) for port in range(len(recording.origin.ports))]
+    return heapq.merge(*ports, key=lambda arrival: arrival[1])
+
+
+@contextlib.contextmanager
+def recorded_frames(
+    path: Path,
+    description: str | None,
+    start_s: float = 0.0,
+    end_s: float | None = None,
+    scratch: Path | None = None,
+) -> Iterator[RecordedFrames]:
+    """Open a recording's frames; where it has none, reconstruct it first, by the code of live.
+
+    Args:
+        path: a recording, or the folder of one that was cut into files.
+        description: what the sensor is made of; None for what the recording says.
+        start_s: leave out what was acquired before, seconds from the recording's beginning.
+        end_s: leave out what was acquired from there on.
+        scratch: a folder with room for the frames, if they have to be made.
+
+    Raises:
+        TactomoError: the recording cannot be read or reconstructed, or the times are no times.
+
+    """
+    from tactomo_client.recording import open_recording
+    from tactomo_models import ModelError, load_description
+
+    if end_s is not None and end_s <= start_s:
+        raise typer.BadParameter(f"--to {end_s:g} is not after --from {start_s:g}")
+    given = open_recording(path)
+    known = None
+    try:
+        known = load_description(description or given.description)
+    except ModelError:
+        if description or not given.has_frames:
+            raise
+    with _reported_warnings(), contextlib.ExitStack() as undo:
+        remade: list[Recording] = []
+        if not given.has_frames or description:
+            folder = undo.enter_context(
+                tempfile.TemporaryDirectory(prefix=".tactomo-", dir=scratch)
+            )
+            remade = _reconstructed(given, description or given.description, Path(folder))
+        yield RecordedFrames(
+            path,
+            given.sensor,
+            known,
+            given.start_ns,
+            start_s,
+            float("inf") if end_s is None else end_s,
+            given,
+            remade,
+        )
+
+
+@contextlib.contextmanager
+def _reported_warnings() -> Iterator[None]:
+    """Report on standard error what a recording lacks, each thing once."""
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_, **__: typer.echo(str(message), err=True)
+        yield
+
+
+@contextlib.contextmanager
+def _progress_bar(doing: str) -> Iterator[Callable[[float, float], None]]:
+    """Show a bar on standard error while this lasts, if that is a terminal."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(doing, total=None)
+
+        yield lambda done, total: progress.update(task, completed=done, total=total)
+
+
+def _reconstructed(given: Recording, description: str, folder: Path) -> list[Recording]:
+    """Replay each file of a recording through a daemon of our own, into one that has frames."""
+    from tactomo_client.recording import open_recording
+
+    interrupt_on_sigterm()
+    made: list[Recording] = []
+    for file in given.files:
+        _reconstruct_file(file, given.sensor, description, folder / file.name)
+        made.append(open_recording(folder / file.name))
+    if not any(recording.has_frames for recording in made):
+        raise TactomoError(
+            f"{given.path} cannot be reconstructed: no dual scan of {description} is in it",
+            "look at it with `tactomo info`; it may need another --description",
+        )
+    return made
+
+
+def _reconstruct_file(path: Path, sensor: str, description: str, target: Path) -> None:
+    from rich.console import Console
+
+    from tactomo.config import load_config
+    from tactomo.log import configure_logging
+    from tactomo.recordings.recording import open_recording
+    from tactomo.service.daemon import Daemon
+
+    configure_logging("error")
+    recording = open_recording(path)
+    with tempfile.TemporaryDirectory(prefix="tactomo-") as sockets:  # their paths must be short
+        config = load_config(
+            name=sensor or None,
+            description=description,
+            ports=recording.replay_urls(speed=0),
+            stream=f"ipc://{sockets}/stream",
+            control=f"ipc://{sockets}/control",
+            lossless=True,
+            exit_at_end=True,
+            recording={"file": target, "maps": True},
+        )
+        with Console(stderr=True).status(f"reconstructing {path.name}"):
+            daemon = Daemon(config)
+            daemon.start()
+            try:  # not by `run`, for which Ctrl-C is a good end
+                status = daemon.wait()
+            finally:
+                daemon.stop()
+    if status != 0:
+        raise TactomoError(f"{path} could not be replayed", "`tactomo replay` tells more")

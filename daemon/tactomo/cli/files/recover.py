@@ -1,0 +1,73 @@
+"""`tactomo recover`: what is intact in a cut or damaged recording, as a new and whole one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tactomo.cli.options import RecordingFile, examples, typer_app
+
+if TYPE_CHECKING:
+    from tactomo.recordings.recording import Summary
+    from tactomo.recordings.recovery import Recovery
+
+app = typer_app()
+
+
+@app.command(
+    epilog=examples("tactomo recover grasp.mcap", "tactomo recover grasp.mcap -o whole.mcap"),
+)
+def recover(
+    recording: RecordingFile,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="The new file. [FILE-recovered.mcap beside it]"),
+    ] = None,
+) -> None:
+    """Rewrite a cut or damaged recording whole and indexed, so that any MCAP tool opens it.
+
+    Keeps everything that a checksum confirms, also beyond damage in the middle, and says what is
+    lost. The damaged file stays as it is. A replay of the new file gives the maps of the live run;
+    after a gap it starts cold, and it shows no maps where their reference is lost.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn
+
+    from tactomo.recordings.recording import open_recording
+    from tactomo.recordings.recovery import recover as rewrite
+
+    target = output or recording.parent / f"{recording.stem}-recovered.mcap"
+    columns = ("recovering", BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("")
+
+        def show(done: int, total: int) -> None:
+            progress.update(task, completed=done, total=total)
+
+        recovery = rewrite(recording, target, show)
+    typer.echo(f"{target}: {_kept(open_recording(target).summary)}")
+    for line in _lost(recovery):
+        typer.echo(line)
+
+
+def _kept(summary: Summary) -> str:
+    scans = ", ".join(f"{count} {c}" for c, count in summary.scans.items())
+    return f"kept {summary.duration_s:.1f} s, {scans or 'no'} scans, {summary.frames} frames"
+
+
+def _lost(recovery: Recovery) -> list[str]:
+    if recovery.is_intact:
+        return ["lost: nothing"]
+    lines = [f"lost: {recovery.lost_bytes} bytes"]
+    for gap in recovery.gaps:
+        scans = ", ".join(f"{n} {channel}" for channel, n in gap.scans.items())
+        lines.append(f"  a gap of {gap.seconds:.2f} s: {scans or 'an unknown number of'} scans")
+    if recovery.frames_lost:
+        lines.append(f"  {recovery.frames_lost} frames whose reference or whose scans are lost")
+    if recovery.is_cut:
+        lines.append("  the end, however much that was: it is cut off or damaged")
+    if not recovery.knows_origin:
+        lines.append("  the beginning: replay it with --sensor and --description")
+    return lines

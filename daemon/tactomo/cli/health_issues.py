@@ -1,0 +1,168 @@
+"""What is wrong with a running daemon, by its status alone, worst first and with a next step.
+
+`tactomo status` shows it at the top, `tactomo doctor` beside what it measures itself. Nothing here
+imports more than the standard library: a status is asked for often.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+CORRUPT_NOTED = 1e-3  # share of packets: a line that loses one now and then still serves
+DROPPED_NOTED = 1e-2  # share of the dual scans
+LATENCY_TIMER_MS = 2  # what an FTDI adapter holds back for longer is felt
+
+FLAG_ADVICE: Mapping[str, tuple[str, str]] = {
+    "magnitude_missing": (
+        "no scans of the magnitude channel",
+        "check that channel's port and cable; until then nobody knows how hard is pressed",
+    ),
+    "structure_missing": (
+        "no scans of the structure channel",
+        "check that channel's port and cable; until then shapes are coarser",
+    ),
+    "no_reference": ("not tared yet", "leave the skin alone and run `tactomo tare`"),
+    "reference_mismatch": (
+        "the reference does not look like this sensor unloaded",
+        "take everything off the skin and run `tactomo tare`; is it the right sensor?",
+    ),
+    "misfit_high": (
+        "the model does not explain the data",
+        "take everything off and run `tactomo tare`; if it stays, run `tactomo doctor`",
+    ),
+    "not_converged": (
+        "the reconstruction ran out of its time",
+        "raise the budget, or free the processor",
+    ),
+    "invalid_voltage": (
+        "some voltages cannot be right and were left out",
+        "run `tactomo doctor` to find the lead",
+    ),
+    "saturated": ("the converter clips", "lower the gain or the current"),
+    "electrode_fault": (
+        "an electrode reads nonsense and was left out",
+        "check its lead and contact, then run `tactomo tare`",
+    ),
+    "noise_high": (
+        "voltages that should be equal differ widely",
+        "look for interference or a loose ground; `tactomo doctor` measures it",
+    ),
+    "low_confidence": (
+        "the network expects this map to be wrong",
+        "do not act on it; run `tactomo tare`, and `tactomo doctor` if it stays",
+    ),
+    "channels_swapped": (
+        "the magnitude channel changes more than the structure channel",
+        "exchange the two plugs, then run `tactomo tare`",
+    ),
+    "channels_skewed": (
+        "the two channels' scans are not of one instant",
+        "check the sync line between the two boards",
+    ),
+}
+STATES: Mapping[str, tuple[str, str]] = {
+    "waiting_for_port": ("a port is not there yet", "check the ports below"),
+    "waiting_for_data": ("no scan has come yet", "check the ports below"),
+    "stale": ("scans have stopped coming", "check the ports below"),
+}
+TARING = ("a reference is being taken", "leave the skin alone until it runs")
+
+
+class HealthIssue(NamedTuple):
+    """One thing that is wrong: `severity` is warning or error."""
+
+    severity: str
+    what: str
+    next_step: str
+
+
+def health_issues(status: Mapping[str, Any]) -> list[HealthIssue]:
+    """Return what is wrong by a status message, errors first; empty where all is well."""
+    found = [
+        *_of_state(status),
+        *(each for port in status.get("ports") or [] for each in _of_port(port)),
+        *_of_method(status),
+        *_of_flags(status),
+        *_of_losses(status),
+        *_of_recorder(status.get("recorder") or {}),
+    ]
+    return sorted(found, key=lambda issue: issue.severity != "error")
+
+
+def _of_state(status: Mapping[str, Any]) -> Iterator[HealthIssue]:
+    known = STATES.get(str(status.get("state")))
+    if known is not None:
+        yield HealthIssue("error", *known)
+
+
+PORT_STATES: Mapping[str, str] = {
+    "closed": "plug it in, or check the cable; it is tried again until it is there",
+    "refused": "give the daemon the sensor's own device and description",
+    "garbage": "check the baud rate, and that the firmware speaks the protocol",
+    "silent": "check that the device has power and that this is its port",
+    "idle": "is the device waiting for a trigger, or was it reset?",
+}
+
+
+def _of_port(port: Mapping[str, Any]) -> Iterator[HealthIssue]:
+    url = port.get("url")
+    step = PORT_STATES.get(str(port.get("state")))
+    if step is not None:
+        yield HealthIssue("error", f"{url} is {port['state']}: {port.get('problem') or '-'}", step)
+    packets, corrupt = port.get("packets") or 0, port.get("corrupt") or 0
+    if corrupt > CORRUPT_NOTED * (packets + corrupt):
+        share = f"{corrupt} of {packets + corrupt} packets came damaged"
+        step = "check the cable, its shield and the baud rate"
+        yield HealthIssue("warning", f"{url}: {share}", step)
+    timer_ms = port.get("latency_timer_ms") or 0
+    if timer_ms > LATENCY_TIMER_MS:
+        step = "set it to 1 ms, as the udev rule of tactomo does"
+        yield HealthIssue("warning", f"{url}: its adapter holds bytes back for {timer_ms} ms", step)
+
+
+def _of_method(status: Mapping[str, Any]) -> Iterator[HealthIssue]:
+    method, reason = status.get("tier_requested"), str(status.get("tier_reason"))
+    if reason.startswith(f"method {method} failed"):
+        what = f"{reason}; frames are {status.get('tier')}'s"
+        yield HealthIssue("error", what, "mend the method, or choose another: `tactomo method`")
+
+
+def _of_flags(status: Mapping[str, Any]) -> Iterator[HealthIssue]:
+    flags = status.get("flags") or []
+    for flag in flags:
+        if "no_reference" in flags and _comes(flag, status):
+            continue
+        what, step = FLAG_ADVICE.get(flag, (flag.replace("_", " "), ""))
+        if flag == "no_reference" and status.get("state") == "taring":
+            what, step = TARING
+        because = status.get("tier_reason") if flag == "electrode_fault" else None
+        yield HealthIssue("warning", f"{what} ({because})" if because else what, step)
+
+
+def _comes(flag: str, status: Mapping[str, Any]) -> bool:
+    """Whether `flag` calls a channel missing whose scans come: it has no reference yet."""
+    channel, _, missing = flag.partition("_")
+    rates = status.get("rates") or {}
+    return missing == "missing" and bool(rates.get(f"{channel}_hz"))
+
+
+def _of_losses(status: Mapping[str, Any]) -> Iterator[HealthIssue]:
+    rate_hz = (status.get("rates") or {}).get("magnitude_hz") or 0.0
+    expected = rate_hz * (status.get("uptime_s") or 0.0)
+    dropped = status.get("dropped_scans") or 0
+    if expected and dropped > DROPPED_NOTED * expected:
+        step = "give the daemon more of the processor, or choose a faster method or a budget"
+        yield HealthIssue(
+            "warning", f"{dropped} dual scans were left out, {expected:.0f} came", step
+        )
+    incomplete = status.get("incomplete_scans") or 0
+    if expected and incomplete > DROPPED_NOTED * expected:
+        step = "check the cable of the channel that is missing; if it comes late, sync_wait_ms"
+        yield HealthIssue("warning", f"{incomplete} dual scans lacked a channel", step)
+
+
+def _of_recorder(recorder: Mapping[str, Any]) -> Iterator[HealthIssue]:
+    if recorder.get("waits_for"):
+        step = "free some space or mend the disk; recording begins again by itself"
+        yield HealthIssue("error", f"nothing is recorded: {recorder['waits_for']}", step)

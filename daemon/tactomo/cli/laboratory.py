@@ -1,0 +1,36 @@
+"""What the laboratory adds where it is installed, and how to get it where it is not."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from tactomo.errors import TactomoError
+
+BENCH: Final = "tactomo.bench"  # entry points: functions that measure for `tactomo bench`
+
+
+def not_installed(what: str) -> TactomoError:
+    """Return the error that says where to get what only the laboratory has."""
+    return TactomoError(
+        f"{what} is part of the laboratory, which is not installed",
+        "pip install tactomo-lab, or `make setup` in a checkout",
+    )
+
+
+def installed_measurement(name: str) -> Any:
+    """Return the function that the laboratory adds to `tactomo bench` under a name, or None."""
+    from importlib.metadata import entry_points
+
+    return next((entry.load() for entry in entry_points(group=BENCH, name=name)), None)
+
+
+def measurement(name: str) -> Any:
+    """Return the function that the laboratory adds to `tactomo bench` under a name.
+
+    Raises:
+        TactomoError: the laboratory is not installed.
+    """
+    measure = installed_measurement(name)
+    if measure is None:
+        raise not_installed(f"bench --{name}")
+    return measure

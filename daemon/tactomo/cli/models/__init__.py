@@ -1,0 +1,1 @@
+"""`tactomo models`: descriptions, artifacts and drawings of sensors."""

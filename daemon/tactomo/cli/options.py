@@ -1,0 +1,170 @@
+"""What the modules of commands share: a Typer each, every option under one name, and defaults."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, Any, TypeAlias
+
+import typer
+
+DEFAULT_NAME = "skin"
+DEFAULT_DESCRIPTION = "paper_square"
+DEFAULT_STREAM = "tcp://127.0.0.1:5560"
+DEFAULT_CONTROL = "tcp://127.0.0.1:5561"
+DEFAULT_TWIN_CONTROL = "tcp://127.0.0.1:5562"
+DEFAULT_PROXY_STREAM = "tcp://127.0.0.1:5570"
+DEFAULT_VIEWER_PORT = 8750
+KEYS_VARIABLE = "TACTOMO_KEYS"
+
+METHODS = ("auto", "tikhonov", "noser", "fit", "levelset", "network")
+"""Those of `tactomo_models`, which takes too long to import for completion."""
+
+
+def typer_app(**settings: Any) -> typer.Typer:
+    """Return a Typer for one module's commands; see `tactomo.cli.commands` for how it is found."""
+    return typer.Typer(
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode="markdown",
+        **settings,
+    )
+
+
+def examples(*lines: str) -> str:
+    """Return an epilog that lists example commands, each on a line of its own."""
+    return "**Examples**\n\n" + "\n\n".join(f"`{line}`" for line in lines)
+
+
+def method_names() -> list[str]:
+    """Return the methods that are installed, for completion."""
+    return [*METHODS, *_installed("tactomo.methods")]
+
+
+def _protocol_names() -> list[str]:
+    return _installed("tactomo.protocols")
+
+
+def _installed(group: str) -> list[str]:
+    from importlib.metadata import entry_points
+
+    return sorted(entry_points(group=group).names)
+
+
+def description_names() -> list[str]:
+    """Return the shipped sensor descriptions, for completion; without importing the models."""
+    from importlib.util import find_spec
+
+    spec = find_spec("tactomo_models")
+    folders = [Path(each) for each in (spec and spec.submodule_search_locations) or ()]
+    return sorted(path.stem for each in folders for path in each.glob("sensor/shipped/*.toml"))
+
+
+def _known_method(context: typer.Context, name: str | None) -> str | None:
+    """Refuse as wrong usage what is no method."""
+    if name is None or context.resilient_parsing:
+        return name
+    from tactomo_models.errors import MethodError
+    from tactomo_models.methods.registry import find_method
+
+    try:
+        find_method(name)
+    except MethodError as error:
+        raise typer.BadParameter(str(error)) from error
+    return name
+
+
+def _known_methods(context: typer.Context, names: list[str] | None) -> list[str] | None:
+    """Refuse as wrong usage what is no method, of several."""
+    for name in names or ():
+        _known_method(context, name)
+    return names
+
+
+def method_option(default: str = "") -> Any:
+    """Return the option --method; `default` says what happens without the option."""
+    words = f"How to reconstruct: a name, or your own my_module:MyMethod.{default}"
+    return typer.Option("--method", help=words, autocompletion=method_names, callback=_known_method)
+
+
+def methods_option(default: str, **settings: Any) -> Any:
+    """Return the option --method of a command that sets methods beside each other."""
+    words = f"How to reconstruct: a name, or your own my_module:MyMethod; may be repeated.{default}"
+    return typer.Option(
+        "--method", help=words, autocompletion=method_names, callback=_known_methods, **settings
+    )
+
+
+def _importable_protocol(name: str | None) -> str | None:
+    """Let Python find my_module where the command is run, as it finds a method's."""
+    if name and ":" in name:
+        sys.path.append(os.getcwd())
+    return name
+
+
+def _protocol(default: str = "") -> Any:
+    words = f"What the device speaks: a name, or your own my_module:MyProtocol.{default}"
+    return typer.Option(
+        "--protocol", help=words, autocompletion=_protocol_names, callback=_importable_protocol
+    )
+
+
+def _description(default: str = "") -> Any:
+    words = f"What the sensor is made of: a shipped name or a TOML file.{default}"
+    return typer.Option("--description", "-d", help=words, autocompletion=description_names)
+
+
+Method: TypeAlias = Annotated[str, method_option()]
+GivenMethod: TypeAlias = Annotated[str | None, method_option(" [auto]")]
+Protocol: TypeAlias = Annotated[str, _protocol()]
+GivenProtocol: TypeAlias = Annotated[str | None, _protocol(" [tactomo]")]
+Description: TypeAlias = Annotated[str, _description()]
+GivenDescription: TypeAlias = Annotated[str | None, _description(f" [{DEFAULT_DESCRIPTION}]")]
+RecordedDescription: TypeAlias = Annotated[str | None, _description(" [the recorded one]")]
+SensorName: TypeAlias = Annotated[
+    str, typer.Option("--sensor", "-s", help="The sensor's name in the stream.")
+]
+StreamAddress: TypeAlias = Annotated[
+    str, typer.Option("--stream", help="Address of the daemon's stream.")
+]
+ControlAddress: TypeAlias = Annotated[
+    str, typer.Option("--control", help="Address of the daemon's control socket.")
+]
+TwinControlAddress: TypeAlias = Annotated[
+    str, typer.Option("--twin-control", help="Address of the twin's control socket.")
+]
+ViewerPort: TypeAlias = Annotated[
+    int, typer.Option("--viewer-port", min=0, max=65535, help="Of the page; 0 takes a free one.")
+]
+KeysFolder: TypeAlias = Annotated[
+    Path | None,
+    typer.Option(
+        "--keys",
+        envvar=KEYS_VARIABLE,
+        help="Folder of keys, for a daemon beyond this computer: see `tactomo keys`.",
+        show_default=False,
+    ),
+]
+JsonOutput: TypeAlias = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
+Announce: TypeAlias = Annotated[
+    bool,
+    typer.Option(
+        "--announce", help="Print one line of JSON with the addresses when ready, for programs."
+    ),
+]
+RecordingFile: TypeAlias = Annotated[Path, typer.Argument(help="A recording (.mcap).")]
+
+
+def frame_slice(text: str | None) -> slice | None:
+    """Return the slice that "0:20" means."""
+    if text is None:
+        return None
+    first, colon, end = text.partition(":")
+    try:
+        if not colon:
+            raise ValueError
+        frames = slice(int(first or 0), int(end) if end else None)
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is not FIRST:END, such as 0:20") from None
+    return frames

@@ -1,0 +1,1 @@
+"""`tactomo plot`: a recording on a page."""

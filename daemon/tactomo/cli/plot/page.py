@@ -1,0 +1,380 @@
+"""The page that `tactomo plot` draws."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from datetime import datetime
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from matplotlib.figure import Figure
+from tactomo_client import Contact
+from tactomo_client.appearance import COLOURS, map_pixels, shown_image
+
+from tactomo.cli.files.recorded_frames import Moment
+from tactomo.cli.plot.course import Course, Track
+from tactomo.imaging.frames import description_fields
+
+if TYPE_CHECKING:
+    from tactomo_models import SensorDescription
+
+WIDTH_IN: Final = 12.0
+STRIP_IN: Final = 2.75
+HEIGHTS_IN: Final = {
+    "pressure": 2.0,
+    "force": 1.5,
+    "misfit": 1.2,
+    "flags": 1.1,
+    "timing": 1.3,
+}
+SIGMAS: Final = 2.0
+GAP_S: Final = 0.5
+"""Without a frame for so long, a line is broken."""
+INK: Final = "0.25"
+LETTERS: Final = "abcdefghijkl"
+
+
+def draw_page(
+    course: Course,
+    maps: Sequence[Moment],
+    description: SensorDescription | None,
+    panels: Sequence[str],
+    title: str,
+) -> Figure:
+    """Return the page with the panels that are requested and have data."""
+    about = {} if description is None else description_fields(description)
+    rows = [panel for panel in panels if panel in HEIGHTS_IN and _has_data(panel, course)]
+    has_path = "path" in panels and bool(course.tracks)
+    strip_in = STRIP_IN if maps else 0.0
+    body_in = max(sum(HEIGHTS_IN[row] for row in rows), 6.4 if has_path else 0.0)
+    figure = Figure(figsize=(WIDTH_IN, strip_in + body_in + 0.7), layout="constrained")
+    figure.suptitle(f"{title}\n", fontsize=14, x=0.01, ha="left", fontweight="bold")
+    figure.text(0.01, 1 - 0.42 / figure.get_figheight(), _subtitle(course), color="0.4")
+    parts = [part for part, height in (("strip", strip_in), ("body", body_in)) if height]
+    heights = [height for height in (strip_in, body_in) if height]
+    column: Any = figure.subfigures(len(parts), 1, height_ratios=heights, squeeze=False)
+    areas = dict(zip(parts, column[:, 0], strict=True))
+    colours = _contact_colours(course)
+    if maps:
+        _draw_strip(areas["strip"], maps, about)
+    if has_path and rows:
+        left, right = areas["body"].subfigures(1, 2, width_ratios=(1.0, 1.35))
+        _draw_path(left, course, description, colours)
+        _draw_rows(right, rows, course, maps, colours)
+    elif has_path:
+        _draw_path(areas["body"], course, description, colours)
+    elif rows:
+        _draw_rows(areas["body"], rows, course, maps, colours)
+    return figure
+
+
+def _subtitle(course: Course) -> str:
+    began = datetime.fromtimestamp(course.start_ns * 1e-9).isoformat(" ", "seconds")
+    length_s = course.times_s[-1] - course.times_s[0]
+    words = (
+        f"{course.sensor}, {began}",
+        f"{length_s:.1f} s, {len(course.times_s)} frames, {len(course.tracks)} contacts",
+    )
+    return "   |   ".join(words)
+
+
+def _has_data(panel: str, course: Course) -> bool:
+    contacts = [contact for track in course.tracks.values() for contact in track.contacts]
+    if panel == "force":
+        return any(contact.force_n is not None for contact in contacts)
+    return bool(contacts) or panel != "pressure"
+
+
+def _contact_colours(course: Course) -> dict[str, Any]:
+    import matplotlib as mpl
+
+    palette = mpl.colormaps["tab10"].colors  # type: ignore[attr-defined]
+    return {name: palette[i % len(palette)] for i, name in enumerate(course.tracks)}
+
+
+def _draw_strip(figure: Any, maps: Sequence[Moment], about: dict[str, Any]) -> None:
+    """Draw the maps side by side, on one scale."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
+
+    axes_row = np.atleast_1d(figure.subplots(1, len(maps), sharey=True))
+    for letter, axes, moment in zip(LETTERS, axes_row, maps, strict=False):
+        _draw_map(axes, moment, about)
+        axes.set_title(f"{letter}   {moment.time_s:.2f} s", fontsize=10)
+    axes_row[0].set_ylabel("y (mm)")
+    known = [s for moment in maps if (s := shown_image(moment.frame, about))]
+    if known:
+        colours = LinearSegmentedColormap.from_list("map", np.array(COLOURS) / 255)
+        scale = ScalarMappable(Normalize(0, known[0][1]), colours)
+        figure.colorbar(scale, ax=axes_row, label=_scale_label(maps[0]), shrink=0.8, pad=0.01)
+
+
+def _scale_label(moment: Moment) -> str:
+    if moment.frame.pressure_kpa is not None:
+        return "pressure (kPa)"
+    return "|Δσ|/σ₀" if moment.frame.map is not None else "pressed"
+
+
+def _draw_map(axes: Any, moment: Moment, about: dict[str, Any]) -> None:
+    frame = moment.frame
+    pixels = map_pixels(frame, about)
+    axes.tick_params(labelsize=7)
+    axes.set_xlabel("x (mm)")
+    if pixels is None or frame.x_mm is None or frame.y_mm is None:
+        axes.text(0.5, 0.5, "no map", ha="center", transform=axes.transAxes)
+        return
+    (left, right), (bottom, top) = frame.x_mm, frame.y_mm
+    dx, dy = ((right - left) / (pixels.shape[1] - 1), (top - bottom) / (pixels.shape[0] - 1))
+    extent = (left - dx / 2, right + dx / 2, bottom - dy / 2, top + dy / 2)
+    axes.imshow(pixels, origin="lower", extent=extent, interpolation="bilinear")
+    for contact in frame.contacts:
+        radius = math.sqrt(contact.area_mm2 / math.pi)
+        axes.annotate(
+            _short_words(contact),
+            (contact.x_mm, contact.y_mm + radius),
+            (0, 3),
+            textcoords="offset points",
+            ha="center",
+            fontsize=7,
+            color="white",
+        )
+
+
+def _short_words(contact: Contact) -> str:
+    if contact.pressure_range == "below":
+        return f"{contact.id}: light"
+    if contact.pressure_kpa is None:
+        return f"{contact.id}"
+    least = "≥ " if contact.pressure_range == "above" else ""
+    return f"{contact.id}: {least}{contact.pressure_kpa:.0f} kPa"
+
+
+def _draw_path(
+    figure: Any,
+    course: Course,
+    description: SensorDescription | None,
+    colours: dict[str, Any],
+) -> None:
+    axes = figure.subplots()
+    if description is not None:
+        _draw_sheet(axes, description)
+    for name, track in course.tracks.items():
+        _draw_track(axes, track, colours[name], name)
+    axes.set(aspect="equal", xlabel="x (mm)", ylabel="y (mm)")
+    axes.set_title("path, from ○ to ●; dots by area", fontsize=10)
+
+
+def _draw_sheet(axes: Any, description: SensorDescription) -> None:
+    from matplotlib.patches import Circle, Rectangle
+
+    width, height = description.width_m * 1e3, description.height_m * 1e3
+    style: dict[str, Any] = {"fill": False, "edgecolor": "0.4", "linewidth": 1.5}
+    if description.sheet.shape == "disc":
+        axes.add_patch(Circle((0, 0), width / 2, **style))
+    else:
+        axes.add_patch(Rectangle((-width / 2, -height / 2), width, height, **style))
+    for number, (begin, end) in enumerate(description.electrode_ends_m * 1e3):
+        axes.plot(*zip(begin, end, strict=True), color="black", linewidth=4, solid_capstyle="butt")
+        x, y = (begin + end) / 2 * 1.08
+        axes.text(x, y, str(number), ha="center", va="center", fontsize=7, color="0.4")
+    axes.set(xlim=(-0.57 * width, 0.57 * width), ylim=(-0.57 * height, 0.57 * height))
+
+
+def _draw_track(axes: Any, track: Track, colour: Any, name: str) -> None:
+    x = [contact.x_mm for contact in track.contacts]
+    y = [contact.y_mm for contact in track.contacts]
+    sizes = [max(4.0, contact.area_mm2 / 25) for contact in track.contacts]
+    axes.scatter(x, y, s=sizes, color=colour, alpha=0.12, linewidths=0, rasterized=True)
+    axes.plot(x, y, color=colour, linewidth=1.2)
+    axes.plot(x[0], y[0], "o", color=colour, markerfacecolor="white", markersize=7)
+    axes.plot(x[-1], y[-1], "o", color=colour, markersize=7)
+    axes.annotate(name, (x[-1], y[-1]), (7, 5), textcoords="offset points", color=colour)
+
+
+def _draw_rows(
+    figure: Any,
+    rows: Sequence[str],
+    course: Course,
+    maps: Sequence[Moment],
+    colours: dict[str, Any],
+) -> None:
+    """Draw what is over time, one above the other, with the maps' letters on top."""
+    heights = [HEIGHTS_IN[row] for row in rows]
+    column = figure.subplots(len(rows), 1, sharex=True, height_ratios=heights, squeeze=False)[:, 0]
+    for row, axes in zip(rows, column, strict=True):
+        _DRAW[row](axes, course, colours)
+        axes.grid(visible=True, alpha=0.25)
+        axes.tick_params(labelsize=8)
+        for moment in maps:
+            axes.axvline(moment.time_s, color="0.6", linewidth=0.7, linestyle=":", zorder=0)
+    for letter, moment in zip(LETTERS, maps, strict=False):
+        column[0].annotate(
+            letter,
+            (moment.time_s, 1.0),
+            (0, 3),
+            xycoords=("data", "axes fraction"),
+            textcoords="offset points",
+            ha="center",
+            fontsize=9,
+            color=INK,
+        )
+    column[-1].set_xlabel("time (s)")
+    column[0].set_xlim(course.times_s[0], max(course.times_s[-1], course.times_s[0] + 1e-3))
+
+
+def _draw_pressure(axes: Any, course: Course, colours: dict[str, Any]) -> None:
+    """Draw how hard is pressed, by what is known of it."""
+    contacts = [contact for track in course.tracks.values() for contact in track.contacts]
+    if any(c.pressure_kpa is not None or c.pressure_range == "below" for c in contacts):
+        _draw_quantity(axes, course, colours, "pressure_kpa", "pressure_sigma_kpa")
+        _draw_out_of_range(axes, course, colours)
+        axes.set_ylabel("pressure (kPa)")
+    elif any(contact.magnitude is not None for contact in contacts):
+        _draw_quantity(axes, course, colours, "magnitude", "magnitude_sigma")
+        axes.set_ylabel("|Δσ|/σ₀")
+    else:
+        _draw_quantity(axes, course, colours, "area_mm2", "area_sigma_mm2")
+        axes.set_ylabel("area (mm²)")
+    axes.set_ylim(bottom=0)
+
+
+def _draw_out_of_range(axes: Any, course: Course, colours: dict[str, Any]) -> None:
+    """Mark when a contact is too light to be measured, along the bottom, or beyond the range."""
+    across = axes.get_xaxis_transform()
+    lights = 0
+    for name, track in course.tracks.items():
+        light = [t for t, c in _pairs(track) if c.pressure_range == "below"]
+        if light:
+            height = 0.05 + 0.06 * (lights % 4)
+            lights += 1
+            axes.plot(
+                *_broken(light, [height] * len(light)),
+                color=colours[name],
+                linewidth=3,
+                alpha=0.5,
+                transform=across,
+                label="touched, pressure unknown" if lights == 1 else None,
+            )
+        beyond = [(t, c.pressure_kpa) for t, c in _pairs(track) if c.pressure_range == "above"]
+        if beyond:
+            axes.plot(*zip(*beyond, strict=True), "^", color=colours[name], markersize=3)
+    if lights:
+        axes.legend(fontsize=7, loc="center left", handlelength=1.2)
+
+
+def _draw_force(axes: Any, course: Course, colours: dict[str, Any]) -> None:
+    _draw_quantity(axes, course, colours, "force_n", "force_sigma_n")
+    axes.set_ylabel("force (N)")
+    axes.set_ylim(bottom=0)
+
+
+def _draw_quantity(
+    axes: Any,
+    course: Course,
+    colours: dict[str, Any],
+    name: str,
+    sigma_name: str,
+) -> None:
+    """Draw one number of each contact over time, with its uncertainty as a band."""
+    for identity, track in course.tracks.items():
+        known = [(t, c) for t, c in _pairs(track) if getattr(c, name) is not None]
+        times = [t for t, _ in known]
+        values = [getattr(c, name) for _, c in known]
+        sigmas = [getattr(c, sigma_name) for _, c in known]
+        spread = [math.nan if sigma is None else SIGMAS * sigma for sigma in sigmas]
+        xs, ys = _broken(times, values)
+        _, bands = _broken(times, spread)
+        style = {"color": colours[identity]}
+        axes.plot(xs, ys, linewidth=1.1, **style)
+        axes.plot(*_alone(xs, ys), ".", markersize=3, **style)
+        axes.fill_between(xs, ys - bands, ys + bands, alpha=0.22, linewidth=0, **style)
+
+
+def _pairs(track: Track) -> list[tuple[float, Contact]]:
+    return list(zip(track.times_s, track.contacts, strict=True))
+
+
+def _broken(times: Sequence[float], values: Iterable[Any]) -> tuple[Any, Any]:
+    """Return the two as arrays, with a gap wherever nothing came for a while."""
+    xs = np.asarray(times, dtype=float)
+    ys = np.asarray([math.nan if value is None else value for value in values], dtype=float)
+    gaps = np.flatnonzero(np.diff(xs) > GAP_S) + 1
+    return np.insert(xs, gaps, np.nan), np.insert(ys, gaps, np.nan)
+
+
+def _alone(xs: Any, ys: Any) -> tuple[Any, Any]:
+    """Return the points between two gaps, which no line shows."""
+    known = np.concatenate([[False], ~np.isnan(ys), [False]])
+    alone = known[1:-1] & ~known[:-2] & ~known[2:]
+    return xs[alone], ys[alone]
+
+
+def _draw_misfit(axes: Any, course: Course, _: dict[str, Any]) -> None:
+    axes.axhline(1.0, color="tab:green", linewidth=0.8, alpha=0.7)
+    axes.plot(*_broken(course.times_s, course.misfits), color=INK, linewidth=0.8)
+    known = [misfit for misfit in course.misfits if misfit is not None]
+    if max(known, default=0.0) > 10 * max(1.0, float(np.median(known or [1.0]))):
+        axes.set_yscale("log")
+    else:
+        axes.set_ylim(bottom=0)
+    axes.set_ylabel("misfit")
+
+
+def _draw_flags(axes: Any, course: Course, _: dict[str, Any]) -> None:
+    """Draw when each tier was at work, and when each flag was up, as bars."""
+    tiers = [(tier, [t == tier for t in course.tiers]) for tier in dict.fromkeys(course.tiers)]
+    names = sorted(set().union(*course.flags))
+    flags = [(name, [name in up for up in course.flags]) for name in names]
+    rows = [(*row, "0.6") for row in tiers] + [(*row, "tab:red") for row in flags]
+    for height, (_name, present, colour) in enumerate(rows):
+        axes.broken_barh(
+            _bars(course.times_s, present), (height - 0.35, 0.7), color=colour, linewidth=0
+        )
+    axes.set_yticks(range(len(rows)), [name for name, _, _ in rows])
+    axes.tick_params(axis="y", labelsize=7)
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+
+
+def _bars(times_s: Sequence[float], present: Sequence[bool]) -> list[tuple[float, float]]:
+    """Return the stretches in which it was present, as (begin, length)."""
+    step_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.05
+    edges = np.flatnonzero(np.diff([False, *present, False]))
+    return [
+        (times_s[begin], times_s[end - 1] - times_s[begin] + step_s)
+        for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+    ]
+
+
+def _draw_timing(axes: Any, course: Course, _: dict[str, Any]) -> None:
+    known_ms = [age_s * 1e3 for age_s in course.ages_s if age_s is not None]
+    periods_ms = np.diff(course.times_s) * 1e3
+    axes.plot(course.times_s[1:], periods_ms, ".", color="0.65", markersize=2, label="period")
+    if known_ms:
+        times_s, ages_s = _broken(course.times_s, course.ages_s)
+        axes.plot(times_s, ages_s * 1e3, color=INK, linewidth=0.8, label="age")
+    lost_at = [t for t, lost in zip(course.times_s, course.lost, strict=True) if lost]
+    for time_s in lost_at:
+        axes.axvline(time_s, color="tab:red", linewidth=0.8, alpha=0.6)
+    rate_hz = 1e3 / float(np.mean(periods_ms)) if len(periods_ms) else math.nan
+    ages = "age unknown: made of the recording"
+    if known_ms:
+        ages = f"age {np.median(known_ms):.1f} ms (99 %: {np.percentile(known_ms, 99):.1f})"
+    words = f"{rate_hz:.1f} frames/s; {ages}; {sum(course.lost)} frames lost, "
+    words += f"{sum(course.left_out)} dual scans left out"
+    axes.set_title(words, fontsize=8, loc="right", pad=2, color=INK)
+    if known_ms:
+        axes.set_yscale("log")
+    else:
+        axes.set_ylim(0.0, 2.0 * float(np.median(periods_ms)) if len(periods_ms) else None)
+    axes.set_ylabel("ms")
+    axes.legend(fontsize=7, loc="upper right", ncols=2, handlelength=1.0)
+
+
+_DRAW: Final[dict[str, Callable[[Any, Course, dict[str, Any]], None]]] = {
+    "pressure": _draw_pressure,
+    "force": _draw_force,
+    "misfit": _draw_misfit,
+    "flags": _draw_flags,
+    "timing": _draw_timing,
+}

@@ -1,0 +1,154 @@
+"""`tactomo plot`: a recording on a page: its maps, its contacts over sheet and time, its health."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tactomo.cli.files.recorded_frames import (
+    FromOption,
+    ToOption,
+    recorded_frames,
+)
+from tactomo.cli.options import RecordedDescription, examples, typer_app
+from tactomo.errors import TactomoError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PANELS = ("maps", "path", "pressure", "force", "misfit", "flags", "timing")
+PAGE_DPI = 125
+
+app = typer_app()
+
+
+@app.command(
+    epilog=examples(
+        "tactomo plot grasp.mcap -o grasp.png",
+        "tactomo plot grasp.mcap -o push.pdf --from 2 --to 8 --what maps,pressure,force",
+    ),
+)
+def plot(
+    recording: Annotated[
+        Path, typer.Argument(help="A recording (.mcap), or the folder of one in several files.")
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="The picture: .png, .svg or .pdf.")
+    ] = Path("recording.png"),
+    what: Annotated[
+        str, typer.Option(metavar="PANELS", help=f"Some of {', '.join(PANELS)}.")
+    ] = ",".join(PANELS),
+    start_s: FromOption = 0.0,
+    end_s: ToOption = None,
+    description: RecordedDescription = None,
+) -> None:
+    """Draw a recording on one page.
+
+    *maps*: at telling moments, lettered; each stretch with the same contacts is shown, the longest
+    ones first. *path*: where the contacts went. *pressure*, *force*: over time, with a band of two
+    standard uncertainties (95 %) where they are known. *misfit*: what the model left unexplained;
+    about 1 is good. *flags*: the method of each frame, and what to be wary of. *timing*: how old
+    frames were when they were published, the time between them, and which were lost.
+
+    Uses the recorded maps (`tactomo record --maps`); without any the recording is reconstructed
+    first, by the same code as live. Needs matplotlib: `pip install 'tactomo[plot]'`.
+    """
+    panels = _panels(what)
+    prepare_picture(output)
+    from tactomo.cli.plot.course import Course, read_course, read_maps
+    from tactomo.cli.plot.page import draw_page
+
+    with recorded_frames(recording, description, start_s, end_s, output.parent) as frames:
+        course: Course = read_course(frames)
+        if not course.times_s:
+            raise TactomoError(
+                f"there are no frames of {recording} between these times",
+                "`tactomo info` tells how long it is",
+            )
+        maps = read_maps(frames, course) if "maps" in panels else []
+        figure = draw_page(course, maps, frames.description, panels, recording.name)
+    save_figure(figure, output, PAGE_DPI)
+    typer.echo(
+        f"wrote {output}: {len(course.tracks)} contact(s) in {len(course.times_s)} frames, "
+        f"{course.times_s[-1] - course.times_s[0]:.1f} s"
+    )
+
+
+def _panels(what: str) -> tuple[str, ...]:
+    requested = [panel.strip() for panel in what.split(",") if panel.strip()]
+    unknown = [panel for panel in requested if panel not in PANELS]
+    if unknown or not requested:
+        raise typer.BadParameter(
+            f"--what {what}: choose from {', '.join(PANELS)}, separated by commas"
+        )
+    return tuple(panel for panel in PANELS if panel in requested)
+
+
+def prepare_picture(output: Path) -> None:
+    """Make sure before the work that a picture of it can be drawn, without a display.
+
+    Raises:
+        TactomoError: matplotlib is not installed, or the picture could not be written.
+    """
+    next_step = "give a .png, .svg or .pdf in a folder that you may write"
+    if not output.parent.is_dir():
+        raise TactomoError(f"cannot write {output}: there is no folder {output.parent}", next_step)
+    if output.suffix.lower() not in (".png", ".svg", ".pdf"):
+        raise TactomoError(f"cannot write {output}: not a kind of picture", next_step)
+    try:
+        import matplotlib
+    except ImportError as error:
+        raise TactomoError(
+            "drawing needs matplotlib, which is not installed",
+            "pip install 'tactomo[plot]', or `make setup` in a checkout",
+        ) from error
+    matplotlib.use("Agg")
+    prepare_file(output)
+
+
+def prepare_folder(folder: Path) -> None:
+    """Make sure before the work that pictures can be drawn into a folder, which is made.
+
+    Raises:
+        TactomoError: as `prepare_picture`, or the folder cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TactomoError(
+            f"cannot make the folder {folder}: {error.strerror}", "give one that you may write"
+        ) from error
+    prepare_picture(folder / "figure.png")
+
+
+def prepare_file(output: Path) -> None:
+    """Make sure before the work that a file can be written; what it holds stays as it is.
+
+    Raises:
+        TactomoError: it cannot be.
+    """
+    is_new = not output.exists()
+    try:
+        output.open("ab").close()
+        if is_new:
+            output.unlink()
+    except OSError as error:
+        raise TactomoError(
+            f"cannot write {output}: {error.strerror}", "name a file that you may write"
+        ) from error
+
+
+def save_figure(figure: Figure, output: Path, dpi: int = 150) -> None:
+    """Write a picture.
+
+    Raises:
+        TactomoError: it cannot be written.
+    """
+    try:
+        figure.savefig(output, dpi=dpi)
+    except (OSError, ValueError) as error:
+        raise TactomoError(
+            f"cannot write {output}: {error}", "give a .png, .svg or .pdf that you may write"
+        ) from error

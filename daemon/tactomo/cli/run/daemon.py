@@ -1,0 +1,222 @@
+"""`tactomo daemon` and `tactomo replay`: maps and contacts of a device, or of a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tactomo.cli.options import (
+    DEFAULT_CONTROL,
+    DEFAULT_NAME,
+    DEFAULT_STREAM,
+    DEFAULT_VIEWER_PORT,
+    ControlAddress,
+    GivenDescription,
+    GivenMethod,
+    GivenProtocol,
+    Method,
+    RecordedDescription,
+    StreamAddress,
+    ViewerPort,
+    examples,
+    typer_app,
+)
+
+if TYPE_CHECKING:
+    from tactomo.config import DaemonConfig
+    from tactomo.recordings.recording import Recording
+
+app = typer_app()
+
+
+@app.command(
+    epilog=examples(
+        "tactomo daemon --port /dev/ttyACM0",
+        "tactomo daemon --sensor left_forearm --port /dev/ttyACM0 --port /dev/ttyACM1",
+        "tactomo daemon /etc/tactomo/left_forearm.toml --method tikhonov",
+        "tactomo daemon --port /dev/ttyACM0 --set tare_scans=40 --set recording.maps=true",
+    ),
+)
+def daemon(
+    config: Annotated[
+        Path | None, typer.Argument(help="Configuration (TOML); options win over it.")
+    ] = None,
+    sensor: Annotated[
+        str | None, typer.Option("--sensor", "-s", help="The sensor's name in the stream. [skin]")
+    ] = None,
+    description: GivenDescription = None,
+    port: Annotated[
+        list[str] | None,
+        typer.Option("--port", "-p", help="Serial device or pyserial URL; twice for two boards."),
+    ] = None,
+    protocol: GivenProtocol = None,
+    method: GivenMethod = None,
+    budget_ms: Annotated[
+        float | None, typer.Option(help="Time that one reconstruction may take. [the method's own]")
+    ] = None,
+    stream: Annotated[
+        str | None, typer.Option(help=f"Where to publish. [{DEFAULT_STREAM}]")
+    ] = None,
+    control: Annotated[
+        str | None, typer.Option(help=f"Where to take commands. [{DEFAULT_CONTROL}]")
+    ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Any other key of the configuration, such as recording.maps=true; repeat.",
+        ),
+    ] = None,
+) -> None:
+    """Read a skin's ports, reconstruct, and publish maps and contacts until stopped.
+
+    At the start the skin must be free for a second: the first scans become the reference that
+    changes are measured against. `tactomo tare` takes a new one at any time.
+
+    deploy/daemon.example.toml shows every key of the configuration. `--set` takes each of them:
+    `lossless=true`, `tare_scans=40`, `metrics=127.0.0.1:9460`, `recording.file=grasp.mcap`.
+    """
+    from tactomo.config import load_config
+
+    settings = load_config(
+        config,
+        **{
+            **dict(_setting(each) for each in set_ or ()),
+            "name": sensor,
+            "description": description,
+            "ports": port or None,
+            "protocol": protocol,
+            "method": method,
+            "budget_ms": budget_ms,
+            "stream": stream,
+            "control": control,
+        },
+    )
+    raise typer.Exit(_run_daemon(settings))
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    """Return key and value of "recording.maps=true"; a value that is no TOML is a string."""
+    import tomllib
+
+    key, equals, value = text.partition("=")
+    if not equals or not key:
+        raise typer.BadParameter(f"{text!r} is not KEY=VALUE", param_hint="'--set'")
+    try:
+        return key, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return key, value
+
+
+@app.command(
+    epilog=examples(
+        "tactomo replay grasp.mcap --viewer",
+        "tactomo replay grasp.mcap --speed 0.25",
+        "tactomo replay grasp.mcap --speed max --record frames.mcap",
+        "tactomo replay ~/.local/share/tactomo/recordings --speed 10",
+    ),
+)
+def replay(
+    recording: Annotated[
+        Path, typer.Argument(help="A recording (.mcap), or a folder of those a daemon has cut.")
+    ],
+    speed: Annotated[
+        str, typer.Option(help="Factor of the recorded speed, or max: as fast as reconstructed.")
+    ] = "1.0",
+    with_viewer: Annotated[
+        bool, typer.Option("--viewer", help="Serve the viewer, too, and stay at the end.")
+    ] = False,
+    sensor: Annotated[
+        str | None, typer.Option("--sensor", "-s", help="Name in the stream. [the recorded one]")
+    ] = None,
+    description: RecordedDescription = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(help="Of pressure, by `tactomo calibrate`. [the recorded one]"),
+    ] = None,
+    method: Method = "auto",
+    stream: StreamAddress = DEFAULT_STREAM,
+    control: ControlAddress = DEFAULT_CONTROL,
+    viewer_port: ViewerPort = DEFAULT_VIEWER_PORT,
+    stay: Annotated[
+        bool, typer.Option("--stay", help="Keep running after the recording's end.")
+    ] = False,
+    record: Annotated[
+        Path | None, typer.Option(help="Record the replay to this file, with maps and contacts.")
+    ] = None,
+) -> None:
+    """Play a recording through the daemon, which cannot tell it from a device.
+
+    The bytes come back by a mock serial port and take the same way as live ones: the maps equal
+    those of the live run. Without --viewer and --stay it ends with the recording.
+
+    A folder of files that a daemon has cut is played as the one recording that it was, from the
+    oldest to the newest; pauses between them are shortened to a second.
+    """
+    from tactomo.recordings.recording_set import RecordingSet, open_replayable
+
+    factor = _speed(speed)
+    opened = open_replayable(recording)
+    origin = opened.origin
+    if with_viewer:
+        if record is not None:
+            raise typer.BadParameter("--record goes without --viewer")
+        from tactomo.cli.run.demo import show_replay
+
+        more = ["--method", method]
+        more += [] if description is None else ["--description", description]
+        more += [] if calibration is None else ["--calibration", str(calibration)]
+        name = sensor or origin.sensor or DEFAULT_NAME
+        show_replay(recording, speed, name, stream, control, viewer_port, more)
+        return
+    from tactomo.config import load_config
+
+    settings = load_config(
+        name=sensor or origin.sensor or None,
+        description=description or origin.description or None,
+        calibration=calibration,
+        ports=opened.replay_urls(factor),
+        method=method,
+        stream=stream,
+        control=control,
+        lossless=factor == 0,
+        exit_at_end=not stay,
+        recording={"file": record, "maps": record is not None},
+    )
+    for part in opened.parts if isinstance(opened, RecordingSet) else [opened]:
+        warn_of_damage(part)
+    raise typer.Exit(_run_daemon(settings))
+
+
+def warn_of_damage(recording: Recording) -> None:
+    """Tell on standard error that a recording is not all there."""
+    summary = recording.summary
+    if summary.ending:
+        typer.echo(
+            f"{recording.path} is {summary.ending}. There are {summary.duration_s:.1f} s up to "
+            "where it ends",
+            err=True,
+        )
+
+
+def _run_daemon(settings: DaemonConfig) -> int:
+    """Serve until the daemon is stopped, and return its exit status."""
+    from tactomo.log import configure_logging
+    from tactomo.service.daemon import Daemon
+
+    configure_logging(settings.log_level, settings.log_format)
+    return Daemon(settings).run()
+
+
+def _speed(text: str) -> float:
+    """Return the factor; 0 for "max"."""
+    try:
+        factor = 0.0 if text == "max" else float(text)
+    except ValueError:
+        factor = -1.0
+    if not 0.0 <= factor < float("inf"):
+        raise typer.BadParameter(f"--speed {text}: give a factor above 0, or max")
+    return factor

@@ -1,0 +1,220 @@
+"""`tactomo demo`: a simulated skin, the daemon and the viewer, started and stopped together."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+import time
+import webbrowser
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tactomo.cli.options import (
+    DEFAULT_CONTROL,
+    DEFAULT_DESCRIPTION,
+    DEFAULT_NAME,
+    DEFAULT_STREAM,
+    DEFAULT_TWIN_CONTROL,
+    DEFAULT_VIEWER_PORT,
+    Announce,
+    ControlAddress,
+    Description,
+    GivenMethod,
+    SensorName,
+    StreamAddress,
+    TwinControlAddress,
+    ViewerPort,
+    examples,
+    typer_app,
+)
+
+if TYPE_CHECKING:
+    from tactomo.cli.children import Family
+
+TARE_PATIENCE_S = 10.0
+
+app = typer_app()
+
+
+@app.command(
+    epilog=examples(
+        "tactomo demo",
+        "tactomo demo --scene deploy/scenes/two_fingers_merge.toml",
+        "tactomo demo --ports 1 --noise-uv 50",
+    ),
+)
+def demo(
+    sensor: SensorName = DEFAULT_NAME,
+    description: Description = DEFAULT_DESCRIPTION,
+    method: GivenMethod = None,
+    ports: Annotated[
+        int, typer.Option(min=1, max=2, help="One line for both channels, or a line for each.")
+    ] = 2,
+    rate: Annotated[float, typer.Option(help="Dual scans a second.")] = 20.0,
+    scene: Annotated[
+        Path | None, typer.Option(help="A scripted scene (TOML) that presses by itself.")
+    ] = None,
+    noise_uv: Annotated[
+        float | None, typer.Option(min=0.0, help="Converter noise, µV rms.")
+    ] = None,
+    record: Annotated[Path | None, typer.Option(help="Record what the ports say.")] = None,
+    viewer_port: ViewerPort = DEFAULT_VIEWER_PORT,
+    stream: StreamAddress = DEFAULT_STREAM,
+    control: ControlAddress = DEFAULT_CONTROL,
+    twin_control: TwinControlAddress = DEFAULT_TWIN_CONTROL,
+    browser: Annotated[bool, typer.Option(help="Open the page, where there is a desktop.")] = True,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Show what the three programs log.")
+    ] = False,
+    announce: Announce = False,
+) -> None:
+    """Start a skin to press in the browser: simulated sensor, daemon and viewer in one command.
+
+    The first start builds the sensor's models, which takes a moment. Ctrl-C stops everything.
+    With tcp addresses of port 0 it takes free ports and prints them.
+    """
+    twin_options = [
+        *("--description", description, "--ports", str(ports), "--rate", str(rate)),
+        *("--twin-control", twin_control),
+        *_optional("--scene", scene),
+        *_optional("--noise-uv", noise_uv),
+    ]
+    daemon_options = [
+        *("--sensor", sensor, "--description", description),
+        *("--stream", stream, "--control", control),
+        *_optional("--method", method),
+        *([] if record is None else ["--set", f"recording.file={json.dumps(str(record))}"]),
+    ]
+    with tempfile.TemporaryDirectory(prefix="tactomo-") as folder, _family(verbose) as family:
+        # On a first start the daemon's models take as long to build as the twin's: do both at once.
+        builder = family.start("models build", "models", "build", "--description", description)
+        skin = family.start("twin", "twin", "--link", folder, "--announce", *twin_options)
+        asked = {"sensor": sensor, "stream": stream, "control": control, "twin": twin_control}
+        page = None
+        if not any(address.endswith((":0", ":*")) for address in (stream, control, twin_control)):
+            # The page waits for the daemon by itself: it need not wait here.
+            page = _open_page(family, asked, viewer_port, browser)
+            print(f"starting; the page is {page}", file=sys.stderr)
+        simulated = skin.wait_ready()
+        builder.wait_done()
+        lines = [word for path in simulated["ports"] for word in ("--port", path)]
+        daemon = family.start("daemon", "daemon", *daemon_options, *lines)
+        addresses = {**_served(daemon.wait_ready()), "twin": simulated["control"]}
+        _wait_tared(addresses["control"])
+        page = page or _open_page(family, addresses, viewer_port, browser)
+        _stay(family, {**addresses, "viewer": page}, announce)
+
+
+def _wait_tared(control: str) -> None:
+    """Wait until the daemon has its reference: a press before that would become part of it."""
+    from tactomo_client import request
+
+    deadline = time.monotonic() + TARE_PATIENCE_S
+    while request("status", control)["state"] != "running" and time.monotonic() < deadline:
+        time.sleep(0.05)
+
+
+def show_replay(
+    recording: Path,
+    speed: str,
+    sensor: str,
+    stream: str,
+    control: str,
+    viewer_port: int,
+    more: list[str],
+) -> None:
+    """Play a recording through a daemon and show it in the viewer until Ctrl-C."""
+    with _family(verbose=False) as family:
+        daemon = family.start(
+            *("replay", "replay", str(recording), "--speed", speed, "--sensor", sensor),
+            *("--stream", stream, "--control", control, "--stay", *more),
+        )
+        addresses = _served(daemon.wait_ready())
+        page = _open_page(family, addresses, viewer_port, browser=True)
+        _stay(family, {**addresses, "viewer": page}, announce=False)
+
+
+def _served(ready: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what matters to others of what a daemon logs when it is ready."""
+    return {name: ready[name] for name in ("sensor", "stream", "control", "ports")}
+
+
+def _open_page(family: Family, addresses: Mapping[str, Any], port: int, browser: bool) -> str:
+    """Start the viewer, show its page where there is a desktop, and return the page's URL."""
+    viewer = family.start(
+        *("viewer", "viewer", "--viewer-port", str(port), "--sensor", addresses["sensor"]),
+        *("--stream", addresses["stream"], "--control", addresses["control"]),
+        *_optional("--twin-control", addresses.get("twin")),
+    )
+    page = str(viewer.wait_ready()["url"])
+    if browser and _has_desktop():
+        webbrowser.open(page)
+    return page
+
+
+def _stay(family: Family, addresses: Mapping[str, Any], announce: bool) -> None:
+    """Tell the user where everything is, and stay until something ends."""
+    from tactomo.cli.children import print_ready
+
+    if announce:
+        print_ready(addresses)
+    else:
+        _print_box(addresses)
+    try:
+        raise family.wait_for_an_end().failure()
+    except KeyboardInterrupt:
+        print("stopping", file=sys.stderr)
+
+
+def _print_box(addresses: Mapping[str, Any]) -> None:
+    from rich.console import Console
+    from rich.panel import Panel
+
+    name = addresses["sensor"]
+    at_control = _flag("--control", addresses["control"], DEFAULT_CONTROL)
+    at_stream = _flag("--stream", addresses["stream"], DEFAULT_STREAM)
+    named = _flag("--sensor", name, DEFAULT_NAME)
+    at = addresses["stream"]
+    called = f'"{name}"' if at == DEFAULT_STREAM else f'"{name}", address="{at}"'
+    lines = [f"open      [bold link={addresses['viewer']}]{addresses['viewer']}[/]"]
+    if "twin" in addresses:
+        at_twin = _flag("--twin-control", addresses["twin"], DEFAULT_TWIN_CONTROL)
+        lines += [
+            "          and press the skin there with the mouse",
+            f"press     tactomo poke press x_mm=10 y_mm=-20{at_twin}",
+        ]
+    lines += [
+        f"watch     tactomo watch{named}{at_stream}",
+        f"health    tactomo status{at_control}",
+        f"tare      tactomo tare{at_control}",
+        f"record    tactomo record press.mcap --seconds 10{at_control}",
+        f"Python    for frame in tactomo_client.subscribe({called}): print(frame.contacts)",
+        "",
+        "Ctrl-C stops everything",
+    ]
+    Console().print(Panel("\n".join(lines), title=f"tactomo: {name} is running", expand=False))
+
+
+def _flag(name: str, value: str, default: str) -> str:
+    return "" if value == default else f" {name} {value}"
+
+
+def _optional(name: str, value: object) -> list[str]:
+    return [] if value is None else [name, str(value)]
+
+
+def _has_desktop() -> bool:
+    has_display = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+    return sys.stdout.isatty() and (has_display or sys.platform == "darwin")
+
+
+def _family(verbose: bool) -> Family:
+    from tactomo.cli.children import Family, interrupt_on_sigterm
+
+    interrupt_on_sigterm()
+    return Family(verbose)

@@ -1,0 +1,141 @@
+"""`tactomo foxglove`: a running sensor in Foxglove's 3D, Image, Plot and Log panels."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tactomo.cli.options import (
+    DEFAULT_NAME,
+    DEFAULT_STREAM,
+    Announce,
+    KeysFolder,
+    StreamAddress,
+    examples,
+    typer_app,
+)
+from tactomo.errors import TactomoError
+
+if TYPE_CHECKING:
+    from tactomo_foxglove import Bridge, Placement
+
+DEFAULT_PORT = 8765
+
+app = typer_app()
+
+
+@app.command(
+    epilog=examples(
+        "tactomo foxglove",
+        "tactomo foxglove left_forearm --layout left_forearm.json",
+        "tactomo foxglove left_forearm --parent forearm_link --pose 0,0.04,0.12,0,90,0",
+        "ssh -L 8765:127.0.0.1:8765 robot tactomo foxglove",
+    ),
+)
+def foxglove(
+    sensors: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[SENSOR]...", help=f"Names in the stream. [{DEFAULT_NAME}]"),
+    ] = None,
+    stream: StreamAddress = DEFAULT_STREAM,
+    host: Annotated[
+        str, typer.Option(help="Address to listen on; any but a loopback one lets others look.")
+    ] = "127.0.0.1",
+    foxglove_port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port to listen on; 0 takes a free one.")
+    ] = DEFAULT_PORT,
+    layout: Annotated[
+        Path | None,
+        typer.Option(help="Write the layout of the (first) sensor here, to import in Foxglove."),
+    ] = None,
+    parent: Annotated[str, typer.Option(help="Frame that the sensor hangs on.")] = "world",
+    pose: Annotated[
+        str,
+        typer.Option(
+            metavar="X,Y,Z[,ROLL,PITCH,YAW]", help="Pose in that frame, metres and degrees."
+        ),
+    ] = "0,0,0",
+    keys: KeysFolder = None,
+    announce: Announce = False,
+) -> None:
+    """Serve maps, contacts, numbers and events to Foxglove until stopped.
+
+    In Foxglove (the desktop app, or a browser on this computer): *Open connection*, *Foxglove
+    WebSocket*, ws://127.0.0.1:8765; then *Import from file* under *Layouts*, with the file that
+    `--layout` writes. It only shows: nothing that is done there reaches the sensor.
+
+    Needs foxglove-sdk: `pip install 'tactomo[foxglove]'`. Recordings open there, too, after
+    `tactomo export RECORDING OUT.mcap`.
+    """
+    need_foxglove()
+    from tactomo_client.keys import as_keys
+    from tactomo_foxglove import Bridge
+
+    names = sensors or [DEFAULT_NAME]
+    if layout is not None:
+        write_layout(layout, names[0])
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    with Bridge(
+        names, stream, host, foxglove_port, as_keys(keys), placement_of(parent, pose)
+    ) as bridge:
+        _print_addresses(bridge, layout, announce)
+        bridge.run(stop)
+
+
+def _print_addresses(bridge: Bridge, layout: Path | None, announce: bool) -> None:
+    from tactomo.cli.children import print_ready
+
+    typer.echo(f"foxglove: {bridge.url}")
+    if bridge.app_url:
+        typer.echo(f"or open   {bridge.app_url}")
+    if layout is not None:
+        typer.echo(f"layout:   {layout} (import it under Layouts)")
+    if announce:
+        print_ready({"url": bridge.url})
+
+
+def write_layout(path: Path, sensor: str) -> None:
+    """Write the layout that shows a sensor.
+
+    Raises:
+        TactomoError: it cannot be written.
+    """
+    from tactomo_foxglove import layout_for
+
+    try:
+        path.write_text(layout_for(sensor), "utf-8")
+    except OSError as error:
+        raise TactomoError(
+            f"cannot write {path}: {error.strerror}", "name a file that you may write"
+        ) from error
+
+
+def placement_of(parent: str, pose: str) -> Placement:
+    """Return the placement that the options mean."""
+    from tactomo_foxglove import Placement
+
+    try:
+        return Placement.parse(parent, pose)
+    except ValueError as error:
+        raise typer.BadParameter(f"--pose {pose}: {error}") from error
+
+
+def need_foxglove() -> None:
+    """Make sure that Foxglove's SDK is there.
+
+    Raises:
+        TactomoError: it is not installed.
+    """
+    try:
+        import foxglove  # noqa: F401
+    except ImportError as error:
+        raise TactomoError(
+            "Foxglove needs foxglove-sdk, which is not installed",
+            "pip install 'tactomo[foxglove]'",
+        ) from error

@@ -1,0 +1,223 @@
+"""`tactomo ports`: the serial adapters of this computer, and what may keep them from being used."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tactomo.cli.options import JsonOutput, examples, typer_app
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from tactomo.acquisition.adapters import Adapter, Holder
+    from tactomo.acquisition.identify import Answer
+
+NONE_THERE = """no USB adapter is there
+  Plug the skin in and look again. If it still does not show: another cable (some only charge),
+  another socket, and `sudo dmesg | tail`, which tells what the computer saw.
+  No skin at hand? `tactomo twin --link /tmp/skin` simulates one."""
+
+app = typer_app()
+
+
+@app.command(
+    epilog=examples(
+        "tactomo ports",
+        "tactomo ports --ask",
+        "tactomo ports /dev/ttyACM0 --ask --json | jq .ports[0].device.device_id",
+    ),
+)
+def ports(
+    paths: Annotated[
+        list[str] | None, typer.Argument(metavar="[PORT]...", help="These alone. [all adapters]")
+    ] = None,
+    ask: Annotated[
+        bool,
+        typer.Option(
+            "--ask",
+            help="Open each and ask who is there; built-in ports only if they are given. Sends a "
+            "few bytes, and resets some boards.",
+        ),
+    ] = False,
+    protocol: Annotated[
+        str | None,
+        typer.Option(
+            metavar="my_module:MyProtocol", help="A protocol of your own, to be recognised, too."
+        ),
+    ] = None,
+    baud: Annotated[
+        int | None, typer.Option(min=1200, help="To ask at; USB takes any. [the protocol's usual]")
+    ] = None,
+    as_json: JsonOutput = False,
+) -> None:
+    """List serial adapters: lasting names for the configuration, who holds them, what is amiss.
+
+    Give the daemon the lasting name: /dev/ttyACM0 may be another device after the next start.
+    Names *by-id* follow the device into any socket; names *by-path* belong to the socket.
+    """
+    found = survey(paths or [])
+    asked = [row.path for row in found if paths or (row.adapter and row.adapter.is_usb)]
+    answers = question(asked, baud, protocol) if ask else {}
+    if as_json:
+        typer.echo(json.dumps({"ports": [as_fields(row, answers) for row in found]}, indent=2))
+        return
+    from rich.console import Console
+
+    if found:
+        Console().print(table(found, answers))
+    if not paths and not any(row.adapter and row.adapter.is_usb for row in found):
+        typer.echo(NONE_THERE)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One port as it is listed."""
+
+    path: str
+    adapter: Adapter | None
+    """None for a port that is no adapter, such as a pseudo-terminal."""
+    use: str
+    """The name to configure; empty where none lasts."""
+    held_by: list[Holder]
+    remarks: list[str]
+
+
+def survey(paths: Sequence[str], root: Path = Path("/")) -> list[Row]:
+    """Look at the given ports, or at all adapters; `root` has /sys, /dev, /proc and /run."""
+    from tactomo.acquisition.adapters import list_adapters, modem_manager_runs
+
+    adapters = list_adapters(root)
+    by_path = {adapter.path: adapter for adapter in adapters}
+    has_modem_manager = modem_manager_runs(root)
+    return [
+        _row(path, by_path.get(os.path.realpath(path)), adapters, has_modem_manager, root)
+        for path in paths or by_path
+    ]
+
+
+def question(
+    paths: Sequence[str], baud: int | None, protocol: str | None = None
+) -> dict[str, Answer]:
+    """Ask all ports at the same time who is there."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    from tactomo.acquisition.identify import identify
+    from tactomo.protocols import NATIVE, find_protocol
+
+    usual = find_protocol(protocol or NATIVE).baud
+    with ThreadPoolExecutor(max_workers=max(1, len(paths))) as pool:
+        return dict(
+            zip(paths, pool.map(lambda path: identify(path, baud or usual), paths), strict=True)
+        )
+
+
+def as_fields(row: Row, answers: dict[str, Answer]) -> dict[str, Any]:
+    """Return a row for programs."""
+    from tactomo.imaging.frames import device_fields
+
+    answer = answers.get(row.path)
+    return {
+        "path": row.path,
+        "use": row.use or None,
+        "adapter": row.adapter and asdict(row.adapter),
+        "held_by": [{"pid": holder.pid, "command": holder.command} for holder in row.held_by],
+        "remarks": row.remarks,
+        "device": answer and answer.hello and device_fields(answer.hello),
+        "no_device_because": (answer and answer.problem) or None,
+    }
+
+
+def table(rows: Sequence[Row], answers: dict[str, Answer]) -> Table:
+    """Return the rows as a table for people, from which whole paths can be copied."""
+    from rich.table import Table
+    from rich.text import Text
+
+    shown = Table.grid(padding=(0, 2))
+    shown.add_column(no_wrap=True)
+    shown.add_column(overflow="fold")
+    for row in rows:
+        shown.add_row(Text(row.path, "bold"), Text(_describe(row.adapter)))
+        lines = [("use", row.use), *(("held by", str(holder)) for holder in row.held_by)]
+        if row.path in answers:
+            lines.append(("device", _describe_device(answers[row.path])))
+        for name, value in lines:
+            if value:
+                shown.add_row(f"  {name}", Text(value))
+        for remark in row.remarks:
+            shown.add_row("  note", Text(remark, "yellow"))
+    return shown
+
+
+def _row(
+    path: str, adapter: Adapter | None, others: list[Adapter], has_modem_manager: bool, root: Path
+) -> Row:
+    from tactomo.acquisition.adapters import lasting_name
+    from tactomo.acquisition.open_serial import other_holders
+
+    use = lasting_name(adapter, others) if adapter else ""
+    remarks = list(_access(path))
+    if adapter is not None:
+        remarks += _remarks(adapter, others, use, has_modem_manager)
+    return Row(path, adapter, use, other_holders(path, root), remarks)
+
+
+def _access(path: str) -> list[str]:
+    from tactomo.acquisition.open_serial import how_to_grant
+
+    if not os.path.exists(path) or os.access(path, os.R_OK | os.W_OK):
+        return []
+    return [f"you may not open it; {how_to_grant(path)}"]
+
+
+def _remarks(
+    adapter: Adapter, others: list[Adapter], use: str, has_modem_manager: bool
+) -> list[str]:
+    """Return in words what may go wrong with an adapter."""
+    from tactomo.acquisition.adapters import LOW_LATENCY_MS, look_alikes
+
+    remarks = []
+    twins = look_alikes(adapter, others)
+    if twins:
+        number = f"serial number {adapter.serial_number}" if adapter.serial_number else "no number"
+        remarks.append(
+            f"looks the same as {', '.join(twin.path for twin in twins)} ({number}): a name by id "
+            "may mean either, one by path means the socket; `device_ids` tells the skins apart"
+        )
+    if adapter.is_usb and not use:
+        remarks.append("has no lasting name: does udev run, and see this /dev?")
+    if has_modem_manager and adapter.is_usb and not adapter.is_kept_from_modem_manager:
+        remarks.append(
+            "ModemManager runs and may talk to it when it is plugged in: install tactomo's udev "
+            "rules, or stop ModemManager"
+        )
+    if (adapter.latency_timer_ms or 0) > LOW_LATENCY_MS:
+        remarks.append(
+            f"holds bytes back for up to {adapter.latency_timer_ms} ms; the daemon asks it for 1 ms"
+        )
+    return remarks
+
+
+def _describe(adapter: Adapter | None) -> str:
+    if adapter is None:
+        return "not an adapter"
+    if not adapter.is_usb:
+        return f"built in ({adapter.driver})"
+    number = f"serial number {adapter.serial_number or 'none'}"
+    usb = f"{adapter.vendor_id:04x}:{adapter.product_id or 0:04x}, {adapter.driver}, {number}"
+    return " ".join(filter(None, (adapter.maker, adapter.product, f"({usb})")))
+
+
+def _describe_device(answer: Answer) -> str:
+    hello = answer.hello
+    if hello is None:
+        return answer.problem
+    channels = ", ".join(channel for channel in hello.channels)
+    rate = f"{hello.scan_rate_hz:g} scans/s" if hello.scan_rate_hz else "triggered"
+    return f"{hello.device_id}: {channels}; {rate}; firmware {hello.firmware}"

@@ -1,0 +1,117 @@
+"""`tactomo twin`: a simulated skin behind simulated firmware."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tactomo.cli.options import (
+    DEFAULT_DESCRIPTION,
+    DEFAULT_TWIN_CONTROL,
+    Announce,
+    Description,
+    Protocol,
+    TwinControlAddress,
+    examples,
+    typer_app,
+)
+
+app = typer_app()
+
+
+@app.command(
+    epilog=examples(
+        "tactomo twin --link /tmp/skin",
+        "tactomo twin --ports 1 --scene deploy/scenes/sliding_finger.toml",
+        "tactomo poke press x_mm=10 y_mm=-20",
+        "tactomo twin --description tank_disc --play tank.npz",
+    ),
+)
+def twin(
+    description: Description = DEFAULT_DESCRIPTION,
+    ports: Annotated[
+        int | None,
+        typer.Option(min=1, max=2, help="One line for both channels, or a line for each. [each]"),
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option(help="Dual scans a second. [20, or as in the file that plays]")
+    ] = None,
+    protocol: Protocol = "tactomo",
+    play: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.npz", help="Say measured frames, as `tactomo import` reads them, instead."
+        ),
+    ] = None,
+    once: Annotated[
+        bool, typer.Option("--once", help="Stop after the last played frame; else again.")
+    ] = False,
+    scene: Annotated[
+        Path | None,
+        typer.Option(help="A scripted scene (TOML); starts with the first scan that is received."),
+    ] = None,
+    link: Annotated[
+        Path | None,
+        typer.Option(help="Folder for links with stable names: magnitude and structure, or skin."),
+    ] = None,
+    noise_uv: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="Converter noise, µV rms. [60 dB below the signal]"),
+    ] = None,
+    drift: Annotated[
+        float, typer.Option(min=0.0, help="Random walk of the gains: relative rms after 1 s.")
+    ] = 2e-6,
+    creep: Annotated[
+        float, typer.Option(help="Relative change of the gains over the first minutes.")
+    ] = 2e-5,
+    unevenness: Annotated[
+        float, typer.Option(min=0.0, max=0.5, help="Of the sheet's conductivity; 0.05 is 5 %.")
+    ] = 0.03,
+    seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal noise and drift.")] = 0,
+    twin_control: TwinControlAddress = DEFAULT_TWIN_CONTROL,
+    announce: Announce = False,
+) -> None:
+    """Simulate a skin behind simulated firmware, on real pseudo-terminals, until stopped.
+
+    It speaks the same wire protocol as a real device, so a daemon (or your own program) opens its
+    ports as it would open /dev/ttyACM0. `tactomo poke` presses and disturbs it while it runs:
+    press, release, mute a channel, send garbage, unplug and replug.
+    """
+    from tactomo_models import load_description
+
+    from tactomo.cli.children import interrupt_on_sigterm, print_ready
+    from tactomo.twin import Drift, Twin, TwinConfig, load_scene
+
+    interrupt_on_sigterm()
+    sensor = load_description(description)
+    lines = len(sensor.channels) if protocol == "tactomo" else 1
+    config = TwinConfig(
+        sensor,
+        ports=lines if ports is None else ports,
+        rate_hz=rate,
+        noise_v=None if noise_uv is None else noise_uv * 1e-6,
+        drift=Drift(walk=drift, creep=creep),
+        unevenness=unevenness,
+        seed=seed,
+        scene=None if scene is None else load_scene(scene),
+        protocol=protocol,
+        play=play,
+        play_once=once,
+        control=twin_control,
+        link_folder=link,
+    )
+    running = Twin(config)
+    running.start()
+    try:
+        for path in running.ports:
+            typer.echo(f"port     {path}")
+        typer.echo(f"control  {running.control}")
+        if announce:
+            print_ready({"ports": running.ports, "control": running.control})
+        running.wait()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        running.stop()

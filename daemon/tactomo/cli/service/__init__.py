@@ -1,0 +1,1 @@
+"""`tactomo service`: the daemon as a systemd service."""

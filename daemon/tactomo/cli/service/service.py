@@ -1,0 +1,161 @@
+"""`tactomo service`: a skin's daemon as a service that starts at boot and stays."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tactomo.cli.options import examples, typer_app
+
+if TYPE_CHECKING:
+    from tactomo.service.installation import Plan
+
+app = typer_app(
+    help="Let systemd run a skin's daemon: at boot, for good, and locked in.",
+    name="service",
+    no_args_is_help=True,
+    epilog=examples(
+        "tactomo service install left_forearm --port /dev/ttyACM0 --dry-run",
+        "tactomo service status",
+    ),
+)
+Name = Annotated[str, typer.Argument(help="The skin's name: left_forearm.")]
+Ports = Annotated[
+    list[str],
+    typer.Option("--port", "-p", help="Its serial port, plugged in; twice for two boards."),
+]
+Root = Annotated[
+    Path, typer.Option(help="Where the robot's disk is mounted, to prepare an image of it.")
+]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Show what would be done; do nothing.")]
+
+
+@app.command(
+    epilog=examples(
+        "tactomo service install left_forearm --port /dev/ttyACM0 --dry-run",
+        "sudo tactomo service install left_forearm --port /dev/ttyUSB0 --port /dev/ttyUSB1",
+        "sudo tactomo service install palm --port /dev/ttyACM0 --root /mnt/robot "
+        "--program /usr/bin/tactomo",
+    ),
+)
+def install(
+    name: Name,
+    port: Ports,
+    dry_run: DryRun = False,
+    root: Root = Path("/"),
+    program: Annotated[
+        str | None, typer.Option(help="`tactomo` on the robot. [the one that runs now]")
+    ] = None,
+) -> None:
+    """Install, enable and start the service of one skin: `tactomo@NAME`.
+
+    An adapter that is plugged in gets a name that lasts, /dev/tactomo/NAME, by a udev rule. The
+    configuration, /etc/tactomo/NAME.toml, is yours from then on: installing again leaves it alone.
+    Several skins on one computer are installed one by one, each with addresses of its own.
+    """
+    from tactomo.acquisition import udev
+    from tactomo.acquisition.adapters import list_adapters
+    from tactomo.service.installation import plan_install
+
+    _check_name(name)
+    rules, names = udev.rules(name, port, list_adapters())
+    root = root.absolute()
+    plan = plan_install(name, names, rules, root, program or _program(dry_run))
+    _carry_out(plan, dry_run)
+    if not dry_run:
+        typer.echo(f"tactomo@{name} is installed; `tactomo service status {name}` shows how it is")
+
+
+@app.command(
+    epilog=examples(
+        "sudo tactomo service uninstall left_forearm",
+        "tactomo service uninstall --dry-run",
+    ),
+)
+def uninstall(
+    name: Annotated[
+        str | None, typer.Argument(help="The skin's name. [all, and what they share]")
+    ] = None,
+    dry_run: DryRun = False,
+    root: Root = Path("/"),
+) -> None:
+    """Stop the service of a skin, or of all, and remove it. Configuration and recordings stay."""
+    from tactomo.service.installation import plan_uninstall
+
+    if name is not None:
+        _check_name(name)
+    _carry_out(plan_uninstall(name, root.absolute()), dry_run)
+
+
+@app.command(epilog=examples("tactomo service status", "tactomo service status palm"))
+def status(
+    name: Annotated[str | None, typer.Argument(help="The skin's name. [all]")] = None,
+) -> None:
+    """Show what systemd says of the skins' services, with the last lines of their logs."""
+    import subprocess
+
+    from tactomo.errors import ServiceError
+    from tactomo.service.installation import check_running_systemd, installed
+
+    check_running_systemd()
+    if name is None and not installed(Path("/")):
+        raise ServiceError(
+            "no skin's service is installed", "tactomo service install NAME --port PORT"
+        )
+    unit = f"tactomo@{name or '*'}.service"
+    command = ["systemctl", "status", "--no-pager", "--lines=5", unit]
+    raise typer.Exit(1 if subprocess.run(command, check=False).returncode else 0)
+
+
+def _check_name(name: str) -> None:
+    from tactomo_client import MessageError
+    from tactomo_client.messages import check_sensor_name
+
+    from tactomo.errors import ServiceError
+
+    try:
+        check_sensor_name(name)
+    except MessageError as error:
+        raise ServiceError(f"{name!r} is no name for a skin", error.next_step) from error
+
+
+def _program(dry_run: bool) -> str:
+    """Return the program that the service is to call; who only looks may do so from anywhere."""
+    from tactomo.errors import ServiceError
+    from tactomo.service.installation import PROGRAM, this_program
+
+    try:
+        return this_program()
+    except ServiceError as error:
+        if not dry_run:
+            raise
+        typer.echo(f"Not from here: {error}. From {PROGRAM}:\n", err=True)
+        return PROGRAM
+
+
+def _carry_out(plan: Plan, dry_run: bool) -> None:
+    from tactomo.errors import ServiceError
+    from tactomo.service.installation import check_running_systemd
+
+    _show(plan, with_text=dry_run)
+    if dry_run:
+        return
+    if plan.root == Path("/"):
+        check_running_systemd()
+        if os.geteuid() != 0:
+            raise ServiceError("only root may do that", "run it with sudo, or look with --dry-run")
+    plan.carry_out()
+
+
+def _show(plan: Plan, with_text: bool) -> None:
+    """Print what a plan does; with the text of each file, if that is wanted."""
+    for file in plan.files:
+        effect = file.effect(plan.root)
+        typer.echo(f"{effect:9}  {plan.root / file.path}")
+        if with_text and effect in ("write", "replace"):
+            typer.echo("".join(f"    {line}\n" for line in (file.text or "").splitlines()))
+    for command in plan.commands:
+        typer.echo(f"run        {' '.join(command)}")

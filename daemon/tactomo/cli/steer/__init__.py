@@ -1,0 +1,1 @@
+"""Commands to a running daemon: status, tare, record, method, poke, watch, keys."""

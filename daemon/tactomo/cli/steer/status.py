@@ -1,0 +1,220 @@
+"""`tactomo status`: what is wrong with a running daemon, and all that it says of itself."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from tactomo.cli.health_issues import health_issues
+from tactomo.cli.options import (
+    DEFAULT_CONTROL,
+    DEFAULT_STREAM,
+    ControlAddress,
+    JsonOutput,
+    KeysFolder,
+    StreamAddress,
+    examples,
+    typer_app,
+)
+from tactomo.errors import TactomoError
+
+HEARD_WITHIN_S = 3.0
+"""A status comes every second."""
+
+app = typer_app()
+
+
+@app.command(
+    epilog=examples(
+        "tactomo status",
+        "tactomo status -s left_forearm",
+        "tactomo status -s left_forearm --stream tcp://127.0.0.1:5570",
+        "tactomo status --json | jq .latency_ms",
+    ),
+)
+def status(
+    sensor: Annotated[
+        str | None,
+        typer.Option(
+            "--sensor",
+            "-s",
+            help="Of this sensor, by its stream; so through a proxy, too. [by the control socket]",
+        ),
+    ] = None,
+    stream: StreamAddress = DEFAULT_STREAM,
+    control: ControlAddress = DEFAULT_CONTROL,
+    keys: KeysFolder = None,
+    as_json: JsonOutput = False,
+) -> None:
+    """Show how the daemon is: first what is wrong and what to do about it, then all there is.
+
+    Ports, rates, latency, the time of each stage, what was lost, what happened since the start.
+    `tactomo doctor` looks deeper.
+    """
+    from tactomo_client import request
+
+    answer = request("status", control, keys=keys) if sensor is None else None
+    if answer is None:
+        answer = _heard_status(str(sensor), stream, keys)
+    if as_json:
+        typer.echo(json.dumps(answer, indent=2, default=str))
+        return
+    for issue in health_issues(answer):
+        typer.secho(issue.what, fg="red" if issue.severity == "error" else "yellow", bold=True)
+        typer.echo(f"    {issue.next_step}")
+    typer.echo(f"{answer['sensor']}: {answer['state']}")
+    for name, value in _rows(answer):
+        typer.echo(f"{typer.style(f'{name:<13} ', bold=True)}{value}")
+
+
+def _heard_status(sensor: str, stream: str, keys: Path | None) -> dict[str, Any]:
+    """Return the status of a sensor from its stream, which repeats it every second."""
+    from tactomo_client import subscribe
+
+    with subscribe(sensor, kind="status", address=stream, keys=keys) as statuses:
+        status = statuses.wait(HEARD_WITHIN_S)
+    if status is not None:
+        return dict(status.fields)
+    raise TactomoError(
+        f"nothing is heard of sensor {sensor!r} at {stream}",
+        "is its daemon running under this name? `tactomo status` without -s asks the one whose "
+        "control socket is at --control",
+    )
+
+
+def _rows(status: dict[str, Any]) -> list[tuple[str, str]]:
+    rates = status.get("rates") or {}
+    latency = status.get("latency_ms") or {}
+    recording = status.get("recording")
+    reference = status.get("reference") or {}
+    description = status.get("description") or {}
+    rows = [
+        ("daemon", f"{status.get('version')}, up {status.get('uptime_s', 0.0):.0f} s"),
+        ("sensor", f"{description.get('model')} ({', '.join(description.get('modalities', []))})"),
+        ("pressure", _pressure(description)),
+        ("source", str((status.get("source") or {}).get("kind"))),
+        *(("port", _port_line(port)) for port in status.get("ports", [])),
+        (
+            "rates",
+            f"{_number(rates.get('frames_hz'))} frames/s; scans/s: "
+            f"magnitude {_number(rates.get('magnitude_hz'))}, "
+            f"structure {_number(rates.get('structure_hz'))}",
+        ),
+        ("latency", _percentiles(latency)),
+        *(
+            (f"  {stage}", _percentiles(times))
+            for stage, times in (status.get("stage_ms") or {}).items()
+        ),
+        (
+            "method",
+            f"{status.get('tier_requested')}; the newest frame by {status.get('tier') or '-'}",
+        ),
+        ("  can be", ", ".join(status.get("methods") or []) or "-"),
+        ("budget", _budget(status.get("budget_ms"), status.get("plan") or {})),
+        ("flags", ", ".join(status.get("flags", [])) or "none"),
+        (
+            "misfit",
+            f"{_number(status.get('misfit'))} (1: explained to the noise; too much is flagged)",
+        ),
+        (
+            "lost",
+            f"{status.get('dropped_scans', 0)} dual scans dropped, "
+            f"{status.get('incomplete_scans', 0)} incomplete",
+        ),
+        ("reference", f"{reference['scans']} dual scans" if reference else "none yet"),
+        ("baseline", _baseline(status.get("baseline") or {})),
+        ("recording", _recording(recording, status.get("recorder") or {})),
+        ("subscribers", str(status.get("subscribers", "-"))),
+        ("events", _events(status.get("events") or {})),
+        *(("  last", _trouble(each)) for each in (status.get("events") or {}).get("troubles", [])),
+        ("process", _process(status.get("process") or {}, status.get("uptime_s") or 0.0)),
+    ]
+    return rows
+
+
+def _pressure(description: dict[str, Any]) -> str:
+    """Say what turns a change into a pressure."""
+    calibration = description.get("calibration")
+    if calibration:
+        low, high = calibration["range_kpa"]
+        return (
+            f"calibrated {calibration['taken'][:10]} by {calibration['readings']} readings: "
+            f"{low:.0f} to {high:.0f} kPa ± {calibration['sigma_kpa']:.1f}"
+        )
+    if description.get("pressure_max_kpa") is None:
+        return "none: no magnitude channel"
+    return "by the description's table; `tactomo calibrate` makes it this sensor's"
+
+
+def _baseline(baseline: dict[str, Any]) -> str:
+    """Say whether the reference follows drift, and how far it has gone since the tare."""
+    state, refusal = str(baseline.get("state") or "-"), baseline.get("refusal")
+    gone = [
+        f"{channel} {drift['gain']:+.2%}, unevenly {drift['uneven']:.2%}"
+        for channel, drift in (baseline.get("drift") or {}).items()
+    ]
+    return "; ".join([f"{_warn(state)}: {refusal}" if refusal else state, *gone])
+
+
+def _recording(recording: dict[str, Any] | None, recorder: dict[str, Any]) -> str:
+    if recording:
+        return f"{recording['path']} ({recording['bytes'] / 1e6:.1f} MB)"
+    waits_for = recorder.get("waits_for")
+    return f"{_warn('waits')}: {waits_for}" if waits_for else "off"
+
+
+def _events(events: dict[str, Any]) -> str:
+    counts = events.get("counts") or {}
+    return ", ".join(f"{name} {count}" for name, count in sorted(counts.items())) or "none"
+
+
+def _trouble(trouble: dict[str, Any]) -> str:
+    age_s = trouble.get("age_s") or 0.0
+    ago = f"{age_s:.0f} s" if age_s < 120 else f"{age_s / 60:.0f} min"
+    return f"{_warn(trouble.get('name'))}, {ago} ago: {trouble.get('detail')}"
+
+
+def _process(process: dict[str, Any], uptime_s: float) -> str:
+    memory_bytes = process.get("memory_bytes")
+    memory = "-" if memory_bytes is None else f"{memory_bytes / 1e6:.0f} MB"
+    share = 1e2 * (process.get("cpu_s") or 0.0) / max(uptime_s, 1.0)
+    return (
+        f"pid {process.get('pid', '-')}, {share:.1f} % of a core on average, "
+        f"{memory}, {process.get('threads', '-')} threads"
+    )
+
+
+def _port_line(port: dict[str, Any]) -> str:
+    device = port.get("device") or {}
+    state = port.get("state", "open") if port.get("connected") else _warn("not open")
+    corrupt, problem = port.get("corrupt", 0), port.get("problem")
+    return (
+        f"{port.get('url')} ({state}), {device.get('device_id', 'no hello yet')}, "
+        f"{', '.join(device.get('channels', [])) or '-'}; {port.get('packets', 0)} packets, "
+        + (_warn(f"{corrupt} corrupt") if corrupt else "none corrupt")
+        + (f"; {_warn(problem)}" if problem else "")
+    )
+
+
+def _budget(budget_ms: float | None, plan: dict[str, Any]) -> str:
+    """Say what time a frame may take, and what it is given for that."""
+    source = f"machine speed: {plan.get('source', '-')}"
+    if budget_ms is None:
+        return f"the method's own; {source}"
+    given = f"{plan.get('tier')}, {_number(plan.get('modelled_ms'))} modelled ms"
+    return f"{budget_ms:g} ms: {given}; {source}"
+
+
+def _percentiles(times: dict[str, Any]) -> str:
+    return f"p50 {_number(times.get('p50'))} ms, p99 {_number(times.get('p99'))} ms"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def _warn(text: object) -> str:
+    return typer.style(str(text), fg="yellow")

@@ -1,0 +1,224 @@
+"""`tactomo tare`, `record`, `method` and `poke`: one request to a running program each."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tactomo.cli.options import (
+    DEFAULT_CONTROL,
+    DEFAULT_TWIN_CONTROL,
+    ControlAddress,
+    KeysFolder,
+    TwinControlAddress,
+    examples,
+    method_names,
+    typer_app,
+)
+
+if TYPE_CHECKING:
+    from tactomo_client import Daemon, RecordedFile
+
+SOON_S = 3.0
+USUAL_TARE_SCANS = 20
+"""Where no reference says yet how many the daemon takes."""
+
+app = typer_app()
+
+
+@app.command(
+    epilog=examples("tactomo tare"),
+)
+def tare(control: ControlAddress = DEFAULT_CONTROL, keys: KeysFolder = None) -> None:
+    """Take a new reference: the next scans of the *unloaded* skin count as "nothing pressed".
+
+    Leave the skin alone for a second, then run this. Needed after mounting the skin, after a
+    change of temperature, and when contacts show up where nobody presses.
+    """
+    from tactomo_client import Daemon
+    from tactomo_client.control import TARE_TIMEOUT_S
+
+    with Daemon(control, keys=keys) as daemon:
+        needs_s = _tare_s(daemon.request("status"))
+        if needs_s > SOON_S:
+            typer.echo(f"leave the skin alone: its scans take {needs_s:.0f} s to come", err=True)
+        taken = daemon.tare(TARE_TIMEOUT_S + 2 * needs_s)
+    typer.echo(f"new reference from {taken.scans} dual scans")
+    if taken.contacts:
+        typer.echo(
+            f"{taken.contacts} contact(s) were shown meanwhile and now count as nothing pressed; "
+            "if something was on the skin, take it off and tare again",
+            err=True,
+        )
+
+
+def _tare_s(status: Mapping[str, Any]) -> float:
+    """Return how long a reference's scans take to come, in seconds, by the last one's number."""
+    scans = (status.get("reference") or {}).get("scans") or USUAL_TARE_SCANS
+    rate_hz = (status.get("rates") or {}).get("frames_hz") or 0.0
+    return float(scans / rate_hz) if rate_hz else 0.0
+
+
+@app.command(
+    epilog=examples(
+        "tactomo record grasp.mcap --seconds 10",
+        "tactomo record grasp.mcap --maps",
+        "tactomo record start grasp.mcap",
+        "tactomo record start        (into the daemon's folder)",
+        "tactomo record stop",
+    ),
+)
+def record(
+    what: Annotated[
+        str,
+        typer.Argument(
+            metavar="start|stop|FILE",
+            help="Start a recording and return, stop it, or record FILE while this runs.",
+        ),
+    ],
+    path: Annotated[Path | None, typer.Argument(help="For `start`: the file.")] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option(min=0.1, help="For FILE: how long; until Ctrl-C when left out."),
+    ] = None,
+    maps: Annotated[
+        bool, typer.Option("--maps", help="With maps and contacts. [as the daemon is configured]")
+    ] = False,
+    control: ControlAddress = DEFAULT_CONTROL,
+    keys: KeysFolder = None,
+) -> None:
+    """Record what the ports say (every byte, with its time) into an MCAP file.
+
+    The daemon writes the file, so it keeps recording when this command ends, and the path is one
+    on the daemon's computer. Without a path it records into its folder, cut into files of which
+    the newest are kept, as its configuration says under [recording]. `tactomo replay` plays a file
+    again; each of several replays by itself.
+    """
+    from tactomo_client import Daemon
+
+    daemon = Daemon(control, keys=keys)
+    if what not in ("start", "stop"):
+        if path is not None:
+            raise typer.BadParameter("give one file, or `start FILE`")
+        _record_for(daemon, Path(what), seconds, maps or None)
+        return
+    if seconds is not None:
+        raise typer.BadParameter("--seconds goes with FILE, not with start or stop")
+    if what == "stop":
+        if path is not None or maps:
+            raise typer.BadParameter("stop takes no file, and no --maps")
+        _print_recorded(daemon.record_stop())
+        return
+    typer.echo(f"recording to {daemon.record_start(path, maps=maps or None).path}")
+
+
+@app.command(
+    epilog=examples("tactomo method levelset", "tactomo method auto --budget-ms 20"),
+)
+def method(
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="The method; auto chooses for each frame. `tactomo status` lists those that the "
+            "daemon has.",
+            autocompletion=method_names,
+        ),
+    ],
+    budget_ms: Annotated[
+        float | None, typer.Option(min=0.1, help="Time that one reconstruction may take.")
+    ] = None,
+    control: ControlAddress = DEFAULT_CONTROL,
+    keys: KeysFolder = None,
+) -> None:
+    """Choose the reconstruction method while the daemon runs.
+
+    One of your own (my_module:MyMethod) can be chosen where the daemon was started with it, or its
+    distribution is installed beside the daemon.
+    """
+    from tactomo_client import Daemon
+
+    with Daemon(control, keys=keys) as daemon:
+        in_force = daemon.set_method(name).tier
+        if budget_ms is not None:
+            daemon.set_budget(budget_ms)
+    typer.echo(f"method {in_force}")
+
+
+@app.command(
+    epilog=examples(
+        "tactomo poke press x_mm=10 y_mm=-20 pressure_kpa=180",
+        "tactomo poke release",
+        "tactomo poke mute channel=structure seconds=3",
+        "tactomo poke garbage count=500",
+        "tactomo poke unplug",
+        "tactomo poke replug",
+        "tactomo poke status",
+    ),
+)
+def poke(
+    command: Annotated[str, typer.Argument(help="A command of the twin, see below.")],
+    arguments: Annotated[
+        list[str] | None, typer.Argument(metavar="[NAME=VALUE]...", help="Its arguments.")
+    ] = None,
+    twin_control: TwinControlAddress = DEFAULT_TWIN_CONTROL,
+) -> None:
+    """Press, move, release and break a running twin, as a test of your own robot would.
+
+    `press` (x_mm, y_mm, id, radius_mm, pressure_kpa, shape; the same id again moves it),
+    `release` (id), `clear`, `scene` (what presses now), `play` (the scripted scene from its start),
+    `noise` (noise_v), `drift` (swing_k, period_s, step_k, press_creep, ...), `mute` (channel,
+    seconds), `garbage` (count, port), `unplug` and `replug` (port), `status`.
+    """
+    from tactomo_client import request
+
+    answer = request(
+        command, twin_control, **dict(_named(argument) for argument in arguments or [])
+    )
+    if answer:
+        typer.echo(json.dumps(answer, indent=2))
+
+
+def _record_for(daemon: Daemon, path: Path, seconds: float | None, maps: bool | None) -> None:
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    size = TextColumn("{task.fields[size]}")
+    columns = (TextColumn("recording"), BarColumn(), TimeElapsedColumn(), size)
+    begin_s = time.monotonic()
+    with (
+        daemon.record(path, maps=maps) as recording,
+        suppress(KeyboardInterrupt),  # the way to end a recording without --seconds
+        Progress(*columns, transient=True) as progress,
+    ):
+        task = progress.add_task(recording.path, total=seconds, size="")
+        while seconds is None or time.monotonic() - begin_s < seconds:
+            now = daemon.status().recording
+            passed_s = time.monotonic() - begin_s
+            recorded = f"{now.bytes / 1e6:.1f} MB" if now else ""
+            progress.update(task, completed=passed_s, size=recorded)
+            left_s = 0.5 if seconds is None else seconds - passed_s
+            time.sleep(max(0.0, min(0.5, left_s)))
+    if recording.file is not None:
+        _print_recorded(recording.file)
+
+
+def _print_recorded(file: RecordedFile) -> None:
+    typer.echo(f"recorded {file.path} ({file.bytes / 1e6:.2f} MB)")
+
+
+def _named(argument: str) -> tuple[str, Any]:
+    """Return name and value of "x_mm=10"; the value is a number where it reads as one."""
+    name, equals, text = argument.partition("=")
+    if not equals or not name:
+        raise typer.BadParameter(f"{argument!r} is not NAME=VALUE")
+    for read in (int, float):
+        try:
+            return name, read(text)
+        except ValueError:
+            continue
+    return name, text

@@ -1,0 +1,248 @@
+"""`tactomo watch`: the skin in a terminal, over ssh if need be."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tactomo.cli.options import (
+    DEFAULT_NAME,
+    DEFAULT_STREAM,
+    KeysFolder,
+    SensorName,
+    StreamAddress,
+    examples,
+    typer_app,
+)
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+    from rich.text import Text
+    from tactomo_client import Event, Frame, Status
+
+REFRESH_HZ = 12.0
+
+app = typer_app()
+
+
+@app.command(
+    epilog=examples("tactomo watch", "tactomo watch -s left_forearm", "tactomo watch | tee log"),
+)
+def watch(
+    sensor: SensorName = DEFAULT_NAME,
+    stream: StreamAddress = DEFAULT_STREAM,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.0, help="Stop after this long; until Ctrl-C without it.")
+    ] = None,
+    keys: KeysFolder = None,
+) -> None:
+    """Show the pressure map, the contacts and the daemon's health live in the terminal.
+
+    Without a terminal (in a pipe) it prints one line a frame instead. Ctrl-C ends it.
+    """
+    from rich.console import Console
+
+    view = View(sensor, stream, keys)
+    console = Console()
+    end_s = float("inf") if seconds is None else time.monotonic() + seconds
+    try:
+        if console.is_terminal:
+            _show_live(view, console, end_s)
+        else:
+            _print_lines(view, end_s)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        view.close()
+
+
+class View:
+    """The newest frame, status and event of one sensor."""
+
+    def __init__(self, sensor: str, stream: str, keys: Path | None = None) -> None:
+        from tactomo_client import subscribe
+
+        self.sensor = sensor
+        self.stream = stream
+        self.frame: Frame | None = None
+        self.status: Status | None = None
+        self.event: Event | None = None
+        self._news = subscribe(sensor, address=stream, kind=("map", "status", "event"), keys=keys)
+
+    def update(self, wait_s: float) -> bool:
+        """Take in what has come, waiting for it at most `wait_s`; return whether a frame came.
+
+        Raises:
+            KeysError: the server does not let us in.
+
+        """
+        before = self.frame
+        while (item := self._news.wait(wait_s)) is not None:
+            wait_s = 0.0
+            self._take(item)
+        return self.frame is not before
+
+    def close(self) -> None:
+        """Close the subscription."""
+        self._news.close()
+
+    @property
+    def is_gone(self) -> bool:
+        """Whether no status has come for so long that the daemon cannot be there."""
+        return self.status is None or self.status.is_stale
+
+    def _take(self, item: Frame | Status | Event) -> None:
+        from tactomo_client import Frame, Status
+
+        if isinstance(item, Frame):
+            self.frame = item
+        elif isinstance(item, Status):
+            self.status = item
+        else:
+            self.event = item
+
+
+def _show_live(view: View, console: Any, end_s: float) -> None:
+    from rich.live import Live
+
+    with Live(console=console, screen=True, auto_refresh=False) as live:
+        while time.monotonic() < end_s:
+            next_s = time.monotonic() + 1.0 / REFRESH_HZ
+            while (left_s := next_s - time.monotonic()) > 0:
+                view.update(left_s)
+            live.update(_screen(view, console.size.width, console.size.height), refresh=True)
+
+
+def _print_lines(view: View, end_s: float) -> None:
+    silent_s = time.monotonic()
+    while time.monotonic() < end_s:
+        if view.update(min(0.5, max(0.0, end_s - time.monotonic()))):
+            silent_s = time.monotonic()
+            assert view.frame is not None
+            print(frame_line(view.frame), flush=True)
+        elif time.monotonic() - silent_s > 1.0:
+            silent_s = time.monotonic()
+            print(f"no frame of {view.sensor} at {view.stream}", file=sys.stderr, flush=True)
+
+
+def frame_line(frame: Frame) -> str:
+    """Return one frame as a line of text."""
+    from tactomo_client.appearance import force_words, pressure_words
+
+    pressed = "; ".join(
+        f"#{c.id} ({c.x_mm:+.1f}, {c.y_mm:+.1f}) mm {pressure_words(c)}{force_words(c, ', ')}"
+        for c in frame.contacts
+    )
+    flags = f"  [{', '.join(sorted(frame.flags))}]" if frame.flags else ""
+    return f"{frame.scan_counter:8d}  {frame.tier or '-':<9} {pressed or 'nothing pressed'}{flags}"
+
+
+def _screen(view: View, columns: int, rows: int) -> RenderableType:
+    from rich.console import Group
+    from rich.panel import Panel
+    from rich.table import Table
+    from rich.text import Text
+
+    frame = view.frame
+    if frame is None:
+        return Panel(_state_line(view), title=f"tactomo watch {view.sensor}")
+    description = view.status.fields.get("description") or {} if view.status else {}
+    image = map_text(frame, description, max(10, min(columns - 44, 2 * (rows - 6))))
+    body = Table.grid(padding=(0, 2))
+    body.add_row(image, Group(_contact_table(frame), Text(), _health(view, frame)))
+    panel = Panel(
+        body,
+        title=f"tactomo watch {view.sensor}",
+        subtitle="Ctrl-C ends",
+        border_style="red" if view.is_gone or frame.is_stale else "none",
+    )
+    return Group(_state_line(view), panel)
+
+
+def _state_line(view: View) -> Text:
+    from rich.text import Text
+
+    if view.status is None or view.is_gone:
+        return Text(
+            f"no daemon answers at {view.stream} for a sensor {view.sensor!r}: is it running?",
+            "bold red",
+        )
+    state = view.status.state
+    if view.frame is not None and view.frame.is_stale:
+        age = f"STALE: the newest frame is {view.frame.age_s:.1f} s old"
+        return Text(f"{age} (the daemon says: {state}) {_event_words(view.event)}", "bold red")
+    return Text(f"{state} {_event_words(view.event)}", "green" if state == "running" else "yellow")
+
+
+def _event_words(event: Event | None) -> str:
+    return f"| last event: {event.name} {event.detail}" if event else ""
+
+
+def map_text(frame: Frame, description: Mapping[str, Any], columns: int) -> Text:
+    """Return the map as text of at most `columns` half-block characters in width.
+
+    Each character is two nodes, one above the other. Colour is pressure, or the relative change
+    where the sensor has no pressure calibration; pressed outlines without a value are blue-grey.
+    """
+    import numpy as np
+    from rich.color import Color
+    from rich.style import Style
+    from rich.text import Text
+    from tactomo_client.appearance import map_pixels
+
+    pixels = map_pixels(frame, description)
+    if pixels is None:
+        return Text("no image: " + ", ".join(sorted(frame.flags)))
+    step = -(-pixels.shape[1] // columns)
+    pixels = pixels[::-step, ::step]  # row 0 of a map is its lowest
+    if len(pixels) % 2:
+        pixels = np.concatenate([pixels, np.zeros_like(pixels[:1])])
+    text = Text()
+    for upper, lower in zip(pixels[0::2], pixels[1::2], strict=True):
+        for top, bottom in zip(upper.tolist(), lower.tolist(), strict=True):
+            style = Style(color=Color.from_rgb(*top), bgcolor=Color.from_rgb(*bottom))
+            text.append("▀", style)
+        text.append("\n")
+    return text
+
+
+def _contact_table(frame: Frame) -> RenderableType:
+    from rich.table import Table
+    from rich.text import Text
+    from tactomo_client.appearance import force_words, pressure_words
+
+    if not frame.contacts:
+        return Text("nothing pressed", "dim")
+    table = Table(box=None, pad_edge=False)
+    for name in ("#", "x mm", "y mm", "mm²", "pressure", "force"):
+        table.add_column(name, justify="right")
+    for c in frame.contacts:
+        place = f"{c.x_mm:+.1f}", f"{c.y_mm:+.1f}", f"{c.area_mm2:.0f}"
+        table.add_row(str(c.id), *place, pressure_words(c), force_words(c))
+    return table
+
+
+def _health(view: View, frame: Frame) -> RenderableType:
+    from rich.table import Table
+
+    status = view.status
+    latency = status and status.latency_ms
+    rows = {
+        "rate": f"{status.rates.frames_hz:.1f} frames/s" if status else "-",
+        "latency": f"{latency.p50:.1f} ms (p99 {latency.p99:.1f})" if latency else "-",
+        "age": f"{frame.age_s * 1e3:.0f} ms",
+        "tier": frame.tier or "-",
+        "because": frame.tier_reason or "-",
+        "misfit": "-" if frame.misfit is None else f"{frame.misfit:.2f}",
+        "flags": ", ".join(sorted(frame.flags)) or "none",
+        "source": status.source.kind if status else "-",
+    }
+    table = Table(box=None, show_header=False, pad_edge=False)
+    for name, value in rows.items():
+        table.add_row(f"[dim]{name}[/]", value)
+    return table

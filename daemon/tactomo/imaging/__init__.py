@@ -1,0 +1,1 @@
+"""From dual scans to frames: tare, reconstruction, the pipeline thread."""

@@ -1,0 +1,263 @@
+"""One dual scan to one frame: check, reconstruct, publish, and mark it in the recording.
+
+For use by the pipeline thread; nothing in here waits. What others may read (`reference`, `stages`,
+...) is written by that thread alone.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any, Final
+
+import structlog
+from tactomo_client.messages import CONTACTS, MAP, SCAN
+from tactomo_models import (
+    BaselineTracker,
+    Reconstruction,
+    Reconstructor,
+    Reference,
+    SensorDescription,
+)
+from tactomo_models.arrays import FloatArray
+from tactomo_models.calibration.calibration_file import PressureCalibration
+from tactomo_models.machine_speed import MachineSpeed
+from tactomo_protocol import Channel, ScanFlag
+
+from tactomo.config import BaselineConfig
+from tactomo.events import OnEvent, RateLimit
+from tactomo.imaging.calibration_in_force import CalibrationInForce
+from tactomo.imaging.frame_marks import FrameMarks
+from tactomo.imaging.frames import (
+    calibration_fields,
+    contacts_fields,
+    frame_header,
+    map_fields,
+    scan_fields,
+    scan_header,
+)
+from tactomo.imaging.method_in_force import Effort, MethodInForce
+from tactomo.imaging.tare import Taring
+from tactomo.recordings.recorder import Recorder
+from tactomo.recordings.recording import calibration_text
+from tactomo.scans import DualScan, Mark, Timing
+from tactomo.stream.publisher import Publisher
+from tactomo.timing import Durations, Rate
+
+REFUSAL_PERIOD_S: Final = 600.0
+
+Volts = dict[Channel, FloatArray]
+
+log = structlog.get_logger()
+
+
+class Imaging:
+    """Reconstructs dual scans against the reference in force, and publishes the frames.
+
+    Args:
+        description: the sensor.
+        reconstructor: belongs to this class from now on.
+        machine_speed: what turns a budget of time into one of work.
+        calibration: of pressure, the sensor's own; None for the description's curve.
+        tare_scans: dual scans for a reference.
+        baseline: whether and how fast the reference follows the skin.
+        recorder: is told of which scans frames were made.
+        publisher: gets the frames.
+        on_event: told what people should know.
+
+    Attributes:
+        method: requested and effective.
+        calibration: of pressure, the one in force.
+        taring: takes references.
+        reference: what changes are measured against; None before the first tare.
+        reference_realtime_ns: when it was taken.
+        stages: how long each stage takes.
+        frame_rate: how often a frame is published.
+        acquired_monotonic_ns: when the newest dual scan was acquired; 0 before the first.
+
+    """
+
+    def __init__(
+        self,
+        description: SensorDescription,
+        reconstructor: Reconstructor,
+        machine_speed: MachineSpeed,
+        calibration: PressureCalibration | None,
+        tare_scans: int,
+        baseline: BaselineConfig,
+        recorder: Recorder,
+        publisher: Publisher,
+        on_event: OnEvent,
+    ) -> None:
+        self.reference: Reference | None = None
+        self.reference_realtime_ns = 0
+        self.stages: dict[str, Durations] = {}
+        self.frame_rate = Rate()
+        self.acquired_monotonic_ns = 0
+        self._description = description
+        self._reconstructor = reconstructor
+        self._tracker = (
+            BaselineTracker(reconstructor, baseline.time_constant_s) if baseline.track else None
+        )
+        self._marks = FrameMarks(recorder, calibration_text(calibration))
+        self.method = MethodInForce(reconstructor, machine_speed)
+        self.calibration = CalibrationInForce(
+            description, reconstructor, self._marks, on_event, calibration
+        )
+        self.taring = Taring(
+            tare_scans,
+            description.channels,
+            self.frame_rate,
+            lambda reference: self.use_reference(reference, time.time_ns()),
+            on_event,
+        )
+        self._recorder = recorder
+        self._publisher = publisher
+        self._on_event = on_event
+        self._contacts = 0  # in the last frame
+        self._failure_limit = RateLimit()
+        self._refusal_limit = RateLimit(REFUSAL_PERIOD_S)
+
+    @property
+    def baseline(self) -> dict[str, Any]:
+        """What `status` says of how the reference follows the skin; for any thread."""
+        tracker = self._tracker
+        if tracker is None:
+            return {"state": "off", "moves": 0, "refusal": None, "drift": {}}
+        drift = {
+            name: {"gain": each.gain, "uneven": each.uneven} for name, each in tracker.drift.items()
+        }
+        refusal = tracker.refusal or None
+        return {"state": tracker.state, "moves": tracker.moves, "refusal": refusal, "drift": drift}
+
+    def has_reference(self, channel: Channel) -> bool:
+        """Whether there is something to measure this channel's changes against."""
+        return getattr(self.reference, channel, None) is not None
+
+    def use_reference(self, reference: Reference, realtime_ns: int) -> None:
+        """Measure changes against `reference` from the next dual scan on, and follow from it."""
+        self.reference_realtime_ns = realtime_ns
+        if self._tracker is None:
+            self._reconstructor.set_reference(reference)
+            self._note_reference(reference)
+        else:
+            self._note_reference(self._tracker.begin(reference))
+
+    def _note_reference(self, reference: Reference) -> None:
+        """Say, and record, that this reference is in force."""
+        self.reference = reference
+        self.taring.note_reference()
+        self._marks.note_reference(reference, self.reference_realtime_ns)
+
+    def use_calibration(self, calibration: PressureCalibration | None) -> dict[str, Any]:
+        """Put a calibration in force, None for the description's curve; return what a client gets.
+
+        Raises:
+            CommandError: it is another device's; what was in force stays so.
+
+        """
+        self.calibration.replace(calibration)
+        self._publisher.tell_status()
+        return {"calibration": calibration and calibration_fields(calibration)}
+
+    def process(self, dual: DualScan, timing: Timing, lost: set[Channel]) -> None:
+        """Turn one dual scan into a frame; `lost` are the channels that are not to be expected."""
+        mark = dual.mark
+        if mark is not None:
+            self._obey(mark)
+        if self._marks.follow(dual):
+            # Which contacts are which is not forgotten: whoever follows one need not know of this.
+            self._reconstructor.forget_shape()
+        volts = {scan.channel: scan.volts for scan in dual.scans}
+        self._publish_scan(dual, timing, volts)
+        frame = self._reconstruct(volts, _saturated(dual), is_exact=mark is not None)
+        self._marks.mark(dual, timing, *self.method.effective)  # first: what was seen is recorded
+        if frame is not None:
+            self._contacts = len(frame.contacts)
+            self._publish_frame(dual, timing, frame)
+        self.taring.add(volts, lost, self._contacts)
+
+    def _obey(self, mark: Mark) -> None:
+        """Put in force what was in force when this dual scan was recorded."""
+        self.method.obey(Effort(mark.tier, mark.budget_ms))
+        if mark.is_cold:
+            self._reconstructor.reset()
+        if mark.is_cut:
+            self._reconstructor.forget_shape()
+        self.calibration.obey(mark.calibration)
+        if mark.reference is not None:
+            self.reference_realtime_ns = time.time_ns()
+            self._reconstructor.set_reference(mark.reference)
+            self._note_reference(mark.reference)
+
+    def _reconstruct(
+        self, volts: Volts, saturated: list[Channel], *, is_exact: bool
+    ) -> Reconstruction | None:
+        """Make a frame; where it is exact, against the reference that the recording had then."""
+        started_s = time.perf_counter()
+        scans = (volts.get(Channel.MAGNITUDE), volts.get(Channel.STRUCTURE))
+        try:
+            if self._tracker is None or is_exact:
+                frame = self._reconstructor.reconstruct(*scans, saturated=saturated)
+            else:
+                acquired_s = self.acquired_monotonic_ns * 1e-9
+                frame = self._tracker.reconstruct(acquired_s, *scans, saturated=saturated)
+                self._follow(self._tracker)
+        except Exception as error:  # a robot is better off with the next frame than with none
+            self._reconstructor.reset()
+            if self._failure_limit.allows():
+                log.exception("reconstruction_failed")
+                self._on_event(
+                    "reconstruction_failed",
+                    "error",
+                    f"{type(error).__name__}: {error}",
+                    "this is a mistake in tactomo: please report it with a recording",
+                )
+            return None
+        self._time("reconstruct", time.perf_counter() - started_s)
+        for stage, seconds in frame.stage_s.items():
+            self._time(stage, seconds)
+        if frame.failure and self._failure_limit.allows():
+            step = "frames are tikhonov's until it works: mend it, or choose another method"
+            self._on_event("method_failed", "warning", frame.failure, step)
+        return frame
+
+    def _follow(self, tracker: BaselineTracker) -> None:
+        """Take over the reference that the tracker has put in force, and tell where it refuses."""
+        if tracker.reference is not None and tracker.reference is not self.reference:
+            self._note_reference(tracker.reference)
+        if tracker.refusal and self._refusal_limit.allows():
+            self._on_event(
+                "baseline_refused",
+                "warning",
+                tracker.refusal,
+                "take off what presses, and away what heats or cools the skin; once it is steady: "
+                "`tactomo tare`",
+            )
+
+    def _publish_scan(self, dual: DualScan, timing: Timing, volts: Volts) -> None:
+        header = scan_header(dual, timing)
+        self.acquired_monotonic_ns = header["acquired_monotonic_ns"]
+        if self._publisher.wants(SCAN):
+            self._publisher.publish(SCAN, scan_fields(dual.counter, volts), header)
+
+    def _publish_frame(self, dual: DualScan, timing: Timing, frame: Reconstruction) -> None:
+        started_s = time.perf_counter()
+        header = frame_header(dual, timing, frame)
+        self._publisher.header = header
+        self._publisher.publish(CONTACTS, contacts_fields(dual.counter, frame), header)
+        active = self._recorder.active
+        if self._publisher.wants(MAP) or (active is not None and active.with_maps):
+            fields = map_fields(dual.counter, frame, self._description)
+            self._publisher.publish(MAP, fields, header)
+        self.frame_rate.add(time.monotonic_ns())
+        self._time("publish", time.perf_counter() - started_s)
+
+    def _time(self, stage: str, seconds: float) -> None:
+        if stage not in self.stages:  # a new dictionary, for those who iterate over the old one
+            self.stages = {**self.stages, stage: Durations()}
+        self.stages[stage].add(seconds)
+
+
+def _saturated(dual: DualScan) -> list[Channel]:
+    """Return the channels whose device says that its converter clipped."""
+    return [scan.channel for scan in dual.scans if scan.flags & ScanFlag.SATURATED]

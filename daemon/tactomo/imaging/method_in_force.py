@@ -1,0 +1,87 @@
+"""The method and the budget that were requested, and those that frames get.
+
+A budget is milliseconds of this machine; the machine's speed turns it into milliseconds of modelled
+work, and may choose another method than `auto` where there is little time. Recordings hold what was
+effective, so that a replay gives the same on any machine. For use by the pipeline thread; others
+may read.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from tactomo_models import Reconstructor
+from tactomo_models.machine_speed import MachineSpeed
+
+from tactomo.errors import CommandError
+
+
+class Effort(NamedTuple):
+    """How much model a frame gets."""
+
+    method: str
+    budget_ms: float | None
+    """None for the method's own."""
+
+
+class MethodInForce:
+    """Tells the reconstructor its method and budget.
+
+    Attributes:
+        requested: what was asked for; the budget in milliseconds of this machine.
+        effective: what frames get; the budget in milliseconds of modelled work.
+        source: where the machine's speed is known from, in words.
+
+    """
+
+    def __init__(self, reconstructor: Reconstructor, machine_speed: MachineSpeed) -> None:
+        self.source = machine_speed.source
+        self._reconstructor = reconstructor
+        self._machine_speed = machine_speed
+        budget_s = reconstructor.budget_s
+        self.requested = self.effective = Effort(
+            reconstructor.method, None if budget_s is None else budget_s * 1e3
+        )
+        self._request(self.requested)
+
+    def request_method(self, method: str) -> None:
+        """Have frames made by another method.
+
+        Raises:
+            CommandError: it cannot be set up; what was in force stays so.
+
+        """
+        try:
+            self._request(self.requested._replace(method=method))
+        except Exception as error:  # somebody else's method: anything may go wrong in it
+            raise CommandError(
+                f"the method {method} cannot be set up: {type(error).__name__}: {error}",
+                "ask for another method",
+                "no_network",
+            ) from error
+
+    def request_budget(self, budget_ms: float | None) -> None:
+        """Have frames take as much time; None for the method's own."""
+        self._request(self.requested._replace(budget_ms=budget_ms))
+
+    def obey(self, recorded: Effort) -> None:
+        """Give frames what was effective when they were recorded."""
+        if recorded != self.effective:
+            self._put_in_force(recorded)
+            self.requested = recorded
+
+    def _request(self, requested: Effort) -> None:
+        budget_ms = requested.budget_ms
+        plan = self._machine_speed.plan(
+            requested.method, None if budget_ms is None else budget_ms * 1e-3
+        )
+        modelled_ms = None if plan.budget_s is None else plan.budget_s * 1e3
+        self._put_in_force(Effort(plan.method, modelled_ms))
+        self.requested = requested
+
+    def _put_in_force(self, effective: Effort) -> None:
+        # Milliseconds are what is recorded: live and replay must come to the same seconds.
+        budget_ms = effective.budget_ms
+        self._reconstructor.method = effective.method
+        self._reconstructor.budget_s = None if budget_ms is None else budget_ms * 1e-3
+        self.effective = effective

@@ -1,0 +1,365 @@
+"""The pipeline thread: from scans as they arrive to dual scans in order, and those to imaging.
+
+Port threads hand over what they read by a queue. When this thread lags, the newest dual scan wins
+and the older ones are counted as dropped, unless every one of them is asked for: then the queue
+fills, and the ports wait.
+
+What others want done they ask for through a second queue, so that it happens between two frames.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import threading
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from typing import Any, Final, NamedTuple
+
+from tactomo_models.calibration.calibration_file import PressureCalibration
+from tactomo_protocol import Channel, Hello
+
+from tactomo.acquisition.scan_pairer import CounterPairer, MarkPairer, ScanPairer
+from tactomo.acquisition.skew import Skew
+from tactomo.acquisition.wall_clock import WallClock
+from tactomo.errors import CommandError
+from tactomo.events import OnEvent, RateLimit
+from tactomo.imaging.imaging import Imaging
+from tactomo.recordings.replay import Replay, ReplayClock
+from tactomo.scans import Delivery, DualScan
+from tactomo.timing import Rate
+from tactomo.worker import Worker
+
+IDLE_S: Final = 0.1
+"""How late, at most, a stop or a tare that gives up is noticed."""
+QUEUED_DELIVERIES: Final = 256
+"""Reads that wait while a frame is made: some 6 s of two ports at 20 Hz."""
+ZERO_PERIOD_S: Final = 10.0
+"""How often devices are asked to zero their counters, while that does not bring them in step."""
+
+
+class _SyncState(NamedTuple):
+    """What events are told about when it changes."""
+
+    lost: frozenset[Channel]
+    resets: int
+    zeroed: int
+    is_skewed: bool
+
+
+class Pipeline(Worker):
+    """`start` it, `deliver` to it, `stop` it.
+
+    Args:
+        imaging: takes the dual scans; it belongs to this thread from `start` on.
+        channels: those that the sensor has.
+        ports: how many ports deliver.
+        sync_wait_ns: how long a scan waits for its partner.
+        lossless: reconstruct every dual scan, however late.
+        replay: what the recording says, where the ports replay one.
+        zero_counters: asks every device to count from 0 again.
+        on_event: told what happens to scans and channels.
+
+    Attributes:
+        sync: pairs the scans; it counts those that it drops.
+        skew: how far apart the channels are.
+        wall_clock: whether it was set.
+        dropped: dual scans left out because newer ones had come.
+        overflowed: deliveries lost because this thread did not come round to them for seconds;
+            written by the port threads under a lock.
+        incomplete: dual scans of which one channel did not come that had come before, or is lost.
+        scan_rates: how often each channel's scans come.
+        finished: set once every replayed port has ended and what came of it was published.
+
+    """
+
+    def __init__(
+        self,
+        imaging: Imaging,
+        channels: tuple[Channel, ...],
+        ports: int,
+        sync_wait_ns: int,
+        lossless: bool,
+        replay: Replay | None,
+        zero_counters: Callable[[], None],
+        on_event: OnEvent,
+    ) -> None:
+        super().__init__("pipeline")
+        self.dropped = 0
+        self.overflowed = 0
+        self.incomplete = 0
+        self.scan_rates = {channel: Rate() for channel in channels}
+        self.finished = threading.Event()
+        self._imaging = imaging
+        self._channels = channels
+        self._ports = ports
+        self._replay = replay
+        self._is_exact = replay is not None and bool(replay.marks)
+        is_unpaced = replay is not None and not replay.is_paced
+        self._is_lossless = lossless or self._is_exact or is_unpaced
+        self.sync: ScanPairer = (
+            MarkPairer(replay.marks)
+            if replay is not None and replay.marks
+            else CounterPairer(channels, sync_wait_ns)
+        )
+        self.skew = Skew()
+        self.wall_clock = WallClock(on_event)
+        self._zero_counters = zero_counters
+        self._zero_limit = RateLimit(ZERO_PERIOD_S)
+        self._on_event = on_event
+        self._received = [0] * ports  # scans, each counted by its port's thread
+        self._used = self._left_out = self._discarded = 0  # scans, too
+        self._drop_limit = RateLimit()
+        self._dropped_told = 0
+        self._is_excused = False  # the dual scans to be dropped next are not worth a warning
+        self._announced: dict[int, Hello] = {}  # what each port's device says of itself
+        self._begun: set[Channel] = set()  # channels that have been in a dual scan
+        self._replay_clock = None if replay is None else ReplayClock(ports, replay.is_paced)
+        self._deliveries: queue.Queue[Delivery | None] = queue.Queue(QUEUED_DELIVERIES)
+        self._commands: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = (
+            queue.SimpleQueue()
+        )
+        self._overflow_lock = threading.Lock()
+
+    def tally(self) -> dict[str, int]:
+        """Return what became of every scan that was delivered; for any thread."""
+        sync = self.sync
+        outcome = {
+            "used": self._used,
+            "late": sync.late,
+            "repeated": sync.repeated,
+            "dropped": self._left_out + self._discarded + sync.unmarked,
+        }
+        received = sum(self._received)
+        return {"received": received, **outcome, "waiting": received - sum(outcome.values())}
+
+    def deliver(self, delivery: Delivery) -> None:
+        """Take what a port read; called by port threads. Waits only if nothing may be lost."""
+        self._received[delivery.port] += len(delivery.scans)
+        while not self._stopping.is_set():
+            try:
+                self._deliveries.put(delivery, timeout=IDLE_S if self._is_lossless else 0)
+                return
+            except queue.Full:
+                if not self._is_lossless:
+                    self._discard_oldest()
+
+    def tare(self) -> Future[Mapping[str, Any]]:
+        """Ask for a new reference; for any thread. The future gets its `scans` and `contacts`.
+
+        Raises:
+            CommandError: the references are those of the recording that is replayed.
+
+        """
+        if self._is_exact:
+            raise CommandError(
+                "an exact replay measures against the references that were recorded",
+                "tare while you record",
+                "tare_refused",
+            )
+        answer: Future[Mapping[str, Any]] = Future()
+        self._ask(lambda: self._imaging.taring.start(answer))
+        return answer
+
+    def set_method(self, method: str) -> Future[None]:
+        """Ask for a method; for any thread. The future is done when it is in force."""
+        return self._ask(lambda: self._imaging.method.request_method(method))
+
+    def set_budget(self, budget_ms: float | None) -> Future[None]:
+        """Ask for a time budget; for any thread. The future is done when it is in force."""
+        return self._ask(lambda: self._imaging.method.request_budget(budget_ms))
+
+    def use_calibration(self, calibration: PressureCalibration | None) -> Future[Mapping[str, Any]]:
+        """Ask for a pressure calibration, None for the description's curve; for any thread.
+
+        The future gets the `calibration` in force, or CommandError where it is another device's.
+        """
+        return self._ask(lambda: self._imaging.use_calibration(calibration))
+
+    def _run(self) -> None:
+        self._begin()
+        while not self._stopping.is_set():
+            self.turns += 1
+            self.wall_clock.check()
+            before = self._sync_state()
+            ready = self._gather()
+            self._tell_changes(before)
+            for dual in ready if self._is_lossless else self._newest(ready):
+                if self._stopping.is_set():
+                    break
+                self.turns += 1
+                taken_ns = self._imaging.reference_realtime_ns
+                self._process(dual)
+                if self._imaging.reference_realtime_ns != taken_ns:
+                    self._is_excused = True
+                self._obey_commands()
+            self._obey_commands()
+            self._imaging.taring.check()
+            if self._replay_clock is not None and self._replay_clock.has_ended:
+                self.finished.set()
+
+    def _obey_commands(self) -> None:
+        while not self._commands.empty():
+            command, done = self._commands.get()
+            try:
+                done.set_result(command())
+            except CommandError as refusal:
+                done.set_exception(refusal)
+
+    def _process(self, dual: DualScan) -> None:
+        recorded = dual.mark.timing if dual.mark is not None else None
+        timing = recorded or self.skew.timing(dual)
+        self.skew.note(timing)
+        self._imaging.process(dual, timing, self.sync.lost)
+        self._used += len(dual.scans)
+
+    def _begin(self) -> None:
+        reference = self._replay.reference if self._replay else None
+        if self._is_exact:
+            return  # the marks bring their references along
+        if reference is None:
+            self._imaging.taring.start()
+        else:
+            self._imaging.use_reference(reference, time.time_ns())
+
+    def _gather(self) -> list[DualScan]:
+        """Wait for deliveries, for a bounded time; return the dual scans that they complete."""
+        ready: list[DualScan] = []
+        try:
+            delivery = self._deliveries.get(timeout=self._wait_s())
+            while True:
+                if delivery is not None:
+                    ready += self._join(delivery)
+                delivery = self._deliveries.get_nowait()
+        except queue.Empty:
+            pass
+        if self._replay is None:
+            ready += self.sync.advance(time.monotonic_ns())
+        self.incomplete += sum(map(self._lacks_a_channel, ready))
+        return ready
+
+    def _lacks_a_channel(self, dual: DualScan) -> bool:
+        """Tell whether one did not come; of two, one begins a little before the other."""
+        there = {scan.channel for scan in dual.scans}
+        self._begun |= there
+        return any(c in self._begun | self.sync.lost for c in self._channels if c not in there)
+
+    def _wait_s(self) -> float:
+        deadline_ns = self.sync.deadline_ns
+        if deadline_ns is None or self._replay is not None:
+            return IDLE_S
+        return min(IDLE_S, max(0.0, (deadline_ns - time.monotonic_ns()) * 1e-9))
+
+    def _join(self, delivery: Delivery) -> list[DualScan]:
+        ready: list[DualScan] = []
+        self._note_device(delivery)
+        for scan in delivery.scans:
+            self.scan_rates[scan.channel].add(scan.monotonic_ns)
+            self.skew.take(scan)
+            ready += self.sync.push(scan)
+        clock = self._replay_clock
+        if clock is not None:
+            now_ns = clock.follow(delivery)
+            if clock.has_ended:
+                ready += self.sync.finish()
+            elif now_ns is not None:
+                ready += self.sync.advance(now_ns)
+        return ready
+
+    def _note_device(self, delivery: Delivery) -> None:
+        """Do not wait for a channel that no device says it sends; a calibration is of a device."""
+        if delivery.hello is None or self._announced.get(delivery.port) == delivery.hello:
+            return
+        self._announced[delivery.port] = delivery.hello
+        hellos = self._announced.values()
+        self._imaging.calibration.meet({hello.device_id for hello in hellos})
+        if len(self._announced) == self._ports:
+            announced = {channel for hello in hellos for channel in hello.channels}
+            self.sync.lost.update(set(self._channels) - announced)
+
+    def _newest(self, ready: list[DualScan]) -> list[DualScan]:
+        self.dropped += max(0, len(ready) - 1)
+        self._left_out += sum(len(dual.scans) for dual in ready[:-1])
+        if ready and self._is_excused:  # a new reference takes a while to prepare for
+            self._is_excused, self._dropped_told = False, self.dropped
+        if self.dropped > self._dropped_told and self._drop_limit.allows():
+            self._on_event(
+                "scans_dropped",
+                "warning",
+                f"{self.dropped - self._dropped_told} dual scans left out, "
+                f"{self.dropped} since the start",
+                "give the daemon more of the processor, or set a faster method or a budget",
+            )
+            self._dropped_told = self.dropped
+        return ready[-1:]
+
+    def _sync_state(self) -> _SyncState:
+        sync = self.sync
+        return _SyncState(frozenset(sync.lost), sync.resets, sync.zeroed, self.skew.is_skewed)
+
+    def _tell_changes(self, before: _SyncState) -> None:
+        now = self._sync_state()
+        self._tell_lost(before.lost, now.lost)
+        if now.resets > before.resets:
+            self._on_event(
+                "device_restarted",
+                "warning",
+                "a device was reset: its scan counter and its clock went back",
+                "check its supply; tare again if it lost its settings",
+            )
+        if now.zeroed > before.zeroed:
+            self._on_event("counters_zeroed", "info", "the scan counter went back, the clock on")
+        if now.is_skewed:
+            self._bring_in_step(is_news=not before.is_skewed)
+        elif before.is_skewed:
+            self._on_event("channels_in_step", "info", "the same counter is the same instant again")
+
+    def _tell_lost(self, before: frozenset[Channel], now: frozenset[Channel]) -> None:
+        for channel in sorted(now - before):
+            self._on_event(
+                "channel_lost",
+                "warning",
+                f"no {channel} scans in time; maps go on without them",
+                "check that channel's cable; if its scans come late, raise sync_wait_ms",
+            )
+        for channel in sorted(before - now):
+            self._on_event(
+                "channel_back",
+                "info",
+                f"{channel} scans come again",
+                "" if self._imaging.has_reference(channel) else "tare: it has no reference yet",
+            )
+
+    def _bring_in_step(self, is_news: bool) -> None:
+        """Have two boards count from 0 again; nothing helps a board that does so by itself."""
+        are_two = self._ports > 1 and self._replay is None
+        if is_news:
+            self._on_event(
+                "channels_skewed",
+                "warning",
+                f"the channels' counters are {abs(self.skew.out_of_step_ns) * 1e-6:.0f} ms apart: "
+                "the same counter is not the same instant",
+                "the boards are asked to zero their counters; should it come again, check the "
+                "sync line between them"
+                if are_two
+                else "correct the firmware: both scans of one counter belong to one instant",
+            )
+        if are_two and self._zero_limit.allows():
+            self._zero_counters()
+
+    def _discard_oldest(self) -> None:
+        with self._overflow_lock, contextlib.suppress(queue.Empty):
+            oldest = self._deliveries.get_nowait()
+            self.overflowed += 1
+            self._discarded += 0 if oldest is None else len(oldest.scans)
+
+    def _ask(self, command: Callable[[], Any]) -> Future[Any]:
+        done: Future[Any] = Future()
+        self._commands.put((command, done))
+        self._wake()
+        return done
+
+    def _wake(self) -> None:
+        with contextlib.suppress(queue.Full):  # then it is busy, and looks soon
+            self._deliveries.put_nowait(None)

@@ -1,0 +1,185 @@
+"""Taking a reference: the mean of some dual scans of the unloaded skin, and their noise.
+
+`Taring` is the pipeline's: it begins tares, gives them up and answers who asked. `Tare` is one of
+them. Somebody who presses meanwhile would be averaged into the reference, so scans that move while
+they are collected are refused. A press that lasts and stays the same cannot be told from a bare
+skin whose reference is out of date: whoever tares is told how many contacts were shown meanwhile.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Mapping
+from concurrent.futures import Future
+from typing import Any, Final
+
+import numpy as np
+from tactomo_models import ModelError, Reference
+from tactomo_models.arrays import FloatArray
+from tactomo_protocol import Channel
+
+from tactomo.errors import CommandError
+from tactomo.events import OnEvent
+from tactomo.timing import Rate
+
+MOVEMENT_LIMIT: Final = 1e-3
+"""Relative change of the voltages, rms, that a skin at rest does not reach within a second."""
+SMALLEST_SHARE: Final = 1e-3
+"""Voltages below this share of the largest one do not count for more than it when compared."""
+
+NO_DATA_S: Final = 3.0
+"""How long a tare on command waits for usable dual scans before it gives up; where they come more
+slowly, a few of their periods."""
+
+Volts = FloatArray
+
+
+class Taring:
+    """Takes references for one sensor. For use by the pipeline thread.
+
+    Args:
+        scans: dual scans for each reference.
+        channels: those of the sensor.
+        frame_rate: how often frames come.
+        put_in_force: called with a reference that was taken.
+        on_event: told what a tare became.
+
+    """
+
+    def __init__(
+        self,
+        scans: int,
+        channels: Collection[Channel],
+        frame_rate: Rate,
+        put_in_force: Callable[[Reference], None],
+        on_event: OnEvent,
+    ) -> None:
+        self._scans = scans
+        self._channels = channels
+        self._frame_rate = frame_rate
+        self._put_in_force = put_in_force
+        self._on_event = on_event
+        self._has_reference = False
+        self._tare: Tare | None = None
+        self._deadline_s = 0.0
+
+    @property
+    def is_on(self) -> bool:
+        """Whether a reference is being taken; for any thread."""
+        return self._tare is not None
+
+    def start(self, answer: Future[Mapping[str, Any]] | None = None) -> None:
+        """Take a reference from the dual scans to come; `answer` gets what it became, or why."""
+        self._tare = self._tare or Tare(self._scans)
+        self._put_off()
+        if answer is not None:
+            self._tare.answers.append(answer)
+
+    def note_reference(self) -> None:
+        """Take note that there is a reference: a tare that is refused is not begun again."""
+        self._has_reference = True
+
+    def check(self) -> None:
+        """Give up a tare on command for which nothing comes."""
+        if self._tare and self._tare.answers and time.monotonic() > self._deadline_s:
+            self._refuse(
+                self._tare,
+                CommandError(
+                    f"no usable dual scan for {self._patience_s:.3g} s",
+                    "`tactomo status` shows what the ports say",
+                    "no_data",
+                ),
+            )
+
+    def add(self, volts: dict[Channel, Volts], lost: Collection[Channel], contacts: int) -> None:
+        """Take one dual scan, if a reference is being taken; with enough, put it in force.
+
+        Args:
+            volts: (M,) of each channel that is there.
+            lost: channels that are not to be expected.
+            contacts: how many were shown in this frame.
+
+        """
+        tare = self._tare
+        needed = {channel for channel in self._channels if channel not in lost}
+        if tare is None or not needed or not needed <= volts.keys():
+            return
+        self._put_off()
+        if not tare.add(volts, needed):
+            return
+        try:
+            reference = tare.reference()
+        except CommandError as refusal:
+            self._refuse(tare, refusal)
+            return
+        except ModelError as error:
+            self._refuse(tare, CommandError(str(error), "", "tare_refused"))
+            return
+        self._tare = None
+        self._put_in_force(reference)
+        shown = f", while {contacts} contact(s) were shown" if contacts else ""
+        self._on_event("tared", "info", f"{reference.scans} dual scans{shown}")
+        for answer in tare.answers:  # when all is in force: a status asked for now shows it
+            answer.set_result({"scans": reference.scans, "contacts": contacts})
+
+    def _refuse(self, tare: Tare, refusal: CommandError) -> None:
+        self._tare = None
+        self._on_event("tare_refused", "warning", refusal.cause, refusal.next_step)
+        if not self._has_reference:
+            self.start()  # without a reference there is nothing else to do
+        for answer in tare.answers:
+            answer.set_exception(refusal)
+
+    def _put_off(self) -> None:
+        self._deadline_s = time.monotonic() + self._patience_s
+
+    @property
+    def _patience_s(self) -> float:
+        return max(NO_DATA_S, self._frame_rate.pace.few_s)
+
+
+class Tare:
+    """Collects dual scans until there are enough of them."""
+
+    def __init__(self, scans: int) -> None:
+        self.answers: list[Future[Mapping[str, Any]]] = []
+        self._wanted = scans
+        self._volts: dict[Channel, list[Volts]] = {}
+
+    def add(self, volts: dict[Channel, Volts], needed: Collection[Channel]) -> bool:
+        """Take one dual scan; returns whether there are enough of every needed channel now."""
+        for channel, values in volts.items():
+            self._volts.setdefault(channel, []).append(values)
+        return all(len(self._volts.get(channel, ())) >= self._wanted for channel in needed)
+
+    def reference(self) -> Reference:
+        """Return the reference; raise CommandError where the scans moved too much for one."""
+        stacks = {
+            channel: np.stack(volts)
+            for channel, volts in self._volts.items()
+            if len(volts) >= self._wanted
+        }
+        for channel, stack in stacks.items():
+            movement, noise = movement_and_noise(stack)
+            if movement > max(noise, MOVEMENT_LIMIT):
+                raise CommandError(
+                    f"the {channel} channel moved by {movement:.2%} meanwhile "
+                    f"(its noise is {noise:.2%})",
+                    "take the load off the skin, then tare again",
+                    "tare_refused",
+                )
+        return Reference.from_scans(stacks.get(Channel.MAGNITUDE), stacks.get(Channel.STRUCTURE))
+
+
+def movement_and_noise(scans: Volts) -> tuple[float, float]:
+    """Tell slow movement from noise in scans (n, M) of one channel, n at least 2.
+
+    Half the mean square of successive differences estimates the noise whether or not there is a
+    trend (von Neumann); what the variance has beyond it is movement. Both are relative to the
+    voltages, rms over the measurements.
+    """
+    size = np.abs(scans.mean(axis=0))
+    relative = scans / np.maximum(size, max(size.max() * SMALLEST_SHARE, np.finfo(float).tiny))
+    noise = 0.5 * np.mean(np.diff(relative, axis=0) ** 2)
+    movement = np.mean(relative.var(axis=0, ddof=1)) - noise
+    return float(np.sqrt(max(movement, 0.0))), float(np.sqrt(noise))

@@ -1,0 +1,1 @@
+"""Recordings: writing, rotating, reading, recovering and replaying them."""

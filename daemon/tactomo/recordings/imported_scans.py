@@ -1,0 +1,334 @@
+"""Scans from files of other programs, as volts in the order of a sensor description.
+
+Two layouts of .npz files are read, told apart by their arrays; Sciospec's .eit files are of the
+second (see `eit_files`):
+
+batch
+    what `tactomo reconstruct` takes: `magnitude` and/or `structure` (T, M) volts in the
+    description's order; optionally `magnitude_reference`, `structure_reference` (M,) and `t` (T,)
+    seconds. A frame that is all NaN is a scan that did not arrive.
+
+single-ended
+    what impedance tomography instruments save: `volts` (T, injections, electrodes), complex or
+    real, each electrode against ground; `injection` (injections, 2), source and sink, numbered
+    from 0 or from 1; optionally `t` (T,) seconds.
+
+A single-ended scan becomes differences V(m) - V(m + offset), and of complex volts the *real part*
+is taken. The field's own unit is the volt in phase with the current; in a mostly resistive body the
+quadrature part comes from stray capacitance and adds noise but no contrast, and a modulus would
+lose the sign. The share that is left out is told, so that a file whose phase was never calibrated
+does not pass unnoticed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tactomo_models import Reference, SensorDescription
+from tactomo_models.archive import read_arrays
+from tactomo_models.arrays import FloatArray
+from tactomo_models.batch import all_nan, scans_of
+from tactomo_models.scans.plausibility import Layout
+from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag
+
+from tactomo.errors import TactomoError
+from tactomo.recordings.eit_files import SUFFIX, eit_files, read_eit_files
+from tactomo.scans import MAX_QUADRATURE
+
+# Of times and electrodes' numbers: seconds since 1970 until 2096.
+MOST = 4e9
+
+
+class ImportFileError(TactomoError):
+    """A file whose scans cannot be imported."""
+
+    name = "cannot_import"
+
+
+@dataclass(frozen=True)
+class Scans:
+    """Scans of one sensor.
+
+    Attributes:
+        volts: (T, M) volts of each channel there is, in the description's order.
+        time_s: (T,) seconds, rising, from 0; None where the file does not say.
+        reference: (M,) volts of each channel whose unloaded scan the file holds.
+        notes: what a user should know about how the file was read.
+
+    """
+
+    volts: Mapping[Channel, FloatArray]
+    time_s: FloatArray | None
+    reference: Mapping[Channel, FloatArray] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def count(self) -> int:
+        """Number of dual scans, T."""
+        return len(next(iter(self.volts.values())))
+
+    def times(self, rate_hz: float | None) -> FloatArray:
+        """Return when each scan was taken, (T,) seconds from 0: by rate, or the file's own.
+
+        Raises:
+            ImportFileError: neither is known.
+
+        """
+        if rate_hz is not None:
+            return np.arange(self.count) / rate_hz
+        if self.time_s is None:
+            raise ImportFileError("the file does not say when its scans were taken", "give --rate")
+        return self.time_s
+
+    def reference_of(self, frames: slice | None) -> Reference | None:
+        """Return the mean of `frames` as the reference, or else the file's own, or None."""
+        if frames is not None:
+            chosen = {channel: self._chosen(channel, frames) for channel in Channel}
+            return Reference.from_scans(**chosen)
+        if not self.reference:
+            return None
+        own = {channel: self.reference.get(channel) for channel in Channel}
+        return Reference(**own, magnitude_noise=None, structure_noise=None, scans=1)
+
+    def _chosen(self, channel: Channel, frames: slice) -> FloatArray | None:
+        volts = self.volts.get(channel)
+        if volts is None:
+            return None
+        if len(volts[frames]) < 2:
+            raise ImportFileError(
+                f"the reference frames are {len(volts[frames])} of the {len(volts)} scans",
+                "give at least two, such as --reference-frames 0:20",
+            )
+        return volts[frames]
+
+    def packets(self, times_s: FloatArray) -> Iterator[tuple[float, Scan]]:
+        """Yield every scan with its time in seconds, as the device would have sent it."""
+        for counter, time_s in enumerate(times_s):
+            for channel, volts in self.volts.items():
+                if not np.all(np.isnan(volts[counter])):
+                    yield (
+                        float(time_s),
+                        Scan(
+                            channel=channel,
+                            counter=counter,
+                            device_us=round(float(time_s) * 1e6),
+                            flags=ScanFlag(0),
+                            samples=volts[counter].astype(np.float32),
+                        ),
+                    )
+
+    def hello(self, description: SensorDescription, rate_hz: float) -> Hello:
+        """Return what the device that took these scans would have said of itself."""
+        drive_offset, measure_offset = description.offsets
+        return Hello(
+            device_id="import",
+            firmware="tactomo import",
+            channels=tuple(sorted(self.volts)),
+            electrodes=description.electrode_count,
+            drive_offset=drive_offset,
+            measure_offset=measure_offset,
+            samples_per_scan=description.measurements,
+            sample_format=SampleFormat.FLOAT32,
+            volts_per_count=1.0,
+            scan_rate_hz=rate_hz,
+        )
+
+
+def read_scans(
+    path: Path | Sequence[Path], description: SensorDescription, channel: Channel | None
+) -> Scans:
+    """Read the scans of a measurement.
+
+    Args:
+        path: as of `load_arrays`.
+        description: the sensor, whose pattern the voltages follow.
+        channel: which channel a file of one channel holds; None for the sensor's only one.
+
+    Raises:
+        ImportFileError, EitFileError, DataError: it cannot be read, is neither layout, or does not
+            fit the sensor.
+
+    """
+    arrays = load_arrays(path)
+    path = path if isinstance(path, Path) else path[0]
+    if is_single_ended(arrays):
+        channel = channel or _only_channel(description)
+        volts, time_s, notes = single_ended(path, arrays, description)
+        return Scans({channel: volts}, time_s, notes=notes)
+    if any(name in arrays for name in Channel):
+        return _batch(path, arrays, description)
+    raise ImportFileError(
+        f"{path} holds {', '.join(arrays) or 'nothing'}",
+        "it must hold `magnitude` and/or `structure` (T, M), or `volts` (T, injections, "
+        "electrodes) and `injection` (injections, 2)",
+    )
+
+
+def load_arrays(path: Path | Sequence[Path]) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an .npz file by name, or those that .eit files amount to.
+
+    Args:
+        path: one file; a folder of .eit files; or a list of them.
+
+    Raises:
+        ImportFileError, EitFileError: it cannot be read.
+        DataError: it is no .npz file of numbers.
+
+    """
+    given = [path] if isinstance(path, Path) else path
+    files = [file for each in given for file in (eit_files(each) if each.is_dir() else [each])]
+    if all(file.suffix.lower() == SUFFIX for file in files):
+        return read_eit_files(files)
+    if len(files) > 1:
+        raise ImportFileError(
+            f"{len(files)} files were given, not all of them {SUFFIX}", "import one .npz at a time"
+        )
+    [one] = files
+    try:
+        return read_arrays(one)
+    except OSError as error:
+        raise ImportFileError(
+            f"cannot read {one}: {error.strerror or error}",
+            f"give the path of an .npz or {SUFFIX} file",
+        ) from error
+
+
+def is_single_ended(arrays: Mapping[str, Any]) -> bool:
+    """Tell whether a file's arrays are of the single-ended layout."""
+    return "volts" in arrays and "injection" in arrays
+
+
+def _only_channel(description: SensorDescription) -> Channel:
+    if len(description.channels) != 1:
+        raise ImportFileError(
+            f"{description.name} has two channels and the file does not say which this is",
+            "give --channel magnitude or --channel structure",
+        )
+    return description.channels[0]
+
+
+def _batch(path: Path, arrays: dict[str, NDArray[Any]], description: SensorDescription) -> Scans:
+    foreign = sorted(arrays.keys() & set(Channel) - set(description.channels))
+    if any(not all_nan(arrays[name]) for name in foreign):
+        raise ImportFileError(
+            f"{path} holds a channel that {description.name} does not have: {', '.join(foreign)}",
+            "give another description with --description",
+        )
+    scans, references = scans_of(path, arrays, description)
+    volts = {Channel(name): channel for name, channel in scans.items()}
+    reference = {Channel(name): channel for name, channel in references.items()}
+    return Scans(volts, _times(path, arrays, len(next(iter(volts.values())))), reference)
+
+
+def single_ended(
+    path: Path, arrays: dict[str, NDArray[Any]], layout: Layout
+) -> tuple[FloatArray, FloatArray | None, tuple[str, ...]]:
+    """Return single-ended readings as differences (T, M), their times, and notes for people.
+
+    Args:
+        path: where they are from, for errors.
+        arrays: with `volts`, `injection` and maybe `t`.
+        layout: the sensor whose pattern the differences are to follow.
+
+    Raises:
+        ImportFileError: they do not fit the sensor, or are out of phase with the current.
+
+    """
+    injection, raw = _single_ended_arrays(path, arrays, layout)
+    rows, signs = _injection_rows(path, injection - injection.min(), layout)
+    plus, minus = layout.pairs.measure.T
+    differences = signs * (raw[:, rows, plus] - raw[:, rows, minus])
+    quadrature = _quadrature(differences)
+    notes = () if raw.dtype.kind != "c" else (f"real part taken; {quadrature:.0%} is quadrature",)
+    if quadrature > MAX_QUADRATURE:
+        raise ImportFileError(
+            f"{path}: {quadrature:.0%} of the signal is out of phase with the current",
+            "multiply volts by the phase factor of a resistor's reading, then import again",
+        )
+    volts = np.asarray(differences.real, dtype=np.float64)
+    return volts, _times(path, arrays, len(raw)), notes
+
+
+def _quadrature(differences: NDArray[Any]) -> float:
+    """Return the share of the signal that is out of phase with the current."""
+    known = differences[np.isfinite(differences)]
+    return float(np.linalg.norm(known.imag) / max(np.linalg.norm(known), np.finfo(float).tiny))
+
+
+def electrode_potentials(
+    path: Path, arrays: dict[str, NDArray[Any]], layout: Layout
+) -> NDArray[np.complexfloating]:
+    """Return single-ended readings as (T, injections, electrodes), in the layout's order of drives.
+
+    Raises:
+        ImportFileError: they do not fit the sensor.
+
+    """
+    injection, raw = _single_ended_arrays(path, arrays, layout)
+    rows, signs = _injection_rows(path, injection - injection.min(), layout)
+    _, first = np.unique(rows, return_index=True)
+    order = np.sort(first)  # of each drive the first voltage
+    potentials = signs[order][None, :, None] * raw[:, rows[order]]
+    return np.asarray(potentials, dtype=np.complex64)
+
+
+def _single_ended_arrays(
+    path: Path, arrays: dict[str, NDArray[Any]], layout: Layout
+) -> tuple[NDArray[np.int_], NDArray[Any]]:
+    injection = _checked(path, "injection", arrays["injection"], (-1, 2)).astype(int)
+    raw, electrodes = arrays["volts"], layout.electrode_count
+    fits = raw.shape[1:] == (len(injection), electrodes) and raw.size > 0
+    if not fits or raw.dtype.kind not in "fciu":
+        raise ImportFileError(
+            f"{path}: volts is {raw.dtype} {raw.shape}",
+            f"it must be numbers (T, {len(injection)}, {electrodes})",
+        )
+    return injection, raw.astype(np.result_type(raw, np.float64))
+
+
+def _injection_rows(
+    path: Path, injection: NDArray[np.int_], layout: Layout
+) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+    """Return, for each voltage, its row in the file and the sign of the current there."""
+    where = {(sink, source): (row, -1) for row, (source, sink) in enumerate(injection.tolist())}
+    where |= {(source, sink): (row, 1) for row, (source, sink) in enumerate(injection.tolist())}
+    wanted = [tuple(pair) for pair in layout.pairs.drive.tolist()]
+    missing = sorted(set(wanted) - where.keys())
+    if missing:
+        raise ImportFileError(
+            f"{path} has no injection {missing[0]}, which the sensor's pattern needs",
+            "give the description of the sensor that was measured",
+        )
+    rows, signs = np.array([where[pair] for pair in wanted]).T
+    return rows, signs
+
+
+def _times(path: Path, arrays: dict[str, NDArray[Any]], count: int) -> FloatArray | None:
+    if "t" not in arrays:
+        return None
+    time_s = _checked(path, "t", arrays["t"], (count,))
+    if np.any(np.diff(time_s) < 0):
+        raise ImportFileError(
+            f"{path}: t does not rise", "sort the frames by it, or leave it out and give --rate"
+        )
+    return np.asarray(time_s - time_s[0])
+
+
+def _checked(path: Path, name: str, array: NDArray[Any], shape: tuple[int, ...]) -> FloatArray:
+    fits = array.ndim == len(shape) and all(
+        wanted in (-1, actual) for wanted, actual in zip(shape, array.shape, strict=True)
+    )
+    if not fits or array.dtype.kind not in "fiu" or array.size == 0:
+        wanted = str(shape).replace("-1", "T")
+        raise ImportFileError(
+            f"{path}: {name} is {array.dtype} {array.shape}", f"it must be real numbers {wanted}"
+        )
+    numbers = array.astype(np.float64)
+    if not np.all(np.abs(numbers) <= MOST):
+        raise ImportFileError(f"{path}: {name} holds what is out of range", "correct it")
+    return numbers

@@ -1,0 +1,442 @@
+"""Recordings: what the ports said, with times, in one MCAP file; its layout, and reading it.
+
+Messages are in the order in which they were written, and that order is what counts:
+
+=============  ==========  =======================================================================
+topic          encoding    message
+=============  ==========  =======================================================================
+port/N         raw         bytes of port N exactly as read, in the protocol of its device
+port/N/hello   raw         what a replay must be told before those: the hello in force when the
+                           recording began, and the packet that had begun to come; for a foreign
+                           protocol also where in its scans the port was (`protocols.interface`),
+                           and again every second
+reference      msgpack     the reference that holds from here on: its number in this recording,
+                           volts and noise of each channel, and how far they have drifted since;
+                           repeated every minute
+frame          msgpack     a dual scan that the daemon reconstructed: channel, counter and device
+                           time of each of its scans, the tier and the budget (ms of modelled
+                           work, not of time) that it was reconstructed with, the numbers of the
+                           reference and of the calibration in force, whether it started cold, and
+                           its timing
+calibration    msgpack     the pressure calibration that holds from here on, where another one than
+                           the metadata's was put in force meanwhile: its number in this recording
+                           and its text; repeated every minute
+map, contacts  stream      messages exactly as published, if asked for; scan likewise, as long as
+                           anybody subscribes to it
+=============  ==========  =======================================================================
+
+A recording that is cut into several files says all of this in each: any of them can be replayed
+alone. At a cut, the ports' bytes go into both files until the pipeline has come over to the new
+one, so every dual scan lies whole in the file that has its mark.
+
+`log_time` is a steady clock: the wall clock when the recording began plus the monotonic time
+since. `publish_time` is the wall clock itself. The metadata record ``tactomo`` says which sensor
+it was, and which protocol its ports spoke.
+
+The file of a daemon that was killed ends somewhere in its last chunk. Everything here reads with
+MCAP's streaming reader, so such a file opens like any other, up to its last complete chunk. What
+lies beyond damage in the middle is for `recovery`.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import IO, Annotated, Any, Final, NamedTuple
+from urllib.parse import quote
+
+import msgpack  # type: ignore[import-untyped]
+import structlog
+from mcap.records import Footer, McapRecord, Message, Metadata
+from pydantic import BaseModel, Strict, StrictBool, StrictInt, StrictStr
+from tactomo_client import MessageError, recording_file
+from tactomo_client.errors import RecordingError as ClientRecordingError
+from tactomo_client.intact_chunks import intact_chunks
+from tactomo_client.messages import MAX_ENTRIES, array_from_wire
+from tactomo_models import CalibrationError, Reference, SensorDescription, load_description
+from tactomo_models.calibration.calibration_file import PressureCalibration, parse_calibration
+from tactomo_models.errors import DescriptionError
+from tactomo_protocol import Channel, Hello, Scan
+
+from tactomo.errors import ConfigError, RecordingError
+from tactomo.protocols import NATIVE, PortProtocol, protocol_named
+from tactomo.scans import Mark, ScanKey, Timing
+
+RECOVERED: Final = "tactomo-recovered"
+REFERENCE_ARRAYS: Final = ("magnitude", "structure", "magnitude_noise", "structure_noise")
+DRIFT_ARRAYS: Final = ("magnitude_drift", "structure_drift")
+"""Missing in recordings of daemons that did not follow drift."""
+REPLAY_SCHEME: Final = "replay"
+OLD_METHODS: Final = {"hybrid": "auto"}
+"""Methods that marks of earlier versions name, and what they are called now."""
+
+log = structlog.get_logger()
+
+
+class Chunk(NamedTuple):
+    """Bytes that one read of a port returned, and when, on the recording's steady clock."""
+
+    clock_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """What a recording is of."""
+
+    sensor: str
+    description: str
+    """The shipped description's name, or its path on the computer that recorded."""
+    description_sha256: str
+    ports: tuple[str, ...]
+    version: str
+    protocol: str = NATIVE
+    """What the ports speak."""
+    calibration: str = ""
+    """The pressure calibration that the daemon began it with, as the text of its file; empty for
+    none."""
+
+    def new_protocol(self) -> PortProtocol:
+        """Return what turns a port's bytes into packets.
+
+        Raises:
+            RecordingError: it is not known here, or needs a description that is not here.
+
+        """
+        try:
+            known = None if self.protocol == NATIVE else load_description(self.description)
+            return protocol_named(self.protocol, known)
+        except (ConfigError, DescriptionError) as error:
+            raise RecordingError(
+                f"the recording is of protocol {self.protocol} and cannot be understood: {error}",
+                "put its sensor description where the recording names it",
+            ) from error
+
+
+@dataclass(slots=True)
+class Summary:
+    """What is in a recording, counted by reading all of it."""
+
+    origin: Origin
+    file_bytes: int
+    is_complete: bool = False
+    """False where the file ends in the middle: its writer was killed, or the disk was full."""
+    has_more: bool = False
+    """Whether intact data lie beyond the damage that ends it here: `tactomo recover` gets them."""
+    recovered_gaps: int | None = None
+    """How many gaps `tactomo recover` had to leave in it; None for a recording as it was made."""
+    start_ns: int = 0
+    """When the first byte was read, nanoseconds since 1970, on the steady clock."""
+    end_ns: int = 0
+    port_bytes: dict[int, int] = field(default_factory=dict)
+    scans: dict[Channel, int] = field(default_factory=dict)
+    hellos: list[Hello] = field(default_factory=list)
+    """The distinct ones, in the order in which they were heard."""
+    corrupt: int = 0
+    """Frames on the ports that yielded no packet."""
+    frames: int = 0
+    """Dual scans that the daemon reconstructed while it recorded."""
+    references: int = 0
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds from the first bytes read to the last ones."""
+        return (self.end_ns - self.start_ns) * 1e-9
+
+    @property
+    def ending(self) -> str:
+        """How the file ends, in words; empty where it is whole."""
+        if self.is_complete:
+            return ""
+        if self.has_more:
+            return "damaged, with intact data beyond; `tactomo recover` gets them"
+        return "cut off; `tactomo recover` makes it whole for other tools"
+
+
+class Recording:
+    """A recording opened for reading; every call reads the file anew, from its start."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with _our_errors():
+            self.origin = to_origin(recording_file.read_metadata(path))
+
+    @cached_property
+    def summary(self) -> Summary:
+        """What is in it, counted by reading all of it once."""
+        return _summarise(self.path, self.origin)
+
+    @cached_property
+    def span(self) -> recording_file.Span:
+        """When it began and ended, without reading what is in it."""
+        with _our_errors():
+            return recording_file.read_span(self.path)
+
+    @cached_property
+    def start_ns(self) -> int:
+        """When the first bytes were read from any port, on the steady clock; 0 if none were."""
+        times = (m.log_time for topic, m in _messages(self.path) if topic.startswith("port/"))
+        return next(times, 0)
+
+    def chunks(self, port: int) -> Iterator[Chunk]:
+        """Yield what port `port` said; before all else its preamble, if there is one."""
+        for message in self.port_messages(port):
+            yield Chunk(message.log_time, message.data)
+
+    def port_messages(self, port: int) -> Iterator[Message]:
+        """Yield the same as messages, with the time on the wall clock, too."""
+        topics = (f"port/{port}", f"port/{port}/hello")
+        for topic, message in _messages(self.path):
+            if topic in topics:
+                yield message
+
+    def marks(self) -> list[Mark]:
+        """Return the dual scans that were reconstructed, each with what was new just before it."""
+        marks: list[Mark] = []
+        reference: Reference | None = None
+        calibration: str | None = None
+        number: int | None = None
+        for topic, message in _messages(self.path):
+            if topic == "reference":
+                before, number = number, read_reference_number(message.data)
+                if number is None or number != before:  # else it is repeated
+                    reference = _read_reference(message.data)
+            elif topic == "calibration":
+                calibration = read_calibration(message.data).text
+            elif topic == "frame":
+                mark = read_mark(message.data)
+                marks.append(replace(mark, reference=reference, calibration=calibration))
+                reference = calibration = None
+        return marks
+
+    def first_reference(self) -> Reference | None:
+        """Return the reference in force when the recording began; None where none was taken."""
+        data = (m.data for topic, m in _messages(self.path) if topic == "reference")
+        first = next(data, None)
+        return None if first is None else _read_reference(first)
+
+    def replay_urls(self, speed: float = 1.0) -> tuple[str, ...]:
+        """Return the serial URLs that say again what each port said.
+
+        Args:
+            speed: 1 as recorded, 10 ten times as fast, 0 as fast as it is taken.
+
+        """
+        path = quote(str(self.path.resolve()))
+        ports = range(len(self.origin.ports))
+        return tuple(f"{REPLAY_SCHEME}://{path}?port={n}&speed={speed:g}" for n in ports)
+
+
+def open_recording(path: str | Path) -> Recording:
+    """Open a recording.
+
+    Raises:
+        RecordingError: there is no such file, or it is no recording of tactomo's. A file that is
+            cut off is no error: see `Summary.is_complete`.
+
+    """
+    return Recording(Path(path))
+
+
+def _summarise(path: Path, origin: Origin) -> Summary:
+    """Read a whole recording; its decoders are the daemon's own."""
+    summary = Summary(origin, path.stat().st_size)
+    decoders: defaultdict[int, PortProtocol] = defaultdict(origin.new_protocol)
+    references: set[int | None] = set()
+    stops: list[int] = []
+    for topic, record in _records(path, stops.append):
+        if isinstance(record, Footer):
+            summary.is_complete = True
+        elif isinstance(record, Metadata) and record.name == RECOVERED:
+            gaps = record.metadata.get("gaps", "")
+            summary.recovered_gaps = int(gaps) if gaps.isdecimal() and len(gaps) < 10 else 0
+        elif isinstance(record, Message):
+            kind, _, rest = topic.partition("/")
+            summary.frames += kind == "frame"
+            if kind == "reference":
+                references.add(read_reference_number(record.data))
+            if kind == "port" and topic in recording_file.CHANNELS:
+                number, _, extra = rest.partition("/")
+                if not extra:
+                    _count_bytes(summary, int(number), record)
+                _count_packets(summary, decoders[int(number)], record.data)
+    summary.corrupt = sum(decoder.counts.corrupt for decoder in decoders.values())
+    summary.references = len(references)
+    summary.has_more = bool(stops) and _has_chunks(path, stops[0])
+    return summary
+
+
+def _has_chunks(path: Path, start: int) -> bool:
+    """Whether an intact chunk begins at or after a position in the file."""
+    with path.open("rb") as file:
+        return any(True for _ in intact_chunks(file, start))
+
+
+def _count_bytes(summary: Summary, port: int, message: Message) -> None:
+    summary.port_bytes[port] = summary.port_bytes.get(port, 0) + len(message.data)
+    summary.start_ns = summary.start_ns or message.log_time
+    summary.end_ns = max(summary.end_ns, message.log_time)
+
+
+def _count_packets(summary: Summary, decoder: PortProtocol, data: bytes) -> None:
+    for packet in decoder.feed(data):
+        if isinstance(packet, Scan):
+            summary.scans[packet.channel] = summary.scans.get(packet.channel, 0) + 1
+        elif isinstance(packet, Hello) and packet not in summary.hellos:
+            summary.hellos.append(packet)
+
+
+def to_origin(metadata: Mapping[str, str]) -> Origin:
+    """Return what a recording's metadata record says that it is of."""
+    ports = tuple(metadata.get("ports", "").split("\n"))
+    return Origin(
+        sensor=metadata.get("sensor", ""),
+        description=metadata.get("description", ""),
+        description_sha256=metadata.get("description_sha256", ""),
+        ports=ports,
+        version=metadata.get("version", ""),
+        protocol=metadata.get("protocol", NATIVE),
+        calibration=metadata.get("calibration", ""),
+    )
+
+
+def _messages(path: Path) -> Iterator[tuple[str, Message]]:
+    for topic, record in _records(path):
+        if isinstance(record, Message):
+            yield topic, record
+
+
+def _records(
+    path: Path, on_damage: Callable[[int], None] = lambda _: None
+) -> Iterator[tuple[str, McapRecord]]:
+    with _our_errors():
+        yield from recording_file.records(path, on_damage)
+
+
+def open_file(path: Path) -> IO[bytes]:
+    """Open a recording's file as it is; raise RecordingError where that cannot be done."""
+    with _our_errors():
+        return recording_file.open_file(path)
+
+
+@contextmanager
+def _our_errors() -> Iterator[None]:
+    """Turn the client's error into ours, which is also an answer to a command."""
+    try:
+        yield
+    except ClientRecordingError as error:
+        raise RecordingError(error.cause, error.next_step) from error
+
+
+def _read_reference(data: bytes) -> Reference:
+    fields = _fields(data, "scans", *REFERENCE_ARRAYS)
+    try:
+        arrays = {
+            name: None if fields.get(name) is None else array_from_wire(fields[name])
+            for name in REFERENCE_ARRAYS + DRIFT_ARRAYS
+        }
+    except MessageError as error:
+        raise _malformed() from error
+    return Reference(scans=_integer(fields["scans"]), **arrays)
+
+
+def read_reference_number(data: bytes) -> int | None:
+    """Return which of its recording's references a message holds; None in old recordings."""
+    number = _fields(data).get("number")
+    return None if number is None else _integer(number)
+
+
+class KeptCalibration(NamedTuple):
+    """A pressure calibration that was put in force during a recording."""
+
+    number: int
+    """Which of its recording's, from 1."""
+    text: str
+    """Of its file; empty for none."""
+
+
+def read_calibration(data: bytes) -> KeptCalibration:
+    """Read a message of the topic ``calibration``; raise RecordingError where it is none."""
+    fields = _fields(data, "number", "text")
+    if not isinstance(fields["text"], str):
+        raise _malformed()
+    return KeptCalibration(_integer(fields["number"]), fields["text"])
+
+
+def calibration_text(calibration: PressureCalibration | None) -> str:
+    """Return a pressure calibration as recordings have it; empty for none."""
+    return "" if calibration is None else calibration.model_dump_json()
+
+
+def recorded_calibration(
+    text: str, source: str, description: SensorDescription
+) -> PressureCalibration | None:
+    """Return a pressure calibration that a recording holds; None where it does not fit here.
+
+    `source` names it in the log.
+    """
+    if not text:
+        return None
+    try:
+        found = parse_calibration(text, source)
+    except CalibrationError as error:
+        log.warning("calibration_unused", detail=str(error))
+        return None
+    return None if found.subject.mismatch(found.subject.sensor, description) else found
+
+
+def read_mark(data: bytes) -> Mark:
+    """Read a message of the topic ``frame``; raise RecordingError where it is none."""
+    try:
+        mark = _Mark.model_validate(_fields(data))
+        keys = [ScanKey(Channel.of_number(c), counter, device) for c, counter, device in mark.scans]
+    except ValueError as error:
+        raise _malformed() from error
+    timing = None if mark.timing is None else Timing(*mark.timing)
+    return Mark(
+        tuple(keys),
+        OLD_METHODS.get(mark.tier, mark.tier),
+        mark.budget_ms,
+        None,
+        mark.reference,
+        mark.cold,
+        timing,
+        calibration_number=mark.calibration,
+    )
+
+
+class _Mark(BaseModel):
+    scans: list[tuple[StrictInt, StrictInt, StrictInt]]
+    tier: StrictStr
+    budget_ms: Annotated[float, Strict()] | None
+    reference: StrictInt | None = None
+    calibration: StrictInt = 0
+    cold: StrictBool = False
+    timing: tuple[StrictInt, StrictBool, StrictInt | None, StrictBool] | None = None
+
+
+def _integer(value: object) -> int:
+    if not isinstance(value, int):
+        raise _malformed()
+    return value
+
+
+def _fields(data: bytes, *needed: str) -> dict[str, Any]:
+    try:
+        fields = msgpack.unpackb(data, max_array_len=MAX_ENTRIES, max_map_len=MAX_ENTRIES)
+    except Exception as error:  # msgpack raises of many kinds
+        raise _malformed() from error
+    if not isinstance(fields, dict) or not fields.keys() >= set(needed):
+        raise _malformed()
+    return fields
+
+
+def _malformed() -> RecordingError:
+    return RecordingError(
+        "the recording holds what tactomo does not write",
+        "it was made by another version or another program: record anew",
+    )

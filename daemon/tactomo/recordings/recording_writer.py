@@ -1,0 +1,300 @@
+"""Writing one recording's file: what its entries are, and how they get onto the disk.
+
+The layout is `recording`'s. Everything here is for one thread, and may wait for the disk as long
+as the disk likes: `recorder` has a thread for that.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Iterable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import msgpack  # type: ignore[import-untyped]
+from mcap.writer import Writer
+from tactomo_client.messages import array_to_wire
+from tactomo_client.recording_file import CHANNELS, PROFILE
+from tactomo_models import Reference
+from tactomo_protocol import Hello, Scan, encode
+
+from tactomo.errors import RecordingError
+from tactomo.recordings.recording import DRIFT_ARRAYS, REFERENCE_ARRAYS, Origin
+from tactomo.scans import Mark
+
+CHUNK_BYTES: Final = 1 << 20
+MAX_PENDING_BYTES: Final = 4 << 20
+HELLO_PERIOD_S: Final = 1.0
+
+
+class Entry(NamedTuple):
+    """One message on its way into a recording."""
+
+    topic: str
+    data: bytes
+    monotonic_ns: int
+    realtime_ns: int
+
+
+def port_entry(port: int, data: bytes, monotonic_ns: int, realtime_ns: int) -> Entry:
+    """What one read of a port returned, with its times."""
+    return Entry(f"port/{port}", data, monotonic_ns, realtime_ns)
+
+
+def preamble_entry(port: int, data: bytes, monotonic_ns: int, realtime_ns: int) -> Entry:
+    """What a port's protocol needs to know of what came before the recording."""
+    return Entry(f"port/{port}/hello", data, monotonic_ns, realtime_ns)
+
+
+def reference_entry(
+    reference: Reference, number: int, monotonic_ns: int, realtime_ns: int
+) -> Entry:
+    """The reference that holds, the `number`-th of its recording; repeated, it changes nothing."""
+    fields: dict[str, Any] = {"number": number, "scans": reference.scans}
+    for name in REFERENCE_ARRAYS + DRIFT_ARRAYS:
+        array = getattr(reference, name)
+        if array is not None or name in REFERENCE_ARRAYS:
+            fields[name] = None if array is None else array_to_wire(array)
+    return Entry("reference", msgpack.packb(fields), monotonic_ns, realtime_ns)
+
+
+def calibration_entry(text: str, number: int, monotonic_ns: int, realtime_ns: int) -> Entry:
+    """The pressure calibration that holds from here on, read again for the `number`-th time."""
+    data = msgpack.packb({"number": number, "text": text})
+    return Entry("calibration", data, monotonic_ns, realtime_ns)
+
+
+def mark_entry(mark: Mark, monotonic_ns: int, realtime_ns: int) -> Entry:
+    """A dual scan that was reconstructed; a new reference is an entry of its own, before it."""
+    return Entry("frame", pack_mark(mark), monotonic_ns, realtime_ns)
+
+
+def pack_mark(mark: Mark) -> bytes:
+    """Return a mark as it is written."""
+    fields = {
+        "scans": [(key.channel.number, key.counter, key.device_us) for key in mark.scans],
+        "tier": mark.tier,
+        "budget_ms": mark.budget_ms,
+        "reference": mark.reference_number,
+        "calibration": mark.calibration_number,
+        "cold": mark.is_cold,
+        "timing": mark.timing,
+    }
+    packed: bytes = msgpack.packb(fields)
+    return packed
+
+
+def message_entry(kind: str, data: bytes, monotonic_ns: int, realtime_ns: int) -> Entry:
+    """A stream message exactly as published."""
+    return Entry(kind, data, monotonic_ns, realtime_ns)
+
+
+class _File:
+    """A file as the MCAP writer sees it: `write` collects, `flush` writes, wholly or not.
+
+    It is a bare descriptor: a buffered file that hangs in a write would keep the interpreter from
+    ending.
+    """
+
+    def __init__(self, path: Path) -> None:
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+        self.descriptor = os.open(path, flags, 0o666)
+        self._length = 0
+        self._pending = bytearray()
+
+    def write(self, data: bytes) -> int:
+        self._pending += data
+        if len(self._pending) > MAX_PENDING_BYTES:
+            self.flush()
+        return len(data)
+
+    def tell(self) -> int:
+        return self._length + len(self._pending)
+
+    def flush(self) -> None:
+        begin = self._length
+        try:
+            while self._pending:
+                written = os.write(self.descriptor, self._pending)
+                self._length += written
+                del self._pending[:written]
+        except OSError:  # a disk that is full takes the first half: the file ends before it
+            with contextlib.suppress(OSError):
+                os.ftruncate(self.descriptor, begin)
+            raise
+
+    def close(self) -> None:
+        descriptor, self.descriptor = self.descriptor, -1
+        if descriptor >= 0:
+            with contextlib.suppress(OSError):  # of what was written before, and told then
+                os.close(descriptor)
+
+
+class RecordingWriter:
+    """Writes one recording. Its methods raise OSError as files do.
+
+    Args:
+        path: the file to write.
+        origin: what it is a recording of.
+
+    Raises:
+        FileExistsError: the file exists: nothing is ever written over.
+
+    """
+
+    def __init__(self, path: Path, origin: Origin) -> None:
+        self._path = path
+        self._name_is_safe = False
+        self._file = _File(path)
+        self._clock_offset_ns = time.time_ns() - time.monotonic_ns()
+        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES)  # type: ignore[arg-type]
+        try:
+            self._begin(origin)
+        except BaseException:
+            self.abandon()
+            raise
+
+    def _begin(self, origin: Origin) -> None:
+        self._writer.start(profile=PROFILE, library=f"tactomo {origin.version}")
+        metadata = {
+            "sensor": origin.sensor,
+            "description": origin.description,
+            "description_sha256": origin.description_sha256,
+            "ports": "\n".join(origin.ports),
+            "version": origin.version,
+            "protocol": origin.protocol,
+            "calibration": origin.calibration,
+        }
+        self._writer.add_metadata(PROFILE, metadata)
+        # Always the same ones in the same order: should the chunk that names them be lost, what
+        # the others hold is known by number.
+        self._channels = {
+            topic: self._writer.register_channel(topic, encoding, schema_id=0)
+            for topic, encoding in CHANNELS.items()
+        }
+        self.flush()
+
+    def add(self, entry: Entry) -> None:
+        """Add one message."""
+        log_time_ns = self._clock_offset_ns + entry.monotonic_ns
+        self.write(entry.topic, entry.data, log_time_ns, entry.realtime_ns)
+
+    def write(self, topic: str, data: bytes, log_time_ns: int, realtime_ns: int) -> None:
+        """Add one message with its time on the steady clock and on the wall clock."""
+        self._writer.add_message(self._channels[topic], log_time_ns, data, realtime_ns)
+
+    def note(self, name: str, facts: dict[str, str]) -> None:
+        """Add a metadata record."""
+        self._writer.add_metadata(name, facts)
+
+    def flush(self) -> int:
+        """Hand everything to the operating system, so that this process may be killed.
+
+        Returns the length of the file.
+        """
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        return self._file.tell()
+
+    def sync(self) -> None:
+        """Have what was flushed, and the file's name, outlive a loss of power."""
+        os.fdatasync(self._file.descriptor)
+        if self._name_is_safe:
+            return
+        folder = os.open(self._path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+        self._name_is_safe = True
+
+    @property
+    def is_deleted(self) -> bool:
+        """Whether the file has lost its last name, so that nobody will ever read it."""
+        return os.fstat(self._file.descriptor).st_nlink == 0
+
+    def close(self) -> int:
+        """Finish the file with its index; returns its length."""
+        try:
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._file.flush()
+            return self._file.tell()
+        finally:
+            self.abandon()
+
+    def abandon(self) -> None:
+        """Close the file as it is, after a write has failed."""
+        self._file.close()
+
+
+def create(path: Path, origin: Origin) -> RecordingWriter:
+    """Begin a recording's file, and its folder if need be.
+
+    Raises:
+        RecordingError: the file exists or cannot be created.
+
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return RecordingWriter(path, origin)
+    except FileExistsError as error:
+        raise RecordingError(
+            f"{path} exists already", "give another path", "cannot_write"
+        ) from error
+    except (OSError, ValueError) as error:  # ValueError: a NUL byte in the path
+        raise RecordingError(
+            f"cannot create {path}: {getattr(error, 'strerror', None) or error}",
+            "give a path in a folder that you may write to",
+            "cannot_write",
+        ) from error
+
+
+def write_recording(
+    path: str | Path,
+    hello: Hello,
+    scans: Iterable[tuple[float, Scan]],
+    *,
+    sensor: str,
+    description: str,
+    description_sha256: str,
+    reference: Reference | None = None,
+) -> int:
+    """Write a recording of scans that came from elsewhere, as one port would have said them.
+
+    Args:
+        path: the file to write; it must not exist.
+        hello: what the device would have said it is; repeated every second.
+        scans: each with its time in seconds since the first, ascending.
+        sensor: the sensor's name.
+        description: the sensor description's name or path.
+        description_sha256: that description's hash.
+        reference: the reference to be used on replay; None leaves that to the replay's tare.
+
+    Returns the length of the file in bytes.
+
+    Raises:
+        RecordingError: the file exists or cannot be written.
+
+    """
+    origin = Origin(sensor, description, description_sha256, ("import",), version("tactomo"))
+    path = Path(path).absolute()
+    writer = create(path, origin)
+    monotonic_ns, realtime_ns = time.monotonic_ns(), time.time_ns()
+    hello_at_s = -HELLO_PERIOD_S
+    try:
+        if reference is not None:
+            writer.add(reference_entry(reference, 1, monotonic_ns, realtime_ns))
+        for time_s, scan in scans:
+            data = encode(scan)
+            if time_s - hello_at_s >= HELLO_PERIOD_S:
+                data, hello_at_s = encode(hello) + data, time_s
+            after_ns = round(time_s * 1e9)
+            writer.add(port_entry(0, data, monotonic_ns + after_ns, realtime_ns + after_ns))
+        return writer.close()
+    except OSError as error:
+        writer.abandon()
+        raise RecordingError(
+            f"cannot write {path}: {error.strerror}", "make room on the disk", "cannot_write"
+        ) from error

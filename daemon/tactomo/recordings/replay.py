@@ -1,0 +1,151 @@
+"""What a recording tells a daemon that replays it, beyond the bytes that its ports say again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from urllib.parse import parse_qsl, unquote, urlsplit
+
+from tactomo_models import Reference, SensorDescription
+from tactomo_models.calibration.calibration_file import PressureCalibration
+
+from tactomo.errors import ConfigError, PortError
+from tactomo.recordings.recording import REPLAY_SCHEME, Recording, recorded_calibration
+from tactomo.recordings.recording_set import open_replayable
+from tactomo.scans import Delivery, Mark
+
+
+@dataclass(frozen=True, slots=True)
+class Replay:
+    """What a recording tells the pipeline beyond the bytes on the ports."""
+
+    marks: list[Mark]
+    """The dual scans to reconstruct; empty where the recording does not say."""
+    reference: Reference | None
+    """The one in force at its beginning."""
+    is_paced: bool
+    """Whether bytes come in their own time rather than as fast as they are taken."""
+    calibration: PressureCalibration | None = None
+    """Of pressure, that the daemon had when it began to record."""
+    knows_calibration: bool = False
+    """Whether it had that one, or none, and no other is to be looked for."""
+
+
+class ReplayClock:
+    """How far a replay is, on the recording's own clock. For use by one thread.
+
+    Args:
+        ports: how many ports are replayed.
+        is_paced: whether their bytes come in their own time. Ports that are read as fast as they
+            are taken run ahead of one another: only what the slowest one has passed is over.
+
+    """
+
+    def __init__(self, ports: int, is_paced: bool) -> None:
+        self._ports = ports
+        self._is_paced = is_paced
+        self._now_ns: dict[int, int] = {}  # the newest time on each port that goes on
+        self._ended: set[int] = set()
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether every port is at its end."""
+        return len(self._ended) == self._ports
+
+    def follow(self, delivery: Delivery) -> int | None:
+        """Take note of what a port said; return the time that has passed, None if none is sure."""
+        if delivery.has_ended:
+            self._ended.add(delivery.port)
+            self._now_ns.pop(delivery.port, None)
+        else:
+            self._now_ns[delivery.port] = delivery.clock_ns
+        if self._is_paced:
+            return max(self._now_ns.values(), default=None)
+        if len(self._now_ns) + len(self._ended) < self._ports:  # one was not heard yet
+            return None
+        return min(self._now_ns.values(), default=None)
+
+
+def read_replay(urls: Sequence[str], description: SensorDescription) -> Replay | None:
+    """Return what the recording says that the ports replay; None where they are live.
+
+    Raises:
+        ConfigError: only some of the ports are replayed, or not all from one recording, or that
+            is of another sensor.
+        RecordingError, PortError: a URL leads to no recording.
+
+    """
+    replayed = [url for url in urls if url.startswith(f"{REPLAY_SCHEME}://")]
+    if not replayed:
+        return None
+    parsed = [parse_replay_url(url) for url in replayed]
+    recording, _, speed = parsed[0]
+    others = {(other.path, other_speed) for other, _, other_speed in parsed}
+    if len(replayed) < len(urls) or len(others) > 1:
+        raise ConfigError(
+            f"the ports {', '.join(urls)} do not replay one recording",
+            "replay all ports from one file at one speed, or none",
+        )
+    reference = recording.first_reference()
+    if reference is not None:
+        _check_reference(reference, recording, description)
+    # A part of the ports cannot give the dual scans that all of them gave.
+    is_whole = len(urls) == len(recording.origin.ports)
+    marks = recording.marks() if is_whole else []
+    if recording.origin.description_sha256 != description.sha256:
+        marks = without_calibrations(marks)
+    text = recording.origin.calibration
+    calibration = recorded_calibration(text, f"the calibration in {recording.path}", description)
+    had_none = not text and any(mark.calibration is not None for mark in marks)
+    return Replay(
+        marks=marks,
+        reference=reference,
+        is_paced=speed > 0,
+        calibration=calibration,
+        knows_calibration=calibration is not None or had_none,
+    )
+
+
+def parse_replay_url(url: str) -> tuple[Recording, int, float]:
+    """Return the recording, the port's number in it and the speed that a URL asks for.
+
+    Raises:
+        PortError: the URL is malformed or asks for a port that was not recorded.
+        RecordingError: its path is no recording.
+
+    """
+    parts = urlsplit(url)
+    options = {"port": "0", "speed": "1", **dict(parse_qsl(parts.query))}
+    try:
+        port, speed = int(options.pop("port")), float(options.pop("speed"))
+        if options or not 0 <= speed < float("inf"):
+            raise ValueError
+    except ValueError as error:
+        raise PortError(
+            f"{url} is not a replay URL",
+            f"use {REPLAY_SCHEME}:///absolute/path.mcap?port=0&speed=1",
+        ) from error
+    recording = open_replayable(unquote(parts.netloc + parts.path))
+    if not 0 <= port < len(recording.origin.ports):
+        raise PortError(
+            f"{url}: the recording has {len(recording.origin.ports)} port(s), numbered from 0",
+            "`tactomo info` shows what is in it",
+        )
+    return recording, port, speed
+
+
+def without_calibrations(marks: Sequence[Mark]) -> list[Mark]:
+    """Return marks that leave the pressure calibration as it is."""
+    return [replace(mark, calibration=None) for mark in marks]
+
+
+def _check_reference(
+    reference: Reference, recording: Recording, description: SensorDescription
+) -> None:
+    lengths = {len(v) for v in (reference.magnitude, reference.structure) if v is not None}
+    if lengths != {description.measurements}:
+        raise ConfigError(
+            f"{recording.path} has {' or '.join(map(str, sorted(lengths)))} voltages a scan, "
+            f"{description.name} has {description.measurements}",
+            f"replay it with the description it was recorded with, {recording.origin.description}",
+        )

@@ -1,0 +1,120 @@
+"""A folder of recordings: what their files are called, and which of them are to be deleted.
+
+Names such as ``left_forearm-000042-20260131T120000Z.mcap`` sort by their number, which rises by one
+with each file, whatever the wall clock does.
+"""
+
+from __future__ import annotations
+
+import re
+import stat
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from itertools import pairwise
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from tactomo_client.recording_file import ROTATED_NAME
+
+from tactomo.config import RecordingConfig
+from tactomo.errors import RecordingError
+from tactomo.recordings.recording import open_recording
+
+_DAY_S: Final = 86_400.0
+_STAMP: Final = "%Y%m%dT%H%M%SZ"
+
+
+class KeptRecording(NamedTuple):
+    """A file in the folder, by its name and what the file system says."""
+
+    number: int
+    path: Path
+    size: int
+    begin_s: float
+    """When it began, seconds since 1970 by the wall clock of that time."""
+    end_s: float
+    """When it was last written to, likewise."""
+
+
+class Deletion(NamedTuple):
+    """A file that is to go, and why."""
+
+    path: Path
+    reason: str
+
+
+def next_path(folder: Path, sensor: str, now_s: float) -> Path:
+    """Return the path of the next recording; raise OSError where the folder cannot be read."""
+    numbers = [kept.number for kept in list_recordings(folder, sensor)]
+    stamp = datetime.fromtimestamp(now_s, UTC).strftime(_STAMP)
+    return folder / f"{sensor}-{max(numbers, default=0) + 1:06d}-{stamp}.mcap"
+
+
+def list_recordings(folder: Path, sensor: str) -> list[KeptRecording]:
+    """Return a sensor's recordings in a folder, in the order in which they were made.
+
+    Raises:
+        OSError: the folder cannot be read.
+
+    """
+    return sorted(_recordings(folder, sensor)) if folder.is_dir() else []
+
+
+def _recordings(folder: Path, sensor: str) -> Iterator[KeptRecording]:
+    for path in folder.iterdir():
+        name = re.fullmatch(ROTATED_NAME, path.name, re.ASCII)
+        if name is None or name["sensor"] != sensor:
+            continue
+        try:
+            begin = datetime.strptime(name["begin"], _STAMP).replace(tzinfo=UTC)
+            facts = path.lstat()
+        except (ValueError, FileNotFoundError):  # no such date; deleted by somebody meanwhile
+            continue
+        if stat.S_ISREG(facts.st_mode):
+            size, end_s = facts.st_size, facts.st_mtime
+            yield KeptRecording(int(name["number"]), path, size, begin.timestamp(), end_s)
+
+
+def to_delete(recordings: list[KeptRecording], rules: RecordingConfig) -> list[Deletion]:
+    """Return what has to go, oldest first, so that the newest may grow to its full size.
+
+    Args:
+        recordings: all there are; the last one, which is being written, stays.
+        rules: what is to be kept.
+
+    """
+    *closed, newest = recordings
+    ages_s = _ages_s(recordings)
+    room = rules.keep_gb * 1e9 - max(newest.size, rules.rotate_mb * 1e6)
+    total = sum(kept.size for kept in closed)
+    deletions = []
+    for kept, age_s in zip(closed, ages_s, strict=False):
+        if rules.keep_gb and total > room:
+            reason = f"more than {rules.keep_gb:g} GB"
+        elif rules.keep_days and age_s > rules.keep_days * _DAY_S:
+            reason = f"older than {rules.keep_days:g} days"
+        else:
+            continue
+        deletions.append(Deletion(kept.path, reason))
+        total -= kept.size
+    return deletions
+
+
+def _ages_s(recordings: list[KeptRecording]) -> list[float]:
+    """Return how long ago each recording ended, as far as the recordings themselves can tell.
+
+    The wall clock may jump by years. So age is summed up over the recordings and the pauses
+    between them, none of which counts for more than a day or less than nothing: a jump makes
+    recordings at most a day older. Pauses longer than that are not counted in full.
+    """
+    times_s = [time_s for kept in recordings for time_s in (kept.begin_s, kept.end_s)]
+    steps_s = [min(max(after - before, 0.0), _DAY_S) for before, after in pairwise(times_s)]
+    return [sum(steps_s[2 * index + 1 :]) for index in range(len(recordings))]
+
+
+def is_ours(path: Path, sensor: str) -> bool:
+    """Whether a file's content, too, says that it is a recording of this sensor."""
+    try:
+        return open_recording(path).origin.sensor == sensor
+    except RecordingError:
+        return False

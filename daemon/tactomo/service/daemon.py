@@ -1,0 +1,503 @@
+"""The daemon: ports, pipeline, publisher, control and recorder, put together and kept running.
+
+Threads, each with what it alone touches, and what it hands on:
+
+============  ==========================  =========================================================
+thread        owns                        hands on
+============  ==========================  =========================================================
+port-0, -1    a serial port               scans to the pipeline, bytes to the recorder
+pipeline      sync, the reconstructor     messages to the publisher, marks to the recorder
+control       the control socket          commands to the pipeline and to the recorder
+publisher     the stream's socket         what it sent to the recorder, if that is asked for
+metrics       the scrapers' socket        nothing; only if it is asked for
+access        the list of clients         nothing; runs where there are keys (AccessControl)
+recorder      the files of recordings     nothing
+============  ==========================  =========================================================
+
+They stop in this order, so nobody hands anything to one that has gone. Numerical libraries are
+held to one thread while a daemon runs: on arrays of this size their pools cost more latency than
+they save, and the processor is shared with everything else on the robot.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import signal
+import threading
+import time
+import uuid
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import structlog
+import zmq
+from tactomo_client.messages import EVENT, SCHEMA, STATUS
+from tactomo_models import (
+    ArtifactError,
+    CalibrationError,
+    Reconstructor,
+    SensorDescription,
+    load_description,
+    load_or_build_artifact,
+)
+from tactomo_models.calibration.calibration_file import (
+    PressureCalibration,
+    calibration_for,
+    load_calibration,
+)
+from tactomo_models.machine_speed import MachineSpeed, machine_speed_for
+from tactomo_models.methods.registry import available_methods, check_method
+from tactomo_protocol import Channel
+from threadpoolctl import threadpool_limits
+
+from tactomo.acquisition.port import PortReader
+from tactomo.config import DaemonConfig
+from tactomo.endpoint import allow_connections
+from tactomo.errors import CommandError, ConfigError
+from tactomo.events import EventBook, Severity
+from tactomo.imaging.imaging import Imaging
+from tactomo.imaging.pipeline import Pipeline
+from tactomo.protocols import find_protocol, protocol_named
+from tactomo.recordings.recorder import Recorder
+from tactomo.recordings.recording import REPLAY_SCHEME, Origin, calibration_text
+from tactomo.recordings.recording_writer import message_entry
+from tactomo.recordings.replay import Replay, parse_replay_url, read_replay, without_calibrations
+from tactomo.service.status import Status
+from tactomo.service.supervision import Supervision, notify
+from tactomo.stream.access_control import AccessControl, load_server_keys
+from tactomo.stream.control import Control, RecordStart, SetBudget, SetTier, Settling
+from tactomo.stream.publisher import Publisher
+from tactomo.worker import Worker
+
+if TYPE_CHECKING:
+    from tactomo.service.metrics import MetricsServer
+
+WATCH_S: Final = 0.1
+
+log = structlog.get_logger()
+
+
+class Daemon:
+    """One sensor's daemon, to be run in this process.
+
+    Args:
+        config: what it serves.
+        reconstructor: what makes maps of voltages; by default the description's own, with an
+            artifact that is built if need be.
+        machine_speed: what turns a budget of time into one of work; by default what was measured on
+            this machine, if that was.
+
+    Raises:
+        ModelError: the description or the artifact cannot be used.
+        ConfigError: the ports are not all live, or not all of one recording.
+        KeysError: the secret key cannot be used.
+        RecordingError, PortError: a replay URL leads to no recording.
+
+    Attributes:
+        session: identity of this run, as in every message.
+
+    """
+
+    def __init__(
+        self,
+        config: DaemonConfig,
+        *,
+        reconstructor: Reconstructor | None = None,
+        machine_speed: MachineSpeed | None = None,
+    ) -> None:
+        self.config = config
+        self.session = uuid.uuid4().hex
+        self._undo = contextlib.ExitStack()
+        self._stop_asked = threading.Event()
+        self._why_stopped = "asked to"
+        self._events = EventBook()
+        curve = config.curve
+        self._keys = None if curve is None else load_server_keys(curve.secret, curve.clients)
+        description = load_description(config.description)
+        self._description = description
+        self._methods = tuple(dict.fromkeys((*available_methods(), config.method)))
+        replay = read_replay(config.ports, description)
+        if replay is not None and config.calibration is not None:
+            replay = replace(replay, marks=without_calibrations(replay.marks))
+        self._replay = replay
+        _check_methods(replay, self._methods)
+        protocol = _protocol(config)
+        channels = tuple(c for c in Channel if c in description.channels)
+        calibration, self._unused = _find_calibration(config, description, replay)
+        origin = _origin(config, protocol, description, calibration)
+        self._recorder = Recorder(origin, config.recording, self._on_event)
+        self._publisher = Publisher(
+            config.name, self.session, self._status_fields, self._record_message, self._on_event
+        )
+        self._imaging = Imaging(
+            description,
+            reconstructor or _make_reconstructor(config, description),
+            machine_speed or _find_machine_speed(description),
+            calibration,
+            config.tare_scans,
+            config.baseline,
+            self._recorder,
+            self._publisher,
+            self._on_event,
+        )
+        self._pipeline = Pipeline(
+            self._imaging,
+            channels,
+            len(config.ports),
+            round(config.sync_wait_ms * 1e6),
+            config.lossless,
+            replay,
+            self._zero_counters,
+            self._on_event,
+        )
+        self._ports = [
+            PortReader(
+                index,
+                url,
+                config.baud or find_protocol(protocol).baud,
+                protocol_named(protocol, description),
+                description,
+                config.device_ids,
+                self._recorder,
+                self._pipeline.deliver,
+                self._on_event,
+            )
+            for index, url in enumerate(config.ports)
+        ]
+        self._control = Control(
+            {
+                "status": lambda _: self.status(),
+                "tare": lambda _: self._pipeline.tare(),
+                "record_start": self._record_start,
+                "record_stop": lambda _: self._recorder.end(),
+                "set_tier": self._set_tier,
+                "set_budget": self._set_budget,
+                "reload_calibration": lambda _: self._reload_calibration(),
+            },
+            on_idle=self._check,
+        )
+        self._status = Status(
+            description,
+            self._ports,
+            self._pipeline,
+            self._imaging,
+            self._recorder,
+            self._events,
+            self._methods,
+        )
+
+        self._access: AccessControl | None = None
+        self._metrics = None if config.metrics is None else self._make_metrics()
+        self._workers: list[Worker] = [self._publisher, self._control, self._pipeline, *self._ports]
+
+    @property
+    def stream_address(self) -> str:
+        """Where the stream is bound, once started."""
+        return self._publisher.address
+
+    @property
+    def metrics_address(self) -> str:
+        """Where Prometheus may scrape, once started; empty if it may not."""
+        return "" if self._metrics is None else self._metrics.address
+
+    @property
+    def control_address(self) -> str:
+        """Where the control socket is bound, once started."""
+        return self._control.address
+
+    def start(self) -> None:
+        """Open everything and start all threads; on failure, what was opened is closed again.
+
+        Raises:
+            PortError: a port cannot be used and `wait_for_ports` is off; one that vanishes later
+                is waited for in any case.
+            AddressError: an address is in use.
+            RecordingError: the recording cannot be created.
+
+        """
+        with contextlib.ExitStack() as undo:
+            self._open(undo)
+            self._undo = undo.pop_all()
+        log.info(
+            "ready",
+            sensor=self.config.name,
+            stream=self.stream_address,
+            control=self.control_address,
+            ports=list(self.config.ports),
+        )
+        for why in self._unused:
+            self._on_event(
+                "calibration_refused", "warning", why, "until then pressures are the description's"
+            )
+
+    def stop(self) -> None:
+        """Stop all threads and close everything; may be called twice."""
+        self._stop_asked.set()
+        self._undo.close()
+
+    def wait(self) -> int:
+        """Wait until the daemon is to stop, and return the exit status that it deserves."""
+        supervision = Supervision(self._turns, self._summary)
+        while not self._stop_asked.wait(WATCH_S):
+            if self.config.exit_at_end and self._pipeline.finished.is_set():
+                self._why_stopped = "every replayed port is at its end"
+                break
+            if not self._all_alive():  # its traceback is in the log
+                self._why_stopped = "a thread died"
+                log.error("thread_died", next_step="please report the traceback above")
+                return 1
+            supervision.turn()
+        return 0
+
+    def run(self) -> int:
+        """Start, serve until SIGTERM or SIGINT, and stop; returns the process's exit status.
+
+        For the main thread. Raises what `start` raises.
+        """
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._on_signal)
+        threading.excepthook = _log_thread_failure
+        allow_connections()
+        self.start()
+        # What is there now stays: never looked through again, which would take tenths of a second.
+        gc.collect()
+        gc.freeze()
+        notify("READY=1", f"STATUS={self._summary()}")
+        try:
+            return self.wait()
+        finally:
+            notify("STOPPING=1", "STATUS=stopping")
+            self.stop()
+            log.info("stopped", why=self._why_stopped, **self._last_words())
+
+    def status(self) -> dict[str, Any]:
+        """Return the fields of a `status` message as of now, envelope included."""
+        envelope = self._publisher.envelope(STATUS)
+        topic = {"schema": SCHEMA, "sensor": self.config.name, "kind": STATUS}
+        return {**topic, **envelope, **self._status_fields()}
+
+    def _on_signal(self, number: int, _: object) -> None:
+        self._why_stopped = signal.Signals(number).name
+        self._stop_asked.set()
+
+    def _last_words(self) -> dict[str, Any]:
+        """What one would want to know afterwards of a daemon that is no more."""
+        status = self._status_fields()
+        troubles = status["events"]["troubles"]
+        said = {key: round(status[key]) for key in ("uptime_s", "frames", "dropped_scans")}
+        if not troubles:
+            return said
+        return {**said, "last_trouble": f"{troubles[0]['name']}: {troubles[0]['detail']}"}
+
+    def _open(self, undo: contextlib.ExitStack) -> None:
+        """Open and start each part, what is downstream first; `undo` goes the other way."""
+        config = self.config
+        undo.enter_context(threadpool_limits(1))
+        context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        undo.callback(context.term)
+        undo.callback(self._recorder.stop)
+        secret = None
+        if self._keys is not None:
+            secret = self._keys.secret
+            self._access = AccessControl(context, self._keys, self._on_event, self._cut_connections)
+            self._access.start()
+            undo.callback(self._access.stop)
+        self._publisher.open(context, config.stream, secret)
+        undo.callback(self._publisher.stop)
+        self._control.open(context, config.control, secret)
+        undo.callback(self._control.stop)
+        undo.callback(self._pipeline.stop)
+        for port in self._ports:
+            port.open(or_wait=config.wait_for_ports)
+            undo.callback(port.stop)
+        if self._metrics is not None and config.metrics is not None:
+            self._metrics.open(config.metrics)
+            undo.callback(self._metrics.stop)
+            self._workers.append(self._metrics)
+        self._recorder.start()  # when nothing can fail any more: no file for each attempt
+        for worker in self._workers:
+            worker.start()
+
+    def _make_metrics(self) -> MetricsServer:
+        # Imported where it is asked for: it needs an extra.
+        from tactomo.service.metrics import MetricsServer
+
+        return MetricsServer(self.status, self._publisher.latency, lambda: self._imaging.stages)
+
+    def _all_alive(self) -> bool:
+        has_access = self._access is None or self._access.is_alive
+        return has_access and all(worker.is_alive for worker in self._workers)
+
+    def _check(self) -> None:
+        """Look after what has no thread of its own; called by the control thread."""
+        self._recorder.check()
+        if self._access is not None:
+            self._access.check()
+
+    def _cut_connections(self) -> None:
+        """Have every client beyond this computer connect anew: one of them may not any more."""
+        self._publisher.cut_connections()
+        self._control.cut_connections()
+
+    def _turns(self) -> Mapping[str, int]:
+        """Return how often each thread went round its loop, of those that are not at their end."""
+        ports = [port for port in self._ports if not port.has_ended]
+        watched = (self._pipeline, self._control, self._publisher, *ports)
+        return {worker.name: worker.turns for worker in watched}
+
+    def _summary(self) -> str:
+        return self._status.summary(self._publisher.subscribers)
+
+    def _record_start(self, arguments: RecordStart) -> Future[Mapping[str, Any]]:
+        path = Path(arguments.path) if arguments.path else None
+        return self._recorder.begin(path, arguments.maps)
+
+    def _set_tier(self, arguments: SetTier) -> Settling:
+        method = arguments.tier
+        if method not in self._methods:
+            raise CommandError(
+                f"there is no method {method!r}",
+                f"use one of: {', '.join(self._methods)}",
+                "bad_argument",
+            )
+        try:
+            check_method(method, self._description)
+        except ArtifactError as error:
+            raise CommandError(str(error), "ask for another method", "no_network") from error
+        return Settling({"tier": method}, self._pipeline.set_method(method))
+
+    def _set_budget(self, arguments: SetBudget) -> Settling:
+        budget_ms = arguments.budget_ms
+        return Settling({"budget_ms": budget_ms}, self._pipeline.set_budget(budget_ms))
+
+    def _reload_calibration(self) -> Future[Mapping[str, Any]]:
+        """Look for the sensor's calibration as at the start; what cannot be used changes nothing.
+
+        Reads a small file, on the control thread.
+        """
+        config, replay = self.config, self._replay
+        if replay is not None and replay.marks and config.calibration is None:
+            raise CommandError(
+                "an exact replay goes by the calibrations that were recorded",
+                "give the replay another one: `tactomo replay --calibration FILE`",
+                "calibration_refused",
+            )
+        try:
+            found, unused = _find_calibration(config, self._description, replay)
+        except CalibrationError as error:
+            found, unused = None, [str(error)]
+        if unused:
+            step = "what was in force stays so"
+            self._on_event("calibration_refused", "warning", unused[0], step)
+            raise CommandError(unused[0], step, "calibration_refused")
+        return self._pipeline.use_calibration(found)
+
+    def _zero_counters(self) -> None:
+        for port in self._ports:
+            port.zero_counters()
+
+    def _status_fields(self) -> Mapping[str, Any]:
+        return self._status.fields(self._publisher.latency, self._publisher.subscribers)
+
+    def _record_message(self, kind: str, data: bytes) -> None:
+        active = self._recorder.active
+        if active is not None and active.with_maps:
+            active.add(message_entry(kind, data, time.monotonic_ns(), time.time_ns()))
+
+    def _on_event(self, name: str, severity: Severity, detail: str, next_step: str = "") -> None:
+        spared = self._events.note(name, severity, detail, next_step)
+        if spared is not None:
+            extra: dict[str, Any] = {"next_step": next_step} if next_step else {}
+            if spared:
+                extra["not_logged"] = spared  # of this name since the last line
+            getattr(log, severity)(name, detail=detail, **extra)
+        fields = {"name": name, "severity": severity, "detail": detail, "next_step": next_step}
+        self._publisher.publish(EVENT, fields)
+
+
+def _log_thread_failure(failure: threading.ExceptHookArgs) -> None:
+    thread = failure.thread.name if failure.thread else "unknown"
+    log.error("thread_failed", thread=thread, exc_info=failure.exc_value)
+
+
+def _make_reconstructor(config: DaemonConfig, description: SensorDescription) -> Reconstructor:
+    log.info("loading", sensor_model=description.name)
+    notify(f"STATUS=loading the model of {description.name}, which is built the first time")
+    budget_s = None if config.budget_ms is None else config.budget_ms * 1e-3
+    artifact = load_or_build_artifact(description)
+    return Reconstructor(description, artifact, method=config.method, budget_s=budget_s)
+
+
+def _check_methods(replay: Replay | None, methods: Sequence[str]) -> None:
+    """Refuse a recording whose frames were made by a method that is not here, before it begins.
+
+    A recording can name no module: only those who start the daemon can.
+    """
+    made_by = {mark.tier for mark in replay.marks} if replay is not None else set()
+    unknown = sorted(made_by - set(methods))
+    if unknown:
+        raise ConfigError(
+            f"the recording's frames were made by the method {unknown[0]!r}, which is not here",
+            "install what brings it, such as tactomo-lab, or name your own with --method",
+        )
+
+
+def _find_machine_speed(description: SensorDescription) -> MachineSpeed:
+    return machine_speed_for(
+        description, lambda why: log.warning("machine_speed_unused", detail=why)
+    )
+
+
+def _protocol(config: DaemonConfig) -> str:
+    """Return what the ports speak: as configured or, where they are replayed, as recorded."""
+    if config.ports[0].startswith(f"{REPLAY_SCHEME}://"):
+        return parse_replay_url(config.ports[0])[0].origin.protocol
+    return find_protocol(config.protocol).name
+
+
+def _find_calibration(
+    config: DaemonConfig, description: SensorDescription, replay: Replay | None
+) -> tuple[PressureCalibration | None, list[str]]:
+    """Return the pressure calibration to be used, and why others are not.
+
+    Raises:
+        CalibrationError: the configured one cannot be used.
+
+    """
+    unused: list[str] = []
+    if description.magnitude is None:
+        return None, unused
+    if config.calibration is not None:
+        try:
+            return load_calibration(config.calibration, config.name, description), unused
+        except FileNotFoundError as error:
+            raise CalibrationError(
+                f"there is no calibration {config.calibration}; run: tactomo calibrate "
+                f"live --sensor {config.name}, or leave the key out"
+            ) from error
+    if replay is not None and replay.knows_calibration:
+        return replay.calibration, unused
+    found = calibration_for(config.name, description, config.description, unused.append)
+    return found, unused
+
+
+def _origin(
+    config: DaemonConfig,
+    protocol: str,
+    description: SensorDescription,
+    calibration: PressureCalibration | None,
+) -> Origin:
+    return Origin(
+        sensor=config.name,
+        description=config.description,
+        description_sha256=description.sha256,
+        ports=config.ports,
+        version=version("tactomo"),
+        protocol=protocol,
+        calibration=calibration_text(calibration),
+    )

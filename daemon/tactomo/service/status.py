@@ -1,0 +1,176 @@
+"""What a `status` message says: how each part of the daemon is, gathered when it is asked for."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+from tactomo_models import SensorDescription
+from tactomo_protocol import Channel
+
+from tactomo.acquisition.port import PortReader
+from tactomo.events import EventBook
+from tactomo.imaging.frames import description_fields, port_fields, pressure_fields
+from tactomo.imaging.imaging import Imaging
+from tactomo.imaging.pipeline import Pipeline
+from tactomo.recordings.recorder import Recorder
+from tactomo.recordings.recording import REPLAY_SCHEME
+from tactomo.timing import Durations
+
+VERSION: Final = version("tactomo")  # read from a file, which may fail later
+STALE_S: Final = 1.0
+"""How old the newest dual scan may be before the daemon says that there are no data any more; where
+they come more slowly, a few of their periods."""
+
+
+class Status:
+    """Reads the other parts, from any thread; nothing is written to them."""
+
+    def __init__(
+        self,
+        description: SensorDescription,
+        ports: list[PortReader],
+        pipeline: Pipeline,
+        imaging: Imaging,
+        recorder: Recorder,
+        events: EventBook,
+        methods: Sequence[str],
+    ) -> None:
+        self._sensor = description
+        self._description = description_fields(description)
+        self._ports = ports
+        self._pipeline = pipeline
+        self._imaging = imaging
+        self._recorder = recorder
+        self._events = events
+        self._methods = methods
+        self._started_s = time.monotonic()
+
+    def fields(self, latency: Durations, subscribers: int) -> dict[str, Any]:
+        """Return the fields of a `status` message; the publisher's part is handed in."""
+        pipeline, imaging = self._pipeline, self._imaging
+        active = self._recorder.active
+        reference = imaging.reference
+        stages = {stage: times.percentiles_ms() for stage, times in imaging.stages.items()}
+        return {
+            "version": VERSION,
+            "state": self.state(),
+            "uptime_s": time.monotonic() - self._started_s,
+            "description": {
+                **self._description,
+                **pressure_fields(self._sensor, imaging.calibration.in_force),
+            },
+            "source": {"kind": source(self._ports)},
+            "ports": [port_fields(port) for port in self._ports],
+            "rates": self._rates(),
+            "scans": {c: rate.count for c, rate in pipeline.scan_rates.items()},
+            "frames": imaging.frame_rate.count,
+            "dropped_scans": pipeline.dropped + pipeline.overflowed,
+            "incomplete_scans": pipeline.incomplete,
+            "late_scans": pipeline.sync.late,
+            "scan_tally": pipeline.tally(),
+            "channel_skew_ms": pipeline.skew.sizes.percentiles_ms(),
+            "wall_clock": {
+                "jumps": pipeline.wall_clock.jumps,
+                "last_jump_s": pipeline.wall_clock.last_jump_s,
+            },
+            "reference": reference
+            and {
+                "scans": reference.scans,
+                "taken_realtime_ns": imaging.reference_realtime_ns,
+            },
+            "baseline": imaging.baseline,
+            "stage_ms": {stage: times for stage, times in stages.items() if times},
+            "latency_ms": latency.percentiles_ms(),
+            "methods": list(self._methods),
+            "tier_requested": imaging.method.requested.method,
+            "budget_ms": imaging.method.requested.budget_ms,
+            "plan": self._plan(),
+            "recording": active
+            and {
+                "path": str(active.path),
+                "bytes": active.bytes_written,
+                "queued_bytes": active.queued_bytes,
+            },
+            "recorder": self._recorder_fields(),
+            "subscribers": subscribers,
+            "events": self._events.fields(),
+            "process": process_fields(),
+        }
+
+    def state(self) -> str:
+        """Return the daemon's state in one word."""
+        last_ns = self._imaging.acquired_monotonic_ns
+        if not last_ns:
+            is_waiting = any(port.state == "closed" for port in self._ports)
+            return "waiting_for_port" if is_waiting else "waiting_for_data"
+        stale_s = max(STALE_S, self._imaging.frame_rate.pace.few_s)
+        if time.monotonic_ns() - last_ns > stale_s * 1e9:
+            return "stale"
+        return "taring" if self._imaging.taring.is_on else "running"
+
+    def summary(self, subscriptions: int) -> str:
+        """Return how the daemon is in one line, for `systemctl status`."""
+        state = self.state().replace("_", " ")
+        absent = [port.url for port in self._ports if not port.is_open and not port.has_ended]
+        if absent:
+            return f"{state}, {' and '.join(absent)} not open"
+        rate_hz = self._imaging.frame_rate.per_second()
+        return f"{state}: {rate_hz:.0f} frames/s, {subscriptions} subscriptions"
+
+    def _recorder_fields(self) -> dict[str, Any]:
+        recorder = self._recorder
+        return {
+            "files": recorder.files,
+            "deleted": recorder.deleted,
+            "failures": recorder.failures,
+            "waits_for": recorder.waits_for or None,
+        }
+
+    def _plan(self) -> dict[str, Any]:
+        method = self._imaging.method
+        tier, modelled_ms = method.effective
+        return {"source": method.source, "tier": tier, "modelled_ms": modelled_ms}
+
+    def _rates(self) -> dict[str, float | None]:
+        rates = self._pipeline.scan_rates
+        return {
+            **{
+                f"{channel}_hz": rates[channel].per_second() if channel in rates else None
+                for channel in Channel
+            },
+            "frames_hz": self._imaging.frame_rate.per_second(),
+        }
+
+
+def process_fields() -> dict[str, Any]:
+    """Return what this process takes of the computer; its memory is None where nobody says."""
+    return {
+        "pid": os.getpid(),
+        "cpu_s": time.process_time(),
+        "memory_bytes": _resident_bytes(),
+        "threads": threading.active_count(),
+    }
+
+
+def _resident_bytes() -> int | None:
+    try:
+        pages = int(Path("/proc/self/statm").read_text("ascii").split()[1])
+    except (OSError, IndexError, ValueError):
+        return None
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def source(ports: list[PortReader]) -> str:
+    """Return what the scans come from."""
+    if any(port.url.startswith(f"{REPLAY_SCHEME}:") for port in ports):
+        return "replay"
+    names = [port.hello.device_id for port in ports if port.hello is not None]
+    if not names:
+        return "unknown"
+    return "twin" if all(name.startswith("twin") for name in names) else "device"

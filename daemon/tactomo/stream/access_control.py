@@ -1,0 +1,215 @@
+"""Who may come in by a ``tcp://`` address that has keys: the list of clients, and its thread.
+
+The list is a folder of public keys, which `tactomo keys allow` and `revoke` change::
+
+    left_forearm.clients/ros.key                 ros may read the stream
+    left_forearm.clients/may_command/desk.key    desk may read the stream and use the control socket
+
+It is read again when it changes. A client that was taken off it is cut off within a second or two.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shlex
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import zmq
+from tactomo_client.errors import KeysError
+from tactomo_client.keys import PUBLIC_SUFFIX, read_public, read_secret
+from zmq.auth.thread import ThreadAuthenticator
+
+from tactomo.events import OnEvent, RateLimit
+from tactomo.stream.keys import MAY_COMMAND, how_to_allow
+
+STREAM: Final = "stream"
+CONTROL: Final = "control"
+MAX_CLIENTS: Final = 1000
+CHECK_S: Final = 1.0
+
+Context = zmq.Context[zmq.Socket[bytes]]
+Signature = tuple[tuple[str, int, int], ...]
+
+
+@dataclass(frozen=True)
+class ServerKeys:
+    """A server's secret key (Z85), and the folder that says who may come in."""
+
+    secret: bytes = field(repr=False)
+    clients: Path
+
+
+def load_server_keys(secret: Path, clients: Path) -> ServerKeys:
+    """Read a server's secret key.
+
+    Raises:
+        KeysError: it cannot be used, see `read_secret`, or there is no such folder of clients.
+
+    """
+    if not clients.is_dir():
+        raise KeysError(
+            f"there is no folder {clients} of clients that may come in",
+            f"make it: `mkdir -p {shlex.quote(str(clients))}`; then {how_to_allow(clients)}",
+        )
+    return ServerKeys(read_secret(secret)[1], clients)
+
+
+class AllowList:
+    """The public keys in a folder, by what their holders may do. For any thread.
+
+    Attributes:
+        revocations: how often a key was taken away from either socket.
+
+    """
+
+    def __init__(self, folder: Path, on_event: OnEvent) -> None:
+        self.revocations = 0
+        self._folder = folder
+        self._on_event = on_event
+        self._lock = threading.Lock()  # held for the reading of some small files
+        self._signature: Signature | None = None
+        self._allowed: dict[str, frozenset[bytes]] = {STREAM: frozenset(), CONTROL: frozenset()}
+
+    def permits(self, domain: str, key: bytes) -> bool:
+        """Whether the holder of this public key (Z85) may use the socket of this name."""
+        self.reload()
+        return key in self._allowed.get(domain, ())
+
+    def reload(self) -> None:
+        """Read the folder again if it has changed; one that cannot be looked at stays as it was."""
+        with self._lock, contextlib.suppress(OSError):  # such as too many open files
+            files = _files(self._folder)
+            signature = _signature([*files[STREAM], *files[CONTROL]])
+            if signature != self._signature:
+                self._signature = signature
+                self._take({domain: self._keys(paths) for domain, paths in files.items()})
+
+    def _take(self, keys: dict[str, frozenset[bytes]]) -> None:
+        before = self._allowed
+        self._allowed = {STREAM: keys[STREAM] | keys[CONTROL], CONTROL: keys[CONTROL]}
+        self.revocations += any(before[domain] - self._allowed[domain] for domain in before)
+
+    def _keys(self, paths: list[Path]) -> frozenset[bytes]:
+        keys = set()
+        for path in paths:
+            try:
+                keys.add(read_public(path))
+            except KeysError as error:  # one bad file locks nobody else out
+                self._on_event("client_key_unusable", "warning", error.cause, error.next_step)
+        return frozenset(keys)
+
+
+def _files(folder: Path) -> dict[str, list[Path]]:
+    pattern = f"*{PUBLIC_SUFFIX}"
+    folders = {STREAM: folder, CONTROL: folder / MAY_COMMAND}
+    return {domain: sorted(where.glob(pattern))[:MAX_CLIENTS] for domain, where in folders.items()}
+
+
+def _signature(paths: list[Path]) -> Signature:
+    found = []
+    for path in paths:
+        try:
+            info = path.stat()
+        except OSError:  # removed in this very moment
+            continue
+        found.append((str(path), info.st_mtime_ns, info.st_size))
+    return tuple(found)
+
+
+class AccessControl:
+    """Answers ZeroMQ's question (ZAP) whether a client may come in, in a thread of its own.
+
+    `start` it before the sockets of its context are bound, and `stop` it after they are closed.
+    A socket's purpose in `tactomo.endpoint.bind` is its domain here.
+
+    Args:
+        context: the sockets' context; there is one access control in it.
+        keys: who may come in.
+        on_event: told of those who were refused.
+        on_revoked: called by whoever calls `check` when somebody was taken off the list.
+
+    """
+
+    def __init__(
+        self,
+        context: Context,
+        keys: ServerKeys,
+        on_event: OnEvent,
+        on_revoked: Callable[[], None],
+    ) -> None:
+        self._allowed = AllowList(keys.clients, on_event)
+        self._clients = keys.clients
+        self._on_event = on_event
+        self._on_revoked = on_revoked
+        self._checked_s = 0.0  # of the one thread that calls `check`, as is _revocations
+        self._revocations = 0
+        self._refused = 0  # the thread's own, as is _limit
+        self._limit = RateLimit()
+        self._authenticator = _Authenticator(context)
+        for domain in (STREAM, CONTROL):
+            self._authenticator.configure_curve_callback(domain, self)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._authenticator.start()
+
+    def stop(self) -> None:
+        """End the thread."""
+        if not self.is_alive:  # it would be waited for
+            self._authenticator.forget_thread()
+        self._authenticator.stop()
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the thread runs."""
+        return self._authenticator.is_alive()
+
+    def check(self) -> None:
+        """Look for changes of the list, at most once a second; to be called by one thread."""
+        if time.monotonic() - self._checked_s < CHECK_S:
+            return
+        self._checked_s = time.monotonic()
+        self._allowed.reload()
+        if self._allowed.revocations != self._revocations:
+            self._revocations = self._allowed.revocations
+            self._on_revoked()
+
+    def callback(self, domain: str, key: bytes) -> bool:
+        """Return whether a client may come in; called by the thread, with the key in Z85."""
+        permitted = self._allowed.permits(domain, key)
+        if not permitted:
+            self._tell_refused(domain, key.decode("ascii"))
+        return permitted
+
+    def _tell_refused(self, domain: str, key: str) -> None:
+        self._refused += 1
+        if self._limit.allows():
+            self._on_event(
+                "client_refused",
+                "warning",
+                f"{self._authenticator.address} may not use the {domain}: its public key {key} is "
+                f"not allowed ({self._refused} refused so far)",
+                "if it is yours, copy its public key (CLIENT.key) to this computer, and "
+                + how_to_allow(self._clients, may_command=domain == CONTROL),
+            )
+
+
+class _Authenticator(ThreadAuthenticator):
+    """Remembers whom it is asked about; everything is asked and answered one by one."""
+
+    address = ""
+
+    async def handle_zap_message(self, msg: list[bytes]) -> None:
+        self.address = msg[3].decode("ascii", "replace") if len(msg) > 3 else ""
+        await super().handle_zap_message(msg)
+
+    def forget_thread(self) -> None:
+        """Let `stop` close everything without a word to a thread that has died."""
+        if self.pipe:
+            self.pipe.close(0)
+            self.pipe = None  # type: ignore[assignment]

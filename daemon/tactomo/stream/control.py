@@ -1,0 +1,191 @@
+"""The control thread: the only one that touches the control socket.
+
+Requests come from anybody on this computer, or who has a key, so each is bounded in size and
+checked whole before anything happens. A command whose outcome takes time (`tare`) is answered when
+it is known, and holds up no other client meanwhile.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from typing import Annotated, Any, Final, NamedTuple
+
+import zmq
+from pydantic import ConfigDict, Field
+from tactomo_client import MessageError
+from tactomo_client.messages import decode_request, encode_error, encode_reply
+
+from tactomo.config import BudgetMs
+from tactomo.endpoint import bind, rebind
+from tactomo.errors import CommandError, TactomoError
+from tactomo.stream.access_control import CONTROL
+from tactomo.stream.commands import Arguments, Nothing, obey
+from tactomo.worker import Worker
+
+MAX_REQUEST_BYTES: Final = 64 * 1024
+POLL_MS: Final = 50
+POLL_WHILE_PENDING_MS: Final = 10
+MAX_PENDING: Final = 64
+QUEUED_PER_CLIENT: Final = 64
+LINGER_MS: Final = 100
+SETTLE_S: Final = 1.0
+"""How long a change may wait for the frame that is being made: clients wait 2 s for the answer."""
+
+Result = Mapping[str, Any]
+
+
+class Settling(NamedTuple):
+    """A result that is known before it is in force; told when it is, or after SETTLE_S."""
+
+    result: Result
+    in_force: Future[None]
+
+
+Outcome = Result | Future[Result] | Settling
+Handler = Callable[[Any], Outcome]
+
+
+class _Strict(Arguments):
+    model_config = ConfigDict(strict=True)
+
+
+class RecordStart(_Strict):
+    """Where to record to, and whether with maps; what is not given is as configured."""
+
+    path: Annotated[str, Field(min_length=1, max_length=4096)] | None = None
+    maps: bool | None = None
+
+
+class SetTier(_Strict):
+    """The method that frames are made by from now on: one of the status' `methods`."""
+
+    tier: str
+
+
+class SetBudget(_Strict):
+    """How long a frame may take from now on; nil leaves it to the tier."""
+
+    budget_ms: BudgetMs | None
+
+
+COMMANDS: Final[Mapping[str, type[Arguments]]] = {
+    "status": Nothing,
+    "tare": Nothing,
+    "record_start": RecordStart,
+    "record_stop": Nothing,
+    "set_tier": SetTier,
+    "set_budget": SetBudget,
+    "reload_calibration": Nothing,
+}
+
+
+class _Pending(NamedTuple):
+    """A request whose answer is to come: what the future says, else `result`; by `by_s` at last."""
+
+    envelope: list[bytes]
+    future: Future[Any]
+    result: Result
+    by_s: float
+
+
+class Control(Worker):
+    """Answers commands. `open` it, `start` its thread, `stop` it.
+
+    Args:
+        handlers: one for each of COMMANDS; called by the thread with the checked arguments.
+        on_idle: called by the thread several times a second.
+
+    Attributes:
+        address: where it is bound, once open.
+
+    """
+
+    def __init__(self, handlers: Mapping[str, Handler], on_idle: Callable[[], None]) -> None:
+        super().__init__("control")
+        self.address = ""
+        self._handlers = handlers
+        self._on_idle = on_idle
+        self._pending: list[_Pending] = []
+        self._socket: zmq.Socket[bytes]
+        self._cut = threading.Event()
+
+    def open(
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoint: str,
+        secret: bytes | None = None,
+    ) -> None:
+        """Bind the control socket; raise AddressError where the address cannot be had."""
+        self._socket = context.socket(zmq.ROUTER)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_REQUEST_BYTES)
+        self._socket.setsockopt(zmq.RCVHWM, QUEUED_PER_CLIENT)
+        self._socket.setsockopt(zmq.SNDHWM, QUEUED_PER_CLIENT)
+        self.address = bind(self._socket, endpoint, CONTROL, secret=secret)
+
+    def cut_connections(self) -> None:
+        """Have every client connect anew, those who still may; for any thread."""
+        self._cut.set()
+
+    def _close(self) -> None:
+        self._socket.close(LINGER_MS)
+
+    def _run(self) -> None:
+        while not self._stopping.is_set():
+            self.turns += 1
+            if self._socket.poll(POLL_WHILE_PENDING_MS if self._pending else POLL_MS):
+                self._receive()
+            self._answer_pending()
+            if self._cut.is_set():
+                self._cut.clear()
+                rebind(self._socket, self.address)
+            self._on_idle()
+        for waiting in self._pending:
+            if not waiting.future.done():
+                waiting.future.set_exception(CommandError("the daemon stops", "start it again"))
+        self._answer_pending()
+
+    def _receive(self) -> None:
+        # The envelope (identity, then an empty part) is handed back as it came.
+        *envelope, data = self._socket.recv_multipart()
+        try:
+            outcome = self._obey(*decode_request(data))
+        except (MessageError, TactomoError) as error:
+            self._send(envelope, encode_error(error.name, error.cause, error.next_step))
+            return
+        if isinstance(outcome, Future):
+            self._pending.append(_Pending(envelope, outcome, {}, math.inf))
+        elif isinstance(outcome, Settling):
+            by_s = time.monotonic() + SETTLE_S
+            self._pending.append(_Pending(envelope, outcome.in_force, outcome.result, by_s))
+        else:
+            self._send(envelope, encode_reply(outcome))
+
+    def _obey(self, command: str, arguments: dict[str, Any]) -> Outcome:
+        if len(self._pending) >= MAX_PENDING:
+            raise CommandError("too many commands wait for their answer", "try again later")
+        return obey(command, arguments, COMMANDS, self._handlers)
+
+    def _answer_pending(self) -> None:
+        now_s = time.monotonic()
+        waiting = []
+        for pending in self._pending:
+            envelope, future, result, by_s = pending
+            if not future.done() and now_s < by_s:
+                waiting.append(pending)
+                continue
+            try:
+                told = future.result() if future.done() else None
+                self._send(envelope, encode_reply(result if told is None else told))
+            except TactomoError as error:
+                self._send(envelope, encode_error(error.name, error.cause, error.next_step))
+        self._pending = waiting
+
+    def _send(self, envelope: list[bytes], reply: bytes) -> None:
+        # Somebody who asks and never reads fills their own queue; they do not hold up the others.
+        with contextlib.suppress(zmq.Again):
+            self._socket.send_multipart([*envelope, reply], zmq.DONTWAIT)

@@ -1,0 +1,259 @@
+"""One address for the streams of all skins of a computer.
+
+A daemon serves one skin. This process subscribes to each daemon's stream, most often an ``ipc://``
+file, to just what its own subscribers ask for, and passes it on at one address, beyond the computer
+if there are keys. Sensors are told apart by their topics, as ever. Daemons may come and go.
+
+It never waits for a subscriber: what does not fit into a slow one's queue is lost to that one
+alone. One thread, the main one, touches everything but access control's own.
+"""
+
+from __future__ import annotations
+
+import math
+import signal
+import threading
+import time
+from collections.abc import Sequence
+from typing import Final
+
+import structlog
+import zmq
+from tactomo_client import Keys
+from tactomo_client.connection import connect_subscriber
+from tactomo_client.messages import STATUS
+
+from tactomo.endpoint import allow_connections
+from tactomo.events import RateLimit, Severity
+from tactomo.stream.access_control import STREAM, AccessControl, Context, ServerKeys
+from tactomo.stream.subscriptions import SUBSCRIBERS_CUT, Subscribers
+
+QUEUED_PER_SUBSCRIBER: Final = 256
+"""Of all sensors together; a daemon keeps 64 of its one."""
+PASSED_AT_ONCE: Final = 64
+POLL_MS: Final = 200
+LOOK_S: Final = 1.0
+REMEMBERED_S: Final = 3.0
+"""A status that is older is not news to a newcomer: its daemon is gone."""
+SILENT_S: Final = 5.0
+"""A source that has not answered so long after the start is missed."""
+LINGER_MS: Final = 200
+MAX_SENSORS: Final = 64
+MAX_TOPIC_BYTES: Final = 128
+
+log = structlog.get_logger()
+
+
+class Proxy:
+    """Passes on the streams of several daemons; `open` it, `run` it until `stop`, `close` it.
+
+    Args:
+        sources: the daemons' stream addresses.
+        endpoint: where to bind.
+        keys: who may come in; None where no other computer can reach `endpoint`.
+        source_keys: this proxy's own, for sources that want some.
+
+    Attributes:
+        address: where it is bound, once open.
+
+    """
+
+    def __init__(
+        self,
+        sources: Sequence[str],
+        endpoint: str,
+        keys: ServerKeys | None = None,
+        source_keys: Keys | None = None,
+    ) -> None:
+        self.address = ""
+        self.sources = sources
+        self._endpoint = endpoint
+        self._keys = keys
+        self._source_keys = source_keys
+        self._stopping = threading.Event()
+        self._context: Context = zmq.Context()
+        self._access: AccessControl | None = None
+        self._inlets: list[_Inlet] = []
+        self._sensors: dict[bytes, tuple[str, float]] = {}  # who sent it last, and when
+        self._statuses: dict[bytes, tuple[bytes, float]] = {}
+        self._look_at_s = 0.0
+        self._told: set[bytes] = set()
+        self._flood = RateLimit()
+
+    def open(self) -> None:
+        """Bind, and connect to the sources, whether or not they are there.
+
+        Raises:
+            AddressError: the address cannot be had, or needs keys.
+            ControlError: a source's address is not one.
+
+        """
+        secret = None
+        if self._keys is not None:
+            secret = self._keys.secret
+            self._access = AccessControl(self._context, self._keys, _tell, self._cut)
+            self._access.start()
+        self._outlet: zmq.Socket[bytes] = self._context.socket(zmq.XPUB)
+        self._outlet.setsockopt(zmq.SNDHWM, QUEUED_PER_SUBSCRIBER)
+        self._readers = Subscribers(self._outlet, self._endpoint, STREAM, secret, "--bind")
+        self.address = self._readers.address
+        for source in self.sources:
+            self._inlets.append(_Inlet(self._context, source, self._source_keys))
+
+    def run(self) -> None:
+        """Pass messages on until `stop`."""
+        poller = zmq.Poller()
+        poller.register(self._outlet, zmq.POLLIN)
+        for inlet in self._inlets:
+            poller.register(inlet.socket, zmq.POLLIN)
+        while not self._stopping.is_set():
+            ready = dict(poller.poll(POLL_MS))
+            if self._outlet in ready:
+                self._pass_subscriptions()
+            for inlet in self._inlets:
+                if inlet.socket in ready:
+                    self._pass_messages(inlet)
+            self._look_after()
+
+    def stop(self) -> None:
+        """Have `run` return; from any thread or a signal's handler."""
+        self._stopping.set()
+
+    def close(self) -> None:
+        """Close everything, whatever `open` came to."""
+        for inlet in self._inlets:
+            inlet.close()
+        if self.address:
+            self._outlet.close(LINGER_MS)
+        if self._access is not None:
+            self._access.stop()
+        self._context.term()
+
+    def _pass_subscriptions(self) -> None:
+        """Ask the sources for what the first one asks for here, and no more for what none does."""
+        before, cuts = set(self._readers.prefixes), self._readers.cuts
+        joined = {prefix for joins, prefix in self._readers.changes() if joins}
+        now = set(self._readers.prefixes)
+        for inlet in self._inlets:
+            inlet.ask(now - before, before - now)
+        # To the first of a prefix the daemon says again how it is, to the others we do.
+        self._repeat_statuses(joined & before)
+        if self._readers.cuts > cuts and self._flood.allows():
+            _tell("subscribers_cut", "warning", *SUBSCRIBERS_CUT)
+
+    def _repeat_statuses(self, prefixes: set[bytes]) -> None:
+        oldest_s = time.monotonic() - REMEMBERED_S
+        for topic, (message, came_s) in self._statuses.items():
+            if came_s > oldest_s and any(topic.startswith(prefix) for prefix in prefixes):
+                self._outlet.send(message, zmq.DONTWAIT)
+
+    def _pass_messages(self, inlet: _Inlet) -> None:
+        """Pass on what waits, a bounded number: the others have their turn."""
+        for _ in range(PASSED_AT_ONCE):
+            try:
+                message = inlet.socket.recv(zmq.DONTWAIT)
+            except zmq.Again:
+                return
+            self._note(inlet.address, message)
+            self._outlet.send(message, zmq.DONTWAIT)
+
+    def _note(self, source: str, message: bytes) -> None:
+        """Keep the last status of each sensor, and see whether two daemons use one name."""
+        topic, _, _ = message[:MAX_TOPIC_BYTES].partition(b"\0")
+        sensor, _, kind = topic.partition(b"/")
+        now_s = time.monotonic()
+        if len(self._sensors) >= MAX_SENSORS and sensor not in self._sensors:
+            return
+        if kind == STATUS.encode():
+            self._statuses[topic + b"\0"] = message, now_s
+        other, seen_s = self._sensors.get(sensor, (source, 0.0))
+        if other != source and now_s - seen_s < REMEMBERED_S and sensor not in self._told:
+            self._told.add(sensor)
+            _tell(
+                "same_sensor_twice",
+                "warning",
+                f"{other} and {source} both publish a sensor {sensor.decode('ascii', 'replace')!r}",
+                "give one of the daemons another name",
+            )
+        self._sensors[sensor] = source, now_s
+
+    def _look_after(self) -> None:
+        if time.monotonic() < self._look_at_s:
+            return
+        self._look_at_s = time.monotonic() + LOOK_S
+        for inlet in self._inlets:
+            inlet.knock_again()
+        if self._access is not None:
+            self._access.check()
+
+    def _cut(self) -> None:
+        self._readers.cut()
+
+
+class _Inlet:
+    """The connection to one daemon's stream."""
+
+    def __init__(self, context: Context, address: str, keys: Keys | None) -> None:
+        self.address = address
+        self.socket: zmq.Socket[bytes] = context.socket(zmq.SUB)
+        self.socket.setsockopt(zmq.RCVHWM, QUEUED_PER_SUBSCRIBER)
+        self._connection = connect_subscriber(self.socket, address, [], keys=keys)
+        self._told: str | None = None
+        self._missed_at_s = time.monotonic() + SILENT_S
+        self._is_missed = False
+
+    def ask(self, more: set[bytes], less: set[bytes]) -> None:
+        """Subscribe to some prefixes, and no more to others."""
+        for prefix in more:
+            self.socket.subscribe(prefix)
+        for prefix in less:
+            self.socket.unsubscribe(prefix)
+
+    def knock_again(self) -> None:
+        """Connect anew where this proxy was not let in, and say so now and then."""
+        refusal = self._connection.knock_again()
+        if refusal is not None and refusal.name != self._told:
+            _tell(refusal.name, "error", refusal.cause, refusal.next_step)
+        self._told = None if refusal is None else refusal.name
+        if refusal is None:
+            self._tell_missed()
+
+    def _tell_missed(self) -> None:
+        """Say once that this source has never answered, and that it does now."""
+        answers = self._connection.handshakes.have_succeeded
+        if self._is_missed and answers:
+            self._is_missed, self._missed_at_s = False, math.inf
+            _tell("source_came", "info", f"{self.address} is there now")
+        elif not answers and not self._is_missed and time.monotonic() > self._missed_at_s:
+            self._is_missed = True
+            _tell(
+                "source_silent",
+                "warning",
+                f"nothing from {self.address}",
+                "start its daemon, or give --from the address that its daemon logs as `stream`",
+            )
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._connection.close()
+
+
+def serve(proxy: Proxy) -> None:
+    """Open a proxy, serve until SIGTERM or SIGINT, and close it; for the main thread.
+
+    Raises what `Proxy.open` raises.
+    """
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: proxy.stop())
+    allow_connections()
+    try:
+        proxy.open()
+        log.info("ready", stream=proxy.address, sources=list(proxy.sources))
+        proxy.run()
+    finally:
+        proxy.close()
+    log.info("stopped")
+
+
+def _tell(name: str, severity: Severity, detail: str, next_step: str = "") -> None:
+    getattr(log, severity)(name, detail=detail, next_step=next_step)

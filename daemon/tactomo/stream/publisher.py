@@ -1,0 +1,242 @@
+"""The publisher thread: the only one that touches the stream's socket.
+
+Other threads hand it messages by a queue and wake it through a pipe, so that it can wait for them
+and for subscriptions at once. It never waits for a subscriber: what does not fit into a slow one's
+queue is lost to that one alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from typing import Any, Final, NamedTuple
+
+import zmq
+from tactomo_client.messages import CONTACTS, EVENT, STATUS, clock_id, encode_message, topic
+
+from tactomo.events import OnEvent
+from tactomo.stream.access_control import STREAM
+from tactomo.stream.subscriptions import SUBSCRIBERS_CUT, Subscribers
+from tactomo.timing import Durations
+from tactomo.worker import Worker
+
+STATUS_PERIOD_S: Final = 1.0
+LINGER_MS: Final = 200
+"""How long messages that were sent may take to leave when the daemon stops."""
+QUEUED_PER_SUBSCRIBER: Final = 64
+MAX_QUEUED: Final = 1024
+
+
+NO_FRAME_YET: Final[dict[str, Any]] = {
+    "acquired_realtime_ns": None,
+    "acquired_monotonic_ns": None,
+    "delay_ns": None,
+    "dated_by": None,
+    "device_us": None,
+    "skew_ms": None,
+    "tier": None,
+    "tier_reason": None,
+    "flags": [],
+    "misfit": None,
+    "confidence": None,
+}
+
+
+class _Outgoing(NamedTuple):
+    kind: str
+    sequence: int
+    header: Mapping[str, Any]
+    fields: Mapping[str, Any]
+
+
+class Publisher(Worker):
+    """Numbers, stamps and sends messages; publishes the status every second, or when asked to.
+
+    `open` it, `start` its thread, `stop` it.
+
+    Args:
+        sensor: the name in every topic.
+        session: identity of this run of the daemon.
+        status: returns the current fields of a `status` message; called by the thread.
+        on_frame: called by the thread with kind and bytes of each frame's message, before it is
+            sent: whatever was seen is in the recording.
+        on_event: told of a flood of subscriptions.
+
+    Attributes:
+        address: where it is bound, once open.
+        subscribers: subscriptions in force.
+        header: the newest frame's; written by the pipeline thread, sent with status and events.
+        latency: from the last byte of a dual scan to the sending of its contacts.
+
+    """
+
+    def __init__(
+        self,
+        sensor: str,
+        session: str,
+        status: Callable[[], Mapping[str, Any]],
+        on_frame: Callable[[str, bytes], None],
+        on_event: OnEvent,
+    ) -> None:
+        super().__init__("publisher")
+        self.address = ""
+        self.subscribers = 0
+        self.header: Mapping[str, Any] = NO_FRAME_YET
+        self.latency = Durations()
+        self._sensor = sensor
+        self._session = session
+        self._status = status
+        self._on_frame = on_frame
+        self._on_event = on_event
+        self._sequence: Counter[str] = Counter()  # the last one of each kind, under _lock
+        self._lock = threading.Lock()
+        self._readers: Subscribers  # this thread's own, as are _socket and _cuts_*
+        self._cuts_seen = self._cuts_told = 0
+        self._prefixes: frozenset[bytes] = frozenset()  # a copy for the other threads
+        self._last_status = b""
+        self._queue: deque[_Outgoing] = deque(maxlen=MAX_QUEUED)
+        self._cut = threading.Event()
+        self._status_asked = threading.Event()
+        self._socket: zmq.Socket[bytes]
+        self._wake_reader = self._wake_writer = -1
+
+    def open(
+        self,
+        context: zmq.Context[zmq.Socket[bytes]],
+        endpoint: str,
+        secret: bytes | None = None,
+    ) -> None:
+        """Bind the stream's socket; raise AddressError where the address cannot be had."""
+        self._socket = context.socket(zmq.XPUB)
+        self._socket.setsockopt(zmq.SNDHWM, QUEUED_PER_SUBSCRIBER)
+        self._readers = Subscribers(self._socket, endpoint, STREAM, secret)
+        self.address = self._readers.address
+        self._wake_reader, self._wake_writer = os.pipe()
+        os.set_blocking(self._wake_reader, False)
+        os.set_blocking(self._wake_writer, False)
+
+    def _close(self) -> None:
+        self._socket.close(LINGER_MS)
+        for descriptor in (self._wake_reader, self._wake_writer):
+            os.close(descriptor)
+
+    def cut_connections(self) -> None:
+        """Have every subscriber connect anew, those who still may; for any thread."""
+        self._cut.set()
+        self._wake()
+
+    def tell_status(self) -> None:
+        """Have the status published now, after what was handed over before; for any thread."""
+        self._status_asked.set()
+        self._wake()
+
+    def wants(self, kind: str) -> bool:
+        """Whether anybody subscribes to this kind of message; for any thread."""
+        name = topic(self._sensor, kind)
+        return any(name.startswith(prefix) for prefix in self._prefixes)
+
+    def publish(
+        self, kind: str, fields: Mapping[str, Any], header: Mapping[str, Any] | None = None
+    ) -> None:
+        """Hand over a message; for any thread, and never waits.
+
+        Args:
+            kind: one of the stream's kinds.
+            fields: the kind's own.
+            header: acquisition, tier, flags and misfit; by default the newest frame's.
+
+        """
+        self._queue.append(self._number(kind, self.header if header is None else header, fields))
+        if not self._stopping.is_set():
+            self._wake()
+
+    def envelope(self, kind: str) -> dict[str, Any]:
+        """Return the envelope of the last message of a kind as of now; for any thread."""
+        return self._stamp(self._sequence[kind], self.header)
+
+    def _number(self, kind: str, header: Mapping[str, Any], fields: Mapping[str, Any]) -> _Outgoing:
+        # Numbered when handed over: should the queue overflow, the gap shows.
+        with self._lock:
+            self._sequence[kind] += 1
+            return _Outgoing(kind, self._sequence[kind], header, fields)
+
+    def _stamp(self, sequence: int, header: Mapping[str, Any]) -> dict[str, Any]:
+        acquired_ns = header["acquired_monotonic_ns"]
+        return {
+            "session": self._session,
+            "sequence": sequence,
+            **header,
+            "clock_id": clock_id(),
+            "age_ns": None if acquired_ns is None else time.monotonic_ns() - acquired_ns,
+        }
+
+    def _run(self) -> None:
+        poller = zmq.Poller()
+        poller.register(self._socket, zmq.POLLIN)
+        poller.register(self._wake_reader, zmq.POLLIN)
+        status_at_s = time.monotonic()
+        while not self._stopping.is_set():
+            wait_s = max(0.0, status_at_s - time.monotonic())
+            for ready, _ in poller.poll(math.ceil(wait_s * 1e3)):
+                if ready is self._socket:
+                    self._read_subscriptions()
+                else:
+                    os.read(self._wake_reader, 4096)
+            self._send_queued()
+            if self._cut.is_set():
+                self._cut.clear()
+                self._readers.cut()
+            if self._status_asked.is_set():
+                self._status_asked.clear()
+                self._send_status()
+            if time.monotonic() >= status_at_s:
+                status_at_s += STATUS_PERIOD_S
+                self._send_status()
+                self._tell_cuts()
+                self.turns += 1
+        self._send_queued()
+
+    def _send_queued(self) -> None:
+        while self._queue:
+            self._send(self._queue.popleft())
+
+    def _send(self, message: _Outgoing) -> bytes:
+        envelope = self._stamp(message.sequence, message.header)
+        data = encode_message(self._sensor, message.kind, {**envelope, **message.fields})
+        if message.kind not in (STATUS, EVENT):
+            self._on_frame(message.kind, data)
+        self._socket.send(data, zmq.DONTWAIT)
+        if message.kind == CONTACTS and envelope["age_ns"] is not None:
+            self.latency.add((envelope["age_ns"] - envelope["delay_ns"]) * 1e-9)
+        return data
+
+    def _send_status(self) -> None:
+        self._last_status = self._send(self._number(STATUS, self.header, self._status()))
+
+    def _tell_cuts(self) -> None:
+        """Tell that subscribers were cut off, a second later: then they are back to hear it."""
+        if self._cuts_seen > self._cuts_told:
+            self._cuts_told = self._cuts_seen
+            self._on_event("subscribers_cut", "warning", *SUBSCRIBERS_CUT)
+        self._cuts_seen = self._readers.cuts
+
+    def _read_subscriptions(self) -> None:
+        """Take note of who comes and goes; a newcomer to the status gets the last one at once."""
+        status, repeat = topic(self._sensor, STATUS), False
+        for joins, prefix in self._readers.changes():
+            repeat = repeat or (joins and status.startswith(prefix))
+        self._prefixes = frozenset(self._readers.prefixes)
+        self.subscribers = self._readers.prefixes.total()
+        if repeat and self._last_status:
+            self._socket.send(self._last_status, zmq.DONTWAIT)
+
+    def _wake(self) -> None:
+        if self._wake_writer < 0:  # not open yet
+            return
+        with contextlib.suppress(BlockingIOError):  # full of reasons to wake up already
+            os.write(self._wake_writer, b"\0")

@@ -1,0 +1,61 @@
+"""The base of the daemon's threads: started, watched and stopped in one way.
+
+Who writes what: a worker's attributes without an underscore are written by its own thread alone, or
+before it starts; every thread may read them. Other threads hand a worker something through a queue,
+an event or a future, never by setting an attribute. Where that is not so, a comment says it.
+"""
+
+from __future__ import annotations
+
+import threading
+
+
+class Worker:
+    """One thread; a subclass has the work in `_run`, which returns soon once `_stopping` is set.
+
+    An exception that ends the thread is in the log; then `is_alive` is False.
+
+    Args:
+        name: the thread's.
+        join_s: how long `stop` waits for the thread at most, in seconds, where it may hang in the
+            operating system; None to wait until it ends.
+
+    Attributes:
+        name: the thread's.
+        turns: how often the thread went round its loop; the watchdog goes by them.
+
+    """
+
+    def __init__(self, name: str, join_s: float | None = None) -> None:
+        self.name = name
+        self.turns = 0
+        self._join_s = join_s
+        self._stopping = threading.Event()
+        # A thread that may hang for ever must not keep the process from ending.
+        self._thread = threading.Thread(target=self._run, name=name, daemon=join_s is not None)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread, and give back what it holds."""
+        self._stopping.set()
+        self._wake()
+        if self._thread.is_alive():
+            self._thread.join(self._join_s)
+        self._close()
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the thread runs."""
+        return self._thread.is_alive()
+
+    def _run(self) -> None:
+        raise NotImplementedError
+
+    def _wake(self) -> None:
+        """Have a thread that waits look at `_stopping`."""
+
+    def _close(self) -> None:
+        """Give back sockets, ports and files, once the thread has ended."""

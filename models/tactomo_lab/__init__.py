@@ -1,0 +1,1 @@
+"""What a researcher adds: evaluation, training, charts, the paper's and other baselines."""

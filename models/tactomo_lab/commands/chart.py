@@ -1,0 +1,219 @@
+"""The chart of `tactomo bench`: every method's speed against its accuracy, on simulated scenes.
+
+Still scenes at three signal-to-noise ratios and moving ones, all with reporting seeds. The points
+go into a table of comma-separated values beside the picture (`bench_chart_picture`).
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import typer
+from rich.console import Console
+from rich.progress import Progress
+from tactomo.cli.bench.machine_speed import warned_if_busy
+from tactomo.cli.plot.plot import prepare_file, prepare_picture, save_figure
+from tactomo.errors import TactomoError
+from tactomo_models import SensorDescription, available_methods, load_description
+
+from tactomo_lab.evaluation import moving
+from tactomo_lab.evaluation.still import Variant
+from tactomo_lab.evaluation.trade_off import (
+    STILL_BUDGETS_S,
+    Point,
+    left_out,
+    measure_moving,
+    measure_still,
+    panels,
+    pareto_front,
+    variants,
+)
+from tactomo_lab.scenes.still_scenes import scenes as draw_scenes
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+STILL_SNR_DB: Final = (40.0, 20.0, 10.0)
+MOVING_SNR_DB: Final = 40.0
+CONTACTS: Final = (1, 2, 3, 4)
+SCENES_A_SEQUENCE: Final = 5  # a sequence has 146 frames
+SEEDS: Final = "reporting"
+
+
+def chart(
+    name: str, picture: Path, count: int, machine: str, methods: Sequence[str] = ()
+) -> tuple[list[dict[str, Any]], Table]:
+    """Measure methods, and write the picture and a table (.csv) beside it.
+
+    Args:
+        name: of the sensor, or its description's path.
+        picture: a .png, .svg or .pdf.
+        count: still scenes of each number of contacts.
+        machine: what the times are those of.
+        methods: to be measured; every available one if there is none.
+
+    Returns:
+        A row for each point of the chart, and a table of the Pareto fronts to print.
+
+    Raises:
+        TactomoError: a file cannot be written, or matplotlib is missing.
+        ModelError: there are no scenes for such a sensor, or a method of the user's own failed.
+    """
+    from tactomo_lab.commands.chart_picture import draw_chart
+
+    prepare_picture(picture)
+    prepare_file(table_path(picture))
+    points = measure_chart(name, count, methods)
+    rows = rows_of(points)
+    write_table(rows, machine, table_path(picture))
+    moving_scenes = sequences(count)
+    title = (
+        f"Simulated, not measured on hardware: sensor {name}, reporting seeds; "
+        f"{count} still scenes each of 1 to 4 contacts, {moving_scenes} moving "
+        f"scene{'s' * (moving_scenes > 1)}\none thread of {machine}; figures at points: "
+        "budget of modelled work; pale: something else is both faster and better"
+    )
+    save_figure(draw_chart(points, title), picture)
+    typer.echo(f"wrote {picture} and {table_path(picture)}", err=True)
+    return rows, table_of(points)
+
+
+def table_path(picture: Path) -> Path:
+    """Return where the points are written: beside the picture."""
+    return picture.with_suffix(".csv")
+
+
+def sequences(count: int) -> int:
+    """Return how many moving scenes go with `count` still ones of each number of contacts."""
+    return -(-count // SCENES_A_SEQUENCE)
+
+
+def measure_chart(name: str, count: int, methods: Sequence[str] = ()) -> list[Point]:
+    """Measure methods, with a progress bar in the terminal.
+
+    Args:
+        name: of the sensor, or its description's path.
+        count: still scenes of each number of contacts.
+        methods: to be measured; every available one if there is none.
+
+    Raises:
+        ModelError: there are no scenes for such a sensor, or a method of the user's own failed.
+    """
+    sensor = load_description(name)
+    methods = usable(sensor, methods or available_methods())
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        still = [
+            list(
+                progress.track(
+                    draw_scenes(sensor, SEEDS, count, contacts=CONTACTS, snr_db=snr_db),
+                    total=count * len(CONTACTS),
+                    description=f"simulating still scenes, {snr_db:g} dB",
+                )
+            )
+            for snr_db in STILL_SNR_DB
+        ]
+        numbers = progress.track(range(sequences(count)), description="simulating moving scenes")
+        played = [moving.draw_sequence(sensor, SEEDS, n, snr_db=MOVING_SNR_DB) for n in numbers]
+        points: list[Point] = []
+        with warned_if_busy():
+            for scenes in still:
+                asked = variants(methods, STILL_BUDGETS_S)
+                what = f"measuring on still scenes, {scenes[0].snr_db:g} dB"
+                task = progress.add_task(what, total=len(scenes) * len(asked))
+                points += measure_still(scenes, asked, partial(progress.advance, task))
+            points += follow(played, variants(methods), progress)
+    return points
+
+
+def usable(sensor: SensorDescription, methods: Sequence[str]) -> list[str]:
+    """Return the methods that serve a sensor; say on standard error why others are left out."""
+    missing = left_out(sensor, methods)
+    for method, reason in missing.items():
+        typer.echo(f"left out: {method}: {reason}", err=True)
+    return [method for method in methods if method not in missing]
+
+
+def follow(
+    sequences: Sequence[moving.Sequence], asked: Sequence[Variant], progress: Progress
+) -> list[Point]:
+    """Measure variants on moving scenes, a bar for each of them."""
+    points: list[Point] = []
+    for variant in asked:
+        frames = sum(len(sequence.steps) for sequence in sequences)
+        task = progress.add_task(f"measuring on moving scenes: {variant}", total=frames)
+        points += measure_moving(sequences, [variant], partial(progress.advance, task))
+        progress.remove_task(task)
+    return points
+
+
+def rows_of(points: Sequence[Point]) -> list[dict[str, Any]]:
+    """Return the points as flat rows, for JSON and tables; in each panel the fastest first."""
+    rows = []
+    for panel in panels(points):
+        front = pareto_front(panel)
+        for point in sorted(panel, key=lambda p: p.p50_s):
+            row = asdict(point)
+            variant, p50_s, p99_s = row.pop("variant"), row.pop("p50_s"), row.pop("p99_s")
+            budget_s = variant["budget_s"]
+            rows.append(
+                {
+                    "scene": row.pop("scene"),
+                    "snr_db": row.pop("snr_db"),
+                    "method": str(variant["method"]),
+                    "budget_ms": None if budget_s is None else budget_s * 1e3,
+                    "p50_ms": p50_s * 1e3,
+                    "p99_ms": p99_s * 1e3,
+                    **row,
+                    "on_front": point in front,
+                }
+            )
+    return rows
+
+
+def write_table(rows: Sequence[dict[str, Any]], machine: str, path: Path) -> None:
+    """Write the chart's rows as comma-separated values, each with the machine it was measured on.
+
+    Raises:
+        TactomoError: the file cannot be written.
+    """
+    try:
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, [*rows[0], "simulated", "seeds", "threads", "machine"])
+            writer.writeheader()
+            for row in rows:
+                shown = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()}
+                how = {"simulated": True, "seeds": SEEDS, "threads": 1, "machine": machine}
+                writer.writerow({**shown, **how})
+    except OSError as error:
+        raise TactomoError(
+            f"cannot write {path}: {error.strerror}",
+            "name a picture in a folder that you may write",
+        ) from error
+
+
+def table_of(points: Sequence[Point]) -> Table:
+    """Lay out the Pareto fronts: that than which nothing is both faster and more right."""
+    from rich.table import Table
+
+    table = Table(title="Pareto fronts (simulated, one thread): the best for its time")
+    for name in ("scenes", "method", "p50 ms", "p99 ms", "ICC", "worst", "count", "wrong"):
+        table.add_column(name, justify="left" if name in ("scenes", "method") else "right")
+    for panel in panels(points):
+        for point in pareto_front(panel):
+            table.add_row(
+                f"{point.scene}, {point.snr_db:g} dB",
+                str(point.variant),
+                f"{point.p50_s * 1e3:.1f}",
+                f"{point.p99_s * 1e3:.1f}",
+                f"{point.icc:.3f}",
+                f"{point.icc_worst:.2f}",
+                f"{point.count_right:.0%}",
+                f"{point.confidently_wrong:.0%}",
+            )
+        table.add_section()
+    return table

@@ -1,0 +1,300 @@
+"""`tactomo models simulate` and `train`: scenes to learn from, and the networks that do."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+
+import typer
+from tactomo.cli.options import DEFAULT_DESCRIPTION, Description, JsonOutput, examples, typer_app
+from tactomo.errors import TactomoError
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+    from tactomo_lab.training.configurations import Prepared
+    from tactomo_lab.training.train import Epoch, Settings, Training
+
+EXTRA = frozenset({"joblib", "onnx", "onnxscript", "torch"})
+INTERRUPTED = 130
+
+# The models' CONFIGURATIONS, which are not imported for a command line that only shows its help.
+ConfigurationName: TypeAlias = Literal[
+    "ours", "ours-small", "ours-single", "refiner", "paper-single", "paper-multimodal"
+]
+
+app = typer_app()
+
+
+@app.command(
+    epilog=examples(
+        "tactomo models simulate scenes/robust",
+        "tactomo models simulate scenes/paper --preset paper",
+        "tactomo models simulate scenes/mine -d my_skin.toml --scenes 8000 --jobs 4",
+    ),
+)
+def simulate(
+    folder: Annotated[Path, typer.Argument(help="Where the scenes go; made if missing.")],
+    preset: Annotated[
+        Literal["paper", "robust"],
+        typer.Option(
+            help="As the paper's, or with errors as real skins have them and any contacts."
+        ),
+    ] = "robust",
+    scenes: Annotated[
+        int | None, typer.Option(min=1, help="How many. [paper: 12000, robust: 24000]")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the whole set.")] = 0,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Processes. [one for each core]", show_default=False)
+    ] = None,
+    sensor: Description = DEFAULT_DESCRIPTION,
+    as_json: JsonOutput = False,
+) -> None:
+    """Simulate scenes to train networks on: voltages of both channels, and the truth.
+
+    Ctrl-C stops it, and the same command goes on where it stopped; with a larger --scenes a
+    finished set grows. Scenes depend on the preset, the seed and their number alone, whatever
+    makes them, and none is one of `tactomo evaluate`. Reckon with a tenth of a second for each on
+    one core, and 2 MB for a thousand.
+
+    *paper*: one to four ellipses that do not overlap, 0.75 to 0.95 S/m on an even sheet of 1 S/m,
+    100 S/m in the structure channel. *robust*: none to six contacts of several shapes, flat or
+    domed, lighter and heavier than the range as well; both signs; contrast 10 to 100; uneven
+    sheets; uneven, displaced and now and then weak electrodes. Noise is added in training.
+
+    Needs `pip install 'tactomo-lab[train]'`.
+    """
+    from tactomo_models import load_description
+
+    from tactomo_lab.scenes.presets import SCENES
+    from tactomo_lab.training.training_scenes import simulate as simulate_scenes
+
+    description = load_description(sensor)
+    total = scenes or SCENES[preset]
+    steps = simulate_scenes(description, preset, folder, total, seed=seed, jobs=jobs or -1)
+    with _training_extra():
+        before, now = _follow(steps, total, f"{preset} scenes", folder)
+    if as_json:
+        settings = {"folder": str(folder), "preset": preset, "seed": seed}
+        counts = {"scenes": before + now, "new": now}
+        typer.echo(json.dumps({**settings, "sensor": description.name, **counts}))
+    else:
+        typer.echo(f"{folder}: {total} {preset} scenes, {now} of them new")
+
+
+@app.command(
+    epilog=examples(
+        "tactomo models train scenes/robust",
+        "tactomo models train scenes/robust --epochs 5 --output trial.onnx",
+        "tactomo models train scenes/robust --configuration refiner --start scenes/robust/ours.pt",
+        "tactomo models train scenes/paper --configuration paper-multimodal --device cuda",
+    ),
+)
+def train(
+    folder: Annotated[Path, typer.Argument(help="Scenes, from `tactomo models simulate`.")],
+    configuration: Annotated[
+        ConfigurationName, typer.Option(help="Which network, see above.")
+    ] = "ours",
+    epochs: Annotated[
+        int | None, typer.Option(min=1, help="Passes over the scenes. [the configuration's]")
+    ] = None,
+    batch: Annotated[
+        int | None, typer.Option(min=1, help="Scenes in a step. [the configuration's]")
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option(min=1e-6, max=1.0, help="Learning rate. [the configuration's]")
+    ] = None,
+    start: Annotated[
+        Path | None, typer.Option(help="Begin with the weights of this checkpoint.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of weights, order, noise and turns.")] = 0,
+    device: Annotated[Literal["cpu", "cuda"], typer.Option(help="What computes.")] = "cpu",
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Processes and threads. [one for each core]")
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="The network. [the cache, where tactomo looks]"),
+    ] = None,
+    checkpoint: Annotated[
+        Path | None, typer.Option(help="What to go on from. [FOLDER/RECIPE.pt]")
+    ] = None,
+    sensor: Description = DEFAULT_DESCRIPTION,
+    as_json: JsonOutput = False,
+) -> None:
+    """Train a network on simulated scenes and export it to ONNX.
+
+    A checkpoint is kept after each epoch: Ctrl-C stops, and the same command goes on, to the same
+    network as without the stop. Some of the scenes are held out; what is shown of them is the
+    correlation (ICC) of the found map with the truth, by noise and number of contacts.
+
+    *ours* takes both channels' voltages, *ours-small* is half as wide, *ours-single* has the
+    magnitude channel alone; *refiner* redraws what the physics has found with the help of *ours*,
+    which is trained first: give its checkpoint by --start. All these want the preset robust.
+    *paper-single* and *paper-multimodal* are the paper's, on scenes of the preset paper. What the
+    physics makes of the scenes, for the refiner and the paper's two, is computed first and kept
+    beside them. All take one to two hours on two cores.
+
+    A network that is written to the cache is used from then on for this sensor, instead of the one
+    that ships; delete it to go back. Needs `pip install 'tactomo-lab[train]'`.
+    """
+    with _training_extra():
+        from tactomo_models import load_description
+        from tactomo_models.methods.trained_networks import own_path
+
+        from tactomo_lab.training.configurations import CONFIGURATIONS, export_trained
+        from tactomo_lab.training.train import use
+
+        use(device, jobs)
+        description, chosen = load_description(sensor), CONFIGURATIONS[configuration]
+        settings = replace(chosen.settings, seed=seed, device=device)
+        settings = replace(
+            settings,
+            epochs=epochs or settings.epochs,
+            batch=batch or settings.batch,
+            rate=rate or settings.rate,
+        )
+        prepared = _prepare(configuration, folder, sensor, seed, jobs, start)
+        kept = checkpoint or folder / f"{configuration}.pt"
+        training = _train(prepared, settings, kept, configuration)
+        written = output or own_path(description, chosen.kind)
+        export_trained(prepared, training, written)
+    if as_json:
+        told = {
+            "configuration": configuration,
+            "folder": str(folder),
+            "simulated": True,
+            "output": str(written),
+        }
+        history = [_as_json(epoch) for epoch in training.history]
+        typer.echo(json.dumps({**told, **asdict(settings), "history": history}, indent=2))
+    else:
+        typer.echo(f"wrote {written}: {written.stat().st_size / 1e6:.1f} MB")
+
+
+def _prepare(
+    configuration: str, folder: Path, sensor: str, seed: int, jobs: int | None, start: Path | None
+) -> Prepared:
+    """Read the scenes; some networks need to see first what other methods make of them."""
+    from rich.console import Console
+    from tactomo_models import load_description
+
+    from tactomo_lab.training.configurations import CONFIGURATIONS, check_scenes, prepare
+    from tactomo_lab.training.preliminary import make_images
+    from tactomo_lab.training.refiner_inputs import MAX_REFINER_SCENES, make_refiner_inputs
+    from tactomo_lab.training.training_scenes import read_manifest
+
+    description, chosen = load_description(sensor), CONFIGURATIONS[configuration]
+    check_scenes(chosen, folder, description)
+    scenes = read_manifest(folder).scenes
+    if chosen.kind == "refiner":
+        scenes = min(scenes, MAX_REFINER_SCENES)
+        steps = make_refiner_inputs(description, folder, scenes, jobs=jobs or -1)
+        _follow(steps, scenes, "scenes reconstructed by the physics", folder)
+    elif chosen.kind != "network":
+        steps = make_images(description, folder, jobs=jobs or -1)
+        _follow(steps, scenes, "images of the scenes", folder)
+    with Console(stderr=True).status(f"reading {folder}"):
+        return prepare(chosen, folder, description, seed, start)
+
+
+def _train(
+    prepared: Prepared, settings: Settings, checkpoint: Path, configuration: str
+) -> Training:
+    """Train to the end, and print what each epoch came to."""
+    from rich.console import Console
+
+    from tactomo_lab.training.train import begin, load_checkpoint, train
+
+    console = Console(stderr=True)
+    training = begin(prepared.network, settings)
+    if checkpoint.exists():
+        load_checkpoint(training, settings, checkpoint)
+        console.print(f"going on after epoch {len(training.history)}, from {checkpoint}")
+    with _progress() as shown:
+        task = shown.add_task("")
+
+        def report(step: int, steps: int, loss: float) -> None:
+            epoch = len(training.history)
+            name = f"{configuration}, epoch {epoch + 1} of {settings.epochs}, loss {loss:.4f}"
+            done = epoch * steps + step
+            shown.update(task, description=name, total=settings.epochs * steps, completed=done)
+
+        try:
+            for epoch in train(training, prepared.objective, settings, checkpoint, report):
+                line = _in_words(epoch, len(training.history))
+                shown.console.print(line, highlight=False, soft_wrap=True)
+        except KeyboardInterrupt:
+            what = f"{checkpoint} has {len(training.history)} of {settings.epochs} epochs"
+            raise _stopped(what) from None
+    return training
+
+
+def _stopped(what: str) -> typer.Exit:
+    typer.echo(f"stopped: {what}; run the same command again, it goes on there", err=True)
+    return typer.Exit(INTERRUPTED)
+
+
+def _in_words(epoch: Epoch, number: int) -> str:
+    """One line: the loss, and the held-out correlations of each level of noise."""
+    rows: dict[str, list[tuple[str, float]]] = {}
+    for name, value in epoch.held_out.items():  # by names such as "40 dB, 2"
+        noise, _, contacts = name.rpartition(", ")
+        rows.setdefault(noise, []).append((contacts, value))
+    names = "/".join(name for name, _ in next(iter(rows.values()), []))
+    parts = [
+        f"{noise} " + "/".join("–" if math.isnan(icc) else f"{icc:.3f}" for _, icc in row)
+        for noise, row in rows.items()
+    ]
+    return f"epoch {number}: loss {epoch.loss:.4f}; held-out ICC ({names}): {', '.join(parts)}"
+
+
+def _as_json(epoch: Epoch) -> dict[str, Any]:
+    held_out = {name: None if math.isnan(v) else v for name, v in epoch.held_out.items()}
+    return {"loss": epoch.loss, "held_out": held_out}
+
+
+def _follow(steps: Iterator[int], total: int, what: str, folder: Path) -> tuple[int, int]:
+    """Show the progress of a simulation.
+
+    Returns:
+        How many scenes were there before, and how many are new.
+    """
+    before = done = next(steps)
+    with _progress() as shown:
+        task = shown.add_task(what, total=total, completed=before)
+        try:
+            for more in steps:
+                done += more
+                shown.advance(task, more)
+        except KeyboardInterrupt:
+            raise _stopped(f"{folder} has {done} of {total} scenes") from None
+    return before, done - before
+
+
+def _progress() -> Progress:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    return Progress(console=Console(stderr=True), transient=True, speed_estimate_period=600)
+
+
+@contextmanager
+def _training_extra() -> Iterator[None]:
+    """Tell what to install where a package that only training needs is missing."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] not in EXTRA:
+            raise
+        raise TactomoError(
+            f"training needs {error.name}, which is not installed",
+            "pip install 'tactomo-lab[train]'; without a GPU, install the smaller PyTorch for CPUs "
+            "first: see https://pytorch.org/get-started",
+        ) from error

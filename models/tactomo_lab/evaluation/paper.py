@@ -1,0 +1,612 @@
+"""The paper's evaluation, repeated on simulated skins (Chen et al., sections IV and V).
+
+Its simulation study (Fig. 5) is repeated as it is described: one to four ellipses that conduct
+worse than an even sheet, a contrast of 100 in the structure channel, white Gaussian noise. "SNR of
+the data" is read as that of the voltage *changes*, which are the data of its equations.
+
+Its experiments (Figs. 7 to 12) were made with hardware: round indenters on a real skin. Here they
+are made with simulated ones, `Rig`: sheets uneven by 5 %, contact impedances by 20 %, conductivity
+that rises under pressure, noise of equal size on every voltage, one scan a press after one tare.
+The paper has one sensor; here several sheets tell what is chance.
+
+Nothing that inverts knows the mesh that simulates; see `simulation`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations, product
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from scipy.interpolate import RegularGridInterpolator
+from tactomo_models.arrays import FloatArray
+from tactomo_models.batch import BUDGET_S
+from tactomo_models.physics.artifact import Artifact, load_or_build_artifact
+from tactomo_models.reconstruct import Reconstructor
+from tactomo_models.scans.reference import Reference
+from tactomo_models.scene.contacts import Contact
+from tactomo_models.scene.press import Press
+from tactomo_models.scene.reconstruction import Reconstruction
+from tactomo_models.sensor.description import SensorDescription
+from tactomo_protocol import Channel
+from threadpoolctl import threadpool_limits
+
+from tactomo_lab.evaluation.still import Outcome
+from tactomo_lab.scenes.cache import cached
+from tactomo_lab.scenes.measures import Summary, correlation, full_range, summarise
+from tactomo_lab.scenes.presets import PAPER_CONTACTS, PAPER_CONTRAST, paper_presses
+from tactomo_lab.scenes.simulation import Truth, UnevenSkin, Volts, fine_mesh, truth_of
+from tactomo_lab.scenes.still_scenes import (
+    BOTH_CHANNELS,
+    REFERENCE_SCANS,
+    SIMULATION,
+    EvaluationScene,
+    Layout,
+    SeedSet,
+    SimulatedVolts,
+    Simulation,
+    measure,
+    noise_std,
+    require_both_channels,
+    seed_of,
+)
+
+# The paper's three, then ours.
+PAPER_METHODS: Final = ("tikhonov", "cnn-single", "cnn-multimodal")
+DEFAULT_METHODS: Final = (*PAPER_METHODS, "network", "auto")
+
+SNR_DB: Final = (float("inf"), 40.0, 20.0, 10.0)  # of Fig. 5
+COUNTS: Final = tuple(range(1, PAPER_CONTACTS + 1))
+SCENES: Final = 100  # of each number of contacts, likewise
+
+PAPER_WIDTH_MM: Final = 150.0  # places and sizes are shares of it on another sensor
+RIG_SNR_DB: Final = 60.0  # of the voltages at rest: a tank that was measured had 58
+SHEETS: Final = 3
+RESPONSE_KPA: Final = tuple(float(kpa) for kpa in range(0, 201, 20))  # of Fig. 7
+CASE_KPA: Final = (140.0, 160.0, 180.0, 200.0)  # of Figs. 8 and 9
+TOP_SHARE: Final = 0.75  # of an image's maximum, above which values are averaged (V-C-2)
+GRID_MM: Final = 18.0  # of the holes that indenters are held by
+
+# What the paper prints, measured on hardware. Figs. 8 and 9: the magnitude error, and the pressure
+# at which the error was that large, kPa. Fig. 10: mean and standard deviation, mm.
+PAPER_MAGNITUDE_ERROR: Final = {
+    "tikhonov": (0.76, 200.0),
+    "cnn-single": (0.57, 160.0),
+    "cnn-multimodal": (0.21, 180.0),
+}
+PAPER_LOCALISATION_MM: Final = {
+    "tikhonov": (7.7, 6.6),
+    "cnn-single": (7.6, 5.8),
+    "cnn-multimodal": (6.4, 5.5),
+}
+
+
+# ------------------------------------------------------------------ Fig. 5: simulation study
+
+
+def paper_scenes(
+    description: SensorDescription,
+    seed_set: SeedSet,
+    count: int = SCENES,
+    *,
+    contacts: Iterable[int] = COUNTS,
+    snr_db: float = 40.0,
+    cache: Path | None = None,
+) -> Iterator[EvaluationScene]:
+    """Test scenes of Fig. 5, drawn as the paper's training scenes are but from other seeds.
+
+    Args:
+        description: the sensor; needs both channels.
+        seed_set: see `scenes.scenes`.
+        count: scenes of each number of contacts; the paper has 100.
+        contacts: how many contacts.
+        snr_db: of the voltage changes.
+        cache: folder of simulated voltages; in the user's cache if None.
+
+    Raises:
+        DataError: the sensor has a single channel, or no room for that many contacts.
+    """
+    require_both_channels(description)
+    assert description.magnitude is not None
+    opposite = description.magnitude.response.sign > 0  # the paper's conductivity falls
+    simulation = Simulation(description, cache, even=True)
+    for contact_count in contacts:
+        for number in range(count):
+            rng = np.random.default_rng(seed_of(seed_set, "paper", contact_count, number))
+            presses = paper_presses(description, rng, contact_count)
+            layout = Layout(seed_set, number, presses, "ellipse", PAPER_CONTRAST, opposite)
+            volts = simulation.voltages(layout)
+            yield measure(volts, layout, description, snr_db, "change")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One point of Fig. 5: a method's measures over the scenes of one count and ratio."""
+
+    method: str
+    snr_db: float
+    contacts: int
+    summary: Summary
+
+
+def cells(outcomes: Iterable[Outcome]) -> list[Cell]:
+    """Points of Fig. 5 from what became of its scenes, which need not be kept."""
+    scores: dict[tuple[str, float, int], list[Any]] = {}
+    for outcome in outcomes:
+        score = outcome.score
+        scores.setdefault((outcome.method, score.snr_db, len(score.contacts)), []).append(score)
+    return [Cell(*key, summarise(of_cell)) for key, of_cell in scores.items()]
+
+
+# ------------------------------------------------------------------ Figs. 7 to 12: experiments
+
+
+@dataclass(frozen=True)
+class Area:
+    """A round indenter, on the paper's sensor of 150 mm."""
+
+    x_mm: float
+    y_mm: float
+    diameter_mm: float = 30.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """One arrangement of indenters, pressed in one or more ways.
+
+    Attributes:
+        number: the paper's.
+        areas: A1, A2, ...
+        pressures_kpa: of each area, for each way.
+        ours: whether the arrangement is ours: the paper shows its own in a picture alone.
+    """
+
+    number: int
+    areas: tuple[Area, ...]
+    pressures_kpa: tuple[tuple[float, ...], ...]
+    ours: bool = False
+
+
+def _single(number: int, x_mm: float, y_mm: float, diameter_mm: float) -> Case:
+    return Case(number, (Area(x_mm, y_mm, diameter_mm),), tuple((kpa,) for kpa in CASE_KPA))
+
+
+LOW, HIGH = CASE_KPA[0], CASE_KPA[-1]
+BOTH_WAYS: Final = tuple(product((LOW, HIGH), repeat=2))
+SINGLE: Final = (
+    _single(1, 0, 0, 30),
+    _single(2, 36, 36, 30),
+    _single(3, 0, 0, 40),
+    _single(4, 36, 36, 40),
+)
+TWO: Final = (
+    Case(5, (Area(0, 0), Area(36, 36)), BOTH_WAYS),
+    Case(6, (Area(-36, -36, 40), Area(36, 36)), BOTH_WAYS),
+)
+MORE: Final = (
+    Case(7, (Area(-36, -36), Area(36, -36), Area(0, 36)), ((HIGH, LOW, HIGH),), ours=True),
+    Case(8, (Area(-36, 36, 40), Area(36, 36), Area(0, -36)), ((LOW, HIGH, LOW),), ours=True),
+    Case(
+        9,
+        (Area(-36, -36), Area(36, -36), Area(36, 36), Area(-36, 36)),
+        ((HIGH, LOW, LOW, HIGH),),
+        ours=True,
+    ),
+    Case(
+        10,
+        (Area(-36, -36, 40), Area(36, -36), Area(36, 36), Area(-36, 36, 40)),
+        ((HIGH, LOW, HIGH, LOW),),
+        ours=True,
+    ),
+)
+# Fig. 10 is one area pressed in turn in 25 places, which have no number of their own.
+PLACES_MM: Final = tuple(product(GRID_MM * np.arange(-2, 3), repeat=2))
+LOCALISATION: Final = tuple(
+    Case(0, (Area(float(x_mm), float(y_mm)),), ((HIGH,),)) for y_mm, x_mm in PLACES_MM
+)
+RESPONSE: Final = Case(0, (Area(36, 36),), tuple((kpa,) for kpa in RESPONSE_KPA))
+
+
+def presses_of(
+    description: SensorDescription, case: Case, pressures_kpa: Sequence[float]
+) -> tuple[Press, ...]:
+    """A case's indenters on a sensor, of the same share of its width as on the paper's."""
+    millimetre_m = description.width_m / PAPER_WIDTH_MM
+    return tuple(
+        Press(
+            area.x_mm * millimetre_m,
+            area.y_mm * millimetre_m,
+            kpa,
+            area.diameter_mm / 2 * millimetre_m,
+        )
+        for area, kpa in zip(case.areas, pressures_kpa, strict=True)
+    )
+
+
+class Rig:
+    """The paper's experiment platform (Fig. 6), simulated: a tared sensor, pressed and measured.
+
+    Args:
+        description: the sensor; needs both channels.
+        seed_set: see `scenes.scenes`.
+        sheet: number of the sensor, each uneven in its own way.
+        snr_db: of the voltages at rest.
+        cache: folder of simulated voltages; in the user's cache if None.
+
+    Raises:
+        DataError: the sensor has a single channel.
+    """
+
+    def __init__(
+        self,
+        description: SensorDescription,
+        seed_set: SeedSet,
+        sheet: int,
+        *,
+        snr_db: float = RIG_SNR_DB,
+        cache: Path | None = None,
+    ) -> None:
+        require_both_channels(description)
+        self.description = description
+        self.sheet = sheet
+        self._seed_set = seed_set
+        self._folder = cache
+        rest = self._clean(())
+        volts = SimulatedVolts(rest, rest)
+        self._noise = {name: noise_std(volts, name, snr_db, "voltage") for name in BOTH_CHANNELS}
+        self.reference = Reference.from_scans(
+            *(self._noisy(rest, (), REFERENCE_SCANS)[name] for name in BOTH_CHANNELS)
+        )
+
+    @cached_property
+    def _skin(self) -> UnevenSkin:
+        seed = seed_of(self._seed_set, "paper sheet", self.sheet)
+        return UnevenSkin(self.description, fine_mesh(self.description), seed)
+
+    def _clean(self, presses: tuple[Press, ...]) -> Volts:
+        what = f"{SIMULATION} paper {self._seed_set} {self.sheet} {presses!r} "
+        what += self.description.model_dump_json()
+
+        def simulate() -> dict[str, FloatArray]:
+            return {str(name): scan for name, scan in self._skin.voltages(presses).items()}
+
+        volts = cached(self._folder, what, simulate)
+        return {name: volts[name] for name in BOTH_CHANNELS}
+
+    def _noisy(self, clean: Volts, presses: tuple[Press, ...], scans: int) -> Volts:
+        rng = np.random.default_rng(seed_of(self._seed_set, f"paper noise {presses}", self.sheet))
+        return {
+            name: volts + self._noise[name] * rng.standard_normal((scans, len(volts)))
+            for name, volts in clean.items()
+        }
+
+    def scan(self, presses: tuple[Press, ...]) -> Volts:
+        """One scan (M,) of each channel, volts, with noise."""
+        noisy = self._noisy(self._clean(presses), presses, 1)
+        return {name: scans[0] for name, scans in noisy.items()}
+
+
+@dataclass(frozen=True)
+class Response:
+    """A point of Fig. 7.
+
+    Attributes:
+        sheet: number of the sensor.
+        pressure_kpa: of the indenter.
+        peak: maximum of each channel's Tikhonov image, relative conductivity change as a linear
+            image has it.
+    """
+
+    sheet: int
+    pressure_kpa: float
+    peak: dict[Channel, float]
+
+
+def measure_response(rigs: Iterable[Rig]) -> Iterator[Response]:
+    """Fig. 7: what each channel shows of a growing pressure in a sensitive place."""
+    matrix: FloatArray | None = None
+    for rig in rigs:
+        if matrix is None:
+            matrix = load_or_build_artifact(rig.description).tikhonov
+        rest: Volts = {n: v for n in BOTH_CHANNELS if (v := getattr(rig.reference, n)) is not None}
+        for (kpa,) in RESPONSE.pressures_kpa:
+            scan = rig.scan(presses_of(rig.description, RESPONSE, (kpa,)) if kpa else ())
+            # Both conduct better under pressure as shipped; else the image is turned over.
+            changes = {n: (scan[n] - rest[n]) / np.abs(rest[n]) for n in BOTH_CHANNELS}
+            signs = {n: rig.description.sign(n) for n in BOTH_CHANNELS}
+            peak = {n: float((matrix @ (signs[n] * changes[n])).max()) for n in BOTH_CHANNELS}
+            yield Response(rig.sheet, kpa, peak)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a method made of one press of one case.
+
+    Attributes:
+        case: what pressed.
+        pressures_kpa: of each of its areas.
+        sheet: number of the sensor.
+        method: of reconstruction.
+        made: its map and contacts.
+        truth: what a perfect reconstruction would show.
+    """
+
+    case: Case
+    pressures_kpa: tuple[float, ...]
+    sheet: int
+    method: str
+    made: Reconstruction
+    truth: Truth
+
+    @property
+    def image(self) -> FloatArray:
+        """The magnitude map; zeros where none was made."""
+        blank = np.zeros_like(self.truth.map)
+        return blank if self.made.map is None else self.made.map.astype(np.float64)
+
+
+def frames_of(cases: Sequence[Case]) -> int:
+    """How many presses the cases are."""
+    return sum(len(case.pressures_kpa) for case in cases)
+
+
+def image_cases(
+    rigs: Iterable[Rig], cases: Sequence[Case], methods: Sequence[str]
+) -> Iterator[Frame]:
+    """Press each case on each sensor and reconstruct it from a cold start by each method."""
+    artifact: Artifact | None = None
+    for rig in rigs:
+        artifact = artifact or load_or_build_artifact(rig.description)
+        reconstructor = Reconstructor(rig.description, artifact, budget_s=BUDGET_S)
+        reconstructor.set_reference(rig.reference)
+        for case in cases:
+            for pressures_kpa in case.pressures_kpa:
+                presses = presses_of(rig.description, case, pressures_kpa)
+                scan, truth = rig.scan(presses), truth_of(rig.description, presses)
+                for method in methods:
+                    reconstructor.method = method
+                    reconstructor.reset()
+                    with threadpool_limits(1):
+                        made = reconstructor.reconstruct(
+                            scan[Channel.MAGNITUDE], scan[Channel.STRUCTURE]
+                        )
+                    yield Frame(case, pressures_kpa, rig.sheet, method, made, truth)
+
+
+def magnitude_estimate(values: FloatArray, method: str) -> float:
+    """One number for how hard an image, or a part of it, says is pressed (the paper, V-C-2).
+
+    The maximum of a linear image, which is smooth; else the mean of what exceeds 75 % of it.
+    """
+    peak = float(values.max(initial=0.0))
+    if method in ("tikhonov", "noser") or peak == 0:
+        return peak
+    return float(values[values > TOP_SHARE * peak].mean())
+
+
+@dataclass(frozen=True)
+class MagnitudeError:
+    """Figs. 8 and 9 in one number, of one method on one sensor.
+
+    Attributes:
+        method: of reconstruction.
+        sheet: number of the sensor.
+        error: largest minus smallest estimate over the cases at one pressure, at the pressure
+            where that is largest, estimates divided by the largest of them all (0-1
+            normalisation); the paper's definition.
+        pressure_kpa: that pressure.
+        of_range: the same in shares of the sensor's range, the change at 200 kPa.
+        of_contacts: likewise of the magnitudes that the contacts are reported with instead of
+            the image's; NaN where a case has none.
+        rises: share of the cases in which the estimate rises with every step of pressure.
+    """
+
+    method: str
+    sheet: int
+    error: float
+    pressure_kpa: float
+    of_range: float
+    of_contacts: float
+    rises: float
+
+
+def magnitude_errors(
+    frames: Iterable[Frame], description: SensorDescription
+) -> list[MagnitudeError]:
+    """The magnitude error of each method on each sensor, over cases 1 to 4.
+
+    Args:
+        frames: of `SINGLE`.
+        description: the sensor.
+    """
+    groups: dict[tuple[str, int], list[Frame]] = {}
+    for frame in frames:
+        groups.setdefault((frame.method, frame.sheet), []).append(frame)
+    return [_magnitude_error(*key, group, description) for key, group in groups.items()]
+
+
+def _magnitude_error(
+    method: str, sheet: int, frames: Sequence[Frame], description: SensorDescription
+) -> MagnitudeError:
+    full = full_range(description)
+    of_image, of_contact = magnitude_estimates(frames), contact_magnitudes(frames)
+    keys = [[(method, sheet, case.number, kpa) for kpa in CASE_KPA] for case in SINGLE]
+    image = np.array([[of_image[key] for key in row] for row in keys])  # (cases, pressures)
+    contact = np.array([[of_contact[key] for key in row] for row in keys])
+    spread = np.ptp(image, axis=0)
+    worst = int(spread.argmax())
+    largest = float(image.max()) or 1.0
+    return MagnitudeError(
+        method=method,
+        sheet=sheet,
+        error=float(spread[worst]) / largest,
+        pressure_kpa=CASE_KPA[worst],
+        of_range=float(spread[worst]) / full,
+        of_contacts=float(np.ptp(contact, axis=0).max()) / full,
+        rises=float(np.mean((np.diff(image, axis=1) > 0).all(axis=1))),
+    )
+
+
+Estimates = dict[tuple[str, int, int, float], float]  # by method, sensor, case and pressure
+
+
+def magnitude_estimates(frames: Iterable[Frame]) -> Estimates:
+    """What the images of single areas say, see `magnitude_estimate`."""
+    return {_key(frame): magnitude_estimate(frame.image, frame.method) for frame in frames}
+
+
+def contact_magnitudes(frames: Iterable[Frame]) -> Estimates:
+    """What the largest contact of each frame says; NaN where there is none, or it says nothing."""
+    found = {_key(frame): largest_contact(frame.made.contacts) for frame in frames}
+    return {key: contact.magnitude if contact else float("nan") for key, contact in found.items()}
+
+
+def _key(frame: Frame) -> tuple[str, int, int, float]:
+    return frame.method, frame.sheet, frame.case.number, frame.pressures_kpa[0]
+
+
+def largest_contact(contacts: Sequence[Contact]) -> Contact | None:
+    """The one that stands for all where a single one presses; None where there is none."""
+    return max(contacts, key=lambda contact: contact.area_m2, default=None)
+
+
+def image_mass(image: FloatArray, description: SensorDescription) -> tuple[float, float]:
+    """Centroid (x, y) of all of an image, metres; NaN of an empty one.
+
+    The paper locates by it (V-C-3, after its reference 2). Blur and noise anywhere on the sheet
+    have a say in it, which draws it towards the middle.
+    """
+    mass = float(image.sum())
+    if not mass > 0:
+        return float("nan"), float("nan")
+    x = image.sum(axis=0) @ description.map_x_m / mass
+    y = image.sum(axis=1) @ description.map_y_m / mass
+    return float(x), float(y)
+
+
+@dataclass(frozen=True)
+class Localisation:
+    """One arrow of Fig. 10.
+
+    Attributes:
+        method: of reconstruction.
+        sheet: number of the sensor.
+        x_m, y_m: where the indenter was.
+        mass_m: (x, y) of the image's mass.
+        contact_m: (x, y) of the largest contact reported; NaN where there was none.
+        contacts: how many were reported.
+    """
+
+    method: str
+    sheet: int
+    x_m: float
+    y_m: float
+    mass_m: tuple[float, float]
+    contact_m: tuple[float, float]
+    contacts: int
+
+    @property
+    def mass_error_mm(self) -> float:
+        """Distance of the image's mass from the indenter."""
+        return self._distance_mm(self.mass_m)
+
+    @property
+    def contact_error_mm(self) -> float:
+        """Distance of the contact from the indenter."""
+        return self._distance_mm(self.contact_m)
+
+    def _distance_mm(self, place_m: tuple[float, float]) -> float:
+        return 1e3 * float(np.hypot(place_m[0] - self.x_m, place_m[1] - self.y_m))
+
+
+def locate(frame: Frame, description: SensorDescription) -> Localisation:
+    """Where a frame of `LOCALISATION` says that the indenter is."""
+    (true,) = frame.truth.contacts
+    contact = largest_contact(frame.made.contacts)
+    return Localisation(
+        method=frame.method,
+        sheet=frame.sheet,
+        x_m=true.x_m,
+        y_m=true.y_m,
+        mass_m=image_mass(frame.image, description),
+        contact_m=(contact.x_m, contact.y_m) if contact else (float("nan"), float("nan")),
+        contacts=len(frame.made.contacts),
+    )
+
+
+@dataclass(frozen=True)
+class SeveralAreas:
+    """How one frame of two to four areas came out, in numbers for Figs. 11 and 12.
+
+    Attributes:
+        case: the paper's number.
+        pressures_kpa: of its areas.
+        method: of reconstruction.
+        sheet: number of the sensor.
+        icc: of the map.
+        estimates: of each area, see `magnitude_estimate`, from the image within its outline.
+        told_apart: whether, on the way between any two areas, the image falls below half of the
+            paler one.
+        counted: whether as many contacts were reported as press.
+    """
+
+    case: int
+    pressures_kpa: tuple[float, ...]
+    method: str
+    sheet: int
+    icc: float
+    estimates: tuple[float, ...]
+    told_apart: bool
+    counted: bool
+
+    @property
+    def ordered(self) -> tuple[bool, ...]:
+        """Of each pair of areas under unlike pressures: whether the harder pressed reads higher."""
+        return tuple((p - q) * (a - b) > 0 for (p, a), (q, b) in self._pairs() if p != q)
+
+    @property
+    def alike(self) -> tuple[float, ...]:
+        """Of each pair of areas under one pressure: the paler reading over the other one."""
+        return tuple(min(a, b) / (max(a, b) or 1.0) for (p, a), (q, b) in self._pairs() if p == q)
+
+    def _pairs(self) -> Iterator[tuple[tuple[float, float], tuple[float, float]]]:
+        return combinations(zip(self.pressures_kpa, self.estimates, strict=True), 2)
+
+
+def read_areas(frame: Frame, description: SensorDescription) -> SeveralAreas:
+    """Measure a frame of several areas."""
+    presses = presses_of(description, frame.case, frame.pressures_kpa)
+    x, y = np.meshgrid(description.map_x_m, description.map_y_m)
+    inside = [press.coverage(x, y, edge_m=1e-9) > 0.5 for press in presses]
+    estimates = tuple(magnitude_estimate(frame.image[area], frame.method) for area in inside)
+    return SeveralAreas(
+        case=frame.case.number,
+        pressures_kpa=frame.pressures_kpa,
+        method=frame.method,
+        sheet=frame.sheet,
+        icc=correlation(frame.image, frame.truth.map),
+        estimates=estimates,
+        told_apart=_told_apart(frame.image, presses, estimates, description),
+        counted=len(frame.made.contacts) == len(presses),
+    )
+
+
+def _told_apart(
+    image: FloatArray,
+    presses: Sequence[Press],
+    estimates: Sequence[float],
+    description: SensorDescription,
+) -> bool:
+    grid = (description.map_y_m, description.map_x_m)
+    value = RegularGridInterpolator(grid, image)
+    share = np.linspace(0, 1, 101)[:, None]
+    for (one, high), (other, low) in combinations(zip(presses, estimates, strict=True), 2):
+        ends = [np.array([press.y_m, press.x_m]) for press in (one, other)]
+        between = value((1 - share) * ends[0] + share * ends[1])
+        if not between.min() < 0.5 * min(high, low):
+            return False
+    return True

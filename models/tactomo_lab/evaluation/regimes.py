@@ -1,0 +1,431 @@
+"""Where methods fail: a named regime for each thing that goes wrong, and cases drawn of it.
+
+A case is a plan: what presses in one frame or a few, on which sheets, through which device, and
+what of that the reconstructor is not told. Its last frame is the one that is judged. Everything
+else is as in the evaluation's scenes: uneven sheets and electrodes, a contrast of 10 to 100, either
+sign of the magnitude channel, noise of 40 dB of the change.
+
+Lengths are the paper's sensor's; on another one they are scaled by its size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Final
+
+import numpy as np
+from tactomo_models.errors import DataError
+from tactomo_models.scene.press import Press, Profile
+from tactomo_models.sensor.description import SensorDescription
+from tactomo_protocol import Channel
+
+from tactomo_lab.scenes.presets import placed_apart, scale_of
+from tactomo_lab.scenes.simulation import AS_MADE, SheetState
+from tactomo_lab.scenes.still_scenes import (
+    BOTH_CHANNELS,
+    CONTRAST,
+    PRESSURE_KPA,
+    SeedSet,
+    SnrOf,
+    gap_m,
+    outline_of,
+    seed_of,
+)
+
+Range = tuple[float, float]
+
+SETTLED_FRAMES = 6  # of a scene that stays, before something happens
+SLIDE_FRAMES = 4
+CONVERTER_DB = 60.0  # of the voltage, where there is no change for noise to be measured by
+
+
+@dataclass(frozen=True)
+class BadLead:
+    """A lead that opens before the last frame.
+
+    Attributes:
+        electrode: whose it is.
+        level: what its input floats to, times the root mean square of the channel's voltages.
+        current: share of the current that still passes.
+    """
+
+    electrode: int
+    level: float
+    current: float = 1e-3
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A case before it is simulated: what is not a default is what makes it hard.
+
+    Attributes:
+        frames: what presses in each; the last one is judged.
+        contrast: true one of the structure channel.
+        opposite: whether the magnitude channel changes against the description's sign.
+        sign_told: whether the reconstructor knows that.
+        snr_db: signal-to-noise ratio, and `snr_of` what; see `scenes.noise_std`.
+        at_fault: the sheets that `tared`, `later` and `lead` are about.
+        tared: their state at the tare.
+        later: their state in the last frame.
+        lead: a lead of theirs that opens before the last frame.
+        displaced_m: (L,) by how much electrodes sit off along the rim; in place where empty.
+        stretch: relative elongation along x, electrodes and all.
+        behind: by how many scans the structure channel is late in the last frame.
+        lost: how many structure scans are missing at the end.
+        regularisation: factor on what the linear methods' rule chooses.
+    """
+
+    frames: tuple[tuple[Press, ...], ...]
+    contrast: float
+    opposite: bool
+    sign_told: bool = True
+    snr_db: float = 40.0
+    snr_of: SnrOf = "change"
+    at_fault: tuple[Channel, ...] = BOTH_CHANNELS
+    tared: SheetState = AS_MADE
+    later: SheetState = AS_MADE
+    lead: BadLead | None = None
+    displaced_m: tuple[float, ...] = ()
+    stretch: float = 0.0
+    behind: int = 0
+    lost: int = 0
+    regularisation: float = 1.0
+
+
+class Draw:
+    """Draws what a case is made of.
+
+    Args:
+        description: the sensor.
+        rng: of the case.
+        number: of the case: kinds of a regime take turns by it.
+    """
+
+    def __init__(
+        self, description: SensorDescription, rng: np.random.Generator, number: int
+    ) -> None:
+        self.description = description
+        self.rng = rng
+        self.number = number
+        self.mm = 1e-3 * scale_of(description)
+
+    def plan(self, *frames: Sequence[Press]) -> Plan:
+        """A plan of these frames, on any sheet."""
+        return Plan(
+            frames=tuple(tuple(presses) for presses in frames),
+            contrast=float(np.exp(self.rng.uniform(*np.log(CONTRAST)))),
+            opposite=bool(self.rng.integers(2)),
+        )
+
+    def scene(self, pressure_kpa: Range = PRESSURE_KPA) -> tuple[Press, ...]:
+        """One to three ordinary contacts."""
+        return self.apart(1 + self.number % 3, lambda: self.press(pressure_kpa=pressure_kpa))
+
+    def press(
+        self,
+        radius_mm: Range = (8, 18),
+        *,
+        pressure_kpa: Range = PRESSURE_KPA,
+        profile: Profile = "flat",
+        within_mm: float = 75,
+    ) -> Press:
+        """An ellipse, at most half as long again as wide, within so much of the centre."""
+        width = self.rng.uniform(*radius_mm)
+        x, y = self.rng.uniform(-within_mm, within_mm, 2)
+        return Press(
+            x_m=x * self.mm,
+            y_m=y * self.mm,
+            pressure_kpa=self.rng.uniform(*pressure_kpa),
+            radius_m=width * self.mm,
+            radius_y_m=width * self.rng.uniform(2 / 3, 1) * self.mm,
+            angle_rad=self.rng.uniform(0, np.pi),
+            profile=profile,
+        )
+
+    def apart(self, count: int, press: Callable[[], Press], gap_mm: float = 9) -> tuple[Press, ...]:
+        """So many inside the sensing area, outlines at least so far from each other."""
+        return placed_apart(self.description, self.rng, count, gap_mm * self.mm, press)
+
+    def tried(
+        self, draw: Callable[[], Sequence[Press]], *, may_overlap: bool = False
+    ) -> tuple[Press, ...]:
+        """What is drawn, anew until all of it lies inside the sensing area and nothing overlaps.
+
+        Raises:
+            DataError: there is no room.
+        """
+        for _ in range(1000):
+            presses = tuple(draw())
+            apart = may_overlap or all(gap_m(a, b) > 0 for a, b in combinations(presses, 2))
+            if apart and all(self._inside(press) for press in presses):
+                return presses
+        raise DataError(
+            f"no room for {len(presses)} contacts on {self.description.name!r}: its sensing area "
+            "is too small"
+        )
+
+    def _inside(self, press: Press) -> bool:
+        frame_m = self.description.sheet.frame_width_m
+        x, y = outline_of(press)
+        return bool(self.description.on_sheet(x, y, frame_m).all())
+
+    def pair(self, first_mm: Range, second_mm: Range, gap_mm: Range) -> tuple[Press, ...]:
+        """Two round contacts, a gap apart."""
+
+        def two() -> Sequence[Press]:
+            one, other = self.press(first_mm), self.press(second_mm)
+            angle, gap = self.rng.uniform(0, 2 * np.pi), self.rng.uniform(*gap_mm) * self.mm
+            away = one.radius_m + other.radius_m + gap
+            return (
+                replace(one, radius_y_m=None),
+                replace(
+                    other,
+                    radius_y_m=None,
+                    x_m=one.x_m + away * np.cos(angle),
+                    y_m=one.y_m + away * np.sin(angle),
+                ),
+            )
+
+        return self.tried(two)
+
+    def slide(self, step_mm: Range) -> list[tuple[Press, ...]]:
+        """A contact that stays, then slides on for some frames."""
+        length = self.rng.uniform(*step_mm) * self.mm
+
+        def ends() -> Sequence[Press]:
+            start, angle = self.press((8, 14)), self.rng.uniform(0, 2 * np.pi)
+            away = SLIDE_FRAMES * length * np.array([np.cos(angle), np.sin(angle)])
+            return start, replace(start, x_m=start.x_m + away[0], y_m=start.y_m + away[1])
+
+        start, end = self.tried(ends, may_overlap=True)
+        x = np.linspace(start.x_m, end.x_m, SLIDE_FRAMES + 1)[1:].tolist()
+        y = np.linspace(start.y_m, end.y_m, SLIDE_FRAMES + 1)[1:].tolist()
+        path = [replace(start, x_m=a, y_m=b) for a, b in zip(x, y, strict=True)]
+        return [(press,) for press in (*[start] * SETTLED_FRAMES, *path)]
+
+    def electrode(self) -> int:
+        """Any of them."""
+        return int(self.rng.integers(self.description.electrode_count))
+
+    def sheet(self) -> tuple[Channel, ...]:
+        """One of the two."""
+        return (BOTH_CHANNELS[self.rng.integers(2)],)
+
+    def in_turn(self, *kinds: float) -> float:
+        """The kind that is this case's."""
+        return kinds[self.number % len(kinds)]
+
+
+@dataclass(frozen=True)
+class Regime:
+    """One thing that goes wrong.
+
+    Attributes:
+        what: it is, in a sentence.
+        draw: draws a case.
+    """
+
+    what: str
+    draw: Callable[[Draw], Plan]
+
+
+REGIMES: Final[dict[str, Regime]] = {}
+
+
+def regime(name: str, what: str) -> Callable[[Callable[[Draw], Plan]], Callable[[Draw], Plan]]:
+    """Let a function draw the cases of a regime."""
+
+    def add(draw: Callable[[Draw], Plan]) -> Callable[[Draw], Plan]:
+        REGIMES[name] = Regime(what, draw)
+        return draw
+
+    return add
+
+
+@regime("ordinary", "Nothing goes wrong: what the others compare with.")
+def _ordinary(draw: Draw) -> Plan:
+    return draw.plan(draw.scene())
+
+
+@regime("noise", "Noise of 10, 5 or 0 dB of the voltages' change.")
+def _noise_of_change(draw: Draw) -> Plan:
+    return replace(draw.plan(draw.scene()), snr_db=draw.in_turn(10, 5, 0))
+
+
+@regime("converter-noise", "Noise of 40, 30 or 20 dB of the voltages themselves.")
+def _noise_of_voltage(draw: Draw) -> Plan:
+    return replace(draw.plan(draw.scene()), snr_db=draw.in_turn(40, 30, 20), snr_of="voltage")
+
+
+@regime(
+    "weak-centre",
+    "A small contact at the centre, which electrodes see least; alone or with two large ones.",
+)
+def _weak_centre(draw: Draw) -> Plan:
+    def alone() -> tuple[Press, ...]:
+        return (draw.press((4, 7), within_mm=10),)
+
+    def among_others() -> tuple[Press, ...]:
+        return (*alone(), draw.press((14, 18)), draw.press((14, 18)))
+
+    return draw.plan(draw.tried(among_others if draw.number % 2 else alone))
+
+
+@regime("edges", "Contacts against the edges and in the corners.")
+def _edges(draw: Draw) -> Plan:
+    half_x, half_y = np.array([draw.description.width_m, draw.description.height_m]) / 2
+    frame_m = draw.description.sheet.frame_width_m
+
+    def at_the_edge() -> Press:
+        press = draw.press((6, 14))
+        a, b = press.radius_m, press.radius_y_m or press.radius_m
+        far = draw.rng.uniform(0, 2) * draw.mm
+        side = draw.rng.choice([-1, 1], 2)
+        corner = draw.rng.random() < 0.5
+        x = side[0] * (half_x - frame_m - a - far)
+        y = side[1] * (half_y - frame_m - b - far) if corner else press.y_m
+        if not corner and draw.rng.random() < 0.5:
+            x, y = press.x_m, side[1] * (half_y - frame_m - b - far)
+        return replace(press, x_m=float(x), y_m=float(y), angle_rad=0.0)
+
+    return draw.plan(draw.apart(1 + draw.number % 3, at_the_edge))
+
+
+@regime("near-touch", "Two contacts, 1 to 6 mm from touching.")
+def _near_touch(draw: Draw) -> Plan:
+    least = draw.in_turn(1, 3, 5)
+    return draw.plan(draw.pair((8, 14), (8, 14), (least, least + 1)))
+
+
+@regime("many", "Five to eight contacts.")
+def _many(draw: Draw) -> Plan:
+    count = int(draw.in_turn(5, 6, 7, 8))
+    return draw.plan(draw.apart(count, lambda: draw.press((7, 12)), gap_mm=6))
+
+
+@regime("small-by-large", "A small contact beside a large one.")
+def _small_beside_large(draw: Draw) -> Plan:
+    return draw.plan(draw.pair((18, 24), (4, 6), (3, 8)))
+
+
+@regime("light", "5 to 90 kPa: structure not saturated, nothing in the magnitude channel.")
+def _light(draw: Draw) -> Plan:
+    return replace(
+        draw.plan(draw.scene(pressure_kpa=(5, 90))), snr_db=CONVERTER_DB, snr_of="voltage"
+    )
+
+
+@regime("soft-rims", "Balls, under which the pressure falls to the rim.")
+def _soft_rims(draw: Draw) -> Plan:
+    def ball() -> Press:
+        return draw.press((10, 20), pressure_kpa=(170, 260), profile="dome")
+
+    return draw.plan(draw.apart(1 + draw.number % 3, ball))
+
+
+@regime("wrong-contrast", "A contrast of 3 or 1000 where 100 was told.")
+def _wrong_contrast(draw: Draw) -> Plan:
+    return replace(draw.plan(draw.scene()), contrast=draw.in_turn(3, 1000))
+
+
+@regime("wrong-sign", "The magnitude channel changes against the sign told.")
+def _wrong_sign(draw: Draw) -> Plan:
+    return replace(draw.plan(draw.scene()), sign_told=False)
+
+
+@regime("dead-lead", "A lead that opens after the tare.")
+def _dead_lead(draw: Draw) -> Plan:
+    lead = BadLead(draw.electrode(), level=draw.in_turn(0, 3, -3))
+    return replace(draw.plan(draw.scene()), lead=lead, at_fault=draw.sheet())
+
+
+@regime("intermittent", "A lead that opens in the last of many good frames.")
+def _intermittent_lead(draw: Draw) -> Plan:
+    scene = draw.scene()
+    lead = BadLead(draw.electrode(), level=draw.in_turn(0, 3), current=draw.in_turn(1e-3, 0.3))
+    return replace(draw.plan(*[scene] * (SETTLED_FRAMES + 1)), lead=lead, at_fault=draw.sheet())
+
+
+@regime("loose", "An electrode's contact impedance grows 30-fold after the tare.")
+def _loose_electrode(draw: Draw) -> Plan:
+    factors = np.ones(draw.description.electrode_count)
+    factors[draw.electrode()] = 30.0
+    return replace(
+        draw.plan(draw.scene()),
+        later=SheetState(impedance=tuple(factors.tolist())),
+        at_fault=draw.sheet(),
+    )
+
+
+@regime("displaced", "An electrode that sits 2 to 4 mm off its place.")
+def _displaced_electrode(draw: Draw) -> Plan:
+    off = np.zeros(draw.description.electrode_count)
+    off[draw.electrode()] = draw.rng.choice([-1, 1]) * draw.rng.uniform(2, 4) * draw.mm
+    return replace(draw.plan(draw.scene()), displaced_m=tuple(off.tolist()))
+
+
+@regime("swapped", "Two leads of one sheet that were exchanged.")
+def _swapped_electrodes(draw: Draw) -> Plan:
+    order = list(range(draw.description.electrode_count))
+    first = draw.electrode()
+    second = (first + 1 + int(draw.in_turn(0, 1, 2))) % len(order)
+    order[first], order[second] = order[second], order[first]
+    wired = SheetState(leads=tuple(order))
+    return replace(draw.plan(draw.scene()), tared=wired, later=wired, at_fault=draw.sheet())
+
+
+@regime("drift", "Sheets 1 to 4 % better or worse conductors than at the tare, unevenly so.")
+def _drift(draw: Draw) -> Plan:
+    return _drifted(draw, draw.plan(draw.scene()))
+
+
+@regime("drift-at-rest", "Drift as above, and nothing presses.")
+def _drift_at_rest(draw: Draw) -> Plan:
+    return _drifted(draw, draw.plan(()))
+
+
+def _drifted(draw: Draw, plan: Plan) -> Plan:
+    drifted = SheetState(
+        warming=draw.in_turn(-1, 1) * draw.rng.uniform(0.01, 0.04),
+        drift=draw.rng.uniform(0.005, 0.02),
+    )
+    return replace(plan, later=drifted, snr_db=CONVERTER_DB, snr_of="voltage")
+
+
+@regime("stretched", "A sheet 2 to 5 % longer along x than described.")
+def _stretched(draw: Draw) -> Plan:
+    return replace(draw.plan(draw.scene()), stretch=draw.rng.uniform(0.02, 0.05))
+
+
+@regime("one-scan-apart", "A sliding contact, the structure scan one behind.")
+def _behind(draw: Draw) -> Plan:
+    return replace(draw.plan(*draw.slide((4, 10))), behind=1)
+
+
+@regime("jump", "A contact that is elsewhere in the next frame.")
+def _jump(draw: Draw) -> Plan:
+    places = draw.apart(2 + draw.number % 2, lambda: draw.press((8, 14)))
+    here, there, *others = places
+    return draw.plan(*[(here, *others)] * SETTLED_FRAMES, (there, *others))
+
+
+@regime("wrong-lambda", "Linear methods' regularisation 100 times too weak or too strong.")
+def _wrong_regularisation(draw: Draw) -> Plan:
+    return replace(draw.plan(draw.scene()), regularisation=draw.in_turn(0.01, 100))
+
+
+@regime("lost-scans", "A sliding contact, its last 1 to 3 structure scans lost.")
+def _lost_scans(draw: Draw) -> Plan:
+    return replace(draw.plan(*draw.slide((3, 8))), lost=int(draw.in_turn(1, 2, 3)))
+
+
+def draw_plan(description: SensorDescription, regime: str, seed_set: SeedSet, number: int) -> Plan:
+    """Draw a case of a regime; the same one every time.
+
+    Raises:
+        DataError: there is no room on the sensor for what presses.
+    """
+    rng = np.random.default_rng(seed_of(seed_set, f"stability {regime}", number))
+    return REGIMES[regime].draw(Draw(description, rng, number))

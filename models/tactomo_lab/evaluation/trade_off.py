@@ -1,0 +1,169 @@
+"""Speed against accuracy: every method under every budget, on the same scenes.
+
+Two kinds of scene. *Still*: each by itself from a cold start, so that a budget which ends early
+leaves what one frame could do. *Moving*: frame after frame as the daemon has them, so that what
+one frame does not finish the next one goes on with; every frame is reconstructed, however long
+that takes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from tactomo_models.batch import BUDGET_S
+from tactomo_models.errors import ModelError
+from tactomo_models.methods.registry import BUDGETED, check_method
+from tactomo_models.reconstruct import DEFAULT_BUDGET_S
+from tactomo_models.sensor.description import SensorDescription
+
+from tactomo_lab.evaluation import moving
+from tactomo_lab.evaluation.still import Variant, reconstruct_scenes
+from tactomo_lab.scenes.measures import SceneScore, Summary, summarise
+from tactomo_lab.scenes.still_scenes import EvaluationScene
+
+SceneKind = Literal["still", "moving"]
+Done = Callable[[], None]
+
+# Methods that a budget bounds, and that go on in a frame from what the one before it came to. The
+# others take what they take, and start anew in each frame.
+RUNGS: Final = ("fit", "levelset")  # of auto, whose budgets stand for theirs
+BUDGETS_S: Final = (0.005, 0.01, 0.02, DEFAULT_BUDGET_S)
+STILL_BUDGETS_S: Final = (*BUDGETS_S, BUDGET_S)  # the last one: as much as a scene needs
+
+
+def variants(methods: Iterable[str], budgets_s: Sequence[float] = BUDGETS_S) -> list[Variant]:
+    """Every method: those that a budget bounds under each of some, auto's rungs under the last."""
+    chosen = []
+    for method in methods:
+        if method not in BUDGETED:
+            chosen.append(Variant(method))
+        else:
+            budgets = budgets_s[-1:] if method in RUNGS else budgets_s
+            chosen += [Variant(method, budget_s) for budget_s in budgets]
+    return chosen
+
+
+@dataclass(frozen=True)
+class Point:
+    """How fast and how right a variant is on scenes of one kind.
+
+    Attributes:
+        scene: "still" or "moving".
+        snr_db: signal-to-noise ratio.
+        variant: method and budget.
+        frames: reconstructed.
+        icc: of the magnitude map, mean.
+        icc_worst: of the worst frame in twenty.
+        count_right: share of frames with the right number of contacts.
+        distrusted: share flagged as not to be trusted.
+        confidently_wrong: share that is wrong and not flagged.
+        p50_s, p99_s: compute time of a frame, one thread.
+    """
+
+    scene: SceneKind
+    snr_db: float
+    variant: Variant
+    frames: int
+    icc: float
+    icc_worst: float
+    count_right: float
+    distrusted: float
+    confidently_wrong: float
+    p50_s: float
+    p99_s: float
+
+
+def measure_still(
+    scenes: Sequence[EvaluationScene], variants: Sequence[Variant], done: Done = lambda: None
+) -> Iterator[Point]:
+    """Reconstruct still scenes of one signal-to-noise ratio, each from a cold start.
+
+    Args:
+        scenes: at least one.
+        variants: what is measured.
+        done: called after each frame.
+    """
+    scores: dict[Variant, list[SceneScore]] = {variant: [] for variant in variants}
+    for outcome in reconstruct_scenes(scenes, *variants):
+        scores[outcome.variant].append(outcome.score)
+        done()
+    for variant, own in scores.items():
+        summary = summarise(own)
+        yield _point("still", scenes[0].snr_db, variant, summary.scenes, summary)
+
+
+def measure_moving(
+    sequences: Sequence[moving.Sequence], variants: Sequence[Variant], done: Done = lambda: None
+) -> Iterator[Point]:
+    """Follow moving scenes of one signal-to-noise ratio frame by frame.
+
+    Args:
+        sequences: at least one.
+        variants: what is measured.
+        done: called after each frame.
+    """
+    for variant in variants:
+        played: list[list[moving.FrameScore]] = []
+        for sequence in sequences:
+            played.append([])
+            for score in moving.play(sequence, variant.method, variant.budget_s):
+                played[-1].append(score)
+                done()
+        summary = moving.summarise_phases(played)["all"]
+        yield _point("moving", sequences[0].snr_db, variant, summary.frames, summary)
+
+
+def left_out(description: SensorDescription, methods: Iterable[str]) -> dict[str, str]:
+    """Methods that are not to be had for a sensor, and why: a network that nobody trained."""
+    reasons = {}
+    for method in methods:
+        try:
+            check_method(method, description)
+        except ModelError as error:
+            reasons[method] = str(error)
+    return reasons
+
+
+def _point(
+    scene: SceneKind,
+    snr_db: float,
+    variant: Variant,
+    frames: int,
+    summary: Summary | moving.PhaseSummary,
+) -> Point:
+    return Point(
+        scene=scene,
+        snr_db=snr_db,
+        variant=variant,
+        frames=frames,
+        icc=summary.icc,
+        icc_worst=summary.icc_worst,
+        count_right=summary.count_right,
+        distrusted=summary.distrusted,
+        confidently_wrong=summary.confidently_wrong,
+        p50_s=summary.seconds,
+        p99_s=summary.seconds_99,
+    )
+
+
+def panels(points: Iterable[Point]) -> Iterator[list[Point]]:
+    """Points that can be compared: of one kind of scene and one signal-to-noise ratio."""
+    groups: dict[tuple[SceneKind, float], list[Point]] = {}
+    for point in points:
+        groups.setdefault((point.scene, point.snr_db), []).append(point)
+    yield from groups.values()
+
+
+def pareto_front(points: Sequence[Point]) -> list[Point]:
+    """Points than which none is both as fast and as right, and better in one; fastest first."""
+    known = [point for point in points if np.isfinite(point.icc)]
+    best = [one for one in known if not any(_dominates(other, one) for other in known)]
+    return sorted(best, key=lambda point: point.p50_s)
+
+
+def _dominates(one: Point, other: Point) -> bool:
+    as_good = one.p50_s <= other.p50_s and one.icc >= other.icc
+    return as_good and (one.p50_s < other.p50_s or one.icc > other.icc)

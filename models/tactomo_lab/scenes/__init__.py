@@ -1,0 +1,1 @@
+"""Scenes with known truth, and the measures by which they are judged."""

@@ -1,0 +1,36 @@
+"""Simulated voltages kept on disk: simulating takes longer than reconstructing."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tactomo_models.archive import read_arrays, write_whole
+from tactomo_models.errors import DataError
+from tactomo_models.physics.artifact import cache_folder
+
+Arrays = dict[str, Any]
+
+
+def cached(folder: Path | None, what: str, make: Callable[[], Arrays]) -> Arrays:
+    """Arrays from an earlier call, or made anew and kept.
+
+    A file that cannot be read or written costs time and nothing else.
+
+    Args:
+        folder: where files are kept; `scenes` in the user's cache if None.
+        what: all that the arrays depend on.
+        make: makes them.
+    """
+    folder = folder or cache_folder() / "scenes"
+    path = folder / f"{hashlib.sha256(what.encode()).hexdigest()[:32]}.npz"
+    with suppress(OSError, DataError):
+        return read_arrays(path)
+    arrays = make()
+    with suppress(OSError):
+        write_whole(path, lambda file: np.savez(file, **arrays))
+    return arrays

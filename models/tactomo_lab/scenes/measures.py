@@ -1,0 +1,331 @@
+"""Measures of a reconstruction against the truth, one scene's and many scenes'.
+
+RIE = |p - g| / |g| and ICC = Pearson correlation of the two images, g the true one. Contacts are
+matched to the true ones by the assignment that moves them least; one that is left over, or farther
+than `MATCH_M`, is a miss or a false one. Magnitude errors are shares of the sensor's range, the
+change at `FULL_RANGE_KPA`, as the paper's are, which normalises by it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
+from tactomo_models.arrays import FloatArray
+from tactomo_models.scans.plausibility import DISTRUST
+from tactomo_models.scene.contacts import Contact
+from tactomo_models.scene.reconstruction import Reconstruction
+from tactomo_models.sensor.description import SensorDescription
+
+from tactomo_lab.scenes.simulation import TrueContact
+from tactomo_lab.scenes.still_scenes import PRESSURE_KPA, EvaluationScene
+
+MATCH_M = 0.012  # centres farther apart belong to different contacts
+WRONG_ICC = 0.8  # a map that correlates less shows something else than what presses
+FULL_RANGE_KPA = PRESSURE_KPA[1]
+BAND_KPA = 10.0  # pressures that count as one where errors at one pressure are compared
+
+
+def correlation(image: NDArray[Any] | None, truth: FloatArray) -> float:
+    """ICC of an image with the truth; 0 where there is no image, or one without contrast."""
+    if image is None or not np.ptp(image) > 0 or not np.ptp(truth) > 0:
+        return 0.0
+    return float(np.corrcoef(image.ravel(), truth.ravel())[0, 1])
+
+
+def relative_error(image: NDArray[Any] | None, truth: FloatArray) -> float:
+    """RIE of an image; 1 where there is none: as of an empty one."""
+    if image is None:
+        return 1.0
+    return float(np.linalg.norm(image - truth) / np.linalg.norm(truth))
+
+
+def match(found: Sequence[Contact], true: Sequence[TrueContact]) -> list[tuple[int, int]]:
+    """Pairs of positions in both that are one contact, by least total distance."""
+    if not found or not true:
+        return []
+    here, there = (np.array([(c.x_m, c.y_m) for c in contacts]) for contacts in (found, true))
+    distance = cdist(here, there)
+    # Too far costs alike: such a pair is made only where nothing better is left, and dropped.
+    pairs = zip(*linear_sum_assignment(np.minimum(distance, MATCH_M)), strict=True)
+    return [(int(i), int(j)) for i, j in pairs if distance[i, j] < MATCH_M]
+
+
+@dataclass(frozen=True)
+class ContactScore:
+    """How one true contact was found.
+
+    Attributes:
+        shape: of the indenter.
+        area_mm2: true area.
+        pressure_kpa: true pressure.
+        magnitude: true |relative conductivity change|.
+        centre_error_mm: distance of the centroids; NaN if missed, as everything below.
+        area_error: relative error of the area.
+        magnitude_error: found minus true, as a share of the range.
+        magnitude_sigma: its standard uncertainty as reported, as a share of the range.
+        pressure_error_kpa: found minus true; NaN, too, where no pressure was reported.
+    """
+
+    shape: str
+    area_mm2: float
+    pressure_kpa: float
+    magnitude: float
+    centre_error_mm: float = float("nan")
+    area_error: float = float("nan")
+    magnitude_error: float = float("nan")
+    magnitude_sigma: float = float("nan")
+    pressure_error_kpa: float = float("nan")
+
+    @property
+    def missed(self) -> bool:
+        """Whether nothing was found there."""
+        return bool(np.isnan(self.centre_error_mm))
+
+
+@dataclass(frozen=True)
+class SceneScore:
+    """How one scene was reconstructed.
+
+    Attributes:
+        scene: its seed set, number of contacts and number, e.g. "tuning 3/17".
+        contacts: one for each true contact.
+        found: contacts reported.
+        matched: of these, how many are true ones.
+        rie, icc: of the magnitude map.
+        icc_structure: of the pressed shape.
+        flags: names of what was flagged.
+        distrusted: whether a flag told the user not to trust the frame.
+        tier: what made it.
+        misfit: as reported.
+        seconds: that it took.
+        shape, contrast, opposite, snr_db: of the scene.
+    """
+
+    scene: str
+    contacts: tuple[ContactScore, ...]
+    found: int
+    matched: int
+    rie: float
+    icc: float
+    icc_structure: float
+    flags: tuple[str, ...]
+    distrusted: bool
+    tier: str
+    misfit: float
+    seconds: float
+    shape: str
+    contrast: float
+    opposite: bool
+    snr_db: float
+
+    @property
+    def count_right(self) -> bool:
+        """Whether as many contacts were reported as there are."""
+        return self.found == len(self.contacts)
+
+    @property
+    def confidently_wrong(self) -> bool:
+        """Whether it shows something else than what presses, and no flag says so."""
+        return not self.distrusted and (self.icc < WRONG_ICC or not self.count_right)
+
+    def as_json(self) -> dict[str, Any]:
+        """All of it as numbers and names."""
+        derived = {"count_right": self.count_right, "confidently_wrong": self.confidently_wrong}
+        return {**asdict(self), **derived}
+
+
+def score(scene: EvaluationScene, frame: Reconstruction, seconds: float) -> SceneScore:
+    """Compare a reconstruction with the truth."""
+    truth = scene.truth
+    pairs = match(frame.contacts, truth.contacts)
+    found = {there: frame.contacts[here] for here, there in pairs}
+    return SceneScore(
+        scene=str(scene.layout),
+        contacts=tuple(
+            score_contact(scene.description, true, found.get(index))
+            for index, true in enumerate(truth.contacts)
+        ),
+        found=len(frame.contacts),
+        matched=len(pairs),
+        rie=relative_error(frame.map, truth.map),
+        icc=correlation(frame.map, truth.map),
+        icc_structure=correlation(frame.structure, truth.pressed),
+        flags=tuple(frame.flags.names()),
+        distrusted=bool(frame.flags & DISTRUST),
+        tier=frame.tier,
+        misfit=frame.misfit,
+        seconds=seconds,
+        shape=scene.layout.shape,
+        contrast=scene.layout.contrast,
+        opposite=scene.layout.opposite,
+        snr_db=scene.snr_db,
+    )
+
+
+def score_contact(
+    description: SensorDescription, true: TrueContact, found: Contact | None
+) -> ContactScore:
+    """Compare a contact with the true one that it is taken for; None where there is none."""
+    known = (true.shape, true.area_m2 * 1e6, true.pressure_kpa, true.magnitude)
+    if found is None:
+        return ContactScore(*known)
+    full = full_range(description)
+    return ContactScore(
+        *known,
+        centre_error_mm=1e3 * float(np.hypot(found.x_m - true.x_m, found.y_m - true.y_m)),
+        area_error=found.area_m2 / true.area_m2 - 1,
+        magnitude_error=(found.magnitude - true.magnitude) / full,
+        magnitude_sigma=found.magnitude_sigma / full,
+        pressure_error_kpa=found.pressure_kpa - true.pressure_kpa,
+    )
+
+
+def full_range(description: SensorDescription) -> float:
+    """Size of the relative change at the end of the sensor's measuring range."""
+    assert description.magnitude is not None
+    return float(np.abs(description.magnitude.response.change(np.array(FULL_RANGE_KPA))))
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Many scenes' measures. Means, where nothing else is said; NaN where nothing was measured.
+
+    Attributes:
+        scenes: how many.
+        icc, rie: of the magnitude map.
+        icc_worst: of the worst scene in twenty (5th percentile).
+        icc_structure: of the pressed shape.
+        count_right: share of scenes with the right number of contacts.
+        missed: share of the true contacts.
+        false: contacts that are none, a scene.
+        centre_mm, centre_mm_95: median and 95th percentile, matched contacts.
+        area_error: median of the relative error's size.
+        magnitude_error: size of the error as a share of the range.
+        magnitude_spread: largest minus smallest error at one pressure (bands of `BAND_KPA`), a
+            share of the range: the paper's measure.
+        pressure_error_kpa: size of the error where a pressure was reported.
+        within_sigma: share of magnitude errors within one reported standard uncertainty;
+            0.68 where those are right.
+        distrusted: share of scenes flagged as not to be trusted.
+        confidently_wrong: share of scenes that are wrong and not flagged.
+        seconds, seconds_99: median and 99th percentile of the compute time.
+    """
+
+    scenes: int
+    icc: float
+    icc_worst: float
+    rie: float
+    icc_structure: float
+    count_right: float
+    missed: float
+    false: float
+    centre_mm: float
+    centre_mm_95: float
+    area_error: float
+    magnitude_error: float
+    magnitude_spread: float
+    pressure_error_kpa: float
+    within_sigma: float
+    distrusted: float
+    confidently_wrong: float
+    seconds: float
+    seconds_99: float
+
+
+def summarise(scores: Sequence[SceneScore]) -> Summary:
+    """Measures of at least one scene."""
+    contacts = [contact for one in scores for contact in one.contacts]
+    matched = [contact for contact in contacts if not contact.missed]
+    centre = np.array([contact.centre_error_mm for contact in matched])
+    error = np.array([contact.magnitude_error for contact in matched])
+    sigma = np.array([contact.magnitude_sigma for contact in matched])
+    seconds = [one.seconds for one in scores]
+    icc = [one.icc for one in scores]
+    return Summary(
+        scenes=len(scores),
+        icc=mean(icc),
+        icc_worst=percentile(icc, 5),
+        rie=mean(one.rie for one in scores),
+        icc_structure=mean(one.icc_structure for one in scores),
+        count_right=mean(one.count_right for one in scores),
+        missed=mean(contact.missed for contact in contacts),
+        false=mean(one.found - one.matched for one in scores),
+        centre_mm=percentile(centre, 50),
+        centre_mm_95=percentile(centre, 95),
+        area_error=percentile([abs(contact.area_error) for contact in matched], 50),
+        magnitude_error=mean(np.abs(error)),
+        magnitude_spread=_largest_spread(matched),
+        pressure_error_kpa=mean(abs(contact.pressure_error_kpa) for contact in matched),
+        within_sigma=mean(np.where(np.isfinite(error), np.abs(error) <= sigma, np.nan)),
+        distrusted=mean(one.distrusted for one in scores),
+        confidently_wrong=mean(one.confidently_wrong for one in scores),
+        seconds=percentile(seconds, 50),
+        seconds_99=percentile(seconds, 99),
+    )
+
+
+def mean(values: Iterable[Any]) -> float:
+    """Mean of the numbers among some values; NaN where there are none."""
+    known = _known(values)
+    return float(known.mean()) if len(known) else float("nan")
+
+
+def percentile(values: Iterable[Any], percent: float) -> float:
+    """Percentile of the numbers among some values; NaN where there are none."""
+    known = _known(values)
+    return float(np.percentile(known, percent)) if len(known) else float("nan")
+
+
+def _known(values: Iterable[Any]) -> FloatArray:
+    array = np.array(list(values), dtype=np.float64)
+    return array[np.isfinite(array)]
+
+
+def _largest_spread(contacts: Iterable[ContactScore]) -> float:
+    bands: dict[int, list[float]] = {}
+    for contact in contacts:
+        if np.isfinite(contact.magnitude_error):
+            band = int(contact.pressure_kpa // BAND_KPA)
+            bands.setdefault(band, []).append(contact.magnitude_error)
+    return max((max(errors) - min(errors) for errors in bands.values()), default=float("nan"))
+
+
+def _contrast_band(one: SceneScore) -> str:
+    edges = (10, 22, 46, 100)  # equal parts of the logarithm
+    index = int(np.searchsorted(edges[1:-1], one.contrast, side="right"))
+    return f"{edges[index]}-{edges[index + 1]}"
+
+
+GROUPINGS: dict[str, Callable[[SceneScore], str]] = {
+    "contacts": lambda one: str(len(one.contacts)),
+    "SNR (dB)": lambda one: f"{one.snr_db:g}",
+    "shape": lambda one: one.shape,
+    "contrast": _contrast_band,
+    "sign": lambda one: "opposite" if one.opposite else "as shipped",
+}
+
+
+def summaries(scores: Sequence[SceneScore]) -> dict[str, dict[str, Summary]]:
+    """Measures by every grouping: what it goes by, its value, and that value's scenes."""
+    return {
+        name: {
+            value: summarise([one for one in scores if key(one) == value])
+            for value in sorted({key(one) for one in scores}, key=_natural)
+        }
+        for name, key in GROUPINGS.items()
+    }
+
+
+def _natural(value: str) -> tuple[float, str]:
+    """Numbers by size, words by the alphabet."""
+    head = value.split("-")[0]
+    try:
+        return float(head), value
+    except ValueError:
+        return float("inf"), value

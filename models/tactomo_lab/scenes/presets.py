@@ -1,0 +1,239 @@
+"""What training scenes are like: the paper's, and ones as hard as a real skin.
+
+A preset draws a scene from a seed and its number. No seed of a training scene is one of the
+evaluation's: the set's name is part of both.
+
+Lengths and pressures are those of a sheet of 150 mm whose response table ends at 300 kPa, the
+paper's; on another sensor they scale with its shorter side and with its own table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+import numpy as np
+from tactomo_models.arrays import FloatArray
+from tactomo_models.errors import DataError
+from tactomo_models.scene.press import Press, Profile, Shape
+from tactomo_models.scene.pressure import PressureCurve
+from tactomo_models.sensor.description import SensorDescription
+
+from tactomo_lab.scenes.still_scenes import CONTRAST, gap_m, outline_of, seed_of
+
+PresetName = Literal["paper", "robust"]
+PRESET_NAMES: Final[tuple[PresetName, ...]] = ("paper", "robust")
+SCENES: Final[dict[PresetName, int]] = {"paper": 12_000, "robust": 24_000}  # of a whole set
+
+SIDE_M = 0.150  # of the sheet that the lengths below are for
+END_KPA = 300.0  # of the response table that the pressures below are for
+
+PAPER_CONTACTS = 4
+PAPER_CHANGE = (0.05, 0.25)  # 0.95 to 0.75 S/m in a sheet of 1 S/m
+PAPER_CONTRAST = 100.0
+PAPER_HALF_AXIS_M = (0.007, 0.020)  # the paper leaves sizes open
+
+ROBUST_CONTACTS = (0.03, 0.22, 0.22, 0.22, 0.20, 0.07, 0.04)  # shares of scenes with 0 to 6
+ROBUST_HALF_AXIS_M = (0.005, 0.023)
+MAX_ASPECT = 2.2
+RING_HALF_AXIS_M = 0.010  # least of a ring
+ROBUST_SHAPES: Final[dict[Shape, float]] = {"ellipse": 0.40, "rectangle": 0.35, "ring": 0.25}
+# Shares of contacts by pressure: measurable, too light to be measured, beyond the range.
+ROBUST_PRESSURE_KPA = ((0.70, 140.0, 210.0), (0.15, 20.0, 140.0), (0.15, 200.0, 300.0))
+DOMES = 0.15  # share of contacts, all ellipses, whose pressure falls towards their rim
+DOME_PEAK = 1.3  # of a dome's pressure, over that of a punch
+ROBUST_GAP_M = 0.004
+MAX_UNEVEN = 0.08  # standard deviation of a sheet's smooth conductivity error
+IMPEDANCE_DEVIATION = 0.3  # standard deviation of the logarithm of contact impedances
+SAME_SKIN = 4  # scenes in a row that have the same sheets, which saves a third of the time
+WEAK_ELECTRODES = 0.03  # share of scenes with one whose contact impedance is
+WEAK_FACTOR = (5.0, 50.0)  # so many times the others'
+DISPLACED_M = 0.0007  # standard deviation of the electrodes' places along the rim
+
+
+@dataclass(frozen=True)
+class SheetErrors:
+    """How one sheet differs from its description.
+
+    Attributes:
+        seed: of the field of conductivity errors.
+        unevenness: standard deviation of that smooth field.
+        impedance: (L,) contact impedances, relative to the description's.
+        displaced_m: (L,) by how much each electrode sits off along the rim, counter-clockwise.
+    """
+
+    seed: int
+    unevenness: float
+    impedance: FloatArray
+    displaced_m: FloatArray
+
+
+@dataclass(frozen=True)
+class TrainingScene:
+    """A scene to simulate.
+
+    Attributes:
+        presses: what presses.
+        contrast: of the structure channel when saturated.
+        opposite: whether the magnitude channel changes against the description's sign.
+        sheets: errors of the magnitude and of the structure sheet; None where there are none.
+    """
+
+    presses: tuple[Press, ...]
+    contrast: float
+    opposite: bool
+    sheets: tuple[SheetErrors, SheetErrors] | None
+
+
+def draw_scene(
+    preset: PresetName, description: SensorDescription, seed: int, number: int
+) -> TrainingScene:
+    """Draw one scene of a preset.
+
+    Args:
+        preset: "paper" or "robust".
+        description: the sensor; needs both channels.
+        seed: of the whole set.
+        number: of the scene in it.
+
+    Raises:
+        DataError: there is no room for so many contacts.
+    """
+    if preset == "paper":
+        return _paper(description, seed, number)
+    return _robust(description, seed, number)
+
+
+def _paper(description: SensorDescription, seed: int, number: int) -> TrainingScene:
+    """One to four ellipses on an even sheet, noise-free."""
+    assert description.magnitude is not None
+    rng = np.random.default_rng(seed_of("training", "paper", seed, number))
+    presses = paper_presses(description, rng, 1 + number % PAPER_CONTACTS)
+    # The paper's conductivity falls, whatever the sensor's does.
+    opposite = description.magnitude.response.sign > 0
+    return TrainingScene(presses, PAPER_CONTRAST, opposite, sheets=None)
+
+
+def paper_presses(
+    description: SensorDescription, rng: np.random.Generator, count: int
+) -> tuple[Press, ...]:
+    """Draw ellipses that do not overlap, as the paper trains and tests on (section III-C-2).
+
+    Raises:
+        DataError: there is no room for so many.
+    """
+    assert description.magnitude is not None
+    curve = PressureCurve.of_response(description.magnitude.response)
+    least, most = (scale_of(description) * half_axis for half_axis in PAPER_HALF_AXIS_M)
+
+    def one() -> Press:
+        long = rng.uniform(least, most)
+        return Press(
+            *_anywhere(description, rng),
+            pressure_kpa=float(curve.pressure(np.array(rng.uniform(*PAPER_CHANGE)))),
+            radius_m=long,
+            radius_y_m=rng.uniform(max(least, long / 2), long),
+            angle_rad=rng.uniform(0, np.pi),
+        )
+
+    return placed_apart(description, rng, count, 0.0, one)
+
+
+def _robust(description: SensorDescription, seed: int, number: int) -> TrainingScene:
+    """None to six contacts of any form and pressure, on sheets as uneven as real ones."""
+    rng = np.random.default_rng(seed_of("training", "robust", seed, number))
+    skin = np.random.default_rng(seed_of("training", "robust skin", seed, number // SAME_SKIN))
+    opposite = bool(skin.integers(2))
+    sheets = (_sheet_errors(description, skin), _sheet_errors(description, skin))
+    count = int(rng.choice(len(ROBUST_CONTACTS), p=ROBUST_CONTACTS))
+    gap = scale_of(description) * ROBUST_GAP_M
+    presses = placed_apart(description, rng, count, gap, lambda: _any_press(description, rng))
+    contrast = float(np.exp(rng.uniform(*np.log(CONTRAST))))
+    return TrainingScene(presses, contrast, opposite, sheets)
+
+
+def _any_press(description: SensorDescription, rng: np.random.Generator) -> Press:
+    shape = tuple(ROBUST_SHAPES)[rng.choice(len(ROBUST_SHAPES), p=tuple(ROBUST_SHAPES.values()))]
+    least, most = ROBUST_HALF_AXIS_M
+    least = RING_HALF_AXIS_M if shape == "ring" else least
+    scale = scale_of(description)
+    least, most = scale * least, scale * most
+    long = rng.uniform(least, most)
+    shares = [share for share, _, _ in ROBUST_PRESSURE_KPA]
+    _, *pressures = ROBUST_PRESSURE_KPA[rng.choice(len(shares), p=shares)]
+    low, high = (_pressure_scale(description) * pressure for pressure in pressures)
+    domed = shape == "ellipse" and rng.random() < DOMES / ROBUST_SHAPES["ellipse"]
+    profile: Profile = "dome" if domed else "flat"
+    return Press(
+        *_anywhere(description, rng),
+        pressure_kpa=rng.uniform(low, high) * (DOME_PEAK if domed else 1.0),
+        radius_m=long,
+        radius_y_m=rng.uniform(max(least, long / MAX_ASPECT), long),
+        angle_rad=rng.uniform(0, np.pi),
+        shape=shape,
+        profile=profile,
+    )
+
+
+def scale_of(description: SensorDescription) -> float:
+    """How large a sensor is, in sheets of 150 mm."""
+    return min(description.width_m, description.height_m) / SIDE_M
+
+
+def _pressure_scale(description: SensorDescription) -> float:
+    assert description.magnitude is not None
+    return description.magnitude.response.pressure_kpa[-1] / END_KPA
+
+
+def _anywhere(description: SensorDescription, rng: np.random.Generator) -> tuple[float, float]:
+    x, y = rng.uniform(-0.5, 0.5, 2)
+    return x * description.width_m, y * description.height_m
+
+
+def placed_apart(
+    description: SensorDescription,
+    rng: np.random.Generator,
+    count: int,
+    least_gap_m: float,
+    draw: Callable[[], Press],
+) -> tuple[Press, ...]:
+    """Draw contacts inside the sensing area that lie apart; anew from the first if one has no room.
+
+    Those that have no room for long are drawn smaller.
+    """
+    frame_m = description.sheet.frame_width_m
+    for trial in range(300):
+        shrink = min(1.0, 60 / (trial + 1))
+        placed: list[Press] = []
+        for _ in range(40 * count):
+            if len(placed) == count:
+                break
+            press = draw()
+            press = replace(
+                press,
+                radius_m=press.radius_m * shrink,
+                radius_y_m=(press.radius_y_m or press.radius_m) * shrink,
+            )
+            x, y = outline_of(press)
+            inside = description.on_sheet(x, y, frame_m).all()
+            if inside and all(gap_m(press, other) > least_gap_m for other in placed):
+                placed.append(press)
+        if len(placed) == count:
+            return tuple(placed)
+    raise DataError(
+        f"no room for {count} contacts on {description.name!r}: its sensing area is too small"
+    )
+
+
+def _sheet_errors(description: SensorDescription, rng: np.random.Generator) -> SheetErrors:
+    electrodes = description.electrode_count
+    impedance = np.exp(IMPEDANCE_DEVIATION * rng.standard_normal(electrodes))
+    if rng.random() < WEAK_ELECTRODES:
+        impedance[rng.integers(electrodes)] *= np.exp(rng.uniform(*np.log(WEAK_FACTOR)))
+    return SheetErrors(
+        seed=int(rng.integers(2**63)),
+        unevenness=rng.uniform(0, MAX_UNEVEN),
+        impedance=impedance,
+        displaced_m=scale_of(description) * DISPLACED_M * rng.standard_normal(electrodes),
+    )

@@ -1,0 +1,339 @@
+"""Simulated skins to evaluate on: each one as uneven as a real one, and no inverse's own model.
+
+A scene has two sheets of its own, each with uneven conductivity and uneven electrodes. They are
+solved directly on a mesh that is finer than the one that inverts and shares next to no node with
+it; it is finer still along the outlines of what presses. Conductivity is constant in each triangle
+and jumps at an outline, while what inverts has it linear between its nodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import skfem
+from scipy.spatial.distance import pdist
+from tactomo_models.arrays import FloatArray
+from tactomo_models.physics.bare_sheet import (
+    exchanged,
+    scan_voltages,
+    transfer_resistances,
+    volts_per_unit,
+)
+from tactomo_models.physics.mesh import SheetMesh, electrode_facets, mesh_sheet
+from tactomo_models.scene.press import Press, Shape, strongest
+from tactomo_models.sensor.description import SensorDescription
+from tactomo_models.sensor.response import (
+    MagnitudeChannel,
+    MagnitudeResponse,
+    StructureChannel,
+    StructureResponse,
+)
+from tactomo_models.simulation.simulator import conductivity_ratio, smooth_noise
+from tactomo_protocol import Channel
+
+Volts = dict[Channel, FloatArray]
+Warp = Callable[[SheetMesh], SheetMesh]
+
+SPACING_SHARE = 0.58  # of the map's nodes' distance: 1.74 mm on the paper's sensor
+REFINEMENTS = 3  # at the electrodes' ends, one more than what inverts
+SHARP_M = 1e-9  # width of an outline: a point lies inside or outside
+OUTLINE_REFINEMENTS = 3  # to 0.2 mm: voltage changes are right to 1 %; without, to 10 %
+UNEVENNESS = 0.05
+IMPEDANCE_DEVIATION = 0.2
+ELECTRODE_REACH_M = 0.008  # of the stretch around an electrode that sits off its place, at most
+REACH_SHARE = 0.30  # of the electrodes' distance: neighbours do not pull at each other
+CELL_SAMPLES = 5  # per side of a map cell, where the truth's coverage is averaged
+
+
+def fine_mesh(description: SensorDescription) -> SheetMesh:
+    """Mesh that scenes of a sensor are simulated on; made once, it serves them all."""
+    spacing_m = SPACING_SHARE * description.width_m / (description.map.nodes_x - 1)
+    return mesh_sheet(description, spacing_m, REFINEMENTS)
+
+
+@dataclass(frozen=True)
+class SheetState:
+    """What has become of a sheet; as it was made by default.
+
+    Attributes:
+        warming: relative change of its conductivity, everywhere alike.
+        drift: standard deviation of a smooth relative change of its conductivity.
+        impedance: (L,) factors on its contact impedances; 1 where empty.
+        leads: (L,) the electrode that each of the device's leads is on; its own where empty.
+    """
+
+    warming: float = 0.0
+    drift: float = 0.0
+    impedance: tuple[float, ...] = ()
+    leads: tuple[int, ...] = ()
+
+
+AS_MADE = SheetState()
+
+
+class UnevenSkin:
+    """The sheets of one sensor, uneven in their own way, and what they show of presses.
+
+    Args:
+        description: the sensor; its responses are the true ones.
+        mesh: see `fine_mesh`; of a sensor of the same geometry.
+        seed: of the unevenness.
+        unevenness: standard deviation of each sheet's smooth conductivity error.
+        impedance_deviation: standard deviation of the logarithm of the contact impedances.
+        warp: moves the nodes of a mesh to where they are on this skin; they stay if None.
+    """
+
+    def __init__(
+        self,
+        description: SensorDescription,
+        mesh: SheetMesh,
+        seed: np.random.SeedSequence,
+        *,
+        unevenness: float = UNEVENNESS,
+        impedance_deviation: float = IMPEDANCE_DEVIATION,
+        warp: Warp | None = None,
+    ) -> None:
+        self.description = description
+        self._mesh = mesh
+        self._warp: Warp = warp or (lambda mesh: mesh)
+        rng = np.random.default_rng(seed)
+        self._sheets = {
+            name: UnevenSheet(description, rng, unevenness, impedance_deviation)
+            for name in description.channels
+        }
+        self._rest: dict[tuple[Channel, SheetState], FloatArray] = {}
+
+    def voltages(
+        self, presses: Sequence[Press], states: Mapping[Channel, SheetState] | None = None
+    ) -> Volts:
+        """Noise-free voltages (M,) of each channel, volts.
+
+        Args:
+            presses: what presses.
+            states: of the sheets that are no longer as they were made.
+        """
+        states = states or {}
+        volts = {name: self._at_rest(name, states.get(name, AS_MADE)) for name in self._sheets}
+        if not presses:
+            return volts
+        mesh = self._warp(fitted_mesh(self._mesh, presses, self.description, self._warp))
+        x, y = centroids(mesh)
+        pressure, coverage = strongest(presses, x, y, edge_m=SHARP_M)
+        for name, sheet in self._sheets.items():
+            state = states.get(name, AS_MADE)
+            ratio = conductivity_ratio(self.description, name, pressure, coverage)
+            pressed = sheet.voltages(mesh, ratio, state)
+            # Of one mesh, so that no change is a change of mesh.
+            volts[name] = volts[name] + pressed - sheet.voltages(mesh, state=state)
+        return volts
+
+    def _at_rest(self, name: Channel, state: SheetState) -> FloatArray:
+        if (name, state) not in self._rest:
+            mesh = self._warp(self._mesh)
+            self._rest[name, state] = self._sheets[name].voltages(mesh, state=state)
+        return self._rest[name, state]
+
+
+class UnevenSheet:
+    """One sheet, uneven in its own way; the arguments are those of `UnevenSkin`."""
+
+    def __init__(
+        self,
+        description: SensorDescription,
+        rng: np.random.Generator,
+        unevenness: float,
+        impedance_deviation: float,
+    ) -> None:
+        self._description = description
+        self._unevenness = unevenness
+        self._seed = int(rng.integers(2**63))  # the same field on whatever mesh
+        spread = impedance_deviation * rng.standard_normal(description.electrode_count)
+        self._impedance = np.exp(spread)
+
+    def voltages(
+        self, mesh: SheetMesh, ratio: FloatArray | float = 1.0, state: SheetState = AS_MADE
+    ) -> FloatArray:
+        """Volts (M,) where the conductivity of each triangle is so many times its own at rest."""
+        x, y = centroids(mesh)
+        length_m = self._description.width_m / 4
+        field = smooth_noise(x, y, length_m, np.random.default_rng(self._seed))
+        conductivity = (1 + self._unevenness * field) * ratio * (1 + state.warming)
+        if state.drift:
+            drift = smooth_noise(x, y, length_m, np.random.default_rng([self._seed, 1]))
+            conductivity = conductivity * (1 + state.drift * drift)
+        impedance = self._impedance * np.array(state.impedance or 1.0)
+        transfer = transfer_resistances(self._description, mesh, conductivity, impedance)
+        if state.leads:
+            transfer = exchanged(transfer, state.leads)
+        return scan_voltages(self._description, transfer) * volts_per_unit(self._description)
+
+
+def centroids(sheet: SheetMesh) -> FloatArray:
+    """Centroids (2, T) of the triangles."""
+    return np.asarray(sheet.mesh.p[:, sheet.mesh.t].mean(axis=1))
+
+
+def fitted_mesh(
+    sheet: SheetMesh,
+    presses: Sequence[Press],
+    description: SensorDescription,
+    warp: Warp = lambda mesh: mesh,
+) -> SheetMesh:
+    """Halve the triangles that an outline cuts, `OUTLINE_REFINEMENTS` times.
+
+    Args:
+        sheet: mesh with its nodes and electrodes in place.
+        presses: what presses.
+        description: the sensor.
+        warp: moves the nodes to where they are when an outline cuts them; what is returned is
+            still in place.
+    """
+    mesh = sheet.mesh
+    for _ in range(OUTLINE_REFINEMENTS):
+        x, y = warp(SheetMesh(mesh, ())).mesh.p
+        cut = np.zeros(mesh.t.shape[1], bool)
+        for press in presses:
+            corners = press.coverage(x, y, SHARP_M)[mesh.t]
+            cut |= corners.max(axis=0) != corners.min(axis=0)
+        mesh = mesh.refined(np.flatnonzero(cut))
+    return SheetMesh(mesh, electrode_facets(mesh, description))
+
+
+def displaced(
+    sheet: SheetMesh, description: SensorDescription, displaced_m: FloatArray
+) -> SheetMesh:
+    """Mesh of a sheet whose electrodes sit off their places.
+
+    Args:
+        sheet: mesh with the electrodes in place.
+        description: the sensor.
+        displaced_m: (L,) by how much along the rim, counter-clockwise.
+    """
+    ends, centres = description.electrode_ends_m, description.electrode_centres_m
+    along = ends[:, 1] - ends[:, 0]
+    step = displaced_m[:, None] * along / np.linalg.norm(along, axis=1, keepdims=True)
+    off = sheet.mesh.p.T[:, None, :] - centres
+    reach_m = min(ELECTRODE_REACH_M, REACH_SHARE * float(pdist(centres).min()))
+    pull = np.exp(-0.5 * (off**2).sum(axis=2) / reach_m**2)
+    return SheetMesh(
+        skfem.MeshTri(sheet.mesh.p + (pull @ step).T, sheet.mesh.t), sheet.electrode_facets
+    )
+
+
+@dataclass(frozen=True)
+class TrueContact:
+    """What really presses in one place.
+
+    Attributes:
+        x_m, y_m: its centroid.
+        area_m2: its area.
+        pressure_kpa: its pressure.
+        magnitude: |relative conductivity change| of the magnitude channel under it.
+        shape: of its indenter.
+    """
+
+    x_m: float
+    y_m: float
+    area_m2: float
+    pressure_kpa: float
+    magnitude: float
+    shape: Shape
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a perfect reconstruction of a scene would show.
+
+    Attributes:
+        map: (nodes_y, nodes_x) |relative conductivity change| of the magnitude channel, averaged
+            over the cell around each node.
+        pressed: (nodes_y, nodes_x) share of each cell that is pressed; below saturation, of the
+            structure channel's change, in logarithm.
+        contacts: one for each indenter.
+    """
+
+    map: FloatArray
+    pressed: FloatArray
+    contacts: tuple[TrueContact, ...]
+
+
+def truth_of(description: SensorDescription, presses: Sequence[Press]) -> Truth:
+    """What a map of these presses should be; needs the sensor's magnitude channel."""
+    assert description.magnitude is not None
+    response = description.magnitude.response
+    along_x, step_x = _cell_samples(description.map_x_m)
+    along_y, step_y = _cell_samples(description.map_y_m)
+    x, y = np.meshgrid(along_x, along_y)
+    edge_m = max(step_x, step_y)
+    pressure, coverage = strongest(presses, x, y, edge_m)
+    magnitude = coverage * np.abs(response.change(pressure))
+    return Truth(
+        map=_over_cells(magnitude),
+        pressed=_over_cells(coverage * _saturation(description, pressure)),
+        contacts=tuple(
+            TrueContact(
+                x_m=press.x_m,
+                y_m=press.y_m,
+                area_m2=float(press.coverage(x, y, edge_m).sum() * step_x * step_y),
+                pressure_kpa=press.pressure_kpa,
+                magnitude=float(np.abs(response.change(np.array(press.pressure_kpa)))),
+                shape=press.shape,
+            )
+            for press in presses
+        ),
+    )
+
+
+def _saturation(description: SensorDescription, pressure_kpa: FloatArray) -> FloatArray:
+    """Share of the structure channel's full change, in logarithm, at a pressure; same shape."""
+    if description.structure is None or description.structure.response is None:
+        return np.asarray((pressure_kpa > 0).astype(np.float64))
+    ratio = description.structure.response.ratio(pressure_kpa)
+    return np.asarray(np.log(ratio) / np.log(description.structure.saturated_ratio))
+
+
+def _cell_samples(nodes_m: FloatArray) -> tuple[FloatArray, float]:
+    """Points along one axis, `CELL_SAMPLES` around each node, and their distance."""
+    step = (nodes_m[1] - nodes_m[0]) / CELL_SAMPLES
+    around = (np.arange(CELL_SAMPLES) - (CELL_SAMPLES - 1) / 2) * step
+    return (nodes_m[:, None] + around).ravel(), float(step)
+
+
+def _over_cells(fine: FloatArray) -> FloatArray:
+    rows, columns = (n // CELL_SAMPLES for n in fine.shape)
+    cells = fine.reshape(rows, CELL_SAMPLES, columns, CELL_SAMPLES)
+    return np.asarray(cells.mean(axis=(1, 3)))
+
+
+def with_opposite_magnitude(description: SensorDescription) -> SensorDescription:
+    """The same sensor, with a magnitude channel that changes by as much the other way."""
+    assert description.magnitude is not None
+    response = description.magnitude.response
+    turned = MagnitudeResponse(
+        pressure_kpa=response.pressure_kpa,
+        relative_change=tuple(-change for change in response.relative_change),
+    )
+    return description.model_copy(update={Channel.MAGNITUDE: MagnitudeChannel(response=turned)})
+
+
+def with_contrast(description: SensorDescription, contrast: float) -> SensorDescription:
+    """The same sensor, whose structure channel saturates at another contrast (at least 1).
+
+    Its ratio is the contrast where pressure raises the conductivity, else one over it.
+    """
+    assert description.structure is not None
+    response, old = description.structure.response, description.structure.saturated_ratio
+    ratio = contrast if old > 1 else 1 / contrast
+    if response is None:
+        channel = StructureChannel(conductivity_ratio=ratio)
+    else:  # the logarithm of the whole response, stretched
+        power = np.log(ratio) / np.log(old)
+        stretched = tuple(float(r**power) for r in response.conductivity_ratio)
+        channel = StructureChannel(
+            response=StructureResponse(
+                pressure_kpa=response.pressure_kpa, conductivity_ratio=stretched
+            )
+        )
+    return description.model_copy(update={Channel.STRUCTURE: channel})

@@ -1,0 +1,1 @@
+"""From magnitude to pressure: a curve from load-cell readings, and its file."""

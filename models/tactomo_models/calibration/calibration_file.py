@@ -1,0 +1,299 @@
+"""A sensor's pressure calibration as it is kept: one file for each sensor, found by its name.
+
+It holds the readings, too, so that it can be looked at, fitted again and added to. What it was made
+for stands in it, and it is refused elsewhere: another name, another description (by its hash) or
+another device would have another curve.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Callable, Collection, Sequence
+from datetime import UTC, datetime
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Final, Literal, Self
+
+import numpy as np
+from platformdirs import user_data_path
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from tactomo_models.archive import write_whole
+from tactomo_models.calibration.curve import Fit, Reading, fit_curve
+from tactomo_models.errors import CalibrationError, explain
+from tactomo_models.scene.pressure import PressureCurve
+from tactomo_models.sensor.description import SensorDescription
+from tactomo_models.sensor.description_file import shipped_descriptions
+
+SUFFIX: Final = ".pressure.json"
+READABLE: Final = "put a file there that may be read, or nothing"
+Points = Annotated[tuple[float, ...], Field(min_length=2, max_length=256)]
+
+
+class Subject(BaseModel):
+    """What a calibration is of.
+
+    Attributes:
+        sensor: its name in the stream.
+        description: name of its description.
+        sha256: that description's hash.
+        device_ids: the devices that it was read by; empty where nobody knows.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    sensor: str
+    description: str
+    sha256: str
+    device_ids: tuple[str, ...] = ()
+
+    def mismatch(self, sensor: str, description: SensorDescription) -> str:
+        """In words, why this is not of a sensor; empty where it is."""
+        if self.sensor != sensor:
+            return f"is of the sensor {self.sensor}, not {sensor}"
+        if self.sha256 != description.sha256:
+            return (
+                f"is of a sensor as {self.description} describes it (sha256 {self.sha256[:12]}), "
+                f"not as {description.name} does ({description.sha256[:12]})"
+            )
+        return ""
+
+    def foreign(self, device_ids: Collection[str]) -> str:
+        """In words, which of the connected devices it was not made with; empty for none."""
+        others = sorted(set(device_ids) - set(self.device_ids))
+        if not self.device_ids or not others:
+            return ""
+        return f"was made with {', '.join(self.device_ids)}, and {', '.join(others)} is connected"
+
+
+def subject_of(
+    sensor: str, description: SensorDescription, device_ids: Sequence[str] = ()
+) -> Subject:
+    """What a calibration of such a sensor is of.
+
+    Raises:
+        CalibrationError: it has no pressure that could be calibrated.
+    """
+    if description.magnitude is None:
+        raise CalibrationError(
+            f"{description.name} has no magnitude channel; its structure channel says where it is "
+            "touched, and never how hard"
+        )
+    return Subject(
+        sensor=sensor,
+        description=description.name,
+        sha256=description.sha256,
+        device_ids=tuple(device_ids),
+    )
+
+
+class PressureCalibration(BaseModel):
+    """What was found for one sensor, and from what.
+
+    Attributes:
+        format: of the file.
+        tactomo: the version that made it.
+        subject: what it is of.
+        taken: when, ISO 8601, UTC.
+        readings: what it was fitted to.
+        magnitude, pressure_kpa, sigma_kpa: its curve, see `PressureCurve`.
+        onset_kpa, hysteresis_kpa, repeatability_kpa: see `Fit`; None where unknown.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    format: Literal[1] = 1
+    tactomo: str
+    subject: Subject
+    taken: str
+    readings: tuple[Reading, ...]
+    magnitude: Points
+    pressure_kpa: Points
+    sigma_kpa: Points
+    onset_kpa: float | None
+    hysteresis_kpa: float | None
+    repeatability_kpa: float
+
+    @model_validator(mode="after")
+    def _is_a_curve(self) -> Self:
+        lengths = {len(self.magnitude), len(self.pressure_kpa), len(self.sigma_kpa)}
+        if len(lengths) > 1:
+            raise ValueError("magnitude, pressure_kpa and sigma_kpa differ in length")
+        if np.any(np.diff(self.magnitude) <= 0) or np.any(np.diff(self.pressure_kpa) < 0):
+            raise ValueError("magnitude and pressure_kpa must rise")
+        if min(self.sigma_kpa) < 0:
+            raise ValueError("sigma_kpa must not be negative")
+        return self
+
+    @classmethod
+    def of_readings(cls, subject: Subject, readings: Sequence[Reading]) -> PressureCalibration:
+        """Fit readings.
+
+        Raises:
+            CalibrationError: they make no curve.
+        """
+        return cls.of_fit(subject, readings, fit_curve(readings))
+
+    @classmethod
+    def of_fit(cls, subject: Subject, readings: Sequence[Reading], fit: Fit) -> PressureCalibration:
+        """Keep what was fitted to readings, as of now."""
+        curve = fit.curve
+        return cls(
+            tactomo=version("tactomo"),
+            subject=subject,
+            taken=datetime.now(UTC).isoformat(timespec="seconds"),
+            readings=tuple(readings),
+            magnitude=_rounded(curve.magnitude),
+            pressure_kpa=_rounded(curve.pressure_kpa),
+            sigma_kpa=_rounded(curve.sigma_kpa),
+            onset_kpa=fit.onset_kpa if np.isfinite(fit.onset_kpa) else None,
+            hysteresis_kpa=fit.hysteresis_kpa if np.isfinite(fit.hysteresis_kpa) else None,
+            repeatability_kpa=fit.repeatability_kpa,
+        )
+
+    @cached_property
+    def curve(self) -> PressureCurve:
+        """By which magnitudes become pressures."""
+        parts = (self.magnitude, self.pressure_kpa, self.sigma_kpa)
+        return PressureCurve(*(np.array(part) for part in parts))
+
+    @property
+    def words(self) -> str:
+        """In words, what it rests on."""
+        low, high = self.curve.range_kpa
+        return f"{len(self.readings)} readings of {self.taken[:10]}, {low:.0f} to {high:.0f} kPa"
+
+
+def data_folder() -> Path:
+    """Where things are kept that cannot be computed again.
+
+    A service finds its own folder in $STATE_DIRECTORY, which systemd sets; else it is the user's.
+    """
+    state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+    return Path(state) if state else user_data_path("tactomo")
+
+
+def calibration_path(sensor: str) -> Path:
+    """Where a sensor's calibration is kept by default."""
+    return data_folder() / "calibrations" / f"{sensor}{SUFFIX}"
+
+
+def save_calibration(calibration: PressureCalibration, path: Path) -> None:
+    """Write a calibration; a half-written one is never left under that name.
+
+    Raises:
+        CalibrationError: the file cannot be written.
+    """
+    content = (calibration.model_dump_json(indent=1) + "\n").encode()
+    try:
+        write_whole(path, lambda file: file.write(content))
+    except OSError as error:
+        raise CalibrationError(
+            f"cannot write {path}: {error.strerror}; name a file that you may write"
+        ) from error
+
+
+def read_calibration(path: Path) -> PressureCalibration:
+    """Read a calibration, whatever it is of.
+
+    Raises:
+        CalibrationError: it is damaged, of another format, or cannot be read.
+        FileNotFoundError: there is none.
+    """
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):  # reading a pipe may never end
+            raise CalibrationError(f"cannot read {path}: it is no regular file; {READABLE}")
+        return parse_calibration(path.read_bytes(), str(path))
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise CalibrationError(f"cannot read {path}: {error.strerror}; {READABLE}") from error
+
+
+def parse_calibration(content: bytes | str, source: str) -> PressureCalibration:
+    """Read a calibration's text; `source` names it in errors.
+
+    Raises:
+        CalibrationError: it is damaged, or of another format.
+    """
+    try:
+        return PressureCalibration.model_validate_json(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        if first["loc"] == ("format",):
+            raise CalibrationError(
+                f"{source} is of format {first['input']!r}, and this tactomo reads format 1; "
+                "calibrate again, from the same readings"
+            ) from error
+        complaint = " ".join(explain(first).split())[:200]
+        raise CalibrationError(
+            f"{source} is damaged ({complaint}); calibrate again, or delete it"
+        ) from error
+
+
+def load_calibration(
+    path: Path, sensor: str, description: SensorDescription
+) -> PressureCalibration:
+    """Read a calibration and make sure that it is of this sensor.
+
+    Raises:
+        CalibrationError: it is not, or see `read_calibration`.
+        FileNotFoundError: there is none.
+    """
+    found = read_calibration(path)
+    mismatch = found.subject.mismatch(sensor, description)
+    if mismatch:
+        raise CalibrationError(f"{path} {mismatch}; run: tactomo calibrate live --sensor {sensor}")
+    return found
+
+
+def calibration_of(description: SensorDescription, path: Path) -> PressureCalibration:
+    """Read a calibration of such a sensor, whatever its name.
+
+    Raises:
+        CalibrationError: there is none, or it is of another description; see `read_calibration`.
+    """
+    try:
+        found = read_calibration(path)
+    except FileNotFoundError as error:
+        raise CalibrationError(f"there is no calibration {path}; give another path") from error
+    mismatch = found.subject.mismatch(found.subject.sensor, description)
+    if mismatch:
+        raise CalibrationError(f"{path} {mismatch}; give the one of this sensor")
+    return found
+
+
+def calibration_for(
+    sensor: str, description: SensorDescription, source: str, warn: Callable[[str], None]
+) -> PressureCalibration | None:
+    """The calibration in force for a sensor, or None.
+
+    It is looked for in the data folder by the sensor's name, then beside its description's file.
+
+    Args:
+        sensor: its name in the stream.
+        description: what it is made of.
+        source: where that came from: a shipped name, or a file.
+        warn: called with one line that says why a calibration that is there is not used.
+    """
+    for path in _places(sensor, source):
+        try:
+            return load_calibration(path, sensor, description)
+        except FileNotFoundError:
+            continue
+        except CalibrationError as error:
+            warn(str(error))
+    return None
+
+
+def _places(sensor: str, source: str) -> list[Path]:
+    own = [calibration_path(sensor)]
+    if source in shipped_descriptions():
+        return own
+    return [*own, Path(source).with_suffix(SUFFIX)]
+
+
+def _rounded(values: Sequence[float] | np.ndarray) -> tuple[float, ...]:
+    return tuple(float(f"{value:.6g}") for value in values)

@@ -1,0 +1,333 @@
+"""A load cell's log (CSV) and what a sensor showed at those times, joined to calibration readings.
+
+Columns, in any order, separated by comma, semicolon or tab; lines that begin with # are skipped:
+
+==================  ===================================================================
+`pressure_kpa`      what was pressed with; or
+`force_n`           ... by the force, on an indenter of
+`area_mm2`          ... this area, or
+`diameter_mm`       ... this diameter, if it is round; or one for all, by an option
+`magnitude`         what the sensor showed, |relative conductivity change|; or
+`time_s`            when, in seconds from the beginning of a recording; or
+`realtime_s`        ... in seconds since 1970 (UTC)
+`magnitude_sigma`   standard uncertainty of `magnitude`; may be left out
+`direction`         of the load: up or down; else it follows from the order of the lines
+==================  ===================================================================
+
+A log of many lines a second is cut into pieces in which the load was still. So is one line for
+each press, by hand.
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactomo_models.arrays import FloatArray, IntArray
+from tactomo_models.calibration.curve import APART, Direction, Reading, direction_at
+from tactomo_models.errors import CalibrationError
+
+MAX_BYTES: Final = 64 << 20  # an hour of lines at 1 kHz
+WINDOW_S: Final = 0.5  # of a log: the load is to be still for so long
+MAX_NUMBER: Final = 1e12  # of any kind: seconds since 1970 are 2e9, and squares stay finite
+UNLOADED_KPA: Final = 1.0  # a load cell at rest
+CLOCKS: Final = ("time_s", "realtime_s")
+
+
+@dataclass(frozen=True)
+class LoadCell:
+    """What a load cell said, line by line.
+
+    Attributes:
+        lines: (n,) numbers of the lines in the file.
+        pressure_kpa: (n,).
+        clock: "time_s", "realtime_s", or "" without times.
+        times_s: (n,) by that clock; NaN without.
+        magnitude, magnitude_sigma: (n,) what the sensor showed; NaN without.
+        directions: n of them, or none.
+    """
+
+    lines: NDArray[np.int64]
+    pressure_kpa: FloatArray
+    clock: str
+    times_s: FloatArray
+    magnitude: FloatArray
+    magnitude_sigma: FloatArray
+    directions: tuple[Direction, ...]
+
+    def direction(self, index: int) -> Direction:
+        """Of the load at a line: by its column, or by the lines before."""
+        return self.directions[index] if self.directions else direction_at(self.pressure_kpa, index)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a sensor showed, frame by frame.
+
+    Attributes:
+        times_s: (n,) rising, by the load cell's clock.
+        magnitude, magnitude_sigma: (n,) of the only contact; NaN where there is none or several.
+        contacts: (n,) how many there were.
+    """
+
+    times_s: FloatArray
+    magnitude: FloatArray
+    magnitude_sigma: FloatArray
+    contacts: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Joined:
+    """Readings, the number of the first line of each, and in words what was left out of them."""
+
+    readings: tuple[Reading, ...]
+    lines: tuple[int, ...]
+    notes: tuple[str, ...]
+
+
+def read_load_cell(path: Path, area_mm2: float | None = None) -> LoadCell:
+    """Read a load cell's log.
+
+    Args:
+        path: the CSV file.
+        area_mm2: of the indenter, where the file does not say.
+
+    Raises:
+        CalibrationError: it cannot be read, a column is missing, or a value is no such number.
+    """
+    table = _Table(path)
+    clock = next((name for name in CLOCKS if name in table.columns), "")
+    if not clock and "magnitude" not in table.columns:
+        raise CalibrationError(
+            f"{path} has no column magnitude, and no {' or '.join(CLOCKS)} by which to find it in "
+            f"a recording; it has: {', '.join(table.columns)}"
+        )
+    pressure = table.pressures_kpa(area_mm2)
+    times_s = table.numbers(clock) if clock else table.unknown
+    if clock and np.any(np.diff(times_s) < 0):
+        worst = int(np.argmin(np.diff(times_s))) + 1
+        raise CalibrationError(
+            f"{path}, line {table.lines[worst]}: {clock} goes back; sort the lines by their times"
+        )
+    return LoadCell(
+        lines=np.array(table.lines),
+        pressure_kpa=pressure,
+        clock=clock,
+        times_s=times_s,
+        magnitude=table.numbers("magnitude") if "magnitude" in table.columns else table.unknown,
+        magnitude_sigma=table.numbers("magnitude_sigma", least=0.0)
+        if "magnitude_sigma" in table.columns
+        else np.zeros(len(pressure)),
+        directions=table.directions(),
+    )
+
+
+def direct_readings(cell: LoadCell) -> Joined:
+    """Readings of a log that has the magnitudes itself."""
+    loaded = np.flatnonzero(cell.pressure_kpa > UNLOADED_KPA)
+    for i in loaded:
+        if cell.magnitude[i] < 0:
+            raise CalibrationError(
+                f"line {cell.lines[i]}: magnitude is below 0; give the size of the relative "
+                "change, without sign"
+            )
+    readings = tuple(
+        Reading(
+            pressure_kpa=float(cell.pressure_kpa[i]),
+            magnitude=float(cell.magnitude[i]),
+            magnitude_sigma=float(cell.magnitude_sigma[i]),
+            direction=cell.direction(int(i)),
+        )
+        for i in loaded
+    )
+    left = len(cell.lines) - len(loaded)
+    notes = (f"{left} lines without a load left out",) if left else ()
+    return Joined(readings, tuple(cell.lines[loaded].tolist()), notes)
+
+
+def joined_readings(cell: LoadCell, seen: Seen) -> Joined:
+    """Readings of a log that has times, and what a sensor showed at those.
+
+    Raises:
+        CalibrationError: at most of the times there was no contact, or more than one.
+    """
+    pieces = _still_pieces(cell)
+    if not pieces:
+        raise CalibrationError(
+            "nothing was held still under a load for half a second; hold each press longer"
+        )
+    readings: list[Reading] = []
+    lines: list[int] = []
+    missed: list[str] = []
+    for piece in pieces:
+        found = _reading(cell, piece, seen)
+        if isinstance(found, Reading):
+            readings.append(found)
+            lines.append(int(cell.lines[piece[0]]))
+        else:
+            missed.append(f"line {cell.lines[piece[0]]}, {found}")
+    if len(missed) > len(readings):
+        raise CalibrationError(
+            f"{len(missed)} of {len(pieces)} presses are not in the recording as one still "
+            f"contact, such as {missed[0]}; it runs from {seen.times_s.min():.1f} to "
+            f"{seen.times_s.max():.1f} s by that clock: are both of one time? --time-offset "
+            "shifts the load cell's"
+        )
+    notes = (f"{len(missed)} presses left out, such as {missed[0]}",) if missed else ()
+    return Joined(tuple(readings), tuple(lines), notes)
+
+
+class _Table:
+    """The file's cells by line and column.
+
+    Attributes:
+        columns: their names.
+        lines: the number of each row's line.
+        unknown: NaN for each row.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        lines = _lines(path)
+        delimiter = max(",;\t", key=lines[0][1].count)
+        self.lines = [number for number, _ in lines[1:]]
+        self.columns: list[str] = []
+        self._rows: list[dict[str, str]] = []
+        for number, line in lines:
+            try:
+                (cells,) = csv.reader([line], delimiter=delimiter, strict=True)
+            except (csv.Error, ValueError) as error:
+                raise CalibrationError(f"{path}, line {number}: {error}; correct it") from error
+            if len(cells) < len(self.columns):
+                raise CalibrationError(
+                    f"{path}, line {number} has {len(cells)} of {len(self.columns)} columns; "
+                    "complete it, or leave it out"
+                )
+            cells = [cell.strip() for cell in cells]
+            if self.columns:
+                self._rows.append(dict(zip(self.columns, cells, strict=False)))
+            else:
+                self.columns = [cell.lower() for cell in cells]
+        self.unknown = np.full(len(self._rows), np.nan)
+
+    def numbers(self, column: str, least: float = -MAX_NUMBER) -> FloatArray:
+        values = np.empty(len(self._rows))
+        for i, row in enumerate(self._rows):
+            try:
+                values[i] = float(row[column])
+            except (TypeError, ValueError):
+                raise self._bad(i, column, "is no number") from None
+            if not least <= values[i] <= MAX_NUMBER:
+                raise self._bad(i, column, "is out of range")
+        return values
+
+    def pressures_kpa(self, area_mm2: float | None) -> FloatArray:
+        if "pressure_kpa" in self.columns:
+            return np.maximum(self.numbers("pressure_kpa"), 0.0)
+        if "force_n" not in self.columns:
+            raise CalibrationError(
+                f"{self._path} has no column pressure_kpa, and no force_n; it has: "
+                f"{', '.join(self.columns)}"
+            )
+        # A load cell at rest says a little less than nothing now and then.
+        return np.maximum(1e3 * self.numbers("force_n") / self._areas_mm2(area_mm2), 0.0)
+
+    def _areas_mm2(self, area_mm2: float | None) -> FloatArray:
+        if "area_mm2" in self.columns:
+            return self.numbers("area_mm2", least=1.0)
+        if "diameter_mm" in self.columns:
+            return np.pi / 4 * self.numbers("diameter_mm", least=1.0) ** 2
+        if area_mm2 is None:
+            raise CalibrationError(
+                f"{self._path} has forces and no area_mm2 or diameter_mm of the indenter; add a "
+                "column, or give --diameter-mm or --area-mm2"
+            )
+        return np.full(len(self._rows), area_mm2)
+
+    def directions(self) -> tuple[Direction, ...]:
+        if "direction" not in self.columns:
+            return ()
+        for i, row in enumerate(self._rows):
+            if row["direction"] not in get_args(Direction):
+                raise self._bad(i, "direction", "is not up, down or unknown")
+        return tuple(row["direction"] for row in self._rows)  # type: ignore[misc]
+
+    def _bad(self, i: int, column: str, why: str) -> CalibrationError:
+        value = self._rows[i][column]
+        return CalibrationError(
+            f"{self._path}, line {self.lines[i]}: {column} = {value!r} {why}; correct it, or "
+            "leave the line out"
+        )
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    """The numbers and texts of the file's lines that are neither empty nor comments."""
+    try:
+        with path.open("rb") as file:
+            text = file.read(MAX_BYTES + 1).decode("utf-8-sig")
+    except OSError as error:
+        raise CalibrationError(f"cannot read {path}: {error.strerror}; give a CSV file") from error
+    except UnicodeDecodeError as error:
+        raise CalibrationError(f"{path} is not text; give a CSV file in UTF-8") from error
+    lines = [
+        (number, line)
+        for number, line in enumerate(text.splitlines(), start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    if len(lines) < 2 or len(text) > MAX_BYTES:
+        raise CalibrationError(
+            f"{path} holds no readings; give a line of column names, and a line for each"
+        )
+    return lines
+
+
+def _still_pieces(cell: LoadCell) -> list[IntArray]:
+    """Lines that belong to one still load each."""
+    top = float(cell.pressure_kpa.max())
+    loaded = np.flatnonzero(cell.pressure_kpa > max(UNLOADED_KPA, APART * top))
+    window = np.floor(cell.times_s / WINDOW_S)
+    pieces: list[IntArray] = []
+    for number in np.unique(window[loaded]):
+        lines = loaded[window[loaded] == number]
+        if np.ptp(cell.pressure_kpa[lines]) > APART * top:
+            continue
+        before = pieces[-1] if pieces else None
+        if before is not None and _goes_on(cell, before, lines, top):
+            pieces[-1] = np.concatenate([before, lines])
+        else:
+            pieces.append(lines)
+    return pieces
+
+
+def _goes_on(cell: LoadCell, before: IntArray, lines: IntArray, top: float) -> bool:
+    """Whether a load is held on from one window into the next."""
+    near = cell.times_s[lines[0]] - cell.times_s[before[-1]] < WINDOW_S
+    change = cell.pressure_kpa[lines].mean() - cell.pressure_kpa[before].mean()
+    return bool(near and abs(change) < APART / 2 * top)
+
+
+def _reading(cell: LoadCell, piece: IntArray, seen: Seen) -> Reading | str:
+    """What the sensor showed of one still load, or why nobody knows."""
+    first, last = cell.times_s[piece[0]], cell.times_s[piece[-1]]
+    at = (seen.times_s >= first - WINDOW_S / 2) & (seen.times_s <= last + WINDOW_S / 2)
+    when = f"{first:.1f} s"
+    if not at.any():
+        return f"{when}: no frame"
+    single = at & (seen.contacts == 1)
+    if 2 * single.sum() <= at.sum():
+        several = int(seen.contacts[at].max())
+        return f"{when}: {several} contacts" if several > 1 else f"{when}: no contact"
+    magnitude, sigma = seen.magnitude[single], seen.magnitude_sigma[single]
+    if not np.all(np.isfinite(magnitude)):
+        return f"{when}: the magnitude channel is missing"
+    return Reading(
+        pressure_kpa=float(cell.pressure_kpa[piece].mean()),
+        magnitude=float(magnitude.mean()),
+        magnitude_sigma=float(np.nan_to_num(sigma).mean()),
+        direction=cell.direction(int(piece[0])),
+    )

@@ -1,0 +1,1 @@
+"""A reference that follows a skin's drift, and never what presses on it."""

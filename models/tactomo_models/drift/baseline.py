@@ -1,0 +1,318 @@
+"""Baseline tracking: a reference that follows a skin's drift, and never what presses on it.
+
+Temperature scales a whole sheet, conductivity wanders smoothly across it, and what was pressed
+stays a little more conductive for a while (creep, logarithmic in time). Against a reference of
+this morning that is a ghost by noon.
+
+*Nothing presses*: the reference follows what is seen, by a first-order low pass. What it has
+followed is split into what skins do (see `drift`) and an unexplained residual. Both are bounded, so
+that a touch that comes up slowly is not learned.
+
+*Something presses*: nothing is followed but a common gain, seen as a factor that all voltages
+share between two times of a contact that is still. A factor cannot hold a contact.
+
+*Something was let go*: what is left is held against what drift may have done since. If it explains
+the data to their noise, by amounts that skins reach in that time, the reference is there at once.
+Only a signal that has just dropped is asked so: a contact that stays is none.
+
+A lead that was broken at the tare is left out of all that: what is flagged since then and explained
+does not keep the rest from being followed. A fault that comes later does, until the next tare.
+
+What passes as neither is shown as it is, and `refusal` says so. Time is the frames' own: equal
+frames lead to equal references.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+from typing import Final, Literal, Protocol
+
+import numpy as np
+from tactomo_protocol import Channel
+
+from tactomo_models.arrays import BoolArray, FloatArray
+from tactomo_models.drift.channel_baseline import ChannelBaseline, Drift
+from tactomo_models.drift.drift_model import DriftSubspace
+from tactomo_models.drift.press_memory import PressMemory
+from tactomo_models.physics.artifact import Artifact
+from tactomo_models.scans.measurement import Measurement
+from tactomo_models.scans.plausibility import Flag
+from tactomo_models.scans.reference import Reference
+from tactomo_models.scene.reconstruction import Reconstruction
+from tactomo_models.sensor.description import SensorDescription
+
+State = Literal["waiting", "following", "held", "refused"]
+Scans = dict[Channel, FloatArray | None]
+
+MOVE_S: Final = 10.0  # least time between two references, unless something was let go
+DISTRUSTED_S: Final = 30.0  # of frames that nothing explains, before that is said
+TIME_CONSTANT_S: Final = 60.0  # by which the reference follows while nothing presses
+
+DROPPED: Final = 0.5  # of its usual signal, below which something was let go
+DISTRUST: Final = Flag.MISFIT_HIGH | Flag.REFERENCE_MISMATCH | Flag.LOW_CONFIDENCE
+
+STRAY = "the {} channel moves at rest as no skin drifts: maybe a touch that comes up slowly"
+FAINT = "what a contact left behind is a faint touch, or a skin that has drifted"
+NEITHER = "what is seen is no contact that explains it, and no drift that skins reach"
+
+
+class Solver(Protocol):
+    """What reconstructs the frames: a `Reconstructor`."""
+
+    @property
+    def description(self) -> SensorDescription:
+        """The sensor."""
+
+    @property
+    def artifact(self) -> Artifact:
+        """What is precomputed for the sensor."""
+
+    def set_reference(self, reference: Reference) -> None:
+        """Measure changes against this unpressed scan from now on."""
+
+    def usable(self, name: Channel) -> BoolArray:
+        """Voltages (M,) of a channel that the tare has found nothing wrong with."""
+
+    def compare(
+        self,
+        magnitude: FloatArray | None,
+        structure: FloatArray | None,
+        *,
+        saturated: Collection[Channel] = (),
+    ) -> Measurement:
+        """What has changed."""
+
+    def solve(self, measurement: Measurement) -> Reconstruction:
+        """What follows from a measurement."""
+
+
+class BaselineTracker:
+    """Reconstructs frames against a reference that follows the skin.
+
+    Args:
+        reconstructor: is given the references, from `begin` on by nobody else.
+        time_constant_s: by which the reference follows while nothing presses.
+
+    Attributes:
+        reference: the one in force; None before the first tare.
+        moves: how often the reference has moved since the tare.
+        refusal: why what is seen is not followed; empty while it is, or may be a contact.
+
+    Not thread-safe: one thread owns it.
+    """
+
+    def __init__(self, reconstructor: Solver, time_constant_s: float = TIME_CONSTANT_S) -> None:
+        self.reference: Reference | None = None
+        self.moves = 0
+        self.refusal = ""
+        self._reconstructor = reconstructor
+        self._time_constant_s = time_constant_s
+        self._subspace = DriftSubspace(reconstructor.description, reconstructor.artifact)
+        self._memory = PressMemory(reconstructor.description, self._subspace)
+        self._channels: dict[Channel, ChannelBaseline] = {}
+        self._release = _Release()
+        self._is_ready = self._is_held = False
+        self._moved_s = self._last_s = 0.0
+        self._distrusted_s: float | None = None
+
+    def begin(self, reference: Reference) -> Reference:
+        """Measure against a reference, and follow from there; returns it as it is in force.
+
+        Where it had drifted itself, that is as good as a tare.
+        """
+        self.reference = reference = reference.taken_as_it_is()
+        self._reconstructor.set_reference(reference)
+        self._channels = {
+            name: ChannelBaseline(self._subspace, tare, self._reconstructor.usable(name))
+            for name in self._reconstructor.description.channels
+            if (tare := getattr(reference, name)) is not None
+        }
+        self._memory.clear()
+        self._release = _Release()
+        self._is_ready = self._is_held = False
+        self.refusal, self._distrusted_s, self.moves = "", None, 0
+        return reference
+
+    @property
+    def state(self) -> State:
+        """What it does: wait for a first good frame, follow, hold under contact, or refuse."""
+        if not self._is_ready:
+            return "waiting"
+        if self.refusal:
+            return "refused"
+        return "held" if self._is_held else "following"
+
+    @property
+    def drift(self) -> dict[Channel, Drift]:
+        """How far each channel's baseline has moved since the tare."""
+        return {name: channel.drift() for name, channel in self._channels.items()}
+
+    def reconstruct(
+        self,
+        time_s: float,
+        magnitude: FloatArray | None,
+        structure: FloatArray | None,
+        *,
+        saturated: Collection[Channel] = (),
+    ) -> Reconstruction:
+        """Reconstruct one frame; before, the reference moves if need be.
+
+        Args:
+            time_s: when it was acquired, on any steady clock.
+            magnitude: (M,) volts; None if that scan is missing.
+            structure: (M,) volts; None if that scan is missing.
+            saturated: channels whose device says that its converter clipped this scan.
+
+        Raises:
+            DataError: a scan has another number of voltages than the sensor.
+        """
+        scans: Scans = {Channel.MAGNITUDE: magnitude, Channel.STRUCTURE: structure}
+        if time_s - self._moved_s >= MOVE_S and any(c.has_moved for c in self._channels.values()):
+            self._move(time_s)
+        measurement = self._reconstructor.compare(magnitude, structure, saturated=saturated)
+        if self._settles(time_s, measurement, scans):
+            self._move(time_s)
+            measurement = self._reconstructor.compare(magnitude, structure, saturated=saturated)
+        frame = self._reconstructor.solve(measurement)
+        if self.reference is not None:
+            self._take_note(time_s, measurement, frame, scans)
+        return frame
+
+    def _move(self, time_s: float) -> None:
+        """Put the baseline as it is now in force."""
+        assert self.reference is not None
+        drift = {name: channel.put_in_force() for name, channel in self._channels.items()}
+        self.reference = replace(
+            self.reference,
+            magnitude_drift=drift.get(Channel.MAGNITUDE),
+            structure_drift=drift.get(Channel.STRUCTURE),
+        )
+        self._reconstructor.set_reference(self.reference)
+        self._moved_s = time_s
+        self.moves += 1
+
+    def _settles(self, time_s: float, measurement: Measurement, scans: Scans) -> bool:
+        """Whether what is seen is nothing but drift; if so, the baseline is there now."""
+        doubtful = 1.5  # times the bounds, from which what is left is certainly a contact
+        known = Flag.REFERENCE_MISMATCH | measurement.standing_flags
+        if not self._is_ready or measurement.is_quiet or measurement.flags & ~known:
+            return False
+        if measurement.changes.keys() != self._channels.keys():
+            return False
+        if self._is_held and not self._release.is_on(time_s, _signal(measurement)):
+            return False
+        found = {
+            name: channel.explain(
+                time_s,
+                scans[name],
+                measurement.changes[name],
+                self._memory.creep(time_s, name),
+                self._time_constant_s,
+            )
+            for name, channel in self._channels.items()
+        }
+        if all(each.misfit < 1 and each.excess < 1 for each in found.values()):
+            for name, channel in self._channels.items():
+                channel.jump(time_s, found[name])
+            self._let_go()
+            return True
+        if self._is_held and all(max(e.misfit, e.excess) < doubtful for e in found.values()):
+            self.refusal = FAINT
+        return False
+
+    def _let_go(self) -> None:
+        self._is_held, self.refusal, self._distrusted_s = False, "", None
+        self._release = _Release()
+        self._drop_blocks()
+
+    def _take_note(
+        self, time_s: float, measurement: Measurement, frame: Reconstruction, scans: Scans
+    ) -> None:
+        """Learn from a frame; what follows from it is in force from the next one on."""
+        elapsed_s = max(0.0, time_s - self._last_s) if self._is_ready else 0.0
+        self._last_s = time_s
+        self._memory.add(time_s, elapsed_s, frame)
+        if measurement.is_quiet and not frame.flags & ~measurement.standing_flags:
+            self._follow(time_s, measurement, scans)
+        elif measurement.is_quiet or not measurement.changes:
+            self._drop_blocks()  # it says nothing of the baseline
+        elif self._is_ready:
+            self._hold(time_s, elapsed_s, measurement, frame, scans)
+
+    def _follow(self, time_s: float, measurement: Measurement, scans: Scans) -> None:
+        if self._is_held or not self._is_ready:
+            if not self._is_ready:
+                for channel in self._channels.values():
+                    channel.begin(time_s)
+            self._let_go()
+            self._is_ready = True
+        self._distrusted_s = None
+        for name, channel in self._channels.items():
+            if not channel.add(time_s, scans[name], measurement.changes[name]):
+                continue
+            creep = self._memory.creep(time_s, name)
+            if channel.follow(time_s, creep, self._time_constant_s):
+                self.refusal = ""
+            else:
+                self.refusal = STRAY.format(name)
+
+    def _hold(
+        self,
+        time_s: float,
+        elapsed_s: float,
+        measurement: Measurement,
+        frame: Reconstruction,
+        scans: Scans,
+    ) -> None:
+        if not self._is_held:
+            self._drop_blocks()
+            self._is_held = True
+        self._release.add(time_s, elapsed_s, _signal(measurement))
+        self._note_distrust(time_s, frame)
+        for name, channel in self._channels.items():
+            if name not in measurement.changes or measurement.flags & ~(
+                DISTRUST | measurement.standing_flags
+            ):
+                channel.drop_block()
+            elif channel.add(time_s, scans[name], measurement.changes[name]):
+                channel.follow_under_contact(time_s, self._memory.creep(time_s, name))
+
+    def _note_distrust(self, time_s: float, frame: Reconstruction) -> None:
+        if not frame.flags & DISTRUST:
+            self._distrusted_s = None
+        elif self._distrusted_s is None:
+            self._distrusted_s = time_s
+        elif time_s - self._distrusted_s > DISTRUSTED_S:
+            self.refusal = NEITHER
+
+    def _drop_blocks(self) -> None:
+        for channel in self._channels.values():
+            channel.drop_block()
+
+
+def _signal(measurement: Measurement) -> float:
+    return max(taken.signal for taken in measurement.changes.values())
+
+
+class _Release:
+    """Notices when something is let go: the signal falls far below what it was a moment ago."""
+
+    def __init__(self) -> None:
+        self._usual = 0.0
+        self._until_s: float | None = None
+
+    def is_on(self, time_s: float, signal: float) -> bool:
+        """Whether something is being let go, or was so a moment ago."""
+        if self._usual and signal < DROPPED * self._usual:
+            return True
+        return self._until_s is not None and time_s < self._until_s
+
+    def add(self, time_s: float, elapsed_s: float, signal: float) -> None:
+        """Take note of a frame in which something presses."""
+        usual_s = 10.0  # over which "usual" is taken
+        settling_s = 30.0  # after that, in which what is left may be drift
+        if self._usual and signal < DROPPED * self._usual:
+            self._until_s, self._usual = time_s + settling_s, signal
+        share = -np.expm1(-elapsed_s / usual_s)
+        self._usual = self._usual + share * (signal - self._usual) if self._usual else signal

@@ -1,0 +1,136 @@
+"""What drift does to a sheet's voltages, and how much of a change it explains.
+
+Three things, each a few modes of the logarithm of the voltages: a common gain (temperature, the
+current, the amplifier), conductivity that wanders smoothly across the sheet, and creep, which
+leaves what was pressed a little more conductive. An amount of each has a prior standard deviation,
+so that the most likely drift behind a change is a small linear least-squares problem.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import scipy.linalg
+
+from tactomo_models.arrays import FloatArray, IntArray
+from tactomo_models.physics.artifact import Artifact
+from tactomo_models.physics.bare_sheet import scan_voltages, transfer_resistances
+from tactomo_models.physics.mesh import SheetMesh, mesh_sheet
+from tactomo_models.scans.changes import noise_limit
+from tactomo_models.sensor.description import SensorDescription
+
+SMOOTH_SHARE: Final = 0.25  # of the sheet's width: how far conductivity wanders together
+HIGHEST_ORDER: Final = 4  # half waves across the sheet
+CELLS: Final = 20  # across the sheet: creep is told apart by them
+PROBE: Final = 0.01  # relative change by which the smooth modes are differentiated
+OUT_OF_BOUNDS: Final = 2.5  # standard deviations that no drift reaches
+
+
+@dataclass(frozen=True)
+class Explained:
+    """The most likely drift behind a change.
+
+    Attributes:
+        amounts: (K,) of every mode.
+        left: (M,) what they do not explain.
+        misfit: sum of squares of that, over the limit of what noise may come to; good below 1.
+        excess: the largest amount over its bound; good below 1.
+    """
+
+    amounts: FloatArray
+    left: FloatArray
+    misfit: float
+    excess: float
+
+
+class DriftSubspace:
+    """The modes of one sensor's drift: the gain, the smooth ones, and one for each cell's creep.
+
+    Making it takes half a second.
+
+    Attributes:
+        modes: (M, K) change of the logarithm of each voltage by a unit of each mode: a factor e
+            for the gain, a field of unit standard deviation for each smooth one together with the
+            others, a relative change of 1 for a cell.
+        smooth: places of the smooth modes among the K.
+        cells: places of the cells among the K.
+        cell_of_map: (nodes_y, nodes_x) the cell of each map node, from 0.
+    """
+
+    def __init__(self, description: SensorDescription, artifact: Artifact) -> None:
+        self._size_m = (description.width_m, description.height_m)
+        x, y = artifact.bare.points[:, artifact.bare.pressable]
+        own = np.zeros((len(x), CELLS**2))
+        own[np.arange(len(x)), self._cell_of(x, y)] = 1.0
+        predicted = scan_voltages(description, artifact.bare.transfer)
+        cells = (artifact.jacobian @ own) * np.sign(predicted)[:, None]
+        smooth = self._smooth_modes(description)
+        self.modes = np.hstack([np.ones((len(cells), 1)), smooth, cells])
+        self.smooth = slice(1, 1 + smooth.shape[1])
+        self.cells = slice(1 + smooth.shape[1], self.modes.shape[1])
+        self.cell_of_map = self._cell_of(*np.meshgrid(description.map_x_m, description.map_y_m))
+
+    def _cell_of(self, x_m: FloatArray, y_m: FloatArray) -> IntArray:
+        width_m, height_m = self._size_m
+        column = np.clip(np.floor((x_m / width_m + 0.5) * CELLS), 0, CELLS - 1)
+        row = np.clip(np.floor((y_m / height_m + 0.5) * CELLS), 0, CELLS - 1)
+        return np.asarray(row * CELLS + column, np.intp)
+
+    def _smooth_modes(self, description: SensorDescription) -> FloatArray:
+        coarse = 2.0  # times the map's spacing: enough for what is smooth
+        spacing_m = coarse * description.width_m / (description.map.nodes_x - 1)
+        sheet = mesh_sheet(description, spacing_m, refinements=1)
+        fields = self._smooth_fields(sheet)
+        derivatives = []
+        for field in fields:
+            up, down = (
+                scan_voltages(
+                    description, transfer_resistances(description, sheet, np.exp(step * field))
+                )
+                for step in (PROBE, -PROBE)
+            )
+            derivatives.append(np.log(up / down) / (2 * PROBE))
+        return np.stack(derivatives, axis=1)
+
+    def _smooth_fields(self, sheet: SheetMesh) -> list[FloatArray]:
+        """Fields (T,) that together vary over `SMOOTH_SHARE`, with unit variance in all."""
+        width_m, height_m = self._size_m
+        x, y = sheet.mesh.p[:, sheet.mesh.t].mean(axis=1)
+        fields, variance = [], 0.0
+        for i in range(HIGHEST_ORDER + 1):
+            for j in range(HIGHEST_ORDER + 1):
+                if not 0 < i**2 + j**2 <= HIGHEST_ORDER**2:
+                    continue
+                size = np.exp(-(i**2 + j**2) * (np.pi * SMOOTH_SHARE) ** 2 / 4)
+                wave = np.cos(np.pi * i * (x / width_m + 0.5))
+                wave *= np.cos(np.pi * j * (y / height_m + 0.5))
+                fields.append(size * wave)
+                variance += float(np.mean(fields[-1] ** 2))
+        return [field / np.sqrt(variance) for field in fields]
+
+    def explain(self, change: FloatArray, precision: FloatArray, sigma: FloatArray) -> Explained:
+        """The most likely amounts of drift behind a change.
+
+        Args:
+            change: (M,) of the logarithm of the voltages.
+            precision: (M,) its inverse variances by noise; 0 where it is not known.
+            sigma: (K,) prior standard deviation of each mode; 0 where it has no say.
+        """
+        active = np.flatnonzero(sigma)
+        modes, prior = self.modes[:, active], 1 / sigma[active] ** 2
+        weighted = modes * precision[:, None]
+        normal = modes.T @ weighted
+        normal[np.diag_indices_from(normal)] += prior
+        amounts = np.zeros_like(sigma)
+        amounts[active] = scipy.linalg.solve(normal, weighted.T @ change, assume_a="pos")
+        left = change - modes @ amounts[active]
+        count = max(int(np.count_nonzero(precision)), 1)
+        excess = np.abs(amounts[active]) * np.sqrt(prior) / OUT_OF_BOUNDS
+        return Explained(
+            amounts,
+            left,
+            float((precision * left**2).sum()) / noise_limit(count),
+            float(excess.max(initial=0.0)),
+        )

@@ -1,0 +1,1 @@
+"""How a skin and its electrodes are, from scans at rest."""

@@ -1,0 +1,1 @@
+"""The reconstruction methods, and the parts that they share."""

@@ -1,0 +1,138 @@
+"""Linear methods: one precomputed matrix for each channel, and no forward solve.
+
+`tikhonov` takes every node alike, `noser` weights nodes by how well the electrodes see them; see
+`physics.tikhonov` for both and for how the regularisation parameter is chosen.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from tactomo_protocol import Channel
+
+from tactomo_models.arrays import FloatArray, Image
+from tactomo_models.methods.magnitudes import (
+    BAD_MISFIT,
+    bare_tangent,
+    known_magnitudes,
+    leaves_unexplained,
+    linear_magnitudes,
+)
+from tactomo_models.methods.method import Estimate, Skin
+from tactomo_models.physics.artifact import TYPICAL_CHANGE, central_target
+from tactomo_models.physics.tikhonov import (
+    EVEN,
+    even_scale,
+    noise_figure_weight,
+    noser_scale,
+    prior_weight,
+    tikhonov_matrix,
+)
+from tactomo_models.scans.measurement import Measurement
+from tactomo_models.scans.plausibility import Flag
+
+Prior = Literal["tikhonov", "noser"]
+
+
+class LinearImages:
+    """Linear images of a skin's channels, each matrix made when it is first needed.
+
+    Making one takes a tenth of a second.
+    """
+
+    def __init__(self, skin: Skin, prior: Prior) -> None:
+        self._skin, self._prior = skin, prior
+        self._matrices: dict[Channel, Image] = {}
+
+    def image(self, channel: Channel, change: FloatArray) -> Image:
+        """Image (P,) of relative voltage changes (M,), in the direction of pressing.
+
+        What goes the other way is cut off, unless the sensor's objects conduct either way.
+        """
+        description = self._skin.description
+        signed = description.sign(channel) * change
+        image = self.matrix(channel) @ signed.astype(np.float32)
+        return image if description.either_way(channel) else np.maximum(image, 0.0, out=image)
+
+    def matrix(self, channel: Channel) -> Image:
+        """Reconstruction matrix (P, M) for the noise at hand.
+
+        In single precision: the rounding is far below the noise, and the product is bound by
+        memory.
+        """
+        if channel not in self._matrices:
+            self._matrices[channel] = self._make_matrix(channel).astype(np.float32)
+        return self._matrices[channel]
+
+    def _make_matrix(self, channel: Channel) -> FloatArray:
+        skin, jacobian = self._skin, self._skin.artifact.jacobian
+        noise = skin.channels[channel].relative_noise
+        noser = noser_scale(jacobian, noise) if self._prior == "noser" else None
+        if channel == Channel.MAGNITUDE:
+            prior_scale = even_scale(skin.forward.node_areas_m2) if noser is None else noser
+            weight = prior_weight(TYPICAL_CHANGE, prior_scale)
+        else:  # it changes far beyond what is linear: how much says no prior
+            prior_scale = EVEN if noser is None else noser
+            target = central_target(skin.description, skin.artifact.bare)
+            weight = noise_figure_weight(jacobian, noise, target, prior_scale)
+        return tikhonov_matrix(jacobian, noise, skin.regularisation * weight, prior_scale)
+
+
+class Tikhonov:
+    """One linear step, every node alike."""
+
+    prior: Prior = "tikhonov"
+
+    def prepare(self, skin: Skin) -> None:
+        """Make each channel's matrix."""
+        self._skin = skin
+        self._images = LinearImages(skin, self.prior)
+        self._jacobian_by_node = np.ascontiguousarray(skin.artifact.jacobian.T)
+        for channel in skin.channels:
+            self._images.matrix(channel)
+
+    def solve(
+        self, measurement: Measurement, previous: Estimate | None, budget_s: float
+    ) -> Estimate:
+        """Linear images of both channels; areas above half of the clearest one's peak."""
+        unexplained_part = 0.5  # of the misfit of nothing, that areas of a linear image may leave
+        changes, areas = measurement.changes, self._skin.areas
+        with measurement.timed(self.prior):
+            images = {name: self._images.image(name, each.change) for name, each in changes.items()}
+            maps = {name: areas.on_map(image) for name, image in images.items()}
+        with measurement.timed("contacts"):
+            shown = images[Channel.STRUCTURE if Channel.STRUCTURE in images else Channel.MAGNITUDE]
+            peak = max(float(np.abs(shown).max()), 1e-12)
+            # The rest of the image is blur: a contact there would be as large as the sheet.
+            inside = np.where(np.abs(shown) > 0.5 * peak, 1.0, 0.0)
+            found = areas.find(areas.on_map(inside), inside)
+            fitted, flags = None, Flag(0)
+            if Channel.MAGNITUDE in changes:
+                magnitude = changes[Channel.MAGNITUDE]
+                if len(found):
+                    fitted = linear_magnitudes(
+                        bare_tangent(self._jacobian_by_node, found), magnitude
+                    )
+                # Its outlines are a guess, so all that can be asked is that they explain most.
+                bad = max(BAD_MISFIT, unexplained_part * magnitude.misfit)
+                if leaves_unexplained(fitted, magnitude, self._skin.magnitude_sign, bad):
+                    flags = Flag.MISFIT_HIGH
+        size, sigma = known_magnitudes(fitted, self._skin.magnitude_sign, len(found))
+        return Estimate(
+            map=maps.get(Channel.MAGNITUDE),
+            structure=maps[Channel.STRUCTURE] / peak if Channel.STRUCTURE in maps else None,
+            areas=found,
+            magnitudes=size,
+            magnitude_sigmas=sigma,
+            tells_pressure=False,  # a linear image spreads and pales
+            misfit=fitted.misfit if fitted else float("nan"),
+            flags=flags,
+            made_by=self.prior,
+        )
+
+
+class Noser(Tikhonov):
+    """One linear step, nodes weighted by how well they are seen."""
+
+    prior = "noser"

@@ -1,0 +1,1 @@
+"""The sheet's physics: mesh, Green's functions, forward model, artifacts, sensitivity."""

@@ -1,0 +1,222 @@
+"""Built artifacts: what is computed once for a sensor and kept in a file.
+
+An artifact holds the solved bare sheet, its Jacobian and the Tikhonov matrix, with the hash of
+the description it was built for. One that was built for another sensor is refused.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+from platformdirs import user_cache_path
+
+from tactomo_models.archive import read_arrays, write_whole
+from tactomo_models.arrays import FloatArray
+from tactomo_models.errors import ArtifactError, DataError
+from tactomo_models.physics.bare_sheet import BareSheet, solve_bare_sheet
+from tactomo_models.physics.forward import ForwardModel
+from tactomo_models.physics.mesh import mesh_sheet
+from tactomo_models.physics.tikhonov import even_scale, prior_weight, tikhonov_matrix
+from tactomo_models.sensor.description import SensorDescription
+
+Progress = Callable[[str], None]
+
+FORMAT = 2  # of the file; rises when what is in it changes
+NOMINAL_SNR_DB = 60.0  # of the voltages' root mean square; until a tare has seen the real noise
+MODEL_ERROR = 0.003  # relative error of any voltage that no noise accounts for
+INVERSE_REFINEMENTS = 2  # of the mesh: one less than the one that simulates
+TYPICAL_CHANGE = 0.3  # of conductivity, by which presses change the magnitude channel
+TARGET_SHARE = 0.1  # radius of the noise figure's target over the smaller half side
+
+
+@dataclass(frozen=True)
+class Artifact:
+    """All that is precomputed for one sensor.
+
+    Attributes:
+        sensor: name of the description it was built for.
+        sha256: that description's hash.
+        bare: the solved bare sheet.
+        jacobian: (M, P) derivative of relative voltage changes by relative conductivity.
+        tikhonov: (P, M) reconstruction matrix for the nominal noise.
+        regularisation: its lambda, for changes of a typical size.
+    """
+
+    sensor: str
+    sha256: str
+    bare: BareSheet
+    jacobian: FloatArray
+    tikhonov: FloatArray
+    regularisation: float
+
+
+def nominal_noise(bare_voltages: FloatArray) -> FloatArray:
+    """Relative noise (M,) of a converter with the same noise in volts on every measurement."""
+    return np.asarray(np.hypot(nominal_noise_v(bare_voltages) / np.abs(bare_voltages), MODEL_ERROR))
+
+
+def nominal_noise_v(voltages: FloatArray) -> FloatArray:
+    """Noise (M,) in volts of that converter; voltages that are no numbers count for nothing."""
+    finite = voltages[np.isfinite(voltages)]
+    largest = float(np.abs(finite).max(initial=0.0)) or 1.0
+    rms = largest * np.sqrt(np.mean((finite / largest) ** 2)) if len(finite) else 0.0
+    return np.full(voltages.shape, rms * 10 ** (-NOMINAL_SNR_DB / 20))
+
+
+def build_artifact(description: SensorDescription, progress: Progress | None = None) -> Artifact:
+    """Mesh, solve and invert: a few seconds.
+
+    Args:
+        description: the sensor to build for.
+        progress: called with a short text at the start of each step.
+    """
+    say = progress or (lambda _: None)
+    say("meshing the sheet")
+    sheet = mesh_sheet(description, refinements=INVERSE_REFINEMENTS)
+    say("solving the bare sheet")
+    bare = solve_bare_sheet(description, sheet)
+    say("differentiating")
+    forward = ForwardModel(description, bare)
+    jacobian = forward.bare_jacobian() / np.abs(forward.bare_voltages)[:, None]
+    say("choosing the regularisation")
+    noise = nominal_noise(forward.bare_voltages)
+    prior_scale = even_scale(forward.node_areas_m2)
+    weight = prior_weight(TYPICAL_CHANGE, prior_scale)
+    return Artifact(
+        sensor=description.name,
+        sha256=description.sha256,
+        bare=bare,
+        jacobian=jacobian,
+        tikhonov=tikhonov_matrix(jacobian, noise, weight, prior_scale),
+        regularisation=weight,
+    )
+
+
+def central_target(description: SensorDescription, bare: BareSheet) -> FloatArray:
+    """Conductivity change (P,) of the noise figure's target: a small disc at the centre."""
+    radius = TARGET_SHARE * min(description.width_m, description.height_m)
+    x, y = bare.points[:, bare.pressable]
+    return np.asarray((np.hypot(x, y) < radius).astype(float))
+
+
+def cache_folder() -> Path:
+    """Where things are kept that can be computed again: the user's cache.
+
+    A service finds its own folder in $CACHE_DIRECTORY, which systemd sets.
+    """
+    return Path(os.environ.get("CACHE_DIRECTORY") or user_cache_path("tactomo"))
+
+
+def default_path(description: SensorDescription) -> Path:
+    """Where an artifact is kept by default."""
+    return cache_folder() / f"{description.name}-{description.sha256[:12]}.npz"
+
+
+def save_artifact(artifact: Artifact, path: Path) -> None:
+    """Write an artifact; a half-written one is never left under that name.
+
+    Raises:
+        ArtifactError: the file cannot be written.
+    """
+    weights = artifact.bare.map_weights.tocsr()
+    arrays = {
+        "format": FORMAT,
+        "sensor": artifact.sensor,
+        "sha256": artifact.sha256,
+        "jacobian": artifact.jacobian,
+        "tikhonov": artifact.tikhonov,
+        "regularisation": artifact.regularisation,
+        "weights_data": weights.data,
+        "weights_indices": weights.indices,
+        "weights_indptr": weights.indptr,
+    }
+    for name in _BARE_ARRAYS:
+        arrays[name] = getattr(artifact.bare, name)
+    try:
+        write_whole(path, lambda file: np.savez(file, **arrays))
+    except OSError as error:
+        raise ArtifactError(
+            f"cannot write {path}: {error.strerror}; free some space or name another path"
+        ) from error
+
+
+_BARE_ARRAYS = ("points", "triangles", "pressable", "support", "green", "potentials", "transfer")
+
+
+def load_artifact(path: Path, description: SensorDescription) -> Artifact:
+    """Read an artifact and make sure that it belongs to this sensor.
+
+    Raises:
+        ArtifactError: it is missing, damaged, of another format, or built for another sensor.
+    """
+    rebuild = f"run: tactomo models build --description {description.name}"
+    try:
+        arrays = read_arrays(path)
+        version, sha256 = int(arrays["format"]), str(arrays["sha256"])
+        if version != FORMAT:
+            raise ArtifactError(
+                f"{path} has format {version}, this version reads {FORMAT}; {rebuild}"
+            )
+        if sha256 != description.sha256:
+            raise ArtifactError(
+                f"{path} was built for sensor {str(arrays['sensor'])!r} ({sha256[:12]}), not for "
+                f"{description.name!r} ({description.sha256[:12]}); {rebuild}"
+            )
+        return _from_arrays(arrays, description)
+    except FileNotFoundError as error:
+        raise ArtifactError(f"no artifact at {path}; {rebuild}") from error
+    except (OSError, KeyError, ValueError, TypeError, DataError) as error:
+        raise ArtifactError(f"{path} is damaged or no artifact ({error}); {rebuild}") from error
+
+
+def _from_arrays(arrays: dict[str, FloatArray], description: SensorDescription) -> Artifact:
+    pressable = len(arrays["pressable"])
+    shape = (description.map.nodes_y * description.map.nodes_x, pressable)
+    weights = sp.csr_matrix(
+        (arrays["weights_data"], arrays["weights_indices"], arrays["weights_indptr"]), shape
+    )
+    artifact = Artifact(
+        sensor=str(arrays["sensor"]),
+        sha256=str(arrays["sha256"]),
+        bare=BareSheet(map_weights=weights, **{name: arrays[name] for name in _BARE_ARRAYS}),  # type: ignore[arg-type]
+        jacobian=arrays["jacobian"],
+        tikhonov=arrays["tikhonov"],
+        regularisation=float(arrays["regularisation"]),
+    )
+    if artifact.jacobian.shape != (description.measurements, pressable):
+        raise ValueError(f"jacobian has shape {artifact.jacobian.shape}")
+    return artifact
+
+
+def load_or_build_artifact(
+    description: SensorDescription, path: Path | None = None, progress: Progress | None = None
+) -> Artifact:
+    """Read the sensor's artifact, or build and keep it where it is missing.
+
+    Args:
+        description: the sensor.
+        path: the file; a place in the user's cache if None.
+        progress: called with a short text at the start of each step of a build.
+
+    Raises:
+        ArtifactError: the file that was named is damaged or built for another sensor, or cannot
+            be written. In the cache it is built anew.
+    """
+    target = path or default_path(description)
+    try:
+        return load_artifact(target, description)
+    except ArtifactError:
+        if path is not None and path.exists():
+            raise  # what was asked for by name is not replaced; what is in the cache is
+    artifact = build_artifact(description, progress)
+    try:
+        save_artifact(artifact, target)
+    except ArtifactError:
+        if path is not None:
+            raise  # the cache is a convenience, a path that was asked for is not
+    return artifact

@@ -1,0 +1,247 @@
+"""The bare sheet, solved by finite elements under the complete electrode model.
+
+From that follow its Green's function between the nodes that can be pressed, the transfer
+resistances between its electrodes, and the voltages of a scan.
+
+Source: Somersalo, Cheney & Isaacson, "Existence and uniqueness for electrode models for electric
+current computed tomography", SIAM J. Appl. Math. 52 (1992).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+import skfem
+from skfem.helpers import dot, grad
+from threadpoolctl import threadpool_limits
+
+from tactomo_models.arrays import BoolArray, FloatArray, IntArray
+from tactomo_models.physics.greens import GreensFunction
+from tactomo_models.physics.mesh import SheetMesh
+from tactomo_models.sensor.description import SensorDescription
+
+
+@dataclass(frozen=True)
+class BareSheet:
+    """What is computed once for a mesh: everything a pressed sheet's voltages follow from.
+
+    Attributes:
+        points: (2, N) mesh nodes, metres.
+        triangles: (3, T) nodes of each triangle.
+        pressable: (P,) mesh nodes whose conductivity may change.
+        support: (S,) nodes of all triangles that touch a pressable node.
+        green: (S, S) potential at a support node for a unit current into another; as a
+            `GreensFunction` where few presses are solved and a quick start is worth more.
+        potentials: (S, L - 1) potential at the support nodes for a unit current into electrode
+            l and out of the last one.
+        transfer: (L, L) electrode potentials for the same currents; the last row and column are 0.
+        map_weights: (nodes_y * nodes_x, P) interpolation of pressable nodes onto the map.
+        conductivity: (N,) of an uneven sheet, relative to the description's; 1 if None.
+    """
+
+    points: FloatArray
+    triangles: IntArray
+    pressable: IntArray
+    support: IntArray
+    green: FloatArray | GreensFunction
+    potentials: FloatArray
+    transfer: FloatArray
+    map_weights: sp.csr_matrix
+    conductivity: FloatArray | None = None
+
+
+def solve_bare_sheet(
+    description: SensorDescription,
+    sheet: SheetMesh,
+    conductivity: FloatArray | None = None,
+    impedance: FloatArray | None = None,
+    *,
+    quick: bool = False,
+) -> BareSheet:
+    """Assemble and solve the complete electrode model of an unpressed sheet.
+
+    Args:
+        description: the sensor.
+        sheet: its mesh of N nodes.
+        conductivity: (N,) of an uneven sheet, relative to the description's; 1 if None.
+        impedance: (L,) contact impedances, relative to the description's; 1 if None.
+        quick: leave the Green's function in pieces: a tenth of the time and memory, but a newly
+            pressed area then costs a millisecond more, and there are no `ForwardModel.probes`.
+    """
+    mesh = sheet.mesh
+    # The integral of a linear conductivity over a triangle is that of its corners' mean.
+    nodal = np.ones(mesh.p.shape[1]) if conductivity is None else conductivity
+    system = assemble_sheet(description, sheet, nodal[mesh.t].mean(axis=0), impedance)
+    inside = description.on_sheet(mesh.p[0], mesh.p[1], description.sheet.frame_width_m)
+    pressable = np.flatnonzero(inside)
+    touched = np.isin(mesh.t, pressable).any(axis=0)
+    support = np.unique(mesh.t[:, touched])
+    fields = _fields(description, system)
+    with threadpool_limits(1):
+        green = GreensFunction(system, support, mesh.p[:, support])
+        whole = green if quick else green.whole()
+    return BareSheet(
+        points=mesh.p,
+        triangles=mesh.t.astype(np.intp),
+        pressable=pressable,
+        support=support,
+        green=whole,
+        potentials=fields[support],
+        transfer=_transfer(description, fields),
+        map_weights=_map_weights(description, mesh)[:, pressable].tocsr(),
+        conductivity=conductivity,
+    )
+
+
+def transfer_resistances(
+    description: SensorDescription,
+    sheet: SheetMesh,
+    conductivity: FloatArray,
+    impedance: FloatArray | None = None,
+) -> FloatArray:
+    """Solve a sheet of any conductivity directly: a fraction of a second, no Green's function.
+
+    Args:
+        description: the sensor.
+        sheet: its mesh of T triangles.
+        conductivity: (T,) of each triangle, relative to the bare sheet's.
+        impedance: (L,) contact impedances, relative to the description's; 1 if None.
+
+    Returns:
+        (L, L) electrode potentials for a unit current into each electrode and out of the last;
+        see `scan_voltages`.
+    """
+    system = assemble_sheet(description, sheet, conductivity, impedance)
+    return _transfer(description, _fields(description, system))
+
+
+def scan_voltages(description: SensorDescription, transfer: FloatArray) -> FloatArray:
+    """Voltages (M,) in scan order that transfer resistances (L, L) lead to, relative.
+
+    Multiply by `volts_per_unit` for volts.
+    """
+    drive, measure = description.pairs.drive.T, description.pairs.measure.T
+    into = transfer[measure[0], drive[0]] - transfer[measure[1], drive[0]]
+    out_of = transfer[measure[0], drive[1]] - transfer[measure[1], drive[1]]
+    return np.asarray(into - out_of)
+
+
+def exchanged(transfer: FloatArray, order: Sequence[int]) -> FloatArray:
+    """Transfer resistances (L, L) where the device's lead i is on electrode order[i].
+
+    Potentials are against the last lead's electrode, by which the currents leave.
+    """
+    moved = transfer[np.ix_(order, order)]
+    return np.asarray(moved - moved[-1:] - moved[:, -1:] + moved[-1, -1])
+
+
+def volts_per_unit(description: SensorDescription) -> float:
+    """Volts of a relative voltage of 1: the drive current over the bare sheet's conductance."""
+    return description.pattern.current_a / description.sheet_conductance_s
+
+
+def _fields(description: SensorDescription, system: sp.csc_matrix) -> FloatArray:
+    """Solutions (unknowns, L - 1) of a sheet's system for a current into each electrode.
+
+    The last electrode is what the currents leave by: its potential is 0 and no unknown.
+    """
+    unknown = description.electrode_count - 1
+    injected = np.zeros((system.shape[0], unknown))
+    injected[-unknown:] = np.eye(unknown)
+    with threadpool_limits(1):  # SuperLU's panels are too small to share: more threads only spin
+        factor = spla.splu(system, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        return np.asarray(factor.solve(injected))
+
+
+def _transfer(description: SensorDescription, fields: FloatArray) -> FloatArray:
+    electrodes = description.electrode_count
+    transfer = np.zeros((electrodes, electrodes))
+    transfer[:-1, :-1] = fields[1 - electrodes :]
+    return transfer
+
+
+@skfem.BilinearForm  # type: ignore[untyped-decorator]
+def _conduction(u: Any, v: Any, w: Any) -> Any:
+    return w["conductivity"] * dot(grad(u), grad(v))
+
+
+def assemble_sheet(
+    description: SensorDescription,
+    sheet: SheetMesh,
+    conductivity: FloatArray,
+    impedance: FloatArray | None = None,
+) -> sp.csc_matrix:
+    """Assemble the complete electrode model.
+
+    Args:
+        description: the sensor.
+        sheet: its mesh of N nodes and T triangles.
+        conductivity: (T,) of each triangle, relative to the description's.
+        impedance: (L,) contact impedances, relative to the description's; 1 if None.
+
+    Returns:
+        (N + L - 1, N + L - 1), symmetric positive definite, of the potentials of the nodes and of
+        all electrodes but the last.
+    """
+    mesh = sheet.mesh
+    nodes, electrodes = mesh.p.shape[1], description.electrode_count
+    basis = skfem.Basis(mesh, skfem.ElementTriP1())
+    stiffness = _conduction.assemble(basis, conductivity=conductivity[:, None])
+    # Contact impedance, made relative to the sheet: an extra length of conductor, in metres.
+    contact_m = np.full(
+        electrodes,
+        description.electrodes.contact_impedance_ohm_m * description.sheet_conductance_s,
+    )
+    if impedance is not None:
+        contact_m *= impedance
+    rows, columns, values = [], [], []  # of the electrodes' terms
+    lengths = np.zeros(electrodes)
+    for index, facets in enumerate(sheet.electrode_facets):
+        ends = mesh.facets[:, facets]
+        length = np.linalg.norm(mesh.p[:, ends[0]] - mesh.p[:, ends[1]], axis=0)
+        lengths[index] = length.sum()
+        for i, j in ((0, 0), (1, 1), (0, 1), (1, 0)):
+            rows.append(ends[i])
+            columns.append(ends[j])
+            values.append(length * (1 / 3 if i == j else 1 / 6) / contact_m[index])
+        for end in ends:
+            potential = np.full_like(end, nodes + index)
+            rows += [end, potential]
+            columns += [potential, end]
+            values += [-length / 2 / contact_m[index]] * 2
+    potentials = nodes + np.arange(electrodes)
+    rows.append(potentials)
+    columns.append(potentials)
+    values.append(lengths / contact_m)
+    size = nodes + electrodes
+    terms = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    stiffness.resize(size, size)
+    return (stiffness + sp.csr_matrix(terms, (size, size)))[:-1, :-1].tocsc()
+
+
+def _map_weights(description: SensorDescription, mesh: skfem.MeshTri) -> sp.csr_matrix:
+    """Linear interpolation from mesh nodes to map nodes; rows off the sheet are empty."""
+    x, y = np.meshgrid(description.map_x_m, description.map_y_m)
+    # A hair inside, so that points on the rim are not lost to rounding or to the disc's facets.
+    points = np.stack([x.ravel(), y.ravel()]) * (1 - 1e-9)
+    on = np.flatnonzero(_inside_mesh(mesh, points))
+    basis = skfem.Basis(mesh, skfem.ElementTriP1())
+    # It looks for each point in the triangles near any of them: row by row these are few.
+    rows = np.split(points[:, on], np.flatnonzero(np.diff(points[1, on])) + 1, axis=1)
+    weights = sp.vstack([basis.probes(row) for row in rows]).tocsr()
+    weights.data[weights.data < 1e-7] = 0  # a trace of other corners; rounding puts some below 0
+    weights.eliminate_zeros()
+    rows = sp.csr_matrix((np.ones(len(on)), (on, np.arange(len(on)))), (x.size, len(on)))
+    return (rows @ weights).tocsr()
+
+
+def _inside_mesh(mesh: skfem.MeshTri, points: FloatArray) -> BoolArray:
+    rim = mesh.p[:, mesh.boundary_nodes()]
+    hull = scipy.spatial.Delaunay(rim.T)
+    return np.asarray(hull.find_simplex(points.T) >= 0)

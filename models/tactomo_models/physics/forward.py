@@ -1,0 +1,411 @@
+"""The forward model: voltages of a pressed sheet by the complete electrode model.
+
+The problem is solved once for the bare sheet, keeping the Green's function between the nodes that
+can be pressed. To all that lies outside, a pressed area is what it does on its rim: its inner
+nodes are condensed onto it (see `condensation`), and the currents that the rims then inject into
+the bare sheet follow from a dense system on their nodes (Woodbury identity). The cost goes by the
+pressed area, not by the size of the sheet.
+
+Everything is relative to a sheet of unit conductance: conductivities are ratios to the bare
+sheet's, transfer resistances are in units of the bare sheet's resistance per square.
+
+Source: Somersalo, Cheney & Isaacson, "Existence and uniqueness for electrode models for electric
+current computed tomography", SIAM J. Appl. Math. 52 (1992); Jacobian: the paper, equation 2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+
+from tactomo_models.arrays import BoolArray, FloatArray, IntArray
+from tactomo_models.physics.bare_sheet import BareSheet, scan_voltages, volts_per_unit
+from tactomo_models.physics.condensation import Condensation
+from tactomo_models.physics.greens import GreensFunction
+from tactomo_models.sensor.description import SensorDescription
+
+_STRIP = 128  # triangles that are differentiated at once: what that takes stays in the cache
+
+
+@dataclass(frozen=True)
+class Probes:
+    """Where the field is looked at: C spots, each an average over its neighbourhood.
+
+    Attributes:
+        bare: (2 C, L - 1) field of the bare sheet there, x components first.
+        green: (2 C, S) field there for a unit current into each support node.
+    """
+
+    bare: FloatArray
+    green: FloatArray
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Voltages of one pressed sheet, with what its potentials and derivatives follow from.
+
+    Attributes:
+        voltages: (M,) in scan order, relative (multiply by `ForwardModel.volts_per_unit`).
+        nodes: (n,) positions in `BareSheet.support` of the corners of all triangles that changed.
+        potentials: (n, L - 1) potentials there.
+        rim: (r,) positions in `BareSheet.support` of those that other triangles touch, too.
+        injected: (r, L - 1) currents that, injected there into the bare sheet, make the pressed
+            sheet's potentials on the rims and everywhere outside.
+        mixed: (P,) changes at the pressable nodes whose resistivities were mixed; None where
+            conductivities were.
+    """
+
+    voltages: FloatArray
+    nodes: IntArray
+    potentials: FloatArray
+    rim: IntArray
+    injected: FloatArray
+    mixed: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class _PressedAreas:
+    """What a solve needs to know of the areas that are pressed, however strongly they are.
+
+    With S and S0 the areas' stiffness on their rims, pressed and bare, the potentials there are
+    u = u0 + G i, and the currents injected there i = -(S - S0) u.
+
+    Attributes:
+        triangles: (t,) indexed triangles that change.
+        condensation: of their corners onto the rims.
+        nodes: (n,) positions of the corners in `BareSheet.support`, in the condensation's order.
+        rim: (r,) positions of those on rims.
+        potentials: (r, L - 1) u0.
+        green: (r, r) G.
+        bare_currents: (r, L - 1) S0 u0.
+        bare_response: (r, r) S0 G.
+    """
+
+    triangles: IntArray
+    condensation: Condensation
+    nodes: IntArray
+    rim: IntArray
+    potentials: FloatArray
+    green: FloatArray
+    bare_currents: FloatArray
+    bare_response: FloatArray
+
+
+class ForwardModel:
+    """Voltages and their derivatives for relative conductivities on the pressable nodes."""
+
+    def __init__(self, description: SensorDescription, bare: BareSheet) -> None:
+        self.description = description
+        self.bare = bare
+        self.volts_per_unit = volts_per_unit(description)
+        self.bare_voltages = scan_voltages(description, bare.transfer)
+        self._index_pairs()
+        self._index_triangles()
+        self._index_nodes()
+
+    def _index_pairs(self) -> None:
+        """The different electrode pairs, and which two of them each voltage belongs to."""
+        pairs = self.description.pairs
+        both = np.concatenate([pairs.drive, pairs.measure])
+        different, pair = np.unique(np.sort(both, axis=1), axis=0, return_inverse=True)
+        matrix = np.zeros((len(different), self.description.electrode_count))
+        np.put_along_axis(matrix, different, [[1.0, -1.0]], axis=1)
+        self._pair_matrix = matrix[:, :-1]  # the last electrode's potential is 0
+        forwards = np.where(both[:, 0] < both[:, 1], 1.0, -1.0)
+        self._sign = np.prod(np.split(forwards, 2), axis=0)
+        # By reciprocity drive and measurement may change places: half of the products suffice.
+        self._products, self._product_of = np.unique(
+            np.sort(np.split(pair, 2), axis=0), axis=1, return_inverse=True
+        )
+
+    def _index_triangles(self) -> None:
+        """Corners, gradients and stiffness of the triangles that touch a pressable node."""
+        bare = self.bare
+        nodes = bare.points.shape[1]
+        touched = np.flatnonzero(np.isin(bare.triangles, bare.pressable).any(axis=0))
+        corners = bare.triangles[:, touched]  # (3, t)
+        p = bare.points[:, corners]  # (2, 3, t)
+        edge = np.roll(p, -2, axis=1) - np.roll(p, -1, axis=1)  # opposite each corner
+        twice = edge[0, 1] * edge[1, 2] - edge[1, 1] * edge[0, 2]
+        gradient = np.stack([-edge[1], edge[0]]) / twice  # (2, 3, t) of each corner's hat function
+        self._corner_support = _positions(bare.support, nodes)[corners].T  # (t, 3)
+        self._corner_pressable = _positions(bare.pressable, nodes)[corners].T  # -1 elsewhere
+        self._area = np.abs(twice) / 2
+        self._gradient = np.ascontiguousarray(gradient.transpose(2, 0, 1))  # (t, 2, 3)
+        self._stiffness = self._area[:, None, None] * np.einsum(
+            "tdi,tdj->tij", self._gradient, self._gradient
+        )
+        uneven = np.ones(nodes) if bare.conductivity is None else bare.conductivity
+        # Conductivity of a triangle is the mean of its corners'.
+        self._bare_conductivity = uneven[corners].mean(axis=0)
+
+    def _index_nodes(self) -> None:
+        """Triangles around each pressable node; neighbours of each support node."""
+        triangles, nodes = len(self._area), len(self.bare.support)
+        triangle, corner = np.nonzero(self._corner_pressable >= 0)
+        node = self._corner_pressable[triangle, corner]
+        self._triangles_of = _lists(node, triangle, len(self.bare.pressable), fill=triangles)
+        self._triangle_count = np.bincount(self._corner_support.ravel(), minlength=nodes)
+        ones = np.ones_like(self._stiffness)  # neighbours may have a stiffness of 0 between them
+        row, column = _assembled(ones, self._corner_support, nodes).nonzero()
+        self._neighbours = _lists(row, column, nodes, fill=nodes)
+        law = _assembled(
+            self._bare_conductivity[:, None, None] * self._stiffness, self._corner_support, nodes
+        )
+        # Nodes where the bare sheet's currents balance among these triangles. Elsewhere an
+        # electrode, or a triangle that cannot be pressed, is part of the balance.
+        left = np.abs(law @ self.bare.potentials).max(axis=1)
+        self._last_areas: _PressedAreas | None = None
+        self._closed = left < 1e-9 * (abs(law) @ np.abs(self.bare.potentials)).max(axis=1)
+
+    def solve(self, change: FloatArray, *, mix_resistivities: bool = False) -> Solution:
+        """Solve for a pressed sheet.
+
+        Args:
+            change: (P,) conductivity minus the bare sheet's at the pressable nodes.
+            mix_resistivities: a triangle's resistivity, not its conductivity, is the mean of its
+                corners'. Across the edge of what conducts far better than the sheet, current
+                meets the two in series: there this keeps an edge where its nodes put it, whatever
+                the contrast (to 0.3 mm of 3 mm triangles; otherwise it is off by up to 0.9 mm).
+                Triangles with a corner that conducts worse than the sheet mix conductivities.
+
+        Raises:
+            numpy.linalg.LinAlgError: a conductivity is not above 0.
+        """
+        triangles = self._around(np.flatnonzero(change))
+        if len(triangles) == 0:
+            nowhere = np.zeros(0, np.intp)
+            none = self.bare.potentials[nowhere]
+            return Solution(self.bare_voltages, nowhere, none, nowhere, none)
+        areas = self._areas(triangles)
+        at_corners = self._at_corners(triangles, change)
+        conductivity = at_corners.mean(axis=1)
+        if mix_resistivities:
+            better = self._better(triangles, at_corners)
+            conductivity[better] = 1 / (1 / at_corners[better]).mean(axis=1)
+        condensed = areas.condensation.condense(
+            conductivity[:, None, None] * self._stiffness[triangles]
+        )
+        system = condensed.times(areas.green) - areas.bare_response
+        system[np.diag_indices(len(system))] += 1.0
+        currents = areas.bare_currents - condensed.times(areas.potentials)
+        injected = np.asarray(np.linalg.solve(system, currents), np.float64)
+        transfer = self.bare.transfer.copy()
+        transfer[:-1, :-1] += areas.potentials.T @ injected
+        return Solution(
+            voltages=scan_voltages(self.description, transfer),
+            nodes=areas.nodes,
+            potentials=condensed.inwards(areas.potentials + areas.green @ injected),
+            rim=areas.rim,
+            injected=injected,
+            mixed=change if mix_resistivities else None,
+        )
+
+    def _at_corners(self, triangles: IntArray, change: FloatArray) -> FloatArray:
+        """Conductivity (t, 3) of triangles as their corners have it."""
+        bare = self._bare_conductivity[triangles, None]
+        return np.asarray(bare + np.append(change, 0.0)[self._corner_pressable[triangles]])
+
+    def _better(self, triangles: IntArray, at_corners: FloatArray) -> BoolArray:
+        """Tell which triangles (t,) conduct nowhere worse than the bare sheet."""
+        return np.asarray((at_corners >= self._bare_conductivity[triangles, None]).all(axis=1))
+
+    def _areas(self, triangles: IntArray) -> _PressedAreas:
+        """What was found out for the last solve, where the same triangles change again."""
+        last = self._last_areas
+        if last is None or not np.array_equal(last.triangles, triangles):
+            self._last_areas = last = self._explored(triangles)
+        return last
+
+    def _explored(self, triangles: IntArray) -> _PressedAreas:
+        count = len(self.bare.support)
+        nodes, corners = _renumbered(self._corner_support[triangles], count)
+        here = np.bincount(corners.ravel())
+        rim = ~self._closed[nodes] | (here < self._triangle_count[nodes])
+        neighbours = _positions(nodes, count + 1)[self._neighbours[nodes]]
+        condensation = Condensation(neighbours, rim, corners)
+        nodes, depth = nodes[condensation.order], condensation.depth
+        near, on_rim = nodes[depth <= 1], depth[depth <= 1] == 0
+        # S0 needs no condensation: the bare sheet's u0 and G balance at inner nodes already, so
+        # that the law itself, at rims and by their neighbours, does what S0 does.
+        law = _rim_law(
+            self._bare_conductivity[triangles, None, None] * self._stiffness[triangles],
+            condensation.corners,
+            depth,
+        )
+        potentials, green = self.bare.potentials[near], self._green(near, near[on_rim])
+        return _PressedAreas(
+            triangles=triangles,
+            condensation=condensation,
+            nodes=nodes,
+            rim=near[on_rim],
+            potentials=potentials[on_rim],
+            green=green[on_rim],
+            bare_currents=law @ potentials,
+            bare_response=law @ green,
+        )
+
+    def _green(self, rows: IntArray, columns: IntArray) -> FloatArray:
+        """Block of the bare sheet's Green's function; `take` is twice as fast as `np.ix_`."""
+        green = self.bare.green
+        if isinstance(green, GreensFunction):
+            return green.between(rows, columns)
+        return np.asarray(green.ravel().take(rows[:, None] * len(green) + columns))
+
+    def _around(self, nodes: IntArray) -> IntArray:
+        """Indexed triangles with any of these pressable nodes as a corner."""
+        found = np.zeros(len(self._area) + 1, bool)
+        found[self._triangles_of[nodes]] = True
+        return np.flatnonzero(found[:-1])
+
+    def potentials(self, solution: Solution, nodes: IntArray) -> FloatArray:
+        """Potentials (n, L - 1) of a pressed sheet at n positions in `BareSheet.support`."""
+        position = _positions(solution.nodes, len(self.bare.support))[nodes]
+        outside = position < 0
+        potentials = np.empty((len(nodes), self.bare.potentials.shape[1]))
+        potentials[~outside] = solution.potentials[position[~outside]]
+        others = nodes[outside]
+        moved = self._green(others, solution.rim) @ solution.injected
+        potentials[outside] = self.bare.potentials[others] + moved
+        return potentials
+
+    def jacobian(
+        self, solution: Solution, where: IntArray, onto: FloatArray | None = None
+    ) -> FloatArray:
+        """Derivative of the voltages with respect to conductivity.
+
+        Args:
+            solution: where to differentiate.
+            where: (n,) pressable nodes.
+            onto: (n, K) derivative of these nodes' conductivities by K parameters: sooner done
+                here than with the (M, n) derivative by nodes.
+
+        Returns:
+            (M, K), or (M, n) by the nodes' relative conductivity (the paper's equation 2).
+        """
+        triangles = self._around(where)
+        nodes, corners = _renumbered(self._corner_support[triangles], len(self.bare.support))
+        fields = self.potentials(solution, nodes) @ self._pair_matrix.T  # (nodes, pairs)
+        gradient = self._gradient[triangles] @ fields[corners]  # (t, 2, pairs)
+        share = self._shares(where, triangles, solution.mixed)
+        if onto is None:
+            summed = share @ self._field_products(gradient)
+        else:
+            weight = share.T @ onto  # (t, K)
+            summed = np.zeros((weight.shape[1], self._products.shape[1]))
+            for start in range(0, len(triangles), _STRIP):
+                strip = slice(start, start + _STRIP)
+                summed += weight[strip].T @ self._field_products(gradient[strip])
+        return np.asarray((summed[:, self._product_of] * self._sign).T)
+
+    def _shares(
+        self, where: IntArray, triangles: IntArray, mixed: FloatArray | None
+    ) -> sp.csr_matrix:
+        """Minus the area (n, t) of each triangle whose conductivity goes with each node's."""
+        position = _positions(where, len(self.bare.pressable) + 1)  # the last: not pressable
+        corner = position[self._corner_pressable[triangles]]
+        triangle, which = np.nonzero(corner >= 0)
+        area = -self._area[triangles[triangle]] / 3
+        if mixed is not None:  # d sigma / d sigma_i = (sigma / sigma_i)^2 / 3
+            at_corners = self._at_corners(triangles, mixed)
+            mean = 1 / (1 / at_corners).mean(axis=1)
+            share = (mean[triangle] / at_corners[triangle, which]) ** 2
+            area *= np.where(self._better(triangles, at_corners)[triangle], share, 1.0)
+        return sp.csr_matrix(
+            (area, (corner[triangle, which], triangle)), (len(where), len(triangles))
+        )
+
+    def _field_products(self, gradient: FloatArray) -> FloatArray:
+        """Products (t, q) of the fields (t, 2, pairs) of two pairs each."""
+        x, y = gradient.transpose(1, 0, 2)
+        one, other = self._products
+        product = x.take(one, axis=1) * x.take(other, axis=1)
+        product += y.take(one, axis=1) * y.take(other, axis=1)
+        return np.asarray(product)
+
+    @property
+    def node_areas_m2(self) -> FloatArray:
+        """(P,) share of the sheet's area that belongs to each pressable node."""
+        return np.asarray(np.append(self._area, 0.0)[self._triangles_of].sum(axis=1) / 3)
+
+    def probes(self, x_m: FloatArray, y_m: FloatArray, radius_m: float) -> Probes:
+        """Prepare to look at the field around C points, each weighted by a cone of that radius."""
+        corners = self.bare.points[:, self.bare.support[self._corner_support]]  # (2, t, 3)
+        middle_x, middle_y = corners.mean(axis=2)
+        distance = np.hypot(x_m[:, None] - middle_x, y_m[:, None] - middle_y)
+        weight = np.clip(1 - distance / radius_m, 0, None) * self._area
+        weight /= weight.sum(axis=1, keepdims=True)
+        triangles, nodes = len(self._area), len(self.bare.support)
+        rows = np.repeat(np.arange(triangles), 3)
+        by_axis = [
+            sp.csr_matrix(
+                (self._gradient[:, axis].ravel(), (rows, self._corner_support.ravel())),
+                (triangles, nodes),
+            )
+            for axis in (0, 1)
+        ]
+        mean = sp.vstack([sp.csr_matrix(weight) @ gradient for gradient in by_axis]).tocsr()
+        return Probes(mean @ self.bare.potentials, mean @ self.bare.green)
+
+    def spot_sensitivity(self, probes: Probes, solution: Solution) -> FloatArray:
+        """Derivative (M, C) of the voltages by the conductivity of one square metre at each spot.
+
+        Unlike `jacobian` it looks anywhere, at the price of resolution: it is for finding where a
+        contact is missing in a solution, not for fitting it.
+        """
+        moved = probes.green[:, solution.rim] @ solution.injected
+        field = (probes.bare + moved) @ self._pair_matrix.T
+        x, y = np.split(field, 2)  # (C, pairs) each
+        one, other = self._products
+        product = x[:, one] * x[:, other] + y[:, one] * y[:, other]
+        return np.asarray(-(product[:, self._product_of] * self._sign).T)
+
+    def bare_jacobian(self) -> FloatArray:
+        """Jacobian of the unpressed sheet, (M, P)."""
+        unpressed = self.solve(np.zeros(len(self.bare.pressable)))
+        return self.jacobian(unpressed, np.arange(len(self.bare.pressable)))
+
+
+def _rim_law(stiffness: FloatArray, corners: IntArray, depth: IntArray) -> sp.csr_matrix:
+    """Rows of the rims' nodes, by them and their neighbours inside, of triangles assembled."""
+    rim, near = depth == 0, depth <= 1
+    triangle, corner = np.nonzero(rim[corners])
+    rows = (rim.cumsum() - 1)[corners[triangle, corner]]
+    columns = (near.cumsum() - 1)[corners[triangle]]
+    values = stiffness[triangle, corner]
+    return sp.csr_matrix(
+        (values.ravel(), (np.repeat(rows, 3), columns.ravel())), (rim.sum(), near.sum())
+    )
+
+
+def _assembled(stiffness: FloatArray, corners: IntArray, nodes: int) -> sp.csr_matrix:
+    """Sum the (t, 3, 3) of triangles into one matrix on all nodes."""
+    rows, columns = np.repeat(corners, 3, axis=1), np.tile(corners, (1, 3))
+    return sp.csr_matrix((stiffness.ravel(), (rows.ravel(), columns.ravel())), (nodes, nodes))
+
+
+def _positions(members: IntArray, count: int) -> IntArray:
+    """Where each number below `count` stands among `members`; -1 for those that do not."""
+    position = np.full(count, -1)
+    position[members] = np.arange(len(members))
+    return position
+
+
+def _renumbered(numbers: IntArray, count: int) -> tuple[IntArray, IntArray]:
+    """The different ones of numbers below `count`, ascending, and each one's place there."""
+    there = np.zeros(count, bool)
+    there[numbers] = True
+    different = np.flatnonzero(there)
+    return different, _positions(different, count)[numbers]
+
+
+def _lists(owner: IntArray, member: IntArray, owners: int, fill: int) -> IntArray:
+    """Members of each owner as (owners, most), filled up with `fill`."""
+    order = np.argsort(owner, kind="stable")
+    count = np.bincount(owner, minlength=owners)
+    slot = np.arange(len(owner)) - np.repeat(count.cumsum() - count, count)
+    lists = np.full((owners, count.max(initial=0)), fill)
+    lists[owner[order], slot] = member[order]
+    return lists

@@ -1,0 +1,116 @@
+"""One linear step, made once into a matrix that turns voltages into an image.
+
+    minimise |N^(-1/2) (J x - d)|^2 + lambda |x / s|^2      the paper, equations 3 and 4
+
+d are relative voltage changes and N their variances, so that small and noisy voltages do not
+spoil the image. s says how large a change is expected at each node:
+
+- Tikhonov (the paper, L = I): s = 1 everywhere.
+- NOSER: s^-2 = diag(J' N^-1 J)^p with p = 1/2, a Gauss-Newton step from the bare sheet whose
+  prior evens out part of the sensitivity; p = 0 is Tikhonov and drives noise to the rim, p = 1 is
+  the authors' own and drives it to the middle.
+
+lambda is chosen by a rule, not by eye: the noise figure is 1, that is, the image is as noisy,
+relative to its signal, as the data are.
+
+Sources: Adler & Guardo, "Electrical impedance tomography: regularized imaging and contrast
+detection", IEEE Trans. Med. Imaging 15 (1996), the rule; Cheney et al., "NOSER: an algorithm for
+solving the inverse conductivity problem", Int. J. Imaging Syst. Technol. 2 (1990); Adler, Dai &
+Lionheart, "Temporal image reconstruction in electrical impedance tomography", Physiol. Meas. 28
+(2007), the power.
+"""
+
+from typing import Final
+
+import numpy as np
+from scipy.optimize import brentq
+
+from tactomo_models.arrays import FloatArray
+
+EVEN: Final = np.ones(1)  # s of Tikhonov
+
+
+def even_scale(areas_m2: FloatArray) -> FloatArray:
+    """Expected size of each node's change (P,), up to a factor, of an image that is white noise.
+
+    A node that stands for a smaller area varies more: without that the image follows the mesh.
+
+    Args:
+        areas_m2: (P,) that each node stands for.
+    """
+    return np.asarray(np.sqrt(areas_m2.mean() / areas_m2))
+
+
+def noser_scale(J: FloatArray, noise: FloatArray) -> FloatArray:
+    """Expected size of each node's change (P,), up to a factor, by the NOSER prior.
+
+    Args:
+        J: (M, P) Jacobian of the relative voltage changes.
+        noise: (M,) their standard deviations.
+    """
+    sensitivity = np.einsum("mp,mp,m->p", J, J, noise**-2)
+    # A node that no voltage sees is no reason to divide by zero.
+    floor = 1e-12 * float(sensitivity.max())
+    return np.asarray(np.maximum(sensitivity, floor) ** -0.25)  # p = 1/2
+
+
+def tikhonov_matrix(
+    J: FloatArray, noise: FloatArray, weight: float, prior_scale: FloatArray = EVEN
+) -> FloatArray:
+    """Reconstruction matrix (P, M).
+
+    Args:
+        J: (M, P) derivative of the relative voltage changes by the nodes' conductivity.
+        noise: (M,) standard deviations of the relative voltage changes.
+        weight: the regularisation parameter lambda.
+        prior_scale: (P,) expected size of each node's change, up to a factor.
+    """
+    # (J'N⁻¹J + λS⁻²)⁻¹J'N⁻¹ = S²J'(JS²J' + λN)⁻¹, which inverts M x M instead of P x P.
+    scaled = J * prior_scale**2
+    data_space = scaled @ J.T + np.diag(weight * noise**2)
+    return np.asarray(np.linalg.solve(data_space, scaled).T)
+
+
+def prior_weight(size: float, prior_scale: FloatArray) -> float:
+    """Regularisation parameter by Bayes: noise and changes are both what they are expected to be.
+
+    Args:
+        size: expected size of a node's change, root mean square over the nodes.
+        prior_scale: (P,) of `tikhonov_matrix`.
+    """
+    return float(np.mean(prior_scale**2)) / size**2
+
+
+def noise_figure_weight(
+    J: FloatArray, noise: FloatArray, target: FloatArray, prior_scale: FloatArray = EVEN
+) -> float:
+    """Regularisation parameter at which the noise figure of a small central target is 1.
+
+    Args:
+        J: (M, P) Jacobian of the relative voltage changes.
+        noise: (M,) their standard deviations.
+        target: (P,) conductivity change of the target.
+        prior_scale: (P,) expected size of each node's change, up to a factor.
+    """
+    whitened = J / noise[:, None]
+    signal = whitened @ target
+    left, singular, right = np.linalg.svd(whitened * prior_scale, full_matrices=False)
+    scale = float(np.mean(singular**2))
+    signal_modes = left.T @ signal
+    modes = right * prior_scale  # of the image, each by the data's mode of the same place
+    noise_modes = np.mean(modes**2, axis=1)
+
+    def log_figure(log_weight: float) -> float:
+        gain = singular / (singular**2 + scale * np.exp(log_weight))
+        image = (gain * signal_modes) @ modes
+        image_noise = np.sqrt(gain**2 @ noise_modes)
+        figure = np.mean(np.abs(signal)) / (np.mean(np.abs(image)) / image_noise)
+        return float(np.log(figure))
+
+    # Within these bounds the figure falls steadily; where even the ends miss 1, take the nearer.
+    low, high = np.log(1e-6), np.log(10.0)
+    if log_figure(low) < 0:
+        return float(scale * np.exp(low))
+    if log_figure(high) > 0:
+        return float(scale * np.exp(high))
+    return float(scale * np.exp(brentq(log_figure, low, high, xtol=1e-3)))

@@ -1,0 +1,1 @@
+"""From volts to changes: polarity, plausibility, reference, changes."""

@@ -1,0 +1,251 @@
+"""From volts to relative changes: what a scan says against the reference, and how surely.
+
+Relative changes (V - V_ref) / |V_ref| cancel current, gain and sheet resistance. Each carries two
+variances: of noise, as seen at the tare, and of the model's error, which grows with the change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtri  # scipy.stats takes half a second to import
+from tactomo_protocol import Channel
+
+from tactomo_models.arrays import FloatArray
+from tactomo_models.errors import DataError
+from tactomo_models.physics.artifact import (
+    MODEL_ERROR,
+    Artifact,
+    nominal_noise_v,
+)
+from tactomo_models.physics.forward import ForwardModel
+from tactomo_models.robust import robust_sigma
+from tactomo_models.scans.plausibility import (
+    Flag,
+    ScanCheck,
+    Wiring,
+    asymmetry_of,
+    examine_reference,
+)
+from tactomo_models.scans.polarity import Polarity
+from tactomo_models.scans.reference import noise_of_reciprocity
+from tactomo_models.sensor.description import SensorDescription
+
+# An uneven sheet has few degrees of freedom: errors of the model go together, about as many
+# voltages at a time, and average out so much less than noise does.
+CORRELATED = 10.0
+UNUSABLE = 1e3  # relative error of a voltage whose reference is zero or no number
+WRONG_WAY = 5.0  # standard uncertainties by which a conductivity may change against its sign
+
+
+@dataclass(frozen=True)
+class Changes:
+    """Relative voltage changes of one channel's scan.
+
+    Attributes:
+        change: (M,) 0 where it is invalid.
+        weight: (M,) inverse standard deviations, of noise and of model error; 0 where invalid.
+        variance_inflation: (M,) factor by which the variance of an estimate exceeds what
+            independent errors of that size would give it: model errors go together.
+        frame_variance: (M,) variances of each of two frames' changes, where the scene is still.
+        quiet: whether nothing presses.
+        signal: root mean square of the changes over their noise and what no noise accounts for;
+            what is quiet is below the root of `noise_limit` over the count (1.24 of 208).
+        precision: (M,) inverse variances of the changes by noise; 0 where invalid.
+    """
+
+    change: FloatArray
+    weight: FloatArray
+    variance_inflation: FloatArray
+    frame_variance: FloatArray
+    quiet: bool
+    signal: float
+    precision: FloatArray
+
+    @property
+    def misfit(self) -> float:
+        """Misfit of a model in which nothing is pressed."""
+        count = max(int(np.count_nonzero(self.weight)), 1)
+        return float(np.sqrt(((self.weight * self.change) ** 2).sum() / count))
+
+
+class ChannelResult(NamedTuple):
+    """What is to be had of a scan."""
+
+    changes: Changes | None
+    """None where there is too little to go by; a flag says so."""
+    flags: Flag
+    electrodes: list[int]
+    """Those left out, ascending."""
+    own_flags: Flag
+    """Those of `flags` that this scan raises, and not its reference."""
+
+
+class MeasuredChannel:
+    """What is known of one channel since the last tare, and what its scans say against that.
+
+    Args:
+        description: the sensor.
+        artifact: what is precomputed for it.
+        forward: the model of its sheet.
+        wiring: which voltages belong to which electrodes.
+        name: the channel.
+        volts: (M,) of the unpressed sheet.
+        noise: (M,) standard deviation of one scan in volts; None where it is not known.
+        scans: how many `volts` is the mean of.
+
+    Attributes:
+        usable: (M,) voltages that the tare has found nothing wrong with.
+        relative_noise: (M,) standard deviation of a relative change by noise, at the tare.
+
+    Raises:
+        DataError: another number of voltages than the sensor has.
+    """
+
+    def __init__(
+        self,
+        description: SensorDescription,
+        artifact: Artifact,
+        forward: ForwardModel,
+        wiring: Wiring,
+        name: Channel,
+        volts: FloatArray,
+        noise: FloatArray | None,
+        scans: int,
+    ) -> None:
+        change_error = 0.01  # least model error, as a share of a change and of a typical one
+        mismatch_share = 1 / 3  # of the reference's mismatch that is left in the changes
+        trace = 1e-9  # relative noise of data that have none
+        max_invalid = 0.5  # share of voltages that may be invalid before the channel is given up
+        self._description, self._name = description, name
+        self._check_length(volts, f"the {name} reference")
+        if noise is None:
+            noise = noise_of_reciprocity(description, volts)
+        if noise is None:
+            noise = nominal_noise_v(volts)
+        predicted, contrast = forward.bare_voltages, description.contrast(name)
+        self._polarity = Polarity(description, wiring, predicted)
+        volts, sought = self._polarity.apply(volts), self._polarity.certain
+        self._least_valid = (1 - max_invalid) * float(np.count_nonzero(sought))
+        verdict = examine_reference(
+            wiring, volts, predicted, noise / np.sqrt(scans), contrast, sought
+        )
+        self._flags, self._electrodes = verdict.flags, verdict.electrodes
+        self.usable = valid = verdict.usable
+        reference = np.where(valid, volts, 0.0)
+        noise = np.where(valid, noise, 0.0)
+        self._tare = self._reference = reference
+        self._tare_per_volt = self._per_volt = np.divide(
+            1, np.abs(reference), out=np.zeros_like(reference), where=valid
+        )
+        relative = np.hypot(noise * self._per_volt * np.sqrt(1 + 1 / scans), MODEL_ERROR)
+        self.relative_noise = np.where(valid, relative, UNUSABLE)
+        self._noise = np.maximum(self.relative_noise**2 - MODEL_ERROR**2, trace**2)
+        self._variance = self.relative_noise**2  # of a change where nothing presses, drift included
+        # A model that is wrong about the reference is wrong about the changes, too, if less: most
+        # of its error divides out.
+        mismatch = _mismatch(reference[valid], predicted[valid])
+        self._error_share = max(change_error, mismatch_share * mismatch)
+        asymmetry = asymmetry_of(wiring, reference)
+        self._check = ScanCheck(wiring, reference, noise, valid, contrast, asymmetry)
+        # Weights of the changes whose sum is the whole sheet's, in the direction of pressing.
+        direction = 0.0 if description.either_way(name) else description.sign(name)
+        self._total = direction * artifact.tikhonov.sum(axis=0)
+
+    def follow(self, drift: FloatArray | None) -> None:
+        """Measure changes against the tare as it has drifted since: (M,) logarithms of factors.
+
+        What is known of noise, wiring and faults stays that of the tare.
+        """
+        factor = 1.0 if drift is None else np.exp(drift)
+        self._reference = self._tare * factor
+        self._per_volt = self._tare_per_volt / factor
+
+    def compare(self, scan: FloatArray, *, saturated: bool = False) -> ChannelResult:
+        """Relative changes of a scan (M,), volts; `saturated` where its converter clipped.
+
+        Raises:
+            DataError: another number of voltages than the sensor has.
+        """
+        still_share = 0.01  # of the model error's variance, that a still scene may change by
+        median_square = 0.455  # of a normal distribution of unit variance
+        self._check_length(scan, f"a {self._name} scan")
+        scan = self._polarity.apply(scan)
+        verdict = self._check.examine(scan, saturated=saturated)
+        valid, flags = verdict.usable, self._flags | verdict.flags
+        electrodes = sorted({*self._electrodes, *verdict.electrodes})
+        count = int(np.count_nonzero(valid))
+        if count < self._least_valid or not scan[valid].any():
+            gone = missing(self._name) | Flag.INVALID_VOLTAGE
+            return ChannelResult(None, flags | gone, electrodes, verdict.flags | gone)
+        change = np.where(valid, scan - self._reference, 0.0) * self._per_volt
+        square = change * change
+        grown = verdict.noise**2
+        variance = self._variance * grown
+        # Small changes share in the error of the large ones beside them.
+        typical = float(np.median(square[valid])) / median_square
+        noise, error = self._noise * grown, self._error_share**2 * (square + typical)
+        statistic = float((square / variance).sum())
+        quiet = statistic < noise_limit(count)
+        total = self._total
+        if not (quiet or electrodes) and _fell(total * change, total**2 * variance):
+            flags |= Flag.REFERENCE_MISMATCH
+        changes = Changes(
+            change=change,
+            weight=valid / np.sqrt(noise + error),
+            variance_inflation=1 + (CORRELATED - 1) * error / (noise + error),
+            # What is far below the model's error is not worth a solve either.
+            frame_variance=noise + still_share * error,
+            quiet=quiet,
+            signal=(statistic / count) ** 0.5,
+            precision=valid / variance,
+        )
+        return ChannelResult(changes, flags, electrodes, flags & ~self._flags | verdict.flags)
+
+    def _check_length(self, volts: FloatArray, what: str) -> None:
+        if volts.shape != (self._description.measurements,):
+            raise DataError(
+                f"{what} has shape {volts.shape}; sensor {self._description.name!r} has "
+                f"{self._description.measurements} voltages a scan"
+            )
+
+
+def towards_pressing(
+    description: SensorDescription, data: Mapping[Channel, Changes]
+) -> tuple[dict[Channel, FloatArray], dict[Channel, FloatArray]]:
+    """Changes (M,) in the direction of pressing, and their inverse variances by noise."""
+    changes = {name: description.sign(name) * each.change for name, each in data.items()}
+    return changes, {name: each.precision for name, each in data.items()}
+
+
+def missing(name: Channel) -> Flag:
+    """The flag that says that a channel has nothing to show."""
+    return Flag.MAGNITUDE_MISSING if name == Channel.MAGNITUDE else Flag.STRUCTURE_MISSING
+
+
+@cache
+def noise_limit(count: int) -> float:
+    """Sum of squares that noise alone in so many voltages stays below, but for false alarms."""
+    false_alarm = 1e-6  # chance that an unpressed frame of pure noise is taken for a pressed one
+    return float(chdtri(count, false_alarm))
+
+
+def _fell(total: FloatArray, variance: FloatArray) -> bool:
+    """Tell whether the sheet as a whole changed against the sign that pressing has.
+
+    Then less presses now than did at the tare.
+    """
+    return float(total.sum()) < -WRONG_WAY * float(np.sqrt(variance.sum()))
+
+
+def _mismatch(reference: FloatArray, predicted: FloatArray) -> float:
+    """Typical relative error of a model that may be off by a common factor; 1 where none fits."""
+    ratio = reference / predicted
+    if len(ratio) == 0:
+        return 1.0
+    middle = float(np.median(ratio))
+    return robust_sigma(ratio / middle - 1)

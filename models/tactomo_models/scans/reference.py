@@ -1,0 +1,152 @@
+"""The reference: the unpressed scan that changes are measured against, and its noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import chdtri
+
+from tactomo_models.arrays import FloatArray
+from tactomo_models.errors import DataError
+from tactomo_models.robust import robust_sigma
+from tactomo_models.sensor.description import SensorDescription
+from tactomo_models.sensor.pattern import reciprocal_pairs
+
+TRUSTED_SCANS = 20  # a variance from as many is known to a third
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Voltages of the unpressed skin; None for a channel that is not there.
+
+    Attributes:
+        magnitude: (M,) volts.
+        structure: (M,) volts.
+        magnitude_noise: (M,) standard deviation of one scan, volts; None where unknown.
+        structure_noise: (M,) likewise.
+        scans: how many were averaged.
+        magnitude_drift: (M,) logarithm of the factor by which each voltage has drifted since; None
+            where nothing has been followed.
+        structure_drift: (M,) likewise.
+    """
+
+    magnitude: FloatArray | None
+    structure: FloatArray | None
+    magnitude_noise: FloatArray | None = None
+    structure_noise: FloatArray | None = None
+    scans: int = 1
+    magnitude_drift: FloatArray | None = None
+    structure_drift: FloatArray | None = None
+
+    @property
+    def lacks_noise(self) -> bool:
+        """Whether no channel's noise is known: the reference is a single scan, for all it says."""
+        is_unknown = self.magnitude_noise is None and self.structure_noise is None
+        return is_unknown and self.scans == 1
+
+    def with_noise_of(
+        self,
+        description: SensorDescription,
+        magnitude: FloatArray | None,
+        structure: FloatArray | None,
+    ) -> Reference:
+        """The same with the noise of scans (M,) or (n, M), pressed or not, by reciprocity.
+
+        Of how many scans the reference is the mean follows from its own noise.
+        """
+        pairs = ((self.magnitude, magnitude), (self.structure, structure))
+        seen = [None if s is None else noise_of_reciprocity(description, s) for _, s in pairs]
+        own = [None if v is None else noise_of_reciprocity(description, v) for v, _ in pairs]
+        averaged = [
+            int(np.clip((noise.max() / max(rest.max(), 1e-30)) ** 2, 1, 1e6))
+            for noise, rest in zip(seen, own, strict=True)
+            if noise is not None and rest is not None
+        ]
+        return replace(
+            self,
+            magnitude_noise=seen[0],
+            structure_noise=seen[1],
+            scans=min(averaged, default=1),
+        )
+
+    def is_followed_from(self, other: Reference) -> bool:
+        """Whether this is another one's tare, drifted."""
+        has_drift = self.magnitude_drift is not None or self.structure_drift is not None
+        return has_drift and all(
+            _same(getattr(self, name), getattr(other, name)) for name in _TAKEN
+        )
+
+    def taken_as_it_is(self) -> Reference:
+        """The same voltages as a tare of its own, drift included."""
+        return replace(
+            self,
+            magnitude=_drifted(self.magnitude, self.magnitude_drift),
+            structure=_drifted(self.structure, self.structure_drift),
+            magnitude_drift=None,
+            structure_drift=None,
+        )
+
+    @classmethod
+    def from_scans(cls, magnitude: FloatArray | None, structure: FloatArray | None) -> Reference:
+        """Average scans (n, M) of an unpressed skin and estimate their noise.
+
+        Raises:
+            DataError: there is no scan, or one of the voltages is not a number.
+        """
+        present = [scans for scans in (magnitude, structure) if scans is not None]
+        if not present or any(len(scans) == 0 for scans in present):
+            raise DataError("no scans to take a reference from; wait for data and tare again")
+        if not all(np.isfinite(scans).all() for scans in present):
+            raise DataError("the reference scans hold voltages that are not numbers; tare again")
+        return cls(
+            magnitude=None if magnitude is None else magnitude.mean(axis=0),
+            structure=None if structure is None else structure.mean(axis=0),
+            magnitude_noise=None if magnitude is None else noise_of_scans(magnitude),
+            structure_noise=None if structure is None else noise_of_scans(structure),
+            scans=min(len(scans) for scans in present),
+        )
+
+
+_TAKEN = ("magnitude", "structure", "magnitude_noise", "structure_noise")
+
+
+def _drifted(volts: FloatArray | None, drift: FloatArray | None) -> FloatArray | None:
+    return volts if volts is None or drift is None else volts * np.exp(drift)
+
+
+def _same(one: FloatArray | None, other: FloatArray | None) -> bool:
+    if one is None or other is None:
+        return one is other
+    return one is other or np.array_equal(one, other)
+
+
+def noise_of_scans(scans: FloatArray) -> FloatArray | None:
+    """Standard deviation (M,) of one scan, from n scans (n, M) at rest; None from a single one.
+
+    A converter's noise is much the same on every measurement while a few scans know each one
+    poorly, so what is common counts as much as `TRUSTED_SCANS` scans of the measurement's own.
+    The common variance is a median: a lead that picks up interference is not the others' noise.
+    """
+    if len(scans) < 2:
+        return None
+    own, freedom = scans.var(axis=0, ddof=1), len(scans) - 1
+    common = float(np.median(own)) * freedom / chdtri(freedom, 0.5)
+    share = len(scans) / (len(scans) + TRUSTED_SCANS)
+    return np.asarray(np.sqrt(share * own + (1 - share) * common))
+
+
+def noise_of_reciprocity(description: SensorDescription, scans: FloatArray) -> FloatArray | None:
+    """Standard deviation (M,) of one scan, from scans (M,) or (n, M), pressed or not.
+
+    V(k, m) = V(m, k) but for noise. Electrodes and an uneven sheet do not disturb it; the median
+    keeps a few broken electrodes from doing so. None where the pattern has no reciprocal pairs.
+    """
+    i, j = reciprocal_pairs(description.pairs).T
+    with np.errstate(over="ignore", invalid="ignore"):
+        differences = scans[..., i] - scans[..., j]
+        differences = differences[np.isfinite(differences)]
+        if differences.size == 0:
+            return None
+        sigma = robust_sigma(differences) / np.sqrt(2)
+    return np.full(description.measurements, float(sigma))

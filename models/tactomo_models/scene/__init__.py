@@ -1,0 +1,1 @@
+"""What presses: presses, shapes, areas, contacts, pressure."""

@@ -1,0 +1,101 @@
+"""Contacts as they are published: each pressed area with its identity over time and pressure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tactomo_models.arrays import FloatArray, Image
+from tactomo_models.scene.areas import Areas
+from tactomo_models.scene.pressure import PressureCurve, PressureRange, pressures_of
+
+
+@dataclass(frozen=True)
+class Contact:
+    """One pressed area.
+
+    Attributes:
+        id: its identity over time, counted up from 1.
+        x_m, y_m: its centroid.
+        area_m2: its area.
+        magnitude: relative conductivity change of the magnitude channel, without its sign;
+            NaN if unknown.
+        magnitude_sigma: standard uncertainty of the magnitude.
+        pressure_kpa: see `pressure_range`; NaN if unknown, the range's top if above.
+        x_sigma_m, y_sigma_m: standard uncertainties of the centroid; NaN if unknown.
+        area_sigma_m2: that of the area; NaN if unknown.
+        pressure_sigma_kpa: standard uncertainty of the pressure; NaN but within the range.
+        force_n: pressure times area; NaN if unknown.
+        force_sigma_n: standard uncertainty of the force; NaN if unknown.
+        pressure_range: where the pressure lies, seen from what the magnitude channel answers to.
+    """
+
+    id: int
+    x_m: float
+    y_m: float
+    area_m2: float
+    magnitude: float = float("nan")
+    magnitude_sigma: float = float("nan")
+    pressure_kpa: float = float("nan")
+    x_sigma_m: float = float("nan")
+    y_sigma_m: float = float("nan")
+    area_sigma_m2: float = float("nan")
+    pressure_sigma_kpa: float = float("nan")
+    force_n: float = float("nan")
+    force_sigma_n: float = float("nan")
+    pressure_range: PressureRange = PressureRange.UNKNOWN
+
+
+def contacts_of(
+    areas: Areas,
+    ids: Sequence[int],
+    size: FloatArray,
+    sigma: FloatArray,
+    curve: PressureCurve | None,
+) -> tuple[Contact, ...]:
+    """Make contacts of K areas.
+
+    Args:
+        areas: where they are.
+        ids: the identity of each.
+        size: (K,) magnitudes; NaN where unknown.
+        sigma: (K,) their standard uncertainties.
+        curve: the sensor's; None where it has none.
+    """
+    pressures = pressures_of(curve, size, sigma, areas.areas_m2, areas.sigmas[:, 2])
+    return tuple(
+        Contact(
+            id=ids[k],
+            x_m=float(areas.centres_m[k, 0]),
+            y_m=float(areas.centres_m[k, 1]),
+            area_m2=float(areas.areas_m2[k]),
+            magnitude=float(size[k]),
+            magnitude_sigma=float(sigma[k]),
+            pressure_kpa=float(pressures.kpa[k]),
+            x_sigma_m=float(areas.sigmas[k, 0]),
+            y_sigma_m=float(areas.sigmas[k, 1]),
+            area_sigma_m2=float(areas.sigmas[k, 2]),
+            pressure_sigma_kpa=float(pressures.sigma_kpa[k]),
+            force_n=float(pressures.force_n[k]),
+            force_sigma_n=float(pressures.force_sigma_n[k]),
+            pressure_range=pressures.ranges[k],
+        )
+        for k in range(len(areas))
+    )
+
+
+def map_of(areas: Areas, values: FloatArray) -> Image:
+    """Map on which each area carries its own value; areas of unknown value stay 0."""
+    fused = np.einsum("k,kyx->yx", np.nan_to_num(values), areas.on_map)
+    return np.asarray(fused, dtype=np.float32)
+
+
+def pressure_map(areas: Areas, contacts: Sequence[Contact]) -> Image:
+    """Each contact's pressure on its area; NaN, and not 0, where it is touched but unknown."""
+    touched = 0.05  # share of a node that a contact covers, from which it is touched
+    values = np.array([contact.pressure_kpa for contact in contacts])
+    fused = map_of(areas, values)
+    fused[(areas.on_map[np.isnan(values)] > touched).any(axis=0)] = np.nan
+    return fused

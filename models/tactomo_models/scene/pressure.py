@@ -1,0 +1,154 @@
+"""From the magnitude channel's conductivity change to pressure and force, with uncertainty.
+
+A sensor's curve answers within a range. Below its onset a contact is felt by the structure channel
+alone: that it is touched is known, how hard is not. Beyond its last reading all that is known is
+that the pressure is at least that one's. Neither is given a number that looks measured.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum, auto
+
+import numpy as np
+
+from tactomo_models.arrays import FloatArray
+from tactomo_models.sensor.description import SensorDescription
+from tactomo_models.sensor.response import MagnitudeResponse
+
+CLEARLY = 2.0  # standard uncertainties above zero from which a magnitude is one
+
+
+class PressureRange(StrEnum):
+    """Where a contact's pressure lies, seen from what the magnitude channel answers to."""
+
+    WITHIN = auto()
+    BELOW = auto()  # touched, but too lightly to be measured
+    ABOVE = auto()  # at least the range's top
+    UNKNOWN = auto()  # no magnitude channel, no curve, or too uncertain to tell
+
+
+@dataclass(frozen=True)
+class Pressures:
+    """Pressures of K contacts; NaN where unknown.
+
+    Attributes:
+        kpa: (K,) the range's top where it is `above`.
+        sigma_kpa: (K,) standard uncertainties; known `within` alone.
+        force_n: (K,) pressure times area.
+        force_sigma_n: (K,) standard uncertainties; NaN where the area's is.
+        ranges: K of them.
+    """
+
+    kpa: FloatArray
+    sigma_kpa: FloatArray
+    force_n: FloatArray
+    force_sigma_n: FloatArray
+    ranges: tuple[PressureRange, ...]
+
+
+@dataclass(frozen=True)
+class PressureCurve:
+    """Pressure against |relative conductivity change|, straight between knots.
+
+    Attributes:
+        magnitude: (n,) rising; the first is the onset.
+        pressure_kpa: (n,) rising.
+        sigma_kpa: (n,) standard uncertainty of the curve itself; 0 where nobody has said.
+    """
+
+    magnitude: FloatArray
+    pressure_kpa: FloatArray
+    sigma_kpa: FloatArray
+
+    @classmethod
+    def of_response(cls, response: MagnitudeResponse) -> PressureCurve:
+        """The curve of a sensor description's table."""
+        size = np.abs(np.asarray(response.relative_change))
+        onset = int(np.flatnonzero(size > 0)[0]) - 1
+        rising = np.append(True, np.diff(size[onset:]) > 0)  # of one change, the least pressure
+        kpa = np.asarray(response.pressure_kpa)[onset:][rising]
+        return cls(size[onset:][rising], kpa, np.zeros(len(kpa)))
+
+    @property
+    def range_kpa(self) -> tuple[float, float]:
+        """Pressures between which it answers."""
+        return float(self.pressure_kpa[0]), float(self.pressure_kpa[-1])
+
+    def pressure(self, magnitude: FloatArray) -> FloatArray:
+        """Pressure in kPa, any shape; the ends' beyond them."""
+        return np.asarray(np.interp(magnitude, self.magnitude, self.pressure_kpa))
+
+    def spread(self, magnitude: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Standard uncertainty in kPa that a magnitude's own one makes, same shape."""
+        return np.asarray(self._beyond(magnitude + sigma) - self._beyond(magnitude - sigma)) / 2
+
+    def sigma(self, magnitude: FloatArray) -> FloatArray:
+        """Standard uncertainty of the curve in kPa, any shape."""
+        return np.asarray(np.interp(magnitude, self.magnitude, self.sigma_kpa))
+
+    def range_of(self, magnitude: float, sigma: float) -> PressureRange:
+        """Where a magnitude with its standard uncertainty lies."""
+        # Of the curve's top: a magnitude that is clearly below that, and may be 0, is below.
+        little = 0.25
+        if not np.isfinite(magnitude + sigma):
+            return PressureRange.UNKNOWN
+        if magnitude > CLEARLY * sigma and magnitude >= self.magnitude[0]:
+            above = magnitude > self.magnitude[-1]
+            return PressureRange.ABOVE if above else PressureRange.WITHIN
+        most = max(little * self.magnitude[-1], self.magnitude[0])
+        light = magnitude + CLEARLY * sigma < most
+        return PressureRange.BELOW if light else PressureRange.UNKNOWN
+
+    def _beyond(self, magnitude: FloatArray) -> FloatArray:
+        """Pressure with the end pieces prolonged, so that a spread does not shrink at the ends."""
+        m, kpa = self.magnitude, self.pressure_kpa
+        first, last = np.diff(kpa)[[0, -1]] / np.diff(m)[[0, -1]]
+        outside = first * np.minimum(magnitude - m[0], 0) + last * np.maximum(magnitude - m[-1], 0)
+        return np.asarray(self.pressure(magnitude) + outside)
+
+
+def described_curve(description: SensorDescription) -> PressureCurve | None:
+    """The curve until there is a calibration; None where there is no magnitude channel."""
+    channel = description.magnitude
+    return None if channel is None else PressureCurve.of_response(channel.response)
+
+
+def pressures_of(
+    curve: PressureCurve | None,
+    magnitude: FloatArray,
+    magnitude_sigma: FloatArray,
+    areas_m2: FloatArray,
+    area_sigmas_m2: FloatArray,
+) -> Pressures:
+    """Pressures and forces of K contacts from their magnitudes and areas.
+
+    An area taken too large makes the magnitude too small, and the magnitude's uncertainty says so
+    already: in the force the two errors partly cancel.
+
+    Args:
+        curve: the sensor's; None where it has none.
+        magnitude: (K,) |relative conductivity change|; NaN where unknown.
+        magnitude_sigma: (K,) standard uncertainties.
+        areas_m2: (K,).
+        area_sigmas_m2: (K,) standard uncertainties; NaN where unknown.
+    """
+    if curve is None:
+        nothing = np.full(len(magnitude), np.nan)
+        unknown = (PressureRange.UNKNOWN,) * len(magnitude)
+        return Pressures(nothing, nothing, nothing, nothing, unknown)
+    pairs = zip(magnitude.tolist(), magnitude_sigma.tolist(), strict=True)
+    ranges = tuple(curve.range_of(*pair) for pair in pairs)
+    within = np.array([r is PressureRange.WITHIN for r in ranges], bool)
+    above = np.array([r is PressureRange.ABOVE for r in ranges], bool)
+    kpa = np.where(within | above, curve.pressure(magnitude), np.nan)
+    spread, own = curve.spread(magnitude, magnitude_sigma), curve.sigma(magnitude)
+    sigma = np.where(within, np.hypot(spread, own), np.nan)
+
+    by_area = magnitude * area_sigmas_m2 / areas_m2
+    apart = np.sqrt(np.maximum(magnitude_sigma**2 - by_area**2, 0.0))
+    slope = spread / np.maximum(magnitude_sigma, 1e-12)
+    of_area = (kpa - slope * magnitude) * area_sigmas_m2
+    of_pressure = np.hypot(curve.spread(magnitude, apart), own) * areas_m2
+    force_sigma = np.where(within, 1e3 * np.hypot(of_pressure, of_area), np.nan)
+    return Pressures(kpa, sigma, 1e3 * kpa * areas_m2, force_sigma, ranges)

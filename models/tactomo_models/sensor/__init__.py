@@ -1,0 +1,1 @@
+"""What a skin is: pattern, sheet, response, description and its file, symmetry."""

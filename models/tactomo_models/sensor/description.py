@@ -1,0 +1,292 @@
+"""The sensor description: what a skin is made of.
+
+Nothing about a sensor is hard-coded elsewhere.
+.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from functools import cached_property
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+from tactomo_protocol import Channel
+
+from tactomo_models.arrays import BoolArray, FloatArray, IntArray
+from tactomo_models.sensor.pattern import Pairs, combined, ring_pairs
+from tactomo_models.sensor.response import MagnitudeChannel, StructureChannel
+from tactomo_models.sensor.section import Section
+from tactomo_models.sensor.sheet import Electrodes, Sheet, check_electrodes, electrode_ends
+
+Electrode = Annotated[int, Field(ge=0, le=63)]
+PairList = Annotated[
+    tuple[Annotated[tuple[Electrode, Electrode], Field(strict=False)], ...],
+    Field(min_length=1, max_length=256, strict=False),
+]
+
+MAX_TABLE_BYTES = 2_000_000_000
+"""Of a sensor's influence tables, which grow as the square of the map's nodes."""
+
+
+class Pattern(Section):
+    """Drive pair k is (k, k + drive_offset), measuring pair m is (m, m + measure_offset).
+
+    Or as listed by `drive`, `measure`: each pair once, source and sink, plus and minus.
+    """
+
+    drive_offset: Annotated[int, Field(ge=1, le=32)] = 1
+    measure_offset: Annotated[int, Field(ge=1, le=32)] = 1
+    drive: PairList | None = None
+    measure: PairList | None = None
+    current_a: Annotated[float, Field(gt=0, le=1)]
+
+    @model_validator(mode="after")
+    def _pairs_are_pairs(self) -> Self:
+        for key in ("drive", "measure"):
+            listed = getattr(self, key)
+            if listed is None:
+                continue
+            if getattr(self, f"{key}_offset") != 1:
+                raise ValueError(f"{key} and {key}_offset: give one of the two")
+            for number, pair in enumerate(listed):
+                if pair[0] == pair[1] or pair in listed[:number]:
+                    raise ValueError(
+                        f"{key}[{number}] = {list(pair)}: must be two electrodes, and no pair twice"
+                    )
+        return self
+
+    def __str__(self) -> str:
+        """The pattern in words."""
+        drive, measure = (
+            f"{len(listed)} listed pairs" if listed else f"({k}, {k}+{offset})"
+            for k, offset, listed in (
+                ("k", self.drive_offset, self.drive),
+                ("m", self.measure_offset, self.measure),
+            )
+        )
+        return f"drive {drive}, measure {measure}"
+
+
+class Instrument(Section):
+    """What the device that reads the electrodes makes of their voltages.
+
+    `unsigned` ones are sizes, as of a peak or RMS detector: see `signs`. A converter that reads
+    nothing of voltages below zero has `positive` ones, or `negative` ones where it is connected the
+    other way round. `single_ended` readings, of each electrode against the one that the current
+    leaves by, are the `matrix` protocol's. `regularisation` is a factor on what the linear methods
+    choose by the noise: above 1 where a device has larger errors than noise.
+    """
+
+    voltages: Literal["signed", "unsigned", "positive", "negative"] = "signed"
+    referenced: Literal["pairs", "single_ended"] = "pairs"
+    volts_per_unit: Annotated[float, Field(gt=0, le=1e6)] = 1.0
+    regularisation: Annotated[float, Field(ge=1e-3, le=1e6)] = 1.0
+    start: Annotated[str, Field(max_length=16, pattern=r"^[ -~\r\n]*$")] = ""
+    scan_rate_hz: Annotated[float, Field(ge=0.1, le=1000)] = 20.0
+    frequency_hz: Annotated[float, Field(ge=100, le=1e7)] = 10_000.0
+
+    @model_validator(mode="after")
+    def _single_ended_readings_have_their_sign(self) -> Self:
+        if self.referenced == "single_ended" and self.voltages != "signed":
+            raise ValueError(
+                f"voltages = {self.voltages!r}: single_ended readings, against the electrode that "
+                "the current leaves by, are positive by themselves; leave it out"
+            )
+        return self
+
+
+class MapGrid(Section):
+    """Nodes of the published map along x and y; the outermost lie on the bounding box."""
+
+    nodes_x: Annotated[int, Field(ge=11, le=401)] = 51
+    nodes_y: Annotated[int, Field(ge=11, le=401)] = 51
+
+
+class SensorDescription(Section):
+    """A whole sensor: sheet, electrodes, pattern, map and the channels' contact response."""
+
+    schema_version: Literal[1] = Field(alias="schema")
+    name: Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,62}$")]
+    title: str = ""
+    sheet: Sheet
+    electrodes: Electrodes
+    pattern: Pattern
+    instrument: Instrument = Instrument()
+    map: MapGrid = MapGrid()
+    magnitude: MagnitudeChannel | None = None
+    structure: StructureChannel | None = None
+
+    @model_validator(mode="after")
+    def _parts_fit(self) -> Self:
+        if self.magnitude is None and self.structure is None:
+            raise ValueError("give at least one of [magnitude.response] and [structure]")
+        check_electrodes(self.sheet, self.electrodes)
+        if not 6 <= self.electrode_count <= 64:
+            raise ValueError(f"electrodes: {self.electrode_count} in all; 6 to 64 are supported")
+        for key in ("drive_offset", "measure_offset"):
+            offset = getattr(self.pattern, key)
+            if offset >= self.electrode_count:
+                raise ValueError(
+                    f"pattern.{key} = {offset}: must be below the number of electrodes, "
+                    f"{self.electrode_count}"
+                )
+        self._check_listed_pairs()
+        self._check_size()
+        return self
+
+    def _check_listed_pairs(self) -> None:
+        count = self.electrode_count
+        for key in ("drive", "measure"):
+            for pair in getattr(self.pattern, key) or ():
+                if max(pair) >= count:
+                    raise ValueError(
+                        f"pattern.{key} holds {list(pair)}: the electrodes are 0 to {count - 1}"
+                    )
+        if not 0 < self.measurements <= count**2:
+            raise ValueError(
+                f"pattern: {self.measurements} voltages by pairs that share no electrode; must be "
+                f"1 to {count**2}, the number of electrodes squared"
+            )
+
+    def _check_size(self) -> None:
+        """Refuse what no computer has the memory for, before anything is built."""
+        nodes, measurements = self.map.nodes_x * self.map.nodes_y, self.electrode_count**2
+        needed = 8 * nodes * (nodes + 2 * measurements)
+        if needed > MAX_TABLE_BYTES:
+            raise ValueError(
+                f"map: {self.map.nodes_x} x {self.map.nodes_y} nodes with {self.electrode_count} "
+                f"electrodes need tables of {needed / 1e9:.1f} GB, more than "
+                f"{MAX_TABLE_BYTES / 1e9:g}: give fewer nodes"
+            )
+
+    @property
+    def width_m(self) -> float:
+        """Width of the bounding box."""
+        return self.sheet.width_m
+
+    @property
+    def height_m(self) -> float:
+        """Height of the bounding box."""
+        return self.sheet.size_m[1]
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """The channels this sensor has, magnitude first."""
+        both: tuple[Channel, ...] = (Channel.MAGNITUDE, Channel.STRUCTURE)
+        return tuple(name for name in both if getattr(self, name) is not None)
+
+    def strongest_ratio(self, channel: Channel) -> float:
+        """Factor on a channel's conductivity where it is pressed hardest; never 1."""
+        if channel == Channel.MAGNITUDE:
+            assert self.magnitude is not None
+            return 1 + self.magnitude.response.relative_change[-1]
+        assert self.structure is not None
+        return self.structure.saturated_ratio
+
+    def contrast(self, channel: Channel) -> float:
+        """The same as a factor above 1, up or down."""
+        ratio = self.strongest_ratio(channel)
+        return max(ratio, 1 / ratio)
+
+    def sign(self, channel: Channel) -> float:
+        """1.0 where pressing makes a channel conduct better, -1.0 where worse."""
+        return 1.0 if self.strongest_ratio(channel) > 1 else -1.0
+
+    def either_way(self, channel: Channel) -> bool:
+        """Whether objects may conduct better or worse than the sheet."""
+        return (
+            channel == Channel.STRUCTURE
+            and self.structure is not None
+            and self.structure.either_way
+        )
+
+    @property
+    def electrode_count(self) -> int:
+        """Number of electrodes of one sheet."""
+        return self.electrodes.total
+
+    def __eq__(self, other: object) -> bool:
+        """Descriptions are equal by what they say, whatever has been worked out from them."""
+        if not isinstance(other, SensorDescription):
+            return NotImplemented
+        return self is other or self.model_dump() == other.model_dump()
+
+    @cached_property
+    def pairs(self) -> Pairs:
+        """Drive and measuring pairs of every voltage, in the order of a scan."""
+        return combined(self.drive_pairs, self.measure_pairs)
+
+    @property
+    def drive_pairs(self) -> IntArray:
+        """Source and sink of every drive, in order, (D, 2)."""
+        return self._pairs_of(self.pattern.drive, self.pattern.drive_offset)
+
+    @property
+    def measure_pairs(self) -> IntArray:
+        """Plus and minus of every measuring pair, in order, (K, 2)."""
+        return self._pairs_of(self.pattern.measure, self.pattern.measure_offset)
+
+    def _pairs_of(self, listed: PairList | None, offset: int) -> IntArray:
+        if listed is None:
+            return ring_pairs(self.electrode_count, offset)
+        return np.array(listed, dtype=np.intp)
+
+    @property
+    def offsets(self) -> tuple[int, int]:
+        """Of the first drive pair and the first measuring pair: what a hello says of a pattern."""
+        steps = (int(pairs[0, 1] - pairs[0, 0]) for pairs in (self.drive_pairs, self.measure_pairs))
+        drive, measure = (step % self.electrode_count for step in steps)
+        return drive, measure
+
+    @property
+    def measurements(self) -> int:
+        """Voltages in one scan."""
+        return len(self.pairs.drive)
+
+    @property
+    def sheet_conductance_s(self) -> float:
+        """Conductivity times thickness."""
+        return self.sheet.conductivity_s_m * self.sheet.thickness_m
+
+    @cached_property
+    def electrode_ends_m(self) -> FloatArray:
+        """Both ends of every electrode on the rim, counter-clockwise: (electrodes, 2, 2)."""
+        return electrode_ends(self.sheet, self.electrodes)
+
+    @property
+    def electrode_centres_m(self) -> FloatArray:
+        """Centre of every electrode, (electrodes, 2)."""
+        return np.asarray(self.electrode_ends_m.mean(axis=1))
+
+    @cached_property
+    def map_x_m(self) -> FloatArray:
+        """X of the map's columns, (nodes_x,)."""
+        return np.linspace(-self.width_m / 2, self.width_m / 2, self.map.nodes_x)
+
+    @cached_property
+    def map_y_m(self) -> FloatArray:
+        """Y of the map's rows, (nodes_y,); row 0 is the lowest."""
+        return np.linspace(-self.height_m / 2, self.height_m / 2, self.map.nodes_y)
+
+    def on_sheet(self, x_m: FloatArray, y_m: FloatArray, margin_m: float = 0.0) -> BoolArray:
+        """Tell which points lie on the sheet, at least `margin_m` inside its rim."""
+        slack = 1e-9
+        if self.sheet.shape == "disc":
+            inside = np.hypot(x_m, y_m) <= self.width_m / 2 - margin_m + slack
+        else:
+            inside = (np.abs(x_m) <= self.width_m / 2 - margin_m + slack) & (
+                np.abs(y_m) <= self.height_m / 2 - margin_m + slack
+            )
+        return np.asarray(inside)
+
+    @cached_property
+    def sha256(self) -> str:
+        """Hash of what the physics depends on; calibration tables may change without a rebuild."""
+        unlisted = {key for key in ("drive", "measure") if getattr(self.pattern, key) is None}
+        physics = self.model_dump_json(
+            include={"schema_version", "sheet", "electrodes", "pattern", "map"},
+            exclude={"pattern": unlisted},  # hashes are older than these keys
+        )
+        return hashlib.sha256(physics.encode()).hexdigest()

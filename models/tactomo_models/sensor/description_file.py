@@ -1,0 +1,76 @@
+"""Sensor descriptions as files: those that are shipped, by name, and a user's own, by path.
+
+The shipped ones lie in `tactomo_models/sensors`; who has another sheet copies one and changes it.
+"""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from tactomo_models.errors import DescriptionError, explain
+from tactomo_models.sensor.description import SensorDescription
+from tactomo_models.toml_file import parse_toml, read_toml
+
+
+def shipped_descriptions() -> list[str]:
+    """Names of the descriptions that come with tactomo."""
+    folder = resources.files("tactomo_models.sensor.shipped")
+    return sorted(
+        f.name.removesuffix(".toml") for f in folder.iterdir() if f.name.endswith(".toml")
+    )
+
+
+def shipped_text(name: str) -> str:
+    """The TOML text of a shipped description, comments and all.
+
+    Raises:
+        DescriptionError: there is none of that name.
+    """
+    if name not in shipped_descriptions():
+        raise DescriptionError(
+            f"no description is shipped as {name!r}; choose one of: "
+            f"{', '.join(shipped_descriptions())}"
+        )
+    return (
+        resources.files("tactomo_models.sensor.shipped").joinpath(f"{name}.toml").read_text("utf-8")
+    )
+
+
+def load_description(source: str | Path) -> SensorDescription:
+    """Read a sensor description by its shipped name or from a TOML file.
+
+    Raises:
+        DescriptionError: the file cannot be read, is not TOML, or a key is unknown, missing
+            or out of range; the message names the key, its value and what is allowed.
+    """
+    name = str(source)
+    try:
+        return SensorDescription.model_validate(_read(name))
+    except ValidationError as error:
+        raise DescriptionError(
+            "\n".join(f"{name}: {explain(item)}" for item in error.errors())
+        ) from error
+
+
+def _read(name: str) -> dict[str, Any]:
+    try:
+        if name in shipped_descriptions():
+            return parse_toml(shipped_text(name))
+        return read_toml(Path(name))
+    except OSError as error:
+        raise _cannot_read(name, error.strerror) from error
+    except UnicodeDecodeError as error:
+        raise _cannot_read(name, "not UTF-8 text") from error
+    except ValueError as error:
+        raise DescriptionError(f"{name} is not valid TOML: {error}") from error
+
+
+def _cannot_read(name: str, reason: str | None) -> DescriptionError:
+    return DescriptionError(
+        f"cannot read the sensor description {name}: {reason}; give the path of a TOML file "
+        f"or one of: {', '.join(shipped_descriptions())}"
+    )

@@ -1,0 +1,106 @@
+"""Which electrodes drive and which measure: the order of the voltages in a scan."""
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from tactomo_models.arrays import BoolArray, FloatArray, IntArray
+from tactomo_models.errors import DataError
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Electrodes of every voltage of a scan, in order.
+
+    Attributes:
+        drive: (M, 2) electrodes that the current enters and leaves by.
+        measure: (M, 2) electrodes whose potential difference, first minus second, is read.
+    """
+
+    drive: IntArray
+    measure: IntArray
+
+
+def scan_pairs(electrodes: int, drive_offset: int = 1, measure_offset: int = 1) -> Pairs:
+    """List the pairs drive-major, measuring pairs ascending, none that touches a driven electrode.
+
+    With both offsets at 1 and 16 electrodes these are the 208 voltages of adjacent drive and
+    adjacent measurement, in the order that EIDORS and pyEIT use.
+    """
+    return combined(ring_pairs(electrodes, drive_offset), ring_pairs(electrodes, measure_offset))
+
+
+def ring_pairs(electrodes: int, offset: int) -> IntArray:
+    """Every electrode with the one `offset` further round, (electrodes, 2)."""
+    first = np.arange(electrodes)
+    return np.stack([first, (first + offset) % electrodes], axis=1)
+
+
+def combined(drive: IntArray, measure: IntArray) -> Pairs:
+    """Every drive pair (D, 2) with every measuring pair (K, 2) that does not touch it."""
+    drive, measure = np.repeat(drive, len(measure), axis=0), np.tile(measure, (len(drive), 1))
+    apart = ~touching(drive, measure)
+    return Pairs(drive[apart], measure[apart])
+
+
+def touching(drive: IntArray, measure: IntArray) -> BoolArray:
+    """Tell which of the pairs (n, 2) and (n, 2) share an electrode, (n,)."""
+    return np.asarray((drive[:, :, None] == measure[:, None, :]).any(axis=(1, 2)))
+
+
+def reciprocal_pairs(pairs: Pairs) -> IntArray:
+    """Positions (n, 2) in a scan of voltages that are the same but for noise: V(k, m) = V(m, k)."""
+    order = {
+        (*drive, *measure): index
+        for index, (drive, measure) in enumerate(
+            zip(pairs.drive.tolist(), pairs.measure.tolist(), strict=True)
+        )
+    }
+    found = [(i, order[k[2:] + k[:2]]) for k, i in order.items() if k[2:] + k[:2] in order]
+    return np.array([(i, j) for i, j in found if i < j], dtype=np.intp).reshape(-1, 2)
+
+
+@dataclass(frozen=True)
+class PatternLayout:
+    """A pattern without a sheet: for devices of which no description is at hand."""
+
+    pairs: Pairs
+    electrode_count: int
+
+
+def pattern_of_zeros(scans: FloatArray) -> PatternLayout:
+    """Read the pattern off scans (T, L * L) of every drive pair by every measuring pair.
+
+    A device that reports all L measuring pairs for each of L drives has 0 where a measuring pair
+    touches a driven electrode: that happens at m - k in {0, drive offset, minus measuring offset,
+    their difference}, which tells both offsets. `without_zeros` leaves them out.
+
+    Raises:
+        DataError: the number of voltages is no square, or the zeros do not fit just one pattern.
+    """
+    count = round(np.sqrt(scans.shape[1]))
+    if count * count != scans.shape[1]:
+        raise DataError(
+            f"scans of {scans.shape[1]} voltages are not every drive by every measuring pair; "
+            "give --description, or a lookup of electrodes"
+        )
+    zero = (scans == 0).all(axis=0).reshape(count, count)
+    always = [n for n in range(count) if np.all(zero[range(count), (np.arange(count) + n) % count])]
+    fits = [
+        (drive, measure)
+        for drive, measure in itertools.product(range(1, count // 2 + 1), repeat=2)
+        if {0, drive, -measure % count, (drive - measure) % count} == set(always)
+    ]
+    if len(fits) != 1:
+        raise DataError(
+            f"the zeros of these {count} x {count} voltages fit {len(fits)} patterns of drive and "
+            "measuring pairs; give --description, or a lookup of electrodes"
+        )
+    return PatternLayout(scan_pairs(count, *fits[0]), count)
+
+
+def without_zeros(layout: PatternLayout, scans: FloatArray) -> FloatArray:
+    """Return the scans (T, M) without the measuring pairs that touch a driven electrode."""
+    position = layout.pairs.drive[:, 0] * layout.electrode_count + layout.pairs.measure[:, 0]
+    return np.asarray(scans[:, position])

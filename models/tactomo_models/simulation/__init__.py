@@ -1,0 +1,1 @@
+"""Simulated skins: their voltages under presses, and their drift."""

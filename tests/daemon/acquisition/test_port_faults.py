@@ -1,0 +1,235 @@
+"""What can go wrong at a port: noise, unplugging, the wrong device, somebody else's port."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from tactomo.config import load_config
+from tactomo.errors import PortBusyError, PortError
+from tactomo.service.daemon import Daemon
+from tactomo_protocol import Acknowledge, AckStatus, Channel, CommandCode, Scan, ScanFlag
+
+Start = Callable[..., Any]
+
+
+def refusal(port: str | Path) -> PortError:
+    """Return the error with which a daemon refuses to start on a port."""
+    memory: Any = SimpleNamespace(method="auto", budget_s=None)
+    local = "tcp://127.0.0.1:0"
+    config = load_config(
+        None, ports=[str(port)], stream=local, control=local, baseline={"track": False}
+    )
+    daemon = Daemon(config, reconstructor=memory)
+    try:
+        with pytest.raises(PortError) as caught:
+            daemon.start()
+    finally:
+        daemon.stop()
+    assert caught.value.next_step
+    return caught.value
+
+
+def test_garbage_is_counted_and_told_and_costs_nothing_else(bench: Start) -> None:
+    b = bench()
+    b.tare()
+    b.skin.lines[0].say(b"\x00" + os.urandom(300).replace(b"\x00", b"\x01") + b"\x00")
+    event = b.listener.event("corrupt_packets")
+    assert event["severity"] == "warning"
+    assert b.step()["flags"] == []
+    (port,) = b.ask("status")["ports"]
+    assert port["corrupt"] == 1
+    assert port["connected"]
+
+
+def test_a_flood_of_garbage_makes_few_events(bench: Start) -> None:
+    b = bench()
+    b.tare()
+    for _ in range(200):
+        b.skin.lines[0].say(b"\x00garbage\x00")
+    b.step()
+    assert b.ask("status")["ports"][0]["corrupt"] == 200
+    assert 1 <= sum(e["name"] == "corrupt_packets" for e in b.listener.of("event")) <= 3
+
+
+@pytest.mark.parametrize("ports", [1, 2])
+def test_an_unplugged_port_is_waited_for_and_started_again(bench: Start, ports: int) -> None:
+    b = bench(ports=ports)
+    b.tare()
+    line = b.skin.lines[0]
+    line.unplug()
+    assert b.listener.event("port_lost")["severity"] == "error"
+    assert not b.ask("status")["ports"][0]["connected"]
+    line.plug()
+    b.listener.event("port_back")
+    line.introduce()
+    frame = b.step(load=0.1)
+    assert frame["flags"] == []  # the reference held
+    assert frame["map"] is not None
+
+
+def test_the_other_port_goes_on_while_one_is_unplugged(bench: Start) -> None:
+    b = bench(ports=2)
+    b.tare()
+    b.skin.line_of(Channel.STRUCTURE).unplug()
+    b.listener.event("port_lost")
+    frame = b.step(load=0.1, channels=(Channel.MAGNITUDE,))
+    assert frame["flags"] == ["structure_missing"]
+
+
+def test_a_device_that_is_there_already_needs_no_introduction(bench: Start) -> None:
+    b = bench()
+    line = b.skin.lines[0]
+    line.say(b"the end of a packet that began before\x00")  # attached in the middle
+    line.say(line.hello)
+    for _ in range(3):
+        b.step()
+    b.listener.event("tared")
+    assert b.ask("status")["ports"][0]["corrupt"] == 0
+
+
+def test_a_silent_device_is_asked_again(bench: Start) -> None:
+    b = bench()
+    codes: list[int] = []
+
+    def asked_twice() -> bool:
+        codes.extend(command.code for command in b.skin.lines[0].heard())
+        return codes.count(CommandCode.IDENTIFY) >= 2 and codes.count(CommandCode.START) >= 2
+
+    b.listener.wait("status", lambda _: asked_twice())
+
+
+@pytest.mark.parametrize(
+    ("differs", "said"),
+    [
+        ({"electrodes": 8}, "electrodes 8, not 16"),
+        ({"samples_per_scan": 192}, "samples_per_scan 192, not 208"),
+        ({"drive_offset": 8}, "drive_offset 8, not 1"),
+    ],
+)
+def test_the_wrong_device_is_refused_and_not_reconstructed(
+    bench: Start, differs: dict[str, int], said: str
+) -> None:
+    b = bench()
+    line = b.skin.lines[0]
+    right = line.hello
+    line.hello = replace(right, **differs)
+    line.introduce()
+    assert said in b.listener.event("device_refused")["detail"]
+    b.skin.scan()
+    line.hello = right
+    line.say(right)
+    b.step()
+    assert [frame["scan_counter"] for frame in b.listener.of("map")] == [2]
+    (port,) = b.ask("status")["ports"]
+    assert (port["refusal"], port["unused_scans"]) == (None, 2)
+
+
+def test_a_device_of_another_skin_is_refused_by_its_name(bench: Start) -> None:
+    b = bench(ports=2, device_ids=["ours-a", "ours-b"])
+    first, second = b.skin.lines
+    first.hello, ours = replace(first.hello, device_id="theirs"), replace(first.hello)
+    second.hello = replace(second.hello, device_id="ours-a")  # whichever port it is at
+    b.skin.introduce()
+    refused = b.listener.event("device_refused")
+    assert "theirs" in refused["detail"]
+    assert "ours-a, ours-b" in refused["detail"]
+    assert "by-path" in refused["next_step"]
+    b.skin.scan()
+    status = b.listener.wait("status", lambda s: s["ports"][0]["unused_scans"])
+    assert [port["state"] for port in status["ports"]] == ["refused", "running"]
+    first.say(replace(ours, device_id="ours-b"))
+    for _ in range(3):
+        b.step()
+    b.listener.event("tared")
+    assert b.ask("status")["ports"][0]["refusal"] is None
+
+
+def test_a_device_that_takes_the_place_of_another_is_told(bench: Start) -> None:
+    b = bench()
+    b.tare()
+    line = b.skin.lines[0]
+    line.unplug()
+    b.listener.event("port_lost")
+    line.hello = replace(line.hello, device_id="bench-2")
+    line.plug()
+    line.introduce()
+    event = b.listener.event("device_changed")
+    assert "bench-2 is where bench-1 was" in event["detail"]
+    assert "tare" in event["next_step"]
+    assert b.step()["flags"] == []
+
+
+def test_a_command_that_the_device_refuses_is_told(bench: Start) -> None:
+    b = bench()
+    b.tare()
+    b.skin.lines[0].say(Acknowledge(3, CommandCode.START, AckStatus.BUSY))
+    assert "BUSY" in b.listener.event("command_refused")["detail"]
+
+
+def test_scans_of_another_length_than_announced_are_not_used(bench: Start) -> None:
+    b = bench()
+    b.tare()
+    line = b.skin.lines[0]
+    line.say(Scan(Channel.MAGNITUDE, 99, 0, ScanFlag(0), np.zeros(10, np.int32)))
+    assert b.step()["flags"] == []
+    assert 99 not in [frame["scan_counter"] for frame in b.listener.of("map")]
+    assert b.ask("status")["ports"][0]["unused_scans"] == 1
+
+
+def test_a_port_that_this_process_holds_is_busy(bench: Start) -> None:
+    error = refusal(bench().skin.lines[0].path)
+    assert isinstance(error, PortBusyError)
+    assert f"pid {os.getpid()}" in error.cause
+
+
+def test_a_port_held_by_another_process_is_busy() -> None:
+    master, slave = os.openpty()
+    name = os.ttyname(slave)
+    os.close(slave)
+    holder = subprocess.Popen(
+        [
+            sys.executable,
+            "-c",
+            f"import fcntl, sys; f = open({name!r}, 'rb'); fcntl.flock(f, fcntl.LOCK_EX); "
+            "print('held', flush=True); sys.stdin.read()",
+        ],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    try:
+        assert holder.stdout is not None
+        holder.stdout.readline()
+        error = refusal(Path(name))
+    finally:
+        holder.communicate()
+        os.close(master)
+    assert isinstance(error, PortBusyError)
+    assert f"pid {holder.pid}" in error.cause
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("absent", "does not exist"),
+        ("file", "is not a serial device"),
+        ("folder", "cannot open"),
+        ("url", "cannot open"),
+    ],
+)
+def test_what_is_no_port_is_refused_at_once(tmp_path: Path, kind: str, said: str) -> None:
+    path = tmp_path / "port"
+    if kind == "file":
+        path.write_text("not a device")
+    if kind == "folder":
+        path.mkdir()
+    error = refusal("nonsense://1" if kind == "url" else path)
+    assert said in error.cause

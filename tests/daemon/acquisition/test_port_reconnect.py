@@ -1,0 +1,421 @@
+"""A port that goes away and comes back, as itself or as something else, and one that never was."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+import serial
+from tactomo.acquisition.connection import Connection
+from tactomo.acquisition.liveness import PATIENCE_S
+from tactomo.acquisition.open_serial import DEVICE_GONE, open_serial
+from tactomo.errors import PortAbsentError, PortBusyError
+from tactomo_models import load_description
+from tactomo_protocol import CommandCode
+
+Start = Callable[..., Any]
+Connect = Callable[[object], Connection]
+Until = Callable[[Callable[[], Any]], Any]
+Hold = Callable[..., subprocess.Popen[bytes]]
+
+
+@pytest.fixture
+def told() -> list[tuple[str, str]]:
+    return []
+
+
+@pytest.fixture
+def connect(told: list[tuple[str, str]]) -> Iterator[Connect]:
+    """Open a connection whose events are in `told`; it is closed later."""
+    made: list[Connection] = []
+
+    def on_event(name: str, severity: str, detail: str, next_step: str = "") -> None:
+        told.append((name, f"{detail}; {next_step}"))
+
+    def open_connection(url: object) -> Connection:
+        made.append(Connection(str(url), 921_600, on_event))
+        return made[-1]
+
+    yield open_connection
+    for connection in made:
+        connection.close()
+
+
+@pytest.fixture
+def hold(until: Until) -> Iterator[Hold]:
+    """Start a process that has a port open; it is stopped later."""
+    started: list[subprocess.Popen[bytes]] = []
+
+    def start(path: Path, *command: str) -> subprocess.Popen[bytes]:
+        process = subprocess.Popen([*command, str(path)], stdout=subprocess.DEVNULL)
+        started.append(process)
+        device, descriptors = os.path.realpath(path), Path(f"/proc/{process.pid}/fd")
+        until(lambda: any(os.path.realpath(fd) == device for fd in descriptors.glob("*")))
+        return process
+
+    yield start
+    for process in started:
+        stop(process)
+
+
+def stop(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.wait()
+
+
+# Going away
+
+
+ACTIONS: dict[str, Callable[[serial.Serial], Any]] = {
+    "read": lambda port: port.read(1),
+    "read many": lambda port: port.read(100),
+    "in_waiting": lambda port: port.in_waiting,
+    "write": lambda port: port.write(b"x"),
+    "flush": lambda port: port.reset_input_buffer(),
+}
+
+
+@pytest.mark.parametrize("how", ["hung up", "closed", "descriptor lost"])
+@pytest.mark.parametrize("action", ACTIONS)
+def test_whatever_pyserial_raises_on_unplugging_is_known(line: Any, action: str, how: str) -> None:
+    port: Any = open_serial(str(line.path), 921_600)
+    if how == "hung up":
+        line.unplug()
+    elif how == "closed":
+        port.close()
+    else:  # what a close by another thread leaves in the middle of a call
+        os.close(port.fd)
+        port.fd = None
+    with pytest.raises(DEVICE_GONE):
+        ACTIONS[action](port)
+    if how == "descriptor lost":
+        port.fd = os.open(os.devnull, os.O_RDWR)  # so that there is something to close
+    port.close()
+
+
+@pytest.mark.parametrize("call", ["read", "write"])
+def test_a_device_may_go_in_the_middle_of_a_call(
+    line: Any,
+    call: str,
+    connect: Connect,
+    monkeypatch: pytest.MonkeyPatch,
+    told: list[tuple[str, str]],
+) -> None:
+    monkeypatch.setattr("tactomo.acquisition.open_serial.READ_TIMEOUT_S", 60)
+    monkeypatch.setattr("tactomo.acquisition.open_serial.WRITE_TIMEOUT_S", 60)
+    connection = connect(line.path)
+    connection.open()
+    pulled = threading.Timer(0.2, line.unplug)
+    pulled.start()
+    if call == "read":
+        assert connection.read() == b""
+    else:
+        assert not connection.write(bytes(1_000_000))  # far more than the line takes unread
+    pulled.join()
+    assert not connection.is_open
+    assert connection.problem
+    assert [name for name, _ in told] == ["port_lost"]
+
+
+def test_a_pty_of_socat_that_is_killed_is_lost_and_found_again(
+    tmp_path: Path, connect: Connect, until: Until
+) -> None:
+    path = tmp_path / "socat"
+
+    def socat() -> subprocess.Popen[bytes]:
+        path.unlink(missing_ok=True)
+        made = subprocess.Popen(["socat", f"pty,raw,echo=0,link={path}", "pipe"])
+        until(path.exists)
+        return made
+
+    try:
+        process = socat()
+    except FileNotFoundError:
+        pytest.skip("needs socat")
+    connection = connect(path)
+    for _ in range(2):
+        until(connection.try_open)
+        assert connection.write(b"echo")
+        until(lambda: connection.read() != b"")
+        stop(process)
+        until(lambda: connection.read() == b"" and not connection.is_open)
+        process = socat()
+    stop(process)
+
+
+# Coming back
+
+
+def test_unplugged_and_replugged_again_and_again(bench: Start, until: Until) -> None:
+    b = bench()
+    b.tare()
+    line = b.skin.lines[0]
+    for time_ in range(10):
+        line.unplug()
+        until(lambda: not b.ask("status")["ports"][0]["connected"])
+        line.plug()
+        line.introduce()
+        frame = b.step()
+        assert frame["flags"] == [], time_
+    events = [e["name"] for e in b.listener.of("event") if e["name"].startswith("port")]
+    assert events == ["port_lost", "port_back"] * 10
+    port_threads = [t for t in threading.enumerate() if t.name.startswith("port-")]
+    assert len(port_threads) == 1
+
+
+def test_what_stands_in_the_way_is_told_and_waited_out(
+    bench: Start, tmp_path: Path, hold: Hold
+) -> None:
+    b = bench()
+    b.tare()
+    line = b.skin.lines[0]
+
+    def lost_because(words: str) -> None:
+        b.listener.wait("event", lambda e: e["name"] == "port_lost" and words in e["detail"])
+        b.listener.wait("status", lambda s: words in (s["ports"][0]["problem"] or ""))
+
+    line.unplug()
+    b.listener.event("port_lost")
+    line.path.write_text("a file where the port was")
+    lost_because("is not a serial device")
+    line.path.unlink()
+    line.plug()
+    line.path.rename(tmp_path / "aside")
+    other = hold(tmp_path / "aside", "cat")
+    (tmp_path / "aside").rename(line.path)
+    lost_because(f"pid {other.pid}: cat")
+    stop(other)
+    b.listener.event("port_back")
+    line.introduce()
+    assert b.step()["flags"] == []
+    assert b.ask("status")["ports"][0]["problem"] is None
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may open everything")
+def test_a_permission_that_udev_gives_later_is_waited_for(
+    line: Any, connect: Connect, told: list[tuple[str, str]]
+) -> None:
+    line.path.chmod(0)
+    connection = connect(line.path)
+    assert not connection.try_open()
+    assert "may not be opened by this user; " in told[0][1]
+    line.path.chmod(0o620)
+    assert connection.try_open()
+
+
+def test_scans_of_a_newcomer_wait_for_its_hello(bench: Start, until: Until) -> None:
+    b = bench()
+    b.tare()
+    line = b.skin.lines[0]
+    line.unplug()
+    b.listener.event("port_lost")
+    line.plug()
+    until(line.heard)
+    before = b.ask("status")["ports"][0]["unused_scans"]
+    b.skin.scan()
+    b.listener.wait("status", lambda s: s["ports"][0]["unused_scans"] == before + 2)
+    line.say(line.hello)
+    assert b.step()["flags"] == []
+
+
+# Never there
+
+
+def test_a_daemon_may_wait_for_a_port_that_is_not_there_yet(bench: Start) -> None:
+    b = bench(is_plugged=False, wait_for_ports=True)
+    status = b.ask("status")
+    assert status["state"] == "waiting_for_port"
+    assert status["ports"][0]["state"] == "closed"
+    assert "does not exist" in status["ports"][0]["problem"]
+    b.skin.lines[0].plug()
+    b.listener.event("port_back")
+    b.tare()
+    assert b.ask("status")["state"] == "running"
+
+
+def test_a_port_that_is_absent_is_told_apart(tmp_path: Path) -> None:
+    with pytest.raises(PortAbsentError, match="tactomo ports"):
+        open_serial(str(tmp_path / "nowhere"), 921_600)
+
+
+# Others who hold it
+
+
+def test_one_who_came_first_is_named(line: Any, hold: Hold) -> None:
+    other = hold(line.path, "cat")
+    with pytest.raises(PortBusyError) as caught:
+        open_serial(str(line.path), 921_600)
+    stop(other)
+    assert f"pid {other.pid}: cat /" in caught.value.cause
+    open_serial(str(line.path), 921_600).close()
+
+
+# Not `cat`: on a port that the daemon has set up, it reads nothing and takes that for the end.
+THIEF = """
+import os, select, sys
+port = os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY)
+while select.select([port], [], []):
+    os.read(port, 4096)
+"""
+
+
+def test_one_who_came_later_is_named(bench: Start, hold: Hold, until: Until) -> None:
+    b = bench()
+    b.tare()
+    line = b.skin.lines[0]
+    other = hold(line.path, sys.executable, "-c", THIEF)  # root may, whatever the lock
+    named = f"pid {other.pid}: "
+
+    def is_named() -> bool:
+        b.skin.scan()
+        return any(named in e["detail"] for e in b.listener.of("event"))
+
+    until(is_named)
+    stop(other)
+    until(lambda: b.ask("status")["ports"][0]["connected"])
+
+
+HOLDER = """
+import sys
+from tactomo.acquisition.open_serial import open_serial
+port = open_serial(sys.argv[1], 921600)
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_port_is_free_at_once_when_its_daemon_is_killed(line: Any) -> None:
+    command = [sys.executable, "-c", HOLDER, str(line.path)]
+    other = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    try:
+        assert other.stdout is not None
+        assert other.stdout.readline() == b"held\n"
+        with pytest.raises(PortBusyError, match=f"pid {other.pid}: "):
+            open_serial(str(line.path), 921_600)
+        other.send_signal(signal.SIGKILL)
+        other.wait()
+        open_serial(str(line.path), 921_600).close()
+    finally:
+        other.kill()
+        other.communicate()
+
+
+# Those that are there and do not speak
+
+
+@pytest.fixture
+def _short_patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tactomo.acquisition.liveness.PATIENCE_S", PATIENCE_S / 10)
+    monkeypatch.setattr("tactomo.acquisition.liveness.REOPEN_S", 0.6)
+
+
+@pytest.mark.usefixtures("_short_patience")
+def test_a_silent_device_is_told_and_its_port_opened_anew(bench: Start, until: Until) -> None:
+    b = bench()
+    assert "nothing came" in b.listener.event("device_silent")["detail"]
+    until(lambda: b.ask("status")["ports"][0]["reopened"])
+    (port,) = b.ask("status")["ports"]
+    assert (port["state"], port["connected"]) == ("silent", True)
+
+    def speak() -> bool:
+        b.skin.lines[0].say(b.skin.lines[0].hello)
+        b.skin.scan()
+        return any(e["name"] == "device_speaks" for e in b.listener.of("event"))
+
+    until(speak)
+    assert "port_lost" not in [e["name"] for e in b.listener.of("event")]
+
+
+@pytest.mark.usefixtures("_short_patience")
+def test_a_device_that_only_babbles_may_have_another_baud_rate(bench: Start, until: Until) -> None:
+    b = bench()
+
+    def babble() -> bool:
+        b.skin.lines[0].say(b"\xf8\x00\x7f\x06")
+        return any(e["name"] == "device_garbled" for e in b.listener.of("event"))
+
+    until(babble)
+    event = b.listener.event("device_garbled")
+    assert "no packet of protocol tactomo at 921600 baud" in event["detail"]
+    assert "baud" in event["next_step"]
+
+
+@pytest.mark.usefixtures("_short_patience")
+def test_a_device_that_says_hello_and_nothing_else_is_asked_to_start(
+    bench: Start, until: Until
+) -> None:
+    b = bench()
+    codes: list[int] = []
+
+    def greet() -> bool:
+        b.skin.lines[0].say(b.skin.lines[0].hello)
+        codes.extend(command.code for command in b.skin.lines[0].heard())
+        return any(e["name"] == "device_idle" for e in b.listener.of("event"))
+
+    until(greet)
+    until(lambda: greet() and codes.count(CommandCode.START) >= 2)
+    (port,) = b.ask("status")["ports"]
+    assert (port["state"], port["reopened"]) == ("idle", 0)
+    assert port["problem"] == "the device speaks, but sends no scans"
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("_short_patience")
+def test_a_slow_board_runs_between_its_frames_until_it_stops(bench: Start, until: Until) -> None:
+    """Its protocol gives the first frame 4 s; then its own pace counts, here one frame a second."""
+    count = load_description("matrix_square").measurements
+    line = b",".join(b"%d" % (1000 + number) for number in range(count)) + b"\n"
+    b = bench(protocol="matrix", description="matrix_square")
+    b.skin.lines[0].say(b"the rest of a line\n")
+
+    def a_second_later() -> None:
+        end_s = time.monotonic() + 1.0
+        until(lambda: time.monotonic() >= end_s)
+
+    def frames_of(sent: int) -> bool:
+        return bool(b.ask("status")["frames"] >= sent)
+
+    for sent in range(1, 5):
+        a_second_later()
+        b.skin.lines[0].say(line)
+        until(partial(frames_of, sent))
+    a_second_later()  # longer than others are given
+    status = b.ask("status")
+    assert (status["state"], status["ports"][0]["state"]) == ("running", "running")
+    assert status["rates"]["frames_hz"] > 0.0
+    assert [e["name"] for e in b.listener.of("event")] == ["tared"]
+    assert "nothing came for 3" in b.listener.event("device_silent")["detail"]
+    assert b.ask("status")["ports"][0]["state"] == "silent"
+
+
+# Noise
+
+
+def test_a_burst_of_noise_is_taken_and_the_next_scan_goes_through(bench: Start) -> None:
+    b = bench()
+    b.tare()
+    b.skin.lines[0].say(os.urandom(1_000_000) + b"\x00")
+    assert b.step()["flags"] == []
+    (port,) = b.ask("status")["ports"]
+    assert port["corrupt"] > 1000
+    assert port["bytes"] > 1_000_000
+
+
+def test_a_device_that_does_not_listen_is_heard_all_the_same(
+    line: Any, connect: Connect, until: Until
+) -> None:
+    connection = connect(line.path)
+    connection.open()
+    until(lambda: not connection.write(bytes(1000)))  # what it does not read fills the line
+    assert connection.is_open
+    line.say(b"still here")
+    assert connection.read() == b"still here"

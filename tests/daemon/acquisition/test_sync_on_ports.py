@@ -1,0 +1,152 @@
+"""Two channels on one port or two: joined by counter, never waited for too long."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from tactomo_client.messages import array_from_wire
+from tactomo_protocol import Channel, Scan, ScanFlag
+
+Start = Callable[..., Any]
+
+
+@pytest.mark.parametrize("ports", [1, 2])
+def test_both_channels_of_one_instant_become_one_frame(bench: Start, ports: int) -> None:
+    b = bench(ports=ports)
+    b.tare()
+    frame = b.step(load=0.1)
+    assert frame["flags"] == []
+    assert array_from_wire(frame["map"])[0, 0] == pytest.approx(0.2, abs=1e-3)
+    assert frame["device_us"] == b.skin.counter * 50_000
+    status = b.ask("status")
+    assert status["incomplete_scans"] == 0
+    assert [port["device"]["device_id"] for port in status["ports"]] == ["bench-1"] * ports
+
+
+@pytest.mark.parametrize("ports", [1, 2])
+def test_the_order_in_which_the_channels_come_does_not_matter(bench: Start, ports: int) -> None:
+    b = bench(ports=ports)
+    b.tare()
+    frame = b.step(channels=(Channel.STRUCTURE, Channel.MAGNITUDE))
+    assert frame["flags"] == []
+
+
+@pytest.mark.parametrize(
+    ("present", "flag"),
+    [(Channel.MAGNITUDE, "structure_missing"), (Channel.STRUCTURE, "magnitude_missing")],
+)
+def test_one_channel_missing_is_flagged_and_the_maps_go_on(
+    bench: Start, present: Channel, flag: str
+) -> None:
+    b = bench(ports=2)
+    b.tare()
+    frame = b.step(load=0.1, channels=(present,))
+    assert frame["flags"] == [flag]
+    assert array_from_wire(frame["map"])[0, 0] == pytest.approx(0.1, abs=1e-3)
+    assert b.step()["flags"] == []  # both again
+    assert b.ask("status")["incomplete_scans"] == 1
+
+
+def test_a_channel_that_stays_out_is_lost_and_comes_back(bench: Start) -> None:
+    # A wait that would be noticed if every frame had to pay for it.
+    b = bench(ports=2, sync_wait_ms=800)
+    b.tare()
+    while not any(e["name"] == "channel_lost" for e in b.listener.of("event")):
+        b.step(channels=(Channel.MAGNITUDE,))
+    frame = b.step(channels=(Channel.MAGNITUDE,))
+    assert frame["age_ns"] < 750e6  # not waited for any more
+    # The first pair is what shows that the channel is back: it may still be sent on alone.
+    b.step()
+    b.listener.event("channel_back")
+    assert b.step()["flags"] == []
+
+
+def test_a_channel_that_comes_after_the_tare_says_that_it_has_no_reference(bench: Start) -> None:
+    b = bench(ports=2)
+    magnitude, structure = b.skin.lines
+    both = structure.hello
+    structure.hello = magnitude.hello
+    b.skin.introduce()  # nobody announces the structure channel, so nobody waits for it
+    structure.hello = both
+    for _ in range(3):
+        b.step(channels=(Channel.MAGNITUDE,))
+    b.listener.event("tared")
+    b.step(channels=(Channel.STRUCTURE, Channel.MAGNITUDE))
+    assert b.listener.event("channel_back")["next_step"].startswith("tare")
+
+
+def test_a_scan_that_comes_too_late_is_counted_and_left_out(bench: Start) -> None:
+    b = bench(ports=2, sync_wait_ms=20)
+    b.tare()
+    counter = b.skin.counter + 1
+    assert b.step(channels=(Channel.MAGNITUDE,))["flags"] == ["structure_missing"]
+    b.skin.scan(channels=(Channel.STRUCTURE,), counter=counter)
+    b.step()
+    assert b.ask("status")["late_scans"] == 1
+
+
+@pytest.mark.parametrize("ports", [1, 2])
+def test_counters_that_start_again_are_followed(bench: Start, ports: int) -> None:
+    b = bench(ports=ports)
+    b.skin.counter = 1000
+    b.tare()
+    b.step()
+    b.step(counter=0, device_us=0)
+    b.listener.event("device_restarted")
+    assert b.step(load=0.1)["flags"] == []
+
+
+def test_counters_wrap_after_32_bits(bench: Start) -> None:
+    b = bench()
+    b.skin.counter = 2**32 - 5
+    b.tare()
+    b.step(counter=2**32 - 1)
+    for counter in (0, 1):  # the clock does not wrap
+        frame = b.step(counter=counter, device_us=(2**32 + counter) * 50_000)
+        assert frame["flags"] == []
+    assert all(event["name"] == "tared" for event in b.listener.of("event"))
+
+
+def test_a_saturated_scan_is_used_and_flagged(bench: Start) -> None:
+    b = bench()
+    b.tare()
+    frame = b.step(flags=ScanFlag.SATURATED)
+    assert frame["flags"] == ["saturated"]
+    assert frame["map"] is not None
+
+
+def test_voltages_that_are_no_numbers_are_left_to_the_models_and_never_tared(
+    bench: Start,
+) -> None:
+    b = bench()
+    b.tare()
+    line = b.skin.lines[0]
+    counter = b.skin.counter + 1
+    good = np.full(208, 1e5, np.float32)
+    bad = good.copy()
+    bad[17] = np.nan
+    answer = b.daemon._pipeline.tare()
+    b.until(lambda: b.daemon._imaging.taring.is_on)  # a scan that comes first is none of the tare's
+    for number in range(counter, counter + 3):
+        line.say(
+            Scan(Channel.MAGNITUDE, number, 0, ScanFlag(0), good),
+            Scan(Channel.STRUCTURE, number, 0, ScanFlag(0), bad),
+        )
+        assert b.listener.frame(number)["flags"] == ["invalid_voltage"]
+    assert "not numbers" in str(answer.exception(30))
+    assert b.ask("status")["reference"]["scans"] == 3
+
+
+def test_a_channel_that_begins_after_the_other_was_never_missing(bench: Start) -> None:
+    b = bench(ports=2, sync_wait_ms=200)
+    b.skin.introduce()
+    for _ in range(2):
+        assert "structure_missing" in b.step(channels=(Channel.MAGNITUDE,))["flags"]
+    assert b.ask("status")["incomplete_scans"] == 0
+    b.tare()
+    assert b.ask("status")["incomplete_scans"] == 0
+    b.step(channels=(Channel.MAGNITUDE,))
+    assert b.ask("status")["incomplete_scans"] == 1

@@ -1,0 +1,373 @@
+"""A pressure calibration is found by the sensor's name, told, and refused where it is foreign.
+
+So it is at the daemon's start, and so when it is read again while the daemon runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tactomo.config import load_config
+from tactomo.recordings import recorder
+from tactomo.recordings.recording import open_recording
+from tactomo.service.daemon import Daemon
+from tactomo_client import CalibrationRefused, request
+from tactomo_models import CalibrationError, load_description
+from tactomo_models.calibration.calibration_file import (
+    PressureCalibration,
+    Subject,
+    calibration_path,
+    save_calibration,
+)
+from tactomo_models.calibration.curve import Reading
+
+SENSOR = load_description("paper_square")
+SUBJECT = Subject(sensor="left", description=SENSOR.name, sha256=SENSOR.sha256)
+RELOADED = "calibration_reloaded"
+LEVELS = [100.0, 150.0, 160.0, 180.0, 200.0, 220.0, 240.0]
+READINGS = [
+    Reading(pressure_kpa=kpa, magnitude=max(0.0, (kpa - 140) * 2e-3)) for kpa in LEVELS + LEVELS
+]
+
+
+@pytest.fixture(autouse=True)
+def _own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
+
+
+def kept(path: Path | None = None, factor: float = 1.0, **changes: Any) -> PressureCalibration:
+    """Keep a calibration of this sensor, whose pressures are by a factor higher, or of another."""
+    subject = SUBJECT.model_copy(update=changes)
+    readings = [r.model_copy(update={"pressure_kpa": factor * r.pressure_kpa}) for r in READINGS]
+    made = PressureCalibration.of_readings(subject, readings)
+    save_calibration(made, path or calibration_path("left"))
+    return made
+
+
+def test_it_is_found_by_the_sensors_name_and_told_in_the_status(bench: Callable[..., Any]) -> None:
+    made = kept()
+    description = bench().ask("status")["description"]
+    told = description["calibration"]
+    assert told["readings"] == len(READINGS)
+    assert told["range_kpa"] == pytest.approx([140, 240], abs=2)
+    assert told["taken"] == made.taken
+    assert description["pressure_max_kpa"] == 240
+    response = description["magnitude_response"]
+    assert np.interp(0.1, response["relative_change"], response["pressure_kpa"]) == pytest.approx(
+        190, abs=2
+    )
+
+
+def test_without_one_pressures_are_the_descriptions(bench: Callable[..., Any]) -> None:
+    daemon = bench()
+    description = daemon.ask("status")["description"]
+    assert description["calibration"] is None
+    assert description["pressure_max_kpa"] == 300
+    assert daemon.ask("status")["events"]["counts"].get("calibration_refused", 0) == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"sensor": "right"}, "is of the sensor right, not left"),
+        ({"sha256": "0" * 64, "description": "mine"}, "as mine describes it (sha256 000000000000)"),
+    ],
+)
+def test_another_sensors_is_refused_by_name(
+    bench: Callable[..., Any], tmp_path: Path, changes: dict[str, Any], said: str
+) -> None:
+    kept(**changes)
+    status = bench().ask("status")
+    assert status["description"]["calibration"] is None
+    (trouble,) = status["events"]["troubles"]
+    assert trouble["name"] == "calibration_refused"
+    assert said in trouble["detail"]
+    assert "run: tactomo calibrate live --sensor left" in trouble["detail"]
+    asked_for = tmp_path / "asked_for.pressure.json"
+    kept(asked_for, **changes)
+    with pytest.raises(CalibrationError, match="run: tactomo calibrate live --sensor left"):
+        bench(calibration=asked_for)
+
+
+def test_one_that_is_asked_for_must_be_there(bench: Callable[..., Any], tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match=r"there is no calibration .*absent"):
+        bench(calibration=tmp_path / "absent")
+
+
+def test_a_damaged_one_is_told_and_not_used(bench: Callable[..., Any]) -> None:
+    kept()
+    path = calibration_path("left")
+    path.write_text(path.read_text().replace('"format": 1', '"format": 2'))
+    (trouble,) = bench().ask("status")["events"]["troubles"]
+    assert "is of format 2, and this tactomo reads format 1" in trouble["detail"]
+
+
+def test_it_is_not_in_force_with_another_device(bench: Callable[..., Any]) -> None:
+    kept(device_ids=("skin-elsewhere",))
+    daemon = bench()
+    daemon.tare()
+    refusal = daemon.listener.event("calibration_refused")
+    assert "was made with skin-elsewhere, and " in refusal["detail"]
+    assert daemon.ask("status")["description"]["calibration"] is None
+
+
+def test_with_its_own_device_it_is(bench: Callable[..., Any]) -> None:
+    device_id = open_hello(bench())
+    kept(device_ids=(device_id,))
+    again = bench()
+    again.tare()
+    assert again.ask("status")["description"]["calibration"]["device_ids"] == [device_id]
+
+
+def open_hello(daemon: Any) -> str:
+    daemon.tare()
+    (port,) = daemon.ask("status")["ports"]
+    return str(port["device"]["device_id"])
+
+
+def test_a_recording_takes_it_along(
+    bench: Callable[..., Any], replay: Callable[..., Any], tmp_path: Path
+) -> None:
+    kept()
+    daemon = bench(recording={"file": tmp_path / "press.mcap"})
+    daemon.tare()
+    daemon.step(load=0.5)
+    daemon.ask("record_stop")
+    calibration_path("left").unlink()
+    recording = open_recording(tmp_path / "press.mcap")
+    assert '"pressure_kpa"' in recording.origin.calibration
+    again = open_recording(replay(recording.path).path)
+    assert again.origin == replace(recording.origin, ports=again.origin.ports)
+
+
+def test_a_new_one_is_in_force_at_once(bench: Callable[..., Any]) -> None:
+    daemon = bench()
+    daemon.tare()
+    for factor in (1.0, 1.1):
+        made = kept(factor=factor)
+        in_force = daemon.ask("reload_calibration")["calibration"]
+        assert in_force["range_kpa"] == list(made.curve.range_kpa)
+        description = daemon.ask("status")["description"]
+        assert description["calibration"] == in_force
+        assert description["pressure_max_kpa"] == made.pressure_kpa[-1]
+        assert description["magnitude_response"]["pressure_kpa"] == list(made.pressure_kpa)
+        daemon.listener.wait(
+            "status", lambda s, now=in_force: s["description"]["calibration"] == now
+        )
+        daemon.listener.wait(
+            "event", lambda e, made=made: (e["name"], e["detail"]) == (RELOADED, made.words)
+        )
+
+
+def test_where_it_was_deleted_pressures_are_the_descriptions_again(
+    bench: Callable[..., Any],
+) -> None:
+    kept()
+    daemon = bench()
+    calibration_path("left").unlink()
+    assert daemon.ask("reload_calibration") == {"calibration": None}
+    description = daemon.ask("status")["description"]
+    assert (description["calibration"], description["pressure_max_kpa"]) == (None, 300)
+    assert "pressures are the description's" in daemon.listener.event(RELOADED)["detail"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"sensor": "right"}, "is of the sensor right, not left"),
+        ({"sha256": "0" * 64}, "sha256 000000000000"),
+        ({"device_ids": ("skin-elsewhere",)}, "was made with skin-elsewhere, and bench-1 is"),
+        (None, "is damaged"),
+    ],
+)
+def test_one_that_cannot_be_used_leaves_the_one_in_force(
+    bench: Callable[..., Any], changes: dict[str, Any] | None, said: str
+) -> None:
+    made = kept()
+    daemon = bench()
+    daemon.tare()
+    if changes is None:
+        calibration_path("left").write_text("{")
+    else:
+        kept(**changes)
+    with pytest.raises(CalibrationRefused, match="what was in force stays so") as refusal:
+        daemon.ask("reload_calibration")
+    assert said in refusal.value.cause
+    assert said in daemon.listener.event("calibration_refused")["detail"]
+    status = daemon.ask("status")
+    assert status["description"]["calibration"]["taken"] == made.taken
+    assert status["events"]["counts"].get(RELOADED, 0) == 0
+
+
+def test_the_configured_file_is_the_one_that_is_read_again(
+    bench: Callable[..., Any], tmp_path: Path
+) -> None:
+    kept(factor=2.0)
+    configured = tmp_path / "configured.pressure.json"
+    kept(configured)
+    daemon = bench(calibration=configured)
+    kept(configured, factor=1.1)
+    assert daemon.ask("reload_calibration")["calibration"]["range_kpa"][1] == pytest.approx(264)
+    configured.unlink()
+    with pytest.raises(CalibrationRefused, match="there is no calibration"):
+        daemon.ask("reload_calibration")
+    status = daemon.ask("status")
+    assert status["description"]["pressure_max_kpa"] == pytest.approx(264)
+
+
+def test_another_device_is_judged_by_the_new_one(bench: Callable[..., Any]) -> None:
+    daemon = bench()
+    kept(device_ids=("bench-2",))
+    daemon.ask("reload_calibration")  # nobody has said yet who it is
+    daemon.tare()
+    daemon.listener.event("calibration_refused")
+    assert daemon.ask("status")["description"]["calibration"] is None
+    kept(device_ids=("bench-1", "bench-2"))
+    assert daemon.ask("reload_calibration")["calibration"]["readings"] == len(READINGS)
+
+
+class Pressed:
+    """A skin that is pressed, and what the live daemon says of it."""
+
+    def __init__(self, bench: Callable[..., Any], **config: Any) -> None:
+        self.bench = bench(**config)
+        self.bench.tare()
+        self._first = self.bench.skin.counter + 1
+
+    def press(self) -> float:
+        """Return what a contact reads, kPa."""
+        for load in (0.1, 0.05, 0.06):
+            counter = self.bench.skin.scan(load)
+            frame = self.bench.listener.wait(
+                "contacts", lambda frame, now=counter: frame["scan_counter"] == now
+            )
+        return float(frame["contacts"][0]["pressure_kpa"])
+
+    def reload(self, factor: float | None) -> None:
+        """Have another calibration read, or have it seen that there is none."""
+        if factor is None:
+            calibration_path("left").unlink()
+        else:
+            kept(factor=factor)
+        self.bench.ask("reload_calibration")
+
+    @property
+    def live(self) -> dict[int, Any]:
+        """Pressures since the tare, or since the last `forget`."""
+        found = pressures(self.bench.listener.of("contacts"))
+        return {counter: kpa for counter, kpa in found.items() if counter >= self._first}
+
+    def forget(self) -> None:
+        """Leave out of `live` what was until now."""
+        self._first = self.bench.skin.counter + 1
+
+
+def pressures(frames: list[dict[str, Any]]) -> dict[int, list[float]]:
+    """What each frame's contacts read, kPa, by its counter."""
+    return {f["scan_counter"]: [c["pressure_kpa"] for c in f["contacts"]] for f in frames}
+
+
+def test_a_replay_goes_by_each_calibration_from_its_frame_on(
+    bench: Callable[..., Any], replay: Callable[..., Any], tmp_path: Path
+) -> None:
+    pressed = Pressed(bench)
+    path = tmp_path / "a.mcap"
+    pressed.bench.ask("record_start", path=str(path))
+    pressed.press()  # the reconstructor remembers: soon each press is after one like it
+    described = pressed.press()
+    pressed.reload(1.1)
+    once = pressed.press()
+    pressed.reload(1.2)
+    assert pressed.press() == pytest.approx(once * 1.2 / 1.1, abs=3)
+    pressed.reload(None)
+    assert pressed.press() == pytest.approx(described, abs=3)
+    pressed.reload(1.3)
+    pressed.bench.ask("record_stop")
+    live = pressed.live
+    assert len(live) == 15
+    kept(factor=3.0)  # whatever is kept by that name meanwhile
+    again = replay(path)
+    assert pressures(again.of("contacts")) == live
+    assert pressures(replay(again.path).of("contacts")) == live
+    by_one = pressures(replay(path, calibration=calibration_path("left")).of("contacts"))
+    assert min(kpa for (kpa,) in by_one.values()) > 2 * described
+
+
+def test_a_recording_to_come_begins_with_the_new_one(
+    bench: Callable[..., Any], replay: Callable[..., Any], tmp_path: Path
+) -> None:
+    pressed = Pressed(bench)
+    pressed.press()
+    pressed.reload(1.1)
+    pressed.forget()
+    path = tmp_path / "later.mcap"
+    pressed.bench.ask("record_start", path=str(path))
+    pressed.press()
+    pressed.bench.ask("record_stop")
+    kept(factor=3.0)
+    assert '"pressure_kpa"' in open_recording(path).origin.calibration
+    assert pressures(replay(path).of("contacts")) == pressed.live
+
+
+@pytest.mark.slow
+def test_files_that_were_cut_replay_by_the_calibration_of_each(
+    bench: Callable[..., Any],
+    replay: Callable[..., Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A file is begun, then the calibration changes, then the first frame comes into that file."""
+    monkeypatch.setattr(recorder, "LOOK_S", 0.3)
+    folder = tmp_path / "set"
+    kept()
+    pressed = Pressed(bench, recording={"folder": folder, "at_start": True, "rotate_mb": 0.01})
+    for factor in (1.1, None, 1.2):
+        files = pressed.bench.ask("status")["recorder"]["files"]
+        while pressed.bench.ask("status")["recorder"]["files"] == files:
+            pressed.press()
+        pressed.reload(factor)
+    pressed.press()
+    pressed.bench.ask("record_stop")
+    pressed.reload(1.3)
+    pressed.bench.ask("record_start")
+    pressed.press()
+    pressed.bench.ask("record_stop")
+    kept(factor=3.0)
+    live = pressed.live
+    again = pressures(replay(folder).of("contacts"))
+    assert {counter: kpa for counter, kpa in again.items() if counter in live} == live
+    parts = sorted(folder.iterdir())
+    assert len(parts) >= 4
+    for part in map(open_recording, parts):
+        if part.summary.frames and part.origin.calibration:  # none: begun just before the end
+            alone = pressures(replay(part.path).of("contacts"))
+            assert alone == {counter: live.get(counter, []) for counter in alone}
+
+
+@pytest.mark.slow
+def test_an_exact_replay_does_not_look_for_another(
+    bench: Callable[..., Any], tmp_path: Path
+) -> None:
+    made = kept()
+    b = bench(recording={"file": tmp_path / "press.mcap"})
+    b.tare()
+    b.step(load=0.5)
+    b.ask("record_stop")
+    kept(factor=1.1)
+    anywhere = {"stream": "tcp://127.0.0.1:0", "control": "tcp://127.0.0.1:0"}
+    urls = open_recording(tmp_path / "press.mcap").replay_urls(0)
+    replaying = Daemon(load_config(None, name="left", ports=urls, **anywhere))
+    replaying.start()
+    try:
+        with pytest.raises(CalibrationRefused, match="tactomo replay --calibration"):
+            request("reload_calibration", replaying.control_address, 30.0)
+        description = request("status", replaying.control_address, 30.0)["description"]
+        assert description["calibration"]["range_kpa"] == list(made.curve.range_kpa)
+    finally:
+        replaying.stop()

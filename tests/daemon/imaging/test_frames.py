@@ -1,0 +1,89 @@
+"""What is published of a frame: units, and nil for what is not known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from tactomo.imaging.frames import contacts_fields, description_fields, map_fields, scan_header
+from tactomo.scans import ChannelScan, DualScan, Timing
+from tactomo_client.messages import array_from_wire
+from tactomo_models import Contact, Flag, Reconstruction, load_description
+from tactomo_protocol import Channel, ScanFlag
+
+SENSOR = load_description("paper_square")
+CONTACT = Contact(
+    7,
+    x_m=0.012,
+    y_m=-0.034,
+    area_m2=5e-4,
+    magnitude=0.2,
+    magnitude_sigma=0.01,
+    pressure_kpa=180.0,
+    x_sigma_m=1.5e-3,
+    y_sigma_m=2.5e-3,
+    area_sigma_m2=3e-5,
+    pressure_sigma_kpa=4.0,
+    force_n=9.0,
+    force_sigma_n=0.5,
+)
+
+
+def frame(**details: Any) -> Reconstruction:
+    said: dict[str, Any] = {
+        "map": np.zeros((51, 51), np.float32),
+        "pressure_kpa": None,
+        "structure": None,
+        "contacts": (CONTACT,),
+        "tier": "fit",
+        "reason": "a test",
+        "misfit": 1.0,
+        "flags": Flag(0),
+        "stage_s": {},
+    }
+    return Reconstruction(**{**said, **details})
+
+
+def test_a_contact_is_in_millimetres_and_kilopascals() -> None:
+    fields = contacts_fields(3, frame())
+    assert fields["scan_counter"] == 3
+    [contact] = fields["contacts"]
+    expected = {
+        **{"id": 7, "x_mm": 12.0, "y_mm": -34.0, "area_mm2": 500.0, "magnitude": 0.2},
+        **{"magnitude_sigma": 0.01, "pressure_kpa": 180.0, "x_sigma_mm": 1.5, "y_sigma_mm": 2.5},
+        **{"area_sigma_mm2": 30.0, "pressure_sigma_kpa": 4.0, "force_n": 9.0, "force_sigma_n": 0.5},
+    }
+    assert {name: contact[name] for name in expected} == pytest.approx(expected)
+
+
+def test_what_is_not_known_is_nil() -> None:
+    contact = Contact(1, 0.0, 0.0, 1e-4, float("nan"), float("inf"), float("nan"))
+    [said] = contacts_fields(0, frame(contacts=(contact,)))["contacts"]
+    assert said["magnitude"] is said["magnitude_sigma"] is said["pressure_kpa"] is None
+
+
+def test_a_map_has_its_ends_in_millimetres() -> None:
+    fields = map_fields(0, frame(), SENSOR)
+    assert fields["x_mm"] == pytest.approx([1e3 * SENSOR.map_x_m[0], 1e3 * SENSOR.map_x_m[-1]])
+    assert array_from_wire(fields["map"]).shape == (51, 51)
+    assert fields["structure"] is None
+
+
+def test_the_sensor_is_in_millimetres() -> None:
+    fields = description_fields(SENSOR)
+    assert (fields["width_mm"], fields["sensing_width_mm"]) == pytest.approx((150.0, 138.0))
+    assert np.ptp(np.array(fields["electrodes_mm"])[:, 0]) > 100
+
+
+def test_a_frame_was_acquired_before_its_last_byte_came() -> None:
+    def scan(channel: Channel, arrived_ns: int) -> ChannelScan:
+        times = (10**9 + arrived_ns, arrived_ns, arrived_ns)
+        return ChannelScan(channel, 1, 50, ScanFlag(0), np.zeros(1), *times, 0)
+
+    dual = DualScan(1, scan(Channel.MAGNITUDE, 4_000_000), scan(Channel.STRUCTURE, 9_000_000))
+    header = scan_header(dual, Timing(5_000_000, True, -2_500_000, True))
+    assert header["acquired_monotonic_ns"] == 4_000_000
+    assert header["acquired_realtime_ns"] == 10**9 + 4_000_000
+    assert (header["dated_by"], header["skew_ms"]) == ("device", -2.5)
+    assert header["flags"] == ["channels_skewed"]

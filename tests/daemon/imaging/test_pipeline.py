@@ -1,0 +1,97 @@
+"""The pipeline by itself: what becomes of scans that come, late or not at all."""
+
+from __future__ import annotations
+
+import threading
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from tactomo.imaging.pipeline import Pipeline
+from tactomo.recordings.replay import Replay
+from tactomo.scans import ChannelScan, Delivery, DualScan
+from tactomo_protocol import Channel, ScanFlag
+from waiting import wait_until
+
+BOTH = (Channel.MAGNITUDE, Channel.STRUCTURE)
+
+
+class Frames:
+    """In the place of imaging: keeps what it is given; `go` lets it take the next."""
+
+    def __init__(self) -> None:
+        self.counters: list[int] = []
+        self.go = threading.Event()
+        self.reference_realtime_ns = 0
+        self.taring = SimpleNamespace(start=lambda: None, check=lambda: None)
+        self.calibration = SimpleNamespace(meet=lambda _: None)
+
+    def has_reference(self, _: Channel) -> bool:
+        return True
+
+    def process(self, dual: DualScan, *_: Any) -> None:
+        assert self.go.wait(20)
+        self.counters.append(dual.counter)
+
+
+def started(frames: Any, *, lossless: bool = False, replay: Replay | None = None) -> Pipeline:
+    ports = 1 if replay is None else 2
+    pipeline = Pipeline(
+        frames, BOTH, ports, 10**8, lossless, replay, lambda: None, lambda *_, **__: None
+    )
+    pipeline.start()
+    return pipeline
+
+
+def scan(channel: Channel, counter: int, clock_ns: int, port: int = 0) -> ChannelScan:
+    times = (0, clock_ns, clock_ns)
+    return ChannelScan(channel, counter, 100 * counter, ScanFlag(0), np.zeros(1), *times, 0, port)
+
+
+def dual(counter: int) -> Delivery:
+    return Delivery(0, counter, tuple(scan(channel, counter, counter) for channel in BOTH))
+
+
+def test_the_newest_wins_where_frames_take_long() -> None:
+    frames = Frames()
+    pipeline = started(frames)
+    pipeline.deliver(dual(0))
+    wait_until(lambda: pipeline.tally()["received"] == 2 and pipeline.turns > 1, "the first frame")
+    for counter in range(1, 6):
+        pipeline.deliver(dual(counter))
+    frames.go.set()
+    wait_until(lambda: pipeline.tally()["waiting"] == 0, "all of them")
+    pipeline.stop()
+    assert frames.counters[-1] == 5
+    assert len(frames.counters) + pipeline.dropped == 6
+    assert pipeline.dropped >= 3
+    tally = pipeline.tally()
+    assert (tally["used"], tally["dropped"]) == (2 * len(frames.counters), 2 * pipeline.dropped)
+
+
+def test_lossless_every_one_is_made() -> None:
+    frames = Frames()
+    frames.go.set()
+    pipeline = started(frames, lossless=True)
+    for counter in range(50):
+        pipeline.deliver(dual(counter))
+    wait_until(lambda: len(frames.counters) == 50, "all of them")
+    pipeline.stop()
+    assert frames.counters == list(range(50))
+    assert pipeline.dropped == 0
+
+
+def test_an_unpaced_replay_waits_for_the_slower_port() -> None:
+    frames = Frames()
+    frames.go.set()
+    pipeline = started(frames, replay=Replay([], None, is_paced=False))
+    for port, channel in enumerate(BOTH):  # one is seconds ahead of the other
+        for counter in range(5):
+            at_ns = counter * 10**9
+            pipeline.deliver(Delivery(port, at_ns, (scan(channel, counter, at_ns, port),)))
+    for port in (0, 1):
+        pipeline.deliver(Delivery(port, 0, (), has_ended=True))
+    assert pipeline.finished.wait(20)
+    pipeline.stop()
+    assert frames.counters == list(range(5))
+    assert pipeline.incomplete == 0

@@ -1,0 +1,177 @@
+"""A device protocol of somebody else's, in a file that no distribution registers."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from daemon_process import DaemonProcess
+from tactomo.config import load_config
+from tactomo.errors import ConfigError, RecordingError
+from tactomo.protocols import find_protocol, protocol_named, recognised, registry
+from tactomo.recordings.recording import Origin, open_recording
+from tactomo.twin import TwinConfig
+from tactomo_client import ControlError, request
+from tactomo_models import load_description
+from typer.testing import CliRunner
+from waiting import wait_until
+
+SENSOR = load_description("matrix_disc")
+OWN = '''
+"""A board that sends frames of float32 volts: the letters EIT, then one number a voltage."""
+
+import numpy as np
+from tactomo.protocols import ForeignProtocol, Reading
+
+MARK = b"EIT\\n"
+
+
+class Floats(ForeignProtocol):
+    """See `tactomo.protocols.ForeignProtocol`."""
+
+    name = "floats"
+    device_id = "floats"
+    baud = 250_000
+
+    def __init__(self, description):
+        super().__init__(description)
+        self._rest = b""
+        self._length = len(MARK) + 4 * description.measurements
+
+    def parse(self, data):
+        self._rest += data
+        while (start := self._rest.find(MARK)) >= 0 and len(self._rest) >= start + self._length:
+            frame = self._rest[start + len(MARK) : start + self._length]
+            self._rest = self._rest[start + self._length :]
+            self.counts.packets += 1
+            yield Reading(np.frombuffer(frame, "<f4"))
+
+    @classmethod
+    def recognises(cls, data):
+        return MARK in data
+
+
+class Broken(Floats):
+    name = "broken"
+
+    def parse(self, data):
+        yield Reading(volts=None)
+
+
+class Another:
+    pass
+
+
+class Matrix(Floats):
+    name = "matrix"
+'''
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the module lies; Python finds it there."""
+    (tmp_path / "own_board.py").write_text(OWN)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(registry, "_named", {})
+    return tmp_path
+
+
+@pytest.fixture
+def board() -> Iterator[str]:
+    """A board that sends frames of noise around some voltages; yields its port's path."""
+    device, host = os.openpty()
+    os.set_blocking(device, False)
+    over = threading.Event()
+    rng = np.random.default_rng(1)
+
+    def send() -> None:
+        while not over.wait(0.02):
+            volts = rng.normal(1.0, 1e-4, SENSOR.measurements).astype("<f4")
+            with contextlib.suppress(BlockingIOError):  # nobody reads yet
+                os.write(device, b"EIT\n" + volts.tobytes())
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    yield os.ttyname(host)
+    over.set()
+    thread.join()
+    os.close(device)
+    os.close(host)
+
+
+def test_the_daemon_reads_a_board_by_a_protocol_that_is_named(folder: Path, board: str) -> None:
+    daemon = DaemonProcess(
+        folder,
+        [board],
+        environment={"PYTHONPATH": str(folder)},
+        protocol="own_board:Floats",
+        description="matrix_disc",
+        method="tikhonov",
+    )
+    path = folder / "own.mcap"
+    try:
+        wait_until(lambda: daemon.status()["state"] == "running", "a reference")
+        [port] = daemon.status()["ports"]
+        assert (port["protocol"], port["device"]["device_id"]) == ("floats", "floats")
+        daemon.ask("record_start", path=str(path))
+        frames = daemon.status()["frames"]
+        wait_until(lambda: daemon.status()["frames"] > frames + 5, "frames")
+        daemon.ask("record_stop")
+        for module in ("own_board:Floats", "own_board:Broken"):
+            with pytest.raises(ControlError):
+                request("set_tier", daemon.control, tier=module)
+    finally:
+        daemon.stop()
+    find_protocol("own_board:Floats")
+    recording = open_recording(path)
+    assert recording.origin.protocol == "floats"
+    assert recording.summary.frames > 5
+    assert sum(recording.summary.scans.values()) >= recording.summary.frames
+
+
+def test_a_recording_names_no_module(folder: Path) -> None:
+    origin = Origin("skin", "matrix_disc", "", ("p",), "0", protocol="own_board:Another")
+    with pytest.raises(RecordingError, match=r"own_board:Another.*there is no protocol"):
+        origin.new_protocol()
+
+
+@pytest.mark.parametrize(
+    ("name", "cause"),
+    [
+        ("no_such_module:Floats", "cannot import no_such_module: ModuleNotFoundError"),
+        ("own_board:Nothing", "own_board has no Nothing"),
+        ("own_board:Another", "own_board:Another is no protocol: no name"),
+        ("own_board:Matrix", "calls itself 'matrix'"),
+        ("own board:Floats", "names no class"),
+        ("floatz", "there is no protocol 'floatz'; use one of: tactomo, "),
+    ],
+)
+def test_what_is_no_protocol_is_named(folder: Path, name: str, cause: str) -> None:
+    with pytest.raises(ConfigError, match=cause):
+        load_config(ports=("/dev/null",), protocol=name)
+
+
+def test_a_mistake_in_a_protocol_costs_no_port(folder: Path) -> None:
+    protocol = protocol_named(find_protocol("own_board:Broken").name, SENSOR)
+    assert protocol.feed(b"EIT\n") == []
+    assert protocol.trouble is not None
+    assert "protocol broken failed: ValueError: volts of shape" in protocol.trouble.cause
+    assert protocol.counts.malformed == 1
+
+
+def test_the_twin_says_what_it_needs_to_speak_it(folder: Path) -> None:
+    with pytest.raises(ConfigError, match=r"does not speak the protocol 'floats'.*emulator ="):
+        TwinConfig(SENSOR, protocol="own_board:Floats")
+
+
+def test_ports_knows_it_by_what_it_sends(folder: Path, board: str) -> None:
+    from tactomo.cli import app
+
+    assert recognised(b"..EIT\n..") is None
+    result = CliRunner().invoke(app, ["ports", board, "--ask", "--protocol", "own_board:Floats"])
+    assert "--protocol floats" in " ".join(result.output.split())

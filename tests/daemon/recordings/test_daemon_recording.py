@@ -1,0 +1,442 @@
+"""Recording what the ports said, and having it said again."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tactomo.config import load_config
+from tactomo.errors import ConfigError, PortError, RecordingError
+from tactomo.imaging import frame_marks
+from tactomo.recordings.recording import open_recording
+from tactomo.recordings.recording_writer import write_recording
+from tactomo.service import daemon
+from tactomo.service.daemon import Daemon
+from tactomo_client.frame import frame_from_message
+from tactomo_client.messages import array_from_wire
+from tactomo_client.recording import open_recording as open_frames
+from tactomo_models import Reference
+from tactomo_models.machine_speed import MachineSpeed, Row
+from tactomo_protocol import Channel, Scan, ScanFlag, encode
+
+Start = Callable[..., Any]
+Replay = Callable[..., Any]
+
+
+def maps(frames: list[dict[str, Any]]) -> dict[int, Any]:
+    return {
+        frame["scan_counter"]: None if frame["map"] is None else array_from_wire(frame["map"])
+        for frame in frames
+    }
+
+
+def assert_same(live: dict[int, Any], again: dict[int, Any]) -> None:
+    assert list(live) == list(again)
+    for counter, image in live.items():
+        np.testing.assert_array_equal(image, again[counter], err_msg=f"counter {counter}")
+
+
+def record_a_life(b: Any, path: Path) -> dict[int, Any]:
+    """Record presses, a lost channel, a tare and noise; return the maps published meanwhile."""
+    b.tare()
+    for _ in range(5):
+        b.step(load=0.3)  # what was before the recording must not show in the replay
+    first = b.skin.counter + 1
+    assert b.ask("record_start", path=str(path)) == {"path": str(path)}
+    for index in range(10):
+        b.step(load=0.02 * index)
+    b.step(load=0.1, channels=(Channel.MAGNITUDE,))
+    b.skin.lines[0].say(b"\x00noise on the line\x00")
+    b.step(load=0.1)
+    tare_and_step(b)
+    for index in range(5):
+        b.step(load=0.01 * index)
+    last = b.skin.counter
+    result = b.ask("record_stop")
+    assert result == {"path": str(path), "bytes": path.stat().st_size}
+    b.step(load=0.5)  # and neither must what came after
+    frames = [f for f in b.listener.of("map") if first <= f["scan_counter"] <= last]
+    return maps(frames)
+
+
+def tare_and_step(b: Any) -> None:
+    answer = b.daemon._pipeline.tare()
+    while not answer.done():
+        b.step(load=0.05)
+
+
+@pytest.mark.parametrize("ports", [1, 2])
+@pytest.mark.parametrize("speed", [0, 20])
+def test_a_replay_gives_the_maps_of_the_live_run(
+    bench: Start, replay: Replay, tmp_path: Path, ports: int, speed: float
+) -> None:
+    path = tmp_path / "life.mcap"
+    live = record_a_life(bench(ports=ports), path)
+    assert_same(live, maps(replay(path, speed=speed).of("map")))
+
+
+def test_a_recording_that_begins_in_the_middle_of_a_packet_has_it_whole(
+    bench: Start, replay: Replay, tmp_path: Path
+) -> None:
+    path = tmp_path / "skin.mcap"
+    b = bench()
+    b.tare()
+    samples = np.full(208, 100_000, np.int32)
+    frames = b"".join(encode(Scan(c, 500, 0, ScanFlag(0), samples)) for c in Channel)
+    (port,) = b.ask("status")["ports"]
+    b.skin.lines[0].say(frames[:400])
+    b.until(lambda: b.ask("status")["ports"][0]["bytes"] == port["bytes"] + 400)
+    b.ask("record_start", path=str(path))
+    b.skin.lines[0].say(frames[400:])
+    live = b.listener.frame(500)
+    b.ask("record_stop")
+    assert open_recording(path).summary.corrupt == 0
+    assert_same(maps([live]), maps(replay(path).of("map")))
+
+
+def test_a_replay_leaves_out_what_the_live_run_dropped(
+    bench: Start, replay: Replay, tmp_path: Path
+) -> None:
+    path = tmp_path / "slow.mcap"
+    b = bench(seconds=0.03)
+    b.tare()
+    b.ask("record_start", path=str(path))
+    start = b.skin.counter
+    for index in range(40):
+        b.skin.scan(load=0.01 * index)
+    b.listener.frame(b.skin.counter)
+    b.ask("record_stop")
+    live = maps([f for f in b.listener.of("map") if f["scan_counter"] > start])
+    assert len(live) < 40
+    assert_same(live, maps(replay(path).of("map")))
+
+
+@pytest.mark.parametrize(
+    ("module", "name"),
+    [(frame_marks, "mark_entry"), (daemon, "message_entry")],
+    ids=["mark", "map"],
+)
+def test_a_frame_that_was_seen_is_in_the_recording(
+    bench: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: Any, name: str
+) -> None:
+    """However slowly it gets there."""
+    entry = getattr(module, name)
+
+    def slowly(*arguments: Any) -> Any:
+        time.sleep(0.3)
+        return entry(*arguments)
+
+    monkeypatch.setattr(module, name, slowly)
+    path = tmp_path / "seen.mcap"
+    b = bench()
+    b.tare()
+    b.ask("record_start", path=str(path), maps=True)
+    seen = b.step(load=0.1)
+    b.ask("record_stop")
+    assert open_recording(path).summary.frames == 1
+    assert [frame.scan_counter for frame in open_frames(path)] == [seen["scan_counter"]]
+
+
+def test_a_recording_from_the_start_has_the_first_tare(
+    bench: Start, replay: Replay, tmp_path: Path
+) -> None:
+    path = tmp_path / "all.mcap"
+    b = bench(recording={"file": path})
+    b.tare()
+    for _ in range(3):
+        b.step(load=0.1)
+    b.daemon.stop()
+    assert_same(maps(b.listener.of("map")), maps(replay(path).of("map")))
+
+
+def test_the_tier_that_was_in_force_is_again(bench: Start, replay: Replay, tmp_path: Path) -> None:
+    path = tmp_path / "tier.mcap"
+    b = bench(recording={"file": path}, method="auto")
+    b.tare()
+    b.ask("set_tier", tier="noser")
+    b.ask("set_budget", budget_ms=12)
+    b.until(lambda: b.ask("status")["budget_ms"] == 12)
+    b.step()
+    b.daemon.stop()
+    marks = open_recording(path).marks()
+    assert [mark.tier for mark in marks] == ["auto"] * 3 + ["noser"]
+    assert marks[-1].budget_ms is not None
+    again = replay(path).path
+    assert [(m.tier, m.budget_ms) for m in open_recording(again).marks()] == [
+        (m.tier, m.budget_ms) for m in marks
+    ]
+
+
+def test_what_a_time_bought_is_given_again_on_any_machine(
+    bench: Start, replay: Replay, tmp_path: Path
+) -> None:
+    path = tmp_path / "budget.mcap"
+    rows = (
+        Row(method="auto", budget_s=0.001, p50_s=0.003, p99_s=0.004, icc=0.9),
+        Row(method="noser", budget_s=None, p50_s=0.001, p99_s=0.002, icc=0.6),
+    )
+    here = MachineSpeed(
+        tactomo="1",
+        machine="of the test",
+        taken="2026-01-31",
+        sensor="paper_square",
+        sha256="",
+        overhead_s=0.002,
+        speed=2.0,
+        rows=rows,
+    )
+    b = bench(recording={"file": path}, machine_speed=here)
+    b.tare()
+    for budget_ms, tier, modelled_ms in (
+        (12, "auto", 5.0),
+        (3, "noser", 1.0),
+        (None, "auto", None),
+    ):
+        b.ask("set_budget", budget_ms=budget_ms)
+        given = {"source": here.source, "tier": tier, "modelled_ms": modelled_ms}
+        b.until(lambda given=given: b.ask("status")["plan"] == pytest.approx(given))
+        status = b.ask("status")
+        assert (status["tier_requested"], status["budget_ms"]) == ("auto", budget_ms)
+        b.step(load=0.1)
+    b.daemon.stop()
+    marks = [(mark.tier, mark.budget_ms) for mark in open_recording(path).marks()]
+    assert [tier for tier, _ in marks] == ["auto"] * 4 + ["noser", "auto"]
+    assert [budget_ms for _, budget_ms in marks[3:]] == [pytest.approx(5), 1, None]
+    elsewhere = here.model_copy(update={"overhead_s": 0.0, "speed": 0.1, "rows": rows[1:]})
+    again = replay(path, machine_speed=elsewhere)
+    assert [(mark.tier, mark.budget_ms) for mark in open_recording(again.path).marks()] == marks
+
+
+def test_a_recording_knows_what_is_in_it(bench: Start, tmp_path: Path) -> None:
+    path = tmp_path / "skin.mcap"
+    b = bench(ports=2, recording={"file": path})
+    b.tare()
+    b.skin.lines[0].say(b"\x00noise\x00")
+    b.step()
+    b.until(lambda: b.ask("status")["recording"]["bytes"] > 0)
+    said = [port["bytes"] for port in b.ask("status")["ports"]]
+    b.daemon.stop()
+    recording = open_recording(path)
+    summary = recording.summary
+    assert summary.is_complete
+    assert (recording.origin.sensor, recording.origin.description) == ("left", "paper_square")
+    assert [summary.port_bytes[port] for port in range(2)] == said
+    assert summary.scans == {Channel.MAGNITUDE: 4, Channel.STRUCTURE: 4}
+    assert (summary.frames, summary.references, summary.corrupt) == (4, 1, 1)
+    assert {hello.device_id for hello in summary.hellos} == {"bench-1"}
+    assert summary.duration_s > 0
+
+
+def test_maps_and_contacts_lie_beside_the_bytes_if_asked_for(bench: Start, tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+
+    path = tmp_path / "maps.mcap"
+    b = bench(recording={"file": path, "maps": True})
+    b.tare()
+    b.step(load=0.1)
+    b.daemon.stop()
+    with path.open("rb") as file:
+        topics = [channel.topic for _, channel, _ in make_reader(file).iter_messages()]
+    assert topics.count("frame") == 4
+    assert topics.count("map") == 4
+    assert topics.count("contacts") == 4
+
+
+def test_a_recording_has_the_frames_that_were_published(bench: Start, tmp_path: Path) -> None:
+    path = tmp_path / "frames.mcap"
+    b = bench()
+    b.tare()
+    b.ask("record_start", path=str(path), maps=True)
+    first = b.skin.counter + 1
+    for load in (0.1, 0.2):
+        b.step(load=load)
+    b.ask("record_stop")
+    live = [m for m in b.listener.messages if m.kind == "map" and m.fields["scan_counter"] >= first]
+    recording = open_frames(path)
+    assert (recording.sensor, recording.description) == ("left", "paper_square")
+    for message, frame in zip(live, recording, strict=True):
+        alive = frame_from_message(message, None, 0.5)
+        assert (frame.sequence, frame.contacts) == (alive.sequence, alive.contacts)
+        np.testing.assert_array_equal(frame.map, alive.map)
+        assert frame.age_s == alive.age_s
+    b.ask("record_start", path=str(tmp_path / "bytes.mcap"))
+    b.step(load=0.3)
+    b.ask("record_stop")
+    assert not open_frames(tmp_path / "bytes.mcap").has_frames
+
+
+def test_a_truncated_recording_opens_up_to_where_it_ends(
+    bench: Start, replay: Replay, tmp_path: Path
+) -> None:
+    path = tmp_path / "whole.mcap"
+    b = bench(recording={"file": path})
+    b.tare()
+    start = b.skin.counter
+    for index in range(60):
+        size = path.stat().st_size
+        b.step(load=0.001 * index)
+        if index % 10 == 0:  # so that the file has several chunks
+            b.until(lambda size=size: path.stat().st_size > size)
+    b.daemon.stop()
+    live = maps(b.listener.of("map"))
+    data = path.read_bytes()
+    whole = open_recording(path).summary
+    counts = []
+    for share in (0.999, 0.7, 0.4):
+        cut = tmp_path / f"cut-{share}.mcap"
+        cut.write_bytes(data[: int(len(data) * share)])
+        summary = open_recording(cut).summary
+        assert not summary.is_complete
+        counts.append(summary.frames)
+        again = maps(replay(cut).of("map"))
+        assert len(again) == summary.frames
+        assert_same({c: image for c, image in live.items() if c in again}, again)
+    assert whole.frames >= counts[0] > counts[1] > counts[2] > start
+
+
+@pytest.mark.parametrize("damage", ["nothing", "text", "foreign", "absent"])
+def test_what_is_no_recording_is_refused(tmp_path: Path, damage: str) -> None:
+    path = tmp_path / "other.mcap"
+    if damage == "nothing":
+        path.touch()
+    elif damage == "text":
+        path.write_text("time,volts\n" * 100)
+    elif damage == "foreign":
+        from mcap.writer import Writer
+
+        with path.open("wb") as file:
+            writer: Any = Writer(file)
+            writer.start(profile="ros2")
+            writer.finish()
+    with pytest.raises(RecordingError) as caught:
+        open_recording(path)
+    assert str(path) in caught.value.cause
+    assert caught.value.next_step
+
+
+def test_a_damaged_chunk_ends_a_recording(bench: Start, tmp_path: Path) -> None:
+    path = tmp_path / "skin.mcap"
+    b = bench(recording={"file": path})
+    b.tare()
+    b.daemon.stop()
+    data = bytearray(path.read_bytes())
+    data[len(data) // 3] ^= 0xFF
+    path.write_bytes(data)
+    assert not open_recording(path).summary.is_complete
+
+
+def test_a_file_that_exists_is_not_written_over(bench: Start, tmp_path: Path) -> None:
+    path = tmp_path / "precious.mcap"
+    path.write_text("precious")
+    b = bench()
+    with pytest.raises(Exception, match="exists already"):
+        b.ask("record_start", path=str(path))
+    assert path.read_text() == "precious"
+
+
+def test_one_recording_at_a_time_and_as_many_as_wanted(bench: Start, tmp_path: Path) -> None:
+    b = bench()
+    b.tare()
+    for number in range(3):
+        path = tmp_path / f"{number}.mcap"
+        b.ask("record_start", path=str(path))
+        with pytest.raises(Exception, match="runs already"):
+            b.ask("record_start", path=str(tmp_path / "other.mcap"))
+        b.step()
+        b.ask("record_stop")
+        assert open_recording(path).summary.frames == 1
+
+
+def imported(path: Path, reference: Reference | None = None, **hello: Any) -> list[Scan]:
+    """Write a recording of 60 scans at 20 Hz that a daemon never saw; return its scans."""
+    from dataclasses import replace
+
+    from tactomo_protocol import Hello, SampleFormat
+
+    greeting = Hello(
+        "import", "1", (Channel.MAGNITUDE,), 16, 1, 1, 208, SampleFormat.FLOAT32, 1.0, 20.0
+    )
+    rest = np.linspace(0.05, 0.2, 208).astype(np.float32)
+    scans = [
+        Scan(Channel.MAGNITUDE, n, n * 50_000, ScanFlag(0), rest * np.float32(1 + (n > 5) * 0.1))
+        for n in range(60)
+    ]
+    write_recording(
+        path,
+        replace(greeting, **hello),
+        [(scan.device_us * 1e-6, scan) for scan in scans],
+        sensor="tank",
+        description="paper_square",
+        description_sha256="",
+        reference=reference,
+    )
+    return scans
+
+
+@pytest.mark.parametrize("speed", [0, 30])
+def test_imported_scans_are_tared_and_reconstructed_one_by_one(
+    replay: Replay, tmp_path: Path, speed: float
+) -> None:
+    path = tmp_path / "tank.mcap"
+    imported(path)
+    again = replay(path, speed=speed, lossless=True)
+    frames = again.of("map")
+    assert [frame["scan_counter"] for frame in frames] == list(range(60))
+    assert frames[0]["flags"] == ["no_reference", "structure_missing"]
+    assert array_from_wire(frames[-1]["map"])[0, 0] == pytest.approx(0.2, rel=1e-3)
+
+
+def test_an_imported_reference_is_used_from_the_first_scan(replay: Replay, tmp_path: Path) -> None:
+    path = tmp_path / "tank.mcap"
+    volts = np.linspace(0.05, 0.2, 208)
+    imported(path, Reference.from_scans(np.stack([volts, volts * 1.0001]), None))
+    frames = replay(path).of("map")
+    assert frames[0]["flags"] == ["structure_missing"]
+
+
+def test_a_recording_of_another_sensor_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "tank.mcap"
+    imported(path, Reference.from_scans(np.ones((2, 192)), None))
+    memory: Any = object()
+    with pytest.raises(ConfigError, match="192 voltages a scan, paper_square has 208"):
+        Daemon(load_config(ports=[f"replay://{path}"]), reconstructor=memory)
+
+
+def test_replay_keeps_the_recordings_time(replay: Replay, tmp_path: Path) -> None:
+    path = tmp_path / "tank.mcap"
+    imported(path)
+    frames = replay(path, speed=4.0).of("map")
+    took_ns = frames[-1]["acquired_monotonic_ns"] - frames[0]["acquired_monotonic_ns"]
+    assert took_ns >= 0.98 * 59 * 50e6 / 4  # never earlier; later if the computer is busy
+
+
+@pytest.mark.parametrize(
+    ("urls", "error"),
+    [
+        (["{0}?port=1"], PortError),
+        (["{0}?port=0&speed=-1"], PortError),
+        (["{0}?pace=1"], PortError),
+        (["{0}", "/dev/null"], ConfigError),
+        (["{0}?speed=1", "{0}?speed=2"], ConfigError),
+        (["{0}.none"], RecordingError),
+    ],
+)
+def test_replay_urls_that_cannot_be_are_refused(
+    tmp_path: Path, urls: list[str], error: type[Exception]
+) -> None:
+    path = tmp_path / "tank.mcap"
+    imported(path)
+    memory: Any = object()
+    ports = [url.format(f"replay://{path}") for url in urls]
+    with pytest.raises(error):
+        Daemon(load_config(ports=ports), reconstructor=memory)
+
+
+def test_the_summary_is_read_from_a_name_with_blanks(replay: Replay, tmp_path: Path) -> None:
+    path = tmp_path / "two words & %.mcap"
+    imported(path)
+    assert len(replay(path).of("map")) == 60

@@ -1,0 +1,257 @@
+"""Recordings in a folder: cut into files that each replay alone, the oldest deleted."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tactomo.config import RecordingConfig
+from tactomo.errors import RecordingError
+from tactomo.recordings import recorder
+from tactomo.recordings.recording import open_recording
+from tactomo.recordings.recording_set import open_replayable
+from tactomo.recordings.rotation import KeptRecording, list_recordings, to_delete
+from tactomo_client.messages import array_from_wire
+from tactomo_protocol import Channel, Decoder, Scan
+
+Start = Callable[..., Any]
+DAY_S = 86_400.0
+
+
+def maps(frames: list[dict[str, Any]]) -> dict[int, Any]:
+    return {f["scan_counter"]: f["map"] and array_from_wire(f["map"]) for f in frames}
+
+
+def counters(path: Path, channel: Channel) -> list[int]:
+    """The counters of a channel's scans in a recording, as its ports said them."""
+    recording = open_recording(path)
+    found = []
+    for port in range(len(recording.origin.ports)):
+        decoder = Decoder()
+        for chunk in recording.chunks(port):
+            found += [p for p in decoder.feed(chunk.data) if isinstance(p, Scan)]
+    return [scan.counter for scan in found if scan.channel == channel]
+
+
+@pytest.mark.parametrize("ports", [pytest.param(1, marks=pytest.mark.slow), 2])
+def test_each_file_replays_alone_and_together_they_have_every_frame_once(
+    bench: Start, replay: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ports: int
+) -> None:
+    monkeypatch.setattr(recorder, "LOOK_S", 0.3)
+    folder = tmp_path / "set"
+    b = bench(
+        ports=ports, recording={"folder": folder, "at_start": True, "rotate_mb": 0.01, "maps": True}
+    )
+    b.tare()
+    load = 0.0
+    while b.ask("status")["recorder"]["files"] < 4:
+        load = (load + 0.01) % 0.4
+        b.step(load=load)
+    for _ in range(5):
+        b.step(load=load)
+    last = b.skin.counter
+    b.daemon.stop()
+    rotated = b.daemon.status()["events"]["counts"]["recording_rotated"]  # the last one unheard
+    live = maps(b.listener.of("map"))
+    files = sorted(folder.iterdir())
+    numbers = [path.name.split("-")[1] for path in files]
+    assert numbers == [f"{number:06d}" for number in range(1, len(files) + 1)]
+    again: list[int] = []
+    for path in files:
+        summary = open_recording(path).summary
+        assert summary.is_complete
+        assert summary.corrupt == 0
+        assert summary.hellos or not summary.port_bytes  # begun just before the end
+        replayed = maps(replay(path).of("map"))
+        assert len(replayed) == summary.frames
+        for counter, image in replayed.items():
+            np.testing.assert_array_equal(image, live[counter], err_msg=f"{path} {counter}")
+        again += replayed
+    assert again == list(live) == list(range(1, last + 1))
+    whole = replay(folder).of("map")
+    assert maps(whole).keys() == live.keys()
+    for counter, image in maps(whole).items():
+        np.testing.assert_array_equal(image, live[counter], err_msg=f"{folder} {counter}")
+    identities = {f["scan_counter"]: [c["id"] for c in f["contacts"]] for f in whole}
+    assert identities == {
+        f["scan_counter"]: [c["id"] for c in f["contacts"]] for f in b.listener.of("map")
+    }
+    for channel in Channel:
+        assert {c for path in files for c in counters(path, channel)} == set(again)
+    assert rotated == len(files) - 1 >= 3
+
+
+def test_a_folder_says_every_byte_once_and_in_time(
+    bench: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder, "LOOK_S", 0.3)
+    folder = tmp_path / "set"
+    b = bench(ports=2, recording={"folder": folder, "at_start": True, "rotate_mb": 0.01})
+    b.tare()
+    while b.ask("status")["recorder"]["files"] < 4:
+        b.step(load=0.1)
+    b.daemon.stop()
+    whole = open_replayable(folder)
+    for port in (0, 1):
+        times = [chunk.clock_ns for chunk in whole.chunks(port)]
+        assert times == sorted(times)
+        decoder = Decoder()
+        said = [p for chunk in whole.chunks(port) for p in decoder.feed(chunk.data)]
+        counted = [p.counter for p in said if isinstance(p, Scan)]
+        assert counted == list(range(counted[0], counted[0] + len(counted)))
+        assert decoder.counts.corrupt == 0
+
+
+def test_a_night_between_two_files_is_not_waited_for(
+    bench: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "set"
+    rules = {"folder": folder, "at_start": True}
+    for hours in (0, 12):
+        later_ns, real_ns = hours * 3600 * 10**9, time.time_ns
+        monkeypatch.setattr(time, "time_ns", lambda by=later_ns, now=real_ns: now() + by)
+        b = bench(recording=rules)
+        b.tare()
+        b.step(load=0.1)
+        b.daemon.stop()
+        monkeypatch.undo()
+    times = [chunk.clock_ns for chunk in open_replayable(folder).chunks(0)]
+    assert times == sorted(times)
+    assert times[-1] - times[0] < 60e9
+
+
+def test_folders_that_cannot_be_played_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="holds no recordings"):
+        open_replayable(tmp_path)
+    for sensor in ("left", "right"):
+        (tmp_path / f"{sensor}-000001-20260131T120000Z.mcap").touch()
+    with pytest.raises(RecordingError, match="recordings of left, right"):
+        open_replayable(tmp_path)
+
+
+def test_numbers_go_on_whatever_the_clock_and_strangers_do(bench: Start, tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    folder.mkdir()
+    strangers = {
+        "left-000007-20400101T000000Z.mcap",
+        "left-000003-20990101T000000Z.mcap",
+        "left-000099-notes.txt",
+        "left-000098-20269999T999999Z.mcap",
+        "leftover-000500-20260101T000000Z.mcap",
+        "right-000900-20260101T000000Z.mcap",
+    }
+    for name in strangers:
+        (folder / name).write_text("precious")
+    b = bench(recording={"folder": folder, "keep_days": 1e-6, "rotate_mb": 0.01})
+    b.ask("record_start")
+    path = Path(b.ask("record_stop")["path"])
+    assert path.name.startswith("left-000008-")
+    assert strangers <= {each.name for each in folder.iterdir()}
+    assert all((folder / name).read_text() == "precious" for name in strangers)
+
+
+def test_the_oldest_files_of_this_sensor_go_when_there_are_too_many(
+    bench: Start, tmp_path: Path
+) -> None:
+    folder = tmp_path / "set"
+    rules = {"folder": folder, "rotate_mb": 0.01, "keep_gb": 0.00006}
+    b = bench(recording=rules)
+    b.tare()
+    made = []
+    for _ in range(6):
+        b.ask("record_start")
+        size = 0
+        while size < 9000:
+            b.step()
+            size = (b.ask("status")["recording"] or {"bytes": 0})["bytes"]
+        made.append(Path(b.ask("record_stop")["path"]))
+    b.ask("record_start")
+    left = sorted(folder.iterdir())
+    assert left[-1] not in made
+    assert left[-2] == made[-1]
+    assert made[0] not in left
+    assert sum(path.stat().st_size for path in left) <= 60_000
+    recorder = b.ask("status")["recorder"]
+    deleted = recorder["deleted"]
+    assert deleted == recorder["files"] - len(left) > 0
+    told = [e["detail"] for e in b.listener.of("event") if e["name"] == "recording_deleted"]
+    assert len(told) == deleted
+    assert str(made[0]) in told[0]
+
+
+def kept(number: int, begin_s: float, end_s: float, size: int = 1) -> KeptRecording:
+    return KeptRecording(number, Path(f"{number}"), size, begin_s, end_s)
+
+
+RULES = RecordingConfig(keep_days=7, keep_gb=0)
+
+
+def gone(recordings: list[KeptRecording], rules: RecordingConfig = RULES) -> list[int]:
+    return [int(deletion.path.name) for deletion in to_delete(recordings, rules)]
+
+
+def days(first: int, end: int, offset_s: float = 0.0) -> list[KeptRecording]:
+    """One recording of a whole day each."""
+    return [kept(n, n * DAY_S + offset_s, (n + 1) * DAY_S + offset_s) for n in range(first, end)]
+
+
+def test_files_go_by_age() -> None:
+    assert gone(days(0, 20)) == list(range(12))
+
+
+@pytest.mark.parametrize("jump_s", [DAY_S, 365 * DAY_S, 50 * 365 * DAY_S])
+def test_a_clock_that_jumps_ahead_costs_a_day_at_most(jump_s: float) -> None:
+    assert gone([*days(0, 5), kept(5, 5 * DAY_S + jump_s, 5 * DAY_S + jump_s + 1)]) == []
+    # And it costs it once, and none when it is set right again.
+    there_and_back = [*days(0, 3), *days(3, 4, jump_s), *days(4, 6)]
+    assert gone(there_and_back) == []
+
+
+def test_a_clock_that_goes_back_deletes_nothing() -> None:
+    assert gone([*days(100, 105), *days(0, 1)]) == []
+
+
+def test_a_file_copied_without_its_times_is_at_most_a_day_long() -> None:
+    copied = [kept(n, n * DAY_S, 5000 * DAY_S) for n in range(3)]
+    assert gone([*copied, kept(3, 5000 * DAY_S, 5000 * DAY_S)]) == []
+
+
+def test_the_file_being_written_stays() -> None:
+    assert gone([kept(0, 0, 1, size=10**12)], RecordingConfig(keep_gb=2, keep_days=1)) == []
+
+
+def test_a_file_is_as_old_as_what_is_in_it(
+    bench: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder, "LOOK_S", 0.1)
+    folder = tmp_path / "set"
+    b = bench(recording={"folder": folder, "at_start": True, "rotate_minutes": 0.01})
+    b.until(lambda: b.ask("status")["uptime_s"] > 1.0)  # longer than that, but nothing came
+    b.tare()
+    while len(list(folder.iterdir())) == 1:
+        b.step()
+    b.daemon.stop()
+    first = min(folder.iterdir())
+    assert open_recording(first).summary.duration_s > 0.3  # and not from when it was begun
+
+
+def test_links_and_folders_are_not_recordings(tmp_path: Path) -> None:
+    name = "left-000001-20260101T000000Z.mcap"
+    (tmp_path / name).mkdir()
+    (tmp_path / name.replace("1-", "2-")).symlink_to("/etc/hostname")
+    assert list_recordings(tmp_path, "left") == []
+
+
+def test_the_names_hold_the_time_of_day_in_utc(bench: Start, tmp_path: Path) -> None:
+    b = bench(recording={"folder": tmp_path / "set"})
+    before_s = int(time.time())
+    path = Path(b.ask("record_start")["path"])
+    (found,) = list_recordings(path.parent, "left")
+    assert before_s <= found.begin_s <= time.time()
+    assert found.path == path
+    assert os.access(path, os.R_OK)

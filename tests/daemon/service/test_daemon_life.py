@@ -1,0 +1,167 @@
+"""Starting, stopping and being killed: nothing is left behind, nothing recorded is lost."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from daemon_process import DaemonProcess
+from tactomo.config import load_config
+from tactomo.errors import TactomoError
+from tactomo.recordings.recording import open_recording
+from tactomo.service.daemon import Daemon
+from waiting import PATIENCE_S, wait_until
+
+Start = Callable[..., Any]
+
+# What `tactomo daemon` does, with a reconstructor that needs no artifact.
+PROGRAM = """
+import sys
+from tactomo.config import load_config
+from tactomo.service.daemon import Daemon
+from tactomo.errors import TactomoError
+from tactomo.log import configure_logging
+from daemon_bench import Memory
+
+configure_logging("info", "json")
+try:
+    sys.exit(Daemon(load_config(sys.argv[1]), reconstructor=Memory()).run())
+except TactomoError as error:
+    sys.exit(f"{error.cause}; {error.next_step}")
+"""
+
+
+@pytest.fixture
+def spawn(tmp_path: Path, make_skin: Callable[..., Any]) -> Iterator[Callable[..., Any]]:
+    """Start a daemon in a process of its own, on a skin of this one: ``spawn(**config)``."""
+    processes: list[DaemonProcess] = []
+
+    def start(**config: Any) -> tuple[DaemonProcess, Any]:
+        skin = make_skin(tmp_path, 1)
+        settings: dict[str, Any] = {
+            "tare_scans": 3,
+            "sync_wait_ms": 500,
+            "baseline": {"track": False},
+        }
+        ports = [str(line.path) for line in skin.lines]
+        process = DaemonProcess(tmp_path, ports, program=PROGRAM, **settings, **config)
+        processes.append(process)
+        return process, skin
+
+    yield start
+    for process in processes:
+        process.kill()
+
+
+def test_nothing_is_left_after_a_stop(bench: Start, tmp_path: Path) -> None:
+    bench().daemon.stop()  # what the libraries keep for good is there now
+    threads = set(threading.enumerate())
+    before = len(os.listdir("/proc/self/fd"))
+    b = bench(ports=2, recording={"file": tmp_path / "skin.mcap"})
+    b.tare()
+    begin_s = time.monotonic()
+    b.daemon.stop()
+    assert time.monotonic() - begin_s < 10.0  # a third of a second, on a machine with time to spare
+    b.daemon.stop()  # again is fine
+    b.listener.socket.close()
+    b.skin.close()
+    b.until(lambda: len(os.listdir("/proc/self/fd")) <= before)
+    assert set(threading.enumerate()) <= threads
+
+
+def test_nothing_is_left_after_a_start_that_failed(bench: Start, tmp_path: Path) -> None:
+    b = bench()
+    free = os.openpty()
+    good, bad = os.ttyname(free[1]), str(tmp_path / "absent")
+    threads = set(threading.enumerate())
+    before = len(os.listdir("/proc/self/fd"))
+    memory: Any = SimpleNamespace(method="auto", budget_s=None)
+    off = {"track": False}
+    local = {"stream": "tcp://127.0.0.1:0", "control": "tcp://127.0.0.1:0"}
+    for settings in (
+        {"ports": [good, bad], **local},
+        {"ports": [good], "stream": "tcp://127.0.0.1:0", "control": b.daemon.control_address},
+        {"ports": [good], "record": Path("/proc/none/skin.mcap"), **local},
+    ):
+        with pytest.raises(TactomoError):
+            Daemon(load_config(baseline=off, **settings), reconstructor=memory).start()
+    b.until(lambda: len(os.listdir("/proc/self/fd")) <= before)
+    assert set(threading.enumerate()) <= threads
+    for descriptor in free:
+        os.close(descriptor)
+
+
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)]
+)
+def test_a_signal_stops_it_within_a_second(spawn: Start, tmp_path: Path, number: int) -> None:
+    process, _ = spawn(recording={"file": str(tmp_path / "skin.mcap")})
+    begin_s = time.monotonic()
+    process.signal(number)
+    assert process.popen.wait(PATIENCE_S) == 0
+    assert time.monotonic() - begin_s < 10.0  # a busy machine and the interpreter's end included
+    assert open_recording(tmp_path / "skin.mcap").summary.is_complete
+
+
+def test_a_killed_daemons_recording_opens_up_to_its_last_flush(
+    spawn: Start, replay: Start, tmp_path: Path
+) -> None:
+    path = tmp_path / "skin.mcap"
+    process, skin = spawn(recording={"file": str(path)})
+    skin.introduce()
+    for _ in range(10):
+        skin.scan()
+
+    def flushed() -> tuple[int, int]:
+        summary = open_recording(path).summary
+        return sum(summary.scans.values()), summary.frames
+
+    wait_until(lambda: flushed() >= (20, 1), "a flush of its own accord")
+    process.kill()
+    assert not open_recording(path).summary.is_complete
+    scans, frames = flushed()
+    assert scans == 20
+    assert frames == len(replay(path).of("map"))
+
+
+def test_a_full_disk_ends_the_recording_and_nothing_else(spawn: Start, tmp_path: Path) -> None:
+    path = tmp_path / "skin.mcap"
+    process, skin = spawn()
+    skin.introduce()
+    for _ in range(4):
+        skin.scan()
+    process.ask("record_start", path=str(path))
+    size = path.stat().st_size
+    skin.scan()
+    wait_until(lambda: path.stat().st_size > size)
+    # As good as a full disk: no file of that process may grow much further.
+    limit = path.stat().st_size + 4000
+    resource.prlimit(process.popen.pid, resource.RLIMIT_FSIZE, (limit, limit))
+    wait_until(lambda: process.status()["recording"] is None, meanwhile=skin.scan)
+    failed = process.told("recording_failed")[0]
+    assert failed["level"] == "error"
+    assert "too large" in failed["detail"]
+    assert process.status()["state"] == "running"
+    assert open_recording(path).summary.frames > 0
+
+
+def test_a_thread_that_dies_takes_the_daemon_down(bench: Start) -> None:
+    b = bench()
+
+    def fail(*_: Any) -> None:
+        raise ZeroDivisionError("a mistake")
+
+    b.daemon._imaging.taring.check = fail
+    hook, threading.excepthook = threading.excepthook, lambda _: None
+    try:
+        assert b.daemon.wait() == 1
+    finally:
+        threading.excepthook = hook

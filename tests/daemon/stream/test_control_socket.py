@@ -1,0 +1,222 @@
+"""Commands to a running daemon, good ones and bad ones, over a real socket."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import msgpack  # type: ignore[import-untyped]
+import pytest
+import zmq
+from tactomo.config import load_config
+from tactomo.errors import AddressError
+from tactomo.service.daemon import Daemon
+from tactomo.stream.control import SETTLE_S
+from tactomo_client import ControlError
+from tactomo_client.messages import array_from_wire, decode_reply, encode_request
+
+Start = Callable[..., Any]
+
+
+def test_status_says_how_everything_is(bench: Start) -> None:
+    b = bench()
+    assert b.ask("status")["state"] == "waiting_for_data"
+    assert b.ask("status")["source"] == {"kind": "unknown"}
+    b.tare()
+    b.step(load=0.1)
+    status = b.ask("status")
+    assert status["state"] == "running"
+    assert status["source"] == {"kind": "device"}
+    assert status["description"]["model"] == "paper_square"
+    assert status["description"]["sensing_width_mm"] == pytest.approx(138)
+    assert len(status["description"]["electrodes_mm"]) == 16
+    assert status["reference"]["scans"] == 3
+    assert status["stage_ms"]["reconstruct"]["p50"] > 0
+    assert 0 < status["latency_ms"]["p50"] <= status["latency_ms"]["p99"]
+    assert status["sequence"] >= 1
+    assert status["tier"] == "tikhonov"
+    assert status["recording"] is None
+    assert status["subscribers"] == 5
+    assert set(b.listener.of("status")[-1]) == set(status)
+
+
+def test_rates_are_what_comes_and_nothing_when_nothing_comes(bench: Start) -> None:
+    b = bench()
+    b.tare()
+    rates = b.ask("status")["rates"]
+    assert rates["magnitude_hz"] > 0
+    assert rates["structure_hz"] > 0
+    assert rates["frames_hz"] > 0
+    b.listener.wait("status", lambda s: s["state"] == "stale")
+    b.listener.wait("status", lambda s: s["rates"]["frames_hz"] == 0)
+
+
+def test_tare_is_answered_when_the_new_reference_holds(bench: Start) -> None:
+    b = bench(ports=2)
+    b.tare()
+    shown = len(b.step(load=0.2)["contacts"])
+    assert shown
+    answers: list[dict[str, Any]] = []
+    asking = threading.Thread(target=lambda: answers.append(b.ask("tare")))
+    asking.start()
+    while not answers:
+        b.step(load=0.2)  # the maps go on meanwhile, against the old reference
+    asking.join()
+    assert answers == [{"scans": 3, "contacts": shown}]
+    b.listener.wait("event", lambda event: f"{shown} contact(s) were shown" in event["detail"])
+    frame = b.step(load=0.2)
+    assert abs(array_from_wire(frame["map"])).max() < 1e-3
+    assert frame["contacts"] == []
+
+
+def test_tare_is_refused_while_somebody_presses(bench: Start) -> None:
+    b = bench(tare_scans=10)
+    b.tare()
+    reference = b.ask("status")["reference"]
+    errors: list[ControlError] = []
+
+    def ask() -> None:
+        with pytest.raises(ControlError) as caught:
+            b.ask("tare")
+        errors.append(caught.value)
+
+    asking = threading.Thread(target=ask)
+    asking.start()
+    load = 0.0
+    while not errors:
+        load += 0.02
+        b.step(load=load)
+    asking.join()
+    assert errors[0].name == "tare_refused"
+    assert "take the load off" in errors[0].next_step
+    b.listener.event("tare_refused")
+    assert b.ask("status")["reference"] == reference
+
+
+def test_the_first_tare_waits_until_nobody_presses(bench: Start) -> None:
+    b = bench(tare_scans=10)
+    b.skin.introduce()
+    for step in range(12):
+        b.step(load=0.02 * step)
+    b.listener.event("tare_refused")
+    assert b.ask("status")["state"] == "taring"
+    for _ in range(20):
+        b.step()
+    b.listener.event("tared")
+
+
+def test_tare_without_data_says_so(bench: Start) -> None:
+    b = bench()
+    with pytest.raises(ControlError) as caught:
+        b.ask("tare")
+    assert caught.value.name == "no_data"
+
+
+def test_tier_and_budget_are_answered_when_they_are_in_force(bench: Start) -> None:
+    b = bench(seconds=0.2)
+    b.tare()
+    for tier, budget_ms in [("levelset", 25.0), ("fit", 30.0), ("tikhonov", None)]:
+        b.skin.scan()  # a frame that takes its time, and the commands come meanwhile
+        assert b.ask("set_tier", tier=tier) == {"tier": tier}
+        assert b.ask("status")["tier_requested"] == tier
+        b.skin.scan()
+        assert b.ask("set_budget", budget_ms=budget_ms) == {"budget_ms": budget_ms}
+        status = b.ask("status")
+        assert (status["tier_requested"], status["budget_ms"]) == (tier, budget_ms)
+        assert status["plan"]["tier"] == tier
+
+
+def test_a_frame_that_takes_long_holds_up_no_command(bench: Start) -> None:
+    b = bench(seconds=4 * SETTLE_S)
+    b.skin.introduce()
+    b.skin.scan()
+    b.until(lambda: b.ask("status")["scans"]["structure"])
+    assert b.ask("set_tier", tier="fit") == {"tier": "fit"}
+    assert b.ask("status")["frames"] == 0  # it is still being made
+    b.until(lambda: b.ask("status")["tier_requested"] == "fit")
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "name"),
+    [
+        ("make_coffee", {}, "unknown_command"),
+        ("tare", {"scans": 3}, "bad_argument"),
+        ("set_tier", {"tier": "best"}, "bad_argument"),
+        ("set_tier", {}, "bad_argument"),
+        ("set_budget", {"budget_ms": -1}, "bad_argument"),
+        ("set_budget", {"budget_ms": "fast"}, "bad_argument"),
+        ("record_start", {"path": 7}, "bad_argument"),
+        ("record_start", {"path": "/proc/none/skin.mcap"}, "cannot_write"),
+        ("record_start", {"path": "/tmp/a\0b"}, "cannot_write"),
+        ("record_start", {"path": "/proc/" + "x" * 300}, "cannot_write"),
+        ("record_stop", {}, "not_recording"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_by_name(
+    bench: Start, command: str, arguments: dict[str, Any], name: str
+) -> None:
+    b = bench()
+    with pytest.raises(ControlError) as caught:
+        b.ask(command, **arguments)
+    assert caught.value.name == name
+    assert caught.value.next_step
+    assert b.ask("status")["state"] == "waiting_for_data"
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"",
+        b"\xc1",
+        b"hello",
+        msgpack.packb([1, 2]),
+        msgpack.packb({"schema": 2, "command": "status"}),
+        msgpack.packb({"schema": 1, "command": 5}),
+        msgpack.packb({"schema": 1, "command": "status", "arguments": [1]}),
+    ],
+)
+def test_malformed_requests_get_an_answer(bench: Start, connect: Start, body: bytes) -> None:
+    b = bench()
+    socket = connect(zmq.REQ, b.daemon.control_address)
+    socket.send(body)
+    assert socket.poll(30_000)
+    with pytest.raises(ControlError) as caught:
+        decode_reply(socket.recv())
+    assert caught.value.name == "malformed_message"
+    assert b.ask("status")
+
+
+def test_a_dealer_and_a_request_that_is_too_large(bench: Start, connect: Start) -> None:
+    b = bench()
+    socket = connect(zmq.DEALER, b.daemon.control_address)
+    socket.send_multipart([b"", encode_request("status", {})])
+    assert socket.poll(30_000)
+    empty, reply = socket.recv_multipart()
+    assert empty == b""
+    assert decode_reply(reply)["state"]
+    socket.send_multipart([b"", b"x" * 1_000_000])  # cut off, not answered
+    assert not socket.poll(200)
+    assert b.ask("status")
+
+
+@pytest.mark.parametrize("purpose", ["stream", "control"])
+@pytest.mark.parametrize("transport", ["tcp", "ipc"])
+def test_an_address_in_use_is_refused_and_nothing_is_left_open(
+    bench: Start, tmp_path: Any, purpose: str, transport: str
+) -> None:
+    other = f"ipc://{tmp_path}/socket" if transport == "ipc" else "tcp://127.0.0.1:0"
+    b = bench(**{purpose: other})
+    taken = getattr(b.daemon, f"{purpose}_address")
+    free = "tcp://127.0.0.1:0"
+    settings: dict[str, Any] = {"stream": free, "control": free, purpose: taken}
+    settings["baseline"] = {"track": False}
+    memory: Any = SimpleNamespace(method="auto", budget_s=None)
+    second = Daemon(load_config(ports=["/dev/null"], **settings), reconstructor=memory)
+    before = threading.active_count()
+    with pytest.raises(AddressError, match="in use") as caught:
+        second.start()
+    assert f"--{purpose}" in caught.value.next_step
+    assert threading.active_count() == before
+    assert b.ask("status")  # the first one goes on

@@ -1,0 +1,513 @@
+"""Beyond the machine: who has an allowed key gets in, nobody else does, nobody can listen in."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zmq
+from page import Page
+from tactomo.cli.calibrate.reload import taken_up
+from tactomo.config import load_config
+from tactomo.endpoint import bind
+from tactomo.errors import AddressError, ConfigError
+from tactomo.log import configure_logging
+from tactomo.service.daemon import Daemon
+from tactomo.stream import keys as key_files
+from tactomo.stream.access_control import AccessControl, ServerKeys
+from tactomo_client import (
+    ClientError,
+    Keys,
+    KeysError,
+    Status,
+    StreamTimeout,
+    aio,
+    request,
+    subscribe,
+)
+from tactomo_client import Daemon as Commander
+from tactomo_client.keys import read_public, read_secret
+from tactomo_models import load_description
+from tactomo_models.calibration.calibration_file import (
+    PressureCalibration,
+    calibration_path,
+    subject_of,
+)
+from tactomo_models.calibration.curve import Reading
+from tactomo_viewer.feed import Feed
+from waiting import PATIENCE_S, wait_until
+
+Start = Callable[..., Any]
+SERVER = "left"
+
+
+def own_address() -> str:
+    """Return an address of this computer that others can reach, or that stands for all of them."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # sends nothing
+        except OSError:
+            return "0.0.0.0"
+        return str(probe.getsockname()[0])
+
+
+class Robot:
+    """The robot's folder of keys, and those of its clients."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder / "robot"
+        self._clients = folder / "clients"
+        key_files.make_pair(self.folder, SERVER, is_server=True)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        address = f"tcp://{own_address()}:0"
+        return {
+            "stream": address,
+            "control": address,
+            "curve": {
+                "secret": str(key_files.secret_path(self.folder, SERVER)),
+                "clients": str(key_files.clients_folder(self.folder, SERVER)),
+            },
+        }
+
+    def client(self, name: str, *, server: str = SERVER) -> Path:
+        """Make a client's folder of keys, with a server's public key in it."""
+        folder = self._clients / name
+        key_files.make_pair(folder, name)
+        shutil.copy(key_files.public_path(self.folder, server), folder)
+        return folder
+
+    def allow(self, folder: Path, *, may_command: bool = False) -> Path:
+        public = key_files.public_path(folder, folder.name)
+        key_files.allow(self.folder, public, SERVER, may_command=may_command)
+        return folder
+
+    def revoke(self, name: str) -> None:
+        key_files.revoke(self.folder, name, SERVER)
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Robot:
+    return Robot(tmp_path)
+
+
+@pytest.fixture
+def guarded(bench: Start, robot: Robot) -> Any:
+    """A daemon at an address that others can reach, and one who may command it: ``desk``."""
+    desk = robot.allow(robot.client("desk"), may_command=True)
+    return bench(keys=Keys.load(desk), **robot.config)
+
+
+def test_an_allowed_client_commands_and_reads_frames(guarded: Any, robot: Robot) -> None:
+    guarded.tare()
+    folder = robot.allow(robot.client("ros"))
+    address = guarded.daemon.stream_address
+    assert guarded.ask("status")["state"] in ("running", "stale")
+    with subscribe(SERVER, address=address, timeout_s=0.2, keys=folder) as skin:
+        for _ in range(100):
+            guarded.step(0.1)
+            try:
+                assert next(skin).sensor == SERVER
+                return
+            except StreamTimeout:
+                continue
+    pytest.fail("no frame came")
+
+
+def test_an_allowed_client_does_so_in_an_event_loop(guarded: Any, robot: Robot) -> None:
+    guarded.tare()
+    folder = robot.folder.parent / "clients" / "desk"
+
+    async def look() -> None:
+        stream, control = guarded.daemon.stream_address, guarded.daemon.control_address
+        async with (
+            aio.subscribe(SERVER, address=stream, keys=folder) as skin,
+            aio.Daemon(control, keys=folder, timeout_s=PATIENCE_S) as daemon,
+            asyncio.timeout(PATIENCE_S),
+        ):
+            assert (await daemon.status()).session == guarded.daemon.session
+            while (frame := await skin.wait(0.2)) is None:
+                await asyncio.to_thread(guarded.step, 0.1)
+            assert frame.sensor == SERVER
+
+    asyncio.run(look())
+
+
+def test_a_stranger_is_turned_away_in_an_event_loop_until_allowed(
+    guarded: Any, robot: Robot
+) -> None:
+    guarded.tare()
+    folder = robot.client("stranger")
+
+    async def look() -> None:
+        stream, control = guarded.daemon.stream_address, guarded.daemon.control_address
+        async with (
+            aio.subscribe(SERVER, address=stream, kind="status", keys=folder) as statuses,
+            aio.Daemon(control, keys=folder, timeout_s=PATIENCE_S) as daemon,
+            asyncio.timeout(PATIENCE_S),
+        ):
+            with pytest.raises(KeysError, match="does not let this client in"):
+                await anext(statuses)
+            with pytest.raises(KeysError, match="does not let this client in"):
+                await daemon.status()
+            robot.allow(folder, may_command=True)
+            while True:  # it knocks again by itself
+                with contextlib.suppress(KeysError):
+                    assert (await anext(statuses)).session == guarded.daemon.session
+                    break
+            while True:
+                with contextlib.suppress(KeysError):
+                    assert (await daemon.status()).session == guarded.daemon.session
+                    break
+
+    asyncio.run(look())
+
+
+def test_another_process_gets_in_with_the_folder_alone(guarded: Any, robot: Robot) -> None:
+    command = [sys.executable, "-m", "tactomo.cli", "status", "--json"]
+    command += ["--control", guarded.daemon.control_address]
+    desk = robot.folder.parent / "clients" / "desk"
+    environment = {**os.environ, "TACTOMO_KEYS": str(desk)}
+    said = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert said.returncode == 0, said.stderr
+    assert '"state"' in said.stdout
+    environment.pop("TACTOMO_KEYS")
+    said = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert said.returncode == 1
+    assert "hangs up on a client without keys" in said.stderr
+    assert "TACTOMO_KEYS" in said.stderr
+
+
+def test_the_viewer_gets_in(guarded: Any) -> None:
+    async def look() -> tuple[Status, dict[str, Any]]:
+        feed = Feed(SERVER, guarded.daemon.stream_address, guarded.keys, lambda: None)
+        link = aio.Control(guarded.daemon.control_address, keys=guarded.keys)
+        reading = asyncio.create_task(feed.run())
+        try:
+            async with asyncio.timeout(PATIENCE_S):
+                while feed.status is None:
+                    await asyncio.sleep(0.01)
+            return feed.status, await link.request("status", PATIENCE_S)
+        finally:
+            reading.cancel()
+            await asyncio.gather(reading, return_exceptions=True)
+            link.close()
+
+    status, answer = asyncio.run(look())
+    assert status.fields["session"] == answer["session"] == guarded.daemon.session
+
+
+def test_the_example_of_the_specification_gets_in(
+    guarded: Any, robot: Robot, tmp_path: Path
+) -> None:
+    (example,) = Page("clients/STREAM.md").blocks("python", "Beyond the machine")
+    script = tmp_path / "health.py"
+    script.write_text(example)
+    folder = robot.allow(robot.client("ros"))
+    command = [sys.executable, "-I", script, folder, SERVER, guarded.daemon.stream_address]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "waiting_for_data\n"
+        process.kill()
+
+
+def test_a_client_that_is_not_listed_is_refused_and_told_of(guarded: Any, robot: Robot) -> None:
+    stranger = robot.client("stranger")
+    address = guarded.daemon.stream_address
+    with subscribe(SERVER, address=address, keys=stranger) as skin:
+        with pytest.raises(KeysError, match="does not let this client in") as caught:
+            next(skin)
+        event = guarded.listener.event("client_refused")
+        public = Keys.load(stranger).public.decode()
+        assert public in caught.value.cause
+        assert public in event["detail"]
+        assert own_address() in event["detail"] or "127.0.0.1" in event["detail"]
+        command = f"`tactomo keys allow CLIENT.key --for {SERVER} --keys {robot.folder}`"
+        assert command in event["next_step"]
+        assert f"`tactomo keys allow stranger.key --for {SERVER}`" in caught.value.next_step
+        with pytest.raises(KeysError) as refused:
+            request("status", guarded.daemon.control_address, PATIENCE_S, keys=stranger)
+        assert refused.value.name == "key_refused"
+        robot.allow(stranger)  # and now it is let in, without a restart of either
+        guarded.tare()
+        deadline = time.monotonic() + PATIENCE_S
+        while skin.latest() is None and time.monotonic() < deadline:
+            guarded.step(0.1)
+        assert skin.latest() is not None
+
+
+def test_a_reader_may_not_command(guarded: Any, robot: Robot) -> None:
+    ros = robot.allow(robot.client("ros"))
+    with pytest.raises(KeysError) as refused:
+        request("tare", guarded.daemon.control_address, PATIENCE_S, keys=ros)
+    assert refused.value.name == "key_refused"
+    event = guarded.listener.event("client_refused")
+    assert "may not use the control" in event["detail"]
+    assert f"--for {SERVER} --may-command --keys {robot.folder}`" in event["next_step"]
+
+
+def test_a_reader_is_told_who_can_put_a_calibration_in_force(guarded: Any, robot: Robot) -> None:
+    sensor = load_description("paper_square")
+    readings = [Reading(pressure_kpa=k, magnitude=(k - 140) * 2e-3) for k in range(150, 241, 10)]
+    made = PressureCalibration.of_readings(subject_of("left", sensor), readings)
+    path = calibration_path("left")
+    reader = robot.allow(robot.client("reader"))
+    told = taken_up(made, path, guarded.daemon.control_address, reader)
+    assert told.startswith("not in force yet: ")
+    assert "calibrate reload --sensor left" in told
+    commander = robot.allow(robot.client("chief"), may_command=True)
+    told = taken_up(made, path, guarded.daemon.control_address, commander)
+    assert "the description's table" in told
+
+
+def test_the_wrong_server_key_is_noticed(guarded: Any, robot: Robot) -> None:
+    key_files.make_pair(robot.folder, "impostor", is_server=True)
+    misled = robot.allow(robot.client("misled", server="impostor"))
+    with pytest.raises(KeysError) as caught:
+        request("status", guarded.daemon.control_address, PATIENCE_S, keys=misled)
+    assert caught.value.name == "wrong_server"
+
+
+def test_who_is_revoked_is_cut_off_and_the_others_come_back(guarded: Any, robot: Robot) -> None:
+    guarded.tare()
+    ros = robot.allow(robot.client("ros"))
+    with subscribe(SERVER, address=guarded.daemon.stream_address, keys=ros) as skin:
+        deadline = time.monotonic() + PATIENCE_S
+        while skin.latest() is None:
+            assert time.monotonic() < deadline
+            guarded.step(0.1)
+        robot.revoke("ros")
+        last = skin.latest()
+        assert last is not None
+        events: list[dict[str, Any]] = []
+        while not events:  # it tries to come in again and again
+            assert time.monotonic() < deadline + PATIENCE_S
+            with contextlib.suppress(KeysError):
+                last = next(skin)
+            events = guarded.listener.of("event")
+            events = [event for event in events if event["name"] == "client_refused"]
+        assert Keys.load(ros).public.decode() in events[0]["detail"]
+        for _ in range(5):
+            assert guarded.step(0.2)["scan_counter"] > last.scan_counter
+        assert skin.latest() is last
+        with pytest.raises(KeysError):
+            next(skin)
+    assert guarded.ask("status")["state"]
+
+
+def test_a_command_of_one_who_was_revoked_ends(
+    guarded: Any, robot: Robot, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """ZeroMQ drops a connection that was refused; sending into what is left would never return."""
+    configure_logging("info", "text")  # to the captured stream
+    ros = robot.allow(robot.client("ros"), may_command=True)
+    with Commander(guarded.daemon.control_address, keys=ros, timeout_s=PATIENCE_S) as commander:
+        assert commander.status().state
+        robot.revoke("ros")
+        # Read in the log: the listener was cut off, too, and may come back after the only event.
+        guarded.until(lambda: "client_refused" in capsys.readouterr().err)
+        commander.timeout_s = 2.0
+        with pytest.raises(ClientError):
+            commander.status()
+
+
+def test_one_who_listens_in_sees_nothing(guarded: Any) -> None:
+    """Between client and server sits a relay that keeps every byte of the conversation."""
+    relay = Relay(guarded.daemon.stream_address)
+    with relay:
+        sub: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
+        with sub:
+            sub.setsockopt(zmq.LINGER, 0)
+            sub.subscribe(b"")
+            sub.curve_publickey, sub.curve_secretkey = guarded.keys.public, guarded.keys.secret
+            sub.curve_serverkey = guarded.keys.server
+            sub.connect(relay.address)
+            assert sub.poll(int(PATIENCE_S * 1000))
+            message = sub.recv()
+    assert message.startswith(b"left/")
+    assert len(relay.heard) > len(message)
+    assert b"CURVE" in relay.heard
+    for word in (b"left/", b"status", b"schema", b"session", guarded.daemon.session.encode()):
+        assert word in message or word == b"status"
+        assert word not in relay.heard
+
+
+class Relay:
+    """A TCP relay that remembers what both sides said."""
+
+    def __init__(self, target: str) -> None:
+        host, _, port = target.removeprefix("tcp://").rpartition(":")
+        self.heard = b""
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.address = f"tcp://127.0.0.1:{self._listener.getsockname()[1]}"
+        self._server = socket.create_connection((host, int(port)))
+        self._threads = [threading.Thread(target=self._accept)]
+
+    def __enter__(self) -> Relay:
+        self._threads[0].start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._client.shutdown(socket.SHUT_RDWR)
+        self._server.shutdown(socket.SHUT_RDWR)
+        for thread in self._threads:
+            thread.join()
+        for sock in (self._client, self._server, self._listener):
+            sock.close()
+
+    def _accept(self) -> None:
+        self._client, _ = self._listener.accept()
+        back = threading.Thread(target=self._pass, args=(self._server, self._client))
+        self._threads.append(back)
+        back.start()
+        self._pass(self._client, self._server)
+
+    def _pass(self, source: socket.socket, sink: socket.socket) -> None:
+        while data := _received(source):
+            self.heard += data
+            try:
+                sink.sendall(data)
+            except OSError:
+                return
+
+
+def _received(source: socket.socket) -> bytes:
+    try:
+        return source.recv(65_536)
+    except OSError:
+        return b""
+
+
+def test_without_a_doorkeeper_the_door_stays_shut(robot: Robot) -> None:
+    """ZeroMQ's own default lets everybody in when nobody is there to ask."""
+    keys = Keys.load(robot.allow(robot.client("desk"), may_command=True))
+    secret = read_secret(key_files.secret_path(robot.folder, SERVER))[1]
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    with context, context.socket(zmq.ROUTER) as server:
+        server.setsockopt(zmq.LINGER, 0)
+        address = bind(server, "tcp://127.0.0.1:0", "control", secret=secret)
+        with pytest.raises(KeysError):
+            request("status", address, PATIENCE_S, keys=keys)
+        assert not server.poll(0)
+
+
+def test_a_doorkeeper_that_dies_is_noticed_and_can_be_stopped(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def trip(*_: object) -> bool:
+        raise RuntimeError
+
+    monkeypatch.setattr("threading.excepthook", lambda _: None)
+    monkeypatch.setattr(AccessControl, "callback", trip)
+    clients = key_files.clients_folder(robot.folder, SERVER)
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    keeper = AccessControl(context, ServerKeys(b"", clients), lambda *_, **__: None, lambda: None)
+    keeper.start()
+    assert keeper.is_alive
+    with context.socket(zmq.REQ) as asking:
+        asking.setsockopt(zmq.LINGER, 0)
+        asking.connect("inproc://zeromq.zap.01")
+        question = [b"1.0", b"1", b"stream", b"127.0.0.1", b"", b"CURVE", bytes(32)]
+        asking.send_multipart(question)
+        wait_until(lambda: not keeper.is_alive)
+    keeper.stop()
+    context.term()
+
+
+def test_a_bad_file_on_the_list_locks_nobody_else_out(guarded: Any, robot: Robot) -> None:
+    listed = key_files.clients_folder(robot.folder, SERVER)
+    (listed / "broken.key").write_text("public-key = nonsense\n")
+    (listed / "folder.key").mkdir()
+    assert "broken.key" in guarded.listener.event("client_key_unusable")["detail"]
+    assert guarded.ask("status")
+
+
+def test_a_list_that_cannot_be_read_lets_nobody_in(guarded: Any, robot: Robot) -> None:
+    shutil.rmtree(key_files.clients_folder(robot.folder, SERVER))
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        with contextlib.suppress(KeysError):
+            request("status", guarded.daemon.control_address, 2.0, keys=guarded.keys)
+            continue
+        return
+    pytest.fail("it was let in")
+
+
+@pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o644])
+def test_a_secret_that_others_may_read_is_refused(robot: Robot, mode: int) -> None:
+    secret = key_files.secret_path(robot.folder, SERVER)
+    secret.chmod(mode)
+    with pytest.raises(KeysError, match="others than its owner") as caught:
+        Daemon(load_config(ports=["/dev/null"], **robot.config))
+    assert f"chmod 600 {secret}" in caught.value.next_step
+
+
+def test_a_secret_that_systemd_guards_is_taken(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    secret = key_files.secret_path(robot.folder, SERVER)
+    secret.chmod(0o440)
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(robot.folder))
+    assert read_secret(secret)[0] == read_public(key_files.public_path(robot.folder, SERVER))
+
+
+@pytest.mark.parametrize("key", ["stream", "control"])
+@pytest.mark.parametrize("host", ["0.0.0.0", "*", "192.0.2.7", "eth0", "[::]", "robot.local"])
+def test_beyond_loopback_needs_keys(key: str, host: str, robot: Robot) -> None:
+    settings: dict[str, Any] = {"ports": ["/dev/null"], key: f"tcp://{host}:5560"}
+    with pytest.raises(ConfigError, match="can be reached from other computers") as caught:
+        load_config(**settings)
+    assert "tactomo keys make" in caught.value.cause
+    assert load_config(**settings, curve=robot.config["curve"]).curve
+
+
+def test_no_socket_of_ours_is_bound_beyond_loopback_without_keys() -> None:
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    with context, pytest.raises(AddressError) as caught:
+        bind(context.socket(zmq.REP), "tcp://0.0.0.0:0", "control")
+    assert caught.value.name == "keys_needed"
+
+
+@pytest.fixture
+def unchecked_umask() -> Iterator[None]:
+    before = os.umask(0)
+    yield
+    os.umask(before)
+
+
+@pytest.mark.usefixtures("unchecked_umask")
+def test_an_ipc_file_is_for_owner_and_group(bench: Start, tmp_path: Path) -> None:
+    path = tmp_path / "left.stream"
+    bench(stream=f"ipc://{path}")
+    assert path.stat().st_mode & 0o777 == 0o660
+    (tmp_path / "other").touch()
+    assert (tmp_path / "other").stat().st_mode & 0o777 == 0o666  # the process's own is untouched
+
+
+def test_a_stale_ipc_file_is_replaced_and_a_file_of_yours_is_not(tmp_path: Path) -> None:
+    stale = tmp_path / "stale"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as killed:
+        killed.bind(str(stale))
+    assert stale.is_socket()
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    with context, context.socket(zmq.REP) as fresh:
+        assert bind(fresh, f"ipc://{stale}", "control")
+        with pytest.raises(AddressError, match="in use"):
+            bind(context.socket(zmq.REP), f"ipc://{stale}", "control")
+    yours = tmp_path / "thesis.tex"
+    yours.write_text("years of work")
+    with context, pytest.raises(AddressError, match="is no socket"):
+        bind(zmq.Context.instance().socket(zmq.REP), f"ipc://{yours}", "control")
+    assert yours.read_text() == "years of work"

@@ -1,0 +1,179 @@
+"""STREAM.md against the programs: its tables have every field, flag, event and command, no more."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tactomo
+import tactomo.stream.control
+import tactomo.twin.control
+from tables import table as cells_of
+from tactomo.errors import CommandError
+from tactomo_client import status
+from tactomo_models import Flag
+from tactomo_models.methods.auto import UNSURE_MISFIT
+from tactomo_models.methods.magnitudes import BAD_MISFIT
+from tactomo_models.methods.registry import METHODS
+
+UNITS = {"ns": "ns", "us": "µs", "ms": "ms", "s": "s", "mm": "mm", "mm2": "mm²", "kpa": "kPa"}
+DOCUMENT = (Path(__file__).parents[3] / "clients" / "STREAM.md").read_text("utf-8")
+
+MAKERS = [
+    "quiet",
+    "tikhonov",
+    "noser",
+    "pls-paper",
+    "fit",
+    "levelset",
+    "network",
+    "hybrid",
+    "cnn-single",
+    "cnn-multimodal",
+]
+
+
+def table(heading: str, column: str = "Name") -> set[str]:
+    """Return the names in the first column of the first such table after a heading or a word."""
+    after = DOCUMENT.partition(f"\n{heading}\n")[2]
+    assert after, f"STREAM.md has no {heading!r}"
+    rows = re.search(rf"^\| {column} \|.*\n\|[-|]+\n((?:\|.*\n)+)", after, re.M)
+    assert rows, f"STREAM.md has no table of {column} after {heading!r}"
+    firsts = [row.split("|")[1] for row in rows[1].splitlines()]
+    return {name for first in firsts for name in re.findall(r"`(\w+)`", first)}
+
+
+def of_status(heading: str) -> dict[str, str]:
+    """Return the meaning of each row of a table of the document."""
+    rows = cells_of("clients/STREAM.md", heading)
+    return {name: row["Meaning"] for name, row in rows.items()}
+
+
+ENVELOPE = table("### Envelope")
+NAMED_BY_THEMSELVES = ("stage_ms", "scans")
+"""Maps whose keys are the names of stages, or of channels."""
+
+
+def test_every_field_is_in_a_table_and_every_row_is_sent(bench: Callable[..., Any]) -> None:
+    daemon = bench(ports=1)
+    daemon.tare()
+    daemon.step(load=0.5)
+    listener = daemon.listener
+    status = listener.wait("status", lambda s: s["ports"][0]["device"] and s["reference"])
+    messages = {"status": status, "map": listener.of("map")[-1]}
+    messages |= {kind: listener.of(kind)[-1] for kind in ("contacts", "scan", "event")}
+    for kind, fields in messages.items():
+        assert fields.keys() == ENVELOPE | table(f"### `{kind}`"), kind
+    contact = messages["contacts"]["contacts"][0]
+    assert contact.keys() == table("Each contact:")
+    assert messages["map"]["contacts"] == [contact]
+    assert status["description"].keys() == table("`description`:")
+    assert status["ports"][0].keys() == table("Each of `ports`:")
+    assert messages["map"]["map"].keys() == table("### Arrays")
+    assert daemon.ask("status").keys() == status.keys()
+    rows = of_status("### `status`") | of_status("Each of `ports`:")
+    for name, inside in [*status.items(), *status["ports"][0].items()]:
+        if isinstance(inside, dict) and name not in ("description", *NAMED_BY_THEMSELVES):
+            told = set(re.findall(r"`(\w+)`", rows[name]))
+            assert inside.keys() <= told, name
+
+
+def test_the_python_client_has_every_field_of_a_status() -> None:
+    def names(kind: type) -> set[str]:
+        return {field.name for field in dataclasses.fields(kind) if field.name[0] != "_"}
+
+    of_the_frame = {"sensor", "session", "sequence", "flags", "tier", "misfit"}
+    assert names(status.Status) == table("### `status`") | of_the_frame | {"fields"}
+    assert names(status.SensorDescription) == table("`description`:")
+    assert names(status.Calibration) == table("`calibration`:")
+    assert names(status.Port) == table("Each of `ports`:")
+
+
+def test_every_flag_is_explained() -> None:
+    assert table("## Flags", "Flag") == {flag.name.lower() for flag in Flag if flag.name}
+
+
+def test_every_method_is_listed_that_may_have_made_a_frame() -> None:
+    row = re.search(r"^\| `tier` \|.*?What made the frame: (.*)\|", DOCUMENT, re.M)
+    assert row
+    listed = set(re.findall(r"`(\S+)`", row[1]))
+    assert listed == {"quiet", "hybrid", *METHODS}
+
+
+def test_it_says_from_what_misfit_on_a_frame_is_flagged() -> None:
+    row = re.search(r"^\| `misfit` .*", DOCUMENT, re.M)
+    assert row
+    assert f"above {BAD_MISFIT:g} the frame" in row[0]
+    assert f"above {UNSURE_MISFIT:g} over both" in row[0]
+
+
+def test_every_event_is_listed() -> None:
+    source = "".join(p.read_text("utf-8") for p in Path(tactomo.__path__[0]).rglob("*.py"))
+    told = set(re.findall(r"\b_?on_event\(\s*\"(\w+)\"", source))
+    assert table("### `event`", "Event") == told
+
+
+@pytest.mark.parametrize(
+    "heading",
+    [
+        *("### Envelope", "### Arrays", "### `map`", "### `contacts`", "Each contact:"),
+        *("### `scan`", "### `status`", "`description`:", "`calibration`:", "Each of `ports`:"),
+        "### `event`",
+    ],
+)
+def test_every_field_has_type_unit_meaning_and_since_when(heading: str) -> None:
+    for name, row in cells_of("clients/STREAM.md", heading).items():
+        assert list(row)[1:] == ["Type", "Unit", "Since", "Meaning"]
+        assert row["Type"], name
+        assert row["Meaning"], name
+        assert row["Since"].isdecimal(), name
+        for ending, unit in UNITS.items():
+            if re.fullmatch(rf"\w+_{ending}(`, `\w+_{ending})*", name):
+                assert row["Unit"] == unit, name
+
+
+def test_every_error_of_a_command_is_listed() -> None:
+    folder = Path(tactomo.__path__[0])
+    sources = [path for path in folder.rglob("*.py") if "cli" not in path.parts]
+    raised = {name for path in sources for name in refusals(ast.parse(path.read_text("utf-8")))}
+    listed = cells_of("clients/STREAM.md", "### Errors")
+    assert listed.keys() == raised | {"malformed_message"}
+    commands = {*tactomo.stream.control.COMMANDS, *tactomo.twin.control.COMMANDS}
+    for row in listed.values():
+        assert set(re.findall(r"`(\w+)`", row["Commands"])) <= commands
+
+
+def refusals(source: ast.AST) -> Iterator[str]:
+    """Yield the names of the errors that a module refuses commands with."""
+    for call in ast.walk(source):
+        if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name):
+            continue
+        given = [keyword.value for keyword in call.keywords if keyword.arg == "name"]
+        named = [each.value for each in [*call.args[2:3], *given] if isinstance(each, ast.Constant)]
+        if call.func.id == "CommandError":
+            yield str(named[0]) if named else CommandError.name
+        elif call.func.id == "RecordingError" and named == ["cannot_write"]:
+            yield "cannot_write"
+
+
+@pytest.mark.parametrize(
+    ("heading", "commands"),
+    [
+        ("### Commands of the daemon", tactomo.stream.control.COMMANDS),
+        ("### Commands of the twin", tactomo.twin.control.COMMANDS),
+    ],
+)
+def test_every_command_is_listed(heading: str, commands: dict[str, Any]) -> None:
+    assert table(heading, "Command") == set(commands)
+    rows = cells_of("clients/STREAM.md", heading)
+    for names, row in rows.items():
+        assert row["Since"] == "1"
+        for command in re.findall(r"\w+", names):
+            assert commands[command].model_fields.keys() <= set(
+                re.findall(r"`(\w+)`", row["Arguments"])
+            ), command

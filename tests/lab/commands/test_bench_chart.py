@@ -1,0 +1,119 @@
+"""`tactomo bench --chart`: the picture and the table beside it say what was measured."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from importlib import resources
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tactomo_lab.commands import chart as bench_chart
+from tactomo_lab.commands.chart_picture import draw_chart
+from tactomo_lab.evaluation.still import Variant
+from tactomo_lab.evaluation.trade_off import Point
+from tactomo_models import available_methods
+
+Run = Callable[..., Any]
+
+
+def point(method: str, p50_s: float, icc: float, budget_s: float | None = None) -> Point:
+    variant = Variant(method, budget_s)
+    return Point("still", 40.0, variant, 4, icc, icc / 2, 1.0, 0.25, 0.0, p50_s, 2 * p50_s)
+
+
+def test_the_table_tells_what_is_on_the_front(tmp_path: Path) -> None:
+    points = [
+        point("auto", 0.05, 0.97, budget_s=0.05),
+        point("auto", 0.06, 0.96, budget_s=2.0),
+        point("noser", 0.001, 0.6),
+    ]
+    bench_chart.write_table(bench_chart.rows_of(points), "a machine", tmp_path / "chart.csv")
+    with (tmp_path / "chart.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    shown = [(r["method"], r["budget_ms"], r["p50_ms"], r["p99_ms"], r["icc"]) for r in rows]
+    assert shown == [
+        ("noser", "", "1", "2", "0.6"),
+        ("auto", "50", "50", "100", "0.97"),
+        ("auto", "2000", "60", "120", "0.96"),
+    ]
+    assert [row["on_front"] for row in rows] == ["True", "True", "False"]
+    assert {(r["simulated"], r["seeds"], r["threads"], r["machine"]) for r in rows} == {
+        ("True", "reporting", "1", "a machine")
+    }
+
+
+@pytest.mark.slow
+def test_the_picture_names_every_method_and_no_label_covers_another() -> None:
+    points = [
+        point(method, 0.001 * 3**k, 1 - 0.5**k) for k, method in enumerate(available_methods())
+    ]
+    twins = [point(method, 0.02, 0.9) for method in available_methods()]
+    budgets = [point("auto", 0.1, icc, budget_s=icc / 10) for icc in (0.1, 0.11, 0.3, 1.0)]
+    impossible = [point("noser", 0.1, icc) for icc in (-0.2, float("nan"))]
+    for panel in (points, [*twins, *budgets], [*points, *impossible]):
+        figure = draw_chart(panel, "a title")
+        (axes,) = figure.axes
+        labels = [
+            text
+            for text in axes.texts
+            if text.get_text() in (*available_methods(), "10 ms", "100 ms")
+        ]
+        assert {label.get_text() for label in labels} >= set(available_methods())
+        boxes = [label.get_window_extent() for label in labels]
+        assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+        assert all(axes.get_window_extent().containsx(box.x0) for box in boxes)
+    assert figure.get_suptitle() == "a title"
+
+
+def test_no_two_methods_look_alike() -> None:
+    figure = draw_chart([point(method, 0.02, 0.9) for method in available_methods()], "a title")
+    (axes,) = figure.axes
+    looks = {(bar[0].get_marker(), bar[0].get_color()) for bar in axes.containers}
+    assert len(looks) == len(available_methods())
+    assert (
+        len({marker for marker, _ in looks}) == len({colour for _, colour in looks}) == len(looks)
+    )
+
+
+def test_what_cannot_be_written_is_refused_before_the_work(
+    tactomo: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(bench_chart, "measure_chart")
+    (tmp_path / "taken.csv").mkdir()
+    for picture, why in (
+        ("nowhere/chart.png", "there is no folder nowhere"),
+        ("chart.txt", "not a kind of picture"),
+        ("taken.png", "cannot write taken.csv"),
+    ):
+        result = tactomo("bench", "--chart", picture)
+        assert result.returncode == 1
+        assert why in result.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["taken.csv"]
+
+
+@pytest.mark.long
+@pytest.mark.timeout(600)
+def test_the_whole_chart(tactomo: Run, tmp_path: Path) -> None:
+    """On a coarse map, so that scenes are simulated in seconds."""
+    shipped = resources.files("tactomo_models.sensor.shipped").joinpath("paper_square.toml")
+    sensor = tmp_path / "coarse.toml"
+    sensor.write_text(shipped.read_text("utf-8") + "[map]\nnodes_x = 21\nnodes_y = 21\n")
+    result = tactomo("bench", "--chart", "chart.png", "--count", 1, "--json", "-d", sensor)
+    assert result.returncode == 0, result.stderr
+    told = json.loads(result.stdout)
+    assert (told["live"], told["methods"]) == ([], [])
+    places = {(row["scene"], row["snr_db"]) for row in told["chart"]}
+    assert places == {("still", 40), ("still", 20), ("still", 10), ("moving", 40)}
+    for scene, snr_db in places:
+        rows = [r for r in told["chart"] if (r["scene"], r["snr_db"]) == (scene, snr_db)]
+        assert any(row["on_front"] for row in rows)
+        measured = {row["method"] for row in rows}
+        assert {
+            m for m in available_methods() if f"left out: {m}:" not in result.stderr
+        } == measured
+    assert (tmp_path / "chart.png").read_bytes().startswith(b"\x89PNG")
+    assert len((tmp_path / "chart.csv").read_text("utf-8").splitlines()) == 1 + len(told["chart"])

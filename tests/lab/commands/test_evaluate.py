@@ -1,0 +1,92 @@
+"""`tactomo evaluate`: what is asked for is what is evaluated, and it is told in full."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+Run = Callable[..., Any]
+FEW = ("evaluate", "scenes", "--count", 1, "--contacts", "1-2", "--method", "tikhonov")
+
+
+@pytest.mark.slow
+def test_scenes_in_numbers(tactomo: Run, tmp_path: Path) -> None:
+    picture = tmp_path / "scenes.png"
+    result = tactomo(*FEW, "--snr", "40,20", "--json", "--picture", picture)
+    assert result.returncode == 0
+    told = json.loads(result.stdout)
+    assert told["simulated"] is True
+    assert (told["seeds"], told["method"], told["snr_of"]) == ("tuning", "tikhonov", "change")
+    assert told["all"]["scenes"] == len(told["scenes"]) == 4
+    assert set(told["by"]["SNR (dB)"]) == {"20", "40"}
+    assert [one["scene"] for one in told["scenes"]] == ["tuning 1/0", "tuning 2/0"] * 2
+    assert {one["tier"] for one in told["scenes"]} == {"tikhonov"}
+    for one in told["scenes"]:
+        assert 0.3 < one["icc"] < 1
+        assert len(one["contacts"]) == int(one["scene"][7])
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_scenes_in_words(tactomo: Run) -> None:
+    result = tactomo(*FEW, "--seeds", "tuning", "--snr-of", "voltage")
+    assert result.returncode == 0
+    assert "Simulated, not measured: paper_square, tuning seeds" in result.stdout
+    assert "SNR of the voltage" in result.stdout
+    for heading in ("RIE", "contacts 2", "spread", "within one reported standard uncertainty"):
+        assert heading in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("--contacts", "4-2"), ("--contacts", "0"), ("--snr", "loud")]
+)
+def test_what_it_cannot_read_is_a_usage_error(tactomo: Run, option: str, value: str) -> None:
+    result = tactomo("evaluate", "scenes", option, value)
+    assert result.returncode == 2
+    assert f"{value!r}: give" in result.stderr
+
+
+def test_a_sensor_of_one_channel_cannot_be_evaluated_so(tactomo: Run) -> None:
+    result = tactomo("evaluate", "scenes", "--description", "tank_disc")
+    assert result.returncode == 1
+    assert "one channel" in result.stderr
+
+
+@pytest.mark.long
+def test_moving_scenes(tactomo: Run, tmp_path: Path) -> None:
+    """On a coarse map, so that a sequence is simulated in seconds."""
+    shipped = resources.files("tactomo_models.sensor.shipped").joinpath("paper_square.toml")
+    sensor = tmp_path / "coarse.toml"
+    sensor.write_text(shipped.read_text("utf-8") + "[map]\nnodes_x = 21\nnodes_y = 21\n")
+    moving = ("evaluate", "moving", "--count", 1, "--description", sensor)
+    words = tactomo(*moving, "--budget-ms", 20)
+    assert words.returncode == 0
+    assert "Simulated, not measured" in words.stdout
+    for phase in ("slide", "jump", "merge", "split", "lost scans", "tare", "all"):
+        assert f" {phase} " in words.stdout
+    numbers = json.loads(tactomo(*moving, "--method", "noser", "--json").stdout)
+    assert numbers["simulated"] is True
+    assert numbers["phases"]["all"]["frames"] == len(numbers["sequences"][0])
+
+
+@pytest.mark.long
+def test_an_hour_of_drift(tactomo: Run, tmp_path: Path) -> None:
+    picture = tmp_path / "drift.png"
+    ask = ("evaluate", "drift", "--hours", 0.75)
+    result = tactomo(*ask, "--json", "--picture", picture)
+    assert result.returncode == 0
+    told = json.loads(result.stdout)
+    assert (told["simulated"], told["seeds"], told["hours"]) == (True, "tuning", 0.75)
+    (day,) = told["days"]
+    assert day["tracked"]["ghosts_per_hour"] == day["tracked"]["erased"] == 0
+    assert day["tracked"]["presses"] == day["untracked"]["presses"] == 3
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    words = tactomo(*ask).stdout
+    assert "Simulated, not measured: paper_square, 0.75 hours after one tare." in words
+    assert "tuning 0" in words
+    assert "frames under a press that do not show it" in words
+    assert "…" not in words

@@ -1,0 +1,93 @@
+"""`tactomo evaluate tanks` and `skin`: tables, JSON, pictures, and files that are none."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from simulated_tanks import simulated_tanks
+from tactomo_models import load_description
+
+Run = Callable[..., Any]
+
+
+@pytest.fixture
+def tank(tmp_path: Path) -> Path:
+    """A smaller map, so that the model is built in a second."""
+    from importlib import resources
+
+    text = (
+        resources.files("tactomo_models.sensor.shipped").joinpath("tank_uef2017.toml").read_text()
+    )
+    path = tmp_path / "tank.toml"
+    path.write_text(text + "\n[map]\nnodes_x = 25\nnodes_y = 25\n")
+    return path
+
+
+def test_tanks_in_numbers_and_pictures(tactomo: Run, tank: Path, tmp_path: Path) -> None:
+    picture = tmp_path / "tanks.png"
+    some = simulated_tanks(load_description(tank), "tuning", 2)
+    np.savez(tmp_path / "two.npz", dv=some.changes, truth=some.truth, name=np.array(some.names))
+    asked = ("evaluate", "tanks", tmp_path / "two.npz", "--description", tank, "--scale", 1.05)
+    result = tactomo(*asked, "--method", "noser", "--json", "--picture", picture)
+    assert result.returncode == 0
+    told = json.loads(result.stdout)
+    assert (told["simulated"], told["scale"]) == (False, 1.05)
+    assert [one["name"] for one in told["tanks"]] == ["tuning 0", "tuning 1"]
+    mean = np.mean([one["correlation"] for one in told["tanks"]])
+    assert told["mean_correlation"] == {"noser": pytest.approx(mean)}
+    assert 0.4 < mean < 1
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_tanks_in_words(tactomo: Run, tank: Path, tmp_path: Path) -> None:
+    rows = np.linspace(1, -1, 32)[:, None]
+    np.savez(
+        tmp_path / "measured.npz",
+        dv=np.random.default_rng(0).normal(size=(1, 208)),
+        truth=np.sign(rows) * np.ones((1, 32, 32)),
+        name=np.array(["half"]),
+    )
+    asked = ("evaluate", "tanks", tmp_path / "measured.npz", "--description", tank, "--scale", 0.01)
+    result = tactomo(*asked)
+    assert result.returncode == 0
+    assert "measured tanks, tank_uef2017, scale 0.01" in result.stdout
+    for heading in ("half", "tikhonov", "noser", "levelset", "mean"):
+        assert heading in result.stdout
+
+
+@pytest.mark.slow
+def test_presses_in_numbers_and_words(tactomo: Run, tmp_path: Path) -> None:
+    skin = load_description("skin_round")
+    rng = np.random.default_rng(1)
+    np.savez(
+        tmp_path / "presses.npz",
+        lookup=np.hstack([skin.pairs.drive, skin.pairs.measure]),
+        dv=rng.normal(size=(40, 192)),
+        pos_m=rng.uniform(-0.03, 0.03, size=(40, 3)),
+    )
+    result = tactomo("evaluate", "skin", tmp_path / "presses.npz", "--json")
+    assert result.returncode == 0
+    told = json.loads(result.stdout)
+    assert told["presses"] == 40
+    noise = told["methods"]["NOSER image"]  # of which nothing can be located
+    assert noise["median_mm"] > 0.7 * told["methods"]["mean position (no measurement)"]["median_mm"]
+    assert noise["most_mm"] > noise["median_mm"]
+    result = tactomo("evaluate", "skin", tmp_path / "presses.npz")
+    assert "40 measured presses" in result.stdout
+    assert "ridge regression" in result.stdout
+
+
+@pytest.mark.parametrize("command", ["tanks", "skin"])
+def test_a_file_that_is_none(tactomo: Run, tmp_path: Path, command: str) -> None:
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    result = tactomo("evaluate", command, tmp_path / "other.npz")
+    assert result.returncode == 1
+    assert "is no set of" in result.stderr
+    result = tactomo("evaluate", command, tmp_path / "absent.npz")
+    assert result.returncode == 1
+    assert "cannot read" in result.stderr

@@ -1,0 +1,87 @@
+"""`tactomo evaluate paper`: the figures asked for, in numbers, words and pictures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from small_sensor import SMALL
+
+Run = Callable[..., Any]
+
+
+@pytest.fixture
+def few(tmp_path: Path) -> tuple[object, ...]:
+    sensor = tmp_path / "small.toml"
+    sensor.write_text(SMALL)
+    return ("evaluate", "paper", "--description", sensor, "--count", 1, "--sheets", 1)
+
+
+@pytest.mark.slow
+def test_in_numbers_and_pictures(tactomo: Run, few: tuple[object, ...], tmp_path: Path) -> None:
+    folder = tmp_path / "figures"
+    ways = ("--method", "noser", "--method", "tikhonov", "--json", "--picture", folder)
+    result = tactomo(*few, "--figure", "5,9", *ways)
+    assert result.returncode == 0
+    assert {file.name for file in folder.iterdir()} == {"figure_5.png", "figure_9.png"}
+    assert all(file.read_bytes().startswith(b"\x89PNG") for file in folder.iterdir())
+    told = json.loads(result.stdout)
+    assert told["simulated"] is True
+    assert set(told["figures"]) == {"5", "9"}
+    cells = told["figures"]["5"]
+    assert len(cells) == 4 * 4 * 2
+    assert {cell["snr_db"] for cell in cells} == {None, 40, 20, 10}
+    assert len(told["figures"]["9"]["estimates"]) == 16 * 2
+    assert told["figures"]["9"]["paper_hardware"]["cnn-multimodal"]["error"] == 0.21
+
+
+@pytest.mark.long
+def test_every_figure(tactomo: Run, few: tuple[object, ...], tmp_path: Path) -> None:
+    result = tactomo(*few, "--method", "tikhonov", "--json", "--picture", tmp_path / "figures")
+    assert result.returncode == 0
+    pictures = {f"figure_{number}.png" for number in (5, 7, 8, 9, 10, 11, 12)}
+    assert {file.name for file in (tmp_path / "figures").iterdir()} == pictures
+    figures = json.loads(result.stdout)["figures"]
+    assert set(figures) == {"5", "7", "9", "10", "11", "12"}
+    assert len(figures["10"]["places"]) == 25
+
+
+def test_in_words(tactomo: Run, few: tuple[object, ...]) -> None:
+    result = tactomo(*few, "--figure", "9,12", "--method", "tikhonov")
+    assert result.returncode == 0
+    assert "Ours are simulated, not measured: small, tuning seeds" in result.stdout
+    for words in ("76% (at 200 kPa)", "paper, hardware", "ours, simulated", "10*"):
+        assert words in result.stdout
+    assert "Fig. 10" not in result.stdout
+
+
+def test_a_method_that_cannot_be_had_is_said_and_left_out(
+    tactomo: Run, few: tuple[object, ...]
+) -> None:
+    asked = (*few, "--figure", "7", "--method")
+    result = tactomo(*asked, "network", "--method", "tikhonov")
+    assert result.returncode == 0
+    assert "network is left out" in result.stdout
+    assert "Fig. 7" in result.stdout
+    result = tactomo(*asked, "network")
+    assert result.returncode == 1
+    assert "choose others with --method" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("--figure", "6"), ("--figure", "all"), ("--method", "magic")]
+)
+def test_what_it_does_not_know_is_a_usage_error(tactomo: Run, option: str, value: str) -> None:
+    result = tactomo("evaluate", "paper", option, value)
+    assert result.returncode == 2
+    assert repr(value) in result.stderr
+
+
+def test_no_folder_to_draw_into(tactomo: Run, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    result = tactomo("evaluate", "paper", "--figure", "7", "--picture", tmp_path / "file" / "x")
+    assert result.returncode == 1
+    assert "cannot make the folder" in result.stderr

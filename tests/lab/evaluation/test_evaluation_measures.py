@@ -1,0 +1,145 @@
+"""Measures against cases whose answer is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tactomo_lab.scenes.measures import (
+    MATCH_M,
+    SceneScore,
+    correlation,
+    full_range,
+    match,
+    relative_error,
+    score_contact,
+    summaries,
+    summarise,
+)
+from tactomo_lab.scenes.simulation import TrueContact
+from tactomo_models import Contact, SensorDescription
+
+TRUE = TrueContact(0.01, -0.02, 400e-6, 180.0, 0.15, "ellipse")
+FOUND = Contact(7, 0.01, -0.02, 400e-6, 0.15, 0.01, 180.0)
+
+
+def test_a_perfect_image_and_none() -> None:
+    truth = np.random.default_rng(0).random((5, 7))
+    assert correlation(2 * truth + 1, truth) == pytest.approx(1)
+    assert correlation(-truth, truth) == pytest.approx(-1)
+    assert relative_error(truth, truth) == 0
+    for nothing in (None, np.zeros_like(truth)):
+        assert correlation(nothing, truth) == 0
+        assert relative_error(nothing, truth) == 1
+
+
+@given(order=st.permutations(range(5)), known=st.integers(0, 5))
+def test_contacts_are_matched_whatever_their_order(order: list[int], known: int) -> None:
+    true = [replace(TRUE, x_m=0.025 * k) for k in range(5)]
+    found = [replace(FOUND, x_m=0.025 * k + 0.4 * MATCH_M) for k in order[:known]]
+    assert sorted(match(found, true)) == sorted(enumerate(order[:known]))
+
+
+def test_too_far_is_no_match_and_spoils_no_other() -> None:
+    far = replace(FOUND, x_m=TRUE.x_m + 1.1 * MATCH_M)
+    assert match([far], [TRUE]) == []
+    near = replace(FOUND, x_m=TRUE.x_m + 0.9 * MATCH_M)
+    assert match([far, near], [TRUE]) == [(1, 0)]
+
+
+def test_a_false_contact_far_away_does_not_push_the_others() -> None:
+    """Least total distance alone would give the near one to the wrong contact."""
+    true = [TRUE, replace(TRUE, x_m=TRUE.x_m + 0.011)]
+    near, false = (replace(FOUND, x_m=TRUE.x_m + x) for x in (0.010, 0.100))
+    assert match([near, false], true) == [(0, 1)]
+
+
+def test_a_contact_is_scored_in_the_units_it_says(paper: SensorDescription) -> None:
+    assert full_range(paper) == 0.25
+    off = replace(
+        FOUND, x_m=0.013, y_m=-0.016, magnitude=0.1, area_m2=500e-6, pressure_kpa=float("nan")
+    )
+    one = score_contact(paper, TRUE, off)
+    assert one.centre_error_mm == pytest.approx(5)
+    assert one.area_error == pytest.approx(0.25)
+    assert one.magnitude_error == pytest.approx(-0.2)
+    assert one.magnitude_sigma == pytest.approx(0.04)
+    assert np.isnan(one.pressure_error_kpa)
+    assert not one.missed
+    assert score_contact(paper, TRUE, None).missed
+
+
+def scene(paper: SensorDescription, *found: Contact | None, **other: object) -> SceneScore:
+    one = SceneScore(
+        scene="tuning 1/0",
+        contacts=tuple(score_contact(paper, TRUE, contact) for contact in found),
+        found=sum(contact is not None for contact in found),
+        matched=sum(contact is not None for contact in found),
+        rie=0.2,
+        icc=0.9,
+        icc_structure=0.95,
+        flags=(),
+        distrusted=False,
+        tier="levelset",
+        misfit=1.0,
+        seconds=0.1,
+        shape="ellipse",
+        contrast=30.0,
+        opposite=False,
+        snr_db=40.0,
+    )
+    return replace(one, **other)  # type: ignore[arg-type]
+
+
+def test_what_is_wrong_and_does_not_say_so(paper: SensorDescription) -> None:
+    assert not scene(paper, FOUND).confidently_wrong
+    wrong = [scene(paper, FOUND, icc=0.7), scene(paper, FOUND, None), scene(paper, FOUND, found=2)]
+    assert all(one.confidently_wrong for one in wrong)
+    assert not any(replace(one, distrusted=True).confidently_wrong for one in wrong)
+
+
+def test_a_summary_by_hand(paper: SensorDescription) -> None:
+    errors = (-0.02, 0.0, 0.03)  # of magnitude, with a standard uncertainty of 0.01
+    found = [replace(FOUND, magnitude=0.15 + error) for error in errors]
+    all_of = summarise(
+        [
+            scene(paper, *found[:2], seconds=0.1),
+            scene(paper, found[2], None, icc=0.5, seconds=0.3),
+            scene(paper, FOUND, found=3, distrusted=True, seconds=0.2),
+        ]
+    )
+    assert all_of.scenes == 3
+    assert all_of.icc == pytest.approx((0.9 + 0.5 + 0.9) / 3)
+    assert all_of.count_right == pytest.approx(1 / 3)
+    assert all_of.missed == pytest.approx(1 / 5)
+    assert all_of.false == pytest.approx(2 / 3)
+    assert all_of.centre_mm == 0
+    assert all_of.magnitude_error == pytest.approx((0.08 + 0 + 0.12 + 0) / 4)
+    assert all_of.magnitude_spread == pytest.approx(0.2)
+    assert all_of.within_sigma == pytest.approx(2 / 4)
+    assert all_of.distrusted == pytest.approx(1 / 3)
+    assert all_of.confidently_wrong == pytest.approx(1 / 3)
+    assert all_of.seconds == 0.2
+
+
+def test_what_was_never_measured_is_nan(paper: SensorDescription) -> None:
+    nothing = summarise([scene(paper, None)])
+    assert nothing.missed == 1
+    assert np.isnan([nothing.centre_mm, nothing.magnitude_error, nothing.within_sigma]).all()
+    unknown = replace(FOUND, magnitude=float("nan"), magnitude_sigma=float("nan"))
+    assert np.isnan(summarise([scene(paper, unknown)]).within_sigma)
+
+
+def test_groups(paper: SensorDescription) -> None:
+    scores = [
+        scene(paper, *[FOUND] * contacts, contrast=contrast, snr_db=snr_db)
+        for contacts, contrast, snr_db in ((2, 10.0, 40.0), (1, 99.0, 6.0), (10, 22.5, 40.0))
+    ]
+    grouped = summaries(scores)
+    assert list(grouped["contacts"]) == ["1", "2", "10"]
+    assert list(grouped["contrast"]) == ["10-22", "22-46", "46-100"]
+    assert grouped["SNR (dB)"]["40"].scenes == 2
+    assert all(sum(s.scenes for s in rows.values()) == 3 for rows in grouped.values())

@@ -1,0 +1,233 @@
+"""Moving scenes: what the choreography asks for, and how a frame of it is scored."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations, pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tactomo_lab.evaluation.moving import (
+    INDENTERS,
+    FrameScore,
+    Sequence,
+    Step,
+    choreography,
+    draw_sequence,
+    play,
+    summarise_phases,
+)
+from tactomo_lab.evaluation.still import Variant
+from tactomo_lab.evaluation.trade_off import measure_moving
+from tactomo_lab.scenes.still_scenes import (
+    BOTH_CHANNELS,
+    GAP_M,
+    SimulatedVolts,
+    gap_m,
+    outline_of,
+)
+from tactomo_models import Artifact, Press, SensorDescription, SkinSimulator
+from tactomo_models.scene.tracking import MAX_MISSED
+from tactomo_protocol import Channel
+
+PLACES_MM = {"A": (-38, -38), "B": (35, 10)}
+
+
+@settings(max_examples=5)
+@given(radius_m=st.floats(0.008, 0.012))
+def test_contacts_stay_on_the_sheet_and_apart_unless_they_merge(
+    paper: SensorDescription, radius_m: float
+) -> None:
+    steps = choreography(dict.fromkeys(INDENTERS, Press(0, 0, 180.0, radius_m)), 1e-3)
+    for step in steps:
+        for press in step.presses.values():
+            x, y = outline_of(press)
+            assert paper.on_sheet(x, y, paper.sheet.frame_width_m).all()
+        if step.phase not in ("merge", "split"):
+            gaps = [gap_m(a, b) for a, b in combinations(step.presses.values(), 2)]
+            assert all(gap >= GAP_M for gap in gaps)
+    merged = [step for step in steps if step.phase == "merge"][-1]
+    assert gap_m(*merged.presses.values()) == 0
+
+
+def test_what_happens_in_it() -> None:
+    steps = choreography(dict.fromkeys(INDENTERS, Press(0, 0, 180.0, 0.01)), 1e-3)
+    assert sum(step.tare for step in steps) == 1
+    assert {step.lost for step in steps} == {
+        (),
+        ("structure",),
+        ("magnitude",),
+        ("magnitude", "structure"),
+    }
+    for before, now in pairwise(steps):
+        for name in before.presses.keys() & now.presses.keys():
+            (x, y), (u, v) = ((s.presses[name].x_m, s.presses[name].y_m) for s in (before, now))
+            assert np.hypot(u - x, v - y) < 0.006  # 120 mm/s at 20 frames a second
+
+
+def press(name: str, x_mm: float | None = None, kpa: float = 180.0) -> Press:
+    x, y = PLACES_MM[name]
+    return Press((x if x_mm is None else x_mm) * 1e-3, y * 1e-3, kpa)
+
+
+def sequence(paper: SensorDescription, simulator: SkinSimulator, *steps: Step) -> Sequence:
+    """A moving scene of these steps, on a sheet that is cheap to solve."""
+    scans = [simulator.voltages(list(step.presses.values())) for step in steps]
+    rest = simulator.voltages([])
+    return Sequence(
+        name="by hand",
+        description=paper,
+        true_description=paper,
+        steps=steps,
+        volts=SimulatedVolts(
+            rest, {name: np.array([scan[name] for scan in scans]) for name in BOTH_CHANNELS}
+        ),
+        snr_db=40.0,
+        noise={Channel.MAGNITUDE: 2e-6, Channel.STRUCTURE: 2e-5},
+        seed=np.random.SeedSequence(0),
+    )
+
+
+@pytest.fixture(autouse=True)
+def _built(artifact: Artifact, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tactomo_lab.evaluation.moving.load_or_build_artifact", lambda _: artifact)
+
+
+def test_frames_are_scored_one_by_one(paper: SensorDescription, simulator: SkinSimulator) -> None:
+    one = {"A": press("A")}
+    steps = [
+        Step("rest", {}),
+        Step("land", {"A": press("A", kpa=100.0)}),
+        *[Step("hold", one)] * 3,
+        Step("lost", one, (Channel.STRUCTURE,)),
+        Step("lost", one, (Channel.MAGNITUDE, Channel.STRUCTURE)),
+        Step("tare", {}, tare=True),
+        Step("again", one),
+    ]
+    rest, land, *hold, half, none, tare, again = play(sequence(paper, simulator, *steps))
+    for empty in (rest, tare):
+        assert (empty.contacts, empty.found, empty.miscounted) == (0, 0, False)
+        assert np.isnan([empty.icc, empty.icc_structure]).all()
+    assert np.isnan(land.icc)  # too light for the magnitude channel
+    for score in (*hold, again):
+        assert score.icc > 0.85
+        assert score.icc_structure > 0.85
+        assert (score.contacts, score.found, score.switches) == (1, 1, 0)
+        assert not score.confidently_wrong
+    assert np.isnan(half.icc_structure)
+    for lost in (half, none):
+        assert lost.distrusted
+        assert not lost.countable
+        assert not lost.confidently_wrong
+    assert [score.phase for score in hold] == ["hold"] * 3
+
+
+def test_contacts_that_touch_are_one_and_near_ones_are_not_counted(
+    paper: SensorDescription, simulator: SkinSimulator
+) -> None:
+    def beside(gap_mm: float) -> Step:
+        other = replace(press("B"), x_m=press("B").x_m - 0.03 - gap_mm * 1e-3)
+        return Step("near", {"A": press("B"), "B": other})
+
+    touching, near, apart = play(
+        sequence(paper, simulator, beside(-5), beside(4), beside(20)), "tikhonov"
+    )
+    assert (touching.contacts, touching.countable) == (1, True)
+    assert (near.contacts, near.countable) == (2, False)
+    assert (apart.contacts, apart.countable) == (2, True)
+
+
+def test_identities_that_are_lost(paper: SensorDescription, simulator: SkinSimulator) -> None:
+    """Scans of nothing for longer than a contact is remembered: it gets a new identity."""
+    held, gap = Step("hold", {"A": press("A")}), MAX_MISSED + 1
+    scene = sequence(paper, simulator, held, *[held] * gap, held)
+    blink = (
+        scene.volts.pressed[Channel.STRUCTURE].copy(),
+        scene.volts.pressed[Channel.MAGNITUDE].copy(),
+    )
+    for scans, name in zip(blink, ("structure", "magnitude"), strict=True):
+        scans[1:-1] = scene.volts.rest[name]  # type: ignore[index]
+    blinking = replace(
+        scene,
+        volts=replace(
+            scene.volts, pressed={Channel.STRUCTURE: blink[0], Channel.MAGNITUDE: blink[1]}
+        ),
+    )
+    none = [0] * (gap + 1)
+    assert [score.switches for score in play(scene)] == [*none, 0]
+    assert [score.switches for score in play(blinking)] == [*none, 1]
+    lifted = replace(blinking, steps=(held, *[Step("hold", {})] * gap, held))
+    assert [score.switches for score in play(lifted)] == [*none, 0]  # a new one, and told so
+
+
+def test_a_tare_forgets_who_was_who(paper: SensorDescription, simulator: SkinSimulator) -> None:
+    held = Step("hold", {"A": press("A")})
+    scores = play(sequence(paper, simulator, held, held, replace(held, tare=True)))
+    assert [score.switches for score in scores] == [0, 0, 1]
+
+
+def frame(phase: str, icc: float, found: int = 1, distrusted: bool = False) -> FrameScore:
+    return FrameScore(phase, icc, icc, 1, found, True, 0, distrusted, 0.01)
+
+
+def test_phases_by_hand() -> None:
+    bad, good, blank = frame("a", 0.5), frame("a", 0.9), replace(frame("a", 0.9), icc=np.nan)
+    blank = replace(blank, icc_structure=np.nan)
+    first = [bad, bad, blank, bad, good, bad, frame("b", 0.95, found=2)]
+    second = [good, frame("a", 0.5, distrusted=True), good, frame("b", 0.95)]
+    phases = summarise_phases([first, second])
+    assert list(phases) == ["a", "b", "all"]
+    a, b = phases["a"], phases["b"]
+    assert (a.frames, b.frames, phases["all"].frames) == (9, 2, 11)
+    assert (a.recovery, a.recovery_most) == (2, 3)
+    assert (b.recovery, b.count_right, a.count_right) == (0, 0.5, 1)
+    assert a.confidently_wrong == pytest.approx(4 / 9)
+    assert b.confidently_wrong == pytest.approx(1 / 2)
+    assert a.distrusted == pytest.approx(1 / 9)
+    assert a.icc == pytest.approx((5 * 0.5 + 3 * 0.9) / 8)
+
+
+@pytest.mark.long
+def test_a_sequence_is_drawn_once_and_kept(small: SensorDescription, tmp_path: Path) -> None:
+    first, again = (draw_sequence(small, "tuning", 0, cache=tmp_path) for _ in range(2))
+    assert len(list(tmp_path.iterdir())) == 1
+    assert first.steps == again.steps
+    np.testing.assert_array_equal(
+        first.volts.pressed[Channel.STRUCTURE], again.volts.pressed[Channel.STRUCTURE]
+    )
+    assert len(first.volts.pressed[Channel.MAGNITUDE]) == len(first.steps)
+    loaded = [bool(step.presses) for step in first.steps]
+    change = first.volts.pressed[Channel.STRUCTURE] - first.volts.rest[Channel.STRUCTURE]
+    assert first.noise[Channel.STRUCTURE] == pytest.approx(
+        0.01 * np.sqrt(np.mean(change[loaded] ** 2))
+    )
+    quiet = np.abs(change).max(axis=1) == 0
+    np.testing.assert_array_equal(quiet, ~np.array(loaded))
+
+
+def test_speed_and_accuracy_are_of_all_frames(
+    paper: SensorDescription,
+    simulator: SkinSimulator,
+    artifact: Artifact,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("tactomo_lab.evaluation.moving.load_or_build_artifact", lambda _: artifact)
+    scene = sequence(paper, simulator, Step("rest", {}), *[Step("still", {"A": press("A")})] * 2)
+    done: list[None] = []
+    points = list(
+        measure_moving(
+            [scene],
+            [Variant("noser"), Variant("fit", 0.05)],
+            lambda: done.append(None),
+        )
+    )
+    assert [(p.scene, p.snr_db, str(p.variant), p.frames) for p in points] == [
+        ("moving", 40.0, "noser", 3),
+        ("moving", 40.0, "fit, 50 ms", 3),
+    ]
+    assert len(done) == 6
+    assert points[0].icc < points[1].icc < 1
+    assert 0 < points[0].p50_s <= points[0].p99_s

@@ -1,0 +1,242 @@
+"""Scenes to evaluate on: what is drawn, what is simulated, and what its truth is."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tactomo_lab.scenes.simulation import (
+    UnevenSkin,
+    fine_mesh,
+    truth_of,
+    with_contrast,
+    with_opposite_magnitude,
+)
+from tactomo_lab.scenes.still_scenes import (
+    BOTH_CHANNELS,
+    GAP_M,
+    PRESSURE_KPA,
+    SHAPES,
+    EvaluationScene,
+    SnrOf,
+    draw_layout,
+    gap_m,
+    outline_of,
+    scenes,
+)
+from tactomo_models import DataError, Press, SensorDescription, load_description
+from tactomo_models.physics.bare_sheet import transfer_resistances
+from tactomo_models.physics.mesh import SheetMesh, mesh_sheet
+from tactomo_protocol import Channel
+from variants import variant
+
+presses = st.builds(
+    Press,
+    x_m=st.floats(-0.05, 0.05),
+    y_m=st.floats(-0.05, 0.05),
+    pressure_kpa=st.just(180.0),
+    radius_m=st.floats(0.007, 0.02),
+    radius_y_m=st.floats(0.007, 0.02),
+    angle_rad=st.floats(0, np.pi),
+    shape=st.sampled_from(SHAPES),
+)
+
+
+@pytest.fixture(scope="module")
+def mesh(paper: SensorDescription) -> SheetMesh:
+    return fine_mesh(paper)
+
+
+@settings(max_examples=30)
+@given(contacts=st.integers(1, 6), number=st.integers(0, 10**6))
+def test_a_layout_keeps_its_promises(paper: SensorDescription, contacts: int, number: int) -> None:
+    layout = draw_layout(paper, "tuning", contacts, number)
+    assert len(layout.presses) == contacts
+    assert 10 <= layout.contrast <= 100
+    for press in layout.presses:
+        x, y = outline_of(press)
+        assert paper.on_sheet(x, y, paper.sheet.frame_width_m).all()
+        assert PRESSURE_KPA[0] <= press.pressure_kpa <= PRESSURE_KPA[1]
+        assert press.shape == layout.shape or layout.shape == "mixed"
+    assert all(gap_m(a, b) >= GAP_M for a, b in combinations(layout.presses, 2))
+
+
+def test_layouts_are_all_that_was_asked_for(paper: SensorDescription) -> None:
+    drawn = [draw_layout(paper, "tuning", contacts, n) for contacts in (1, 3) for n in range(60)]
+    assert {layout.shape for layout in drawn} == {*SHAPES, "mixed"}
+    assert {layout.opposite for layout in drawn} == {True, False}
+    contrasts = [layout.contrast for layout in drawn]
+    assert min(contrasts) < 15
+    assert max(contrasts) > 70
+    reach = max(np.abs(outline_of(press)).max() for layout in drawn for press in layout.presses)
+    assert reach > 0.066  # of a sensing area that ends at 0.069
+
+
+def test_no_scene_is_in_both_seed_sets(paper: SensorDescription) -> None:
+    of = {
+        seed_set: {draw_layout(paper, seed_set, contacts, n).presses[0].x_m for n in range(50)}
+        for contacts in (1, 2)
+        for seed_set in ("tuning", "reporting")
+    }
+    assert of["tuning"].isdisjoint(of["reporting"])
+    assert draw_layout(paper, "tuning", 2, 3) == draw_layout(paper, "tuning", 2, 3)
+
+
+@given(press=presses)
+def test_an_outline_is_where_coverage_ends(press: Press) -> None:
+    """A hair inside its outline an indenter covers, a hair outside it does not."""
+    outline = outline_of(press)
+    centre = np.array([[press.x_m], [press.y_m]])
+    for scale, covered in ((0.98, 1.0), (1.02, 0.0)):
+        x, y = centre + scale * (outline - centre)
+        np.testing.assert_array_equal(press.coverage(x, y, 1e-9), covered)
+
+
+def test_the_gap_of_indenters() -> None:
+    left = Press(-0.02, 0.0, 180.0, 0.01)
+    assert gap_m(left, Press(0.02, 0.0, 180.0, 0.01)) == pytest.approx(0.02, rel=1e-3)
+    assert gap_m(left, Press(-0.015, 0.0, 180.0, 0.01)) == 0
+    around = Press(-0.02, 0.0, 180.0, 0.04, shape="ring")
+    assert gap_m(left, around) == gap_m(around, left) == 0
+
+
+@given(press=presses)
+def test_the_truth_has_the_area_the_place_and_the_magnitude(
+    paper: SensorDescription, press: Press
+) -> None:
+    truth = truth_of(paper, [press])
+    (contact,) = truth.contacts
+    a, b = press.radius_m, press.radius_y_m or 0
+    area = {"ellipse": np.pi, "rectangle": 4.0, "ring": 0.75 * np.pi}[press.shape] * a * b
+    assert contact.area_m2 == pytest.approx(area, rel=0.02)
+    assert truth.pressed.sum() * 9e-6 == pytest.approx(area, rel=0.02)
+    x, y = np.meshgrid(paper.map_x_m, paper.map_y_m)
+    centre = [float((truth.pressed * axis).sum() / truth.pressed.sum()) for axis in (x, y)]
+    np.testing.assert_allclose(centre, [press.x_m, press.y_m], atol=2e-4)
+    assert contact.magnitude == pytest.approx(0.03 + 0.22 * 40 / 60)  # of the table, at 180 kPa
+    np.testing.assert_allclose(truth.map, contact.magnitude * truth.pressed)
+
+
+def test_a_light_press_is_pressed_in_part_and_has_no_magnitude(paper: SensorDescription) -> None:
+    light, firm = (truth_of(paper, [Press(0, 0, kpa, 0.012)]) for kpa in (5.0, 150.0))
+    np.testing.assert_allclose(light.pressed, firm.pressed * np.log(2) / np.log(100))
+    assert not light.map.any()
+    assert firm.map.max() == pytest.approx(0.03 + 0.22 / 6)
+
+
+def test_variants_of_a_sensor(paper: SensorDescription, small: SensorDescription) -> None:
+    assert paper.magnitude
+    assert small.structure
+    turned = with_opposite_magnitude(paper)
+    assert turned.magnitude
+    assert turned.magnitude.response.sign == -paper.magnitude.response.sign
+    assert turned.sha256 == paper.sha256  # the same artifact serves
+    for sensor in (paper, small):
+        channel = with_contrast(sensor, 20.0).structure
+        assert channel
+        assert channel.saturated_ratio == pytest.approx(20)
+    insulating = variant(small, structure={"conductivity_ratio": 0.01})
+    assert (channel := with_contrast(insulating, 20.0).structure)
+    assert channel.saturated_ratio == pytest.approx(1 / 20)
+
+
+def test_transfer_resistances_of_an_uneven_sheet(small: SensorDescription) -> None:
+    """Symmetric, and inversely proportional to conductivity and impedance together."""
+    sheet = mesh_sheet(small, refinements=1)
+    rng = np.random.default_rng(0)
+    uneven = np.exp(rng.standard_normal(sheet.mesh.t.shape[1]))
+    impedance = np.exp(rng.standard_normal(small.electrode_count))
+    transfer = transfer_resistances(small, sheet, uneven, impedance)
+    np.testing.assert_allclose(transfer, transfer.T, rtol=1e-8)
+    halved = transfer_resistances(small, sheet, 2 * uneven, impedance / 2)
+    np.testing.assert_allclose(halved, transfer / 2, rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_the_simulation_converges(paper: SensorDescription) -> None:
+    """Voltage changes are right to about a percent: a mesh with other nodes says the same."""
+    press = Press(0.021, -0.034, 180.0, 0.012, 0.009, 0.4)
+    sensor = with_contrast(paper, 50.0)
+    changes = []
+    for spacing_m in (0.00174, 0.00131):
+        seed = np.random.SeedSequence(5)
+        skin = UnevenSkin(sensor, mesh_sheet(sensor, spacing_m), seed)
+        rest, pressed = skin.voltages([]), skin.voltages([press])
+        changes.append([pressed[name] - rest[name] for name in BOTH_CHANNELS])
+    for coarse, fine, limit in zip(*changes, (0.003, 0.015), strict=True):
+        assert 1e-6 < np.linalg.norm(coarse - fine) / np.linalg.norm(fine) < limit
+
+
+def test_every_sheet_is_uneven_in_its_own_way(paper: SensorDescription, mesh: SheetMesh) -> None:
+    first, again, other = (
+        UnevenSkin(paper, mesh, np.random.SeedSequence(seed)).voltages([]) for seed in (5, 5, 6)
+    )
+    np.testing.assert_array_equal(first[Channel.STRUCTURE], again[Channel.STRUCTURE])
+    for sheet in (first[Channel.MAGNITUDE], other[Channel.STRUCTURE]):
+        assert 0.01 < np.std(sheet / first[Channel.STRUCTURE]) < 0.2
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("scenes")
+
+
+def one(
+    paper: SensorDescription, folder: Path, snr_db: float = 40, snr_of: SnrOf = "change"
+) -> EvaluationScene:
+    (scene,) = scenes(paper, "tuning", 1, contacts=(2,), snr_db=snr_db, snr_of=snr_of, cache=folder)
+    return scene
+
+
+@pytest.mark.parametrize("snr_of", ["change", "voltage"])
+def test_noise_is_what_the_ratio_says(
+    paper: SensorDescription, folder: Path, snr_of: SnrOf
+) -> None:
+    """Of one size in volts on every voltage, in scan and reference."""
+    clean, noisy = one(paper, folder, np.inf), one(paper, folder, 20, snr_of)
+    for name in BOTH_CHANNELS:
+        rest, pressed = getattr(clean.reference, name), getattr(clean, name)
+        signal = rest if snr_of == "voltage" else pressed - rest
+        expected = 0.1 * np.sqrt(np.mean(signal**2))
+        noise = getattr(noisy, name) - pressed
+        assert np.std(noise) == pytest.approx(expected, rel=0.2)
+        small = np.abs(rest) < np.median(np.abs(rest))
+        assert np.std(noise[small]) == pytest.approx(np.std(noise[~small]), rel=0.3)
+        averaged = getattr(noisy.reference, name) - rest
+        assert np.std(averaged) == pytest.approx(expected / np.sqrt(20), rel=0.2)
+        known = np.mean(getattr(noisy.reference, f"{name}_noise"))
+        assert known == pytest.approx(expected, rel=0.1)
+
+
+def test_the_same_scene_comes_out_of_the_cache(
+    paper: SensorDescription, folder: Path, tmp_path: Path
+) -> None:
+    first = one(paper, folder)
+    written = {file: file.stat().st_mtime_ns for file in folder.iterdir()}
+    assert written
+    again = one(paper, folder)
+    assert {file: file.stat().st_mtime_ns for file in folder.iterdir()} == written
+    for file in folder.iterdir():  # a disc that damages it costs time only
+        (tmp_path / file.name).write_bytes(file.read_bytes()[:100])
+    mended = one(paper, tmp_path)
+    for scene in (again, mended):
+        np.testing.assert_array_equal(scene.structure, first.structure)
+
+
+def test_what_the_cache_cannot_keep_is_simulated(paper: SensorDescription, folder: Path) -> None:
+    uncached = one(paper, Path("/proc/nowhere"))
+    np.testing.assert_array_equal(uncached.magnitude, one(paper, folder).magnitude)
+
+
+def test_a_sensor_of_one_channel_has_no_scenes() -> None:
+    with pytest.raises(DataError, match="one channel"):
+        next(scenes(load_description("tank_disc"), "tuning", 1))
+
+
+def test_more_contacts_than_there_is_room_for(small: SensorDescription) -> None:
+    with pytest.raises(DataError, match="no room for 9"):
+        draw_layout(small, "tuning", 9, 0)

@@ -1,0 +1,302 @@
+"""Regimes where methods fail: each breaks what it says, and what is flagged is counted right."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tactomo_lab.evaluation.regimes import REGIMES, Plan, draw_plan
+from tactomo_lab.evaluation.stability import (
+    Case,
+    CaseScore,
+    Outcome,
+    Trust,
+    evaluate_regimes,
+    make_case,
+    reconstruct_case,
+    trust,
+    trust_by_regime,
+)
+from tactomo_lab.scenes.simulation import (
+    SheetState,
+    UnevenSkin,
+    displaced,
+    fine_mesh,
+    with_opposite_magnitude,
+)
+from tactomo_lab.scenes.still_scenes import BOTH_CHANNELS, gap_m, outline_of
+from tactomo_models import Artifact, DataError, Reconstructor, SensorDescription, build_artifact
+from tactomo_models.arrays import FloatArray
+from tactomo_models.physics import tikhonov as linear
+from tactomo_models.physics.bare_sheet import exchanged
+from tactomo_protocol import Channel
+from variants import variant
+
+CASES = range(8)
+
+
+def plans(description: SensorDescription, regime: str) -> list[Plan]:
+    return [draw_plan(description, regime, "tuning", number) for number in CASES]
+
+
+@pytest.mark.parametrize("regime", REGIMES)
+def test_cases_are_the_same_every_time_and_fit_on_the_sheet(
+    paper: SensorDescription, small: SensorDescription, regime: str
+) -> None:
+    for sensor in (paper, small):
+        drawn = plans(sensor, regime)
+        assert drawn == plans(sensor, regime)
+        assert len({repr(plan) for plan in drawn}) == len(drawn)
+        assert repr(draw_plan(sensor, regime, "reporting", 0)) != repr(drawn[0])
+        for press in {press for plan in drawn for frame in plan.frames for press in frame}:
+            x, y = outline_of(press)
+            assert sensor.on_sheet(x, y, sensor.sheet.frame_width_m).all()
+
+
+def test_regimes_are_what_they_are_called(paper: SensorDescription) -> None:
+    near = {number: plan.frames[0] for number, plan in enumerate(plans(paper, "near-touch"))}
+    gaps = [1e3 * gap_m(*presses) for presses in near.values()]
+    assert 1 <= min(gaps) < 2
+    assert 5 <= max(gaps) < 6.1
+    assert {len(plan.frames[0]) for plan in plans(paper, "many")} == {5, 6, 7, 8}
+    for plan in plans(paper, "many"):
+        assert all(gap_m(a, b) > 0.005 for a, b in combinations(plan.frames[0], 2))
+    for plan in plans(paper, "edges"):
+        for press in plan.frames[0]:
+            assert 0.0669 < np.abs(outline_of(press)).max() < 0.0691
+    assert all(np.hypot(*centre(plan)) < 0.015 for plan in plans(paper, "weak-centre"))
+    light = [press.pressure_kpa for plan in plans(paper, "light") for press in plan.frames[0]]
+    assert 5 <= min(light) < max(light) <= 90
+    for plan in plans(paper, "jump"):
+        before, after = set(plan.frames[-2]), set(plan.frames[-1])
+        assert len(before - after) == len(after - before) == 1
+    for regime in ("one-scan-apart", "lost-scans"):
+        for plan in plans(paper, regime):
+            (a,), (b,) = plan.frames[-2:]
+            assert 3 <= 1e3 * np.hypot(b.x_m - a.x_m, b.y_m - a.y_m) <= 10
+
+
+def centre(plan: Plan) -> tuple[float, float]:
+    first = plan.frames[0][0]
+    return first.x_m, first.y_m
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cases")
+
+
+def case_of(small: SensorDescription, folder: Path, regime: str, number: int = 0) -> Case:
+    return make_case(small, regime, "tuning", number, folder)
+
+
+def test_a_case_is_measured_as_planned(small: SensorDescription, folder: Path) -> None:
+    lost = case_of(small, folder, "lost-scans", 1)
+    assert [set(scans) for scans in lost.frames[-3:]] == [
+        set(BOTH_CHANNELS),
+        {"magnitude"},
+        {"magnitude"},
+    ]
+    late = case_of(small, folder, "one-scan-apart")
+    before, last = late.frames[-2:]
+    np.testing.assert_array_equal(before[Channel.STRUCTURE], last[Channel.STRUCTURE])
+    assert change(before[Channel.MAGNITUDE], last[Channel.MAGNITUDE]) > 3e-4
+    rest = case_of(small, folder, "drift-at-rest")
+    assert not rest.truth.pressed.any()
+    assert rest.reference.structure is not None
+    assert 0.005 < change(rest.frames[0][Channel.STRUCTURE], rest.reference.structure) < 0.2
+
+
+def change(volts: FloatArray, others: FloatArray) -> float:
+    return float(np.linalg.norm(volts - others) / np.linalg.norm(others))
+
+
+def test_a_lead_opens_on_one_sheet_in_the_last_frame(
+    small: SensorDescription, folder: Path
+) -> None:
+    case = case_of(small, folder, "intermittent")
+    assert case.plan.lead
+    (broken,) = case.plan.at_fault
+    (good,) = set(BOTH_CHANNELS) - {broken}
+    *_, before, last = case.frames
+    assert change(last[good], before[good]) < 1e-2
+    driven = (small.pairs.drive == case.plan.lead.electrode).any(axis=1)
+    assert np.abs(last[broken][driven]).max() < 0.1 * np.abs(before[broken][driven]).max()
+
+
+def test_the_wrong_sign_is_told(small: SensorDescription, folder: Path) -> None:
+    case = case_of(small, folder, "wrong-sign")
+    true = with_opposite_magnitude(small) if case.plan.opposite else small
+    assert case.description.magnitude
+    assert true.magnitude
+    assert case.description.magnitude.response.sign == -true.magnitude.response.sign
+
+
+def test_states_of_a_sheet(small: SensorDescription) -> None:
+    """Conductivity scales voltages, half a turn is a symmetry, and one sheet alone changes."""
+    mesh = fine_mesh(small)
+    seed = np.random.SeedSequence(3)
+    even = UnevenSkin(small, mesh, seed, unevenness=0, impedance_deviation=0)
+    made = even.voltages([])
+    warm = even.voltages([], {Channel.STRUCTURE: SheetState(warming=0.04)})
+    np.testing.assert_allclose(warm[Channel.STRUCTURE], made[Channel.STRUCTURE] / 1.04, rtol=0.01)
+    np.testing.assert_array_equal(warm[Channel.MAGNITUDE], made[Channel.MAGNITUDE])
+    drifted = even.voltages([], {Channel.STRUCTURE: SheetState(drift=0.02)})
+    assert 0.005 < np.std(drifted[Channel.STRUCTURE] / made[Channel.STRUCTURE]) < 0.05
+    count = small.electrode_count
+    turned = [(e + count // 2) % count for e in range(count)]
+    for order, same in ((turned, True), ([1, 0, *range(2, count)], False)):
+        wired = even.voltages([], {Channel.STRUCTURE: SheetState(leads=tuple(order))})
+        assert (change(wired[Channel.STRUCTURE], made[Channel.STRUCTURE]) < 0.01) is same
+    poor = tuple(30.0 if e == 2 else 1.0 for e in range(count))
+    loose = even.voltages([], {Channel.STRUCTURE: SheetState(impedance=poor)})
+    assert 1e-4 < change(loose[Channel.STRUCTURE], made[Channel.STRUCTURE]) < 0.2
+
+
+def test_exchanging_leads_twice_is_nothing() -> None:
+    rng = np.random.default_rng(0)
+    resistance = np.pad(rng.standard_normal((4, 4)), (0, 1))
+    order = [3, 1, 2, 0, 4]
+    np.testing.assert_allclose(exchanged(exchanged(resistance, order), order), resistance)
+
+
+def test_a_skin_may_be_warped(small: SensorDescription) -> None:
+    """A contact lies where it lies, whatever the sheet beneath it does."""
+    off = np.where(np.arange(small.electrode_count) == 1, 0.001, 0.0)
+    (press,) = draw_plan(small, "ordinary", "tuning", 0).frames[0]
+    plain, warped = (
+        UnevenSkin(small, fine_mesh(small), np.random.SeedSequence(3), warp=warp)
+        for warp in (None, lambda mesh: displaced(mesh, small, off))
+    )
+    touched = (np.hstack([small.pairs.drive, small.pairs.measure]) == 1).any(axis=1)
+    one, other = plain.voltages([])[Channel.STRUCTURE], warped.voltages([])[Channel.STRUCTURE]
+    assert change(other[touched], one[touched]) > 3 * change(other[~touched], one[~touched]) > 0
+    changes = [
+        skin.voltages([press])[Channel.STRUCTURE] - rest
+        for skin, rest in ((plain, one), (warped, other))
+    ]
+    assert 0 < change(*changes) < 0.2
+
+
+@pytest.fixture(scope="module")
+def small_artifact(small: SensorDescription) -> Artifact:
+    return build_artifact(small)
+
+
+def by(method: str, case: Case, artifact: Artifact) -> Outcome:
+    (outcome,) = reconstruct_case(case, method, artifact=artifact)
+    return outcome
+
+
+@pytest.mark.parametrize("method", ["tikhonov", "noser"])
+def test_regularisation_is_so_many_times_what_the_rule_chooses(
+    small: SensorDescription,
+    small_artifact: Artifact,
+    folder: Path,
+    method: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    case = case_of(small, folder, "wrong-lambda")
+    factor = case.plan.regularisation
+    assert factor == 0.01
+    wrong = by(method, case, small_artifact).frame.map
+    plan = replace(case.plan, regularisation=1.0)
+    right = by(method, replace(case, plan=plan), small_artifact).frame.map
+    monkeypatch.setattr(
+        "tactomo_models.methods.linear.prior_weight",
+        lambda *given: factor * linear.prior_weight(*given),
+    )
+    expected = by(method, replace(case, plan=plan), small_artifact).frame.map
+    assert wrong is not None
+    assert right is not None
+    assert expected is not None
+    top = float(expected.max())
+    np.testing.assert_allclose(wrong, expected, atol=1e-3 * top)
+    assert np.abs(right - expected).max() > 0.1 * top
+
+
+def test_a_case_is_judged_by_its_last_frame(
+    small: SensorDescription, small_artifact: Artifact, folder: Path
+) -> None:
+    case = case_of(small, folder, "jump")
+    outcome = by("tikhonov", case, small_artifact)
+    alone = Reconstructor(case.description, small_artifact, method=outcome.frame.tier)
+    alone.set_reference(case.reference)
+    frame = alone.reconstruct(**case.frames[-1])
+    assert frame.map is not None
+    np.testing.assert_array_equal(outcome.frame.map, frame.map)
+    expected = np.corrcoef(frame.map.ravel(), case.truth.map.ravel())[0, 1]
+    assert outcome.score.icc == pytest.approx(expected)
+    assert outcome.score.contacts == len(case.plan.frames[-1])
+
+
+def test_what_is_right_where_the_magnitude_channel_shows_nothing(
+    small: SensorDescription, small_artifact: Artifact, folder: Path
+) -> None:
+    """The pressed shape counts; at rest, whether a contact is reported; a lack of a map warns."""
+    light = case_of(small, folder, "light")
+    assert not light.truth.map.any()
+    outcome = by("tikhonov", light, small_artifact)
+    assert outcome.frame.structure is not None
+    expected = np.corrcoef(outcome.frame.structure.ravel(), light.truth.pressed.ravel())[0, 1]
+    assert outcome.score.icc == pytest.approx(expected)
+    drifted = case_of(small, folder, "drift-at-rest")
+    ghosts = by("tikhonov", drifted, small_artifact).score
+    assert (ghosts.icc == 0) is (ghosts.found > 0)
+    still = replace(drifted, frames=({n: getattr(drifted.reference, n) for n in BOTH_CHANNELS},))
+    assert by("tikhonov", still, small_artifact).score.icc == 1
+    nothing = replace(case_of(small, folder, "ordinary"), frames=({},))
+    absent = by("tikhonov", nothing, small_artifact).score
+    assert absent.bad
+    assert absent.warned
+
+
+def one(icc: float, warned: bool = False, flags: tuple[str, ...] = ()) -> CaseScore:
+    return CaseScore(
+        "a", "tuning 0", "auto", 1, 1, icc, warned, flags, "fit", "", 1.0, float("nan")
+    )
+
+
+def test_warnings_are_counted() -> None:
+    lead = ("electrode_fault",)
+    scores = [
+        *(one(0.69), one(0.2, flags=lead), one(0.1, warned=True, flags=("misfit_high",))),
+        *(one(0.7), one(0.9, flags=lead), one(0.8, warned=True), one(0.95)),
+    ]
+    counted = trust(scores)
+    assert counted.icc == pytest.approx(4.34 / 7)
+    assert counted == Trust(7, counted.icc, 3, 2, 1, 1, 2)
+    assert counted.silent == pytest.approx(2 / 3)
+    assert counted.alarms == pytest.approx(1 / 4)
+    assert np.isnan(trust([one(0.9)]).silent)
+    assert np.isnan(trust([one(0.1)]).alarms)
+    scores += [replace(one(0.3), regime="b", method="fit")]
+    by_regime = trust_by_regime(scores)
+    assert list(by_regime) == ["a", "b", "all"]
+    assert by_regime["a"]["auto"] == counted
+    assert by_regime["b"]["fit"].bad_unwarned == by_regime["all"]["fit"].bad_unwarned == 1
+
+
+def test_a_sensor_of_one_channel_has_no_cases(small: SensorDescription) -> None:
+    single = variant(small, magnitude=None)
+    with pytest.raises(DataError, match="one channel"):
+        make_case(single, "ordinary", "tuning", 0)
+
+
+@pytest.mark.long
+def test_more_processes_do_the_same(small: SensorDescription, tmp_path: Path) -> None:
+    regimes, methods = ("near-touch", "dead-lead"), ("tikhonov", "auto")
+    alone, shared = (
+        [
+            [outcome.score for outcome in case]
+            for case in evaluate_regimes(
+                small, regimes, methods, "tuning", 2, jobs=jobs, cache=tmp_path
+            )
+        ]
+        for jobs in (1, 2)
+    )
+    assert repr(alone) == repr(shared)  # an unknown confidence is NaN, which equals nothing
+    assert [case[0].case for case in alone] == ["tuning 0", "tuning 1"] * 2

@@ -1,0 +1,272 @@
+"""Tanks that hold what conducts better and what conducts worse, simulated."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from measured import measured
+from simulated_tanks import simulated_tanks
+from tactomo_lab.evaluation.tanks import (
+    TankImager,
+    Tanks,
+    correlation,
+    estimate_scale,
+    evaluate_tanks,
+    on_pixels,
+    read_tanks,
+)
+from tactomo_models import (
+    Artifact,
+    DataError,
+    Reconstructor,
+    Reference,
+    SensorDescription,
+    build_artifact,
+    load_description,
+)
+from tactomo_models.arrays import FloatArray
+from tactomo_models.batch import reconstruct_file
+from tactomo_models.methods.objects import SignedLevelSet
+from tactomo_models.physics.bare_sheet import volts_per_unit
+from tactomo_models.physics.forward import ForwardModel
+from tactomo_models.scene.shape_fit import ShapeFit, conductivity
+
+
+@pytest.fixture(scope="module")
+def tank() -> SensorDescription:
+    return load_description("tank_uef2017")
+
+
+@pytest.fixture(scope="module")
+def tank_artifact(tank: SensorDescription) -> Artifact:
+    return build_artifact(tank)
+
+
+@pytest.fixture(scope="module")
+def imager(tank: SensorDescription, tank_artifact: Artifact) -> TankImager:
+    return TankImager(tank, tank_artifact)
+
+
+@pytest.fixture(scope="module")
+def drawn(tank: SensorDescription) -> Tanks:
+    """The first simulated tank with objects of both kinds, in the model's units."""
+    some = simulated_tanks(tank, "tuning", 3)
+    both = [i for i, truth in enumerate(some.truth) if truth.min() < 0 < truth.max()][:1]
+    assert both
+    changes = some.changes[both] / volts_per_unit(tank)
+    return Tanks(tuple(some.names[i] for i in both), changes, some.truth[both])
+
+
+def test_both_kinds_are_found_with_the_right_sign(imager: TankImager, drawn: Tanks) -> None:
+    methods = ("tikhonov", "noser", "levelset")
+    outcomes = {o.method: o for o in evaluate_tanks(imager, drawn, methods, 1.0)}
+    found, truth = outcomes["levelset"], drawn.truth[0]
+    assert found.correlation > 0.85
+    assert found.image[truth > 0].mean() > 0.6
+    assert found.image[truth < 0].mean() < -0.6
+    assert np.nanmean(np.abs(found.image[truth == 0])) < 0.03
+    assert found.misfit < 1.3
+    for method in ("tikhonov", "noser"):
+        assert 0.4 < outcomes[method].correlation < found.correlation - 0.05
+        assert outcomes[method].image[truth > 0].mean() > 0.2
+        assert outcomes[method].image[truth < 0].mean() < -0.2
+
+
+def test_turned_over_the_kinds_change_places(imager: TankImager, drawn: Tanks) -> None:
+    """A linear image of the opposite change is the opposite image."""
+    image = imager.reconstruct(drawn.changes[0], "noser").structure
+    opposite = imager.reconstruct(-drawn.changes[0], "noser").structure
+    assert image is not None
+    assert opposite is not None
+    np.testing.assert_allclose(opposite, -image, atol=1e-4)
+
+
+def test_a_file_of_scans_of_such_a_tank(
+    tank: SensorDescription,
+    tank_artifact: Artifact,
+    drawn: Tanks,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What a user has: volts with objects and without; contacts are of both kinds."""
+    monkeypatch.setattr(
+        "tactomo_models.methods.method.load_or_build_artifact", lambda _: tank_artifact
+    )
+    empty = ForwardModel(tank, tank_artifact.bare).bare_voltages
+    scan = empty + np.sign(empty) * drawn.changes[0]
+    np.savez(
+        tmp_path / "in.npz",
+        structure=np.array([scan, scan, empty]) * 3.0,
+        structure_reference=empty * 3.0,
+    )
+    assert len(reconstruct_file(tmp_path / "in.npz", tmp_path / "out.npz", description=tank)) == 3
+    with np.load(tmp_path / "out.npz") as out:
+        maps = out["structure"]
+        assert -1 <= maps.min() < -0.9
+        assert 0.9 < maps.max() <= 1
+        assert correlation(on_pixels(tank, maps[0], (128, 128)), drawn.truth[0]) > 0.85
+        np.testing.assert_array_equal(maps[1], maps[0])  # a still scene stays as it is
+        assert not maps[2].any()
+        at = out["contact_frame"] == 0
+        where = np.stack([out["contact_y_mm"][at], out["contact_x_mm"][at]], axis=1) * 1e-3
+    rows = np.round((1 - where[:, 0] / 0.14) * 64 - 0.5).astype(int)
+    columns = np.round((1 + where[:, 1] / 0.14) * 64 - 0.5).astype(int)
+    assert set(drawn.truth[0][rows, columns]) == {-1.0, 1.0}
+
+
+def test_a_small_budget_is_kept_and_the_next_frames_go_on(
+    tank: SensorDescription, tank_artifact: Artifact, drawn: Tanks
+) -> None:
+    empty = ForwardModel(tank, tank_artifact.bare).bare_voltages
+    scan = empty + np.sign(empty) * drawn.changes[0]
+    live = Reconstructor(tank, tank_artifact, budget_s=0.01)
+    noise = np.full(len(empty), 0.03 * np.sqrt(np.mean(drawn.changes**2)))
+    live.set_reference(Reference(None, empty, structure_noise=noise, scans=100))
+    frames = [live.reconstruct(None, scan) for _ in range(40)]
+    assert frames[0].tier == "levelset"
+    assert frames[-1].misfit < frames[0].misfit
+    assert all(b.misfit <= a.misfit * 1.05 for a, b in pairwise(frames))
+    live.reset()
+    again = live.reconstruct(None, scan)
+    assert again.misfit == frames[0].misfit
+
+
+@pytest.fixture(scope="module")
+def signed(tank: SensorDescription, tank_artifact: Artifact) -> tuple[ShapeFit, SignedLevelSet]:
+    forward = ForwardModel(tank, tank_artifact.bare)
+    return ShapeFit(forward, 100.0), SignedLevelSet(forward)
+
+
+def _one_of_each(fit: ShapeFit) -> FloatArray:
+    x, y = fit.forward.bare.points[:, fit.forward.bare.pressable]
+    better = np.clip(1.5 - np.hypot(x + 0.06, y) / 0.03, 0, 1)
+    worse = np.clip(1.5 - np.hypot(x - 0.05, y - 0.03) / 0.03, 0, 1)
+    return np.asarray(better - worse)
+
+
+def test_taylor_of_both_kinds(signed: tuple[ShapeFit, SignedLevelSet]) -> None:
+    """|F(x + t v) - F(x) - t J v| falls with t squared."""
+    fit, level_set = signed
+    size = len(fit.forward.bare_voltages)
+    weight = np.ones(size)
+    parameters = level_set.parameters_of(_one_of_each(fit))
+    data = measured(np.zeros(size), weight)
+    start = fit.evaluate(level_set, parameters, 3.0, data)
+    assert start is not None
+    assert start.pressed.min() < -0.9
+    assert start.pressed.max() > 0.9
+    direction = np.random.default_rng(0).standard_normal(len(parameters) + 1)
+    along = fit.jacobian(start, weight) @ direction
+    left = []
+    for t in (1e-3, 5e-4, 2.5e-4):
+        there = fit.evaluate(
+            level_set, parameters + t * direction[:-1], 3.0 + t * direction[-1], data
+        )
+        assert there is not None
+        left.append(np.linalg.norm(there.residual - start.residual - t * along))
+    rates = np.log2(np.array(left[:-1]) / left[1:])
+    assert np.all(rates > 1.8), rates
+
+
+@given(h=st.floats(-1, 1), log_ratio=st.floats(-4.6, 4.6).filter(lambda r: abs(r) > 0.1))
+def test_what_conducts_worse_is_one_over_what_conducts_better(h: float, log_ratio: float) -> None:
+    nodes = np.array([h, -h])
+    sigma, by_h, by_log_ratio = conductivity(nodes, log_ratio)
+    assert sigma[0] * sigma[1] == pytest.approx(1)
+    assert np.exp(-abs(log_ratio)) * 0.999 <= sigma.min() <= 1 <= sigma.max()
+    step = 1e-6
+    moved = conductivity(nodes + step * np.sign(nodes), log_ratio)[0]
+    np.testing.assert_allclose(moved - sigma, by_h * step * np.sign(nodes), rtol=1e-3, atol=1e-11)
+    moved = conductivity(nodes, log_ratio + step)[0]
+    np.testing.assert_allclose(moved - sigma, by_log_ratio * step, rtol=1e-3, atol=1e-10)
+
+
+@settings(max_examples=25)
+@given(st.lists(st.floats(-3, 3), min_size=81, max_size=81))
+def test_no_node_is_both(signed: tuple[ShapeFit, SignedLevelSet], parameters: list[float]) -> None:
+    """Turned over, each object becomes one of the other kind in the same place."""
+    level_set = signed[1]
+    h, moving = level_set.render(np.array(parameters))
+    opposite, _ = level_set.render(-np.array(parameters))
+    np.testing.assert_allclose(opposite, -h, atol=1e-12)
+    assert np.abs(h).max() <= 1
+    assert moving[h != 0].all()
+
+
+@pytest.mark.long
+def test_the_scale_is_found_without_the_truth(tank: SensorDescription, imager: TankImager) -> None:
+    """The model's own scale within a fifth, and whatever unit the changes are in."""
+    some = simulated_tanks(tank, "tuning", 6)
+    changes = some.changes / volts_per_unit(tank)
+    found = estimate_scale(imager, changes)
+    assert 0.8 < found < 1.25
+    assert estimate_scale(imager, 1e4 * changes) == pytest.approx(1e-4 * found, rel=0.02)
+
+
+@pytest.mark.long
+def test_simulated_tanks_on_average(tank: SensorDescription, imager: TankImager) -> None:
+    """Seeds that nothing was chosen by."""
+    some = simulated_tanks(tank, "reporting", 16)
+    scale = 1 / volts_per_unit(tank)
+    outcomes = list(evaluate_tanks(imager, some, ["noser", "levelset"], scale))
+    mean = {
+        method: np.mean([o.correlation for o in outcomes if o.method == method])
+        for method in ("noser", "levelset")
+    }
+    assert mean["levelset"] > 0.9
+    assert mean["levelset"] > mean["noser"] + 0.1
+
+
+@pytest.mark.slow
+def test_seeds_say_which_tank(tank: SensorDescription, drawn: Tanks) -> None:
+    number = int(drawn.names[0].split()[1])
+    again = simulated_tanks(tank, "tuning", number + 1)
+    np.testing.assert_array_equal(again.truth[number], drawn.truth[0])
+    other = simulated_tanks(tank, "reporting", 1)
+    assert not np.array_equal(other.truth[0], again.truth[0])
+
+
+def test_what_is_no_set_of_tanks(tank: SensorDescription, tmp_path: Path) -> None:
+    good: dict[str, Any] = {
+        "dv": np.zeros((2, 208)),
+        "truth": np.zeros((2, 16, 16), np.int8),
+        "name": np.array(["a", "b"]),
+    }
+    path = tmp_path / "tanks.npz"
+    np.savez(path, **good)
+    assert read_tanks(path, tank).names == ("a", "b")
+    for change, told in (
+        ({"dv": np.zeros((2, 200))}, "200"),
+        ({"dv": np.full((2, 208), np.nan)}, "not numbers"),
+        ({"truth": np.zeros((2, 16))}, "truth"),
+        ({"truth": np.zeros((3, 16, 16))}, "truth"),
+        ({"name": np.array(["a"])}, "dv is"),
+        ({"dv": np.array([["a"]])}, "numbers"),
+    ):
+        np.savez(path, **{**good, **change})
+        with pytest.raises(DataError, match=told):
+            read_tanks(path, tank)
+    np.savez(path, dv=good["dv"])
+    with pytest.raises(DataError, match="truth"):
+        read_tanks(path, tank)
+    with pytest.raises(DataError, match="cannot read"):
+        read_tanks(tmp_path / "absent.npz", tank)
+
+
+def test_pixels_and_correlation(tank: SensorDescription) -> None:
+    x, y = np.meshgrid(tank.map_x_m, tank.map_y_m)
+    image = on_pixels(tank, (3 * x + 5 * y).astype(np.float32), (32, 32))
+    assert image[2, 16] > image[29, 16]  # row 0 is the top
+    assert image[16, 29] > image[16, 2]
+    assert np.isnan(image[0, 0])
+    on = np.isfinite(image)
+    assert on.mean() == pytest.approx(np.pi / 4, abs=0.02)
+    assert correlation(image, np.where(on, image, 7.0)) == pytest.approx(1)
+    assert correlation(image, -2 * image + 1) == pytest.approx(-1)
+    assert correlation(np.where(on, 0.5, np.nan), image) == 0

@@ -1,0 +1,19 @@
+"""What needs the extra `train`, run by `make test-train`; without it nothing is collected."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib.util import find_spec
+
+import pytest
+from threadpoolctl import threadpool_limits
+
+EXTRA = ("joblib", "onnx", "torch")
+collect_ignore_glob = [] if all(map(find_spec, EXTRA)) else ["test_*.py"]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_thread() -> Iterator[None]:
+    """More threads only get into each other's way, and a sum's order is always the same."""
+    with threadpool_limits(1):
+        yield

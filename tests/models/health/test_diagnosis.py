@@ -1,0 +1,272 @@
+"""What is found in the scans of skins that are well, and of each kind that is not."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from faulty_skin import rewired, shorted, touches
+from hypothesis import given
+from hypothesis import strategies as st
+from noisy_skin import rms
+from tactomo_lab.evaluation.faults import with_lead
+from tactomo_models import Artifact, DataError, Press, SensorDescription, SkinSimulator
+from tactomo_models.arrays import FloatArray
+from tactomo_models.health.diagnosis import Diagnosis, diagnose
+from tactomo_models.health.examination import noise_about_line
+from tactomo_models.health.findings import Finding, Level
+from tactomo_models.sensor.pattern import PatternLayout, pattern_of_zeros, scan_pairs, without_zeros
+from tactomo_protocol import Channel
+from whole_system import repository
+
+Change = Callable[[FloatArray], FloatArray]
+
+SCANS = 60
+PERIOD_S = 0.05
+NOISY_ELECTRODE = 6
+
+
+class Patient:
+    """A simulated skin: its voltages at rest, and what is found in its scans."""
+
+    def __init__(
+        self, description: SensorDescription, simulator: SkinSimulator, artifact: Artifact
+    ) -> None:
+        self.description = description
+        self.simulator = simulator
+        self._transfer = artifact.bare.transfer
+
+    def rest(self, *presses: Press, simulator: SkinSimulator | None = None) -> FloatArray:
+        return (simulator or self.simulator).voltages(presses)[Channel.STRUCTURE]
+
+    def scans(self, volts: FloatArray, noise: float = 1e-3, count: int = SCANS) -> FloatArray:
+        rng = np.random.default_rng(3)
+        return volts + noise * rms(self.rest()) * rng.standard_normal((count, len(volts)))
+
+    def examine(self, scans: FloatArray, *, has_model: bool = True) -> Diagnosis:
+        return diagnose(
+            self.description,
+            scans,
+            times_s=np.arange(len(scans)) * np.float64(PERIOD_S),
+            transfer=self._transfer if has_model else None,
+            contrast=self.description.contrast(Channel.STRUCTURE),
+        )
+
+
+@pytest.fixture
+def patient(paper: SensorDescription, simulator: SkinSimulator, artifact: Artifact) -> Patient:
+    return Patient(paper, simulator, artifact)
+
+
+def about(diagnosis: Diagnosis, what: str) -> Finding:
+    return next(finding for finding in diagnosis.findings if finding.about == what)
+
+
+def ill(diagnosis: Diagnosis) -> dict[int, str]:
+    return {n: state for n, state in enumerate(diagnosis.electrodes) if state != "good"}
+
+
+@pytest.mark.parametrize("noise", [1e-3, 1e-2])
+@pytest.mark.parametrize("has_model", [True, False])
+def test_a_healthy_skin_is_healthy(patient: Patient, noise: float, has_model: bool) -> None:
+    found = patient.examine(patient.scans(patient.rest(), noise), has_model=has_model)
+    assert found.level in (Level.OK, Level.ADVICE)
+    assert not ill(found)
+    snr = about(found, "snr").figures["snr_db"]
+    assert snr == pytest.approx(-20 * np.log10(noise), abs=0.5)
+
+
+LEADS: dict[str, tuple[str, Callable[[SensorDescription, FloatArray], FloatArray]]] = {
+    "open, reads 0 V": ("dead", lambda d, v: with_lead(d, v, 6, 1e-3, lambda *_: 0.0)),
+    "open, floats": ("misread", lambda d, v: with_lead(d, v, 6, 1e-3, lambda *_: 3 * rms(v))),
+    "poor": ("misread", lambda d, v: with_lead(d, v, 6, 0.5, lambda _, p: p / 2)),
+    "silent": ("dead", lambda d, v: np.where(touches(d, 6), 1e-6 * v, v)),
+    "a gain halved": ("misread", lambda d, v: np.where(d.pairs.measure[:, 0] == 6, v / 2, v)),
+}
+
+
+@pytest.mark.parametrize("kind", LEADS)
+def test_a_bad_lead_is_named(patient: Patient, kind: str) -> None:
+    state, broken = LEADS[kind]
+    found = patient.examine(patient.scans(broken(patient.description, patient.rest())))
+    assert found.level == Level.FAULT
+    assert ill(found) == {6: state}
+    finding = about(found, f"{state}_electrodes")
+    assert "electrode 6" in finding.detail
+    assert finding.next_step
+
+
+def test_a_noisy_lead_is_loose(patient: Patient) -> None:
+    noise = np.where(touches(patient.description, NOISY_ELECTRODE), 10.0, 1.0)
+    scans = patient.rest() + noise * (patient.scans(patient.rest()) - patient.rest())
+    assert ill(patient.examine(scans)) == {NOISY_ELECTRODE: "loose"}
+
+
+def test_a_lead_that_opens_now_and_then_is_loose_and_not_the_whole_device(
+    patient: Patient,
+) -> None:
+    rest = patient.rest()
+    scans = patient.scans(rest)
+    scans[[7, 20, 41]] += with_lead(patient.description, rest, 6, 1e-3, lambda *_: 0.0) - rest
+    found = patient.examine(scans)
+    assert ill(found) == {6: "loose"}
+    assert found.level == Level.FAULT
+    assert about(found, "snr").level == Level.OK
+
+
+@pytest.mark.parametrize("pair", [(6, 7), (2, 13)])
+def test_two_leads_that_changed_places_are_named(patient: Patient, pair: tuple[int, int]) -> None:
+    order = list(range(16))
+    order[pair[0]], order[pair[1]] = order[pair[1]], order[pair[0]]
+    volts = patient.rest(simulator=rewired(patient.simulator, order))
+    found = patient.examine(patient.scans(volts))
+    assert ill(found) == dict.fromkeys(pair, "swapped")
+    assert f"{pair[0]} with {pair[1]}" in about(found, "swapped_electrodes").detail
+
+
+def test_a_turned_plug_is_told(patient: Patient) -> None:
+    volts = patient.rest(simulator=rewired(patient.simulator, [*range(1, 16), 0]))
+    found = patient.examine(patient.scans(volts))
+    assert not ill(found)
+    assert "on by 1 of 16" in about(found, "model").detail
+
+
+def test_a_short_is_blamed_on_one_of_its_two(patient: Patient) -> None:
+    volts = patient.rest(simulator=shorted(patient.simulator, 5, 6))
+    found = patient.examine(patient.scans(volts))
+    assert found.level == Level.FAULT
+    assert ill(found)
+    assert set(ill(found)) <= {5, 6}
+
+
+@pytest.mark.parametrize(
+    ("noise", "level"), [(10**-1.5, Level.FAULT), (0.3, Level.BROKEN)], ids=["30 dB", "10 dB"]
+)
+def test_noise(patient: Patient, noise: float, level: Level) -> None:
+    found = patient.examine(patient.scans(patient.rest(), noise))
+    assert about(found, "snr").level == level
+    assert not ill(found)
+
+
+def test_clipping(patient: Patient) -> None:
+    scans = np.maximum(patient.scans(patient.rest()), -1.7 * rms(patient.rest()))
+    found = about(patient.examine(scans), "saturation")
+    assert (found.level, found.figures["clipped_percent"]) == (Level.FAULT, 100.0)
+
+
+@pytest.mark.parametrize(
+    ("percent", "level"), [(0.1, Level.OK), (2.0, Level.ADVICE), (-8.0, Level.FAULT)]
+)
+def test_drift(patient: Patient, percent: float, level: Level) -> None:
+    minutes = PERIOD_S * np.arange(SCANS)[:, None] / 60
+    found = patient.examine(patient.scans(patient.rest()) * (1 + percent / 100 * minutes))
+    drift = about(found, "drift")
+    assert drift.level == level
+    measured, sigma = (drift.figures[k] for k in ("percent_per_min", "sigma_percent_per_min"))
+    assert isinstance(measured, float)
+    assert isinstance(sigma, float)
+    assert measured == pytest.approx(percent, abs=5 * sigma)
+
+
+def test_the_stillest_scans_count_where_something_presses(patient: Patient) -> None:
+    pressed = patient.rest(Press(0.01, 0.02, 180.0, 0.02))
+    scans = np.concatenate([patient.scans(pressed), patient.scans(patient.rest(), count=40)])
+    scans[:60] = patient.rest() + np.linspace(0, 1, 60)[:, None] * (scans[:60] - patient.rest())
+    found = patient.examine(scans)
+    assert found.level == Level.ADVICE
+    first, end = about(found, "scans").figures["examined"]  # type: ignore[misc]
+    assert 60 <= first < end <= 100
+    assert about(found, "snr").figures["snr_db"] == pytest.approx(60, abs=1)
+
+
+def test_scans_of_many_things_say_nothing_about_noise(patient: Patient) -> None:
+    scans = np.outer([1, 5, 2, 2, 9, 3, 7, 4], patient.rest())
+    assert about(patient.examine(scans), "snr").level == Level.UNKNOWN
+
+
+def test_a_device_that_repeats_itself_is_told(patient: Patient) -> None:
+    found = patient.examine(np.tile(patient.rest(), (10, 1)))
+    assert "no noise" in about(found, "snr").detail
+
+
+def test_one_scan_is_enough_for_reciprocity_and_none_is_not(patient: Patient) -> None:
+    found = patient.examine(patient.rest()[None])
+    assert found.level == Level.OK
+    assert about(found, "snr").level == Level.UNKNOWN
+    with pytest.raises(DataError, match="every voltage is a number"):
+        patient.examine(np.full((3, 208), np.nan))
+    with pytest.raises(DataError, match="do not fit"):
+        patient.examine(np.ones((3, 200)))
+
+
+def test_voltages_in_no_order_are_broken(patient: Patient) -> None:
+    mixed = np.random.default_rng(0).permutation(patient.rest())
+    found = patient.examine(patient.scans(mixed), has_model=False)
+    assert found.level == Level.BROKEN
+    reciprocity = about(found, "reciprocity")
+    assert reciprocity.level == Level.BROKEN
+    assert "nothing can be located" in reciprocity.next_step
+
+
+@given(
+    electrodes=st.integers(8, 24),
+    drive=st.integers(1, 4),
+    measure=st.integers(1, 4),
+)
+def test_a_pattern_is_read_off_its_zeros(electrodes: int, drive: int, measure: int) -> None:
+    pairs = scan_pairs(electrodes, drive, measure)
+    full = np.zeros((2, electrodes, electrodes))
+    full[:, pairs.drive[:, 0], pairs.measure[:, 0]] = 1 + np.arange(len(pairs.drive))
+    scans = full.reshape(2, -1)
+    if (drive, measure) != (1, 1) and electrodes < 13:  # several patterns may have the same zeros
+        with contextlib.suppress(DataError):
+            pattern_of_zeros(scans)
+        return
+    layout = pattern_of_zeros(scans)
+    np.testing.assert_array_equal(layout.pairs.drive, pairs.drive)
+    np.testing.assert_array_equal(layout.pairs.measure, pairs.measure)
+    np.testing.assert_array_equal(without_zeros(layout, scans)[0], 1 + np.arange(len(pairs.drive)))
+
+
+@pytest.mark.parametrize("scans", [np.ones((2, 256)), np.ones((2, 255))])
+def test_no_pattern_is_guessed(scans: FloatArray) -> None:
+    with pytest.raises(DataError, match="lookup"):
+        pattern_of_zeros(scans)
+
+
+def test_noise_is_not_drift() -> None:
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal((2000, 3))
+    drift = np.arange(2000)[:, None] * [0.0, 1.0, -10.0]
+    np.testing.assert_allclose(noise_about_line(100 + noise + drift), 1.0, rtol=0.1)
+    assert not noise_about_line(noise[:2]).any()
+
+
+SHARED = repository().parent / "shared/data"
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="measured data are not here")
+def test_the_broken_device_is_broken() -> None:
+    with np.load(SHARED / "skin_bad_device_32el.npz") as file:
+        scans = file["baseline"].astype(float)
+    layout = pattern_of_zeros(scans)
+    assert layout.electrode_count == 32
+    found = diagnose(layout, without_zeros(layout, scans))
+    assert found.level == Level.BROKEN
+    assert about(found, "reciprocity").figures["pairs_percent"] == pytest.approx(68, abs=0.5)
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="measured data are not here")
+def test_the_tank_is_healthy() -> None:
+    with np.load(SHARED / "tank_sciospec_20fps.npz") as file:
+        volts = file["volts"][:20].real
+    pairs = scan_pairs(16)
+    scans = volts[:, pairs.drive[:, 0], pairs.measure[:, 0]]
+    scans = scans - volts[:, pairs.drive[:, 0], pairs.measure[:, 1]]
+    found = diagnose(PatternLayout(pairs, 16), scans)
+    assert found.level == Level.OK
+    assert not ill(found)
+    assert about(found, "snr").figures["snr_db"] == pytest.approx(57.7, abs=0.3)
+    assert about(found, "reciprocity").figures["together_percent"] == pytest.approx(2.5, abs=0.1)

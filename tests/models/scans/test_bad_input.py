@@ -1,0 +1,400 @@
+"""Bad input is flagged where the data can show it, and never makes a confident wrong map.
+
+What the data cannot show is here, too: an order of electrodes that is a symmetry of the sheet, and
+a bad contact of an ideal device. What is said for one frame here is counted over many in
+`test_bad_input_rates.py`, a slow test.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from faulty_skin import rewired, shorted, touches
+from hypothesis import given
+from hypothesis import strategies as st
+from noisy_skin import Skin, rms
+from tactomo_lab.evaluation.faults import with_lead
+from tactomo_models import (
+    Artifact,
+    Flag,
+    Press,
+    Reconstruction,
+    Reconstructor,
+    Reference,
+    SensorDescription,
+    SkinSimulator,
+    build_artifact,
+)
+from tactomo_models.arrays import FloatArray
+from tactomo_models.physics.bare_sheet import solve_bare_sheet
+from tactomo_models.physics.forward import ForwardModel
+from tactomo_models.physics.mesh import mesh_sheet
+from tactomo_protocol import Channel
+from variants import variant
+
+Scans = dict[str, FloatArray]
+Change = Callable[[Scans], Scans]
+
+PRESS = Press(0.03, -0.02, 180.0)
+OTHER = Press(-0.03, 0.03, 170.0)
+LEAD = 9
+BAD_DEVICE = Path(__file__).parents[4] / "shared" / "data" / "skin_bad_device_32el.npz"
+
+
+def frame_of(
+    paper: SensorDescription,
+    artifact: Artifact,
+    skin: Skin,
+    *presses: Press,
+    at_tare: Change = lambda scans: scans,
+    later: Change = lambda scans: scans,
+    tared_on: Skin | None = None,
+    frames: int = 6,
+) -> Reconstruction:
+    reconstructor = Reconstructor(paper, artifact)
+    reconstructor.set_reference(reference_of(tared_on or skin, at_tare))
+    for _ in range(frames):
+        frame = reconstructor.reconstruct(**later(skin.scan(*presses)))
+    return frame
+
+
+def reference_of(skin: Skin, change: Change, *presses: Press) -> Reference:
+    taken = [change(skin.scan(*presses)) for _ in range(20)]
+    return Reference.from_scans(
+        np.array([scans["magnitude"] for scans in taken]),
+        np.array([scans["structure"] for scans in taken]),
+    )
+
+
+def only(channel: str, change: Callable[[FloatArray], FloatArray]) -> Change:
+    return lambda scans: {**scans, channel: change(scans[channel])}
+
+
+def each(change: Callable[[FloatArray], FloatArray]) -> Change:
+    return lambda scans: {name: change(volts) for name, volts in scans.items()}
+
+
+def bad_lead(paper: SensorDescription, kind: str) -> Callable[[FloatArray], FloatArray]:
+    """A lead that is open, and what its input does then; or a contact that is poor."""
+    rng = np.random.default_rng(4)
+    mine = touches(paper, LEAD)
+
+    def broken(volts: FloatArray) -> FloatArray:
+        size = rms(volts)
+        match kind:
+            case "grounded":
+                return with_lead(paper, volts, LEAD, 1e-3, lambda *_: 0.0)
+            case "floats":
+                return with_lead(paper, volts, LEAD, 1e-3, lambda *_: 3 * size)
+            case "picks up mains":
+                return with_lead(paper, volts, LEAD, 1e-3, lambda *_: 3 * size * rng.normal())
+            case "at the rail":
+                made = with_lead(paper, volts, LEAD, 1e-3, lambda *_: 1e3 * size)
+                return np.clip(made, -0.8, 0.8)
+            case "poor":
+                return with_lead(paper, volts, LEAD, 0.5, lambda _, true: 0.5 * true)
+            case "silent":
+                return np.where(mine, 1e-6 * volts, volts)
+            case _:
+                return np.where(mine, math.nan, volts)
+
+    return broken
+
+
+LEADS = ["grounded", "floats", "picks up mains", "at the rail", "poor", "silent"]
+
+
+def assert_found(frame: Reconstruction, *presses: Press, within_m: float = 0.003) -> None:
+    assert len(frame.contacts) == len(presses)
+    for press in presses:
+        assert within_m > min(
+            math.dist((c.x_m, c.y_m), (press.x_m, press.y_m)) for c in frame.contacts
+        )
+
+
+@pytest.mark.parametrize("kind", [*LEADS, "no number"])
+def test_a_bad_lead_is_named_and_the_rest_goes_on(
+    paper: SensorDescription, artifact: Artifact, skin: Skin, kind: str
+) -> None:
+    later = only("structure", bad_lead(paper, kind))
+    frame = frame_of(paper, artifact, skin, PRESS, OTHER, later=later, frames=8)
+    assert Flag.ELECTRODE_FAULT in frame.flags
+    assert frame.reason.endswith(f"structure electrode {LEAD} left out")
+    assert_found(frame, PRESS, OTHER)
+
+
+@pytest.mark.parametrize("kind", LEADS)
+def test_a_lead_that_is_bad_at_the_tare_is_named(
+    paper: SensorDescription, artifact: Artifact, skin: Skin, kind: str
+) -> None:
+    broken = each(bad_lead(paper, kind))
+    frame = frame_of(paper, artifact, skin, PRESS, at_tare=broken, later=broken)
+    assert Flag.ELECTRODE_FAULT in frame.flags
+    for channel in Channel:
+        assert f"{channel} electrode {LEAD} left out" in frame.reason
+    assert_found(frame, PRESS)
+
+
+def test_two_bad_leads_are_survived(
+    paper: SensorDescription, artifact: Artifact, skin: Skin
+) -> None:
+    def broken(volts: FloatArray) -> FloatArray:
+        return np.where(touches(paper, 3) | touches(paper, 9), 0.0, volts)
+
+    frame = frame_of(paper, artifact, skin, PRESS, OTHER, later=only("structure", broken), frames=8)
+    assert frame.reason.endswith("structure electrodes 3, 9 left out")
+    assert_found(frame, PRESS, OTHER)
+
+
+def test_a_poor_contact_alone_does_no_harm(
+    paper: SensorDescription, artifact: Artifact, skin: Skin
+) -> None:
+    """Four-wire voltages of an ideal device do not depend on the contact that is driven."""
+    impedance = np.where(np.arange(paper.electrode_count) == LEAD, 1e6, 1.0)
+    sheet = mesh_sheet(paper, spacing_m=0.006)
+    good, poor = (
+        ForwardModel(paper, solve_bare_sheet(paper, sheet, impedance=given)).bare_voltages
+        for given in (None, impedance)
+    )
+
+    def change(volts: FloatArray) -> FloatArray:
+        return volts * poor / good
+
+    assert np.abs(poor / good - 1).max() < 0.2
+    frame = frame_of(paper, artifact, skin, PRESS, at_tare=each(change), later=each(change))
+    assert frame.flags == Flag(0)
+    assert_found(frame, PRESS)
+
+
+@pytest.mark.parametrize(
+    "pair",
+    [(3, 4), *(pytest.param(pair, marks=pytest.mark.slow) for pair in ((5, 6), (2, 4), (1, 9)))],
+    ids=str,
+)
+@pytest.mark.parametrize("when", ["at the tare", "later"])
+def test_a_short_is_flagged(
+    paper: SensorDescription,
+    artifact: Artifact,
+    simulator: SkinSimulator,
+    skin: Skin,
+    pair: tuple[int, int],
+    when: str,
+) -> None:
+    short = Skin(shorted(simulator, *pair))
+    tared_on = short if when == "at the tare" else skin
+    frame = frame_of(paper, artifact, short, PRESS, tared_on=tared_on, frames=2)
+    assert Flag.ELECTRODE_FAULT in frame.flags
+
+
+@pytest.mark.parametrize(
+    ("order", "shown"),
+    [
+        ([*range(1, 16), 0], True),
+        ([*range(2, 16), 0, 1], True),
+        ([*range(14, -1, -1), 15], True),
+        ([0, 2, 1, *range(3, 16)], True),
+        ([0, 1, 9, *range(3, 9), 2, *range(10, 16)], True),
+        ([*range(4, 16), *range(4)], False),
+        ([*range(15, -1, -1)], False),
+    ],
+    ids=["by one", "by two", "reversed", "two beside", "two apart", "by a side", "mirrored"],
+)
+def test_an_order_of_electrodes_is_flagged_unless_it_is_a_symmetry_of_the_sheet(
+    paper: SensorDescription,
+    artifact: Artifact,
+    simulator: SkinSimulator,
+    order: list[int],
+    shown: bool,
+) -> None:
+    frame = frame_of(paper, artifact, Skin(rewired(simulator, order)), PRESS, frames=2)
+    assert (Flag.REFERENCE_MISMATCH in frame.flags) is shown
+
+
+@pytest.mark.parametrize("when", ["at the tare", "later", "said by the device"])
+def test_clipped_voltages_are_left_out(
+    paper: SensorDescription, artifact: Artifact, skin: Skin, when: str
+) -> None:
+    limit = 0.6 * np.abs(skin.scan()["structure"]).max()
+
+    def clip(volts: FloatArray) -> FloatArray:
+        return np.clip(volts, -limit, limit)
+
+    reconstructor = Reconstructor(paper, artifact)
+    at_tare = only("structure", clip) if when == "at the tare" else each(np.asarray)
+    reconstructor.set_reference(reference_of(skin, at_tare))
+    for _ in range(6):
+        scans = skin.scan(PRESS)
+        if when == "said by the device":
+            worst = np.abs(scans["structure"]).argmax()
+            scans["structure"][worst] *= 1.5
+            frame = reconstructor.reconstruct(**scans, saturated=[Channel.STRUCTURE])
+        else:
+            frame = reconstructor.reconstruct(**only("structure", clip)(scans))
+    assert Flag.SATURATED in frame.flags
+    assert Flag.ELECTRODE_FAULT not in frame.flags
+    assert_found(frame, PRESS)
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-3, -0.1, 1e300, 1e-310])
+def test_a_scan_of_one_value_gives_no_map(
+    paper: SensorDescription, artifact: Artifact, skin: Skin, value: float
+) -> None:
+    constant = each(lambda volts: np.full_like(volts, value))
+    frame = frame_of(paper, artifact, skin, PRESS, later=constant, frames=1)
+    assert frame.map is None
+    assert frame.structure is None
+    assert Flag.INVALID_VOLTAGE in frame.flags
+
+
+@pytest.mark.parametrize("size", [1.0, 1e300, -1e300])
+def test_a_voltage_that_cannot_be_is_left_out(
+    paper: SensorDescription, artifact: Artifact, skin: Skin, size: float
+) -> None:
+    def spoil(volts: FloatArray) -> FloatArray:
+        return np.where(np.isin(np.arange(len(volts)), [7, 60, 111]), size, volts)
+
+    frame = frame_of(paper, artifact, skin, PRESS, later=each(spoil))
+    assert frame.flags == Flag.INVALID_VOLTAGE
+    assert_found(frame, PRESS)
+
+
+def test_a_tare_under_load_is_flagged_at_once_and_after_the_lift(
+    paper: SensorDescription, artifact: Artifact, skin: Skin
+) -> None:
+    reconstructor = Reconstructor(paper, artifact)
+    reconstructor.set_reference(reference_of(skin, each(np.asarray), PRESS, OTHER))
+    assert Flag.REFERENCE_MISMATCH in reconstructor.reconstruct(**skin.scan(PRESS, OTHER)).flags
+    assert Flag.REFERENCE_MISMATCH in reconstructor.reconstruct(**skin.scan()).flags
+
+
+@pytest.mark.parametrize("channel", ["magnitude", "structure"])
+def test_a_lift_after_a_tare_under_load_shows_in_either_channel(
+    paper: SensorDescription, artifact: Artifact, skin: Skin, channel: str
+) -> None:
+    """What the model cannot tell from an uneven sheet, the lift tells by its sign."""
+    light = Press(0.02, 0.02, 190.0, 0.008)
+    reconstructor = Reconstructor(paper, artifact)
+    reference = reference_of(skin, each(np.asarray), light)
+    magnitude = channel == "magnitude"
+    reconstructor.set_reference(
+        Reference(
+            reference.magnitude if magnitude else None,
+            None if magnitude else reference.structure,
+            scans=20,
+        )
+    )
+    loaded, lifted = (
+        reconstructor.reconstruct(
+            scans["magnitude"] if magnitude else None, None if magnitude else scans["structure"]
+        )
+        for scans in (skin.scan(light), skin.scan())
+    )
+    assert Flag.REFERENCE_MISMATCH not in loaded.flags
+    assert Flag.REFERENCE_MISMATCH in lifted.flags
+
+
+def test_swapped_channels_are_told(
+    paper: SensorDescription, artifact: Artifact, skin: Skin
+) -> None:
+    def swap(scans: Scans) -> Scans:
+        return {"magnitude": scans["structure"], "structure": scans["magnitude"]}
+
+    frame = frame_of(paper, artifact, skin, PRESS, at_tare=swap, later=swap, frames=1)
+    assert Flag.CHANNELS_SWAPPED in frame.flags
+    assert Flag.CHANNELS_SWAPPED not in frame_of(paper, artifact, skin, PRESS, frames=1).flags
+
+
+def test_interference_is_flagged_and_widens_the_uncertainty(
+    paper: SensorDescription, artifact: Artifact, skin: Skin
+) -> None:
+    rng = np.random.default_rng(5)
+
+    def noisier(times: float) -> Change:
+        return each(lambda v: v + times * 1e-3 * rms(v) * rng.standard_normal(len(v)))
+
+    calm = frame_of(paper, artifact, skin, PRESS)
+    some, much = (frame_of(paper, artifact, skin, PRESS, later=noisier(t)) for t in (4, 25))
+    assert Flag.NOISE_HIGH not in some.flags
+    assert Flag.NOISE_HIGH in much.flags
+    sigma = [frame.contacts[0].magnitude_sigma for frame in (calm, some, much)]
+    assert sigma[1] > 2 * sigma[0]
+    assert sigma[2] > 10 * sigma[0]
+    at_rest = frame_of(paper, artifact, skin, later=noisier(4))
+    assert at_rest.tier == "quiet", "interference is not pressing"
+
+
+@pytest.mark.skipif(not BAD_DEVICE.exists(), reason="measured data are not here")
+def test_a_broken_device_is_flagged(paper: SensorDescription) -> None:
+    """Its reciprocity error is 68 %: nothing can be located from it."""
+    sensor = variant(paper, electrodes={"per_side": 8, "pitch_m": 0.018}, magnitude=None)
+    with np.load(BAD_DEVICE) as stored:
+        baseline, dv = (stored[name].astype(float) for name in ("baseline", "dv"))
+    apart = (np.arange(32)[:, None] - np.arange(32)) % 32
+    kept = ((apart > 1) & (apart < 31)).ravel()  # drive-major; a row holds driven pairs as 0
+    reconstructor = Reconstructor(sensor, build_artifact(sensor))
+    reconstructor.set_reference(Reference.from_scans(None, baseline[:, kept]))
+    for change in dv[:10, kept]:
+        frame = reconstructor.reconstruct(None, baseline[:, kept].mean(axis=0) + change)
+        assert Flag.NOISE_HIGH | Flag.REFERENCE_MISMATCH in frame.flags
+
+
+def test_clean_scenes_have_no_flag(
+    paper: SensorDescription, artifact: Artifact, simulator: SkinSimulator
+) -> None:
+    """Seen by the checks alone: what the fits say of themselves is tested with them."""
+    rng = np.random.default_rng(6)
+    for noise_share in (1e-3, 1e-2):
+        skin = Skin(simulator, noise_share)
+        reconstructor = Reconstructor(paper, artifact, budget_s=1e-3)
+        reconstructor.set_reference(skin.reference())
+        for count in np.tile(np.arange(5), 3):
+            presses = [
+                Press(float(x), float(y), rng.uniform(60, 200), rng.uniform(0.008, 0.02))
+                for x, y in rng.uniform(-0.055, 0.055, (count, 2))
+            ]
+            frame = reconstructor.reconstruct(**skin.scan(*presses))
+            of_the_fits = Flag.NOT_CONVERGED | Flag.MISFIT_HIGH | Flag.LOW_CONFIDENCE
+            assert not frame.flags & ~of_the_fits
+
+
+@pytest.fixture(scope="module")
+def small_reconstructor(small: SensorDescription) -> Reconstructor:
+    return Reconstructor(small, build_artifact(small), budget_s=2e-3)
+
+
+STRANGE = [0.0, math.nan, math.inf, -math.inf, 1e308, -1e308, 5e-324, 1e-310, 1e300, 1e-30, 1.0]
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    strange=st.lists(st.floats() | st.sampled_from(STRANGE), min_size=1, max_size=4),
+    shares=st.tuples(*[st.sampled_from([0.0, 0.02, 0.2, 0.6, 1.0])] * 3),
+)
+def test_whatever_comes_a_map_is_finite_or_absent(
+    small_reconstructor: Reconstructor,
+    seed: int,
+    strange: list[float],
+    shares: tuple[float, float, float],
+) -> None:
+    rng = np.random.default_rng(seed)
+    good = small_reconstructor._skin.forward.bare_voltages
+
+    def spoilt(volts: FloatArray, share: float) -> FloatArray:
+        return np.where(rng.random(len(volts)) < share, rng.choice(strange, len(volts)), volts)
+
+    in_reference, in_noise, in_scan = shares
+    rest = [spoilt(good * rng.uniform(0.97, 1.03, len(good)), in_reference) for _ in range(2)]
+    noise = None if in_noise == 1 else spoilt(1e-3 * np.abs(good), in_noise)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        small_reconstructor.set_reference(Reference(rest[0], rest[1], noise, None))
+        for _ in range(2):
+            scans = [spoilt(good * rng.uniform(0.3, 1.1, len(good)), in_scan) for _ in range(2)]
+            frame = small_reconstructor.reconstruct(scans[0], scans[1])
+            for image in (frame.map, frame.pressure_kpa, frame.structure):
+                assert image is None or np.isfinite(image).all()

@@ -1,0 +1,92 @@
+"""From a conductivity change to pressure and force: what is known, how well, and what is not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from tactomo_models import PressureCurve, PressureRange
+from tactomo_models.scene.pressure import Pressures, pressures_of
+from tactomo_models.sensor.response import MagnitudeResponse
+
+CURVE = PressureCurve(np.array([0.02, 0.2]), np.array([140.0, 200.0]), np.array([2.0, 4.0]))
+AREA_M2 = 7e-4
+
+
+@given(st.floats(0.001, 0.999), st.sampled_from([1.0, -1.0]))
+def test_pressure_inverts_the_response(share: float, sign: float) -> None:
+    response = MagnitudeResponse(
+        pressure_kpa=(0, 130, 140, 200), relative_change=(0, 0, 0.03 * sign, 0.25 * sign)
+    )
+    pressure = 130 + 70 * share
+    change = response.change(np.array([pressure]))
+    curve = PressureCurve.of_response(response)
+    assert curve.pressure(np.abs(change)) == pytest.approx(pressure, rel=1e-9)
+    assert curve.range_kpa == (130, 200)
+    assert response.sign == sign
+
+
+def test_a_response_that_flattens_answers_up_to_where_it_does() -> None:
+    flat = MagnitudeResponse(pressure_kpa=(0, 100, 200, 300), relative_change=(0, 0, 0.3, 0.3))
+    assert PressureCurve.of_response(flat).range_kpa == (100, 200)
+
+
+def one(
+    magnitude: float, sigma: float, area_sigma_m2: float = np.nan, curve: PressureCurve = CURVE
+) -> Pressures:
+    parts = (magnitude, sigma, AREA_M2, area_sigma_m2)
+    return pressures_of(curve, *(np.array([part]) for part in parts))
+
+
+@pytest.mark.parametrize(
+    ("magnitude", "sigma", "expected"),
+    [
+        (0.1, 0.01, "within"),
+        (0.0, 0.005, "below"),
+        (0.019, 0.001, "below"),  # clearly there, and less than the least that was calibrated
+        (0.21, 0.01, "above"),
+        (0.0, 0.2, "unknown"),  # may be anything
+        (0.15, 0.1, "unknown"),
+        (np.nan, np.nan, "unknown"),
+    ],
+)
+def test_each_contact_is_told_where_its_pressure_lies(
+    magnitude: float, sigma: float, expected: str
+) -> None:
+    pressures = one(magnitude, sigma, 1e-5)
+    (found,) = pressures.ranges
+    assert found == expected
+    assert np.isfinite(pressures.kpa[0]) == (found in ("within", "above"))
+    assert np.isfinite(pressures.force_n[0]) == (found in ("within", "above"))
+    assert np.isfinite(pressures.sigma_kpa[0]) == (found == "within")
+    assert np.isfinite(pressures.force_sigma_n[0]) == (found == "within")
+
+
+def test_beyond_the_range_its_top_is_a_lower_bound() -> None:
+    pressures = one(0.4, 0.01)
+    assert pressures.kpa[0] == 200
+    assert pressures.force_n[0] == pytest.approx(200e3 * AREA_M2)
+
+
+def test_without_a_curve_nothing_is_known() -> None:
+    pressures = pressures_of(None, *np.full((4, 2), 0.1))
+    assert pressures.ranges == (PressureRange.UNKNOWN,) * 2
+    assert np.isnan([pressures.kpa, pressures.sigma_kpa, pressures.force_n]).all()
+
+
+@pytest.mark.parametrize("area_share", [0.0, 0.02, 0.1])
+def test_uncertainties_are_what_happens(area_share: float) -> None:
+    """The area's error is in the magnitude, too: an area too large makes it too small."""
+    rng = np.random.default_rng(5)
+    truth, noise, count = 0.1, 0.004, 100_000
+    areas = AREA_M2 * (1 + area_share * rng.standard_normal(count))
+    magnitude = truth * AREA_M2 / areas + noise * rng.standard_normal(count)
+    off = rng.standard_normal(count)  # of the curve, in its own uncertainties
+    true_kpa = CURVE.pressure(np.array([truth])) + off * CURVE.sigma(np.array([truth]))
+    sigma = np.full(count, np.hypot(noise, truth * area_share))
+    found = pressures_of(CURVE, magnitude, sigma, areas, np.full(count, area_share * AREA_M2))
+    pressure_error = (found.kpa - true_kpa).std()
+    assert pressure_error == pytest.approx(found.sigma_kpa.mean(), rel=0.03)
+    force_error = (found.force_n - 1e3 * true_kpa * AREA_M2).std()
+    assert force_error == pytest.approx(found.force_sigma_n.mean(), rel=0.03)

@@ -1,0 +1,98 @@
+"""The simulated skin: what presses shows in the voltages as the description says it does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tactomo_models import Artifact, Press, SensorDescription, SkinSimulator
+from tactomo_models.physics.forward import ForwardModel
+from tactomo_protocol import Channel
+from variants import variant
+
+PLACE = (0.005, -0.004)
+
+
+@pytest.fixture(scope="module")
+def bench(small: SensorDescription) -> SkinSimulator:
+    return SkinSimulator(small)
+
+
+def press(kpa: float, radius_m: float = 0.008) -> Press:
+    return Press(*PLACE, kpa, radius_m)
+
+
+def change(bench: SkinSimulator, *presses: Press) -> dict[str, float]:
+    """Largest relative change of a voltage, by channel."""
+    rest, pressed = bench.voltages([]), bench.voltages(presses)
+    return {str(name): float(np.abs(pressed[name] / rest[name] - 1).max()) for name in rest}
+
+
+def test_the_channels_answer_where_the_description_says(bench: SkinSimulator) -> None:
+    """Here: magnitude from 100 to 200 kPa, structure at once and no further."""
+    light, onset, half, full, more = (change(bench, press(p)) for p in (1, 100, 150, 200, 400))
+    assert light["magnitude"] == onset["magnitude"] == 0
+    assert 0.01 < half["magnitude"] < full["magnitude"] == more["magnitude"]
+    assert 0.2 < light["structure"] == more["structure"]
+
+
+def test_a_falling_sensor_goes_the_other_way(
+    small: SensorDescription, bench: SkinSimulator
+) -> None:
+    falling = variant(
+        small,
+        magnitude={
+            "response": {"pressure_kpa": [0.0, 100.0, 200.0], "relative_change": [0.0, 0.0, -0.2]}
+        },
+        structure={"conductivity_ratio": 0.01},
+    )
+    other = SkinSimulator(falling)
+    for name, rest in bench.voltages([]).items():
+        rising = bench.voltages([press(180)])[name] - rest
+        fallen = other.voltages([press(180)])[name] - rest
+        assert float(np.sign(rising) @ np.sign(fallen)) < -0.9 * len(rest)
+
+
+def test_a_press_off_the_sheet_or_of_no_pressure_is_none(bench: SkinSimulator) -> None:
+    for nothing in (press(0), Press(0.5, 0.5, 180.0)):
+        assert change(bench, nothing) == {"magnitude": 0, "structure": 0}
+
+
+def test_the_stronger_of_two_indenters_on_one_place_counts(bench: SkinSimulator) -> None:
+    strong = bench.voltages([press(190)])
+    for both in ([press(120), press(190)], [press(190), press(120)]):
+        for name, volts in bench.voltages(both).items():
+            np.testing.assert_allclose(volts, strong[name], rtol=1e-12)
+
+
+def test_scenes_do_not_remember_each_other(bench: SkinSimulator) -> None:
+    before = {name: volts.copy() for name, volts in bench.voltages([press(150)]).items()}
+    bench.voltages([press(190), Press(-0.01, 0.01, 150.0, 0.005)])
+    bench.voltages([])
+    for name, volts in bench.voltages([press(150)]).items():
+        np.testing.assert_array_equal(volts, before[name])
+
+
+def test_an_uneven_sheet_is_as_uneven_as_asked_and_the_same_for_a_seed(
+    small: SensorDescription, bench: SkinSimulator
+) -> None:
+    even = bench.voltages([])[Channel.STRUCTURE]
+    first, again, other = (
+        SkinSimulator(small, unevenness=0.05, impedance_spread=0.2, seed=seed).voltages([])
+        for seed in (1, 1, 2)
+    )
+    np.testing.assert_array_equal(first[Channel.STRUCTURE], again[Channel.STRUCTURE])
+    assert not np.allclose(first[Channel.STRUCTURE], other[Channel.STRUCTURE], rtol=1e-3)
+    assert 0.005 < np.abs(first[Channel.STRUCTURE] / even - 1).max() < 0.5
+
+
+def test_the_data_are_not_made_by_the_model_that_inverts_them(
+    paper: SensorDescription, artifact: Artifact, simulator: SkinSimulator
+) -> None:
+    """Another mesh: unpressed voltages differ by its error, and by no more than a few percent."""
+    forward = ForwardModel(paper, artifact.bare)
+    rest = SkinSimulator(paper, spacing_m=0.004).voltages([])[Channel.STRUCTURE]
+    predicted = forward.bare_voltages * forward.volts_per_unit
+    difference = np.abs(rest / predicted - 1)
+    assert 1e-5 < difference.max() < 0.02
+    uneven = simulator.voltages([])[Channel.STRUCTURE]
+    assert 0.01 < np.abs(uneven / predicted - 1).max() < 0.3

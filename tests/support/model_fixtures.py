@@ -1,0 +1,89 @@
+"""Fixtures for models that many tests share, built once for each worker: a plugin of pytest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from noisy_skin import Skin
+from small_sensor import SMALL
+from tactomo_models import (
+    Artifact,
+    Reconstructor,
+    SensorDescription,
+    SkinSimulator,
+    load_description,
+    load_or_build_artifact,
+)
+from tactomo_models.physics.bare_sheet import solve_bare_sheet
+from tactomo_models.physics.forward import ForwardModel
+from tactomo_models.physics.mesh import mesh_sheet
+
+
+@pytest.fixture(scope="session")
+def paper() -> SensorDescription:
+    return load_description("paper_square")
+
+
+@pytest.fixture(scope="session")
+def artifact(paper: SensorDescription) -> Artifact:
+    return load_or_build_artifact(paper)
+
+
+@pytest.fixture(scope="session")
+def small_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A description file of a sheet that solves in a blink."""
+    file = tmp_path_factory.mktemp("sensor") / "small.toml"
+    file.write_text(SMALL)
+    return file
+
+
+@pytest.fixture(scope="session")
+def small(small_file: Path) -> SensorDescription:
+    return load_description(small_file)
+
+
+@pytest.fixture(scope="session")
+def forward(small: SensorDescription) -> ForwardModel:
+    """The small sheet on a coarse mesh."""
+    return ForwardModel(small, solve_bare_sheet(small, mesh_sheet(small, refinements=1)))
+
+
+@pytest.fixture(scope="session")
+def simulator(paper: SensorDescription) -> SkinSimulator:
+    return SkinSimulator(paper, unevenness=0.03, impedance_spread=0.1, seed=11)
+
+
+@pytest.fixture
+def skin(simulator: SkinSimulator) -> Skin:
+    return Skin(simulator)
+
+
+@pytest.fixture
+def reconstructor(paper: SensorDescription, artifact: Artifact, skin: Skin) -> Reconstructor:
+    """Tared on the unpressed skin."""
+    made = Reconstructor(paper, artifact)
+    made.set_reference(skin.reference())
+    return made
+
+
+@pytest.fixture
+def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder in place of the one where models are kept that tests share."""
+    folder = tmp_path / "cache"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(folder))
+    return folder
+
+
+@pytest.fixture
+def solves(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Counts forward solves."""
+    counted: list[int] = []
+    solve = ForwardModel.solve
+
+    def counting(self: ForwardModel, *arguments: object, **options: object) -> object:
+        counted.append(1)
+        return solve(self, *arguments, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(ForwardModel, "solve", counting)
+    return counted

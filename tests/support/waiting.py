@@ -1,0 +1,39 @@
+"""Wait for what another thread or process does, and no longer than it takes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import TypeVar
+
+PATIENCE_S = 60.0
+_T = TypeVar("_T")
+
+
+def wait_until(
+    condition: Callable[[], _T],
+    what: str = "what a test waits for",
+    patience_s: float = PATIENCE_S,
+    step_s: float = 0.005,
+    meanwhile: Callable[[], object] = lambda: None,
+) -> _T:
+    """Return the first true value of a condition, asked again every `step_s` seconds.
+
+    Args:
+        condition: gives a true value once it holds.
+        what: named if it never holds.
+        patience_s: how long, seconds.
+        step_s: seconds between two times.
+        meanwhile: called before each time that the condition is asked.
+
+    Raises:
+        AssertionError: the condition did not hold within `patience_s`.
+
+    """
+    deadline_s = time.monotonic() + patience_s
+    while True:
+        meanwhile()
+        if value := condition():
+            return value
+        assert time.monotonic() < deadline_s, f"waited {patience_s:g} s in vain for {what}"
+        time.sleep(step_s)
