@@ -9,7 +9,7 @@ import numpy as np
 
 from tactomo_models.arrays import FloatArray, Image
 from tactomo_models.scene.areas import Areas
-from tactomo_models.scene.pressure import PressureCurve, PressureRange, pressures_of
+from tactomo_models.scene.pressure import ONE_SIDED_95, PressureCurve, PressureRange, pressures_of
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,12 @@ class Contact:
         force_n: pressure times area; NaN if unknown.
         force_sigma_n: standard uncertainty of the force; NaN if unknown.
         pressure_range: where the pressure lies, seen from what the magnitude channel answers to.
+        peak_kpa: highest pressure under it; NaN if unknown, the range's top if above.
+        peak_sigma_kpa: standard uncertainty of the peak; NaN but within the range.
+        max_kpa: upper bound of its highest pressure, 95 %, whatever the range; +inf where the
+            curve ends below it, NaN where nothing bounds it: no magnitude, or no uncertainty.
+        edge: exponent γ of the pressure (1 - ρ²)^γ from the middle to the edge: 0 flat,
+            0.5 Hertz; NaN if unknown.
     """
 
     id: int
@@ -46,6 +52,10 @@ class Contact:
     force_n: float = float("nan")
     force_sigma_n: float = float("nan")
     pressure_range: PressureRange = PressureRange.UNKNOWN
+    peak_kpa: float = float("nan")
+    peak_sigma_kpa: float = float("nan")
+    max_kpa: float = float("nan")
+    edge: float = float("nan")
 
 
 def contacts_of(
@@ -54,6 +64,10 @@ def contacts_of(
     size: FloatArray,
     sigma: FloatArray,
     curve: PressureCurve | None,
+    *,
+    peak_kpa: FloatArray | None = None,
+    peak_sigma_kpa: FloatArray | None = None,
+    edge: FloatArray | None = None,
 ) -> tuple[Contact, ...]:
     """Make contacts of K areas.
 
@@ -63,8 +77,16 @@ def contacts_of(
         size: (K,) magnitudes; NaN where unknown.
         sigma: (K,) their standard uncertainties.
         curve: the sensor's; None where it has none.
+        peak_kpa: (K,) highest pressures; those of the magnitudes if None.
+        peak_sigma_kpa: (K,) their standard uncertainties; likewise.
+        edge: (K,) exponents of the pressure's edge; unknown if None.
     """
     pressures = pressures_of(curve, size, sigma, areas.areas_m2, areas.sigmas[:, 2])
+    peak = pressures.kpa if peak_kpa is None else peak_kpa
+    peak_sigma = pressures.sigma_kpa if peak_sigma_kpa is None else peak_sigma_kpa
+    gamma = np.full(len(areas), np.nan) if edge is None else edge
+    # A peak that is fitted may lie above what the magnitude, a mean over the area, allows.
+    bound = np.fmax(pressures.max_kpa, peak + ONE_SIDED_95 * peak_sigma)
     return tuple(
         Contact(
             id=ids[k],
@@ -81,6 +103,10 @@ def contacts_of(
             force_n=float(pressures.force_n[k]),
             force_sigma_n=float(pressures.force_sigma_n[k]),
             pressure_range=pressures.ranges[k],
+            peak_kpa=float(peak[k]),
+            peak_sigma_kpa=float(peak_sigma[k]),
+            max_kpa=float(bound[k]),
+            edge=float(gamma[k]),
         )
         for k in range(len(areas))
     )

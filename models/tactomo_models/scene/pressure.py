@@ -17,6 +17,7 @@ from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.sensor.response import MagnitudeResponse
 
 CLEARLY = 2.0  # standard uncertainties above zero from which a magnitude is one
+ONE_SIDED_95 = 1.645  # standard uncertainties below which 95 % of a normal distribution lie
 
 
 class PressureRange(StrEnum):
@@ -38,6 +39,7 @@ class Pressures:
         force_n: (K,) pressure times area.
         force_sigma_n: (K,) standard uncertainties; NaN where the area's is.
         ranges: K of them.
+        max_kpa: (K,) upper bounds, 95 %, in every range; +inf where the curve ends below.
     """
 
     kpa: FloatArray
@@ -45,6 +47,7 @@ class Pressures:
     force_n: FloatArray
     force_sigma_n: FloatArray
     ranges: tuple[PressureRange, ...]
+    max_kpa: FloatArray
 
 
 @dataclass(frozen=True)
@@ -86,6 +89,16 @@ class PressureCurve:
     def sigma(self, magnitude: FloatArray) -> FloatArray:
         """Standard uncertainty of the curve in kPa, any shape."""
         return np.asarray(np.interp(magnitude, self.magnitude, self.sigma_kpa))
+
+    def bound(self, magnitude: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Pressure in kPa, same shape, that the true one stays below with 95 %.
+
+        +inf where the bound of the magnitude lies beyond the curve's top, NaN where it is unknown.
+        """
+        most = magnitude + ONE_SIDED_95 * sigma
+        reported = self.pressure(magnitude)
+        kpa = reported + np.hypot(self.pressure(most) - reported, ONE_SIDED_95 * self.sigma(most))
+        return np.where(most > self.magnitude[-1], np.inf, kpa)
 
     def range_of(self, magnitude: float, sigma: float) -> PressureRange:
         """Where a magnitude with its standard uncertainty lies."""
@@ -136,7 +149,7 @@ def pressures_of(
     if curve is None:
         nothing = np.full(len(magnitude), np.nan)
         unknown = (PressureRange.UNKNOWN,) * len(magnitude)
-        return Pressures(nothing, nothing, nothing, nothing, unknown)
+        return Pressures(nothing, nothing, nothing, nothing, unknown, nothing)
     pairs = zip(magnitude.tolist(), magnitude_sigma.tolist(), strict=True)
     ranges = tuple(curve.range_of(*pair) for pair in pairs)
     within = np.array([r is PressureRange.WITHIN for r in ranges], bool)
@@ -151,4 +164,5 @@ def pressures_of(
     of_area = (kpa - slope * magnitude) * area_sigmas_m2
     of_pressure = np.hypot(curve.spread(magnitude, apart), own) * areas_m2
     force_sigma = np.where(within, 1e3 * np.hypot(of_pressure, of_area), np.nan)
-    return Pressures(kpa, sigma, 1e3 * kpa * areas_m2, force_sigma, ranges)
+    bound = curve.bound(magnitude, magnitude_sigma)
+    return Pressures(kpa, sigma, 1e3 * kpa * areas_m2, force_sigma, ranges, bound)

@@ -63,6 +63,40 @@ def test_each_contact_is_told_where_its_pressure_lies(
     assert np.isfinite(pressures.force_sigma_n[0]) == (found == "within")
 
 
+@pytest.mark.parametrize(
+    ("magnitude", "sigma", "at_least", "at_most"),
+    [
+        (0.0, 0.005, 140, 144),  # too light to be measured: at most the onset
+        (0.05, 0.04, 172, 173),  # too uncertain for a pressure, and bounded all the same
+        (0.1, 0.0, 171, 172.1),  # the curve's own uncertainty counts
+        (0.19, 0.01, np.inf, np.inf),  # may lie beyond the curve's top
+        (0.21, 0.0, np.inf, np.inf),
+    ],
+)
+def test_every_magnitude_bounds_its_pressure(
+    magnitude: float, sigma: float, at_least: float, at_most: float
+) -> None:
+    pressures = one(magnitude, sigma)
+    assert at_least <= pressures.max_kpa[0] <= at_most
+    assert not pressures.max_kpa[0] < pressures.kpa[0]
+
+
+@pytest.mark.parametrize(("magnitude", "sigma"), [(np.nan, np.nan), (0.1, np.nan)])
+def test_a_magnitude_that_is_unknown_bounds_nothing(magnitude: float, sigma: float) -> None:
+    assert np.isnan(one(magnitude, sigma).max_kpa[0])
+
+
+def test_the_bound_holds_in_95_of_100() -> None:
+    rng = np.random.default_rng(5)
+    truth, count = 0.1, 100_000
+    magnitude = truth + 0.01 * rng.standard_normal(count)
+    true_kpa = CURVE.pressure(np.array([truth])) + rng.standard_normal(count) * CURVE.sigma(
+        np.array([truth])
+    )
+    held = true_kpa <= CURVE.bound(magnitude, np.full(count, 0.01))
+    assert held.mean() == pytest.approx(0.95, abs=0.01)
+
+
 def test_beyond_the_range_its_top_is_a_lower_bound() -> None:
     pressures = one(0.4, 0.01)
     assert pressures.kpa[0] == 200
@@ -72,7 +106,7 @@ def test_beyond_the_range_its_top_is_a_lower_bound() -> None:
 def test_without_a_curve_nothing_is_known() -> None:
     pressures = pressures_of(None, *np.full((4, 2), 0.1))
     assert pressures.ranges == (PressureRange.UNKNOWN,) * 2
-    assert np.isnan([pressures.kpa, pressures.sigma_kpa, pressures.force_n]).all()
+    assert np.isnan([pressures.kpa, pressures.max_kpa, pressures.force_n]).all()
 
 
 @pytest.mark.parametrize("area_share", [0.0, 0.02, 0.1])
