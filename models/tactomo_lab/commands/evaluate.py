@@ -101,7 +101,7 @@ def scenes(
     )
     total = count * len(numbers) * len(ratios)
     outcomes = list(shown(reconstruct_scenes(drawn, method), total, f"{seeds} scenes"))
-    settings = _settings(description.name, seeds, snr_of, method)
+    settings = settings_of(description.name, seeds, snr_of, method)
     if as_json:
         typer.echo(json.dumps({**settings, "scenes_each": count, **_as_json(outcomes)}, indent=2))
     else:
@@ -159,7 +159,7 @@ def moving(
             played.append(scores)
             shown.remove_task(task)
     phases = summarise_phases(played)
-    settings = _settings(description.name, seeds, snr_of, method)
+    settings = settings_of(description.name, seeds, snr_of, method)
     if as_json:
         settings |= {"snr_db": snr, "budget_ms": budget_ms}
         rows = {name: asdict(summary) for name, summary in phases.items()}
@@ -218,7 +218,8 @@ def _as_json(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     }
 
 
-def _settings(sensor: str, seeds: str, snr_of: str, method: str) -> dict[str, Any]:
+def settings_of(sensor: str, seeds: str, snr_of: str, method: str) -> dict[str, Any]:
+    """Return what was evaluated, for JSON and `print_settings`."""
     return {
         "simulated": True,
         "sensor": sensor,
@@ -228,7 +229,8 @@ def _settings(sensor: str, seeds: str, snr_of: str, method: str) -> dict[str, An
     }
 
 
-def _print_settings(console: Console, settings: dict[str, Any]) -> None:
+def print_settings(console: Console, settings: dict[str, Any]) -> None:
+    """Print what was evaluated."""
     console.print(
         f"Simulated, not measured: {settings['sensor']}, {settings['seeds']} seeds, method "
         f"[bold]{settings['method']}[/], SNR of the {settings['snr_of']}."
@@ -242,13 +244,13 @@ def _print_scenes(settings: dict[str, Any], outcomes: Sequence[Outcome]) -> None
 
     scores = [outcome.score for outcome in outcomes]
     console = Console()
-    _print_settings(console, settings)
+    print_settings(console, settings)
     groups = {"all": summarise(scores)}
     for name, rows in summaries(scores).items():
         if len(rows) > 1:
             groups |= {f"{name} {value}": summary for value, summary in rows.items()}
-    console.print(_table("maps, cold start", groups, MAPS))
-    console.print(_table("contacts", groups, CONTACTS))
+    console.print(summary_table("maps, cold start", groups, MAPS))
+    console.print(summary_table("contacts", groups, CONTACTS))
     console.print(
         "[dim]worst: ICC that 95 % exceed; shape: ICC of the pressed shape; wrong: ICC below 0.8 "
         "or another count, and no flag that says so. count: right; missed: of the true contacts; "
@@ -288,8 +290,8 @@ def _print_moving(settings: dict[str, Any], title: str, phases: dict[str, PhaseS
     from rich.console import Console
 
     console = Console()
-    _print_settings(console, settings)
-    console.print(_table(title, phases, PHASES))
+    print_settings(console, settings)
+    console.print(summary_table(title, phases, PHASES))
     console.print(
         "[dim]worst: ICC that 95 % exceed; shape: ICC of the pressed shape; lost: longest run of "
         "frames in which that is below 0.8, median and most; ids: identities lost; wrong: frames "
@@ -313,7 +315,10 @@ PHASES: dict[str, Callable[[PhaseSummary], str]] = {
 }
 
 
-def _table(title: str, groups: dict[str, Row], columns: dict[str, Callable[[Row], str]]) -> Table:
+def summary_table(
+    title: str, groups: dict[str, Row], columns: dict[str, Callable[[Row], str]]
+) -> Table:
+    """Return a table of summaries, by the name of each."""
     from rich import box
     from rich.table import Table
 

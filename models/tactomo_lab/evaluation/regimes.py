@@ -19,10 +19,16 @@ import numpy as np
 from tactomo_models.errors import DataError
 from tactomo_models.scene.press import Press, Profile
 from tactomo_models.sensor.description import SensorDescription
+from tactomo_models.sensor.response import MagnitudeChannel, MagnitudeResponse
 from tactomo_protocol import Channel
 
 from tactomo_lab.scenes.presets import placed_apart, scale_of
-from tactomo_lab.scenes.simulation import AS_MADE, SheetState
+from tactomo_lab.scenes.simulation import (
+    AS_MADE,
+    IMPEDANCE_DEVIATION,
+    UNEVENNESS,
+    SheetState,
+)
 from tactomo_lab.scenes.still_scenes import (
     BOTH_CHANNELS,
     CONTRAST,
@@ -35,10 +41,12 @@ from tactomo_lab.scenes.still_scenes import (
 )
 
 Range = tuple[float, float]
+SensorOf = Callable[[SensorDescription], SensorDescription]
 
 SETTLED_FRAMES = 6  # of a scene that stays, before something happens
 SLIDE_FRAMES = 4
 CONVERTER_DB = 60.0  # of the voltage, where there is no change for noise to be measured by
+SOFT_KPA = (180.0, 300.0)  # peak under a ball: well above where the magnitude channel answers
 
 
 @dataclass(frozen=True)
@@ -70,6 +78,8 @@ class Plan:
         tared: their state at the tare.
         later: their state in the last frame.
         lead: a lead of theirs that opens before the last frame.
+        unevenness: standard deviation of each sheet's smooth conductivity error.
+        impedance_deviation: standard deviation of the logarithm of the contact impedances.
         displaced_m: (L,) by how much electrodes sit off along the rim; in place where empty.
         stretch: relative elongation along x, electrodes and all.
         behind: by how many scans the structure channel is late in the last frame.
@@ -87,6 +97,8 @@ class Plan:
     tared: SheetState = AS_MADE
     later: SheetState = AS_MADE
     lead: BadLead | None = None
+    unevenness: float = UNEVENNESS
+    impedance_deviation: float = IMPEDANCE_DEVIATION
     displaced_m: tuple[float, ...] = ()
     stretch: float = 0.0
     behind: int = 0
@@ -225,20 +237,24 @@ class Regime:
     Attributes:
         what: it is, in a sentence.
         draw: draws a case.
+        sensor_of: the sensor whose cases these are, made of the one that is evaluated.
     """
 
     what: str
     draw: Callable[[Draw], Plan]
+    sensor_of: SensorOf
 
 
 REGIMES: Final[dict[str, Regime]] = {}
 
 
-def regime(name: str, what: str) -> Callable[[Callable[[Draw], Plan]], Callable[[Draw], Plan]]:
+def regime(
+    name: str, what: str, sensor_of: SensorOf = lambda sensor: sensor
+) -> Callable[[Callable[[Draw], Plan]], Callable[[Draw], Plan]]:
     """Let a function draw the cases of a regime."""
 
     def add(draw: Callable[[Draw], Plan]) -> Callable[[Draw], Plan]:
-        REGIMES[name] = Regime(what, draw)
+        REGIMES[name] = Regime(what, draw, sensor_of)
         return draw
 
     return add
@@ -299,10 +315,18 @@ def _near_touch(draw: Draw) -> Plan:
     return draw.plan(draw.pair((8, 14), (8, 14), (least, least + 1)))
 
 
-@regime("many", "Five to eight contacts.")
+@regime("crowded", "Five or six small contacts.")
+def _crowded(draw: Draw) -> Plan:
+    return _small_ones(draw, 5 + draw.number % 2)
+
+
+@regime("many", "Eight to ten small contacts.")
 def _many(draw: Draw) -> Plan:
-    count = int(draw.in_turn(5, 6, 7, 8))
-    return draw.plan(draw.apart(count, lambda: draw.press((7, 12)), gap_mm=6))
+    return _small_ones(draw, 8 + draw.number % 3)
+
+
+def _small_ones(draw: Draw, count: int) -> Plan:
+    return draw.plan(draw.apart(count, lambda: draw.press((6, 10)), gap_mm=6))
 
 
 @regime("small-by-large", "A small contact beside a large one.")
@@ -317,12 +341,53 @@ def _light(draw: Draw) -> Plan:
     )
 
 
-@regime("soft-rims", "Balls, under which the pressure falls to the rim.")
-def _soft_rims(draw: Draw) -> Plan:
+@regime("soft", "Balls, under which the pressure falls to the rim.")
+def _soft(draw: Draw) -> Plan:
     def ball() -> Press:
-        return draw.press((10, 20), pressure_kpa=(170, 260), profile="dome")
+        return draw.press((10, 20), pressure_kpa=SOFT_KPA, profile="dome")
 
     return draw.plan(draw.apart(1 + draw.number % 3, ball))
+
+
+@regime("hand-made", "Electrodes 1 mm off, contact impedances by 30 %, sheets uneven by 10 %.")
+def _hand_made(draw: Draw) -> Plan:
+    return _by_hand(draw, draw.plan(draw.scene()))
+
+
+@regime("soft-hand-made", "Balls on a skin made by hand.")
+def _soft_hand_made(draw: Draw) -> Plan:
+    return _by_hand(draw, _soft(draw))
+
+
+def _by_hand(draw: Draw, plan: Plan) -> Plan:
+    off_m = draw.mm * draw.rng.standard_normal(draw.description.electrode_count)
+    return replace(
+        plan, unevenness=0.10, impedance_deviation=0.30, displaced_m=tuple(off_m.tolist())
+    )
+
+
+def one_graded_sheet(description: SensorDescription) -> SensorDescription:
+    """A sensor of the same geometry with one sheet, which answers from 0 kPa on."""
+    response = MagnitudeResponse(pressure_kpa=(0.0, 300.0), relative_change=(0.0, 2.0))
+    changed = {
+        "name": "one_graded_sheet",
+        "title": "One graded sheet",
+        Channel.MAGNITUDE: MagnitudeChannel(response=response),
+        Channel.STRUCTURE: None,
+    }
+    return description.model_copy(update=changed)
+
+
+@regime(
+    "graded", "One sheet that answers from 0 kPa; punches and balls of 40 to 280.", one_graded_sheet
+)
+def _graded(draw: Draw) -> Plan:
+    def punch_or_ball() -> Press:
+        profile: Profile = "dome" if draw.rng.random() < 0.5 else "flat"
+        return draw.press(pressure_kpa=(40, 280), profile=profile)
+
+    plan = draw.plan(draw.apart(1 + draw.number % 3, punch_or_ball))
+    return replace(plan, opposite=False)  # conductivity cannot fall by more than all of it
 
 
 @regime("wrong-contrast", "A contrast of 3 or 1000 where 100 was told.")

@@ -30,8 +30,8 @@ from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
 
 from tactomo_lab.evaluation.faults import with_lead
-from tactomo_lab.evaluation.regimes import Plan, draw_plan
-from tactomo_lab.scenes.measures import correlation, mean
+from tactomo_lab.evaluation.regimes import REGIMES, Plan, draw_plan
+from tactomo_lab.scenes.measures import BAD_ICC, correlation, mean
 from tactomo_lab.scenes.simulation import (
     SheetState,
     Truth,
@@ -43,7 +43,6 @@ from tactomo_lab.scenes.simulation import (
     with_opposite_magnitude,
 )
 from tactomo_lab.scenes.still_scenes import (
-    BOTH_CHANNELS,
     REFERENCE_SCANS,
     SIMULATION,
     SeedSet,
@@ -53,8 +52,6 @@ from tactomo_lab.scenes.still_scenes import (
     require_both_channels,
     seed_of,
 )
-
-BAD_ICC = 0.7
 
 
 @dataclass(frozen=True)
@@ -90,7 +87,7 @@ def make_case(
     """Draw, simulate and measure a case; the same one every time.
 
     Args:
-        description: the sensor; needs both channels.
+        description: the sensor; needs both channels, whatever sensor the regime makes of it.
         regime: one of `REGIMES`.
         seed_set: see `scenes.scenes`.
         number: of the case.
@@ -100,10 +97,12 @@ def make_case(
         DataError: the sensor has a single channel, or no room for what presses.
     """
     require_both_channels(description)
+    description = REGIMES[regime].sensor_of(description)
     plan = draw_plan(description, regime, seed_set, number)
     true = with_opposite_magnitude(description) if plan.opposite else description
     told = true if plan.sign_told else with_opposite_magnitude(true)
-    true = with_contrast(true, plan.contrast)
+    if true.structure is not None:
+        true = with_contrast(true, plan.contrast)
     seed = seed_of(seed_set, f"stability {regime} sheet", number)
     what = f"{SIMULATION} {seed_set} {regime} {number} {plan!r} {true.model_dump_json()}"
     volts = kept_volts(cache, what, lambda: _simulate(plan, true, _fine_mesh(description), seed))
@@ -130,7 +129,14 @@ def _simulate(
 ) -> SimulatedVolts:
     """Noise-free voltages of each channel, at the tare (M,) and in every frame (T, M)."""
     warp = partial(_warped, plan=plan, sensor=sensor)
-    skin = UnevenSkin(sensor, mesh, seed, warp=warp)
+    skin = UnevenSkin(
+        sensor,
+        mesh,
+        seed,
+        unevenness=plan.unevenness,
+        impedance_deviation=plan.impedance_deviation,
+        warp=warp,
+    )
 
     def states(state: SheetState) -> dict[Channel, SheetState]:
         return dict.fromkeys(plan.at_fault, state)
@@ -138,7 +144,7 @@ def _simulate(
     *before, last = plan.frames
     known = {presses: skin.voltages(presses, states(plan.tared)) for presses in set(before)}
     scans = [*(known[presses] for presses in before), skin.voltages(last, states(plan.later))]
-    pressed = {name: np.array([scan[name] for scan in scans]) for name in BOTH_CHANNELS}
+    pressed = {name: np.array([scan[name] for scan in scans]) for name in sensor.channels}
     return SimulatedVolts(skin.voltages([], states(plan.tared)), pressed)
 
 
@@ -158,7 +164,7 @@ def _measure(
     """What the device makes of voltages: noise, a lead that opens, scans late or lost."""
     rest: dict[Channel, FloatArray] = {}
     scans: dict[Channel, FloatArray] = {}
-    for name in BOTH_CHANNELS:
+    for name in description.channels:
         std = noise_std(volts, name, plan.snr_db, plan.snr_of)
         clean, pressed = volts.rest[name], volts.pressed[name].copy()
         rest[name] = clean + std * rng.standard_normal((REFERENCE_SCANS, len(clean)))
@@ -175,12 +181,12 @@ def _measure(
     frames = tuple(
         {
             name: scans[name][index]
-            for name in BOTH_CHANNELS
+            for name in description.channels
             if name == Channel.MAGNITUDE or index < count - plan.lost
         }
         for index in range(count)
     )
-    return Reference.from_scans(rest[Channel.MAGNITUDE], rest[Channel.STRUCTURE]), frames
+    return Reference.from_scans(rest[Channel.MAGNITUDE], rest.get(Channel.STRUCTURE)), frames
 
 
 @dataclass(frozen=True)

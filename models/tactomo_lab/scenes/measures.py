@@ -27,6 +27,8 @@ from tactomo_lab.scenes.still_scenes import PRESSURE_KPA, EvaluationScene
 
 MATCH_M = 0.012  # centres farther apart belong to different contacts
 WRONG_ICC = 0.8  # a map that correlates less shows something else than what presses
+BAD_ICC = 0.7  # one that correlates less should have been flagged
+RIGHT_PEAK = 0.10  # largest relative error of a peak pressure that is right
 FULL_RANGE_KPA = PRESSURE_KPA[1]
 BAND_KPA = 10.0  # pressures that count as one where errors at one pressure are compared
 
@@ -70,6 +72,10 @@ class ContactScore:
         magnitude_error: found minus true, as a share of the range.
         magnitude_sigma: its standard uncertainty as reported, as a share of the range.
         pressure_error_kpa: found minus true; NaN, too, where no pressure was reported.
+        peak_error: relative error of the peak pressure, or of the pressure where no peak was
+            reported; NaN, too, where neither was.
+        x_error_sigmas, y_error_sigmas, area_error_sigmas: errors of place and area over their
+            standard uncertainties; NaN, too, where none was reported.
     """
 
     shape: str
@@ -81,11 +87,20 @@ class ContactScore:
     magnitude_error: float = float("nan")
     magnitude_sigma: float = float("nan")
     pressure_error_kpa: float = float("nan")
+    peak_error: float = float("nan")
+    x_error_sigmas: float = float("nan")
+    y_error_sigmas: float = float("nan")
+    area_error_sigmas: float = float("nan")
 
     @property
     def missed(self) -> bool:
         """Whether nothing was found there."""
         return bool(np.isnan(self.centre_error_mm))
+
+    @property
+    def peak_right(self) -> bool:
+        """Whether it was found with its peak pressure, or nearly."""
+        return abs(self.peak_error) <= RIGHT_PEAK
 
 
 @dataclass(frozen=True)
@@ -96,7 +111,6 @@ class SceneScore:
         scene: its seed set, number of contacts and number, e.g. "tuning 3/17".
         contacts: one for each true contact.
         found: contacts reported.
-        matched: of these, how many are true ones.
         rie, icc: of the magnitude map.
         icc_structure: of the pressed shape.
         flags: names of what was flagged.
@@ -110,7 +124,6 @@ class SceneScore:
     scene: str
     contacts: tuple[ContactScore, ...]
     found: int
-    matched: int
     rie: float
     icc: float
     icc_structure: float
@@ -128,6 +141,11 @@ class SceneScore:
     def count_right(self) -> bool:
         """Whether as many contacts were reported as there are."""
         return self.found == len(self.contacts)
+
+    @property
+    def bad(self) -> bool:
+        """Whether its map should have been flagged."""
+        return self.icc < BAD_ICC
 
     @property
     def confidently_wrong(self) -> bool:
@@ -152,7 +170,6 @@ def score(scene: EvaluationScene, frame: Reconstruction, seconds: float) -> Scen
             for index, true in enumerate(truth.contacts)
         ),
         found=len(frame.contacts),
-        matched=len(pairs),
         rie=relative_error(frame.map, truth.map),
         icc=correlation(frame.map, truth.map),
         icc_structure=correlation(frame.structure, truth.pressed),
@@ -183,7 +200,19 @@ def score_contact(
         magnitude_error=(found.magnitude - true.magnitude) / full,
         magnitude_sigma=found.magnitude_sigma / full,
         pressure_error_kpa=found.pressure_kpa - true.pressure_kpa,
+        peak_error=_peak_kpa(found) / true.pressure_kpa - 1,
+        x_error_sigmas=_sigmas(found.x_m - true.x_m, found.x_sigma_m),
+        y_error_sigmas=_sigmas(found.y_m - true.y_m, found.y_sigma_m),
+        area_error_sigmas=_sigmas(found.area_m2 - true.area_m2, found.area_sigma_m2),
     )
+
+
+def _peak_kpa(found: Contact) -> float:
+    return found.peak_kpa if np.isfinite(found.peak_kpa) else found.pressure_kpa
+
+
+def _sigmas(error: float, sigma: float) -> float:
+    return error / sigma if sigma > 0 else float("nan")
 
 
 def full_range(description: SensorDescription) -> float:
@@ -212,7 +241,11 @@ class Summary:
         pressure_error_kpa: size of the error where a pressure was reported.
         within_sigma: share of magnitude errors within one reported standard uncertainty;
             0.68 where those are right.
+        place_within_sigma, area_within_sigma: likewise of x and y, and of the area.
+        peak_right: share of the true contacts whose peak pressure is right to `RIGHT_PEAK`.
         distrusted: share of scenes flagged as not to be trusted.
+        bad_unflagged: share of scenes with an ICC below `BAD_ICC` and not flagged so.
+        good_flagged: share of the other scenes that are flagged so.
         confidently_wrong: share of scenes that are wrong and not flagged.
         seconds, seconds_99: median and 99th percentile of the compute time.
     """
@@ -232,7 +265,12 @@ class Summary:
     magnitude_spread: float
     pressure_error_kpa: float
     within_sigma: float
+    place_within_sigma: float
+    area_within_sigma: float
+    peak_right: float
     distrusted: float
+    bad_unflagged: float
+    good_flagged: float
     confidently_wrong: float
     seconds: float
     seconds_99: float
@@ -245,6 +283,7 @@ def summarise(scores: Sequence[SceneScore]) -> Summary:
     centre = np.array([contact.centre_error_mm for contact in matched])
     error = np.array([contact.magnitude_error for contact in matched])
     sigma = np.array([contact.magnitude_sigma for contact in matched])
+    place = [e for contact in matched for e in (contact.x_error_sigmas, contact.y_error_sigmas)]
     seconds = [one.seconds for one in scores]
     icc = [one.icc for one in scores]
     return Summary(
@@ -255,7 +294,7 @@ def summarise(scores: Sequence[SceneScore]) -> Summary:
         icc_structure=mean(one.icc_structure for one in scores),
         count_right=mean(one.count_right for one in scores),
         missed=mean(contact.missed for contact in contacts),
-        false=mean(one.found - one.matched for one in scores),
+        false=mean(one.found - sum(not c.missed for c in one.contacts) for one in scores),
         centre_mm=percentile(centre, 50),
         centre_mm_95=percentile(centre, 95),
         area_error=percentile([abs(contact.area_error) for contact in matched], 50),
@@ -263,11 +302,20 @@ def summarise(scores: Sequence[SceneScore]) -> Summary:
         magnitude_spread=_largest_spread(matched),
         pressure_error_kpa=mean(abs(contact.pressure_error_kpa) for contact in matched),
         within_sigma=mean(np.where(np.isfinite(error), np.abs(error) <= sigma, np.nan)),
+        place_within_sigma=_share_within_one(place),
+        area_within_sigma=_share_within_one([contact.area_error_sigmas for contact in matched]),
+        peak_right=mean(contact.peak_right for contact in contacts),
         distrusted=mean(one.distrusted for one in scores),
+        bad_unflagged=mean(one.bad and not one.distrusted for one in scores),
+        good_flagged=mean(one.distrusted for one in scores if not one.bad),
         confidently_wrong=mean(one.confidently_wrong for one in scores),
         seconds=percentile(seconds, 50),
         seconds_99=percentile(seconds, 99),
     )
+
+
+def _share_within_one(errors: Sequence[float]) -> float:
+    return mean(abs(error) <= 1 for error in errors if np.isfinite(error))
 
 
 def mean(values: Iterable[Any]) -> float:

@@ -229,8 +229,8 @@ class TrueContact:
     Attributes:
         x_m, y_m: its centroid.
         area_m2: its area.
-        pressure_kpa: its pressure.
-        magnitude: |relative conductivity change| of the magnitude channel under it.
+        pressure_kpa: its highest pressure.
+        magnitude: |relative conductivity change| of the magnitude channel, mean over its area.
         shape: of its indenter.
     """
 
@@ -269,20 +269,24 @@ def truth_of(description: SensorDescription, presses: Sequence[Press]) -> Truth:
     edge_m = max(step_x, step_y)
     pressure, coverage = strongest(presses, x, y, edge_m)
     magnitude = coverage * np.abs(response.change(pressure))
-    return Truth(
-        map=_over_cells(magnitude),
-        pressed=_over_cells(coverage * _saturation(description, pressure)),
-        contacts=tuple(
+    contacts = []
+    for press in presses:
+        own = press.coverage(x, y, edge_m)
+        change = np.broadcast_to(response.change(np.asarray(press.pressure_at(x, y))), x.shape)
+        contacts.append(
             TrueContact(
                 x_m=press.x_m,
                 y_m=press.y_m,
-                area_m2=float(press.coverage(x, y, edge_m).sum() * step_x * step_y),
+                area_m2=float(own.sum() * step_x * step_y),
                 pressure_kpa=press.pressure_kpa,
-                magnitude=float(np.abs(response.change(np.array(press.pressure_kpa)))),
+                magnitude=float(np.average(np.abs(change), weights=own)),
                 shape=press.shape,
             )
-            for press in presses
-        ),
+        )
+    return Truth(
+        map=_over_cells(magnitude),
+        pressed=_over_cells(coverage * _saturation(description, pressure)),
+        contacts=tuple(contacts),
     )
 
 

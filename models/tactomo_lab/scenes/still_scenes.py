@@ -99,7 +99,7 @@ class EvaluationScene:
         snr_db: signal-to-noise ratio, and `snr_of` what; see `noise_std`.
         reference: the mean of noisy unpressed scans, as at a tare.
         magnitude: (M,) volts.
-        structure: (M,) volts.
+        structure: (M,) volts; None of a sensor without that channel.
     """
 
     layout: Layout
@@ -108,7 +108,7 @@ class EvaluationScene:
     snr_of: SnrOf
     reference: Reference
     magnitude: FloatArray
-    structure: FloatArray
+    structure: FloatArray | None
 
     @cached_property
     def truth(self) -> Truth:
@@ -297,7 +297,7 @@ class Simulation:
 
 @dataclass(frozen=True)
 class SimulatedVolts:
-    """Noise-free voltages of each channel, volts: (M,) at rest and (M,) or (T, M) pressed."""
+    """Noise-free volts of a sensor's channels: (M,) at rest and (M,) or (T, M) pressed."""
 
     rest: Volts
     pressed: Volts
@@ -306,7 +306,7 @@ class SimulatedVolts:
 def kept_volts(
     folder: Path | None, what: str, simulate: Callable[[], SimulatedVolts]
 ) -> SimulatedVolts:
-    """Voltages of both channels from an earlier call, or simulated and kept.
+    """Voltages of a sensor's channels from an earlier call, or simulated and kept.
 
     Args:
         folder: see `cached`.
@@ -316,13 +316,14 @@ def kept_volts(
 
     def make() -> dict[str, FloatArray]:
         volts = simulate()
-        rest = {f"{name}_rest": volts.rest[name] for name in BOTH_CHANNELS}
-        return rest | {f"{name}_pressed": volts.pressed[name] for name in BOTH_CHANNELS}
+        rest = {f"{name}_rest": scan for name, scan in volts.rest.items()}
+        return rest | {f"{name}_pressed": scans for name, scans in volts.pressed.items()}
 
     arrays = cached(folder, what, make)
+    channels = [name for name in BOTH_CHANNELS if f"{name}_rest" in arrays]
     return SimulatedVolts(
-        rest={name: arrays[f"{name}_rest"] for name in BOTH_CHANNELS},
-        pressed={name: arrays[f"{name}_pressed"] for name in BOTH_CHANNELS},
+        rest={name: arrays[f"{name}_rest"] for name in channels},
+        pressed={name: arrays[f"{name}_pressed"] for name in channels},
     )
 
 

@@ -77,7 +77,6 @@ def scene(paper: SensorDescription, *found: Contact | None, **other: object) -> 
         scene="tuning 1/0",
         contacts=tuple(score_contact(paper, TRUE, contact) for contact in found),
         found=sum(contact is not None for contact in found),
-        matched=sum(contact is not None for contact in found),
         rie=0.2,
         icc=0.9,
         icc_structure=0.95,

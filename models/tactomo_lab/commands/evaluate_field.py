@@ -1,0 +1,135 @@
+"""`tactomo evaluate field`: the scenes that a pressure field has to explain, row by row."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from tactomo.cli.options import (
+    DEFAULT_DESCRIPTION,
+    Description,
+    JsonOutput,
+    Method,
+    examples,
+    typer_app,
+)
+
+from tactomo_lab.commands.evaluate import (
+    Seeds,
+    print_settings,
+    settings_of,
+    shown,
+    summary_table,
+)
+
+if TYPE_CHECKING:
+    from tactomo_lab.scenes.measures import SceneScore, Summary
+
+app = typer_app()
+
+
+@app.command(
+    epilog=examples(
+        "tactomo evaluate field",
+        "tactomo evaluate field --rows soft,graded --method fit --count 30",
+        "tactomo evaluate field --seeds reporting --count 50 --json > field.json",
+    ),
+)
+def field(
+    seeds: Seeds = "tuning",
+    count: Annotated[int, typer.Option(min=1, help="Scenes of each line.")] = 10,
+    rows: Annotated[str | None, typer.Option(help="Which rows, with commas. [all of them]")] = None,
+    method: Method = "auto",
+    sensor: Description = DEFAULT_DESCRIPTION,
+    as_json: JsonOutput = False,
+) -> None:
+    """Reconstruct what one pressure field has to explain: soft presses, one graded sheet, crowds.
+
+    *ordinary*: one to four contacts, at 40, 20 and 10 dB of the change; the others at 40.
+    *rectangles-rings*: of those shapes alone. *hand-made*: electrodes 1 mm off, contact impedances
+    by 30 %, sheets uneven by 10 %. *soft*: balls of 180 to 300 kPa. *graded*: one sheet alone that
+    answers from 0 kPa on. *crowded*: five or six small contacts; *many*: eight to ten. All are
+    simulated as in `tactomo evaluate scenes`, each reconstructed from a cold start. The first run
+    simulates (half a second to a second a scene) and keeps the voltages in the cache.
+    """
+    from tactomo_models import ModelError, load_description
+
+    from tactomo_lab.evaluation.field import ROWS, scenes_of_row
+    from tactomo_lab.evaluation.still import reconstruct_scenes
+
+    description = load_description(sensor)
+    scores: dict[str, list[SceneScore]] = {}
+    for row in _chosen(rows, ROWS):
+        for line, scenes in scenes_of_row(description, row, seeds, count).items():
+            try:
+                outcomes = list(shown(reconstruct_scenes(scenes, method), count, line))
+            except ModelError as error:  # of a row's own sensor, for which a method may not serve
+                typer.echo(f"left out: {line}: {error}", err=True)
+                continue
+            scores[line] = [outcome.score for outcome in outcomes]
+    settings = settings_of(description.name, seeds, "change", method)
+    if as_json:
+        told = {**settings, "scenes_each": count, "lines": _as_json(scores)}
+        typer.echo(json.dumps(told, indent=2))
+    else:
+        _print(settings, scores)
+
+
+def _chosen(text: str | None, known: tuple[str, ...]) -> list[str]:
+    """The names from "a,b", in that order; all where nothing was asked for."""
+    names = [name.strip() for name in text.split(",")] if text is not None else list(known)
+    for name in names:
+        if name not in known:
+            raise typer.BadParameter(f"--rows {name!r}: give one or more of {', '.join(known)}")
+    return list(dict.fromkeys(names))
+
+
+def _as_json(scores: dict[str, list[SceneScore]]) -> dict[str, Any]:
+    from tactomo_lab.scenes.measures import summarise
+
+    return {
+        line: {**asdict(summarise(own)), "scores": [one.as_json() for one in own]}
+        for line, own in scores.items()
+    }
+
+
+def _print(settings: dict[str, Any], scores: dict[str, list[SceneScore]]) -> None:
+    from rich.console import Console
+
+    from tactomo_lab.scenes.measures import summarise
+
+    console = Console()
+    print_settings(console, settings)
+    groups = {line: summarise(own) for line, own in scores.items()}
+    console.print(summary_table("maps", groups, MAPS))
+    console.print(summary_table("contacts", groups, CONTACTS))
+    console.print(
+        "[dim]worst: ICC that 95 % exceed; silent: maps with an ICC below 0.7 and no flag that "
+        "tells to distrust, of all; alarms: good maps with one, of the good ones. mm: centre "
+        "error, median; peak: right to 10 %, of the true contacts; in σ: magnitudes, places and "
+        "areas within one reported standard uncertainty, 68 % where that is right.[/]"
+    )
+
+
+MAPS: dict[str, Callable[[Summary], str]] = {
+    "maps": lambda s: str(s.scenes),
+    "ICC": lambda s: f"{s.icc:.3f}",
+    "RIE": lambda s: f"{s.rie:.3f}",
+    "worst": lambda s: f"{s.icc_worst:.2f}",
+    "flagged": lambda s: f"{s.distrusted:.0%}",
+    "silent": lambda s: f"{s.bad_unflagged:.0%}",
+    "alarms": lambda s: f"{s.good_flagged:.0%}",
+    "ms": lambda s: f"{s.seconds * 1e3:.0f}",
+    "p99": lambda s: f"{s.seconds_99 * 1e3:.0f}",
+}
+CONTACTS: dict[str, Callable[[Summary], str]] = {
+    "count": lambda s: f"{s.count_right:.0%}",
+    "mm": lambda s: f"{s.centre_mm:.2f}",
+    "peak": lambda s: f"{s.peak_right:.0%}",
+    "magnitude in σ": lambda s: f"{s.within_sigma:.0%}",
+    "place in σ": lambda s: f"{s.place_within_sigma:.0%}",
+    "area in σ": lambda s: f"{s.area_within_sigma:.0%}",
+}

@@ -1,0 +1,98 @@
+"""The scenes that a pressure field has to explain, in rows: soft, graded, made by hand, crowded.
+
+Still scenes, each reconstructed from a cold start and run to its end. The rows of ordinary scenes,
+rectangles and rings are `still_scenes`'; each of the others is the regime of that name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import count as count_from
+from itertools import islice
+from pathlib import Path
+from typing import Final
+
+from tactomo_models.sensor.description import SensorDescription
+from tactomo_protocol import Channel
+
+from tactomo_lab.evaluation.stability import make_case
+from tactomo_lab.scenes.still_scenes import (
+    SCENE_SHAPES,
+    EvaluationScene,
+    Layout,
+    SceneShape,
+    SeedSet,
+    Simulation,
+    draw_layout,
+    measure,
+    require_both_channels,
+)
+
+MAX_CONTACTS = 4  # of a scene that is not crowded
+ORDINARY_DB = (40.0, 20.0, 10.0)  # of the change, as the paper tests
+SHAPES_DB = 40.0
+REGIME_ROWS: Final = ("hand-made", "soft", "soft-hand-made", "graded", "crowded", "many")
+ROWS: Final = ("ordinary", "rectangles-rings", *REGIME_ROWS)
+
+
+def scenes_of_row(
+    description: SensorDescription,
+    row: str,
+    seed_set: SeedSet,
+    count: int,
+    cache: Path | None = None,
+) -> dict[str, Iterator[EvaluationScene]]:
+    """Scenes of a row, `count` on each of its lines, by the line's name; the same ones every time.
+
+    Args:
+        description: the sensor; needs both channels, whatever sensor the row makes of it.
+        row: one of `ROWS`.
+        seed_set: see `still_scenes.scenes`.
+        count: scenes of each line.
+        cache: folder of simulated voltages; in the user's cache if None.
+
+    Raises:
+        DataError: the sensor has a single channel, or no room for what presses.
+    """
+    require_both_channels(description)
+    if row in REGIME_ROWS:
+        cases = (_of_regime(description, row, seed_set, number, cache) for number in range(count))
+        return {row: cases}
+    simulation = Simulation(description, cache)
+
+    def still(shapes: tuple[SceneShape, ...], snr_db: float) -> Iterator[EvaluationScene]:
+        for layout in islice(_layouts(description, seed_set, shapes), count):
+            yield measure(simulation.voltages(layout), layout, description, snr_db, "change")
+
+    if row == "ordinary":
+        return {f"{row} {snr_db:g} dB": still(SCENE_SHAPES, snr_db) for snr_db in ORDINARY_DB}
+    return {row: still(("rectangle", "ring"), SHAPES_DB)}
+
+
+def _layouts(
+    description: SensorDescription, seed_set: SeedSet, shapes: tuple[SceneShape, ...]
+) -> Iterator[Layout]:
+    """Those of some shapes, of one to `MAX_CONTACTS` contacts in turns."""
+    for number in count_from():
+        for contacts in range(1, MAX_CONTACTS + 1):
+            layout = draw_layout(description, seed_set, contacts, number)
+            if layout.shape in shapes:
+                yield layout
+
+
+def _of_regime(
+    description: SensorDescription, regime: str, seed_set: SeedSet, number: int, cache: Path | None
+) -> EvaluationScene:
+    """A case of a regime of single frames."""
+    case = make_case(description, regime, seed_set, number, cache)
+    plan, (scans,) = case.plan, case.frames
+    (presses,) = plan.frames
+    return EvaluationScene(
+        layout=Layout(seed_set, number, presses, "ellipse", plan.contrast, plan.opposite),
+        description=case.description,
+        snr_db=plan.snr_db,
+        snr_of=plan.snr_of,
+        reference=case.reference,
+        magnitude=scans[Channel.MAGNITUDE],
+        structure=scans.get(Channel.STRUCTURE),
+    )

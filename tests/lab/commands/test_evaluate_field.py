@@ -1,0 +1,37 @@
+"""`tactomo evaluate field`: what is asked for is what is evaluated, and it is told in full."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from small_sensor import SMALL
+
+Run = Callable[..., Any]
+
+
+def test_in_numbers_and_words(tactomo: Run, tmp_path: Path) -> None:
+    sensor = tmp_path / "small.toml"
+    sensor.write_text(SMALL)
+    ask = ("evaluate", "field", "--description", sensor, "--rows", "soft,graded", "--count", 1)
+    numbers = tactomo(*ask, "--method", "tikhonov", "--json")
+    assert numbers.returncode == 0, numbers.stderr
+    told = json.loads(numbers.stdout)
+    assert (told["simulated"], told["seeds"], told["method"]) == (True, "tuning", "tikhonov")
+    assert list(told["lines"]) == ["soft", "graded"]
+    for line in told["lines"].values():
+        assert line["scenes"] == len(line["scores"]) == 1
+        assert line["icc"] == pytest.approx(line["scores"][0]["icc"])
+    words = tactomo(*ask, "--method", "tikhonov")
+    assert words.returncode == 0
+    assert "Simulated, not measured: small, tuning seeds" in words.stdout
+    assert "area in σ" in words.stdout
+
+
+def test_an_unknown_row_is_a_usage_error(tactomo: Run) -> None:
+    result = tactomo("evaluate", "field", "--rows", "soft,loud")
+    assert result.returncode == 2
+    assert "'loud': give" in result.stderr

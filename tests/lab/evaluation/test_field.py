@@ -1,0 +1,80 @@
+"""Rows of the field's evaluation: each is made of the scenes that it names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tactomo_lab.evaluation.field import ROWS, scenes_of_row
+from tactomo_lab.evaluation.still import reconstruct_scenes
+from tactomo_lab.scenes.still_scenes import EvaluationScene
+from tactomo_models import DataError, SensorDescription
+from variants import variant
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("scenes")
+
+
+def one_of(small: SensorDescription, row: str, folder: Path) -> dict[str, EvaluationScene]:
+    lines = scenes_of_row(small, row, "tuning", 1, folder)
+    return {line: scene for line, scenes in lines.items() for scene in scenes}
+
+
+@pytest.mark.parametrize("row", ROWS)
+def test_a_scene_of_each_row_is_reconstructed_and_scored(
+    small: SensorDescription, folder: Path, row: str
+) -> None:
+    lines = one_of(small, row, folder)
+    assert lines
+    for scene, outcome in zip(
+        lines.values(), reconstruct_scenes(lines.values(), "tikhonov"), strict=True
+    ):
+        score = outcome.score
+        assert len(score.contacts) == len(scene.layout.presses)
+        assert -1 <= score.icc <= 1
+        assert score.seconds > 0
+
+
+def test_ordinary_scenes_are_the_same_ones_at_each_noise(
+    small: SensorDescription, folder: Path
+) -> None:
+    quiet, noisy, noisiest = one_of(small, "ordinary", folder).values()
+    assert quiet.layout == noisy.layout == noisiest.layout
+    assert [scene.snr_db for scene in (quiet, noisy, noisiest)] == [40, 20, 10]
+    assert quiet.reference.magnitude_noise is not None
+    assert noisy.reference.magnitude_noise is not None
+    np.testing.assert_allclose(
+        noisy.reference.magnitude_noise / quiet.reference.magnitude_noise, 10, rtol=1e-6
+    )
+
+
+def test_one_graded_sheet_has_no_structure_scan(small: SensorDescription, folder: Path) -> None:
+    (scene,) = one_of(small, "graded", folder).values()
+    assert scene.structure is None
+    assert scene.reference.structure is None
+    assert scene.description.magnitude is not None
+    assert scene.description.channels == ("magnitude",)
+    assert scene.description.sha256 == small.sha256  # the same artifact serves
+    (press,) = scene.layout.presses
+    highest = scene.description.magnitude.response.change(np.array(press.pressure_kpa))
+    assert 0.5 * highest < scene.truth.map.max() <= highest
+
+
+def test_a_ball_has_its_peak_and_the_mean_over_its_area(
+    small: SensorDescription, folder: Path
+) -> None:
+    (scene,) = one_of(small, "soft", folder).values()
+    (press,), (contact,) = scene.layout.presses, scene.truth.contacts
+    assert press.profile == "dome"
+    assert contact.pressure_kpa == press.pressure_kpa
+    cell_m2 = np.diff(small.map_x_m)[0] * np.diff(small.map_y_m)[0]
+    in_all = scene.truth.map.sum() * cell_m2
+    assert contact.magnitude * contact.area_m2 == pytest.approx(in_all, rel=1e-6)
+
+
+def test_a_sensor_of_one_channel_has_no_rows(small: SensorDescription) -> None:
+    with pytest.raises(DataError, match="one channel"):
+        scenes_of_row(variant(small, magnitude=None), "soft", "tuning", 1)
