@@ -174,6 +174,9 @@ def frame_arrays(
 
     return {
         "map": np.array([absent if f.map is None else f.map for f in frames]),
+        "pressure_kpa": np.array(
+            [absent if f.pressure_kpa is None else f.pressure_kpa for f in frames]
+        ),
         "structure": np.array([absent if f.structure is None else f.structure for f in frames]),
         "misfit": column([f.misfit for f in frames]),
         "confidence": column([f.confidence for f in frames]),
@@ -190,6 +193,10 @@ def frame_arrays(
         "contact_pressure_kpa": column([c.pressure_kpa for _, c in contacts]),
         "contact_pressure_sigma_kpa": column([c.pressure_sigma_kpa for _, c in contacts]),
         "contact_pressure_range": np.array([str(c.pressure_range) for _, c in contacts], "U7"),
+        "contact_peak_kpa": column([c.peak_kpa for _, c in contacts]),
+        "contact_peak_sigma_kpa": column([c.peak_sigma_kpa for _, c in contacts]),
+        "contact_max_kpa": column([c.max_kpa for _, c in contacts]),
+        "contact_edge": column([c.edge for _, c in contacts]),
         "contact_force_n": column([c.force_n for _, c in contacts]),
         "contact_force_sigma_n": column([c.force_sigma_n for _, c in contacts]),
     }

@@ -43,6 +43,11 @@ def test_a_press_is_found_in_a_file(tactomo: Run, tmp_path: Path) -> None:
         force_n = 1e-3 * maps["contact_pressure_kpa"] * maps["contact_area_mm2"]
         np.testing.assert_allclose(maps["contact_force_n"], force_n)
         assert np.isfinite(maps["contact_force_sigma_n"]).all()
+        assert maps["contact_max_kpa"] > maps["contact_peak_kpa"] >= maps["contact_pressure_kpa"]
+        assert maps["contact_peak_sigma_kpa"].shape == maps["contact_edge"].shape == (1,)
+        assert maps["pressure_kpa"].dtype == np.float32
+        np.testing.assert_array_equal(maps["pressure_kpa"][0], np.zeros((51, 51)))
+        assert maps["pressure_kpa"][1].max() == pytest.approx(maps["contact_pressure_kpa"][0])
 
 
 def test_a_calibration_says_how_hard_is_pressed(tactomo: Run, tmp_path: Path) -> None:

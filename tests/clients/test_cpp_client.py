@@ -118,7 +118,10 @@ def python_view(frame: Frame) -> dict[str, Any]:
         if not field.name.startswith("_") and field.name not in ("x_mm", "y_mm")
     }
     view["flags"] = sorted(frame.flags)
-    view["contacts"] = [dataclasses.asdict(contact) for contact in frame.contacts]
+    view["contacts"] = [
+        {**dataclasses.asdict(contact), "exceeds_150": contact.exceeds(150).value}
+        for contact in frame.contacts
+    ]
     for name in IMAGES:
         image = getattr(frame, name)
         if image is not None:
@@ -131,7 +134,7 @@ def python_view(frame: Frame) -> dict[str, Any]:
 def cpp_view(said: dict[str, Any]) -> dict[str, Any]:
     """The frame that the probe printed, in the words of `python_view`."""
     view = {**said, "flags": sorted(set(said["flags"]))}
-    del view["age_ns"]
+    del view["age_ns"], view["exceeds_150"]  # they go by the time at which they are asked for
     for name in ("tier", "tier_reason"):
         view[name] = said[name] or None
     return view
@@ -394,6 +397,30 @@ def test_gaps_malformed_messages_and_a_flag_of_tomorrow(sensor: FakeSensor, prob
     assert (seen["malformed"], seen["malformed_by"], seen["missed"]) == (2, "schema", 2)
 
 
+def test_a_limit_is_judged_as_in_python(sensor: FakeSensor, probe: Path) -> None:
+    hard = Contact(1, 0.0, 0.0, 700.0, 0.2, 0.01, 170.0, max_kpa=180.0)
+    light = Contact(2, 30.0, 0.0, 700.0, 0.0, 0.01, None, pressure_range="below", max_kpa=134.0)
+    unknown = Contact(3, 0.0, 30.0, 700.0, None, None, None)
+    cases: list[tuple[list[Contact], list[str], str]] = [
+        ([], [], "no"),
+        ([light], [], "no"),
+        ([light], ["misfit_high"], "cannot tell"),
+        ([light, unknown], [], "cannot tell"),
+        ([unknown, hard], ["misfit_high"], "yes"),
+    ]
+    with (
+        Watch(probe, "left", sensor.address, "contacts") as skin,
+        subscribe("left", address=sensor.address, kind="contacts", timeout_s=PATIENCE_S) as python,
+    ):
+        for _ in range(2):
+            sensor.wait_for_subscriber(PATIENCE_S)
+        for contacts, flags, answer in cases:
+            sensor.publish(contacts, flags=flags)
+            assert next(python).exceeds(150).value == answer
+            said = skin.wait(lambda said: said["frame"], "the frame")
+            assert said["frame"]["exceeds_150"] == answer
+
+
 def test_an_old_frame_is_stale_and_silence_makes_one_stale(sensor: FakeSensor, probe: Path) -> None:
     old_ns = time.monotonic_ns() - 2_000_000_000
     with Watch(probe, "left", sensor.address, "contacts") as skin:
@@ -439,7 +466,9 @@ def examples() -> dict[str, dict[str, Any]]:
     """Fields of a `map` and of a `contacts` message."""
     image = np.linspace(0, 1, 12, dtype=np.float32).reshape(3, 4)
     contact = {**CONTACT, "magnitude_sigma": 0.5, "force_n": 2, "pressure_range": "below"}
-    fields = {**HEADER, "contacts": [contact, dict(CONTACT)], "clock_id": "a", "dated_by": "device"}
+    soft = {**CONTACT, "pressure_kpa": 120.0, "peak_kpa": 160, "peak_sigma_kpa": 3.0, "edge": 0.5}
+    contacts = [contact | {"max_kpa": 134.0}, soft, dict(CONTACT)]
+    fields = {**HEADER, "contacts": contacts, "clock_id": "a", "dated_by": "device"}
     array = {"shape": [3, 4], "dtype": "<f4", "data": image.tobytes()}
     images = {"map": array, "pressure_kpa": None, "structure": dict(array)}
     extent = {"x_mm": [-75.0, 75.0], "y_mm": [-75, 75]}

@@ -9,11 +9,13 @@ import subprocess
 import sys
 import time
 import weakref
-from typing import assert_type
+from dataclasses import replace
+from typing import Any, assert_type
 
 import numpy as np
 import pytest
 from tactomo_client import (
+    Answer,
     Contact,
     ControlError,
     Event,
@@ -38,6 +40,43 @@ CONTACT = Contact(
     pressure_kpa=170.0,
 )
 RAMP = np.tile(np.linspace(0, 1, 51, dtype=np.float32), (51, 1))
+
+
+@pytest.mark.parametrize(
+    ("known", "answer"),
+    [
+        ({"pressure_kpa": 170.0}, Answer.YES),
+        ({"pressure_kpa": 120.0, "peak_kpa": 150.0, "max_kpa": 170.0}, Answer.YES),
+        ({"pressure_kpa": 145.0, "max_kpa": 152.0}, Answer.CANNOT_TELL),
+        ({"pressure_kpa": 140.0, "max_kpa": 146.0}, Answer.NO),
+        ({"pressure_kpa": None, "pressure_range": "below", "max_kpa": 134.0}, Answer.NO),
+        ({"pressure_kpa": None, "pressure_range": "below"}, Answer.CANNOT_TELL),
+        ({"pressure_kpa": 120.0, "pressure_range": "above"}, Answer.CANNOT_TELL),
+    ],
+)
+def test_a_contact_exceeds_a_limit_or_not_or_nobody_can_tell(
+    known: dict[str, Any], answer: Answer
+) -> None:
+    assert replace(CONTACT, **known).exceeds(150) is answer
+
+
+@pytest.mark.parametrize("answer", Answer)
+def test_no_answer_is_taken_for_another_by_a_bare_if(answer: Answer) -> None:
+    with pytest.raises(TypeError, match=r"Answer\.YES"):
+        bool(answer)
+
+
+def test_an_old_frame_or_a_flag_is_no_no(sensor: FakeSensor) -> None:
+    with subscribe("left", address=sensor.address, timeout_s=10) as frames:
+        sensor.wait_for_subscriber()
+        sensor.publish()
+        assert next(frames).exceeds(150) is Answer.NO
+        sensor.publish(flags=["no_reference"])
+        assert next(frames).exceeds(150) is Answer.CANNOT_TELL
+        sensor.publish(acquired_monotonic_ns=time.monotonic_ns() - 2_000_000_000)
+        assert next(frames).exceeds(150) is Answer.CANNOT_TELL
+        sensor.publish([CONTACT], flags=["misfit_high"])
+        assert next(frames).exceeds(150) is Answer.YES
 
 
 def newest_sequence(frames: Subscription[Frame]) -> int:

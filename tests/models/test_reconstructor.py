@@ -283,7 +283,9 @@ def test_the_same_frames_give_the_same_maps(
     for first, second in zip(*runs, strict=True):
         np.testing.assert_array_equal(first.map, second.map)
         one, other = ([astuple(contact) for contact in run.contacts] for run in (first, second))
-        assert str(one) == str(other), "to the last bit; what is not known is NaN, unequal to itself"
+        assert str(one) == str(other), (
+            "to the last bit; what is not known is NaN, unequal to itself"
+        )
 
 
 def test_a_sheet_whose_conductivity_falls_is_no_different(

@@ -345,12 +345,15 @@ def test_what_is_touched_too_lightly_is_shown_and_has_no_number(page: Page) -> N
     page.skin.press(36, -48)
     (contact,) = page.skin.contacts
     unknown = np.where(blob(36, -48, 1.0) > 0, np.nan, 0).astype(np.float32)
-    page.skin.contacts = [replace(contact, pressure_kpa=None, pressure_range="below")]
+    light = replace(contact, pressure_kpa=None, pressure_range="below")
+    page.skin.contacts = [light]
     page.skin.frame |= {"pressure_kpa": unknown}
     page.open()
     wait_until(lambda: page["contacts"].text.split()[-2:] == ["touched", "–"])
     wait_until(lambda: page.colour(30, -48)[1] > 120)  # as where there is no map at all
     assert sum(page.colour(-36, 48)) < 60
+    page.skin.contacts = [replace(light, max_kpa=90.4)]
+    wait_until(lambda: page["contacts"].text.split()[-4:] == ["at", "most", "90", "–"])
 
 
 def test_rate_latency_method_and_quality_are_shown(page: Page) -> None:

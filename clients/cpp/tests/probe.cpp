@@ -111,6 +111,18 @@ std::string_view name_of(tactomo::PressureRange range) {
     return "unknown";
 }
 
+std::string_view name_of(tactomo::Answer answer) {
+    switch (answer) {
+        case tactomo::Answer::yes:
+            return "yes";
+        case tactomo::Answer::no:
+            return "no";
+        case tactomo::Answer::cannot_tell:
+            break;
+    }
+    return "cannot tell";
+}
+
 void print_contact(const tactomo::Contact& contact) {
     std::printf("{\"id\": %" PRId64, contact.id);
     print_member("x_mm", contact.x_mm);
@@ -126,6 +138,11 @@ void print_contact(const tactomo::Contact& contact) {
     print_member("y_sigma_mm", contact.y_sigma_mm);
     print_member("area_sigma_mm2", contact.area_sigma_mm2);
     print_member("pressure_range", name_of(contact.pressure_range));
+    print_member("peak_kpa", contact.peak_kpa);
+    print_member("peak_sigma_kpa", contact.peak_sigma_kpa);
+    print_member("max_kpa", contact.max_kpa);
+    print_member("edge", contact.edge);
+    print_member("exceeds_150", name_of(contact.exceeds(150)));
     print("}");
 }
 
@@ -155,6 +172,7 @@ void print_frame(const tactomo::Frame& frame) {
     print_member("tier_reason", frame.tier_reason.view());
     print_member("misfit", frame.misfit);
     print_member("confidence", frame.confidence);
+    print_member("exceeds_150", name_of(frame.exceeds(150)));
     print_member("age_ns", std::int64_t{frame.age().count()});
     print_image("map", frame.map);
     print_image("pressure_kpa", frame.pressure_kpa);

@@ -44,7 +44,7 @@ from tactomo_client.errors import (
     TareRefused,
 )
 from tactomo_client.event import Event
-from tactomo_client.frame import Contact, Frame
+from tactomo_client.frame import Answer, Contact, Frame
 from tactomo_client.keys import Keys
 from tactomo_client.messages import (
     DEFAULT_CONTROL,
@@ -59,6 +59,7 @@ __all__ = [
     "DEFAULT_STREAM",
     "DEFAULT_TWIN_CONTROL",
     "AlreadyRecording",
+    "Answer",
     "BadArgument",
     "BudgetInForce",
     "CalibrationInForce",

@@ -67,6 +67,8 @@ def pressure_words(contact: Contact) -> str:
     """Return the contact's pressure, as far as it is known."""
     if contact.pressure_kpa is not None:
         return _measured(contact, contact.pressure_kpa, contact.pressure_sigma_kpa, "kPa")
+    if contact.max_kpa is not None:
+        return f"at most {contact.max_kpa:.0f} kPa"
     if contact.pressure_range == "below":
         return "touched, pressure unknown"
     return "pressed" if contact.magnitude is None else f"Δσ/σ₀ {contact.magnitude:.3f}"

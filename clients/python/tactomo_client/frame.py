@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from tactomo_client.errors import MessageError
@@ -20,6 +21,20 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Image: TypeAlias = "NDArray[np.float32]"
+
+
+class Answer(Enum):
+    """What `exceeds` answers: compare it, as in ``is Answer.NO``.
+
+    It is neither true nor false, so that no `if` takes CANNOT_TELL for one of the others.
+    """
+
+    YES = "yes"
+    NO = "no"
+    CANNOT_TELL = "cannot tell"
+
+    def __bool__(self) -> bool:
+        raise TypeError("an Answer is one of three: compare it, such as 'is Answer.YES'")
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +67,27 @@ class Contact:
     pressure_range: str = "unknown"
     """``within``; ``below``: touched, too lightly to be measured, `pressure_kpa` is None;
     ``above``: `pressure_kpa` is the least that it can be; ``unknown``."""
+    peak_kpa: float | None = None
+    """Highest pressure under it; `pressure_kpa` is a mean over its area."""
+    peak_sigma_kpa: float | None = None
+    """Standard uncertainty of `peak_kpa`."""
+    max_kpa: float | None = None
+    """Upper bound of its highest pressure, 95 %, whatever `pressure_range` says; None: no bound."""
+    edge: float | None = None
+    """Exponent γ of the pressure (1 - ρ²)^γ from the middle to the edge: 0 flat, 0.5 Hertz."""
+
+    def exceeds(self, limit_kpa: float) -> Answer:
+        """Return whether it presses with `limit_kpa` or more.
+
+        YES goes by the best estimate of its highest pressure, NO by the upper bound of 95 %. So
+        noise moves the answer near the limit to and fro: stop at one, go on below a lower one.
+        """
+        least_kpa = self.pressure_kpa if self.peak_kpa is None else self.peak_kpa
+        if least_kpa is not None and least_kpa >= limit_kpa:
+            return Answer.YES
+        if self.max_kpa is not None and self.max_kpa < limit_kpa:
+            return Answer.NO
+        return Answer.CANNOT_TELL
 
 
 _MAY_BE_UNKNOWN = [name for name, kind in Contact.__annotations__.items() if "None" in kind]
@@ -120,6 +156,17 @@ class Frame:
     def is_stale(self) -> bool:
         """Whether this frame is older than the subscription's `stale_after_s`."""
         return self.age_s > self._stale_after_s
+
+    def exceeds(self, limit_kpa: float) -> Answer:
+        """Return whether any contact presses with `limit_kpa` or more.
+
+        YES if one does. NO only if none does, the frame is fresh and nothing flags it.
+        """
+        answers = [contact.exceeds(limit_kpa) for contact in self.contacts]
+        if Answer.YES in answers:
+            return Answer.YES
+        is_sure = Answer.CANNOT_TELL not in answers and not self.flags and not self.is_stale
+        return Answer.NO if is_sure else Answer.CANNOT_TELL
 
 
 def frame_from_message(message: Message, received_ns: int | None, stale_after_s: float) -> Frame:

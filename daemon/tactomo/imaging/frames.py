@@ -196,6 +196,10 @@ def _contact(contact: Contact) -> dict[str, Any]:
         "force_n": _finite(contact.force_n),
         "force_sigma_n": _finite(contact.force_sigma_n),
         "pressure_range": str(contact.pressure_range),
+        "peak_kpa": _finite(contact.peak_kpa),
+        "peak_sigma_kpa": _finite(contact.peak_sigma_kpa),
+        "max_kpa": _finite(contact.max_kpa),
+        "edge": _finite(contact.edge),
     }
 
 

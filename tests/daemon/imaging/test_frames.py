@@ -27,6 +27,10 @@ CONTACT = Contact(
     pressure_sigma_kpa=4.0,
     force_n=9.0,
     force_sigma_n=0.5,
+    peak_kpa=220.0,
+    peak_sigma_kpa=6.0,
+    max_kpa=230.0,
+    edge=0.5,
 )
 
 
@@ -53,14 +57,16 @@ def test_a_contact_is_in_millimetres_and_kilopascals() -> None:
         **{"id": 7, "x_mm": 12.0, "y_mm": -34.0, "area_mm2": 500.0, "magnitude": 0.2},
         **{"magnitude_sigma": 0.01, "pressure_kpa": 180.0, "x_sigma_mm": 1.5, "y_sigma_mm": 2.5},
         **{"area_sigma_mm2": 30.0, "pressure_sigma_kpa": 4.0, "force_n": 9.0, "force_sigma_n": 0.5},
+        **{"peak_kpa": 220.0, "peak_sigma_kpa": 6.0, "max_kpa": 230.0, "edge": 0.5},
     }
     assert {name: contact[name] for name in expected} == pytest.approx(expected)
 
 
 def test_what_is_not_known_is_nil() -> None:
-    contact = Contact(1, 0.0, 0.0, 1e-4, float("nan"), float("inf"), float("nan"))
+    contact = Contact(1, 0.0, 0.0, 1e-4, float("nan"), float("inf"), max_kpa=float("inf"))
     [said] = contacts_fields(0, frame(contacts=(contact,)))["contacts"]
     assert said["magnitude"] is said["magnitude_sigma"] is said["pressure_kpa"] is None
+    assert said["max_kpa"] is said["peak_kpa"] is said["edge"] is None
 
 
 def test_a_map_has_its_ends_in_millimetres() -> None:

@@ -50,6 +50,10 @@ enum class PressureRange {
     above,    ///< beyond what was calibrated: the pressure is the range's top, a lower bound
 };
 
+/// What exceeds() answers. It is neither true nor false, so that no `if` takes cannot_tell for one
+/// of the others.
+enum class Answer { cannot_tell, no, yes };
+
 /// One pressed area. It keeps its id for as long as it is followed from frame to frame.
 struct Contact {
     std::int64_t id = 0;
@@ -66,6 +70,19 @@ struct Contact {
     std::optional<double> y_sigma_mm;
     std::optional<double> area_sigma_mm2;
     PressureRange pressure_range = PressureRange::unknown;
+    std::optional<double> peak_kpa;  ///< highest pressure under it; pressure_kpa is a mean
+    std::optional<double> peak_sigma_kpa;
+    std::optional<double> max_kpa;  ///< upper bound of the highest, 95 %, in every pressure_range
+    std::optional<double> edge;     ///< γ of its pressure (1 - ρ²)^γ: 0 flat, 0.5 Hertz
+
+    /// Whether it presses with limit_kpa or more: yes by the best estimate of its highest pressure,
+    /// no by the upper bound of 95 %. So noise moves the answer near the limit to and fro: stop at
+    /// one, go on below a lower one.
+    Answer exceeds(double limit_kpa) const noexcept {
+        const std::optional<double>& estimate = peak_kpa ? peak_kpa : pressure_kpa;
+        if (estimate && *estimate >= limit_kpa) return Answer::yes;
+        return max_kpa && *max_kpa < limit_kpa ? Answer::no : Answer::cannot_tell;
+    }
 };
 
 /// Values at the nodes of an even grid, row by row from the bottom; false where there are none.
@@ -141,6 +158,18 @@ struct Frame {
 
     /// Whether it is too old to say anything: no contacts then means "not known".
     bool is_stale() const noexcept { return age() > stale_after; }
+
+    /// Whether any contact presses with limit_kpa or more: yes if one does; no only if none does, the
+    /// frame is fresh and nothing flags it.
+    Answer exceeds(double limit_kpa) const noexcept {
+        Answer all = flags.empty() && !is_stale() ? Answer::no : Answer::cannot_tell;
+        for (const Contact& contact : contacts) {
+            const Answer one = contact.exceeds(limit_kpa);
+            if (one == Answer::yes) return one;
+            if (one == Answer::cannot_tell) all = one;
+        }
+        return all;
+    }
 };
 
 }  // namespace tactomo

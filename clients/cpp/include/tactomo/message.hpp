@@ -392,6 +392,10 @@ inline Contact contact(Fields& fields) noexcept {
     read.force_n = fields.number("force_n", Allow::both);
     read.force_sigma_n = fields.number("force_sigma_n", Allow::both);
     read.pressure_range = pressure_range(fields.text("pressure_range", Allow::absence));
+    read.peak_kpa = fields.number("peak_kpa", Allow::both);
+    read.peak_sigma_kpa = fields.number("peak_sigma_kpa", Allow::both);
+    read.max_kpa = fields.number("max_kpa", Allow::both);
+    read.edge = fields.number("edge", Allow::both);
     return read;
 }
 

@@ -176,12 +176,16 @@ function valueText(contact, unit) {
 
 // What stands where there is no number: how hard is not known, that it is touched is.
 function touchedText(contact, unit) {
-  return unit === "kpa" && contact.pressure_range === "below" ? "touched, pressure unknown" : "touched";
+  if (unit !== "kpa") return "touched";
+  if (Number.isFinite(contact.max_kpa)) return `at most ${fixed(contact.max_kpa, 0)} kPa`;
+  return contact.pressure_range === "below" ? "touched, pressure unknown" : "touched";
 }
 
 function cellText(contact, unit) {
   const text = valueText(contact, unit).replace(/ (kPa|%)$/, "");
-  return text || (contact.pressure_range === "below" ? "touched" : "–");
+  if (text) return text;
+  if (unit === "kpa" && Number.isFinite(contact.max_kpa)) return `at most ${fixed(contact.max_kpa, 0)}`;
+  return contact.pressure_range === "below" ? "touched" : "–";
 }
 
 function contactNear({ x, y, size }) {

@@ -142,6 +142,8 @@ def _draw_map(axes: Any, moment: Moment, about: dict[str, Any]) -> None:
 
 
 def _short_words(contact: Contact) -> str:
+    if contact.pressure_kpa is None and contact.max_kpa is not None:
+        return f"{contact.id}: ≤ {contact.max_kpa:.0f} kPa"
     if contact.pressure_range == "below":
         return f"{contact.id}: light"
     if contact.pressure_kpa is None:
