@@ -178,7 +178,7 @@ class Reconstructor:
             return self._nothing(measurement, "no usable scan")
         if measurement.is_quiet:
             self._previous = None
-            self._tracker.update(np.zeros((0, 2)))
+            self._tracker.update(np.zeros((0, 2)), np.zeros(0))
             return self._nothing(measurement, "no change above the noise")
         previous, self._previous = self._previous, None
         try:
@@ -288,7 +288,7 @@ class Reconstructor:
         has_magnitude = Channel.MAGNITUDE in measurement.changes
         with measurement.timed("contacts"):
             areas, size, sigma = self._areas_of(estimate)
-            ids = self._tracker.update(areas.centres_m)
+            ids = self._tracker.update(areas.centres_m, areas.areas_m2)
             contacts = contacts_of(areas, ids, size, sigma, self.curve)
         tells_pressure = estimate.tells_pressure and has_magnitude
         return Reconstruction(

@@ -26,8 +26,10 @@ from tactomo_models import (
 CENTRE = Press(0.0, 0.0, 180.0)
 
 
-def press_mm(x_mm: float, y_mm: float, pressure_kpa: float = 180.0) -> Press:
-    return Press(x_mm / 1e3, y_mm / 1e3, pressure_kpa)
+def press_mm(
+    x_mm: float, y_mm: float, pressure_kpa: float = 180.0, radius_mm: float = 15.0
+) -> Press:
+    return Press(x_mm / 1e3, y_mm / 1e3, pressure_kpa, radius_mm / 1e3)
 
 
 def settle(
@@ -131,6 +133,28 @@ def test_contacts_land_slide_jump_and_lift(reconstructor: Reconstructor, skin: S
     (left,) = settle(reconstructor, skin, stays).contacts
     assert left.id == first.id
     assert settle(reconstructor, skin, frames=1).tier == "quiet"
+
+
+@pytest.mark.parametrize("name", ["auto", "fit"])
+@pytest.mark.parametrize(("beside_mm", "radius_mm"), [((-16, -20), 11), ((-25, -16), 8)])
+def test_the_identity_stays_with_the_contact_that_never_moved(
+    paper: SensorDescription,
+    artifact: Artifact,
+    skin: Skin,
+    name: str,
+    beside_mm: tuple[float, float],
+    radius_mm: float,
+) -> None:
+    """Another lands beside it; for a frame or more both look like one, half-way between them."""
+    reconstructor = Reconstructor(paper, artifact, method=name)
+    reconstructor.set_reference(skin.reference())
+    held = press_mm(8, 5, radius_mm=7)
+    lands = press_mm(8 + beside_mm[0], 5 + beside_mm[1], radius_mm=radius_mm)
+    (first,) = settle(reconstructor, skin, held).contacts
+    both = settle(reconstructor, skin, held, lands, frames=10)
+    assert len(both.contacts) == 2
+    assert nearest(both, held).id == first.id
+    assert nearest(both, lands).id != first.id
 
 
 def test_a_press_below_the_onset_is_touched_with_unknown_pressure(

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections import deque
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
@@ -9,6 +13,52 @@ from tactomo_models.arrays import FloatArray
 
 FARTHEST_STEP_M = 0.025  # a contact that moved more than this between frames is a new one
 MAX_MISSED = 5  # frames that a contact may be gone and still be the same when it comes back
+GROWN = 1.5  # times its area: a contact that grew so much may be two; merged ones grow by 2 to 7
+LANDING = 5  # frames in which one lands: 0.25 s at 20 frames/s
+MAX_MERGED = 10  # frames until what has grown is one contact: twice what a fit takes to tell two
+
+
+class _Seen(NamedTuple):
+    """One sight of a contact."""
+
+    centre_m: FloatArray
+    area_m2: float
+
+
+@dataclass
+class _Track:
+    """One identity.
+
+    Attributes:
+        id: counted up from 1.
+        last: its last sight.
+        before: the last `LANDING` sights of it; while it is grown, those before it grew.
+        grown: frames for which it has been larger than it was in `before`.
+        missed: frames since it was last seen.
+    """
+
+    id: int
+    last: _Seen
+    before: deque[_Seen] = field(default_factory=lambda: deque(maxlen=LANDING))
+    grown: int = 0
+    missed: int = 0
+
+    def see(self, seen: _Seen) -> None:
+        """Follow it to where it is now."""
+        is_grown = bool(self.before) and seen.area_m2 > GROWN * self.before[0].area_m2
+        self.grown = self.grown + 1 if is_grown else 0
+        if self.grown > MAX_MERGED:
+            self.before.clear()
+            self.grown = 0
+        if not self.grown:
+            self.before.append(seen)
+        self.last, self.missed = seen, 0
+
+    def distances_m(self, centres_m: FloatArray) -> FloatArray:
+        """How far contacts (K, 2) are from where it is, or was before it grew: the nearer."""
+        places = [self.last.centre_m, *(seen.centre_m for seen in self.before if self.grown)]
+        apart = np.linalg.norm(np.array(places)[:, None] - centres_m, axis=2)
+        return np.asarray(apart.min(axis=0))
 
 
 class ContactTracker:
@@ -21,42 +71,43 @@ class ContactTracker:
       a new one. So a frame that misses a contact costs nothing.
     - Where two contacts merge, the one whose centre is nearer to that of both together lives on;
       if they part again within 5 frames, each has its own identity back.
+    - Where a contact lands beside another and both are first seen as one, the identity is, once
+      they are told apart within 10 frames, that of the contact that was there before.
     - An identity that is gone for longer is never used again.
     """
 
     def __init__(self) -> None:
-        self._centres = np.zeros((0, 2))
-        self._ids: list[int] = []
-        self._missed: list[int] = []  # frames since each was last seen
+        self._tracks: list[_Track] = []
         self._next = 1
 
-    def update(self, centres_m: FloatArray) -> list[int]:
-        """Identities of the contacts at `centres_m` (K, 2) in the next frame."""
-        ids = [0] * len(centres_m)
-        distance = np.linalg.norm(self._centres[:, None] - centres_m[None], axis=2)
+    def update(self, centres_m: FloatArray, areas_m2: FloatArray) -> list[int]:
+        """Identities of the contacts at `centres_m` (K, 2) of `areas_m2` (K,) in the next frame."""
+        tracks = self._tracks
+        distance = np.array([track.distances_m(centres_m) for track in tracks])
+        distance = distance.reshape(len(tracks), len(centres_m))
         # Too far costs alike: such a pair is made only where nothing better is left, and dropped.
         # What has been missed comes second to what was there.
         cost = np.minimum(distance, FARTHEST_STEP_M)
-        cost += np.where(np.array(self._missed, int) > 0, FARTHEST_STEP_M, 0.0)[:, None]
-        found = set()
-        for old, new in zip(*linear_sum_assignment(cost), strict=True):
-            if distance[old, new] < FARTHEST_STEP_M:
-                ids[new] = self._ids[old]
-                found.add(old)
-        for index, known in enumerate(ids):
-            if not known:
-                ids[index] = self._next
+        cost += FARTHEST_STEP_M * np.array([[track.missed > 0] for track in tracks]).reshape(-1, 1)
+        owner = {
+            new: tracks[old]
+            for old, new in zip(*linear_sum_assignment(cost), strict=True)
+            if distance[old, new] < FARTHEST_STEP_M
+        }
+        for track in tracks:
+            track.missed += 1
+        ids = []
+        for index, (centre_m, area_m2) in enumerate(zip(centres_m, areas_m2, strict=True)):
+            seen = _Seen(centre_m, float(area_m2))
+            if index not in owner:
+                owner[index] = _Track(self._next, seen)
                 self._next += 1
-        kept = [
-            old
-            for old in range(len(self._ids))
-            if old not in found and self._missed[old] < MAX_MISSED
-        ]
-        self._missed = [0] * len(ids) + [self._missed[old] + 1 for old in kept]
-        self._centres = np.vstack([centres_m, self._centres[kept]])
-        self._ids = ids + [self._ids[old] for old in kept]
+            owner[index].see(seen)
+            ids.append(owner[index].id)
+        lost = [track for track in tracks if 0 < track.missed <= MAX_MISSED]
+        self._tracks = [*(owner[index] for index in range(len(ids))), *lost]
         return ids
 
     def clear(self) -> None:
         """Forget all contacts; identities are not used again."""
-        self._centres, self._ids, self._missed = np.zeros((0, 2)), [], []
+        self._tracks = []

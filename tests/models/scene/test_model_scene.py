@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tactomo_models import Press
+from tactomo_models.arrays import FloatArray
 from tactomo_models.scene.press import strongest
 from tactomo_models.scene.tracking import FARTHEST_STEP_M, ContactTracker
 
@@ -61,6 +62,17 @@ def test_the_strongest_of_two_indenters_is_felt_point_by_point() -> None:
     np.testing.assert_allclose(pressure, [200.0, 200.0 * np.sqrt(1 - 0.5625), 120.0])
 
 
+def update(tracker: ContactTracker, centres_m: FloatArray) -> list[int]:
+    """Identities of contacts that are all of one size."""
+    return tracker.update(centres_m, np.full(len(centres_m), 200e-6))
+
+
+def sees(tracker: ContactTracker, *x_mm: float, area_mm2: float = 200.0) -> list[int]:
+    """Identities of contacts on the x axis."""
+    centres = np.array([[1e-3 * x, 0.0] for x in x_mm])
+    return tracker.update(centres, np.full(len(x_mm), 1e-6 * area_mm2))
+
+
 places = st.lists(st.tuples(st.floats(-0.07, 0.07), st.floats(-0.07, 0.07)), max_size=6)
 
 
@@ -68,9 +80,9 @@ places = st.lists(st.tuples(st.floats(-0.07, 0.07), st.floats(-0.07, 0.07)), max
 def test_contacts_that_stand_still_keep_their_identity(centres: list[tuple[float, float]]) -> None:
     tracker = ContactTracker()
     at = np.array(centres).reshape(-1, 2)
-    first = tracker.update(at)
+    first = update(tracker, at)
     assert len(set(first)) == len(first)
-    again = tracker.update(at)
+    again = update(tracker, at)
     assert sorted(again) == sorted(first)
 
 
@@ -79,8 +91,8 @@ def test_no_identity_is_given_twice(
     before: list[tuple[float, float]], after: list[tuple[float, float]]
 ) -> None:
     tracker = ContactTracker()
-    old = tracker.update(np.array(before).reshape(-1, 2))
-    new = tracker.update(np.array(after).reshape(-1, 2))
+    old = update(tracker, np.array(before).reshape(-1, 2))
+    new = update(tracker, np.array(after).reshape(-1, 2))
     assert len(set(new)) == len(new)
     for identity, place in zip(new, after, strict=True):
         if identity in old:
@@ -95,9 +107,9 @@ def test_identities_are_not_used_again_after_a_tare(
     before: list[tuple[float, float]], after: list[tuple[float, float]]
 ) -> None:
     tracker = ContactTracker()
-    old = tracker.update(np.array(before).reshape(-1, 2))
+    old = update(tracker, np.array(before).reshape(-1, 2))
     tracker.clear()
-    new = tracker.update(np.array(after).reshape(-1, 2))
+    new = update(tracker, np.array(after).reshape(-1, 2))
     assert not set(old) & set(new)
 
 
@@ -107,8 +119,8 @@ def test_identities_follow_contacts_and_not_their_order(
 ) -> None:
     at = np.array([[-0.05, -0.05], [0.05, -0.05], [0.05, 0.05], [-0.05, 0.05], [0.0, 0.0]])
     tracker = ContactTracker()
-    first = tracker.update(at)
-    again = tracker.update(at[order] + (dx, dy))
+    first = update(tracker, at)
+    again = update(tracker, at[order] + (dx, dy))
     assert again == [first[index] for index in order]
 
 
@@ -116,25 +128,63 @@ def test_identities_follow_contacts_and_not_their_order(
 def test_a_contact_outlives_a_short_gap(gap: int, same: bool) -> None:
     tracker = ContactTracker()
     here, beside = np.array([[0.02, 0.03]]), np.array([[0.02, 0.03], [-0.04, 0.0]])
-    known, other = tracker.update(beside)
+    known, other = update(tracker, beside)
     for _ in range(gap):
-        assert tracker.update(beside[1:]) == [other]
-    back = tracker.update(np.vstack([here + 0.002, beside[1:]]))
+        assert update(tracker, beside[1:]) == [other]
+    back = update(tracker, np.vstack([here + 0.002, beside[1:]]))
     assert (back[0] == known) is same
     assert back[1] == other
 
 
 def test_contacts_that_merge_and_part_again_have_their_identities_back() -> None:
     tracker = ContactTracker()
-    apart = np.array([[-0.012, 0.0], [0.010, 0.0]])
-    both = tracker.update(apart)
-    assert tracker.update(np.array([[0.0, 0.0]])) == [both[1]]  # the nearer one lives on
-    assert tracker.update(apart) == both
+    both = sees(tracker, -12, 10)
+    assert sees(tracker, 0) == [both[1]]  # the nearer one lives on
+    assert sees(tracker, -12, 10) == both
 
 
 def test_what_was_missed_does_not_take_the_identity_of_what_moved() -> None:
     tracker = ContactTracker()
-    left, right = tracker.update(np.array([[-0.02, 0.0], [0.0, 0.0]]))
-    assert tracker.update(np.array([[-0.002, 0.0]])) == [right]
-    assert tracker.update(np.array([[-0.018, 0.0]])) == [right]  # it moved to where the other was
+    left, right = sees(tracker, -20, 0)
+    assert sees(tracker, -2) == [right]
+    assert sees(tracker, -18) == [right]  # it moved to where the other was
     assert left != right
+
+
+@given(st.floats(0.1, 0.9), st.integers(1, 10), st.floats(15.0, 45.0), st.booleans())
+def test_the_identity_stays_with_what_never_moved(
+    share: float, frames: int, beside_mm: float, swapped: bool
+) -> None:
+    """A contact lands beside another, and at first both are seen as one, anywhere between them."""
+    tracker = ContactTracker()
+    between_mm = share * min(beside_mm, 25.0)
+    for _ in range(3):
+        (held,) = sees(tracker, 0)
+    for _ in range(frames):
+        assert sees(tracker, between_mm, area_mm2=500) == [held]
+    told_apart = [0.5, beside_mm - 1]
+    ids = sees(tracker, *(told_apart[::-1] if swapped else told_apart))
+    assert ids[:: -1 if swapped else 1][0] == held
+
+
+def test_a_contact_that_lands_by_and_by_does_not_take_the_identity_beside_it() -> None:
+    tracker = ContactTracker()
+    held = sees(tracker, 0) + sees(tracker, 0)
+    for x_mm, area_mm2 in ((1, 240), (4, 290), (7, 350), (9, 430)):
+        assert sees(tracker, x_mm, area_mm2=area_mm2) == held[:1]
+    assert sees(tracker, 0, 20)[:1] == held[:1]
+
+
+def test_the_identity_goes_with_a_contact_that_slides_and_not_to_where_it_was() -> None:
+    tracker = ContactTracker()
+    for x_mm in (0, 8, 16):
+        ids = sees(tracker, x_mm)
+    assert sees(tracker, 0, 20)[1:] == ids
+
+
+def test_a_contact_that_has_long_been_larger_is_no_longer_where_it_was_before() -> None:
+    tracker = ContactTracker()
+    held = sees(tracker, 0)
+    for x_mm in range(20):
+        assert sees(tracker, x_mm, area_mm2=500) == held
+    assert sees(tracker, 0, 20)[1:] == held
