@@ -29,7 +29,7 @@ from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scans.reference import Reference
 from tactomo_models.scene.areas import Areas
 from tactomo_models.scene.contacts import contacts_of, pressure_map
-from tactomo_models.scene.pressure import PressureCurve, described_curve
+from tactomo_models.scene.pressure import PressureCurve, PressureRange, described_curve
 from tactomo_models.scene.reconstruction import Reconstruction
 from tactomo_models.scene.tracking import ContactTracker
 from tactomo_models.sensor.description import SensorDescription
@@ -85,6 +85,7 @@ class Reconstructor:
         self._failures: dict[str, str] = {}  # of methods prepared since the tare; empty if good
         self._previous: Estimate | None = None
         self._tracker = ContactTracker()
+        self._ranges: dict[int, PressureRange] = {}  # that each identity was last seen in
         self._name = method if isinstance(method, str) else type(method).__name__
         if isinstance(method, str):
             check_method(method, description)
@@ -289,7 +290,9 @@ class Reconstructor:
         with measurement.timed("contacts"):
             areas, size, sigma = self._areas_of(estimate)
             ids = self._tracker.update(areas.centres_m, areas.areas_m2)
-            contacts = contacts_of(areas, ids, size, sigma, self.curve)
+            contacts = contacts_of(areas, ids, size, sigma, self.curve, last=self._ranges)
+            seen = self._ranges | {contact.id: contact.pressure_range for contact in contacts}
+            self._ranges = {known: seen[known] for known in self._tracker.ids if known in seen}
         tells_pressure = estimate.tells_pressure and has_magnitude
         return Reconstruction(
             map=_image(estimate.map),

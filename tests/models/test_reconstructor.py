@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import astuple, replace
 from typing import Literal
@@ -172,6 +173,23 @@ def test_a_press_below_the_onset_is_touched_with_unknown_pressure(
     pressed = frame.structure > 0.5
     assert np.isnan(frame.pressure_kpa[pressed]).all(), "0 would say that nothing touches"
     assert not frame.pressure_kpa[frame.structure == 0].any()
+
+
+@pytest.mark.parametrize("pressure_kpa", [60.0, 95.0, 120.0, 130.0])
+def test_a_steady_light_press_does_not_flicker(
+    reconstructor: Reconstructor, skin: Skin, pressure_kpa: float
+) -> None:
+    press = press_mm(-25, 10, pressure_kpa)
+    frames = [reconstructor.reconstruct(**skin.scan(press)) for _ in range(80)]
+    contacts = [contact for frame in frames for contact in frame.contacts]
+    assert len({contact.id for contact in contacts}) == 1
+    ranges = [contact.pressure_range for contact in contacts]
+    assert len(ranges) == 80
+    assert ranges[-1] == "below"
+    assert sum(a != b for a, b in itertools.pairwise(ranges)) <= 1
+    assert all(130 < contact.max_kpa < 140 for contact in contacts), "near the curve's onset"
+    harder = reconstructor.reconstruct(**skin.scan(press_mm(-25, 10, 150)))
+    assert harder.contacts[0].pressure_range == "within", "at once"
 
 
 def test_without_structure_the_linear_image_goes_on_flagged(

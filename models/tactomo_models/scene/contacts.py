@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,6 +65,7 @@ def contacts_of(
     sigma: FloatArray,
     curve: PressureCurve | None,
     *,
+    last: Mapping[int, PressureRange] | None = None,
     peak_kpa: FloatArray | None = None,
     peak_sigma_kpa: FloatArray | None = None,
     edge: FloatArray | None = None,
@@ -77,11 +78,13 @@ def contacts_of(
         size: (K,) magnitudes; NaN where unknown.
         sigma: (K,) their standard uncertainties.
         curve: the sensor's; None where it has none.
+        last: the range that each identity was in; a new one has none.
         peak_kpa: (K,) highest pressures; those of the magnitudes if None.
         peak_sigma_kpa: (K,) their standard uncertainties; likewise.
         edge: (K,) exponents of the pressure's edge; unknown if None.
     """
-    pressures = pressures_of(curve, size, sigma, areas.areas_m2, areas.sigmas[:, 2])
+    ago = [(last or {}).get(known, PressureRange.UNKNOWN) for known in ids]
+    pressures = pressures_of(curve, size, sigma, areas.areas_m2, areas.sigmas[:, 2], last=ago)
     peak = pressures.kpa if peak_kpa is None else peak_kpa
     peak_sigma = pressures.sigma_kpa if peak_sigma_kpa is None else peak_sigma_kpa
     gamma = np.full(len(areas), np.nan) if edge is None else edge

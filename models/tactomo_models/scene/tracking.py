@@ -80,6 +80,11 @@ class ContactTracker:
         self._tracks: list[_Track] = []
         self._next = 1
 
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """Identities that are followed, those that were missed lately among them."""
+        return tuple(track.id for track in self._tracks)
+
     def update(self, centres_m: FloatArray, areas_m2: FloatArray) -> list[int]:
         """Identities of the contacts at `centres_m` (K, 2) of `areas_m2` (K,) in the next frame."""
         tracks = self._tracks

@@ -64,6 +64,26 @@ def test_each_contact_is_told_where_its_pressure_lies(
 
 
 @pytest.mark.parametrize(
+    ("magnitude", "from_below", "from_within"),
+    [
+        (0.01, "below", "below"),
+        (0.028, "below", "within"),  # within noise of the onset at 0.02: as it was
+        (0.013, "below", "within"),
+        (0.05, "within", "within"),
+        (0.21, "above", "above"),
+    ],
+)
+def test_near_the_onset_a_contact_stays_in_its_range(
+    magnitude: float, from_below: str, from_within: str
+) -> None:
+    found = [
+        CURVE.range_of(magnitude, 0.005, last)
+        for last in (PressureRange.BELOW, PressureRange.WITHIN)
+    ]
+    assert found == [from_below, from_within]
+
+
+@pytest.mark.parametrize(
     ("magnitude", "sigma", "at_least", "at_most"),
     [
         (0.0, 0.005, 140, 144),  # too light to be measured: at most the onset
