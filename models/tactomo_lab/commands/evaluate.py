@@ -194,8 +194,8 @@ def _decibels(text: str) -> list[float]:
     return ratios
 
 
-def shown(items: Iterable[Item], total: int, what: str) -> Iterator[Item]:
-    """Pass items on, with a progress bar in the terminal."""
+def shown(items: Iterable[Item], total: int | None, what: str) -> Iterator[Item]:
+    """Pass items on, with a progress bar in the terminal; without an end if there is no total."""
     from rich.console import Console
     from rich.progress import track
 

@@ -26,7 +26,7 @@ from tactomo_lab.commands.evaluate import (
 )
 
 if TYPE_CHECKING:
-    from tactomo_lab.scenes.measures import SceneScore, Summary
+    from tactomo_lab.scenes.measures import FrameScore, Summary
 
 app = typer_app()
 
@@ -50,26 +50,26 @@ def field(
 
     *ordinary*: one to four contacts, at 40, 20 and 10 dB of the change; the others at 40.
     *rectangles-rings*: of those shapes alone. *hand-made*: electrodes 1 mm off, contact impedances
-    by 30 %, sheets uneven by 10 %. *soft*: balls of 180 to 300 kPa. *graded*: one sheet alone that
-    answers from 0 kPa on. *crowded*: five or six small contacts; *many*: eight to ten. All are
-    simulated as in `tactomo evaluate scenes`, each reconstructed from a cold start. The first run
-    simulates (half a second to a second a scene) and keeps the voltages in the cache.
+    by 30 %, sheets uneven by 10 %. *soft*: balls of 180 to 300 kPa, at 60 dB of the voltages.
+    *graded*: one sheet alone that answers from 0 kPa on. *crowded*: five or six small contacts;
+    *many*: eight to ten. *moving*: a sequence of `tactomo evaluate moving` for every ten scenes,
+    without the frames whose scans are lost. All are simulated as in `tactomo evaluate scenes`,
+    still ones reconstructed from a cold start. The first run simulates (a second a scene, a minute
+    a sequence) and keeps the voltages in the cache.
     """
     from tactomo_models import ModelError, load_description
 
-    from tactomo_lab.evaluation.field import ROWS, scenes_of_row
-    from tactomo_lab.evaluation.still import reconstruct_scenes
+    from tactomo_lab.evaluation.field import ROWS, STILL_ROWS, scores_of_row
 
     description = load_description(sensor)
-    scores: dict[str, list[SceneScore]] = {}
+    scores: dict[str, list[FrameScore]] = {}
     for row in _chosen(rows, ROWS):
-        for line, scenes in scenes_of_row(description, row, seeds, count).items():
+        total = count if row in STILL_ROWS else None
+        for line, frames in scores_of_row(description, row, method, seeds, count).items():
             try:
-                outcomes = list(shown(reconstruct_scenes(scenes, method), count, line))
+                scores[line] = list(shown(frames, total, line))
             except ModelError as error:  # of a row's own sensor, for which a method may not serve
                 typer.echo(f"left out: {line}: {error}", err=True)
-                continue
-            scores[line] = [outcome.score for outcome in outcomes]
     settings = settings_of(description.name, seeds, "change", method)
     if as_json:
         told = {**settings, "scenes_each": count, "lines": _as_json(scores)}
@@ -87,16 +87,16 @@ def _chosen(text: str | None, known: tuple[str, ...]) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def _as_json(scores: dict[str, list[SceneScore]]) -> dict[str, Any]:
+def _as_json(scores: dict[str, list[FrameScore]]) -> dict[str, Any]:
     from tactomo_lab.scenes.measures import summarise
 
     return {
-        line: {**asdict(summarise(own)), "scores": [one.as_json() for one in own]}
+        line: {**asdict(summarise(own)), "scores": [asdict(one) for one in own]}
         for line, own in scores.items()
     }
 
 
-def _print(settings: dict[str, Any], scores: dict[str, list[SceneScore]]) -> None:
+def _print(settings: dict[str, Any], scores: dict[str, list[FrameScore]]) -> None:
     from rich.console import Console
 
     from tactomo_lab.scenes.measures import summarise

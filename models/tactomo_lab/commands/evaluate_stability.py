@@ -176,6 +176,8 @@ def _counts(rows: dict[str, dict[str, Trust]], methods: Sequence[str]) -> Table:
 
 
 def _cell(counts: Trust) -> str:
+    if not counts.maps:  # the method does not serve this regime's sensor
+        return "-"
     silent = f"{counts.bad_unwarned}/{counts.bad}"
     if counts.bad_unwarned:
         silent = f"[red]{silent}[/]"

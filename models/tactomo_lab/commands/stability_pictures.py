@@ -38,7 +38,8 @@ def draw_overview(scores: Sequence[CaseScore], output: Path) -> None:
     for row, by_method in enumerate(rows.values()):
         for column, counts in enumerate(by_method.values()):
             ink = "black" if counts.icc > 0.6 else "white"
-            axes.text(column - 0.44, row, f"{counts.icc:.2f}", va="center", fontsize=8, color=ink)
+            icc_shown = f"{counts.icc:.2f}" if counts.maps else ""
+            axes.text(column - 0.44, row, icc_shown, va="center", fontsize=8, color=ink)
             if counts.bad_unwarned:
                 _mark(axes, column + 0.44, row, f"{counts.bad_unwarned}/{counts.maps}")
     figure.colorbar(image, ax=axes, label="mean ICC with the truth", aspect=30)

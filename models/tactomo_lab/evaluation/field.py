@@ -1,7 +1,8 @@
 """The scenes that a pressure field has to explain, in rows: soft, graded, made by hand, crowded.
 
-Still scenes, each reconstructed from a cold start and run to its end. The rows of ordinary scenes,
-rectangles and rings are `still_scenes`'; each of the others is the regime of that name.
+Still scenes, each reconstructed from a cold start and run to its end, and moving ones. The rows of
+ordinary scenes, rectangles and rings are `still_scenes`'; each of the others is the regime of that
+name.
 """
 
 from __future__ import annotations
@@ -9,13 +10,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import count as count_from
 from itertools import islice
+from math import ceil
 from pathlib import Path
 from typing import Final
 
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_protocol import Channel
 
+from tactomo_lab.evaluation.moving import draw_sequence, play
 from tactomo_lab.evaluation.stability import make_case
+from tactomo_lab.evaluation.still import reconstruct_scenes
+from tactomo_lab.scenes.measures import FrameScore
 from tactomo_lab.scenes.still_scenes import (
     SCENE_SHAPES,
     EvaluationScene,
@@ -32,7 +37,53 @@ MAX_CONTACTS = 4  # of a scene that is not crowded
 ORDINARY_DB = (40.0, 20.0, 10.0)  # of the change, as the paper tests
 SHAPES_DB = 40.0
 REGIME_ROWS: Final = ("hand-made", "soft", "soft-hand-made", "graded", "crowded", "many")
-ROWS: Final = ("ordinary", "rectangles-rings", *REGIME_ROWS)
+STILL_ROWS: Final = ("ordinary", "rectangles-rings", *REGIME_ROWS)
+ROWS: Final = (*STILL_ROWS, "moving")
+SCENES_A_SEQUENCE = 10  # a moving scene has 160 frames and takes a minute to simulate
+
+
+def scores_of_row(
+    description: SensorDescription,
+    row: str,
+    method: str,
+    seed_set: SeedSet,
+    count: int,
+    cache: Path | None = None,
+) -> dict[str, Iterator[FrameScore]]:
+    """Frames of a row as a method reconstructs them, by the name of the line that they are on.
+
+    Args:
+        description: the sensor; needs both channels, whatever sensor the row makes of it.
+        row: one of `ROWS`.
+        method: the name of one.
+        seed_set: see `still_scenes.scenes`.
+        count: scenes of each line; of moving ones one for each `SCENES_A_SEQUENCE`.
+        cache: folder of simulated voltages; in the user's cache if None.
+
+    Raises:
+        DataError: the sensor has a single channel, or no room for what presses.
+        ModelError: the method is not to be had for this sensor, or is the user's own and failed.
+    """
+    if row == "moving":
+        return {row: _moving(description, method, seed_set, count, cache)}
+    lines = scenes_of_row(description, row, seed_set, count, cache)
+    return {line: _still(scenes, method) for line, scenes in lines.items()}
+
+
+def _still(scenes: Iterator[EvaluationScene], method: str) -> Iterator[FrameScore]:
+    for outcome in reconstruct_scenes(scenes, method):
+        yield outcome.score
+
+
+def _moving(
+    description: SensorDescription, method: str, seed_set: SeedSet, count: int, cache: Path | None
+) -> Iterator[FrameScore]:
+    """Frames in which no scan is lost: a map of half a measurement is another question."""
+    for number in range(ceil(count / SCENES_A_SEQUENCE)):
+        sequence = draw_sequence(description, seed_set, number, cache=cache)
+        for step, score in zip(sequence.steps, play(sequence, method), strict=True):
+            if not step.lost:
+                yield score
 
 
 def scenes_of_row(
@@ -42,17 +93,9 @@ def scenes_of_row(
     count: int,
     cache: Path | None = None,
 ) -> dict[str, Iterator[EvaluationScene]]:
-    """Scenes of a row, `count` on each of its lines, by the line's name; the same ones every time.
+    """Scenes of one of `STILL_ROWS`, by the line's name; the same ones every time.
 
-    Args:
-        description: the sensor; needs both channels, whatever sensor the row makes of it.
-        row: one of `ROWS`.
-        seed_set: see `still_scenes.scenes`.
-        count: scenes of each line.
-        cache: folder of simulated voltages; in the user's cache if None.
-
-    Raises:
-        DataError: the sensor has a single channel, or no room for what presses.
+    Arguments and errors are those of `scores_of_row`.
     """
     require_both_channels(description)
     if row in REGIME_ROWS:

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from tactomo_models.arrays import FloatArray, Image
 from tactomo_models.errors import MethodError
 from tactomo_models.physics.artifact import load_or_build_artifact
 from tactomo_models.reconstruct import Reconstructor
@@ -28,10 +27,13 @@ from threadpoolctl import threadpool_limits
 
 from tactomo_lab.scenes.measures import (
     WRONG_ICC,
+    FrameScore,
     correlation,
     match,
     mean,
     percentile,
+    relative_error,
+    score_contacts,
 )
 from tactomo_lab.scenes.simulation import (
     TrueContact,
@@ -268,48 +270,40 @@ def _turned(press: Press, quarters: int, mirrored: bool) -> Press:
 
 
 @dataclass(frozen=True)
-class FrameScore:
-    """How one frame came out.
+class StepScore(FrameScore):
+    """How one frame came out; `contacts` has those alone that touch no other.
+
+    Its measures of the map are NaN where nothing presses hard enough to show, or no map was made;
+    that of the shape where nothing presses, or no shape was made.
 
     Attributes:
         phase: of the choreography.
-        icc: of the magnitude map; NaN where nothing presses hard enough to show, or no map was
-            made.
-        icc_structure: of the pressed shape; NaN where nothing presses, or no shape was made.
-        contacts: how many press; contacts that touch count as one.
-        found: how many were reported.
+        groups: how many contacts press, those that touch counted as one.
         countable: False where contacts are so near each other that either number would do, and
             where a scan is lost.
         switches: contacts that another identity was given to than they had.
-        distrusted: whether a flag told the user not to trust the frame.
-        seconds: that it took.
     """
 
     phase: str
-    icc: float
-    icc_structure: float
-    contacts: int
-    found: int
+    groups: int
     countable: bool
     switches: int
-    distrusted: bool
-    seconds: float
 
     @property
-    def miscounted(self) -> bool:
-        """Whether another number of contacts was reported than press."""
-        return self.countable and self.found != self.contacts
+    def count_right(self) -> bool | None:
+        """See `FrameScore`."""
+        return self.found == self.groups if self.countable else None
 
     @property
     def confidently_wrong(self) -> bool:
         """Whether it shows something else than what presses, and no flag says so."""
         low = self.icc < WRONG_ICC or self.icc_structure < WRONG_ICC  # what is NaN is not
-        return (low or self.miscounted) and not self.distrusted
+        return (low or self.count_right is False) and not self.distrusted
 
 
 def play(
     sequence: Sequence, method: str = "auto", budget_s: float | None = None
-) -> Iterator[FrameScore]:
+) -> Iterator[StepScore]:
     """Reconstruct a moving scene frame by frame, on one thread.
 
     Args:
@@ -343,7 +337,7 @@ def play(
         if frame.failure:  # the frame is another method's
             raise MethodError(frame.failure)
         truth = truth_of(sequence.true_description, list(step.presses.values()))
-        yield _score(step, truth, frame, identities, seconds)
+        yield _score(sensor, step, truth, frame, identities, seconds)
 
 
 def _reference(sequence: Sequence, rng: np.random.Generator) -> Reference:
@@ -355,28 +349,34 @@ def _reference(sequence: Sequence, rng: np.random.Generator) -> Reference:
 
 
 def _score(
-    step: Step, truth: Truth, frame: Reconstruction, identities: _Identities, seconds: float
-) -> FrameScore:
+    sensor: SensorDescription,
+    step: Step,
+    truth: Truth,
+    frame: Reconstruction,
+    identities: _Identities,
+    seconds: float,
+) -> StepScore:
     apart, clear = _groups(step.presses)
     contacts = dict(zip(step.presses, truth.contacts, strict=True))
     alone = {group[0]: contacts[group[0]] for group in apart if len(group) == 1}
-    return FrameScore(
-        phase=step.phase,
-        icc=_icc(frame.map, truth.map),
-        icc_structure=_icc(frame.structure, truth.pressed),
-        contacts=len(apart),
+    shows = frame.map is not None and truth.map.any()
+    return StepScore(
+        contacts=score_contacts(sensor, list(alone.values()), frame.contacts),
         found=len(frame.contacts),
-        countable=clear and not step.lost,
-        switches=identities.switches(alone, frame),
+        rie=relative_error(frame.map, truth.map) if shows else float("nan"),
+        icc=correlation(frame.map, truth.map) if shows else float("nan"),
+        icc_structure=(
+            correlation(frame.structure, truth.pressed)
+            if frame.structure is not None and truth.pressed.any()
+            else float("nan")
+        ),
         distrusted=bool(frame.flags & LOST),
         seconds=seconds,
+        phase=step.phase,
+        groups=len(apart),
+        countable=clear and not step.lost,
+        switches=identities.switches(alone, frame),
     )
-
-
-def _icc(image: Image | None, truth: FloatArray) -> float:
-    if image is None or not truth.any():
-        return float("nan")
-    return correlation(image, truth)
 
 
 def _groups(presses: Presses) -> tuple[list[list[str]], bool]:
@@ -442,7 +442,7 @@ class PhaseSummary:
     seconds_99: float
 
 
-def summarise_phases(sequences: Iterable[Iterable[FrameScore]]) -> dict[str, PhaseSummary]:
+def summarise_phases(sequences: Iterable[Iterable[StepScore]]) -> dict[str, PhaseSummary]:
     """Measures of each phase, in order, and of all of them under "all"."""
     played = [list(scores) for scores in sequences]
     phases = dict.fromkeys(score.phase for scores in played for score in scores)
@@ -454,7 +454,7 @@ def summarise_phases(sequences: Iterable[Iterable[FrameScore]]) -> dict[str, Pha
     return {**summaries, "all": _summarise([one for part in parts.values() for one in part])}
 
 
-def _summarise(played: list[list[FrameScore]]) -> PhaseSummary:
+def _summarise(played: list[list[StepScore]]) -> PhaseSummary:
     scores = [score for part in played for score in part]
     icc = [score.icc for score in scores]
     seconds = [score.seconds for score in scores]
@@ -464,7 +464,7 @@ def _summarise(played: list[list[FrameScore]]) -> PhaseSummary:
         icc=mean(icc),
         icc_worst=percentile(icc, 5),
         icc_structure=mean(score.icc_structure for score in scores),
-        count_right=mean(not score.miscounted for score in scores if score.countable),
+        count_right=mean(score.count_right for score in scores),
         recovery=percentile(recovery, 50),
         recovery_most=percentile(recovery, 100),
         switches=sum(score.switches for score in scores),
@@ -475,7 +475,7 @@ def _summarise(played: list[list[FrameScore]]) -> PhaseSummary:
     )
 
 
-def _recovery(scores: list[FrameScore]) -> float:
+def _recovery(scores: list[StepScore]) -> float:
     """Longest run of frames whose shape is wrong; NaN where none of them is pressed."""
     icc = np.array([score.icc_structure for score in scores])
     wrong = icc[np.isfinite(icc)] < WRONG_ICC

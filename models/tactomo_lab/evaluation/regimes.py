@@ -45,7 +45,7 @@ SensorOf = Callable[[SensorDescription], SensorDescription]
 
 SETTLED_FRAMES = 6  # of a scene that stays, before something happens
 SLIDE_FRAMES = 4
-CONVERTER_DB = 60.0  # of the voltage, where there is no change for noise to be measured by
+CONVERTER_DB = 60.0  # of the voltage: a good converter's, where changes are small or none
 SOFT_KPA = (180.0, 300.0)  # peak under a ball: well above where the magnitude channel answers
 
 
@@ -346,7 +346,8 @@ def _soft(draw: Draw) -> Plan:
     def ball() -> Press:
         return draw.press((10, 20), pressure_kpa=SOFT_KPA, profile="dome")
 
-    return draw.plan(draw.apart(1 + draw.number % 3, ball))
+    plan = draw.plan(draw.apart(1 + draw.number % 3, ball))
+    return replace(plan, snr_db=CONVERTER_DB, snr_of="voltage")
 
 
 @regime("hand-made", "Electrodes 1 mm off, contact impedances by 30 %, sheets uneven by 10 %.")

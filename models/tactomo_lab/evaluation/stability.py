@@ -31,6 +31,7 @@ from threadpoolctl import threadpool_limits
 
 from tactomo_lab.evaluation.faults import with_lead
 from tactomo_lab.evaluation.regimes import REGIMES, Plan, draw_plan
+from tactomo_lab.evaluation.trade_off import left_out
 from tactomo_lab.scenes.measures import BAD_ICC, correlation, mean
 from tactomo_lab.scenes.simulation import (
     SheetState,
@@ -317,11 +318,11 @@ def evaluate_regimes(
         cache: folder of simulated voltages; in the user's cache if None.
 
     Yields:
-        Each case's outcomes, by method; in the order of regimes and numbers whatever `jobs`.
+        Each case's outcomes, of the methods that its sensor has; in the order of regimes and
+        numbers whatever `jobs`.
 
     Raises:
         DataError: the sensor has a single channel, or no room for what presses.
-        ModelError: a method's models are not there.
     """
     require_both_channels(description)
     _artifact(description)  # built once, by this process
@@ -343,7 +344,8 @@ def _evaluate_case(
     which: tuple[str, int],
 ) -> list[Outcome]:
     case = make_case(description, which[0], seed_set, which[1], cache)
-    return reconstruct_case(case, *methods)
+    missing = left_out(case.description, methods)  # a regime may have a sensor of its own
+    return reconstruct_case(case, *(method for method in methods if method not in missing))
 
 
 @dataclass(frozen=True)

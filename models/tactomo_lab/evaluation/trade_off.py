@@ -106,7 +106,7 @@ def measure_moving(
         done: called after each frame.
     """
     for variant in variants:
-        played: list[list[moving.FrameScore]] = []
+        played: list[list[moving.StepScore]] = []
         for sequence in sequences:
             played.append([])
             for score in moving.play(sequence, variant.method, variant.budget_s):

@@ -104,42 +104,29 @@ class ContactScore:
 
 
 @dataclass(frozen=True)
-class SceneScore:
-    """How one scene was reconstructed.
+class FrameScore:
+    """How one frame was reconstructed.
 
     Attributes:
-        scene: its seed set, number of contacts and number, e.g. "tuning 3/17".
         contacts: one for each true contact.
         found: contacts reported.
         rie, icc: of the magnitude map.
         icc_structure: of the pressed shape.
-        flags: names of what was flagged.
         distrusted: whether a flag told the user not to trust the frame.
-        tier: what made it.
-        misfit: as reported.
         seconds: that it took.
-        shape, contrast, opposite, snr_db: of the scene.
     """
 
-    scene: str
     contacts: tuple[ContactScore, ...]
     found: int
     rie: float
     icc: float
     icc_structure: float
-    flags: tuple[str, ...]
     distrusted: bool
-    tier: str
-    misfit: float
     seconds: float
-    shape: str
-    contrast: float
-    opposite: bool
-    snr_db: float
 
     @property
-    def count_right(self) -> bool:
-        """Whether as many contacts were reported as there are."""
+    def count_right(self) -> bool | None:
+        """Whether as many contacts were reported as there are; None where that is not clear."""
         return self.found == len(self.contacts)
 
     @property
@@ -150,7 +137,29 @@ class SceneScore:
     @property
     def confidently_wrong(self) -> bool:
         """Whether it shows something else than what presses, and no flag says so."""
-        return not self.distrusted and (self.icc < WRONG_ICC or not self.count_right)
+        return not self.distrusted and (self.icc < WRONG_ICC or self.count_right is False)
+
+
+@dataclass(frozen=True)
+class SceneScore(FrameScore):
+    """How one still scene was reconstructed.
+
+    Attributes:
+        scene: its seed set, number of contacts and number, e.g. "tuning 3/17".
+        flags: names of what was flagged.
+        tier: what made it.
+        misfit: as reported.
+        shape, contrast, opposite, snr_db: of the scene.
+    """
+
+    scene: str
+    flags: tuple[str, ...]
+    tier: str
+    misfit: float
+    shape: str
+    contrast: float
+    opposite: bool
+    snr_db: float
 
     def as_json(self) -> dict[str, Any]:
         """All of it as numbers and names."""
@@ -161,14 +170,9 @@ class SceneScore:
 def score(scene: EvaluationScene, frame: Reconstruction, seconds: float) -> SceneScore:
     """Compare a reconstruction with the truth."""
     truth = scene.truth
-    pairs = match(frame.contacts, truth.contacts)
-    found = {there: frame.contacts[here] for here, there in pairs}
     return SceneScore(
         scene=str(scene.layout),
-        contacts=tuple(
-            score_contact(scene.description, true, found.get(index))
-            for index, true in enumerate(truth.contacts)
-        ),
+        contacts=score_contacts(scene.description, truth.contacts, frame.contacts),
         found=len(frame.contacts),
         rie=relative_error(frame.map, truth.map),
         icc=correlation(frame.map, truth.map),
@@ -182,6 +186,16 @@ def score(scene: EvaluationScene, frame: Reconstruction, seconds: float) -> Scen
         contrast=scene.layout.contrast,
         opposite=scene.layout.opposite,
         snr_db=scene.snr_db,
+    )
+
+
+def score_contacts(
+    description: SensorDescription, true: Sequence[TrueContact], found: Sequence[Contact]
+) -> tuple[ContactScore, ...]:
+    """Compare each true contact with the one that is taken for it."""
+    taken = {there: found[here] for here, there in match(found, true)}
+    return tuple(
+        score_contact(description, each, taken.get(index)) for index, each in enumerate(true)
     )
 
 
@@ -223,10 +237,10 @@ def full_range(description: SensorDescription) -> float:
 
 @dataclass(frozen=True)
 class Summary:
-    """Many scenes' measures. Means, where nothing else is said; NaN where nothing was measured.
+    """Many frames' measures. Means, where nothing else is said; NaN where nothing was measured.
 
     Attributes:
-        scenes: how many.
+        scenes: how many frames, of a scene each where scenes are still.
         icc, rie: of the magnitude map.
         icc_worst: of the worst scene in twenty (5th percentile).
         icc_structure: of the pressed shape.
@@ -242,7 +256,8 @@ class Summary:
         within_sigma: share of magnitude errors within one reported standard uncertainty;
             0.68 where those are right.
         place_within_sigma, area_within_sigma: likewise of x and y, and of the area.
-        peak_right: share of the true contacts whose peak pressure is right to `RIGHT_PEAK`.
+        peak_right: share of the true contacts whose peak pressure is right to `RIGHT_PEAK`, of
+            those that the magnitude channel answers to.
         distrusted: share of scenes flagged as not to be trusted.
         bad_unflagged: share of scenes with an ICC below `BAD_ICC` and not flagged so.
         good_flagged: share of the other scenes that are flagged so.
@@ -276,8 +291,8 @@ class Summary:
     seconds_99: float
 
 
-def summarise(scores: Sequence[SceneScore]) -> Summary:
-    """Measures of at least one scene."""
+def summarise(scores: Sequence[FrameScore]) -> Summary:
+    """Measures of at least one frame."""
     contacts = [contact for one in scores for contact in one.contacts]
     matched = [contact for contact in contacts if not contact.missed]
     centre = np.array([contact.centre_error_mm for contact in matched])
@@ -304,7 +319,7 @@ def summarise(scores: Sequence[SceneScore]) -> Summary:
         within_sigma=mean(np.where(np.isfinite(error), np.abs(error) <= sigma, np.nan)),
         place_within_sigma=_share_within_one(place),
         area_within_sigma=_share_within_one([contact.area_error_sigmas for contact in matched]),
-        peak_right=mean(contact.peak_right for contact in contacts),
+        peak_right=mean(contact.peak_right for contact in contacts if contact.magnitude > 0),
         distrusted=mean(one.distrusted for one in scores),
         bad_unflagged=mean(one.bad and not one.distrusted for one in scores),
         good_flagged=mean(one.distrusted for one in scores if not one.bad),

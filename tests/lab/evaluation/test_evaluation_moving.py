@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tactomo_lab.evaluation.moving import (
     INDENTERS,
-    FrameScore,
     Sequence,
     Step,
+    StepScore,
     choreography,
     draw_sequence,
     play,
@@ -109,13 +109,14 @@ def test_frames_are_scored_one_by_one(paper: SensorDescription, simulator: SkinS
     ]
     rest, land, *hold, half, none, tare, again = play(sequence(paper, simulator, *steps))
     for empty in (rest, tare):
-        assert (empty.contacts, empty.found, empty.miscounted) == (0, 0, False)
-        assert np.isnan([empty.icc, empty.icc_structure]).all()
+        assert (empty.groups, empty.found, empty.count_right) == (0, 0, True)
+        assert np.isnan([empty.icc, empty.rie, empty.icc_structure]).all()
     assert np.isnan(land.icc)  # too light for the magnitude channel
     for score in (*hold, again):
         assert score.icc > 0.85
         assert score.icc_structure > 0.85
-        assert (score.contacts, score.found, score.switches) == (1, 1, 0)
+        assert (score.groups, score.found, score.switches) == (1, 1, 0)
+        assert not any(contact.missed for contact in score.contacts)
         assert not score.confidently_wrong
     assert np.isnan(half.icc_structure)
     for lost in (half, none):
@@ -135,9 +136,9 @@ def test_contacts_that_touch_are_one_and_near_ones_are_not_counted(
     touching, near, apart = play(
         sequence(paper, simulator, beside(-5), beside(4), beside(20)), "tikhonov"
     )
-    assert (touching.contacts, touching.countable) == (1, True)
-    assert (near.contacts, near.countable) == (2, False)
-    assert (apart.contacts, apart.countable) == (2, True)
+    assert (touching.groups, touching.countable) == (1, True)
+    assert (near.groups, near.countable) == (2, False)
+    assert (apart.groups, apart.countable) == (2, True)
 
 
 def test_identities_that_are_lost(paper: SensorDescription, simulator: SkinSimulator) -> None:
@@ -169,8 +170,20 @@ def test_a_tare_forgets_who_was_who(paper: SensorDescription, simulator: SkinSim
     assert [score.switches for score in scores] == [0, 0, 1]
 
 
-def frame(phase: str, icc: float, found: int = 1, distrusted: bool = False) -> FrameScore:
-    return FrameScore(phase, icc, icc, 1, found, True, 0, distrusted, 0.01)
+def frame(phase: str, icc: float, found: int = 1, distrusted: bool = False) -> StepScore:
+    return StepScore(
+        contacts=(),
+        found=found,
+        rie=1 - icc,
+        icc=icc,
+        icc_structure=icc,
+        distrusted=distrusted,
+        seconds=0.01,
+        phase=phase,
+        groups=1,
+        countable=True,
+        switches=0,
+    )
 
 
 def test_phases_by_hand() -> None:

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tactomo_lab.evaluation.field import ROWS, scenes_of_row
-from tactomo_lab.evaluation.still import reconstruct_scenes
+from tactomo_lab.evaluation.field import STILL_ROWS, scenes_of_row, scores_of_row
+from tactomo_lab.evaluation.moving import draw_sequence
+from tactomo_lab.scenes.measures import summarise
 from tactomo_lab.scenes.still_scenes import EvaluationScene
 from tactomo_models import DataError, SensorDescription
 from variants import variant
@@ -23,19 +24,29 @@ def one_of(small: SensorDescription, row: str, folder: Path) -> dict[str, Evalua
     return {line: scene for line, scenes in lines.items() for scene in scenes}
 
 
-@pytest.mark.parametrize("row", ROWS)
+@pytest.mark.parametrize("row", STILL_ROWS)
 def test_a_scene_of_each_row_is_reconstructed_and_scored(
     small: SensorDescription, folder: Path, row: str
 ) -> None:
-    lines = one_of(small, row, folder)
-    assert lines
-    for scene, outcome in zip(
-        lines.values(), reconstruct_scenes(lines.values(), "tikhonov"), strict=True
-    ):
-        score = outcome.score
-        assert len(score.contacts) == len(scene.layout.presses)
+    scenes = one_of(small, row, folder)
+    lines = scores_of_row(small, row, "tikhonov", "tuning", 1, folder)
+    assert list(lines) == list(scenes)
+    for line, scores in lines.items():
+        (score,) = scores
+        assert len(score.contacts) == len(scenes[line].layout.presses)
         assert -1 <= score.icc <= 1
         assert score.seconds > 0
+
+
+@pytest.mark.slow
+def test_a_moving_scene_is_scored_where_no_scan_is_lost(
+    small: SensorDescription, folder: Path
+) -> None:
+    sequence = draw_sequence(small, "tuning", 0, cache=folder)
+    (scores,) = scores_of_row(small, "moving", "tikhonov", "tuning", 1, folder).values()
+    frames = list(scores)
+    assert len(frames) == sum(not step.lost for step in sequence.steps)
+    assert 0 < summarise(frames).icc < 1
 
 
 def test_ordinary_scenes_are_the_same_ones_at_each_noise(

@@ -286,6 +286,15 @@ def test_a_sensor_of_one_channel_has_no_cases(small: SensorDescription) -> None:
         make_case(single, "ordinary", "tuning", 0)
 
 
+def test_a_regime_may_have_a_sensor_that_a_method_does_not_serve(
+    small: SensorDescription, folder: Path
+) -> None:
+    methods = ("tikhonov", "network")  # which needs both channels
+    ((outcome,),) = evaluate_regimes(small, ["graded"], methods, "tuning", 1, cache=folder)
+    assert outcome.score.method == "tikhonov"
+    assert outcome.case.description.channels == (Channel.MAGNITUDE,)
+
+
 @pytest.mark.long
 def test_more_processes_do_the_same(small: SensorDescription, tmp_path: Path) -> None:
     regimes, methods = ("near-touch", "dead-lead"), ("tikhonov", "auto")
