@@ -39,7 +39,7 @@ SHAPES_DB = 40.0
 REGIME_ROWS: Final = ("hand-made", "soft", "soft-hand-made", "graded", "crowded", "many")
 STILL_ROWS: Final = ("ordinary", "rectangles-rings", *REGIME_ROWS)
 ROWS: Final = (*STILL_ROWS, "moving")
-SCENES_A_SEQUENCE = 10  # a moving scene has 160 frames and takes a minute to simulate
+SCENES_A_SEQUENCE = 10  # a moving scene has 146 frames and takes a minute to simulate
 
 
 def scores_of_row(
