@@ -6,7 +6,7 @@ ModelError
  ├── ArtifactError      a built artifact that is missing, damaged or made for another sensor
  ├── CalibrationError   load-cell readings that make no curve, or a calibration of another sensor
  ├── DataError          voltages of the wrong shape or kind
- └── MethodError        a reconstruction method that there is not, or that is none
+ └── MethodError        a reconstruction method that there is not, or that the sensor cannot do
                         ("unknown method 'tikonov'; use one of: auto, tikhonov, ...")
 """
 
@@ -37,7 +37,7 @@ class DataError(ModelError):
 
 
 class MethodError(ModelError):
-    """A reconstruction method that there is not, or that is none."""
+    """A reconstruction method that there is not, or that the sensor cannot do."""
 
 
 def explain(item: "ErrorDetails") -> str:

@@ -52,7 +52,7 @@ class Reconstructor:
 
     Raises:
         ArtifactError: the artifact or the method's network cannot be used.
-        MethodError: there is no such method.
+        MethodError: there is no such method, or the sensor lacks a channel that it needs.
 
     Attributes:
         description: the sensor.

@@ -318,7 +318,7 @@ class Daemon(Control):
         """Choose what solves frames: one of `Status.methods`, such as ``auto`` or ``fit``.
 
         Raises:
-            BadArgument: there is no such method.
+            BadArgument: there is no such method, or the sensor lacks a channel that it needs.
             NoNetwork: the sensor has no network for it.
         """
         return filled(MethodInForce, self.request("set_tier", tier=method))

@@ -40,6 +40,7 @@ from tactomo_client.messages import EVENT, SCHEMA, STATUS
 from tactomo_models import (
     ArtifactError,
     CalibrationError,
+    ModelError,
     Reconstructor,
     SensorDescription,
     load_description,
@@ -119,6 +120,10 @@ class Daemon:
         curve = config.curve
         self._keys = None if curve is None else load_server_keys(curve.secret, curve.clients)
         description = load_description(config.description)
+        if len(config.ports) > len(description.channels):
+            raise ConfigError(
+                f"{description.name} has one channel, and two ports are given", "give one port"
+            )
         self._description = description
         self._methods = tuple(dict.fromkeys((*available_methods(), config.method)))
         replay = read_replay(config.ports, description)
@@ -367,8 +372,9 @@ class Daemon:
             )
         try:
             check_method(method, self._description)
-        except ArtifactError as error:
-            raise CommandError(str(error), "ask for another method", "no_network") from error
+        except ModelError as error:
+            name = "no_network" if isinstance(error, ArtifactError) else "bad_argument"
+            raise CommandError(str(error), name=name) from error
         return Settling({"tier": method}, self._pipeline.set_method(method))
 
     def _set_budget(self, arguments: SetBudget) -> Settling:

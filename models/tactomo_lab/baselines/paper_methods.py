@@ -39,6 +39,8 @@ class PaperShapes:
 class PaperLevelSetMethod(OutlineFit):
     """`pls-paper`: the paper's shape, and a magnitude for each of its areas as `fit` has it."""
 
+    needs = (Channel.STRUCTURE,)
+
     def prepare(self, skin: Skin) -> None:
         """Make the level set's equations."""
         super().prepare(skin)

@@ -143,3 +143,4 @@ class LevelSetFit(OutlineFit):
     """Shapes of any form, and how hard each area is pressed."""
 
     shape_model = ShapeModel.LEVEL_SET
+    needs = (Channel.STRUCTURE,)

@@ -121,8 +121,9 @@ class Method(Protocol):
 
     An instance belongs to one reconstructor and is made without arguments. It may keep what it
     likes between frames, as long as the outcome depends on the sequence of frames alone, never on
-    the clock. A class may have a static method `check(description)` that raises `ArtifactError`
-    where the sensor lacks what the method needs.
+    the clock. A class may name the channels that it cannot do without as `needs`, and have a
+    static method `check(description)` that raises `ArtifactError` where the sensor lacks anything
+    else.
     """
 
     def prepare(self, skin: Skin) -> None:

@@ -106,10 +106,17 @@ def check_method(name: str, description: SensorDescription) -> None:
     """Make sure that a sensor can be reconstructed that way.
 
     Raises:
-        MethodError: there is no such method.
-        ArtifactError: the sensor lacks what the method needs, such as a trained network.
+        MethodError: there is no such method, or the sensor lacks a channel that the method needs.
+        ArtifactError: the sensor lacks something else, such as a trained network.
     """
-    check = getattr(find_method(name), "check", None)
+    found = find_method(name)
+    for channel in getattr(found, "needs", ()):
+        if channel not in description.channels:
+            raise MethodError(
+                f"method {name!r} needs a {channel} channel, and sensor {description.name!r} has "
+                "none; use auto, or another method"
+            )
+    check = getattr(found, "check", None)
     if check is not None:
         check(description)
 

@@ -268,7 +268,7 @@ def load_network(
     if found is None and len(description.channels) < 2:
         raise ArtifactError(
             f"there is no {kind} for sensor {description.name!r}, and there can be none: networks "
-            "need both channels; choose fit, levelset or another method"
+            "need both channels; use auto, or another method"
         )
     if found is None:
         raise ArtifactError(
@@ -318,6 +318,11 @@ def _checked(
         raise ArtifactError(
             f"{path} was trained for sensor {meta['sensor']!r} ({meta['sha256'][:12]}), not for "
             f"{description.name!r} ({description.sha256[:12]}); {again}"
+        )
+    if not set(meta[CHANNELS_KEY].split()) <= set(description.channels):
+        raise ArtifactError(
+            f"{path} takes the channels {meta[CHANNELS_KEY]}, and sensor {description.name!r} has "
+            f"{' '.join(description.channels)} alone; use auto, or another method"
         )
     return meta
 

@@ -85,6 +85,16 @@ def test_a_network_of_another_kind_is_refused(shipped: Path, paper: SensorDescri
         Network(shipped, paper, "refiner")
 
 
+def test_a_network_of_a_channel_that_the_sensor_lacks_is_refused(
+    shipped: Path, paper: SensorDescription
+) -> None:
+    """The hash is of sheet and electrodes alone: that of the sensor with one sheet is the same."""
+    for channel in ("magnitude", "structure"):
+        one_sheet = paper.model_copy(update={channel: None})
+        with pytest.raises(ArtifactError, match="takes the channels magnitude structure"):
+            Network(shipped, one_sheet, "network")
+
+
 @pytest.mark.parametrize("keep", [0, 100, 0.5, 0.99])
 def test_a_truncated_network_is_refused(
     shipped: Path, paper: SensorDescription, tmp_path: Path, keep: float

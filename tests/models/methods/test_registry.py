@@ -13,6 +13,7 @@ from tactomo_models import (
     Reconstructor,
     SensorDescription,
     available_methods,
+    load_description,
 )
 from tactomo_models.methods.registry import METHODS, check_method, find_method
 
@@ -67,6 +68,16 @@ def test_a_method_says_itself_what_sensor_it_cannot_do(
     assert found.__name__ == "NeedsMore"
     with pytest.raises(ArtifactError, match="no weights"):
         Reconstructor(paper, method=f"{module}:NeedsMore")
+
+
+@pytest.mark.parametrize("name", ["levelset", "pls-paper"])
+def test_a_sensor_without_the_channel_that_a_method_needs_is_told(name: str) -> None:
+    graded = load_description("graded_square")
+    with pytest.raises(MethodError, match=f"{name}.* needs a structure channel, .*graded_square"):
+        check_method(name, graded)
+    check_method(name, load_description("skin_round"))
+    for other in ("auto", "fit", "tikhonov", "noser"):
+        check_method(other, graded)
 
 
 def test_ours_come_first_and_each_is_found() -> None:
