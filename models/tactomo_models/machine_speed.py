@@ -217,7 +217,7 @@ def machine_speed_for(description: SensorDescription, warn: Callable[[str], None
         warn(f"{error}; until then: the one that comes with tactomo")
         found = _shipped()
     # Which method is best is another sensor's, and a network may be gone that was there.
-    of_this = found.sha256 == description.sha256
+    of_this = (found.sensor, found.sha256) == (description.name, description.sha256)
     rows = [row for row in found.rows if of_this and _is_available(description, row.method)]
     return found.model_copy(update={"rows": tuple(rows)})
 

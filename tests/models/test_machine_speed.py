@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from tactomo_models import ArtifactError, SensorDescription, machine_speed
+from tactomo_models import ArtifactError, SensorDescription, load_description, machine_speed
 from tactomo_models.machine_speed import (
     CLEARLY,
     MachineSpeed,
@@ -125,6 +125,9 @@ def test_the_shipped_one_is_of_the_shipped_sensor(
     assert {"auto", "tikhonov"} <= {row.method for row in shipped.rows}
     assert "shipped" in shipped.source
     assert shipped.plan("auto", 0.05).method == "auto"
+    graded = load_description("graded_square")
+    assert graded.sha256 == paper.sha256
+    assert not machine_speed_for(graded, pytest.fail).rows  # of two sheets, and this is one
 
 
 @pytest.mark.parametrize(
