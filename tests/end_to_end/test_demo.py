@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import re
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from page import Page
+from page import first_line_of_the_readme
 from processes import children_of, is_running
 from selenium.webdriver import ActionChains, Chrome
 from selenium.webdriver.common.by import By
@@ -84,19 +83,8 @@ while True:
 
 
 def test_the_readme_subscribes_in_six_lines(demo: Demo, tmp_path: Path) -> None:
-    code = next(block for block in Page("README.md").blocks("python") if "subscribe" in block)
-    assert len(code.strip().splitlines()) <= 6
-    code = code.replace("subscribe(", f"subscribe(address={demo.stream!r}, sensor=", 1)
-    code = re.sub(r'sensor="\w+"', f'sensor="{SENSOR}"', code)
     demo.press(20.0, 0.0)
-    script = tmp_path / "six_lines.py"
-    script.write_text(code)
-    with subprocess.Popen(
-        [sys.executable, "-u", script], stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None
-        line = process.stdout.readline()
-        process.kill()
+    line = first_line_of_the_readme(demo, tmp_path)
     demo.clear()
     assert "kPa" in line
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
+from pathlib import Path
 
-from whole_system import repository
+from whole_system import SENSOR, Demo, repository
 
 
 class Page:
@@ -36,3 +39,19 @@ class Page:
         found = re.search(rf"^##+ {re.escape(heading)}\b.*?(?=^##|\Z)", self.text, re.M | re.S)
         assert found, f"there is no section {heading}"
         return found[0]
+
+
+def first_line_of_the_readme(demo: Demo, folder: Path) -> str:
+    """Run the README's client on a demo that is pressed, and return the first line it prints."""
+    code = next(block for block in Page("README.md").blocks("python") if "subscribe" in block)
+    assert len(code.strip().splitlines()) <= 6
+    code = code.replace("subscribe(", f"subscribe(address={demo.stream!r}, sensor=", 1)
+    script = folder / "six_lines.py"
+    script.write_text(re.sub(r'sensor="\w+"', f'sensor="{SENSOR}"', code))
+    with subprocess.Popen(
+        [sys.executable, "-u", script], stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        process.kill()
+    return line

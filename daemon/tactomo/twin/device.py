@@ -435,6 +435,13 @@ class Twin:
         return {}
 
     def _mute(self, arguments: MuteArguments) -> dict[str, Any]:
+        channels = self.config.description.channels
+        if arguments.channel not in channels:
+            raise CommandError(
+                f"this skin has no {arguments.channel} channel",
+                f"give {' or '.join(channels)}",
+                name="bad_argument",
+            )
         self._firmware.mute(Channel(arguments.channel), arguments.seconds)
         return {}
 

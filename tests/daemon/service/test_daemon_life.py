@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from daemon_process import DaemonProcess
 from tactomo.config import load_config
-from tactomo.errors import TactomoError
+from tactomo.errors import ConfigError, TactomoError
 from tactomo.recordings.recording import open_recording
 from tactomo.service.daemon import Daemon
 from waiting import PATIENCE_S, wait_until
@@ -27,7 +27,7 @@ PROGRAM = """
 import sys
 from tactomo.config import load_config
 from tactomo.service.daemon import Daemon
-from tactomo.errors import TactomoError
+from tactomo.errors import ConfigError, TactomoError
 from tactomo.log import configure_logging
 from daemon_bench import Memory
 
@@ -97,6 +97,12 @@ def test_nothing_is_left_after_a_start_that_failed(bench: Start, tmp_path: Path)
     assert set(threading.enumerate()) <= threads
     for descriptor in free:
         os.close(descriptor)
+
+
+def test_a_sensor_of_one_channel_has_one_port() -> None:
+    config = load_config(ports=("/dev/null", "/dev/zero"), description="graded_square")
+    with pytest.raises(ConfigError, match="give one port"):
+        Daemon(config)
 
 
 @pytest.mark.parametrize(

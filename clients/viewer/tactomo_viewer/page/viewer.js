@@ -146,7 +146,9 @@ function imageIn(frame, unit) {
 
 function noticeFor(frame, unit) {
   if (frame.images.map && unit === "kpa") return "No pressure in this frame: choose Δσ/σ₀";
-  return frame.images.structure ? "Magnitude missing: only where, not how hard" : "No map in this frame";
+  if (!frame.images.structure) return "No map in this frame";
+  const has = state.status?.fields.description?.modalities;
+  return has?.includes("magnitude") === false ? "" : "Magnitude missing: only where, not how hard";
 }
 
 // "sensor": the range that the sensor has. "fit": the largest value lately, slowly forgotten.

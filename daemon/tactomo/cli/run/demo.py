@@ -46,6 +46,7 @@ app = typer_app()
         "tactomo demo",
         "tactomo demo --scene deploy/scenes/two_fingers_merge.toml",
         "tactomo demo --ports 1 --noise-uv 50",
+        "tactomo demo --description graded_square",
     ),
 )
 def demo(
@@ -53,8 +54,9 @@ def demo(
     description: Description = DEFAULT_DESCRIPTION,
     method: GivenMethod = None,
     ports: Annotated[
-        int, typer.Option(min=1, max=2, help="One line for both channels, or a line for each.")
-    ] = 2,
+        int | None,
+        typer.Option(min=1, max=2, help="One line for both channels, or a line for each. [each]"),
+    ] = None,
     rate: Annotated[float, typer.Option(help="Dual scans a second.")] = 20.0,
     scene: Annotated[
         Path | None, typer.Option(help="A scripted scene (TOML) that presses by itself.")
@@ -79,8 +81,8 @@ def demo(
     With tcp addresses of port 0 it takes free ports and prints them.
     """
     twin_options = [
-        *("--description", description, "--ports", str(ports), "--rate", str(rate)),
-        *("--twin-control", twin_control),
+        *("--description", description, "--rate", str(rate), "--twin-control", twin_control),
+        *_optional("--ports", ports),
         *_optional("--scene", scene),
         *_optional("--noise-uv", noise_uv),
     ]

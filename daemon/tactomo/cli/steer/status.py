@@ -100,8 +100,10 @@ def _rows(status: dict[str, Any]) -> list[tuple[str, str]]:
         (
             "rates",
             f"{_number(rates.get('frames_hz'))} frames/s; scans/s: "
-            f"magnitude {_number(rates.get('magnitude_hz'))}, "
-            f"structure {_number(rates.get('structure_hz'))}",
+            + ", ".join(
+                f"{channel} {_number(rates.get(f'{channel}_hz'))}"
+                for channel in description.get("modalities", [])
+            ),
         ),
         ("latency", _percentiles(latency)),
         *(

@@ -1,0 +1,153 @@
+"""Sensors of one sheet, graded or saturating, as a user starts them: `tactomo demo -d NAME`."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from page import first_line_of_the_readme
+from selenium.webdriver import Chrome
+from selenium.webdriver.common.by import By
+from tactomo_client import (
+    BadArgument,
+    Contact,
+    ControlError,
+    Daemon,
+    Frame,
+    NoNetwork,
+    request,
+    subscribe,
+)
+from tactomo_client.recording import open_recording
+from waiting import PATIENCE_S, wait_until
+from whole_system import ANYWHERE, SENSOR, Demo, running_demo
+
+GRADED, SATURATING = "graded_square", "skin_round"
+AT_MM = (15.0, -10.0)
+PRESS = {"pressure_kpa": 200.0, "radius_mm": 10.0}
+NEAR_MM = 3.0
+
+
+@pytest.fixture(scope="module", params=[GRADED, SATURATING])
+def one_sheet(request: pytest.FixtureRequest) -> Iterator[tuple[Demo, str]]:
+    """A demo, pressed at AT_MM, and its channel."""
+    with running_demo("--description", request.param) as demo:
+        demo.press(*AT_MM, **PRESS)
+        yield demo, "magnitude" if request.param == GRADED else "structure"
+
+
+def pressed_frame(demo: Demo) -> Frame:
+    """Wait for the frame of one contact where the demo is pressed."""
+    frames: list[Frame] = []
+    with subscribe(SENSOR, address=demo.stream, timeout_s=PATIENCE_S) as skin:
+        wait_until(
+            lambda: is_there(frames[-1].contacts),
+            "the contact",
+            meanwhile=lambda: frames.append(next(skin)),
+        )
+    return frames[-1]
+
+
+def is_there(contacts: tuple[Contact, ...]) -> bool:
+    return [math.dist((c.x_mm, c.y_mm), AT_MM) < NEAR_MM for c in contacts] == [True]
+
+
+def tactomo(*arguments: object) -> None:
+    command = [sys.executable, "-m", "tactomo.cli", *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_a_press_becomes_a_contact_there_and_what_the_sheet_cannot_tell_is_absent(
+    one_sheet: tuple[Demo, str],
+) -> None:
+    demo, channel = one_sheet
+    frame = pressed_frame(demo)
+    assert {"magnitude": frame.map is not None, "structure": frame.structure is not None} == {
+        name: name == channel for name in ("magnitude", "structure")
+    }
+    assert not frame.flags & {"magnitude_missing", "structure_missing"}
+    if channel == "structure":
+        assert frame.pressure_kpa is None
+        assert frame.contacts[0].pressure_kpa is None
+    with Daemon(demo.control) as daemon:
+        status = daemon.status()
+    assert len(status.ports) == 1
+    assert status.incomplete_scans == 0
+
+
+def test_the_readmes_client_prints_the_contact(one_sheet: tuple[Demo, str], tmp_path: Path) -> None:
+    demo, _ = one_sheet
+    pressed_frame(demo)
+    assert "kPa" in first_line_of_the_readme(demo, tmp_path)
+
+
+def test_a_method_that_needs_what_the_sheet_lacks_is_refused(one_sheet: tuple[Demo, str]) -> None:
+    demo, channel = one_sheet
+    with Daemon(demo.control) as daemon:
+        with pytest.raises(NoNetwork, match="both channels"):
+            daemon.set_method("network")
+        if channel == "magnitude":
+            with pytest.raises(BadArgument, match="structure channel"):
+                daemon.set_method("levelset")
+        else:
+            daemon.set_method("levelset")
+            daemon.set_method("auto")
+        assert daemon.status().tier_requested == "auto"
+
+
+def test_the_twin_has_no_sheet_but_its_own_to_mute(one_sheet: tuple[Demo, str]) -> None:
+    demo, channel = one_sheet
+    other = {"magnitude": "structure", "structure": "magnitude"}[channel]
+    with pytest.raises(ControlError, match=f"give {channel}"):
+        request("mute", demo.twin, channel=other, seconds=1.0)
+
+
+def test_what_is_recorded_replays_and_is_plotted(
+    one_sheet: tuple[Demo, str], tmp_path: Path
+) -> None:
+    demo, channel = one_sheet
+    live, again = tmp_path / "live.mcap", tmp_path / "again.mcap"
+    with (
+        Daemon(demo.control) as daemon,
+        subscribe(SENSOR, address=demo.stream, timeout_s=PATIENCE_S) as skin,
+    ):
+        pressed_frame(demo)
+        with daemon.record(live, maps=True):
+            skin.latest()
+            for _ in range(10):
+                next(skin)
+    anywhere = ("--stream", ANYWHERE, "--control", ANYWHERE)
+    tactomo("replay", live, "--speed", "max", "--record", again, *anywhere)
+    tactomo("plot", live, "-o", tmp_path / "live.png")
+    name = "map" if channel == "magnitude" else "structure"
+    recorded = {frame.scan_counter: frame for frame in open_recording(live)}
+    replayed = {frame.scan_counter: frame for frame in open_recording(again)}
+    shared = recorded.keys() & replayed.keys()
+    assert len(shared) >= 8
+    for counter in shared:
+        np.testing.assert_array_equal(
+            getattr(recorded[counter], name), getattr(replayed[counter], name)
+        )
+
+
+def test_status_and_doctor_know_of_one_sheet(one_sheet: tuple[Demo, str]) -> None:
+    demo, _ = one_sheet
+    tactomo("status", "--control", demo.control)
+    demo.clear()
+    tactomo("doctor", "-s", SENSOR, "--stream", demo.stream, "--seconds", "2")
+    demo.press(*AT_MM, **PRESS)
+
+
+@pytest.mark.browser
+def test_the_page_shows_the_contact(one_sheet: tuple[Demo, str], browser: Chrome) -> None:
+    demo, _ = one_sheet
+    pressed_frame(demo)
+    browser.get(demo.page)
+    wait_until(lambda: browser.find_elements(By.CSS_SELECTOR, "#contacts [data-id]"), "the contact")
+    assert browser.execute_script("return document.body.dataset.health") == "good"
