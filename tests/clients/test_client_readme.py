@@ -6,6 +6,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -106,17 +107,15 @@ def test_in_a_control_loop() -> None:
     deadline = time.monotonic() + PATIENCE_S
 
     def is_running() -> bool:
-        return "retreat" not in done and time.monotonic() < deadline
+        return "stop" not in done and time.monotonic() < deadline
 
     robot = SimpleNamespace(
         is_running=is_running,
-        slow_down=lambda: done.append("slow_down"),
-        be_careful=lambda: done.append("be_careful"),
-        retreat=lambda: done.append("retreat"),
+        is_stopped=lambda: done[-1:] == ["stop"],
+        **{name: partial(done.append, name) for name in ("stop", "slow_down", "move")},
     )
     exec(EXAMPLES["In a control loop"], {"robot": robot})
-    assert done[-1] == "retreat"
-    assert "be_careful" not in done
+    assert done == ["stop"]
 
 
 def test_what_stale_means(pressed: FakeSensor, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,6 +18,8 @@ from whole_system import repository
 EXAMPLES = repository() / "examples"
 PROGRAMS = sorted(EXAMPLES.glob("*.py"))
 Run = Callable[..., str]
+Script = list[tuple[list[Contact], list[str]]]
+"""Frames: contacts and flags of each."""
 
 
 @pytest.fixture
@@ -76,33 +78,67 @@ def test_a_recording_is_summed_up_by_contact(run: Run, tmp_path: Path) -> None:
     ]
 
 
-def press(pressure_kpa: float) -> Contact:
+class EnoughError(Exception):
+    """Ends a program that would go on for ever."""
+
+
+def touch(pressure_kpa: float | None, max_kpa: float | None) -> list[Contact]:
     """A contact on the fake sensor."""
-    return Contact(1, 10.0, -5.0, 700.0, 0.2, 0.01, pressure_kpa, pressure_range="within")
+    return [Contact(1, 10.0, -5.0, 700.0, None, None, pressure_kpa, max_kpa=max_kpa)]
 
 
-@pytest.mark.parametrize(
-    ("flags", "pressure_kpa", "reason"),
-    [
-        ([], 151.0, "contact 1: 151 kPa"),
-        (["misfit_high"], 20.0, "not to be trusted: misfit_high"),
-        (None, 0.0, "no frame within half a second"),
-    ],
-)
-def test_the_robot_stops(
-    run: Run, flags: list[str] | None, pressure_kpa: float, reason: str
-) -> None:
+def steady(contacts: list[Contact], *flags: str, frames: int = 25) -> Script:
+    """The same frame, again and again."""
+    return [(contacts, list(flags))] * frames
+
+
+def test_the_robot_stops_once_for_each_cause_and_at_nothing_less() -> None:
+    light, hard = steady(touch(None, 134.0)), steady(touch(151.0, 155.0))
+    shrug = steady([], "misfit_high", frames=3)  # a short doubt
+    calm = steady([]) + light + steady(touch(145.0, 149.0)) + shrug + light
+    to_and_fro = 15 * (light[:1] + hard[:1])
+    assert said_by_the_robot(
+        [
+            *(*calm, *hard, *to_and_fro, *light, *steady([], "misfit_high", "not_converged")),
+            *(*light, *steady(touch(None, None)), *light, *steady(touch(145.0, 151.0)), *light),
+        ]
+    ) == [
+        "moves",
+        "stops: contact 1: 151 kPa",
+        "moves",
+        "stops: not to be trusted: misfit_high, not_converged",
+        "moves",
+        "stops: contact 1: pressed",
+        "moves",
+        "stops: contact 1: 145 kPa",
+        "moves",
+        "stops: no fresh frame",
+    ]
+
+
+def said_by_the_robot(script: Script) -> list[str]:
+    """What the program says while frames come, 50 a second, and then none."""
+    said: list[str] = []
+
+    def note(text: str, **_: object) -> None:
+        said.append(text)
+        if text.endswith("no fresh frame"):
+            raise EnoughError
+
     with FakeSensor("skin") as sensor:
 
         def publish() -> None:
             sensor.wait_for_subscriber()
-            for _ in range(5):
-                sensor.publish([press(149.0)])
-            if flags is not None:
-                sensor.publish([press(pressure_kpa)], flags=flags)
+            for contacts, flags in script:
+                sensor.publish(contacts, flags=flags)
+                threading.Event().wait(0.02)
 
         publisher = threading.Thread(target=publish)
         publisher.start()
-        said = run("stop_robot.py", "skin", sensor.address)
+        program = EXAMPLES / "stop_robot.py"
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("sys.argv", [str(program), "skin", sensor.address])
+            with pytest.raises(EnoughError):
+                runpy.run_path(str(program), {"print": note}, run_name="__main__")
         publisher.join()
-    assert said == f"moving\nstopped: {reason}\n"
+    return said

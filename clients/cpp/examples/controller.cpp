@@ -3,7 +3,7 @@
 //     controller SENSOR [--stream ADDRESS] [--keys FOLDER] [--seconds N]
 //
 // It moves freely while nothing is pressed, slows down where it touches something or the skin warns,
-// retreats from a hard contact, and stops when it cannot know: no frame is fresh. What would be the
+// retreats from a hard contact until it is clearly lighter, and stops when no frame is fresh. What would be the
 // robot is a line on standard output, each time that it changes. At the end, or at Ctrl-C, it tells
 // how long latest() took and how late the loop woke up.
 
@@ -23,6 +23,7 @@ namespace {
 
 constexpr long period_ns = 1'000'000;
 constexpr double hard_kpa = 150;
+constexpr double calm_kpa = 140;  // lower, so that noise does not have it come and go
 
 volatile std::sig_atomic_t stopping = 0;
 
@@ -66,13 +67,14 @@ struct Decision {
     std::string_view reason;
 };
 
-Decision decide(const tactomo::Frame* frame) {
+Decision decide(const tactomo::Frame* frame, bool& retreats) {
     if (frame == nullptr) return {"stop", "no frame yet: what does `tactomo status` say?"};
     if (frame->is_stale()) return {"stop", "stale"};
+    const tactomo::Answer hard = frame->exceeds(retreats ? calm_kpa : hard_kpa);
+    if (hard != tactomo::Answer::cannot_tell) retreats = hard == tactomo::Answer::yes;
+    if (retreats) return {"retreat", "pressed hard"};
     if (!frame->flags.empty()) return {"slow", frame->flags.front()};
-    for (const tactomo::Contact& contact : frame->contacts) {
-        if (contact.pressure_kpa.value_or(0) > hard_kpa) return {"retreat", "pressed hard"};
-    }
+    if (hard == tactomo::Answer::cannot_tell) return {"slow", "cannot tell how hard"};
     // Touched, though perhaps too lightly for a pressure.
     if (!frame->contacts.empty()) return {"slow", "touched"};
     return {"move", "nothing pressed"};
@@ -108,13 +110,14 @@ void run(const Settings& settings) {
     clock_gettime(CLOCK_MONOTONIC, &wake);
     const auto turns = static_cast<std::uint64_t>(settings.seconds * 1e9 / period_ns);
     std::uint64_t turn = 0;
+    bool retreats = false;
     for (; turn < turns && stopping == 0; ++turn) {
         lateness.add(sleep_until(wake));
         const auto before = std::chrono::steady_clock::now();
         const tactomo::Frame* const frame = skin.latest();
         reading.add(std::chrono::steady_clock::now() - before);
 
-        const Decision decision = decide(frame);
+        const Decision decision = decide(frame, retreats);
         if (last != decision.reason) tell(decision);
         last = decision.reason;
     }
