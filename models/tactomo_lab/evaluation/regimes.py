@@ -19,7 +19,7 @@ import numpy as np
 from tactomo_models.errors import DataError
 from tactomo_models.scene.press import Press, Profile
 from tactomo_models.sensor.description import SensorDescription
-from tactomo_models.sensor.response import MagnitudeChannel, MagnitudeResponse
+from tactomo_models.sensor.description_file import load_description
 from tactomo_protocol import Channel
 
 from tactomo_lab.scenes.presets import placed_apart, scale_of
@@ -368,15 +368,10 @@ def _by_hand(draw: Draw, plan: Plan) -> Plan:
 
 
 def one_graded_sheet(description: SensorDescription) -> SensorDescription:
-    """A sensor of the same geometry with one sheet, which answers from 0 kPa on."""
-    response = MagnitudeResponse(pressure_kpa=(0.0, 300.0), relative_change=(0.0, 2.0))
-    changed = {
-        "name": "one_graded_sheet",
-        "title": "One graded sheet",
-        Channel.MAGNITUDE: MagnitudeChannel(response=response),
-        Channel.STRUCTURE: None,
-    }
-    return description.model_copy(update=changed)
+    """The sensor with the one sheet of `graded_square`, which answers from 0 kPa on."""
+    graded = load_description("graded_square")
+    sheet = {Channel.MAGNITUDE: graded.magnitude, Channel.STRUCTURE: None}
+    return description.model_copy(update={"name": graded.name, "title": graded.title, **sheet})
 
 
 @regime(
