@@ -94,8 +94,9 @@ def bench(
         typer.Option(min=1.0, rich_help_panel=LIVE, help="Time of each of the four live scenes."),
     ] = STATUS_S,
     ports: Annotated[
-        int, typer.Option(min=1, max=2, rich_help_panel=LIVE, help="Lines of the twin.")
-    ] = 2,
+        int | None,
+        typer.Option(min=1, max=2, rich_help_panel=LIVE, help="Lines of the twin. [one a channel]"),
+    ] = None,
     rate: Annotated[
         float, typer.Option(rich_help_panel=LIVE, help="Dual scans a second of the twin.")
     ] = 20.0,
@@ -215,7 +216,7 @@ def _machine_speed(results: Results, show: bool, as_json: bool) -> None:
 
 
 def _measure_twin(
-    results: Results, ports: int, rate: float, seconds: float, report: Callable[[str], None]
+    results: Results, ports: int | None, rate: float, seconds: float, report: Callable[[str], None]
 ) -> None:
     """Press a twin in several ways and measure each."""
     from tactomo_client import request
@@ -227,8 +228,9 @@ def _measure_twin(
         options = ("--description", results.description)
         family.start("models build", "models", "build", *options).wait_done()
         skin = family.start(
-            *("twin", "twin", *options, "--ports", str(ports), "--rate", str(rate)),
+            *("twin", "twin", *options, "--rate", str(rate)),
             *("--twin-control", at("twin"), "--announce"),
+            *([] if ports is None else ["--ports", str(ports)]),
         ).wait_ready()
         lines = [word for path in skin["ports"] for word in ("--port", path)]
         family.start(
