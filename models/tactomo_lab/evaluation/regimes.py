@@ -370,8 +370,8 @@ def _by_hand(draw: Draw, plan: Plan) -> Plan:
 def one_graded_sheet(description: SensorDescription) -> SensorDescription:
     """The sensor with the one sheet of `graded_square`, which answers from 0 kPa on."""
     graded = load_description("graded_square")
-    sheet = {Channel.MAGNITUDE: graded.magnitude, Channel.STRUCTURE: None}
-    return description.model_copy(update={"name": graded.name, "title": graded.title, **sheet})
+    taken = {key: getattr(graded, key) for key in ("name", "title", "magnitude", "structure")}
+    return description.model_copy(update=taken)
 
 
 @regime(
