@@ -13,4 +13,16 @@ def measured(change: FloatArray, weight: FloatArray | float = 1.0) -> Changes:
     with np.errstate(divide="ignore"):
         variance = np.where(weights > 0, 1 / weights**2, 0.0)
     even = np.ones(change.shape)
-    return Changes(change, weights, even, variance, False, 1.0, weights**2)
+    none, modes = np.zeros(change.shape), np.eye(len(change), len(change) // 2)
+    return Changes(
+        change,
+        weights,
+        even,
+        variance,
+        False,
+        1.0,
+        weights**2,
+        variance + (weights == 0),
+        none,
+        modes,
+    )

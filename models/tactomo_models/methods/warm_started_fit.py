@@ -25,6 +25,7 @@ from tactomo_models.arrays import FloatArray
 from tactomo_models.methods.contact_search import ContactSearch, MissingContact
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scans.changes import Changes
+from tactomo_models.scans.stillness import is_still
 from tactomo_models.scene.level_set import LevelSet
 from tactomo_models.scene.outlines import (
     E1,
@@ -153,7 +154,7 @@ class _Course:
     def __init__(self, tools: _Tools, shape_model: ShapeModel) -> None:
         self.tools, self.shape_model = tools, shape_model
         self._shape: Shape | None = None
-        self._settled_change = np.zeros(0)  # of the frame that the shape is of
+        self._settled_on: Changes | None = None  # the frame that the shape is of
         self._tried_misfit = 0.0  # at which all moves were tried on contacts like these
         self._from_nothing = True  # or from the shape of frames before
         self._cold_start: _Course | None = None
@@ -170,7 +171,7 @@ class _Course:
         shape, how = self._start(frame)
         if not shape.converged:
             shape = self._improve(shape, frame)
-            self._settled_change = frame.measured.change
+            self._settled_on = frame.measured
         self._shape = shape
         while self._doubtful(shape):
             shape, how = self._against_cold_start(shape, how, frame)
@@ -198,7 +199,7 @@ class _Course:
         if not (is_better or (simpler and as_good)):
             return shape, how
         self._start_over()
-        self._shape, self._settled_change = other, frame.measured.change
+        self._shape, self._settled_on = other, frame.measured
         self._tried_misfit = other.misfit
         return other, "restarted"
 
@@ -247,11 +248,7 @@ class _Course:
 
     def _is_still(self, measured: Changes) -> bool:
         """Tell whether this frame differs by noise alone from the one that the shape is of."""
-        still = 1.5  # mean square of differences over their noise: 1, give or take 0.1, at rest
-        valid = measured.weight > 0
-        difference = (measured.change - self._settled_change)[valid]
-        variance = 2 * measured.frame_variance[valid]
-        return float(np.mean(difference**2 / variance)) < still
+        return self._settled_on is not None and is_still(self._settled_on, measured)
 
     def _improve(self, shape: Shape, frame: _Frame) -> Shape:
         """Refine, and try one candidate after another, until none is left or the budget ends."""

@@ -52,6 +52,11 @@ class Changes:
         variance_inflation: (M,) factor by which the variance of an estimate exceeds what
             independent errors of that size would give it: model errors go together.
         frame_variance: (M,) variances of each of two frames' changes, where the scene is still.
+        noise_variance: (M,) that of the changes by noise, as the tare knows it: where it was of a
+            single scan, no more than an upper bound.
+        tolerance: (M,) square of a change too far below the model's error to be worth a solve.
+        modes: (M, K) orthonormal directions in which the sheet's conductivity can move changes
+            over their noise.
         quiet: whether nothing presses.
         signal: root mean square of the changes over their noise and what no noise accounts for;
             what is quiet is below the root of `noise_limit` over the count (1.24 of 208).
@@ -65,6 +70,9 @@ class Changes:
     quiet: bool
     signal: float
     precision: FloatArray
+    noise_variance: FloatArray
+    tolerance: FloatArray
+    modes: FloatArray
 
     @property
     def misfit(self) -> float:
@@ -145,6 +153,7 @@ class MeasuredChannel:
         relative = np.hypot(noise * self._per_volt * np.sqrt(1 + 1 / scans), MODEL_ERROR)
         self.relative_noise = np.where(valid, relative, UNUSABLE)
         self._noise = np.maximum(self.relative_noise**2 - MODEL_ERROR**2, trace**2)
+        self._modes = _leading_modes(artifact.jacobian, np.where(valid, self._noise, np.inf))
         self._variance = self.relative_noise**2  # of a change where nothing presses, drift included
         # A model that is wrong about the reference is wrong about the changes, too, if less: most
         # of its error divides out.
@@ -200,6 +209,9 @@ class MeasuredChannel:
             variance_inflation=1 + (CORRELATED - 1) * error / (noise + error),
             # What is far below the model's error is not worth a solve either.
             frame_variance=noise + still_share * error,
+            noise_variance=noise,
+            tolerance=still_share * error,
+            modes=self._modes,
             quiet=quiet,
             signal=(statistic / count) ** 0.5,
             precision=valid / variance,
@@ -225,6 +237,19 @@ def towards_pressing(
 def missing(name: Channel) -> Flag:
     """The flag that says that a channel has nothing to show."""
     return Flag.MAGNITUDE_MISSING if name == Channel.MAGNITUDE else Flag.STRUCTURE_MISSING
+
+
+def _leading_modes(jacobian: FloatArray, variance: FloatArray) -> FloatArray:
+    """Orthonormal directions (M, K) that the sheet's conductivity moves voltages over noise in.
+
+    Args:
+        jacobian: (M, P) of the relative voltage changes.
+        variance: (M,) of their noise; infinite where they are not measured.
+    """
+    least = 0.02  # of the largest singular value: 45 of 208; with half or twice that, 50 or 40
+    whitened = jacobian / np.sqrt(variance)[:, None]
+    squares, vectors = np.linalg.eigh(whitened @ whitened.T)
+    return np.ascontiguousarray(vectors[:, squares > least**2 * squares[-1]])
 
 
 @cache

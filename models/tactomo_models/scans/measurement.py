@@ -126,16 +126,16 @@ class Comparator:
     def _ask_noise(self, *scans: FloatArray | None) -> None:
         """Take the noise of the first frame's scans, where a reference of one scan told none.
 
-        A reference is often the mean of many scans, and so much quieter than the scans to come.
+        A reference is often the mean of many scans, and so much quieter than the scans to come; and
+        it breaks reciprocity not by noise alone, but also by what is the same in every scan.
         """
-        noisier = 2.0  # times the reference: a scan noisier than that by more than chance
         self._asks_noise = False
         if self._reference is None or any(
             scan is not None and scan.shape != (self._description.measurements,) for scan in scans
         ):
             return
         seen = self._reference.with_noise_of(self._description, *scans)
-        if seen.scans > noisier**2:
+        if not seen.lacks_noise:
             self._tare(seen)
             self._follow(seen)
 

@@ -53,21 +53,17 @@ class Reference:
     ) -> Reference:
         """The same with the noise of scans (M,) or (n, M), pressed or not, by reciprocity.
 
-        Of how many scans the reference is the mean follows from its own noise.
+        Of how many scans the reference is the mean follows, too; see `_noise_against`.
         """
         pairs = ((self.magnitude, magnitude), (self.structure, structure))
-        seen = [None if s is None else noise_of_reciprocity(description, s) for _, s in pairs]
-        own = [None if v is None else noise_of_reciprocity(description, v) for v, _ in pairs]
-        averaged = [
-            int(np.clip((noise.max() / max(rest.max(), 1e-30)) ** 2, 1, 1e6))
-            for noise, rest in zip(seen, own, strict=True)
-            if noise is not None and rest is not None
+        seen = [
+            None if v is None or s is None else _noise_against(description, v, s) for v, s in pairs
         ]
         return replace(
             self,
-            magnitude_noise=seen[0],
-            structure_noise=seen[1],
-            scans=min(averaged, default=1),
+            magnitude_noise=seen[0][0] if seen[0] else None,
+            structure_noise=seen[1][0] if seen[1] else None,
+            scans=min((each[1] for each in seen if each), default=1),
         )
 
     def is_followed_from(self, other: Reference) -> bool:
@@ -150,3 +146,23 @@ def noise_of_reciprocity(description: SensorDescription, scans: FloatArray) -> F
             return None
         sigma = robust_sigma(differences) / np.sqrt(2)
     return np.full(description.measurements, float(sigma))
+
+
+def _noise_against(
+    description: SensorDescription, reference: FloatArray, scans: FloatArray
+) -> tuple[FloatArray, int] | None:
+    """Noise (M,) of one scan, and how many scans a reference (M,) is the mean of; None as above.
+
+    A device breaks reciprocity by noise, and by a share that is the same in every scan: of s² and
+    e², the reference, a mean of n, has s²/n + e², a scan s² + e², and their difference s² + s²/n,
+    which leaves s² and n. Where e² is much the larger, the difference alone is to be trusted.
+    """
+    own, one, both = (
+        noise_of_reciprocity(description, volts) for volts in (reference, scans, scans - reference)
+    )
+    if own is None or one is None or both is None:
+        return None
+    with np.errstate(all="ignore"):
+        share = (1 + (one - own) / both * ((one + own) / both)) / 2  # of s² in the difference
+        share = np.clip(np.nan_to_num(share, nan=1.0), 0.5, 1 - 1e-6)
+    return both * np.sqrt(share), round(float((share / (1 - share)).min()))

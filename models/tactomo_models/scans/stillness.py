@@ -1,0 +1,46 @@
+"""Whether two scans are of one scene: whether they differ by noise alone.
+
+Whatever moves on a sheet moves its voltages along few directions: those that its conductivity can
+move at all (the Jacobian's leading singular vectors, 40 or 50 of 208). Noise moves all of them
+alike. So the difference of two scans tells how noisy both are, by the directions that no
+conductivity explains, and whether something moved, by the others (an F test). Neither a tare of a
+single scan nor a device that breaks reciprocity by the same share in every scan can make a moving
+scene look still: no noise is taken from them but as an upper bound.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+from scipy.special import fdtri
+
+from tactomo_models.scans.changes import Changes
+
+
+def is_still(settled: Changes, new: Changes) -> bool:
+    """Tell whether a scan is of the same scene as the one that was settled on.
+
+    Changes that are far below the model's own error (`Changes.tolerance`) count as still.
+
+    Args:
+        settled: changes of one channel's scan, which a solution is of.
+        new: changes of a later scan of the same channel since the same tare.
+    """
+    valid = (settled.weight > 0) & (new.weight > 0)
+    sigma = np.sqrt(new.noise_variance)
+    difference = np.where(valid, (new.change - settled.change) / sigma, 0.0)
+    along = difference @ new.modes
+    smooth, total = float(along @ along), float(difference @ difference)
+    modes, others = len(along), max(int(np.count_nonzero(valid)) - len(along), 1)
+    # Where the difference is large, curvature leaves some of it in the other directions, too.
+    noise = min((total - smooth) / others, 2.0)
+    tolerated = 2 * float((new.tolerance / new.noise_variance)[valid].sum())
+    return smooth <= _noise_limit(modes, others) * modes * noise + tolerated
+
+
+@cache
+def _noise_limit(modes: int, others: int) -> float:
+    """Ratio of two variances of so many degrees of freedom that noise stays below."""
+    false_alarm = 1e-4  # chance that a still frame is solved again, which costs a few solves
+    return float(fdtri(modes, others, 1 - false_alarm))
