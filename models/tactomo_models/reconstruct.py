@@ -96,13 +96,14 @@ class Reconstructor:
     def method(self) -> str:
         """The name of the method that is asked for.
 
-        A new one starts cold. Raises `MethodError` where there is none of that name.
+        A new one starts cold. Setting it raises what making a reconstructor does.
         """
         return self._name
 
     @method.setter
     def method(self, name: str) -> None:
         if name not in self._methods:
+            check_method(name, self.description)
             self._methods[name] = make_method(name)
         if name != self._name:
             self._name = name

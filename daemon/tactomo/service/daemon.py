@@ -130,7 +130,7 @@ class Daemon:
         if replay is not None and config.calibration is not None:
             replay = replace(replay, marks=without_calibrations(replay.marks))
         self._replay = replay
-        _check_methods(replay, self._methods)
+        _check_methods(replay, self._methods, description)
         protocol = _protocol(config)
         channels = tuple(c for c in Channel if c in description.channels)
         calibration, self._unused = _find_calibration(config, description, replay)
@@ -439,7 +439,9 @@ def _make_reconstructor(config: DaemonConfig, description: SensorDescription) ->
     return Reconstructor(description, artifact, method=config.method, budget_s=budget_s)
 
 
-def _check_methods(replay: Replay | None, methods: Sequence[str]) -> None:
+def _check_methods(
+    replay: Replay | None, methods: Sequence[str], description: SensorDescription
+) -> None:
     """Refuse a recording whose frames were made by a method that is not here, before it begins.
 
     A recording can name no module: only those who start the daemon can.
@@ -451,6 +453,8 @@ def _check_methods(replay: Replay | None, methods: Sequence[str]) -> None:
             f"the recording's frames were made by the method {unknown[0]!r}, which is not here",
             "install what brings it, such as tactomo-lab, or name your own with --method",
         )
+    for method in made_by:
+        check_method(method, description)
 
 
 def _find_machine_speed(description: SensorDescription) -> MachineSpeed:

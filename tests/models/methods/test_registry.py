@@ -75,6 +75,10 @@ def test_a_sensor_without_the_channel_that_a_method_needs_is_told(name: str) -> 
     graded = load_description("graded_square")
     with pytest.raises(MethodError, match=f"{name}.* needs a structure channel, .*graded_square"):
         check_method(name, graded)
+    reconstructor = Reconstructor(graded)
+    with pytest.raises(MethodError, match="structure channel"):
+        reconstructor.method = name
+    assert reconstructor.method == "auto"
     check_method(name, load_description("skin_round"))
     for other in ("auto", "fit", "tikhonov", "noser"):
         check_method(other, graded)
