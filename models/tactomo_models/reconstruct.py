@@ -291,13 +291,24 @@ class Reconstructor:
         with measurement.timed("contacts"):
             areas, size, sigma = self._areas_of(estimate)
             ids = self._tracker.update(areas.centres_m, areas.areas_m2)
-            contacts = contacts_of(areas, ids, size, sigma, self.curve, last=self._ranges)
+            account = estimate.account
+            contacts = contacts_of(
+                areas,
+                ids,
+                size,
+                sigma,
+                self.curve,
+                last=self._ranges,
+                field=account.contacts if account else None,
+            )
             seen = self._ranges | {contact.id: contact.pressure_range for contact in contacts}
             self._ranges = {known: seen[known] for known in self._tracker.ids if known in seen}
-        tells_pressure = estimate.tells_pressure and has_magnitude
+        pressure = None
+        if estimate.tells_pressure and has_magnitude:
+            pressure = pressure_map(areas, contacts, account.pressure_kpa if account else None)
         return Reconstruction(
             map=_image(estimate.map),
-            pressure_kpa=pressure_map(areas, contacts) if tells_pressure else None,
+            pressure_kpa=pressure,
             structure=_image(estimate.structure),
             contacts=contacts,
             tier=estimate.made_by or self._name,

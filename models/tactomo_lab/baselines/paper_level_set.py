@@ -29,8 +29,9 @@ import numpy as np
 from tactomo_models.arrays import BoolArray, FloatArray, Image
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scans.changes import Changes
+from tactomo_models.scene.field_fit import STEP_LIMIT, WORST_DAMPING, FieldFit, FittedField
 from tactomo_models.scene.level_set import LevelSet
-from tactomo_models.scene.shape_fit import STEP_LIMIT, WORST_DAMPING, Shape, ShapeFit
+from tactomo_protocol import Channel
 
 ALPHA: Final = 1.0  # with data of unit root mean square
 CUT: Final = 0.25  # of the Tikhonov image's peak, where the outline starts
@@ -52,18 +53,19 @@ class PaperLevelSet:
         self.family = LevelSet(forward)
         self._volts = np.abs(forward.bare_voltages)
         self._by_node = 2 * (ratio - 1) / (ratio + 1) * jacobian_by_node * self._volts  # (P, M)
-        self._judge = ShapeFit(forward, ratio)
+        self._judge = FieldFit(forward)
 
     def predict(self, mu: FloatArray) -> FloatArray:
         """Voltage changes (M,) by equation 8, in the bare sheet's units, for coefficients (K,)."""
-        return np.asarray(self.family.render(mu)[0] @ self._by_node)
+        drawing = self.family.draw(mu)
+        return np.asarray(drawing.share @ self._by_node[drawing.nodes])
 
     def jacobian(self, mu: FloatArray) -> FloatArray:
         """Derivative (M, K) of `predict`."""
-        nodes = np.flatnonzero(self.family.render(mu)[1])
-        return np.asarray(self._by_node[nodes].T @ self.family.slope(mu, nodes))
+        drawing = self.family.draw(mu)
+        return np.asarray(self._by_node[drawing.nodes].T @ drawing.slopes()[1])
 
-    def fit(self, measured: Changes, image: FloatArray | Image) -> Shape:
+    def fit(self, measured: Changes, image: FloatArray | Image) -> FittedField:
         """Minimise equation 9 and judge what comes out by the nonlinear model.
 
         Args:
@@ -74,7 +76,7 @@ class PaperLevelSet:
         start = self.family.parameters_of(0.5 + 0.5 * (likeness - CUT) / (1 - CUT))
         mu, converged = self._minimise(start, measured.change * self._volts, measured.weight > 0)
         shape = self._judge.evaluate(
-            self.family, mu, self._judge.likely, measured, most_pressed=len(image)
+            self.family, mu, self._judge.likely, {Channel.STRUCTURE: measured}, len(image)
         )
         assert shape is not None
         return replace(shape, converged=converged)
@@ -111,4 +113,4 @@ class PaperLevelSet:
         residual = scale * (self.predict(mu) - data)
         cost = float(residual @ residual + ALPHA * (mu @ mu))
         # Where nothing is pressed there is no slope, and no way back.
-        return residual, cost if self.family.render(mu)[0].max() > 0.5 else np.inf
+        return residual, cost if self.family.draw(mu).share.max(initial=0.0) > 0.5 else np.inf

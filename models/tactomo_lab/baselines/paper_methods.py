@@ -7,15 +7,18 @@ from typing import ClassVar
 
 import numpy as np
 from tactomo_models.arrays import FloatArray
-from tactomo_models.methods.fit import OutlineFit
 from tactomo_models.methods.linear import LinearImages
+from tactomo_models.methods.magnitudes import BAD_MISFIT, known_magnitudes
 from tactomo_models.methods.method import Estimate, Skin, UnsolvableError
 from tactomo_models.scans.changes import Changes
 from tactomo_models.scans.measurement import Measurement
-from tactomo_models.scene.shape_fit import Budget, Shape
+from tactomo_models.scans.plausibility import Flag
+from tactomo_models.scene.contacts import map_of
+from tactomo_models.scene.field_fit import FittedField
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_protocol import Channel
 
+from tactomo_lab.baselines.area_magnitudes import fit_magnitudes
 from tactomo_lab.baselines.paper_level_set import PaperLevelSet
 from tactomo_lab.baselines.paper_network import PaperNetwork, load_paper_network
 
@@ -30,29 +33,60 @@ class PaperShapes:
         self._images = LinearImages(skin, "tikhonov")
         self._level_set = PaperLevelSet(skin.forward, by_node, ratio)
 
-    def fit(self, structure: Changes) -> Shape:
+    def fit(self, structure: Changes) -> FittedField:
         """Fit a shape to the structure channel's changes."""
         image = np.maximum(self._images.image(Channel.STRUCTURE, structure.change), 0.0)
         return self._level_set.fit(structure, image)
 
 
-class PaperLevelSetMethod(OutlineFit):
-    """`pls-paper`: the paper's shape, and a magnitude for each of its areas as `fit` has it."""
+class PaperLevelSetMethod:
+    """`pls-paper`: the paper's shape, and a magnitude for each of its areas."""
 
     needs = (Channel.STRUCTURE,)
 
     def prepare(self, skin: Skin) -> None:
         """Make the level set's equations."""
-        super().prepare(skin)
+        self._skin = skin
         if Channel.STRUCTURE in skin.channels:
             self._shapes = PaperShapes(skin)
 
-    def _shape(self, measurement: Measurement, budget: Budget) -> tuple[Shape, str]:
-        self._forget()  # it starts cold, always
-        return self._shapes.fit(measurement.changes[Channel.STRUCTURE]), "as requested"
+    def solve(
+        self, measurement: Measurement, previous: Estimate | None, budget_s: float
+    ) -> Estimate:
+        """Fit the shape, from a cold start, then each area's magnitude."""
+        changes, finder = measurement.changes, self._skin.areas
+        if Channel.STRUCTURE not in changes:
+            raise UnsolvableError("the structure channel is missing")
+        with measurement.timed("shape"):
+            shape = self._shapes.fit(changes[Channel.STRUCTURE])
+        pressed = coverage_of(self._skin, shape)
+        structure = finder.on_map(pressed)
+        areas, fitted = finder.find(structure, pressed), None
+        if len(areas) and Channel.MAGNITUDE in changes:
+            with measurement.timed("contacts"):
+                magnitude = changes[Channel.MAGNITUDE]
+                fitted = fit_magnitudes(self._skin.forward, areas.on_nodes, magnitude)
+        size, sigma = known_magnitudes(fitted, self._skin.magnitude_sign, len(areas))
+        flags = Flag(0) if shape.converged else Flag.NOT_CONVERGED
+        if max(shape.misfit, fitted.misfit if fitted else 0.0) > BAD_MISFIT:
+            flags |= Flag.MISFIT_HIGH
+        return Estimate(
+            map=map_of(areas, size) if Channel.MAGNITUDE in changes else None,
+            structure=structure,
+            areas=areas,
+            magnitudes=size,
+            magnitude_sigmas=sigma,
+            misfit=shape.misfit,
+            flags=flags,
+            made_by="pls-paper",
+        )
 
-    def _name_of(self, shape: Shape) -> str:
-        return "pls-paper"
+
+def coverage_of(skin: Skin, shape: FittedField) -> FloatArray:
+    """Share pressed (P,) at the pressable nodes."""
+    pressed = np.zeros(len(skin.forward.bare.pressable))
+    pressed[shape.drawing.nodes] = shape.drawing.share
+    return pressed
 
 
 class PreliminaryImages:
@@ -77,7 +111,7 @@ class PreliminaryImages:
         if Channel.STRUCTURE in changes and Channel.STRUCTURE in channels:
             assert self._shapes is not None
             shape = self._shapes.fit(changes[Channel.STRUCTURE])
-            images[Channel.STRUCTURE] = areas.on_map(shape.coverage)
+            images[Channel.STRUCTURE] = areas.on_map(coverage_of(self._skin, shape))
         return images
 
 

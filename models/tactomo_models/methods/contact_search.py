@@ -20,8 +20,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactomo_models.arrays import FloatArray
-from tactomo_models.physics.forward import ForwardModel
-from tactomo_models.scene.shape_fit import Shape
+from tactomo_models.physics.forward import ForwardModel, Solution
+from tactomo_models.scene.pressure_field import Drawing
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,11 @@ class MissingContact:
 
 
 class ContactSearch:
-    """Looks for a contact in what a shape leaves unexplained.
+    """Looks for a contact in what is left unexplained of one sheet.
 
     Args:
         forward: the model of the sheet.
-        ratio: conductivity of the saturated phase over the bare sheet's.
+        ratio: conductivity of a typical contact over the bare sheet's.
     """
 
     def __init__(self, forward: ForwardModel, ratio: float) -> None:
@@ -62,19 +62,25 @@ class ContactSearch:
         self._x, self._y = x[self._nodes], y[self._nodes]
         self._probes = forward.probes(self._x, self._y, reach * spacing)
 
-    def best(self, shape: Shape, weight: FloatArray) -> MissingContact:
-        """The disc that would explain most of a shape's residual.
+    def best(
+        self, solution: Solution, residual: FloatArray, drawing: Drawing, weight: FloatArray
+    ) -> MissingContact:
+        """The disc that would explain most of a residual.
 
         Args:
-            shape: what is known to be pressed.
+            solution: of what is known to be pressed.
+            residual: (M,) noise-weighted misfit that it leaves.
+            drawing: what is known to be pressed.
             weight: (M,) inverse standard deviations of the data.
         """
         largest_m = 0.02  # radius of a contact to begin with
-        by_area = self._forward.spot_sensitivity(self._probes, shape.solution)
+        by_area = self._forward.spot_sensitivity(self._probes, solution)
         by_area *= (self._dipole * weight / np.abs(self._forward.bare_voltages))[:, None]
         power = np.maximum((by_area**2).sum(axis=0), 1e-30)
-        area = -(by_area.T @ shape.residual) / power
-        bare = shape.pressed[self._nodes] < 0.1
+        area = -(by_area.T @ residual) / power
+        pressed = np.zeros(self._forward.bare.pressable.shape)
+        pressed[drawing.nodes] = np.abs(drawing.enclosed)
+        bare = pressed[self._nodes] < 0.1
         gain = np.where(bare & (area > 0), area**2 * power, 0.0)
         best = int(gain.argmax())
         radius = float(np.sqrt(max(area[best], 0.0) / np.pi))

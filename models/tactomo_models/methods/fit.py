@@ -1,6 +1,6 @@
-"""Shapes fitted to the structure channel, and a magnitude for each of their areas.
+"""A pressure field fitted to all sheets that have a scan.
 
-`fit` describes what presses by a few outlines, `levelset` by shapes of any form; see
+`fit` describes what presses by a few contacts, `levelset` by shapes of any form; see
 `warm_started_fit`. Where a sensor's objects conduct better or worse than what surrounds them,
 either one is the fit of both kinds (`objects`).
 """
@@ -11,125 +11,127 @@ import numpy as np
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
-from tactomo_models.methods.contact_model import Account, ContactModel
 from tactomo_models.methods.linear import LinearImages
-from tactomo_models.methods.magnitudes import BAD_MISFIT, known_magnitudes, leaves_unexplained
+from tactomo_models.methods.magnitudes import BAD_MISFIT
 from tactomo_models.methods.method import Estimate, Skin, UnsolvableError
 from tactomo_models.methods.objects import ObjectFit
 from tactomo_models.methods.warm_started_fit import Propose, ShapeModel, WarmStartedFit
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
-from tactomo_models.scene.contacts import map_of
-from tactomo_models.scene.outlines import Outlines
-from tactomo_models.scene.shape_fit import Budget, Shape
+from tactomo_models.scene.field_account import FieldAccount, FieldAccountant
+from tactomo_models.scene.field_fit import Budget, FieldFit, FittedField, Measured
+from tactomo_models.scene.pressure_field import PressureField
 
 
 class OutlineFit:
-    """A few outlines, and how hard each area is pressed."""
+    """A few contacts: their outlines, and how hard each presses."""
 
     shape_model = ShapeModel.OUTLINES
 
     def prepare(self, skin: Skin) -> None:
-        """Make the fit of this sheet, unless the last tare was of the same."""
+        """Make the fit of this sensor, unless the last tare was of the same."""
         before = getattr(self, "_skin", None)
         self._skin = skin
-        self._sign = skin.magnitude_sign
         self._images = LinearImages(skin, "noser")
         self._frames_held = 0  # since the last structure scan
+        self._last: tuple[FittedField, FieldAccount] | None = None
         if before is not None and before.forward is skin.forward:
             return
+        self._field_fit = FieldFit(skin.forward, skin.description)
+        self._accountant = FieldAccountant(self._field_fit, skin.areas)
         structure = skin.description.structure
-        self._fit: WarmStartedFit | ObjectFit | None = None
-        if structure is None:
-            return
-        if structure.either_way:
-            self._fit = ObjectFit(skin.forward, structure.saturated_ratio, self._linear_image)
+        self._fit: WarmStartedFit | ObjectFit
+        if structure is not None and structure.either_way:
+            self._fit = ObjectFit(self._field_fit, self._linear_image)
         else:
-            ratio = structure.saturated_ratio
-            self._fit = WarmStartedFit(skin.forward, ratio, self.shape_model)
-        self._contact_model = ContactModel(skin.forward, skin.areas, self._fit.fit)
+            self._fit = WarmStartedFit(self._field_fit, self.shape_model)
+            self._typical_peak = self._fit.typical_peak
 
     def solve(
         self, measurement: Measurement, previous: Estimate | None, budget_s: float
     ) -> Estimate:
-        """Fit a shape, from where the frame before ended, and the magnitudes of its areas."""
+        """Fit a field, from where the frame before ended."""
         if previous is None:
             self._forget()
-        if self._fit is None:
-            raise UnsolvableError("no structure channel")
-        if Channel.STRUCTURE not in measurement.changes:
-            return self._held(measurement)
-        self._frames_held = 0
+        if Channel.STRUCTURE in self._skin.description.channels:
+            if Channel.STRUCTURE not in measurement.changes:
+                return self._held(measurement)
+            self._frames_held = 0
         with measurement.timed("shape"):
-            shape, how = self._shape(measurement, Budget(budget_s))
-        solves = 3 if shape.converged else 1
+            fitted, how = self._fitted(measurement, Budget(budget_s))
         with measurement.timed("contacts"):
-            own = self._contact_model.account(shape, measurement.changes, solves)
-        self._made_by = self._name_of(shape)
-        return self._conclude(measurement, shape, own, how, solves)
+            account = self._account(fitted, measurement.changes)
+        self._made_by = self._name_of(fitted)
+        return self._conclude(measurement, fitted, account, how)
 
     def _forget(self) -> None:
-        if self._fit is not None:
-            self._fit.forget()
-            self._contact_model.forget()
+        self._fit.forget()
+        self._last = None
 
-    def _shape(self, measurement: Measurement, budget: Budget) -> tuple[Shape, str]:
-        structure = measurement.changes[Channel.STRUCTURE]
+    def _fitted(self, measurement: Measurement, budget: Budget) -> tuple[FittedField, str]:
+        changes = measurement.changes
         if isinstance(self._fit, ObjectFit):
-            return self._fit.follow(structure, budget)
-        assert self._fit is not None
-        return self._fit.follow(structure, budget, self._proposer(measurement))
+            return self._fit.follow({Channel.STRUCTURE: changes[Channel.STRUCTURE]}, budget)
+        return self._fit.follow(changes, budget, self._proposer(measurement))
+
+    def _account(self, fitted: FittedField, measured: Measured) -> FieldAccount:
+        """The account of a field; that of the frame before while the field has not moved."""
+        if self._last is not None and self._last[0].drawing is fitted.drawing:
+            return self._last[1]
+        doubts = self._fit.doubts if isinstance(self._fit, WarmStartedFit) else []
+        known = {name: measured[name] for name in fitted.residuals}
+        account = self._accountant.account(fitted, known, doubts)
+        self._last = fitted, account
+        return account
 
     def _proposer(self, measurement: Measurement) -> Propose | None:
         """What proposes contacts to start from; None where nothing does."""
         return None
 
-    def _name_of(self, shape: Shape) -> str:
-        return "fit" if isinstance(shape.family, Outlines) else "levelset"
+    def _name_of(self, fitted: FittedField) -> str:
+        return "fit" if isinstance(fitted.family, PressureField) else "levelset"
 
     def _conclude(
-        self, measurement: Measurement, shape: Shape, own: Account, how: str, solves: int
+        self, measurement: Measurement, fitted: FittedField, account: FieldAccount, how: str
     ) -> Estimate:
-        """The estimate that a shape and the account of it come to."""
-        flags = Flag(0) if shape.converged else Flag.NOT_CONVERGED
-        if self._leaves_unexplained(measurement, shape, own):
+        """The estimate that a field and the account of it come to."""
+        flags = Flag(0) if fitted.converged else Flag.NOT_CONVERGED
+        if self._leaves_unexplained(fitted, account):
             flags |= Flag.MISFIT_HIGH
-        size, sigma = known_magnitudes(own.fitted, self._sign, len(own.areas))
         return Estimate(
-            map=own.map(self._sign) if Channel.MAGNITUDE in measurement.changes else None,
-            structure=own.pressed,
-            areas=own.areas,
-            magnitudes=size,
-            magnitude_sigmas=sigma,
-            misfit=shape.misfit,
+            map=account.map if Channel.MAGNITUDE in measurement.changes else None,
+            structure=account.structure if Channel.STRUCTURE in measurement.changes else None,
+            areas=account.areas,
+            magnitudes=account.magnitudes,
+            magnitude_sigmas=account.magnitude_sigmas,
+            account=account,
+            misfit=fitted.misfit,
             flags=flags,
             made_by=self._made_by,
             reason=how,
         )
 
-    def _leaves_unexplained(self, measurement: Measurement, shape: Shape, shown: Account) -> bool:
+    def _leaves_unexplained(self, fitted: FittedField, account: FieldAccount) -> bool:
         """Tell whether the data say that something else presses."""
-        magnitude = measurement.changes.get(Channel.MAGNITUDE)
-        return shape.misfit > BAD_MISFIT or (
-            magnitude is not None and leaves_unexplained(shown.fitted, magnitude, self._sign)
-        )
+        worst = max(fitted.misfit_of(name) for name in fitted.residuals)
+        return worst > BAD_MISFIT or account.goes_wrong_way
 
     def _held(self, measurement: Measurement) -> Estimate:
-        """Bridge a lost structure scan with the last shape, as long as it explains the other."""
-        max_held = 10  # frames without a structure scan that the last shape stands in for: 0.5 s
+        """Bridge a lost structure scan with the last field, as long as it explains the other."""
+        max_held = 10  # frames without a structure scan that the last field stands in for: 0.5 s
         self._frames_held += 1
-        if self._contact_model.has_shape and self._frames_held <= max_held:
+        if self._last is not None and self._frames_held <= max_held:
             with measurement.timed("contacts"):
-                shown = self._contact_model.account_again(measurement.changes)
-            fitted, magnitude = shown.fitted, measurement.changes[Channel.MAGNITUDE]
-            if fitted is not None and not leaves_unexplained(fitted, magnitude, self._sign):
-                size, sigma = known_magnitudes(fitted, self._sign, len(shown.areas))
+                held = self._field_fit.compare(self._last[0], measurement.changes)
+            if held.misfit <= BAD_MISFIT:
+                account = self._last[1]
                 return Estimate(
-                    map=map_of(shown.areas, size),
-                    areas=shown.areas,
-                    magnitudes=size,
-                    magnitude_sigmas=sigma,
-                    misfit=fitted.misfit,
+                    map=account.map,
+                    areas=account.areas,
+                    magnitudes=account.magnitudes,
+                    magnitude_sigmas=account.magnitude_sigmas,
+                    account=account,
+                    misfit=held.misfit,
                     made_by=self._made_by,
                     reason="the last shape: the structure scan is missing",
                 )

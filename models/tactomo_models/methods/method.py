@@ -32,6 +32,7 @@ from tactomo_models.scans.changes import MeasuredChannel
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scene.areas import AreaFinder, Areas
+from tactomo_models.scene.field_account import FieldAccount
 from tactomo_models.sensor.description import SensorDescription
 
 
@@ -87,6 +88,7 @@ class Estimate:
             None, the map's mean in each area.
         magnitude_sigmas: (K,) their standard uncertainties, or one for all; where NaN, pressures
             are unknown, too.
+        account: what a fitted pressure field says of the same areas; None where none was fitted.
         tells_pressure: whether a pressure map follows from the areas' magnitudes.
         misfit: root mean square of the noise-weighted residual; NaN where it is not known.
         confidence: expected correlation of the map with the truth, 0 to 1; NaN where not known.
@@ -101,6 +103,7 @@ class Estimate:
     areas: Areas | None = None
     magnitudes: FloatArray | None = None
     magnitude_sigmas: FloatArray | float = float("nan")
+    account: FieldAccount | None = None
     tells_pressure: bool = True
     misfit: float = float("nan")
     confidence: float = float("nan")

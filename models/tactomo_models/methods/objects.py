@@ -14,12 +14,13 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from tactomo_protocol import Channel
 
-from tactomo_models.arrays import BoolArray, FloatArray, IntArray
+from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.physics.forward import ForwardModel
-from tactomo_models.scans.changes import Changes
+from tactomo_models.scene.field_fit import Budget, FieldFit, FittedField, Measured
 from tactomo_models.scene.level_set import HALF_WIDTH, RESTING, LevelSet
-from tactomo_models.scene.shape_fit import Budget, Shape, ShapeFit, heaviside, heaviside_slope
+from tactomo_models.scene.pressure_field import heaviside, heaviside_slope
 
 Imager = Callable[[FloatArray], FloatArray]
 
@@ -34,58 +35,45 @@ class SignedLevelSet(LevelSet):
         super().__init__(forward)
         self.prior_precision = np.full(self.kernels.shape[1], prior)
 
-    def parameters_of(self, likeness: FloatArray) -> FloatArray:
+    def parameters_of(self, likeness: FloatArray, peaks: FloatArray | None = None) -> FloatArray:
         """Coefficients (K,) for an image (P,) that is 1 or -1 in objects and 0 elsewhere."""
         mu = self._projection @ np.clip(likeness, 2 * RESTING, -2 * RESTING)
         # Gaussians round off small objects; a start without any has no derivative.
         return np.asarray(mu * (-2 * RESTING / max(float(np.abs(self.kernels @ mu).max()), 1e-6)))
 
-    def render(self, parameters: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """(P,) h from -1 to 1, and where it is not 0 or may become so."""
-        better, worse = self._both(parameters, slice(None))
-        h = heaviside(better / HALF_WIDTH) - heaviside(worse / HALF_WIDTH)
-        return h, np.maximum(better, worse) > -HALF_WIDTH
+    def _step(self, f: FloatArray) -> tuple[FloatArray, BoolArray]:
+        better, worse = f, 2 * RESTING - f
+        share = heaviside(better / HALF_WIDTH) - heaviside(worse / HALF_WIDTH)
+        return share, np.maximum(better, worse) > -HALF_WIDTH
 
-    def slope(self, parameters: FloatArray, nodes: IntArray) -> FloatArray:
-        """Derivative (n, K) of h at n nodes by the coefficients."""
-        better, worse = self._both(parameters, nodes)
-        by_f = (
-            heaviside_slope(better / HALF_WIDTH) + heaviside_slope(worse / HALF_WIDTH)
-        ) / HALF_WIDTH
-        return np.asarray(by_f[:, None] * self.kernels[nodes])
-
-    def _both(
-        self, parameters: FloatArray, nodes: slice | IntArray
-    ) -> tuple[FloatArray, FloatArray]:
-        f = self._function(parameters, nodes)
-        return f, 2 * RESTING - f
+    def _slope(self, f: FloatArray) -> FloatArray:
+        worse = 2 * RESTING - f
+        return (heaviside_slope(f / HALF_WIDTH) + heaviside_slope(worse / HALF_WIDTH)) / HALF_WIDTH
 
 
 class ObjectFit:
     """Finds objects of both kinds, frame by frame.
 
     Args:
-        forward: the model of what surrounds them.
-        contrast: conductivity of the better objects over the bare one, and of the bare one over
-            that of the worse objects.
+        fit: what fits them to the structure sheet.
         imager: signed linear image (P,) of relative voltage changes (M,).
     """
 
-    def __init__(self, forward: ForwardModel, contrast: float, imager: Imager) -> None:
-        self.fit = ShapeFit(forward, contrast)
-        self._level_set = SignedLevelSet(forward)
+    def __init__(self, fit: FieldFit, imager: Imager) -> None:
+        self.fit = fit
+        self._level_set = SignedLevelSet(fit.forward)
         self._imager = imager
         self.forget()
 
     def forget(self) -> None:
         """Drop the warm start."""
-        self._shape: Shape | None = None
+        self._shape: FittedField | None = None
 
-    def follow(self, measured: Changes, budget: Budget) -> tuple[Shape, str]:
+    def follow(self, measured: Measured, budget: Budget) -> tuple[FittedField, str]:
         """Find the objects that explain a frame.
 
         Args:
-            measured: the frame's changes.
+            measured: the structure channel's changes.
             budget: compute time that may be spent.
 
         Returns:
@@ -106,7 +94,7 @@ class ObjectFit:
         self._shape = best
         return best, how
 
-    def _warm(self, measured: Changes) -> Shape | None:
+    def _warm(self, measured: Measured) -> FittedField | None:
         """The last frame's shape against this one's data; None where there is none."""
         still_misfit = 1.1  # share of its misfit within which a settled shape is left alone
         if self._shape is None:
@@ -115,10 +103,10 @@ class ObjectFit:
         still = shape.misfit <= still_misfit * max(self._shape.misfit, GOOD_MISFIT)
         return replace(shape, converged=self._shape.converged and still)
 
-    def _cold(self, measured: Changes) -> list[Shape]:
+    def _cold(self, measured: Measured) -> list[FittedField]:
         """The linear image, cut at each height; the more likely start comes first."""
         cut_heights = (0.35, 0.6)  # of the linear image's peak, where outlines may start
-        image = self._imager(measured.change)
+        image = self._imager(measured[Channel.STRUCTURE].change)
         image = image / max(float(np.abs(image).max()), 1e-12)
         shapes = []
         for height in cut_heights:
@@ -127,10 +115,10 @@ class ObjectFit:
             shapes.append(self._evaluate(parameters, measured))
         return sorted((shape for shape in shapes if shape), key=lambda shape: shape.cost)
 
-    def _nothing(self, measured: Changes) -> Shape:
+    def _nothing(self, measured: Measured) -> FittedField:
         shape = self._evaluate(np.zeros(self._level_set.kernels.shape[1]), measured)
         assert shape is not None
         return shape
 
-    def _evaluate(self, parameters: FloatArray, measured: Changes) -> Shape | None:
+    def _evaluate(self, parameters: FloatArray, measured: Measured) -> FittedField | None:
         return self.fit.evaluate(self._level_set, parameters, self.fit.likely, measured)

@@ -20,36 +20,43 @@ from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
+from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
 from tactomo_models.methods.contact_search import ContactSearch, MissingContact
-from tactomo_models.physics.forward import ForwardModel
-from tactomo_models.scans.changes import Changes
 from tactomo_models.scans.stillness import is_still
+from tactomo_models.scene.field_account import Doubt
+from tactomo_models.scene.field_fit import Budget, FieldFit, FittedField, Measured
 from tactomo_models.scene.level_set import LevelSet
-from tactomo_models.scene.outlines import (
+from tactomo_models.scene.pressure_field import (
+    COLUMNS,
     E1,
     E2,
-    MAX_PARAMETERS,
+    EDGE,
+    HARMONIC,
+    HERTZ,
+    HOLE,
+    MAX_BULGE,
+    PEAK,
+    PRIOR_SIGMA,
     SIZE,
     UNIT_M,
-    Outlines,
+    PressureField,
     X,
     Y,
-    outlines_on,
 )
-from tactomo_models.scene.shape_fit import Budget, Shape, ShapeFit
+from tactomo_models.scene.sheet_response import GradedResponse
 
 GOOD_MISFIT = 1.0  # explained to the noise (discrepancy principle): no further step
 SUSPECT_MISFIT = 1.5  # a minimum this bad may be the wrong one
 SLACK = 1.1  # contacts that are explained as well as before are not questioned again
 TRIALS = 4  # of so many steps that a candidate may take
-MAX_CONTACTS = 8
+MAX_CONTACTS = 12
 # Gains and losses are in squared misfit, and count by how well the data are explained otherwise.
 SURE_GAIN = 30.0  # of a contact: the best of 500 places gains some 15 by noise alone
 SMALL_M = 0.006  # contacts of a smaller radius are asked whether they are needed
 
-Propose = Callable[[], FloatArray]  # (K, MAX_PARAMETERS), see `outlines.ellipses_of`
+Propose = Callable[[], FloatArray]  # (K, COLUMNS), see `pressure_field.ellipses_of`
 
 
 class ShapeModel(Enum):
@@ -58,6 +65,7 @@ class ShapeModel(Enum):
     AS_NEEDED = "as needed"
     OUTLINES = "outlines"
     LEVEL_SET = "level set"
+    AS_THEY_ARE = "as they are"  # no contact comes, goes, or takes another form
 
 
 @dataclass(frozen=True)
@@ -70,7 +78,7 @@ class _Candidate:
         trials: refinements that it may still have.
     """
 
-    shape: Shape
+    shape: FittedField
     gain: float
     trials: int = TRIALS
 
@@ -80,64 +88,74 @@ class _Frame:
     """What one frame is fitted to, and what the fit may spend.
 
     Attributes:
-        measured: the structure channel's changes.
+        measured: the changes of each channel that has a scan.
         budget: compute time.
         propose: asked for contacts to start from; None where nothing proposes any.
     """
 
-    measured: Changes
+    measured: Measured
     budget: Budget
     propose: Propose | None
 
     @cached_property
     def doubt(self) -> float:
         """Errors that go together look like something that is there: gains count for less."""
-        return float(np.sqrt(np.mean(self.measured.variance_inflation)))
+        inflation = [each.variance_inflation for each in self.measured.values()]
+        return float(np.sqrt(np.mean(inflation)))
 
 
 class _Tools:
-    """What every fit on one sheet shares."""
+    """What every fit on one sensor shares."""
 
-    def __init__(self, forward: ForwardModel, ratio: float) -> None:
-        self.fit = ShapeFit(forward, ratio)
-        self.outlines = outlines_on(forward)
-        self.level_set = LevelSet(forward)
-        self.search = ContactSearch(forward, ratio)
+    def __init__(self, fit: FieldFit) -> None:
+        graded = fit.responses.get(Channel.MAGNITUDE)
+        assert graded is None or isinstance(graded, GradedResponse)
+        self.fit = fit
+        self.field = PressureField.on(fit.forward, graded)
+        self.level_set = LevelSet(fit.forward)
+        self._typical = {Channel.STRUCTURE: float(np.exp(fit.likely))}
+        if graded is not None:
+            peak_kpa = np.array(self.field.typical_peak * self.field.unit_kpa)
+            self._typical[Channel.MAGNITUDE] = 1 + float(graded.relative_change(peak_kpa)[0])
+        self._searches: dict[Channel, ContactSearch] = {}
+
+    def search(self, measured: Measured) -> tuple[Channel, ContactSearch]:
+        """The channel that answers most, which shows best what is missing, and its search."""
+        name = max(measured, key=lambda name: abs(np.log(self._typical[name])))
+        if name not in self._searches:
+            self._searches[name] = ContactSearch(self.fit.forward, self._typical[name])
+        return name, self._searches[name]
 
 
 class WarmStartedFit:
     """Keeps the shape of what presses from frame to frame.
 
     Args:
-        forward: the model of the sheet.
-        ratio: conductivity of the saturated phase over the bare sheet's.
+        fit: what fits fields to the sensor's sheets.
         shape_model: how a scene may be described.
     """
 
-    def __init__(
-        self,
-        forward: ForwardModel,
-        ratio: float,
-        shape_model: ShapeModel = ShapeModel.AS_NEEDED,
-    ) -> None:
-        self._course = _Course(_Tools(forward, ratio), shape_model)
+    def __init__(self, fit: FieldFit, shape_model: ShapeModel = ShapeModel.AS_NEEDED) -> None:
+        self._course = _Course(_Tools(fit), shape_model)
+        self._joint = _Course(self._course.tools, ShapeModel.AS_THEY_ARE)
 
     @property
-    def fit(self) -> ShapeFit:
-        """What the shapes are fitted by."""
-        return self._course.tools.fit
+    def typical_peak(self) -> float:
+        """Peak that a proposed contact starts with, in the field's unit."""
+        return self._course.tools.field.typical_peak
 
     def forget(self) -> None:
         """Drop the warm start."""
         self._course = _Course(self._course.tools, self._course.shape_model)
+        self._joint = _Course(self._course.tools, ShapeModel.AS_THEY_ARE)
 
     def follow(
-        self, measured: Changes, budget: Budget, propose: Propose | None = None
-    ) -> tuple[Shape, str]:
+        self, measured: Measured, budget: Budget, propose: Propose | None = None
+    ) -> tuple[FittedField, str]:
         """Find the shape that explains a frame.
 
         Args:
-            measured: the structure channel's changes.
+            measured: the changes of each channel that has a scan.
             budget: compute time that may be spent.
             propose: asked for contacts to start from where there is no shape to go on with; they
                 are judged by the data as any other.
@@ -145,7 +163,21 @@ class WarmStartedFit:
         Returns:
             The shape, and in words what it came from.
         """
-        return self._course.follow(_Frame(measured, budget, propose))
+        if len(measured) == 1:
+            return self._course.follow(_Frame(measured, budget, propose))
+        # The saturating sheet shows outlines best, and alone it costs half: what is there and of
+        # what form is found on it, and then all sheets judge together.
+        outlines = {Channel.STRUCTURE: measured[Channel.STRUCTURE]}
+        shape, how = self._course.follow(_Frame(outlines, budget, propose))
+        joint = self._joint.go_on_from(shape, _Frame(measured, budget, None))
+        self._course.adopt(joint, outlines)
+        return replace(joint, converged=joint.converged and shape.converged), how
+
+    @property
+    def doubts(self) -> list[Doubt]:
+        """Other accounts of the contacts that were followed last, as likely as the data say."""
+        course = self._joint if self._joint.has_shape else self._course
+        return list(course.doubts.values())
 
 
 class _Course:
@@ -153,10 +185,12 @@ class _Course:
 
     def __init__(self, tools: _Tools, shape_model: ShapeModel) -> None:
         self.tools, self.shape_model = tools, shape_model
-        self._shape: Shape | None = None
-        self._settled_on: Changes | None = None  # the frame that the shape is of
+        self._shape: FittedField | None = None
+        self._settled_on: Measured = {}  # the frame that the shape is of
         self._tried_misfit = 0.0  # at which all moves were tried on contacts like these
         self._from_nothing = True  # or from the shape of frames before
+        self._tried_signal = 0.0  # of the data that they were tried on
+        self.doubts: dict[int, Doubt] = {}  # of contacts like these, by what is in doubt
         self._cold_start: _Course | None = None
         self._start_over()
 
@@ -166,7 +200,7 @@ class _Course:
         self._moved = False  # whether known contacts were let move, before any is added
         self._settled = False  # whether the shape in force is at its minimum
 
-    def follow(self, frame: _Frame) -> tuple[Shape, str]:
+    def follow(self, frame: _Frame) -> tuple[FittedField, str]:
         """Fit one frame more; see `WarmStartedFit.follow`."""
         shape, how = self._start(frame)
         if not shape.converged:
@@ -181,11 +215,72 @@ class _Course:
             self._cold_start = None
         return shape, f"{how}, {_in_words(shape)}"
 
-    def _doubtful(self, shape: Shape) -> bool:
+    def go_on_from(self, start: FittedField, frame: _Frame) -> FittedField:
+        """Fit one frame more, from what was found on another channel."""
+        tells_more = 1.25  # times the signal, from which what was undecided is asked again
+        before = self._shape
+        if (
+            before is not None
+            and before.drawing is start.drawing
+            and self._is_still(frame.measured)
+        ):
+            shape = self.tools.fit.compare(before, frame.measured)
+            if before.converged:
+                return replace(shape, converged=True)
+        else:
+            if isinstance(start.family, PressureField):
+                each, order = start.family.split(start.parameters), start.family.order
+                evaluated = self._evaluate(each, order, start.log_ratio, frame)
+            else:
+                evaluated = self._peaks_of(start, frame)
+            assert evaluated is not None
+            same = before is not None and len(before.parameters) == len(evaluated.parameters)
+            signal = frame.measured[Channel.MAGNITUDE].misfit
+            if not same or signal > tells_more * self._tried_signal:
+                self._tried_misfit, self._tried_signal = 0.0, signal
+                self.doubts.clear()
+            shape = evaluated
+            self._start_over()
+        self._shape = shape = self._improve(shape, frame)
+        self._settled_on = frame.measured
+        return shape
+
+    def _peaks_of(self, start: FittedField, frame: _Frame) -> FittedField | None:
+        """A level set and the pressure of each of its parts."""
+        assert isinstance(start.family, LevelSet)
+        family = start.family.owned_by(start.family.centres_m, self.tools.field)
+        typical = np.full(len(family.centres_m), self.tools.field.typical_peak)
+        parameters = np.append(start.parameters, typical)
+        before = self._shape
+        if before is not None and len(before.parameters) == len(parameters):
+            parameters[len(start.parameters) :] = before.parameters[len(start.parameters) :]
+        return self.tools.fit.evaluate(family, parameters, start.log_ratio, frame.measured)
+
+    @property
+    def has_shape(self) -> bool:
+        """Whether anything was followed."""
+        return self._shape is not None
+
+    def adopt(self, joint: FittedField, measured: Measured) -> None:
+        """Go on from what all channels have made of the shape in force."""
+        assert self._shape is not None
+        if joint.drawing is self._shape.drawing:
+            return
+        family, parameters = joint.family, joint.parameters
+        if isinstance(family, PressureField):
+            each = family.split(parameters)
+            family = family.of(each, family.order, fits_peaks=False)
+            parameters = family.join(each)
+            known = self.tools.fit.restricted(joint, family, parameters, measured)
+            self._shape = replace(known, converged=self._shape.converged)
+
+    def _doubtful(self, shape: FittedField) -> bool:
         """Tell whether a cold start might do better: where the warm one had little to go on."""
         return shape.converged and not self._from_nothing
 
-    def _against_cold_start(self, shape: Shape, how: str, frame: _Frame) -> tuple[Shape, str]:
+    def _against_cold_start(
+        self, shape: FittedField, how: str, frame: _Frame
+    ) -> tuple[FittedField, str]:
         """Let a cold start run beside a doubtful shape; the better or the simpler goes on."""
         if self._cold_start is None:
             self._cold_start = _Course(self.tools, self.shape_model)
@@ -203,7 +298,7 @@ class _Course:
         self._tried_misfit = other.misfit
         return other, "restarted"
 
-    def _start(self, frame: _Frame) -> tuple[Shape, str]:
+    def _start(self, frame: _Frame) -> tuple[FittedField, str]:
         """The last frame's shape where it still holds; else the best of what may be left of it."""
         max_left = 0.25  # of the cost of nothing, that contacts which moved leave to a new frame
         before = self._shape
@@ -236,7 +331,7 @@ class _Course:
             self._candidate = replace(self._candidate, shape=replace(other, converged=False))
         return shape, "warm start"
 
-    def _from_scratch(self, frame: _Frame) -> tuple[Shape, str]:
+    def _from_scratch(self, frame: _Frame) -> tuple[FittedField, str]:
         """What is proposed, where that explains something; else nothing at all."""
         proposed_order = 2  # ellipses
         nothing = self._nothing(frame)
@@ -246,11 +341,13 @@ class _Course:
                 return proposed, "proposed"
         return nothing, "cold start"
 
-    def _is_still(self, measured: Changes) -> bool:
+    def _is_still(self, measured: Measured) -> bool:
         """Tell whether this frame differs by noise alone from the one that the shape is of."""
-        return self._settled_on is not None and is_still(self._settled_on, measured)
+        return measured.keys() == self._settled_on.keys() and all(
+            is_still(self._settled_on[name], changes) for name, changes in measured.items()
+        )
 
-    def _improve(self, shape: Shape, frame: _Frame) -> Shape:
+    def _improve(self, shape: FittedField, frame: _Frame) -> FittedField:
         """Refine, and try one candidate after another, until none is left or the budget ends."""
         noise = 3.0  # what a parameter gains by following a new frame's noise, at most
         budget = frame.budget
@@ -271,17 +368,20 @@ class _Course:
             if budget.over:  # one thing at least is done in every frame
                 return replace(shape, converged=False)
 
-    def _refined(self, shape: Shape, frame: _Frame) -> Shape:
+    def _refined(self, shape: FittedField, frame: _Frame) -> FittedField:
         steps = 4  # of a refinement, before what it leads to is judged
         if len(shape.parameters) == 0:
             return replace(shape, converged=True)
         # Few parameters are better known at the minimum; many would begin to explain the noise.
-        good = 0.0 if isinstance(shape.family, Outlines) else GOOD_MISFIT
+        good = 0.0 if isinstance(shape.family, PressureField) else GOOD_MISFIT
         return self.tools.fit.refine(shape, frame.measured, frame.budget, good, steps)
 
-    def _judge(self, candidate: _Candidate, shape: Shape, frame: _Frame) -> Shape:
+    def _judge(self, candidate: _Candidate, shape: FittedField, frame: _Frame) -> FittedField:
         """Refine a candidate: it takes the shape's place, is given up, or goes on."""
         refined = self._refined(candidate.shape, frame)
+        if refined.cost < shape.cost - candidate.gain:
+            self.doubts.clear()
+        self._doubt(shape, refined, candidate.gain, frame)
         if refined.cost < shape.cost - candidate.gain:
             self._start_over()
             self._tried_misfit = 0.0
@@ -296,7 +396,19 @@ class _Course:
             self._candidate = replace(candidate, shape=refined, trials=trials)
         return shape
 
-    def _propose(self, shape: Shape, frame: _Frame) -> bool:
+    def _doubt(self, shape: FittedField, other: FittedField, gain: float, frame: _Frame) -> None:
+        """Remember another account of the same contacts, as likely as the data leave it."""
+        if len(one := _each(shape)) != len(two := _each(other)):
+            return
+        if not (one[:, EDGE:] != two[:, EDGE:]).any():
+            return
+        odds = np.exp(np.clip((other.cost + gain - shape.cost) / 2 / _scale(shape, frame), -50, 50))
+        if odds < 1:
+            one, two, odds = two, one, 1 / odds
+        what = EDGE if (one[:, EDGE] != two[:, EDGE]).any() else HOLE
+        self.doubts[what] = Doubt(float(1 / odds), two - one)
+
+    def _propose(self, shape: FittedField, frame: _Frame) -> bool:
         """Set the next candidate beside a shape at its minimum; False when all were tried."""
         moves = self._moves(shape)
         while self._candidate is None and self._moves_tried < len(moves):
@@ -305,34 +417,44 @@ class _Course:
                 self._moves_tried += 1
         return self._candidate is not None
 
-    def _moves(self, shape: Shape) -> list[_Move]:
-        if not isinstance(shape.family, Outlines):
+    def _moves(self, shape: FittedField) -> list[_Move]:
+        if not isinstance(shape.family, PressureField):
             return []
         if self.shape_model == ShapeModel.LEVEL_SET:
             return [self._birth, self._escalate]
-        form = [self._of_higher_order, self._split, self._birth_anywhere]
-        if shape.misfit <= GOOD_MISFIT:
-            form = [self._of_higher_order] if shape.family.order == 0 else []
+        inside: list[_Move] = [self._soften, self._hollow]
+        inside = inside if Channel.MAGNITUDE in shape.residuals else []
+        if self.shape_model == ShapeModel.AS_THEY_ARE:
+            return inside
+        form = [self._of_higher_order, self._modulate, *inside]
+        if shape.misfit > GOOD_MISFIT:
+            form += [self._split, self._birth_anywhere]
         free = [self._escalate] if self.shape_model == ShapeModel.AS_NEEDED else []
         return [self._birth, *form, *free, *self._deaths(shape)]
 
-    def _early_birth(self, shape: Shape, frame: _Frame) -> _Candidate | None:
+    def _early_birth(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
         """A further contact where that much is left that it need not wait for the others."""
-        return self._birth(shape, frame) if shape.misfit > SUSPECT_MISFIT else None
+        sought = self.shape_model != ShapeModel.AS_THEY_ARE and shape.misfit > SUSPECT_MISFIT
+        return self._birth(shape, frame) if sought else None
 
-    def _birth(self, shape: Shape, frame: _Frame) -> _Candidate | None:
+    def _birth(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
         """A further contact, away from those that are known."""
         near_m = 0.012  # what is missing this near an outline is more likely a part of its form
         return self._with_another(shape, frame, near_m)
 
-    def _birth_anywhere(self, shape: Shape, frame: _Frame) -> _Candidate | None:
+    def _birth_anywhere(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
         return self._with_another(shape, frame, -np.inf)
 
-    def _with_another(self, shape: Shape, frame: _Frame, least_gap_m: float) -> _Candidate | None:
+    def _with_another(
+        self, shape: FittedField, frame: _Frame, least_gap_m: float
+    ) -> _Candidate | None:
         smallest_m = 0.003  # radius below which it is an error of the model, not a contact
-        if not isinstance(shape.family, Outlines) or shape.family.count == MAX_CONTACTS:
+        if not isinstance(shape.family, PressureField) or shape.family.count == MAX_CONTACTS:
             return None
-        found = self.tools.search.best(shape, frame.measured.weight)
+        name, search = self.tools.search(frame.measured)
+        found = search.best(
+            shape.solutions[name], shape.residuals[name], shape.drawing, frame.measured[name].weight
+        )
         frame.budget.spend(shape)  # about what a search takes, too
         each = shape.family.split(shape.parameters)
         worth = SURE_GAIN * _scale(shape, frame)
@@ -340,32 +462,119 @@ class _Course:
         sure = worth * (2 if shape.family.order < 2 and len(each) else 1)
         if found.gain < sure or found.radius_m < smallest_m or _gap_m(each, found) <= least_gap_m:
             return None
-        further = np.zeros((1, MAX_PARAMETERS))
-        further[0, [X, Y, SIZE]] = (
+        further = np.zeros((1, COLUMNS))
+        further[0, [X, Y, SIZE, PEAK]] = (
             found.x_m / UNIT_M,
             found.y_m / UNIT_M,
             np.log(max(found.radius_m, SMALL_M)),
+            self.tools.field.typical_peak,
         )
         order = shape.family.order
         other = self._evaluate(np.vstack([each, further]), order, shape.log_ratio, frame)
         return _Candidate(other, worth) if other else None
 
-    def _of_higher_order(self, shape: Shape, frame: _Frame) -> _Candidate | None:
+    def _of_higher_order(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
         worth = 2.5  # of one more parameter of a form
-        assert isinstance(shape.family, Outlines)
-        if shape.family.order == 4 or shape.family.count == 0:
+        assert isinstance(shape.family, PressureField)
+        if shape.family.order == 2 or shape.family.count == 0:
             return None
-        order = {0: 1, 1: 2, 2: 4}[shape.family.order]
         each = shape.family.split(shape.parameters)
-        other = self._evaluate(each, order, shape.log_ratio, frame)
+        other = self._evaluate(each, shape.family.order + 1, shape.log_ratio, frame)
         if other is None:
             return None
         further = len(other.parameters) - len(shape.parameters)
         return _Candidate(other, worth * further * _scale(shape, frame))
 
-    def _split(self, shape: Shape, frame: _Frame) -> _Candidate | None:
+    def _modulate(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
+        """Eggs and rounded rectangles for ellipses, where that would explain more."""
+        worth = 4.0  # of an outline's four: rectangles gain 12 and more, other outlines up to 6
+        assert isinstance(shape.family, PressureField)
+        if shape.family.order < 2:
+            return None
+        needed = worth * _scale(shape, frame)
+        slopes, bends = self._further(shape, frame, slice(HARMONIC, PEAK))
+        prior = np.diag(PRIOR_SIGMA[HARMONIC:PEAK] ** -2.0)
+        steps = -np.linalg.solve(bends + prior, slopes[:, :, None])[:, :, 0]
+        each = shape.family.split(shape.parameters)
+        asked = (-(slopes * steps).sum(axis=1) > needed) & ~each[:, HARMONIC:PEAK].any(axis=1)
+        if not asked.any():
+            return None
+        each[asked, HARMONIC:PEAK] = np.clip(steps[asked], -MAX_BULGE / 2, MAX_BULGE / 2)
+        other = self._evaluate(each, shape.family.order, shape.log_ratio, frame)
+        return _Candidate(other, needed * asked.sum()) if other else None
+
+    def _soften(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
+        """Pressures that fall towards the edge, unless the data are clearly against it."""
+        worth = (
+            4.0  # of what data of even pressures gain by chance; half of it changes maps by 0.005
+        )
+        return self._with(EDGE, HERTZ, worth, shape, frame)
+
+    def _hollow(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
+        """Rings for discs, unless the data are clearly against it."""
+        worth = 6.0  # rings are rarer than balls and fingers
+        return self._with(HOLE, 1.0, worth, shape, frame)
+
+    def _with(
+        self, column: int, value: float, worth: float, shape: FittedField, frame: _Frame
+    ) -> _Candidate | None:
+        """Contacts with another edge or with holes, as many as may have one.
+
+        What presses is likely of one kind, so they are all asked at once.
+        """
+        clearly = 12.0  # rise of the cost, to second order, from which nothing is asked
+        assert isinstance(shape.family, PressureField)
+        slopes, bends = self._further(shape, frame, slice(column, column + 1))
+        rise = 2 * value * slopes[:, 0] + value**2 * bends[:, 0, 0]
+        each = shape.family.split(shape.parameters)
+        # Far from the data a parabola knows little: a falling slope is always worth asking.
+        asked = (rise < clearly * _scale(shape, frame)) | (slopes[:, 0] < 0)
+        asked &= (each[:, EDGE] == 0) & (each[:, HOLE] == 0)
+        if not asked.any():
+            return None
+        each[asked, column] = value
+        # The mean pressure stays, about.
+        each[asked, PEAK] = np.minimum(1.25 * each[asked, PEAK], shape.family.peak_limits[1])
+        other = self._evaluate(each, shape.family.order, shape.log_ratio, frame)
+        return _Candidate(other, worth * _scale(shape, frame)) if other else None
+
+    def _further(
+        self, shape: FittedField, frame: _Frame, columns: slice
+    ) -> tuple[FloatArray, FloatArray]:
+        """How the cost would go with further parameters of each contact, the others following.
+
+        Args:
+            shape: at its minimum.
+            frame: what it is fitted to.
+            columns: C further parameters.
+
+        Returns:
+            Half the cost's slopes (K, C), and half its curvatures (K, C, C), at what they are now.
+        """
+        assert isinstance(shape.family, PressureField)
+        family, count = shape.family, columns.stop - columns.start
+        slopes, bends = np.zeros((family.count, count)), np.zeros((family.count, count, count))
+        if family.count == 0:
+            return slopes, bends
+        frame.budget.spend(shape)
+        every = family.with_free(columns)
+        drawing = every.draw(every.join(family.split(shape.parameters)))
+        J = self.tools.fit.jacobian(shape, frame.measured, drawing)
+        known = np.append(family.free[every.free], True)  # and the log ratio
+        precision, offset = self.tools.fit.prior(shape)
+        own = J[:, known]
+        normal = own.T @ own + np.diag(precision)
+        gradient = own.T @ shape.residual + precision * offset
+        for k, index in enumerate(every.index[:, columns]):
+            further = J[:, index]
+            cross = np.linalg.solve(normal, own.T @ further)
+            slopes[k] = further.T @ shape.residual - cross.T @ gradient
+            bends[k] = further.T @ further - cross.T @ (own.T @ further)
+        return slopes, bends
+
+    def _split(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
         """Two contacts for one, of the contact that stands it best."""
-        assert isinstance(shape.family, Outlines)
+        assert isinstance(shape.family, PressureField)
         if shape.family.count == MAX_CONTACTS:
             return None
         each, order = shape.family.split(shape.parameters), shape.family.order
@@ -376,21 +585,27 @@ class _Course:
         best = min((h for h in halved if h), key=lambda half: half.cost, default=None)
         return _Candidate(best, SURE_GAIN * _scale(shape, frame)) if best else None
 
-    def _escalate(self, shape: Shape, frame: _Frame) -> _Candidate | None:
+    def _escalate(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
         """The same as a level set."""
         free_worth = 100.0  # of a level set
         always = self.shape_model == ShapeModel.LEVEL_SET
         if len(shape.parameters) == 0 or (shape.misfit < SUSPECT_MISFIT and not always):
             return None
-        level_set = self.tools.level_set
-        parameters = level_set.parameters_of(shape.pressed)
+        assert isinstance(shape.family, PressureField)
+        likeness = np.zeros(len(shape.family.x_m))
+        likeness[shape.drawing.nodes] = shape.drawing.enclosed
+        each = shape.family.split(shape.parameters)
+        level_set = self.tools.level_set.owned_by(
+            each[:, [X, Y]] * UNIT_M, shape.family if Channel.MAGNITUDE in frame.measured else None
+        )
+        parameters = level_set.parameters_of(likeness, each[:, PEAK])
         other = self.tools.fit.evaluate(level_set, parameters, shape.log_ratio, frame.measured)
         worth = -np.inf if always else free_worth * _scale(shape, frame)
         return _Candidate(other, worth) if other else None
 
-    def _deaths(self, shape: Shape) -> list[_Move]:
+    def _deaths(self, shape: FittedField) -> list[_Move]:
         """A move for each contact that is small or lies against another: leave it out."""
-        assert isinstance(shape.family, Outlines)
+        assert isinstance(shape.family, PressureField)
         each = shape.family.split(shape.parameters)
         if len(each) < 2:
             return []
@@ -400,7 +615,7 @@ class _Course:
         asked = np.flatnonzero((radius < SMALL_M) | (gap.min(axis=1) < 0))
 
         def without(k: int) -> _Move:
-            def move(shape: Shape, frame: _Frame) -> _Candidate | None:
+            def move(shape: FittedField, frame: _Frame) -> _Candidate | None:
                 needless = 15.0  # a contact whose absence costs less is not there
                 other = self._left_out(shape, k, frame)
                 return _Candidate(other, -needless * _scale(shape, frame)) if other else None
@@ -409,45 +624,54 @@ class _Course:
 
         return [without(k) for k in asked[np.argsort(radius[asked])]]
 
-    def _each_left_out(self, shape: Shape, frame: _Frame) -> list[Shape]:
-        if not isinstance(shape.family, Outlines) or shape.family.count < 2:
+    def _each_left_out(self, shape: FittedField, frame: _Frame) -> list[FittedField]:
+        if not isinstance(shape.family, PressureField) or shape.family.count < 2:
             return []
         left = [self._left_out(shape, k, frame) for k in range(shape.family.count)]
         return [rest for rest in left if rest is not None]
 
-    def _left_out(self, shape: Shape, k: int, frame: _Frame) -> Shape | None:
-        assert isinstance(shape.family, Outlines)
+    def _left_out(self, shape: FittedField, k: int, frame: _Frame) -> FittedField | None:
+        assert isinstance(shape.family, PressureField)
         each = np.delete(shape.family.split(shape.parameters), k, axis=0)
         return self._evaluate(each, shape.family.order, shape.log_ratio, frame)
 
-    def _nothing(self, frame: _Frame) -> Shape:
-        none = np.zeros((0, MAX_PARAMETERS))
+    def _nothing(self, frame: _Frame) -> FittedField:
+        none = np.zeros((0, COLUMNS))
         nothing = self._evaluate(none, 0, self.tools.fit.likely, frame)
         assert nothing is not None
         return nothing
 
     def _evaluate(
         self, each: FloatArray, order: int, log_ratio: float, frame: _Frame
-    ) -> Shape | None:
-        family = self.tools.outlines.of(order, len(each))
+    ) -> FittedField | None:
+        family = self.tools.field.of(each, order, fits_peaks=Channel.MAGNITUDE in frame.measured)
         shape = self.tools.fit.evaluate(family, family.join(each), log_ratio, frame.measured)
         if shape is not None:
             frame.budget.spend(shape)
         return shape
 
 
-_Move: TypeAlias = Callable[[Shape, _Frame], _Candidate | None]
+_Move: TypeAlias = Callable[[FittedField, _Frame], _Candidate | None]
 
 
-def _scale(shape: Shape, frame: _Frame) -> float:
+def _each(shape: FittedField) -> FloatArray:
+    """(K, COLUMNS) of a field's contacts; none of a level set."""
+    if not isinstance(shape.family, PressureField):
+        return np.zeros((0, COLUMNS))
+    return shape.family.split(shape.parameters)
+
+
+def _scale(shape: FittedField, frame: _Frame) -> float:
     """What one unit of squared misfit means, by what a shape leaves unexplained."""
     return max(frame.doubt, shape.misfit**2 / 2)
 
 
-def _in_words(shape: Shape) -> str:
-    if not isinstance(shape.family, Outlines):
+def _in_words(shape: FittedField) -> str:
+    if not isinstance(shape.family, PressureField):
         return "level set"
-    name = {0: "circle", 1: "circle", 2: "ellipse", 4: "rounded outline"}[shape.family.order]
+    name = "circle" if shape.family.order < 2 else "ellipse"
+    if shape.family.forms == PEAK:
+        name = "rounded outline"
     return f"{shape.family.count} {name}{'s' * (shape.family.count != 1)}"
 
 
@@ -460,7 +684,7 @@ def _halved(each: FloatArray, k: int) -> FloatArray:
     away = np.exp(size + elongation) / 2 / UNIT_M * np.array([np.cos(angle), np.sin(angle)])
     half = each[k].copy()
     half[SIZE] -= np.log(2) / 2
-    half[E1:] = 0.0
+    half[E1:PEAK] = half[EDGE:] = 0.0
     one, other = half.copy(), half
     one[[X, Y]] += away
     other[[X, Y]] -= away

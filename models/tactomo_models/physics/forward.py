@@ -160,7 +160,13 @@ class ForwardModel:
         self._last_areas: _PressedAreas | None = None
         self._closed = left < 1e-9 * (abs(law) @ np.abs(self.bare.potentials)).max(axis=1)
 
-    def solve(self, change: FloatArray, *, mix_resistivities: bool = False) -> Solution:
+    def solve(
+        self,
+        change: FloatArray,
+        *,
+        mix_resistivities: bool = False,
+        within: IntArray | None = None,
+    ) -> Solution:
         """Solve for a pressed sheet.
 
         Args:
@@ -170,11 +176,13 @@ class ForwardModel:
                 meets the two in series: there this keeps an edge where its nodes put it, whatever
                 the contrast (to 0.3 mm of 3 mm triangles; otherwise it is off by up to 0.9 mm).
                 Triangles with a corner that conducts worse than the sheet mix conductivities.
+            within: pressable nodes outside of which nothing changes; those that change if None.
+                Solves that share them share what is found out about them.
 
         Raises:
             numpy.linalg.LinAlgError: a conductivity is not above 0.
         """
-        triangles = self._around(np.flatnonzero(change))
+        triangles = self._around(np.flatnonzero(change) if within is None else within)
         if len(triangles) == 0:
             nowhere = np.zeros(0, np.intp)
             none = self.bare.potentials[nowhere]

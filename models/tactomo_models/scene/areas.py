@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage
 
-from tactomo_models.arrays import FloatArray, Image
+from tactomo_models.arrays import FloatArray, Image, IntArray
 from tactomo_models.physics.forward import ForwardModel
-from tactomo_models.scene.shape_fit import Shape
 
 
 @dataclass(frozen=True)
@@ -35,21 +34,27 @@ class Areas:
 
 
 class AreaFinder:
-    """Splits an image of what is pressed into separate areas."""
+    """Splits an image of what is pressed into separate areas.
+
+    Attributes:
+        places: (2, P) x and y of the pressable nodes, metres.
+        node_areas_m2: (P,) share of the sheet's area that belongs to each.
+        nearest: row and column (P,) of the map node next to each.
+    """
 
     def __init__(self, forward: ForwardModel) -> None:
         description = forward.description
-        self._nodes = forward.bare.points[:, forward.bare.pressable]
+        self.places = forward.bare.points[:, forward.bare.pressable]
         self._map_weights = forward.bare.map_weights
-        self._node_m2 = forward.node_areas_m2
+        self.node_areas_m2 = forward.node_areas_m2
         self._x, self._y = np.meshgrid(description.map_x_m, description.map_y_m)
         self._cell_m2 = (description.map_x_m[1] - description.map_x_m[0]) * (
             description.map_y_m[1] - description.map_y_m[0]
         )
-        x, y = self._nodes
+        x, y = self.places
         column = np.abs(x[:, None] - description.map_x_m).argmin(axis=1)
         row = np.abs(y[:, None] - description.map_y_m).argmin(axis=1)
-        self._nearest = (row, column)  # map node next to each pressable node
+        self.nearest: tuple[IntArray, IntArray] = (row, column)
 
     @property
     def map_places(self) -> tuple[FloatArray, FloatArray]:
@@ -62,7 +67,7 @@ class AreaFinder:
 
     def on_nodes(self, image: FloatArray | Image) -> FloatArray:
         """What an image (nodes_y, nodes_x) shows at the pressable nodes, (P,)."""
-        return np.asarray(image[self._nearest], np.float64)
+        return np.asarray(image[self.nearest], np.float64)
 
     def find(self, pressed: FloatArray | Image, pressed_nodes: FloatArray) -> Areas:
         """Find connected areas above one half; what lies around each goes to the nearest.
@@ -90,37 +95,10 @@ class AreaFinder:
         centres = np.stack(
             [(on_map * axis).sum(axis=(1, 2)) / weight for axis in (self._x, self._y)], axis=1
         )
-        on_nodes = mine[keep][:, *self._nearest] * pressed_nodes
+        on_nodes = mine[keep][:, *self.nearest] * pressed_nodes
         return Areas(on_map, on_nodes, centres, areas, np.full((len(areas), 3), np.nan))
 
-    def inner_parts(self, areas: Areas, coverage: FloatArray, on_map: FloatArray) -> Areas:
-        """What of each area lies within shapes that are drawn smaller.
-
-        Args:
-            areas: K areas.
-            coverage: (P,) share pressed by the smaller shapes.
-            on_map: (nodes_y, nodes_x) the same.
-        """
-        inside = np.minimum(areas.on_nodes, (areas.on_nodes > 0) * coverage)
-        parts = np.minimum(areas.on_map, (areas.on_map > 0) * on_map)
-        size = parts.sum(axis=(1, 2)) * self._cell_m2
-        return replace(areas, on_map=parts, on_nodes=inside, areas_m2=size)
-
-    def with_sigmas(self, areas: Areas, shape: Shape, covariance: FloatArray) -> Areas:
-        """Say how far the places and sizes of a shape's areas may be trusted.
-
-        Args:
-            areas: those of the shape.
-            shape: what they were found in.
-            covariance: (n, n) of its parameters.
-        """
-        edge = shape.moving
-        slope = shape.family.slope(shape.parameters, edge) * self._node_m2[edge, None]
-        sigmas = np.full((len(areas), 3), np.nan)
-        for k, inside in enumerate(areas.on_nodes[:, edge] > 0):
-            by_area = slope[inside].sum(axis=0)
-            off = self._nodes[:, edge[inside]] - areas.centres_m[k, :, None]
-            by_centre = off @ slope[inside] / areas.areas_m2[k]
-            gradient = np.vstack([by_centre, by_area])
-            sigmas[k] = np.sqrt(np.einsum("ij,jk,ik->i", gradient, covariance, gradient))
-        return replace(areas, sigmas=sigmas)
+    def less(self, areas: Areas, share: FloatArray) -> Areas:
+        """The same areas where a share (nodes_y, nodes_x) of each node is left of them."""
+        on_map = areas.on_map * share
+        return replace(areas, on_map=on_map, areas_m2=on_map.sum(axis=(1, 2)) * self._cell_m2)

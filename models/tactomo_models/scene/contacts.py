@@ -9,7 +9,7 @@ import numpy as np
 
 from tactomo_models.arrays import FloatArray, Image
 from tactomo_models.scene.areas import Areas
-from tactomo_models.scene.pressure import ONE_SIDED_95, PressureCurve, PressureRange, pressures_of
+from tactomo_models.scene.pressure import FieldContacts, PressureCurve, PressureRange, pressures_of
 
 
 @dataclass(frozen=True)
@@ -66,9 +66,7 @@ def contacts_of(
     curve: PressureCurve | None,
     *,
     last: Mapping[int, PressureRange] | None = None,
-    peak_kpa: FloatArray | None = None,
-    peak_sigma_kpa: FloatArray | None = None,
-    edge: FloatArray | None = None,
+    field: FieldContacts | None = None,
 ) -> tuple[Contact, ...]:
     """Make contacts of K areas.
 
@@ -79,17 +77,13 @@ def contacts_of(
         sigma: (K,) their standard uncertainties.
         curve: the sensor's; None where it has none.
         last: the range that each identity was in; a new one has none.
-        peak_kpa: (K,) highest pressures; those of the magnitudes if None.
-        peak_sigma_kpa: (K,) their standard uncertainties; likewise.
-        edge: (K,) exponents of the pressure's edge; unknown if None.
+        field: what a fitted field says of them; the magnitudes are even ones if None.
     """
     ago = [(last or {}).get(known, PressureRange.UNKNOWN) for known in ids]
-    pressures = pressures_of(curve, size, sigma, areas.areas_m2, areas.sigmas[:, 2], last=ago)
-    peak = pressures.kpa if peak_kpa is None else peak_kpa
-    peak_sigma = pressures.sigma_kpa if peak_sigma_kpa is None else peak_sigma_kpa
-    gamma = np.full(len(areas), np.nan) if edge is None else edge
-    # A peak that is fitted may lie above what the magnitude, a mean over the area, allows.
-    bound = np.fmax(pressures.max_kpa, peak + ONE_SIDED_95 * peak_sigma)
+    pressures = pressures_of(
+        curve, size, sigma, areas.areas_m2, areas.sigmas[:, 2], field=field, last=ago
+    )
+    edges = np.full(len(areas), np.nan) if field is None else field.edge
     return tuple(
         Contact(
             id=ids[k],
@@ -106,10 +100,10 @@ def contacts_of(
             force_n=float(pressures.force_n[k]),
             force_sigma_n=float(pressures.force_sigma_n[k]),
             pressure_range=pressures.ranges[k],
-            peak_kpa=float(peak[k]),
-            peak_sigma_kpa=float(peak_sigma[k]),
-            max_kpa=float(bound[k]),
-            edge=float(gamma[k]),
+            peak_kpa=float(pressures.peak_kpa[k]),
+            peak_sigma_kpa=float(pressures.peak_sigma_kpa[k]),
+            max_kpa=float(pressures.max_kpa[k]),
+            edge=float(edges[k]),
         )
         for k in range(len(areas))
     )
@@ -121,10 +115,23 @@ def map_of(areas: Areas, values: FloatArray) -> Image:
     return np.asarray(fused, dtype=np.float32)
 
 
-def pressure_map(areas: Areas, contacts: Sequence[Contact]) -> Image:
-    """Each contact's pressure on its area; NaN, and not 0, where it is touched but unknown."""
+def pressure_map(
+    areas: Areas, contacts: Sequence[Contact], pressure_kpa: FloatArray | None = None
+) -> Image:
+    """Each contact's pressure on its area; NaN, and not 0, where it is touched but unknown.
+
+    Args:
+        areas: K areas.
+        contacts: one for each.
+        pressure_kpa: (nodes_y, nodes_x) as it falls over each area; even if None.
+    """
     touched = 0.05  # share of a node that a contact covers, from which it is touched
     values = np.array([contact.pressure_kpa for contact in contacts])
     fused = map_of(areas, values)
+    if pressure_kpa is not None and len(areas):
+        mean = (areas.on_map > 0).astype(float)
+        whole = np.maximum(np.einsum("kyx,yx->k", mean, pressure_kpa), 1e-12)
+        scale = np.nan_to_num(values * areas.on_map.sum(axis=(1, 2)) / whole)
+        fused = np.einsum("k,kyx,yx->yx", scale, mean, pressure_kpa).astype(np.float32)
     fused[(areas.on_map[np.isnan(values)] > touched).any(axis=0)] = np.nan
     return fused

@@ -9,14 +9,24 @@ outlines explain, such as an L or two contacts that merge.
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 from tactomo_models.physics.forward import ForwardModel
-from tactomo_models.scene.shape_fit import heaviside, heaviside_slope
+from tactomo_models.scene.pressure_field import (
+    PEAK,
+    PRIOR_SIGMA,
+    Drawing,
+    PressureField,
+    heaviside,
+    heaviside_slope,
+)
 
 KERNEL_SPREAD = 0.7  # standard deviation of a Gaussian over the kernels' distance
 HALF_WIDTH = 0.15  # w of the Heaviside
+SATURATING_KPA = 1e9  # pressure where none is fitted: the sheet is saturated
 RESTING = -0.5  # f where nothing presses: below -HALF_WIDTH, so h is exactly 0
 
 
@@ -38,35 +48,80 @@ class LevelSet:
         self.ratio_freedom = 1.0
         self.prior_mean = np.zeros(self.kernels.shape[1])
         self.prior_precision = np.full(self.kernels.shape[1], prior)
+        self._places = np.stack([x, y])
+        self.centres_m = np.zeros((0, 2))  # of the contacts that own its parts
+        self._owner: IntArray = np.zeros(0, np.intp)
+        self._field: PressureField | None = None
 
-    def parameters_of(self, likeness: FloatArray) -> FloatArray:
-        """Coefficients (K,) for an image (P,) that is 0 where nothing presses and 1 in contacts."""
+    def owned_by(self, centres_m: FloatArray, field: PressureField | None) -> LevelSet:
+        """The same level set, each part of which has the pressure of the nearest contact.
+
+        Args:
+            centres_m: (K, 2) places of the contacts.
+            field: what their peaks are counted by; None where pressures are not fitted.
+        """
+        owned = copy(self)
+        owned.centres_m, owned._field = centres_m, field
+        if field is not None:
+            apart = np.hypot(*(self._places[:, None] - centres_m.T[:, :, None]))
+            owned._owner = apart.argmin(axis=0)
+            peaks = np.full(len(centres_m), PRIOR_SIGMA[PEAK])
+            kernels = self.kernels.shape[1]
+            owned.prior_mean = np.append(
+                self.prior_mean[:kernels], np.full(len(peaks), field.typical_peak)
+            )
+            owned.prior_precision = np.append(self.prior_precision[:kernels], peaks**-2)
+        return owned
+
+    def parameters_of(self, likeness: FloatArray, peaks: FloatArray | None = None) -> FloatArray:
+        """Parameters for an image (P,) that is 0 where nothing presses and 1 in contacts.
+
+        Args:
+            likeness: the image.
+            peaks: (K,) pressures of the contacts that own its parts, in the field's unit.
+        """
         f = np.clip(2 * likeness - 1, RESTING, -RESTING)
         mu = self._projection @ (f - RESTING)
         # Gaussians round off small contacts; a start that presses nothing has no derivative.
-        return np.asarray(mu * (-2 * RESTING / max(float((self.kernels @ mu).max()), 1e-6)))
+        mu = mu * (-2 * RESTING / max(float((self.kernels @ mu).max()), 1e-6))
+        return mu if self._field is None or peaks is None else np.append(mu, peaks)
 
     def bounded(self, parameters: FloatArray) -> FloatArray:
-        """Any coefficients will do."""
-        return parameters
+        """Any coefficients will do; pressures stay in their range."""
+        if self._field is None:
+            return parameters
+        mu, peaks = np.split(parameters, [self.kernels.shape[1]])
+        return np.append(mu, np.clip(peaks, *self._field.peak_limits))
 
-    def render(self, parameters: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """(P,) h, and where it is not 0 or may become so."""
-        f = self._function(parameters, slice(None))
+    def draw(self, parameters: FloatArray) -> Drawing:
+        """Draw what is pressed on the nodes."""
+        kernels = self.kernels.shape[1]
+        f = self.kernels @ parameters[:kernels] + RESTING
+        share, there = self._step(f)
+        nodes = np.flatnonzero(there)
+        if self._field is None:
+            pressure = np.full(len(nodes), SATURATING_KPA)
+        else:
+            pressure = self._field.unit_kpa * parameters[kernels + self._owner[nodes]]
+
+        def slopes() -> tuple[FloatArray, FloatArray, FloatArray]:
+            by_share = np.zeros((len(nodes), len(parameters)))
+            by_share[:, :kernels] = self._slope(f[nodes])[:, None] * self.kernels[nodes]
+            by_pressure = np.zeros_like(by_share)
+            if self._field is not None:
+                owner = kernels + self._owner[nodes]
+                by_pressure[np.arange(len(nodes)), owner] = self._field.unit_kpa
+            return by_share, by_share, by_pressure
+
+        return Drawing(nodes, share[nodes], share[nodes], pressure, slopes)
+
+    def _step(self, f: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Share pressed, and where it is not 0 or may become so."""
         return heaviside(f / HALF_WIDTH), f > -HALF_WIDTH
 
-    def coverage(self, parameters: FloatArray) -> FloatArray:
-        """(P,) share pressed."""
-        return self.render(parameters)[0]
-
-    def slope(self, parameters: FloatArray, nodes: IntArray) -> FloatArray:
-        """Derivative (n, K) of h at n nodes by the coefficients."""
-        f = self._function(parameters, nodes)
-        by_f = heaviside_slope(f / HALF_WIDTH) / HALF_WIDTH
-        return np.asarray(by_f[:, None] * self.kernels[nodes])
-
-    def _function(self, parameters: FloatArray, nodes: slice | IntArray) -> FloatArray:
-        return np.asarray(self.kernels[nodes] @ parameters + RESTING)
+    def _slope(self, f: FloatArray) -> FloatArray:
+        """Derivative of the share by f."""
+        return heaviside_slope(f / HALF_WIDTH) / HALF_WIDTH
 
 
 def _kernel_centres(half_side_m: float) -> tuple[FloatArray, float]:

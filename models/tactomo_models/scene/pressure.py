@@ -44,6 +44,8 @@ class Pressures:
         force_n: (K,) pressure times area.
         force_sigma_n: (K,) standard uncertainties; NaN where the area's is.
         ranges: K of them.
+        peak_kpa: (K,) highest pressures; the range's top where one is `above`.
+        peak_sigma_kpa: (K,) standard uncertainties; known `within` alone.
         max_kpa: (K,) upper bounds, 95 %, in every range; +inf where the curve ends below.
     """
 
@@ -52,7 +54,30 @@ class Pressures:
     force_n: FloatArray
     force_sigma_n: FloatArray
     ranges: tuple[PressureRange, ...]
+    peak_kpa: FloatArray
+    peak_sigma_kpa: FloatArray
     max_kpa: FloatArray
+
+
+@dataclass(frozen=True)
+class FieldContacts:
+    """What a fitted pressure field says of K contacts, by the sensor description's table.
+
+    Attributes:
+        peak_magnitude: (K,) |relative conductivity change| under the highest pressure.
+        peak_magnitude_sigma: (K,) standard uncertainties.
+        peak_kpa: (K,) highest pressures.
+        force_n: (K,) forces.
+        force_sigma_n: (K,) standard uncertainties.
+        edge: (K,) gamma; 0 flat, 1/2 Hertz.
+    """
+
+    peak_magnitude: FloatArray
+    peak_magnitude_sigma: FloatArray
+    peak_kpa: FloatArray
+    force_n: FloatArray
+    force_sigma_n: FloatArray
+    edge: FloatArray
 
 
 @dataclass(frozen=True)
@@ -144,6 +169,7 @@ def pressures_of(
     areas_m2: FloatArray,
     area_sigmas_m2: FloatArray,
     *,
+    field: FieldContacts | None = None,
     last: Sequence[PressureRange] | None = None,
 ) -> Pressures:
     """Pressures and forces of K contacts from their magnitudes and areas.
@@ -157,26 +183,39 @@ def pressures_of(
         magnitude_sigma: (K,) standard uncertainties.
         areas_m2: (K,).
         area_sigmas_m2: (K,) standard uncertainties; NaN where unknown.
+        field: what a fitted field says of them; the magnitudes are even ones if None.
         last: K ranges of the same contacts a frame ago; none is known if None.
     """
     if curve is None:
         nothing = np.full(len(magnitude), np.nan)
         unknown = (PressureRange.UNKNOWN,) * len(magnitude)
-        return Pressures(nothing, nothing, nothing, nothing, unknown, nothing)
+        return Pressures(nothing, nothing, nothing, nothing, unknown, nothing, nothing, nothing)
+    highest, highest_sigma = magnitude, magnitude_sigma
+    if field is not None:
+        highest, highest_sigma = field.peak_magnitude, field.peak_magnitude_sigma
     ago = [PressureRange.UNKNOWN] * len(magnitude) if last is None else last
-    each = zip(magnitude.tolist(), magnitude_sigma.tolist(), ago, strict=True)
+    each = zip(highest.tolist(), highest_sigma.tolist(), ago, strict=True)
     ranges = tuple(curve.range_of(*one) for one in each)
     within = np.array([r is PressureRange.WITHIN for r in ranges], bool)
     above = np.array([r is PressureRange.ABOVE for r in ranges], bool)
-    kpa = np.where(within | above, curve.pressure(magnitude), np.nan)
-    spread, own = curve.spread(magnitude, magnitude_sigma), curve.sigma(magnitude)
-    sigma = np.where(within, np.hypot(spread, own), np.nan)
-
-    by_area = magnitude * area_sigmas_m2 / areas_m2
-    apart = np.sqrt(np.maximum(magnitude_sigma**2 - by_area**2, 0.0))
-    slope = spread / np.maximum(magnitude_sigma, 1e-12)
-    of_area = (kpa - slope * magnitude) * area_sigmas_m2
-    of_pressure = np.hypot(curve.spread(magnitude, apart), own) * areas_m2
-    force_sigma = np.where(within, 1e3 * np.hypot(of_pressure, of_area), np.nan)
-    bound = curve.bound(magnitude, magnitude_sigma)
-    return Pressures(kpa, sigma, 1e3 * kpa * areas_m2, force_sigma, ranges, bound)
+    peak = np.where(within | above, curve.pressure(highest), np.nan)
+    spread, own = curve.spread(highest, highest_sigma), curve.sigma(highest)
+    peak_sigma = np.where(within, np.hypot(spread, own), np.nan)
+    bound = curve.bound(highest, highest_sigma)
+    if field is not None:
+        # The curve in force may be another than the description's table, as after a calibration.
+        by_curve = peak / np.maximum(field.peak_kpa, 1e-12)
+        force = field.force_n * by_curve
+        force_sigma = np.hypot(field.force_sigma_n * by_curve, force * own / peak)
+        kpa = 1e-3 * force / areas_m2
+        sigma = peak_sigma * kpa / peak
+    else:
+        kpa, sigma, force = peak, peak_sigma, 1e3 * peak * areas_m2
+        by_area = magnitude * area_sigmas_m2 / areas_m2
+        apart = np.sqrt(np.maximum(magnitude_sigma**2 - by_area**2, 0.0))
+        slope = spread / np.maximum(magnitude_sigma, 1e-12)
+        of_area = (kpa - slope * magnitude) * area_sigmas_m2
+        of_pressure = np.hypot(curve.spread(magnitude, apart), own) * areas_m2
+        force_sigma = 1e3 * np.hypot(of_pressure, of_area)
+    force_sigma = np.where(within, force_sigma, np.nan)
+    return Pressures(kpa, sigma, force, force_sigma, ranges, peak, peak_sigma, bound)

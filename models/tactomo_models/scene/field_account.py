@@ -1,0 +1,320 @@
+"""What a fitted pressure field says: images, and each contact with its numbers and uncertainties.
+
+Everything follows from the field and from the covariance of its parameters. An edge or a hole that
+was not fitted, because the data did not pay for it, is still uncertain as far as the data leave it
+open: peak, area and force know their share of that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from tactomo_protocol import Channel
+
+from tactomo_models.arrays import BoolArray, FloatArray, IntArray
+from tactomo_models.scene.areas import AreaFinder, Areas
+from tactomo_models.scene.field_fit import FieldFit, FittedField, Measured, covariance_of
+from tactomo_models.scene.pressure import FieldContacts
+from tactomo_models.scene.pressure_field import (
+    EDGE,
+    HOLE,
+    PEAK,
+    SIZE,
+    UNIT_M,
+    Drawing,
+    PressureField,
+    X,
+    Y,
+)
+from tactomo_models.scene.sheet_response import GradedResponse, SaturatingResponse
+
+SAMPLES = 3  # per side of a map cell: what an outline covers of it is right to 3 %
+
+
+@dataclass(frozen=True)
+class FieldAccount:
+    """What a fitted field says.
+
+    Attributes:
+        areas: K pressed areas.
+        map: (nodes_y, nodes_x) |relative conductivity change| of the magnitude sheet.
+        structure: (nodes_y, nodes_x) share of the structure sheet's full change.
+        pressure_kpa: (nodes_y, nodes_x) by the description's table.
+        magnitudes: (K,) |relative conductivity change|, mean over each area.
+        magnitude_sigmas: (K,) their standard uncertainties.
+        contacts: what it says of each area's pressure.
+        goes_wrong_way: whether a conductivity goes where no pressure takes it.
+    """
+
+    areas: Areas
+    map: FloatArray
+    structure: FloatArray
+    pressure_kpa: FloatArray
+    magnitudes: FloatArray
+    magnitude_sigmas: FloatArray
+    contacts: FieldContacts | None
+    goes_wrong_way: bool
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """Another account of the same contacts that the data leave possible.
+
+    Attributes:
+        odds: how likely it is, over the likelier account, 0 to 1.
+        difference: (K, COLUMNS) of its contacts' parameters from those of the likelier account.
+    """
+
+    odds: float
+    difference: FloatArray
+
+
+class FieldAccountant:
+    """Makes accounts of one sensor's fields.
+
+    Args:
+        fit: what fits them.
+        areas: finds areas on the map.
+    """
+
+    def __init__(self, fit: FieldFit, areas: AreaFinder) -> None:
+        self._fit, self._areas = fit, areas
+        self._graded = fit.responses.get(Channel.MAGNITUDE)
+        self._saturating = fit.responses.get(Channel.STRUCTURE)
+        x, y = areas.map_places
+        self._step_m = float(x[0, 1] - x[0, 0]) / SAMPLES
+        offset = (np.arange(SAMPLES) - (SAMPLES - 1) / 2) * self._step_m
+        dx, dy = (each.ravel() for each in np.meshgrid(offset, offset))
+        self._x = x.ravel()[:, None] + dx  # (cells, samples)
+        self._y = y.ravel()[:, None] + dy
+        self._shape = x.shape
+
+    def account(
+        self, fitted: FittedField, measured: Measured, doubts: Sequence[Doubt] = ()
+    ) -> FieldAccount:
+        """Account for a field.
+
+        Args:
+            fitted: the field.
+            measured: the data that it explains.
+            doubts: other accounts; where they are likely, images are the mean of all.
+        """
+        negligible = 0.02  # odds of what need not be drawn
+        shown, family, weight = self._drawn(fitted, measured, None), fitted.family, 1.0
+        if not isinstance(family, PressureField):
+            return shown
+        each = family.split(fitted.parameters)
+        for doubt in doubts:
+            if doubt.odds < negligible or doubt.difference.shape != each.shape:
+                continue
+            changed = each.copy()
+            columns = [SIZE, PEAK, EDGE, HOLE]
+            changed[:, columns] += doubt.difference[:, columns]
+            changed[:, PEAK] = np.clip(changed[:, PEAK], *family.peak_limits)
+            changed[:, [EDGE, HOLE]] = np.clip(changed[:, [EDGE, HOLE]], 0.0, 1.0)
+            weight += doubt.odds
+            shown = _mean(shown, self._drawn(fitted, measured, changed), doubt.odds / weight)
+        return shown
+
+    def _drawn(
+        self, fitted: FittedField, measured: Measured, changed: FloatArray | None
+    ) -> FieldAccount:
+        """Account for a field, or for the same with its contacts (K, COLUMNS) changed."""
+        family = fitted.family
+        if changed is not None:
+            assert isinstance(family, PressureField)
+            family = family.of(changed, family.order)
+            parameters = family.join(changed)
+            fitted = replace(
+                fitted, family=family, parameters=parameters, drawing=family.draw(parameters)
+            )
+        solid, share, pressure = self._images(fitted)
+        magnitude = np.zeros(share.shape)
+        if isinstance(self._graded, GradedResponse):
+            magnitude = np.abs(self._graded.relative_change(pressure)[0])
+        saturation = np.ones(share.shape)
+        if isinstance(self._saturating, SaturatingResponse):
+            saturation = self._saturating.saturation(pressure)[0]
+
+        def seen(values: FloatArray) -> FloatArray:
+            return np.asarray(values.mean(axis=1).reshape(self._shape))
+
+        covered, whole = seen(np.abs(share)), seen(np.abs(solid))
+        drawing = fitted.drawing
+        there = np.zeros(len(self._fit.forward.bare.pressable))
+        there[drawing.nodes] = 1.0
+        areas = self._areas.find(whole, there)
+        mine = areas.on_nodes[:, drawing.nodes] > 0
+        areas = self._areas.less(areas, covered / np.maximum(whole, 1e-12))
+        known = self._contacts(fitted, measured, areas, mine)
+        return FieldAccount(
+            map=seen(np.abs(share) * magnitude),
+            structure=seen(share * saturation),
+            pressure_kpa=seen(np.abs(share) * pressure),
+            **known,
+        )
+
+    def _images(self, fitted: FittedField) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """What is enclosed, share, and pressure at each sample, (cells, samples) each."""
+        samples = self._x.shape
+        family, drawing = fitted.family, fitted.drawing
+        if not isinstance(family, PressureField):
+            on_nodes = np.zeros((2, len(self._fit.forward.bare.pressable)))
+            on_nodes[:, drawing.nodes] = drawing.share, np.abs(drawing.share) * drawing.pressure_kpa
+            share, pressed = (self._areas.on_map(each).reshape(-1, 1) for each in on_nodes)
+            pressure = pressed / np.maximum(np.abs(share), 1e-12)
+            return share, share, pressure
+        solid, share, pressure = np.zeros((3, *samples))
+        if family.count:
+            near = self._near(drawing)
+            x, y = self._x[near], self._y[near]
+            each = family.split(fitted.parameters)
+            found = family.sampled(each, x.ravel(), y.ravel(), self._step_m)
+            solid[near], share[near], pressure[near] = (one.reshape(x.shape) for one in found)
+        return solid, share, pressure
+
+    def _near(self, drawing: Drawing) -> IntArray:
+        """Map cells next to a node that is pressed."""
+        pressed = np.zeros(self._shape, bool)
+        rows, columns = self._areas.nearest
+        pressed[rows[drawing.nodes], columns[drawing.nodes]] = True
+        grown = pressed.copy()
+        grown[1:] |= pressed[:-1]
+        grown[:-1] |= pressed[1:]
+        pressed = grown.copy()
+        grown[:, 1:] |= pressed[:, :-1]
+        grown[:, :-1] |= pressed[:, 1:]
+        return np.flatnonzero(grown)
+
+    def _contacts(
+        self, fitted: FittedField, measured: Measured, areas: Areas, mine: BoolArray
+    ) -> dict[str, Any]:
+        """Numbers of each area's contact, and what they do not know of themselves."""
+        count = len(areas)
+        nothing = np.full(count, np.nan)
+        known: dict[str, Any] = {
+            "areas": areas,
+            "magnitudes": nothing,
+            "magnitude_sigmas": nothing,
+            "contacts": None,
+            "goes_wrong_way": False,
+        }
+        if count == 0:
+            return known
+        family, drawing, parameters = fitted.family, fitted.drawing, fitted.parameters
+        precision = self._fit.prior(fitted)[0]
+        if isinstance(family, PressureField):
+            each = family.split(parameters)
+        J = self._fit.jacobian(fitted, measured, drawing)
+        covariance = covariance_of(J, precision, measured, fitted.misfit)[:-1, :-1]
+        _, by_share, by_pressure = drawing.slopes()
+        cell = self._areas.node_areas_m2[drawing.nodes]
+        share, pressure = drawing.share, drawing.pressure_kpa
+
+        def sigma(gradients: FloatArray) -> FloatArray:
+            return np.asarray(np.sqrt(np.einsum("ki,ij,kj->k", gradients, covariance, gradients)))
+
+        weight = mine * cell
+        area = np.maximum(weight @ np.abs(share), 1e-12)
+        places = self._areas.places[:, drawing.nodes]
+        off = [
+            mine * cell * (axis - centre[:, None])
+            for axis, centre in zip(places, areas.centres_m.T, strict=True)
+        ]
+        signed = np.sign(share)[:, None] * by_share
+        sigmas = np.stack(
+            [
+                *(sigma(each_off @ signed / area[:, None]) for each_off in off),
+                sigma(weight @ signed),
+            ],
+            axis=1,
+        )
+        known["areas"] = replace(areas, sigmas=sigmas)
+        if Channel.MAGNITUDE not in measured or not isinstance(self._graded, GradedResponse):
+            return known
+        size, slope = (np.abs(v) for v in self._graded.relative_change(pressure))
+        known["magnitudes"] = (weight @ (share * size)) / area
+        by_magnitude = signed * (size[:, None]) + (share * slope)[:, None] * by_pressure
+        by_mean = (weight @ by_magnitude - known["magnitudes"][:, None] * (weight @ signed)) / area[
+            :, None
+        ]
+        known["magnitude_sigmas"] = sigma(by_mean)
+        scale = areas.areas_m2 / area  # the map's, over the mesh's
+        highest = np.where(mine, share * pressure, -1.0).argmax(axis=1)  # a node of each area
+        peaks, by_peak, edges = pressure[highest], by_pressure[highest], nothing
+        if isinstance(family, PressureField):
+            owner = self._owners(each, areas, places[:, highest])
+            peaks, edges = family.unit_kpa * each[owner, PEAK], each[owner, EDGE]
+            index = family.index
+            by_peak = np.zeros_like(by_peak)
+            by_peak[np.arange(count), index[owner, PEAK]] = family.unit_kpa
+        peak_size, peak_slope = (np.abs(v) for v in self._graded.relative_change(peaks))
+        scale = areas.areas_m2 / area  # the map's, over the mesh's
+        by_force = signed * pressure[:, None] + share[:, None] * by_pressure
+        known["contacts"] = FieldContacts(
+            peak_magnitude=peak_size,
+            peak_magnitude_sigma=peak_slope * sigma(by_peak),
+            peak_kpa=peaks,
+            force_n=1e3 * (weight @ (share * pressure)) * scale,
+            force_sigma_n=1e3 * sigma(weight @ by_force) * scale,
+            edge=edges,
+        )
+        return known
+
+    @staticmethod
+    def _owners(each: FloatArray, areas: Areas, highest_m: FloatArray) -> IntArray:
+        """Contact (K,) of the field that presses hardest in each area."""
+        apart = np.hypot(
+            UNIT_M * each[:, X] - highest_m[0][:, None], UNIT_M * each[:, Y] - highest_m[1][:, None]
+        )
+        return np.asarray((apart / np.exp(each[:, SIZE])).argmin(axis=1))
+
+
+def _mean(one: FieldAccount, other: FieldAccount, share: float) -> FieldAccount:
+    """Mean of two accounts of the same areas, of which the other has a share.
+
+    How far they are apart is part of the uncertainties.
+    """
+    if len(one.areas) != len(other.areas):
+        return one
+
+    def mean(first: FloatArray, second: FloatArray) -> FloatArray:
+        return first + share * (second - first)
+
+    def spread(sigma: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
+        return np.asarray(np.hypot(sigma, np.sqrt(share * (1 - share)) * (second - first)))
+
+    contacts = one.contacts
+    if one.contacts is not None and other.contacts is not None:
+        a, b = one.contacts, other.contacts
+        contacts = FieldContacts(
+            peak_magnitude=mean(a.peak_magnitude, b.peak_magnitude),
+            peak_magnitude_sigma=spread(a.peak_magnitude_sigma, a.peak_magnitude, b.peak_magnitude),
+            peak_kpa=mean(a.peak_kpa, b.peak_kpa),
+            force_n=mean(a.force_n, b.force_n),
+            force_sigma_n=spread(a.force_sigma_n, a.force_n, b.force_n),
+            edge=a.edge,
+        )
+    areas = replace(
+        one.areas,
+        areas_m2=mean(one.areas.areas_m2, other.areas.areas_m2),
+        sigmas=np.column_stack(
+            [
+                one.areas.sigmas[:, :2],
+                spread(one.areas.sigmas[:, 2], one.areas.areas_m2, other.areas.areas_m2),
+            ]
+        ),
+    )
+    return replace(
+        one,
+        areas=areas,
+        map=mean(one.map, other.map),
+        structure=mean(one.structure, other.structure),
+        pressure_kpa=mean(one.pressure_kpa, other.pressure_kpa),
+        magnitudes=mean(one.magnitudes, other.magnitudes),
+        magnitude_sigmas=spread(one.magnitude_sigmas, one.magnitudes, other.magnitudes),
+        contacts=contacts,
+    )

@@ -1,0 +1,343 @@
+"""Fitting a pressure field: which of its parameters explain the voltages of all sheets together.
+
+Each sheet's response turns the same pressure into that sheet's conductivity. The fit is nonlinear:
+the forward model is solved for every trial, because at a ratio of 100 the paper's linear form
+(equations 5 to 9) is far outside the range of its Jacobian.
+
+    minimise sum_s |W_s (d_s(p, c) - measured_s)|^2 + |(p - p0) / prior|^2   (Levenberg-Marquardt)
+
+What the parameters mean is a family's matter: a few contacts (`pressure_field`), or a level set.
+In both, nothing is pressed away from contacts, so that only nodes near them change: solve and
+Jacobian go by the pressed area.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+from tactomo_protocol import Channel
+
+from tactomo_models.arrays import FloatArray
+from tactomo_models.physics.forward import ForwardModel, Solution
+from tactomo_models.scans.changes import Changes
+from tactomo_models.scene.pressure_field import Drawing
+from tactomo_models.scene.sheet_response import SheetResponse, responses_of
+from tactomo_models.sensor.description import SensorDescription
+
+MAX_PRESSED = 1000  # nodes that one solve may change: some 5 ms, two fifths of a sheet
+SETTLED = 5e-3  # share of the cost below which another gain is not worth a step
+WORST_DAMPING = 1e6  # no step downhill even at this: a minimum
+STEP_LIMIT = 0.5  # largest change of a parameter in one step
+
+Measured = Mapping[Channel, Changes]
+
+
+class Family(Protocol):
+    """A way of describing what presses by N parameters of order 1."""
+
+    @property
+    def prior_mean(self) -> FloatArray:
+        """(N,) what is likely."""
+
+    @property
+    def prior_precision(self) -> FloatArray:
+        """(N,) inverse variances of that."""
+
+    @property
+    def ratio_freedom(self) -> float:
+        """How far the log ratio may stray from what is likely: 1 as far as is known of it."""
+
+    def bounded(self, parameters: FloatArray) -> FloatArray:
+        """Bring parameters (N,) back to where they mean something."""
+
+    def draw(self, parameters: FloatArray) -> Drawing:
+        """What is pressed."""
+
+
+@dataclass(frozen=True)
+class FittedField:
+    """An estimate of what presses.
+
+    Attributes:
+        family: what its parameters mean.
+        parameters: (N,) of the family.
+        log_ratio: logarithm of the structure sheet's pressed over its bare conductivity.
+        drawing: the field on the nodes.
+        solutions: each sheet's forward solution.
+        residuals: each sheet's (M,) noise-weighted misfit of the data.
+        cost: what is minimised, the prior included.
+        damping: Levenberg-Marquardt damping that its last step got through with.
+        jacobian: (sum M, N + 1) that its last step was made with; None before any.
+        converged: whether the last step changed next to nothing.
+    """
+
+    family: Family
+    parameters: FloatArray
+    log_ratio: float
+    drawing: Drawing
+    solutions: Mapping[Channel, Solution] = field(repr=False)
+    residuals: Mapping[Channel, FloatArray] = field(repr=False)
+    cost: float
+    damping: float = 1.0
+    jacobian: FloatArray | None = field(default=None, repr=False)
+    converged: bool = False
+
+    @property
+    def residual(self) -> FloatArray:
+        """(sum M,) noise-weighted misfit of all sheets' data."""
+        return np.concatenate(list(self.residuals.values()))
+
+    @property
+    def misfit(self) -> float:
+        """Root mean square of the noise-weighted residual; about 1 where the model explains all."""
+        return float(np.sqrt(np.mean(self.residual**2)))
+
+    def misfit_of(self, channel: Channel) -> float:
+        """The same of one sheet."""
+        return float(np.sqrt(np.mean(self.residuals[channel] ** 2)))
+
+
+class Budget:
+    """Compute time that is left, by a model of the work on a core of the 2.5 GHz class.
+
+    A model and not a clock: the steps taken, and so the maps, must not depend on how busy the
+    machine was.
+
+    Attributes:
+        left_s: seconds left.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self.left_s = seconds
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing more should be begun."""
+        return self.left_s <= 0
+
+    def spend(self, fitted: FittedField) -> None:
+        """Take off what a solve or a Jacobian of this size costs, on every sheet."""
+        for solution in fitted.solutions.values():
+            nodes = len(solution.nodes)
+            self.left_s -= 0.0007 + 2.5e-6 * nodes + 2e-12 * nodes**3  # see tactomo evaluate solves
+
+
+class FieldFit:
+    """Fit of a pressure field to all sheets of a sensor.
+
+    Args:
+        forward: the model of the sheets.
+        description: the sensor; that of `forward` if None.
+
+    Attributes:
+        forward: the model of the sheets.
+        responses: of each sheet.
+        likely: logarithm of the structure sheet's ratio, as likely as any.
+    """
+
+    def __init__(self, forward: ForwardModel, description: SensorDescription | None = None) -> None:
+        description = description or forward.description
+        self.forward = forward
+        self.responses: dict[Channel, SheetResponse] = responses_of(description)
+        self._volts = np.abs(forward.bare_voltages)
+        saturated = np.log(10.0)
+        if description.structure is not None:
+            saturated = float(np.log(description.structure.saturated_ratio))
+        # Most contacts reach something between a tenth of saturation and all of it.
+        self.likely = float(saturated - np.sign(saturated) * np.log(10) / 2)
+        if abs(saturated) < np.log(10):
+            self.likely = saturated / 2
+        self._ratio_sigma = np.log(10) / np.sqrt(12)
+        self._least_ratio, self._most_ratio = sorted((0.1 * saturated, 1.5 * saturated))
+
+    def compare(self, fitted: FittedField, measured: Measured) -> FittedField:
+        """Hold an estimate against other data, without a solve.
+
+        Sheets that the estimate has not solved are solved.
+        """
+        if measured.keys() - fitted.solutions.keys():
+            again = self.evaluate(fitted.family, fitted.parameters, fitted.log_ratio, measured)
+            assert again is not None
+            return again
+        judged = self._judged(
+            fitted.family,
+            fitted.parameters,
+            fitted.log_ratio,
+            fitted.drawing,
+            {name: fitted.solutions[name] for name in measured},
+            measured,
+        )
+        same = measured.keys() == fitted.solutions.keys()
+        damping = 1.0 if fitted.converged else fitted.damping
+        return replace(judged, damping=damping, jacobian=fitted.jacobian if same else None)
+
+    def evaluate(
+        self,
+        family: Family,
+        parameters: FloatArray,
+        log_ratio: float,
+        measured: Measured,
+        max_pressed: int = MAX_PRESSED,
+    ) -> FittedField | None:
+        """Solve the forward model for given parameters and compare it with the data.
+
+        None where so much would be pressed that no deadline could be kept.
+        """
+        drawing = family.draw(parameters)
+        if len(drawing.nodes) > max_pressed:
+            return None
+        solutions = {}
+        for name in measured:
+            response = self.responses[name]
+            share = _seen(name, drawing)
+            change = np.zeros(len(self.forward.bare.pressable))
+            change[drawing.nodes] = (
+                response.conductivity(share, drawing.pressure_kpa, log_ratio)[0] - 1
+            )
+            solutions[name] = self.forward.solve(
+                change, mix_resistivities=response.rises(log_ratio), within=drawing.nodes
+            )
+        return self._judged(family, parameters, log_ratio, drawing, solutions, measured)
+
+    def _judged(
+        self,
+        family: Family,
+        parameters: FloatArray,
+        log_ratio: float,
+        drawing: Drawing,
+        solutions: Mapping[Channel, Solution],
+        measured: Measured,
+    ) -> FittedField:
+        bare = self.forward.bare_voltages
+        residuals = {
+            name: changes.weight
+            * ((solutions[name].voltages - bare) / self._volts - changes.change)
+            for name, changes in measured.items()
+        }
+        off = (log_ratio - self.likely) / (family.ratio_freedom * self._ratio_sigma)
+        away = family.prior_precision @ (parameters - family.prior_mean) ** 2
+        cost = float(sum(each @ each for each in residuals.values()) + away + off**2)
+        return FittedField(family, parameters, log_ratio, drawing, solutions, residuals, cost)
+
+    def restricted(
+        self, fitted: FittedField, family: Family, parameters: FloatArray, measured: Measured
+    ) -> FittedField:
+        """The same field on fewer sheets, with fewer parameters fitted: no solve."""
+        solutions = {name: fitted.solutions[name] for name in measured}
+        return self._judged(
+            family, parameters, fitted.log_ratio, fitted.drawing, solutions, measured
+        )
+
+    def jacobian(
+        self, fitted: FittedField, measured: Measured, drawing: Drawing | None = None
+    ) -> FloatArray:
+        """Derivative of the weighted residual by the parameters and the log ratio.
+
+        Args:
+            fitted: where to differentiate.
+            measured: the data.
+            drawing: the same field with other parameters free; that of `fitted` if None.
+
+        Returns:
+            (sum M, N + 1).
+        """
+        drawing = drawing or fitted.drawing
+        enclosed, share, pressure = drawing.slopes()
+        sheets = []
+        for name, changes in measured.items():
+            _, by_share, by_pressure, by_log_ratio = self.responses[name].conductivity(
+                _seen(name, drawing), drawing.pressure_kpa, fitted.log_ratio
+            )
+            seen = enclosed if name == Channel.STRUCTURE else share
+            onto = np.empty((len(drawing.nodes), share.shape[1] + 1))
+            onto[:, :-1] = by_share[:, None] * seen + by_pressure[:, None] * pressure
+            onto[:, -1] = by_log_ratio
+            by_parameter = self.forward.jacobian(fitted.solutions[name], drawing.nodes, onto)
+            sheets.append(by_parameter * (changes.weight / self._volts)[:, None])
+        return np.concatenate(sheets)
+
+    def refine(
+        self,
+        fitted: FittedField,
+        measured: Measured,
+        budget: Budget,
+        good_enough: float,
+        steps: int = 100,
+    ) -> FittedField:
+        """Improve an estimate by Levenberg-Marquardt.
+
+        Args:
+            fitted: where to start; its residuals must belong to the same data.
+            measured: the data.
+            budget: work after which no further step is begun; one step is always tried.
+            good_enough: misfit at which the data are explained to their noise (discrepancy
+                principle): no further step is taken.
+            steps: no more than these.
+        """
+        for _ in range(steps):
+            if fitted.misfit <= good_enough:
+                return replace(fitted, converged=True)
+            budget.spend(fitted)
+            better = self._step(fitted, measured, budget)
+            gain = fitted.cost - better.cost
+            # No gain because the budget ended says nothing about a minimum.
+            settled = 0 < gain < SETTLED * fitted.cost or better.damping >= WORST_DAMPING
+            fitted = replace(better, converged=settled)
+            if settled or budget.over:
+                break
+        return fitted
+
+    def prior(self, fitted: FittedField) -> tuple[FloatArray, FloatArray]:
+        """Inverse variances (N + 1,) of parameters and log ratio, and their offsets from it."""
+        ratio_sigma = fitted.family.ratio_freedom * self._ratio_sigma
+        precision = np.append(fitted.family.prior_precision, ratio_sigma**-2)
+        mean = np.append(fitted.family.prior_mean, self.likely)
+        return precision, np.append(fitted.parameters, fitted.log_ratio) - mean
+
+    def _step(self, fitted: FittedField, measured: Measured, budget: Budget) -> FittedField:
+        """Damp until a step leads downhill: the better estimate, or the old one."""
+        J = self.jacobian(fitted, measured)
+        precision, offset = self.prior(fitted)
+        normal = J.T @ J + np.diag(precision)
+        gradient = J.T @ fitted.residual + precision * offset
+        damping = fitted.damping
+        while damping < WORST_DAMPING:
+            step = -np.linalg.solve(normal + damping * np.eye(len(normal)), gradient)
+            step *= min(1.0, STEP_LIMIT / max(np.abs(step[:-1]).max(initial=0.0), 1e-12))
+            ratio = float(np.clip(fitted.log_ratio + step[-1], self._least_ratio, self._most_ratio))
+            parameters = fitted.family.bounded(fitted.parameters + step[:-1])
+            trial = self.evaluate(fitted.family, parameters, ratio, measured)
+            if trial is not None:
+                budget.spend(trial)
+                if trial.cost < fitted.cost:
+                    return replace(trial, damping=max(damping / 5, 1e-3), jacobian=J)
+            damping *= 5
+            if budget.over:
+                break
+        return replace(fitted, damping=damping)
+
+
+def _seen(name: Channel, drawing: Drawing) -> FloatArray:
+    """The share (n,) that a sheet shows as pressed."""
+    return drawing.enclosed if name == Channel.STRUCTURE else drawing.share
+
+
+def covariance_of(
+    jacobian: FloatArray, precision: FloatArray, measured: Measured, misfit: float
+) -> FloatArray:
+    """Covariance (n, n) of parameters; larger where the data are left unexplained.
+
+    Args:
+        jacobian: (sum M, n) of the weighted residual.
+        precision: (n,) inverse variances of the prior.
+        measured: the data.
+        misfit: that is left of them.
+    """
+    inflation = np.concatenate([each.variance_inflation for each in measured.values()])
+    prior = np.diag(precision)
+    inverse = np.linalg.inv(jacobian.T @ jacobian + prior)
+    information = jacobian.T @ (inflation[:, None] * jacobian) + prior
+    return np.asarray(inverse @ information @ inverse * max(1.0, misfit**2))

@@ -1,0 +1,159 @@
+"""What a pressure does to each sheet: its conductivity, and how that changes with the pressure.
+
+One pressure field presses on all sheets. A node that is pressed in part conducts in between. On a
+saturated sheet the worse conductor has that share of the say: resistivities mix where pressing
+makes it conduct better, conductivities where worse, so that an outline stands where the voltages
+put it, whatever the contrast. On a graded sheet, whose contrast is mild, conductivities mix.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from tactomo_protocol import Channel
+
+from tactomo_models.arrays import FloatArray
+from tactomo_models.sensor.description import SensorDescription
+from tactomo_models.sensor.response import MagnitudeResponse, StructureChannel
+
+
+class SheetResponse(Protocol):
+    """How one sheet's conductivity, over its own at rest, follows from the pressure."""
+
+    def conductivity(
+        self, share: FloatArray, pressure_kpa: FloatArray, log_ratio: float
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Conductivity ratio (n,) of nodes, and its slopes.
+
+        Args:
+            share: (n,) share of each that is pressed; where it is negative (`objects`), pressing
+                goes the other way.
+            pressure_kpa: (n,) pressure on that share.
+            log_ratio: logarithm of the structure sheet's ratio where it is saturated.
+
+        Returns:
+            The ratio, its derivatives by share, by pressure and by the log ratio, each (n,).
+        """
+
+    def rises(self, log_ratio: float) -> bool:
+        """Whether pressing makes the sheet conduct better."""
+
+
+@dataclass(frozen=True)
+class GradedResponse:
+    """A magnitude sheet: the relative change of conductivity grows with the pressure.
+
+    Attributes:
+        pressure_kpa: (n,) of the description's table.
+        change: (n,) relative conductivity changes, signed.
+    """
+
+    pressure_kpa: FloatArray
+    change: FloatArray
+
+    @classmethod
+    def of(cls, response: MagnitudeResponse) -> GradedResponse:
+        """The response that a description's table gives."""
+        return cls(np.asarray(response.pressure_kpa), np.asarray(response.relative_change))
+
+    @property
+    def onset_kpa(self) -> float:
+        """Pressure from which the sheet answers."""
+        first = int(np.flatnonzero(self.change)[0])
+        return float(self.pressure_kpa[first - 1])
+
+    @property
+    def end_kpa(self) -> float:
+        """Pressure at which the table ends."""
+        return float(self.pressure_kpa[-1])
+
+    def relative_change(self, pressure_kpa: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Relative conductivity change, and its slope by the pressure, each of the same shape.
+
+        Beyond the table its last piece goes on: there a pressure is a lower bound.
+        """
+        piece = np.searchsorted(self.pressure_kpa, pressure_kpa, side="right") - 1
+        piece = np.clip(piece, 0, len(self.pressure_kpa) - 2)
+        slope = (np.diff(self.change) / np.diff(self.pressure_kpa))[piece]
+        change = self.change[piece] + slope * (pressure_kpa - self.pressure_kpa[piece])
+        # A falling table must not fall through zero.
+        least = -0.99
+        return np.maximum(change, least), np.where(change > least, slope, 0.0)
+
+    def conductivity(
+        self, share: FloatArray, pressure_kpa: FloatArray, log_ratio: float
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """See `SheetResponse`."""
+        change, slope = self.relative_change(pressure_kpa)
+        return 1 + share * change, change, share * slope, np.zeros(len(share))
+
+    def rises(self, log_ratio: float) -> bool:
+        """See `SheetResponse`."""
+        return bool(self.change[-1] > 0)
+
+
+@dataclass(frozen=True)
+class SaturatingResponse:
+    """A structure sheet: a share of its full change, in logarithm, by a table.
+
+    The table gives the shares alone: how far the sheet changes where it is saturated is fitted.
+
+    Attributes:
+        pressure_kpa: (n,) of the description's table; empty where any pressure saturates.
+        share: (n,) of the logarithm of the saturated ratio, from 0 to 1.
+    """
+
+    pressure_kpa: FloatArray
+    share: FloatArray
+
+    @classmethod
+    def of(cls, channel: StructureChannel) -> SaturatingResponse:
+        """The response that a description gives."""
+        if channel.response is None:
+            return cls(np.zeros(0), np.zeros(0))
+        logs = np.log(channel.response.conductivity_ratio)
+        return cls(np.asarray(channel.response.pressure_kpa), logs / logs[-1])
+
+    def saturation(self, pressure_kpa: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Share of the full change, in logarithm, and its slope, each of the pressure's shape."""
+        if len(self.share) == 0:
+            return np.ones_like(pressure_kpa), np.zeros_like(pressure_kpa)
+        share = np.interp(pressure_kpa, self.pressure_kpa, self.share)
+        slopes = np.append(np.diff(self.share) / np.diff(self.pressure_kpa), 0.0)
+        piece = np.searchsorted(self.pressure_kpa, pressure_kpa, side="right") - 1
+        return share, slopes[np.clip(piece, 0, len(slopes) - 1)]
+
+    def conductivity(
+        self, share: FloatArray, pressure_kpa: FloatArray, log_ratio: float
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """See `SheetResponse`."""
+        saturation, slope = self.saturation(pressure_kpa)
+        turned = np.where(share < 0, -1.0, 1.0)
+        log_full = turned * log_ratio * saturation  # of the whole node
+        least, better = np.exp(-np.abs(log_full)), log_full > 0
+        mixed = 1 - np.abs(share) * (1 - least)
+        sigma = np.where(better, 1 / mixed, mixed)
+        by_mixed = np.where(better, -(sigma**2), 1.0)
+        by_log_full = by_mixed * np.abs(share) * least * np.where(better, -1.0, 1.0)
+        return (
+            sigma,
+            by_mixed * (least - 1) * turned,
+            by_log_full * turned * log_ratio * slope,
+            by_log_full * turned * saturation,
+        )
+
+    def rises(self, log_ratio: float) -> bool:
+        """See `SheetResponse`."""
+        return log_ratio > 0
+
+
+def responses_of(description: SensorDescription) -> dict[Channel, SheetResponse]:
+    """The response of each of a sensor's sheets."""
+    sheets: dict[Channel, SheetResponse] = {}
+    if description.magnitude is not None:
+        sheets[Channel.MAGNITUDE] = GradedResponse.of(description.magnitude.response)
+    if description.structure is not None:
+        sheets[Channel.STRUCTURE] = SaturatingResponse.of(description.structure)
+    return sheets
