@@ -24,6 +24,14 @@ from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
 from tactomo_models.methods.contact_search import ContactSearch, MissingContact
+from tactomo_models.methods.joint_fit import (
+    FALLEN_PEAK,
+    QUESTIONS,
+    JointFit,
+    Question,
+    further,
+    is_open,
+)
 from tactomo_models.scans.stillness import is_still
 from tactomo_models.scene.field_account import Doubt
 from tactomo_models.scene.field_fit import Budget, FieldFit, FittedField, Measured
@@ -34,13 +42,13 @@ from tactomo_models.scene.pressure_field import (
     E2,
     EDGE,
     HARMONIC,
-    HERTZ,
     HOLE,
     MAX_BULGE,
     PEAK,
     PRIOR_SIGMA,
     SIZE,
     UNIT_M,
+    Drawing,
     PressureField,
     X,
     Y,
@@ -65,7 +73,6 @@ class ShapeModel(Enum):
     AS_NEEDED = "as needed"
     OUTLINES = "outlines"
     LEVEL_SET = "level set"
-    AS_THEY_ARE = "as they are"  # no contact comes, goes, or takes another form
 
 
 @dataclass(frozen=True)
@@ -137,7 +144,7 @@ class WarmStartedFit:
 
     def __init__(self, fit: FieldFit, shape_model: ShapeModel = ShapeModel.AS_NEEDED) -> None:
         self._course = _Course(_Tools(fit), shape_model)
-        self._joint = _Course(self._course.tools, ShapeModel.AS_THEY_ARE)
+        self._joint = JointFit(fit, self._course.tools.field)
 
     @property
     def typical_peak(self) -> float:
@@ -147,7 +154,7 @@ class WarmStartedFit:
     def forget(self) -> None:
         """Drop the warm start."""
         self._course = _Course(self._course.tools, self._course.shape_model)
-        self._joint = _Course(self._course.tools, ShapeModel.AS_THEY_ARE)
+        self._joint.forget()
 
     def follow(
         self, measured: Measured, budget: Budget, propose: Propose | None = None
@@ -169,15 +176,16 @@ class WarmStartedFit:
         # what form is found on it, and then all sheets judge together.
         outlines = {Channel.STRUCTURE: measured[Channel.STRUCTURE]}
         shape, how = self._course.follow(_Frame(outlines, budget, propose))
-        joint = self._joint.go_on_from(shape, _Frame(measured, budget, None))
-        self._course.adopt(joint, outlines)
+        joint = self._joint.follow(
+            shape, measured, budget, lambda fitted: _scale(fitted, _Frame(measured, budget, None))
+        )
+        self._joint.is_fit_of(self._course.adopt(joint, outlines))
         return replace(joint, converged=joint.converged and shape.converged), how
 
     @property
     def doubts(self) -> list[Doubt]:
         """Other accounts of the contacts that were followed last, as likely as the data say."""
-        course = self._joint if self._joint.has_shape else self._course
-        return list(course.doubts.values())
+        return [*self._joint.doubts.values(), *self._course.doubts.values()]
 
 
 class _Course:
@@ -189,8 +197,8 @@ class _Course:
         self._settled_on: Measured = {}  # the frame that the shape is of
         self._tried_misfit = 0.0  # at which all moves were tried on contacts like these
         self._from_nothing = True  # or from the shape of frames before
-        self._tried_signal = 0.0  # of the data that they were tried on
         self.doubts: dict[int, Doubt] = {}  # of contacts like these, by what is in doubt
+        self._adopted: Drawing | None = None
         self._cold_start: _Course | None = None
         self._start_over()
 
@@ -215,64 +223,18 @@ class _Course:
             self._cold_start = None
         return shape, f"{how}, {_in_words(shape)}"
 
-    def go_on_from(self, start: FittedField, frame: _Frame) -> FittedField:
-        """Fit one frame more, from what was found on another channel."""
-        tells_more = 1.25  # times the signal, from which what was undecided is asked again
-        before = self._shape
-        if (
-            before is not None
-            and before.drawing is start.drawing
-            and self._is_still(frame.measured)
-        ):
-            shape = self.tools.fit.compare(before, frame.measured)
-            if before.converged:
-                return replace(shape, converged=True)
-        else:
-            if isinstance(start.family, PressureField):
-                each, order = start.family.split(start.parameters), start.family.order
-                evaluated = self._evaluate(each, order, start.log_ratio, frame)
-            else:
-                evaluated = self._peaks_of(start, frame)
-            assert evaluated is not None
-            same = before is not None and len(before.parameters) == len(evaluated.parameters)
-            signal = frame.measured[Channel.MAGNITUDE].misfit
-            if not same or signal > tells_more * self._tried_signal:
-                self._tried_misfit, self._tried_signal = 0.0, signal
-                self.doubts.clear()
-            shape = evaluated
-            self._start_over()
-        self._shape = shape = self._improve(shape, frame)
-        self._settled_on = frame.measured
-        return shape
-
-    def _peaks_of(self, start: FittedField, frame: _Frame) -> FittedField | None:
-        """A level set and the pressure of each of its parts."""
-        assert isinstance(start.family, LevelSet)
-        family = start.family.owned_by(start.family.centres_m, self.tools.field)
-        typical = np.full(len(family.centres_m), self.tools.field.typical_peak)
-        parameters = np.append(start.parameters, typical)
-        before = self._shape
-        if before is not None and len(before.parameters) == len(parameters):
-            parameters[len(start.parameters) :] = before.parameters[len(start.parameters) :]
-        return self.tools.fit.evaluate(family, parameters, start.log_ratio, frame.measured)
-
-    @property
-    def has_shape(self) -> bool:
-        """Whether anything was followed."""
-        return self._shape is not None
-
-    def adopt(self, joint: FittedField, measured: Measured) -> None:
-        """Go on from what all channels have made of the shape in force."""
+    def adopt(self, joint: FittedField, measured: Measured) -> Drawing:
+        """Go on from what all channels have made of the shape in force, and return its drawing."""
         assert self._shape is not None
-        if joint.drawing is self._shape.drawing:
-            return
-        family, parameters = joint.family, joint.parameters
-        if isinstance(family, PressureField):
-            each = family.split(parameters)
+        family = joint.family
+        if isinstance(family, PressureField) and joint.drawing is not self._adopted:
+            each = family.split(joint.parameters)
             family = family.of(each, family.order, fits_peaks=False)
             parameters = family.join(each)
             known = self.tools.fit.restricted(joint, family, parameters, measured)
             self._shape = replace(known, converged=self._shape.converged)
+            self._adopted = joint.drawing
+        return self._shape.drawing
 
     def _doubtful(self, shape: FittedField) -> bool:
         """Tell whether a cold start might do better: where the warm one had little to go on."""
@@ -424,8 +386,6 @@ class _Course:
             return [self._birth, self._escalate]
         inside: list[_Move] = [self._soften, self._hollow]
         inside = inside if Channel.MAGNITUDE in shape.residuals else []
-        if self.shape_model == ShapeModel.AS_THEY_ARE:
-            return inside
         form = [self._of_higher_order, self._modulate, *inside]
         if shape.misfit > GOOD_MISFIT:
             form += [self._split, self._birth_anywhere]
@@ -434,8 +394,7 @@ class _Course:
 
     def _early_birth(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
         """A further contact where that much is left that it need not wait for the others."""
-        sought = self.shape_model != ShapeModel.AS_THEY_ARE and shape.misfit > SUSPECT_MISFIT
-        return self._birth(shape, frame) if sought else None
+        return self._birth(shape, frame) if shape.misfit > SUSPECT_MISFIT else None
 
     def _birth(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
         """A further contact, away from those that are known."""
@@ -492,7 +451,8 @@ class _Course:
         if shape.family.order < 2:
             return None
         needed = worth * _scale(shape, frame)
-        slopes, bends = self._further(shape, frame, slice(HARMONIC, PEAK))
+        frame.budget.spend(shape)
+        slopes, bends = further(self.tools.fit, shape, frame.measured, slice(HARMONIC, PEAK))
         prior = np.diag(PRIOR_SIGMA[HARMONIC:PEAK] ** -2.0)
         steps = -np.linalg.solve(bends + prior, slopes[:, :, None])[:, :, 0]
         each = shape.family.split(shape.parameters)
@@ -504,73 +464,30 @@ class _Course:
         return _Candidate(other, needed * asked.sum()) if other else None
 
     def _soften(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
-        """Pressures that fall towards the edge, unless the data are clearly against it."""
-        worth = (
-            4.0  # of what data of even pressures gain by chance; half of it changes maps by 0.005
-        )
-        return self._with(EDGE, HERTZ, worth, shape, frame)
+        """Pressures that fall towards the edge, or rings, unless the data are clearly against it.
+
+        What presses is likely of one kind, so all contacts are asked at once.
+        """
+        return self._with(QUESTIONS[0], shape, frame)
 
     def _hollow(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
-        """Rings for discs, unless the data are clearly against it."""
-        worth = 6.0  # rings are rarer than balls and fingers
-        return self._with(HOLE, 1.0, worth, shape, frame)
+        return self._with(QUESTIONS[1], shape, frame)
 
-    def _with(
-        self, column: int, value: float, worth: float, shape: FittedField, frame: _Frame
-    ) -> _Candidate | None:
-        """Contacts with another edge or with holes, as many as may have one.
-
-        What presses is likely of one kind, so they are all asked at once.
-        """
-        clearly = 12.0  # rise of the cost, to second order, from which nothing is asked
+    def _with(self, question: Question, shape: FittedField, frame: _Frame) -> _Candidate | None:
         assert isinstance(shape.family, PressureField)
-        slopes, bends = self._further(shape, frame, slice(column, column + 1))
-        rise = 2 * value * slopes[:, 0] + value**2 * bends[:, 0, 0]
+        column, scale = question.column, _scale(shape, frame)
+        frame.budget.spend(shape)
+        columns = slice(column, column + 1)
+        slopes, bends = further(self.tools.fit, shape, frame.measured, columns)
         each = shape.family.split(shape.parameters)
-        # Far from the data a parabola knows little: a falling slope is always worth asking.
-        asked = (rise < clearly * _scale(shape, frame)) | (slopes[:, 0] < 0)
+        asked = is_open(question, slopes, bends, scale)
         asked &= (each[:, EDGE] == 0) & (each[:, HOLE] == 0)
         if not asked.any():
             return None
-        each[asked, column] = value
-        # The mean pressure stays, about.
-        each[asked, PEAK] = np.minimum(1.25 * each[asked, PEAK], shape.family.peak_limits[1])
+        each[asked, column] = question.value
+        each[asked, PEAK] = np.minimum(FALLEN_PEAK * each[asked, PEAK], shape.family.peak_limits[1])
         other = self._evaluate(each, shape.family.order, shape.log_ratio, frame)
-        return _Candidate(other, worth * _scale(shape, frame)) if other else None
-
-    def _further(
-        self, shape: FittedField, frame: _Frame, columns: slice
-    ) -> tuple[FloatArray, FloatArray]:
-        """How the cost would go with further parameters of each contact, the others following.
-
-        Args:
-            shape: at its minimum.
-            frame: what it is fitted to.
-            columns: C further parameters.
-
-        Returns:
-            Half the cost's slopes (K, C), and half its curvatures (K, C, C), at what they are now.
-        """
-        assert isinstance(shape.family, PressureField)
-        family, count = shape.family, columns.stop - columns.start
-        slopes, bends = np.zeros((family.count, count)), np.zeros((family.count, count, count))
-        if family.count == 0:
-            return slopes, bends
-        frame.budget.spend(shape)
-        every = family.with_free(columns)
-        drawing = every.draw(every.join(family.split(shape.parameters)))
-        J = self.tools.fit.jacobian(shape, frame.measured, drawing)
-        known = np.append(family.free[every.free], True)  # and the log ratio
-        precision, offset = self.tools.fit.prior(shape)
-        own = J[:, known]
-        normal = own.T @ own + np.diag(precision)
-        gradient = own.T @ shape.residual + precision * offset
-        for k, index in enumerate(every.index[:, columns]):
-            further = J[:, index]
-            cross = np.linalg.solve(normal, own.T @ further)
-            slopes[k] = further.T @ shape.residual - cross.T @ gradient
-            bends[k] = further.T @ further - cross.T @ (own.T @ further)
-        return slopes, bends
+        return _Candidate(other, question.worth * scale) if other else None
 
     def _split(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
         """Two contacts for one, of the contact that stands it best."""

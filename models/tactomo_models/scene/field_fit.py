@@ -227,9 +227,8 @@ class FieldFit:
     ) -> FittedField:
         """The same field on fewer sheets, with fewer parameters fitted: no solve."""
         solutions = {name: fitted.solutions[name] for name in measured}
-        return self._judged(
-            family, parameters, fitted.log_ratio, fitted.drawing, solutions, measured
-        )
+        drawing = family.draw(parameters)
+        return self._judged(family, parameters, fitted.log_ratio, drawing, solutions, measured)
 
     def jacobian(
         self, fitted: FittedField, measured: Measured, drawing: Drawing | None = None

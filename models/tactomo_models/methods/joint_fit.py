@@ -1,0 +1,236 @@
+"""All sheets judge together: what was found on one sheet is fitted to every sheet's data.
+
+What is there, and of what form, is found on the sheet that shows outlines best. Here follow the
+pressures, the outlines as all sheets have them, and two questions that the graded sheet answers:
+does the pressure fall towards the edge, and does a ring press with its rim alone? An answer is an
+odds ratio that grows or shrinks from frame to frame; while it is open, the other account of the
+contacts has its share in what is shown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tactomo_models.arrays import BoolArray, FloatArray
+from tactomo_models.scans.stillness import is_still
+from tactomo_models.scene.field_account import Doubt
+from tactomo_models.scene.field_fit import Budget, Family, FieldFit, FittedField, Measured
+from tactomo_models.scene.level_set import LevelSet
+from tactomo_models.scene.pressure_field import (
+    EDGE,
+    HERTZ,
+    HOLE,
+    PEAK,
+    Drawing,
+    PressureField,
+)
+
+
+@dataclass(frozen=True)
+class Question:
+    """Whether contacts have an edge, or a hole.
+
+    Attributes:
+        column: of their parameters.
+        value: that the column then has.
+        worth: by how much the cost must fall for it, times what errors that go together make of
+            one unit. Even pressures gain about 4 by chance; half of it changes ICC by 0.005.
+    """
+
+    column: int
+    value: float
+    worth: float
+
+
+QUESTIONS = (Question(EDGE, HERTZ, 4.0), Question(HOLE, 1.0, 6.0))  # rings are rarer than balls
+FALLEN_PEAK = 1.25  # peak of a pressure that falls, over the even one of about the same mean
+CLEARLY = 12.0  # rise of the cost, to second order, from which a question need not be asked
+MEMORY = 0.7  # of the logarithm of the odds, from one asking to the next
+STEPS = 4  # of a refinement, and of an answer
+
+
+class JointFit:
+    """Fits what a course of frames has found on one sheet to all sheets, frame by frame.
+
+    Args:
+        fit: what fits fields to the sensor's sheets.
+        field: a field without contacts.
+    """
+
+    def __init__(self, fit: FieldFit, field: PressureField) -> None:
+        self._fit, self._field = fit, field
+        self.forget()
+
+    def forget(self) -> None:
+        """Drop the warm start."""
+        self._fitted: FittedField | None = None
+        self._given: Drawing | None = None  # what it is the fit of
+        self._settled_on: Measured = {}
+        self._evidence: dict[int, float] = {}  # logarithm of the odds against each column's value
+        self._frames_moved = 0  # with these contacts
+        self.doubts: dict[int, Doubt] = {}
+
+    def follow(
+        self, start: FittedField, measured: Measured, budget: Budget, scale: Callable[..., float]
+    ) -> FittedField:
+        """Fit one frame more.
+
+        Args:
+            start: what was found on one sheet.
+            measured: the changes of all sheets.
+            budget: compute time that may be spent; one step is always taken.
+            scale: what one unit of squared misfit means, for a field that is fitted.
+        """
+        fitted = self._continued(start, measured)
+        if not fitted.converged:
+            while not (fitted.converged or budget.over):
+                fitted = self._fit.refine(fitted, measured, budget, 0.0, STEPS)
+            # Asked at once and then ever more seldom: what moves costs no more for that.
+            due = self._frames_moved & (self._frames_moved - 1) == 0
+            self._frames_moved += 1
+            if due and isinstance(fitted.family, PressureField) and fitted.family.count:
+                fitted = self._answered(fitted, measured, budget, scale(fitted))
+        self._fitted, self._settled_on = fitted, measured
+        return fitted
+
+    def is_fit_of(self, drawing: Drawing) -> None:
+        """Say what drawing the next frame will start with if nothing has moved on the one sheet."""
+        self._given = drawing
+
+    def _continued(self, start: FittedField, measured: Measured) -> FittedField:
+        before = self._fitted
+        if before is not None and self._given is start.drawing:
+            fitted = self._fit.compare(before, measured)
+            if self._is_still(measured):
+                return replace(fitted, converged=before.converged)
+            if before.solutions.keys() == measured.keys():
+                return fitted
+        if isinstance(start.family, PressureField):
+            each = start.family.split(start.parameters)
+            field = self._field.of(each, start.family.order)
+            family: Family = field
+            parameters = field.join(each)
+        else:
+            assert isinstance(start.family, LevelSet)
+            family, parameters = self._with_peaks(start.family, start.parameters)
+        if before is None or len(before.parameters) != len(parameters):
+            self.forget()
+        started = self._fit.evaluate(family, parameters, start.log_ratio, measured)
+        assert started is not None  # it was small enough for one sheet
+        return started
+
+    def _with_peaks(
+        self, family: LevelSet, coefficients: FloatArray
+    ) -> tuple[LevelSet, FloatArray]:
+        """A level set and the pressure of each of its parts."""
+        owned = family.owned_by(family.centres_m, self._field)
+        peaks = np.full(len(owned.centres_m), self._field.typical_peak)
+        if self._fitted is not None and len(self._fitted.parameters) == len(owned.prior_mean):
+            peaks = self._fitted.parameters[len(coefficients) :]
+        return owned, np.append(coefficients, peaks)
+
+    def _is_still(self, measured: Measured) -> bool:
+        return measured.keys() == self._settled_on.keys() and all(
+            is_still(self._settled_on[name], changes) for name, changes in measured.items()
+        )
+
+    def _answered(
+        self, fitted: FittedField, measured: Measured, budget: Budget, scale: float
+    ) -> FittedField:
+        """Ask each question once more; the field that the answers leave."""
+        for question in QUESTIONS:
+            other = self._other(fitted, question, measured, budget, scale)
+            if other is None:
+                continue
+            one, two = _contacts_of(fitted), _contacts_of(other)
+            # For the even pressure, whichever of the two is the present account.
+            falls = bool(one[:, question.column].any())
+            rise = (fitted.cost - other.cost if falls else other.cost - fitted.cost) / scale
+            known = MEMORY * self._evidence.get(question.column, 0.0)
+            evidence = float(np.clip(known + (question.worth + rise) / 2, -50.0, 50.0))
+            self._evidence[question.column] = evidence
+            if falls == (evidence > 0):
+                fitted, one, two = other, two, one
+                self.doubts.clear()
+            self.doubts[question.column] = Doubt(float(np.exp(-abs(evidence))), two - one)
+        return fitted
+
+    def _other(
+        self,
+        fitted: FittedField,
+        question: Question,
+        measured: Measured,
+        budget: Budget,
+        scale: float,
+    ) -> FittedField | None:
+        """The field as it else might be; None where nothing is in question, or time is short."""
+        assert isinstance(fitted.family, PressureField)
+        each, column = _contacts_of(fitted), question.column
+        asked = each[:, column] > 0
+        value, peak = 0.0, 1 / FALLEN_PEAK
+        if not asked.any():
+            slopes, bends = further(self._fit, fitted, measured, slice(column, column + 1))
+            budget.spend(fitted)
+            asked = is_open(question, slopes, bends, scale)
+            asked &= (each[:, [EDGE, HOLE]] == 0).all(axis=1)
+            value, peak = question.value, FALLEN_PEAK
+        if not asked.any():
+            return None
+        each[asked, column] = value
+        each[asked, PEAK] = np.clip(peak * each[asked, PEAK], *fitted.family.peak_limits)
+        family = self._field.of(each, fitted.family.order)
+        other = self._fit.evaluate(family, family.join(each), fitted.log_ratio, measured)
+        if other is None:
+            return None
+        other = self._fit.refine(other, measured, budget, 0.0, 2 * STEPS)
+        return other if other.converged or other.cost < fitted.cost else None
+
+
+def _contacts_of(fitted: FittedField) -> FloatArray:
+    assert isinstance(fitted.family, PressureField)
+    return fitted.family.split(fitted.parameters)
+
+
+def is_open(question: Question, slopes: FloatArray, bends: FloatArray, scale: float) -> BoolArray:
+    """Tell of which contacts (K,) a question is worth asking; see `further`."""
+    rise = 2 * question.value * slopes[:, 0] + question.value**2 * bends[:, 0, 0]
+    # Far from where it was made a parabola knows little: a falling one is always worth asking.
+    return np.asarray((rise < CLEARLY * scale) | (slopes[:, 0] < 0))
+
+
+def further(
+    fit: FieldFit, fitted: FittedField, measured: Measured, columns: slice
+) -> tuple[FloatArray, FloatArray]:
+    """How the cost would go with further parameters of each contact, the others following.
+
+    Args:
+        fit: what fitted the field.
+        fitted: at its minimum.
+        measured: what it is fitted to.
+        columns: C further parameters.
+
+    Returns:
+        Half the cost's slopes (K, C), and half its curvatures (K, C, C), at what they are now.
+    """
+    assert isinstance(fitted.family, PressureField)
+    family, count = fitted.family, columns.stop - columns.start
+    slopes, bends = np.zeros((family.count, count)), np.zeros((family.count, count, count))
+    if family.count == 0:
+        return slopes, bends
+    every = family.with_free(columns)
+    drawing = every.draw(every.join(family.split(fitted.parameters)))
+    J = fit.jacobian(fitted, measured, drawing)
+    known = np.append(family.free[every.free], True)  # and the log ratio
+    precision, offset = fit.prior(fitted)
+    own = J[:, known]
+    normal = own.T @ own + np.diag(precision)
+    gradient = own.T @ fitted.residual + precision * offset
+    for k, index in enumerate(every.index[:, columns]):
+        more = J[:, index]
+        cross = np.linalg.solve(normal, own.T @ more)
+        slopes[k] = more.T @ fitted.residual - cross.T @ gradient
+        bends[k] = more.T @ more - cross.T @ (own.T @ more)
+    return slopes, bends
