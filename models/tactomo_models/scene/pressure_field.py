@@ -45,6 +45,7 @@ HERTZ = 0.5
 # holes of what presses with its rim.
 PRIOR_SIGMA = np.array([5.0, 5.0, 0.6, 0.3, 0.3, 0.05, 0.05, 0.07, 0.07, 1.0, 0.12, 0.5])
 NOWHERE = 1e-6  # distance from a contact's centre, over its size, that has no direction
+GRADED_WIDTH = 0.7
 RIM = 0.5  # of the nodes' distance: how far inside its edge a falling pressure is averaged
 
 
@@ -262,7 +263,7 @@ class _Contacts:
         self.outline = _Outlines(of, each, x_m, y_m)
         step = _linear_step if is_sharp else heaviside
         self.wide = self.outline.t + of.offset_m / of.half_width_m
-        self._wide, self.whole = step(self.wide), step(self.outline.t)
+        self._wide, self.whole = step(self.wide), step(self.outline.t / GRADED_WIDTH)
         self._hole, self._inner = each[:, HOLE, None], None
         if self._hole.any():
             self._inner = self._inner_outlines()
@@ -296,7 +297,9 @@ class _Contacts:
         by_t, by_log_q = self.outline.slopes()
         wide, shares = np.zeros((2, len(each), COLUMNS, n))
         wide[:, :forms] = heaviside_slope(self.wide)[:, None] * by_t
-        shares[:, :forms] = (heaviside_slope(self.outline.t) * self._left)[:, None] * by_t
+        shares[:, :forms] = (
+            heaviside_slope(self.outline.t / GRADED_WIDTH) / GRADED_WIDTH * self._left
+        )[:, None] * by_t
         if self._inner is not None or of.free[:, HOLE].any():
             inner = self._inner or self._inner_outlines()
             shares[:, HOLE] = -self.whole * heaviside(inner.t)
