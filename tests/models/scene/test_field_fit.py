@@ -1,0 +1,369 @@
+"""Fits of a pressure field to all sheets: derivatives, convergence, and what they leave open."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from measured import measured
+from pressed import contact, contacts
+from tactomo_models import Channel, SensorDescription
+from tactomo_models.arrays import FloatArray
+from tactomo_models.physics.bare_sheet import solve_bare_sheet
+from tactomo_models.physics.forward import ForwardModel
+from tactomo_models.physics.mesh import mesh_sheet
+from tactomo_models.scene.field_fit import (
+    Budget,
+    Family,
+    FieldFit,
+    FittedField,
+    Measured,
+    covariance_of,
+)
+from tactomo_models.scene.level_set import LevelSet
+from tactomo_models.scene.pressure_field import (
+    EDGE,
+    EDGE_LIMITS,
+    HERTZ,
+    PEAK,
+    PRIOR_SIGMA,
+    SIZE,
+    UNIT_M,
+    PressureField,
+    X,
+    Y,
+)
+from tactomo_models.scene.sheet_response import GradedResponse
+from taylor import taylor_orders
+from variants import variant
+
+TABLE_KPA = (0.0, 50.0, 130.0, 200.0)  # no peak and no mean of peaks is on one of its knots
+RISING = {"pressure_kpa": TABLE_KPA, "relative_change": (0.0, 0.1, 0.5, 1.0)}
+FALLING = {"pressure_kpa": TABLE_KPA, "relative_change": (0.0, -0.05, -0.2, -0.4)}
+LATE = {"pressure_kpa": (0.0, 100.0, 200.0), "relative_change": (0.0, 0.0, 0.25)}
+SATURATING = {"pressure_kpa": (0.0, 40.0, 220.0), "conductivity_ratio": (1.0, 20.0, 100.0)}
+SENSORS: dict[str, tuple[dict[str, Any] | None, dict[str, Any] | None]] = {
+    "both": (LATE, {"conductivity_ratio": 100.0}),
+    "both falling": (FALLING, {"conductivity_ratio": 0.01}),
+    "both graded": (RISING, {"conductivity_ratio": None, "response": SATURATING}),
+    "one graded": (RISING, None),
+    "one falling": (FALLING, None),
+    "structure alone": (None, {"conductivity_ratio": 100.0}),
+    "resistive structure alone": (None, {"conductivity_ratio": 0.01}),
+}
+EGG = (0.03, -0.02, 0.04, 0.05)
+SCENES = {
+    "circle": (1, contacts(contact())),
+    "ellipse": (2, contacts(contact(e=(0.2, -0.1)))),
+    "rounded": (2, contacts(contact(e=(0.2, -0.1), waves=EGG))),
+    "soft": (2, contacts(contact(e=(0.2, -0.1), edge=0.5))),
+    "soft ring": (2, contacts(contact(waves=EGG, edge=0.4, hole=0.6))),
+    "overlapping": (
+        2,
+        contacts(
+            contact(-0.004, 0.001, 0.009, peak=0.9, edge=0.5),
+            contact(0.005, -0.002, 0.007, peak=0.6),
+        ),
+    ),
+}
+PLENTY_S = 30.0
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A sensor's fit and field, and the data that contacts on it make."""
+
+    fit: FieldFit
+    field: PressureField
+
+    @classmethod
+    def of(cls, forward: ForwardModel, description: SensorDescription) -> Sensor:
+        magnitude = description.magnitude
+        graded = GradedResponse.of(magnitude.response) if magnitude else None
+        return cls(FieldFit(forward, description), PressureField.on(forward, graded))
+
+    def family(self, each: FloatArray, order: int) -> PressureField:
+        return self.field.of(each, order, fits_peaks=Channel.MAGNITUDE in self.fit.responses)
+
+    def no_data(self) -> Measured:
+        none = np.zeros(len(self.fit.forward.bare_voltages))
+        return {name: measured(none) for name in self.fit.responses}
+
+    def at(self, each: FloatArray, order: int, data: Measured) -> FittedField:
+        family = self.family(each, order)
+        return evaluated(self.fit, family, family.join(each), data)
+
+    def changes(self, fitted: FittedField) -> dict[Channel, FloatArray]:
+        """Relative changes (M,) of each sheet's voltages."""
+        bare = self.fit.forward.bare_voltages
+        return {
+            name: (solution.voltages - bare) / np.abs(bare)
+            for name, solution in fitted.solutions.items()
+        }
+
+    def settled(self, start: FittedField, data: Measured) -> FittedField:
+        """The minimum below a start, closer than a frame would ever ask for it."""
+        for _ in range(100):
+            better = self.fit.refine(start, data, Budget(PLENTY_S), 0.0, steps=1)
+            if better.cost > start.cost * (1 - 1e-6) and better.damping < 1e3:
+                return better
+            start = better
+        return start
+
+
+def evaluated(
+    fit: FieldFit,
+    family: Family,
+    parameters: FloatArray,
+    data: Measured,
+    log_ratio: float | None = None,
+) -> FittedField:
+    ratio = fit.likely if log_ratio is None else log_ratio
+    fitted = fit.evaluate(family, parameters, ratio, data, len(fit.forward.bare.pressable))
+    assert fitted is not None
+    return fitted
+
+
+def data_of(
+    exact: Mapping[Channel, FloatArray], sigma: float, rng: np.random.Generator | None = None
+) -> Measured:
+    """Data of a noise, of which there is none without a generator."""
+    noise = 0.0 if rng is None else sigma
+    rng = rng or np.random.default_rng(0)
+    return {
+        name: measured(change + noise * rng.standard_normal(len(change)), 1 / sigma)
+        for name, change in exact.items()
+    }
+
+
+def described(small: SensorDescription, name: str) -> SensorDescription:
+    magnitude, structure = SENSORS[name]
+    return variant(
+        small, magnitude={"response": magnitude} if magnitude else None, structure=structure
+    )
+
+
+@pytest.fixture(scope="module", params=SENSORS)
+def sensor(
+    request: pytest.FixtureRequest, forward: ForwardModel, small: SensorDescription
+) -> Sensor:
+    return Sensor.of(forward, described(small, request.param))
+
+
+def level_set_at(sensor: Sensor) -> tuple[LevelSet, FloatArray]:
+    """Two parts, with a pressure each where pressures are fitted."""
+    centres = np.array([[-0.01, 0.0], [0.012, 0.004]])
+    peaks = sensor.field if Channel.MAGNITUDE in sensor.fit.responses else None
+    level_set = LevelSet(sensor.fit.forward).owned_by(centres, peaks)
+    x, y = sensor.field.x_m, sensor.field.y_m
+    near = np.hypot(x - centres[:, :1], y - centres[:, 1:]).min(axis=0)
+    image = np.clip(1 - near / 0.016, 0, 1)
+    return level_set, level_set.parameters_of(image, np.array([0.8, 0.9]))
+
+
+@pytest.mark.parametrize("scene", [*SCENES, "level set"])
+def test_the_jacobian_passes_a_taylor_test(sensor: Sensor, scene: str) -> None:
+    """Of all sheets' residuals, by all parameters and the log ratio together."""
+    fit, rng = sensor.fit, np.random.default_rng(3)
+    data = {
+        name: measured(0.1 * rng.normal(size=len(none.change)), 1 + rng.random(len(none.change)))
+        for name, none in sensor.no_data().items()
+    }
+    if scene == "level set":
+        family: Family
+        family, parameters = level_set_at(sensor)
+    else:
+        order, each = SCENES[scene]
+        family = sensor.family(each, order)
+        parameters = family.join(each)
+    at = np.append(parameters, fit.likely)
+    here = evaluated(fit, family, parameters, data)
+    direction = rng.standard_normal(len(at))
+    orders = taylor_orders(
+        lambda p: evaluated(fit, family, p[:-1], data, p[-1]).residual,
+        at,
+        fit.jacobian(here, data) @ direction,
+        direction,
+    )
+    assert orders == pytest.approx(2, abs=0.1)
+
+
+@pytest.mark.parametrize("scene", ["circle", "soft"])
+def test_estimates_converge_as_the_mesh_is_refined(small: SensorDescription, scene: str) -> None:
+    """Voltages and what is estimated from a finer mesh's: at second order, or nearly.
+
+    The magnitude channel's go at order 1.5 on meshes as coarse as these.
+    """
+    described_ = described(small, "both graded")
+    order, each = SCENES[scene]
+    each = each.copy()
+    sensors = [
+        Sensor.of(ForwardModel(described_, solve_bare_sheet(described_, mesh)), described_)
+        for mesh in (mesh_sheet(described_, spacing) for spacing in (0.003, 0.0015, 0.00075))
+    ]
+    made = [s.changes(s.at(each, order, s.no_data())) for s in sensors]
+    for name in made[0]:
+        coarse, middle, fine = (each[name] for each in made)
+        left = np.linalg.norm(coarse - middle) / np.linalg.norm(middle - fine)
+        assert 1.3 < np.log2(left) < 2.5
+    data = data_of(made[-1], 1e-3)
+    beside = each.copy()
+    beside[:, [X, SIZE]] += 0.1
+    off = []
+    for s in sensors[:-1]:
+        found = s.settled(s.at(beside, order, data), data)
+        (one,) = s.family(each, order).split(found.parameters)
+        off.append(np.abs(one - each[0]))
+    coarse, middle = off
+    assert middle[SIZE] < 0.01  # of the radius
+    assert middle[PEAK] < 0.05  # of the table's end
+    assert (middle[[SIZE, PEAK]] < 0.5 * coarse[[SIZE, PEAK]]).all()
+    assert np.hypot(*middle[[X, Y]]) * UNIT_M < 1e-4
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_fit_explains_what_its_own_model_made(sensor: Sensor, scene: str) -> None:
+    """Without noise or model error a field comes back from a start beside it."""
+    order, each = SCENES[scene]
+    truth = sensor.at(each, order, sensor.no_data())
+    data = data_of(sensor.changes(truth), 0.001)
+    beside = each.copy()
+    beside[:, X] -= 0.2
+    beside[:, Y] += 0.15
+    beside[:, SIZE] += 0.1
+    beside[:, PEAK] -= 0.07
+    start = sensor.at(beside, order, data)
+    found = sensor.fit.refine(start, data, Budget(PLENTY_S), good_enough=0.2)
+    assert start.misfit > 3
+    assert found.misfit <= 0.5
+    assert found.converged
+    one, other = on_nodes(truth), on_nodes(found)
+    assert np.minimum(one[0], other[0]).sum() / one[0].sum() > 0.95
+    if Channel.MAGNITUDE in sensor.fit.responses:
+        force, found_force = (
+            pressed @ sensor.fit.forward.node_areas_m2 for _, pressed in (one, other)
+        )
+        assert found_force == pytest.approx(force, rel=0.06)
+
+
+def on_nodes(fitted: FittedField) -> FloatArray:
+    """What is enclosed, and the pressure on what is pressed, (2, P)."""
+    assert isinstance(fitted.family, PressureField)
+    values = np.zeros((2, len(fitted.family.x_m)))
+    drawing = fitted.drawing
+    values[:, drawing.nodes] = drawing.enclosed, drawing.share * drawing.pressure_kpa
+    return values
+
+
+@pytest.mark.parametrize("scene", ["circle", "soft"])
+def test_parameters_scatter_as_their_covariance_says(sensor: Sensor, scene: str) -> None:
+    """Place, size, and where the sheet is graded peak and edge.
+
+    What voltages hardly tell is known from before: edges are as wide apart as the prior says.
+    """
+    order, each = SCENES[scene]
+    sigma, rng = 0.003, np.random.default_rng(8)
+    index = sensor.family(each, order).index[0, [X, Y, SIZE, PEAK, EDGE]]
+    index = index[index >= 0]
+    off = []
+    for _ in range(80):
+        true = each.copy()
+        if each[0, EDGE]:
+            drawn = HERTZ + PRIOR_SIGMA[EDGE] * rng.standard_normal()
+            true[0, EDGE] = np.clip(drawn, *EDGE_LIMITS)
+        truth = sensor.at(true, order, sensor.no_data())
+        data = data_of(sensor.changes(truth), sigma, rng)
+        found = sensor.settled(sensor.fit.compare(truth, data), data)
+        J, (precision, _) = sensor.fit.jacobian(found, data), sensor.fit.prior(found)
+        covariance = covariance_of(J, precision, data, found.misfit)
+        spread = np.sqrt(np.diag(covariance))[:-1]
+        off.append(((found.parameters - truth.parameters) / spread)[index])
+    within = np.abs(off) < 1
+    assert within.mean() == pytest.approx(0.68, abs=0.1)
+    assert within.mean(axis=0) == pytest.approx(0.68, abs=0.2)
+
+
+def test_what_the_data_leave_unexplained_widens_the_covariance(sensor: Sensor) -> None:
+    order, each = SCENES["circle"]
+    truth = sensor.at(each, order, sensor.no_data())
+    data = data_of(sensor.changes(truth), 0.003)
+    J = sensor.fit.jacobian(sensor.fit.compare(truth, data), data)
+    precision, _ = sensor.fit.prior(truth)
+    good, bad = (covariance_of(J, precision, data, misfit) for misfit in (0.5, 3.0))
+    np.testing.assert_allclose(bad, 9 * good)
+
+
+def test_a_budget_that_is_used_up_leaves_a_better_field_that_has_not_converged(
+    sensor: Sensor,
+) -> None:
+    order, each = SCENES["ellipse"]
+    data = data_of(sensor.changes(sensor.at(each, order, sensor.no_data())), 0.002)
+    field = sensor.at(contacts(contact(-0.01, 0.003, 0.009)), order, data)
+    for _ in range(3):
+        better = sensor.fit.refine(field, data, Budget(0.0), good_enough=0.0)
+        assert better.cost <= field.cost
+        assert not better.converged
+        field = better
+
+
+def test_more_than_a_deadline_allows_is_not_solved(sensor: Sensor, solves: list[int]) -> None:
+    order, each = SCENES["circle"]
+    family = sensor.family(each, order)
+    none = sensor.fit.evaluate(family, family.join(each), 1.0, sensor.no_data(), max_pressed=5)
+    assert none is None
+    assert not solves
+
+
+def test_holding_a_field_against_other_data_is_what_solving_it_would_say(
+    sensor: Sensor, solves: list[int]
+) -> None:
+    order, each = SCENES["soft"]
+    field = sensor.at(each, order, sensor.no_data())
+    change = np.linspace(-1, 1, len(sensor.fit.forward.bare_voltages))
+    data = {name: measured(change, np.linspace(1, 2, len(change))) for name in sensor.fit.responses}
+    solves.clear()
+    compared = sensor.fit.compare(field, data)
+    assert not solves
+    solved = sensor.at(each, order, data)
+    np.testing.assert_array_equal(compared.residual, solved.residual)
+    assert compared.cost == solved.cost
+    assert compared.misfit == pytest.approx(
+        np.sqrt(np.mean([solved.misfit_of(name) ** 2 for name in data]))
+    )
+
+
+def test_a_sheet_that_is_lost_and_comes_back_is_left_out_and_solved(
+    forward: ForwardModel, small: SensorDescription, solves: list[int]
+) -> None:
+    sensor = Sensor.of(forward, described(small, "both"))
+    order, each = SCENES["circle"]
+    both = sensor.at(each, order, sensor.no_data())
+    exact = data_of(sensor.changes(both), 0.002)
+    alone = {Channel.STRUCTURE: exact[Channel.STRUCTURE]}
+    solves.clear()
+    left = sensor.fit.compare(both, alone)
+    assert not solves
+    assert list(left.residuals) == [Channel.STRUCTURE]
+    again = sensor.fit.compare(left, exact)
+    assert solves
+    assert again.residuals.keys() == exact.keys()
+    assert again.misfit == pytest.approx(sensor.fit.compare(both, exact).misfit)
+
+
+def test_a_field_pushed_off_the_sheet_stays_on_it(sensor: Sensor) -> None:
+    """Data of a contact half beyond the rim, and a start in the corner."""
+    width, height = 0.06, 0.05
+    beyond = contacts(contact(width / 2, 0.005, 0.009))
+    made = sensor.changes(sensor.at(beyond, 1, sensor.no_data()))
+    data = data_of(made, 0.01, np.random.default_rng(2))
+    start = sensor.at(contacts(contact(width / 2 - 0.002, height / 2, 0.006)), 2, data)
+    found = sensor.fit.refine(start, data, Budget(PLENTY_S), 1.0)
+    assert isinstance(found.family, PressureField)
+    (one,) = found.family.split(found.parameters)
+    assert np.isfinite(one).all()
+    assert abs(one[X]) * UNIT_M <= width / 2
+    assert abs(one[Y]) * UNIT_M <= height / 2
+    assert found.cost < start.cost
