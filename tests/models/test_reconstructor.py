@@ -57,7 +57,7 @@ def test_one_press_is_found_with_its_pressure(
 ) -> None:
     press = press_mm(*place)
     frame = settle(reconstructor, skin, press)
-    assert frame.tier == "hybrid"
+    assert frame.tier == "fit"
     assert frame.flags == Flag(0)
     assert frame.misfit < 1.5
     (contact,) = frame.contacts

@@ -84,7 +84,7 @@ def messages_of(number: int, changes: Mapping[str, Any]) -> list[tuple[str, byte
         "acquired_monotonic_ns": monotonic_ns,
         "device_us": monotonic_ns // 1000,
         "age_ns": 7_000_000,
-        "tier": "quiet" if not contacts_of(number) else "hybrid",
+        "tier": "quiet" if not contacts_of(number) else "fit",
         "tier_reason": None,
         "flags": ["misfit_high"] if number in (33, 34) else [],
         "misfit": 1.0 + 0.01 * (number % 7),

@@ -120,7 +120,7 @@ class Frame:
     skew_ms: float | None
     """The magnitude scan's time less the structure scan's; None where that is not known."""
     tier: str | None
-    """What made the frame: ``quiet``, ``fit``, ``hybrid``, ..., or an own method's name."""
+    """What made the frame: ``quiet``, ``fit``, ``network``, ..., or an own method's name."""
     tier_reason: str | None
     flags: frozenset[str]
     """What to be wary of, such as ``misfit_high``; empty when all is well. See STREAM.md."""

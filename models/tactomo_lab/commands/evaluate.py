@@ -83,8 +83,8 @@ def scenes(
     are simulated on another, finer mesh than the one that reconstructs. The first run simulates
     (half a second a scene) and keeps the voltages in the cache.
 
-    A frame whose *misfit*, in units of the scans' noise, is above 2 (1.5 over both channels, for
-    *hybrid*) is flagged misfit_high; about 1 is good.
+    A frame whose *misfit*, in units of the scans' noise, is above 2 (1.5 over both channels, where
+    an unsure network stands in) is flagged misfit_high; about 1 is good.
     """
     from tactomo_models import load_description
 

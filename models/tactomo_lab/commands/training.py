@@ -25,7 +25,7 @@ INTERRUPTED = 130
 
 # The models' CONFIGURATIONS, which are not imported for a command line that only shows its help.
 ConfigurationName: TypeAlias = Literal[
-    "ours", "ours-small", "ours-single", "refiner", "paper-single", "paper-multimodal"
+    "ours", "ours-small", "ours-single", "paper-single", "paper-multimodal"
 ]
 
 app = typer_app()
@@ -92,7 +92,7 @@ def simulate(
     epilog=examples(
         "tactomo models train scenes/robust",
         "tactomo models train scenes/robust --epochs 5 --output trial.onnx",
-        "tactomo models train scenes/robust --configuration refiner --start scenes/robust/ours.pt",
+        "tactomo models train scenes/robust --start scenes/robust/ours.pt --checkpoint more.pt",
         "tactomo models train scenes/paper --configuration paper-multimodal --device cuda",
     ),
 )
@@ -135,11 +135,9 @@ def train(
     correlation (ICC) of the found map with the truth, by noise and number of contacts.
 
     *ours* takes both channels' voltages, *ours-small* is half as wide, *ours-single* has the
-    magnitude channel alone; *refiner* redraws what the physics has found with the help of *ours*,
-    which is trained first: give its checkpoint by --start. All these want the preset robust.
-    *paper-single* and *paper-multimodal* are the paper's, on scenes of the preset paper. What the
-    physics makes of the scenes, for the refiner and the paper's two, is computed first and kept
-    beside them. All take one to two hours on two cores.
+    magnitude channel alone. All these want the preset robust. *paper-single* and *paper-multimodal*
+    are the paper's, on scenes of the preset paper, whose images are computed first and kept beside
+    them. All take one to two hours on two cores.
 
     A network that is written to the cache is used from then on for this sensor, instead of the one
     that ships; delete it to go back. Needs `pip install 'tactomo-lab[train]'`.
@@ -181,25 +179,19 @@ def train(
 def _prepare(
     configuration: str, folder: Path, sensor: str, seed: int, jobs: int | None, start: Path | None
 ) -> Prepared:
-    """Read the scenes; some networks need to see first what other methods make of them."""
+    """Read the scenes; the paper's networks need images of them first."""
     from rich.console import Console
     from tactomo_models import load_description
 
     from tactomo_lab.training.configurations import CONFIGURATIONS, check_scenes, prepare
     from tactomo_lab.training.preliminary import make_images
-    from tactomo_lab.training.refiner_inputs import MAX_REFINER_SCENES, make_refiner_inputs
     from tactomo_lab.training.training_scenes import read_manifest
 
     description, chosen = load_description(sensor), CONFIGURATIONS[configuration]
     check_scenes(chosen, folder, description)
-    scenes = read_manifest(folder).scenes
-    if chosen.kind == "refiner":
-        scenes = min(scenes, MAX_REFINER_SCENES)
-        steps = make_refiner_inputs(description, folder, scenes, jobs=jobs or -1)
-        _follow(steps, scenes, "scenes reconstructed by the physics", folder)
-    elif chosen.kind != "network":
+    if chosen.kind != "network":
         steps = make_images(description, folder, jobs=jobs or -1)
-        _follow(steps, scenes, "images of the scenes", folder)
+        _follow(steps, read_manifest(folder).scenes, "images of the scenes", folder)
     with Console(stderr=True).status(f"reading {folder}"):
         return prepare(chosen, folder, description, seed, start)
 

@@ -89,8 +89,9 @@ class SceneBatches:
         self._contacts = torch.as_tensor(scenes["contacts"].astype(np.int64))
         self.nodes = (int(self._map.shape[1]), int(self._map.shape[2]))
         self.turns = len(self._symmetries)
-        self.held_out = range(trained_of(len(self._map)), len(self._map))
-        self.trained = range(self.held_out.start)
+        scenes_there = len(self._map)
+        self.trained = range(min(int(scenes_there * (1 - HELD_OUT)), scenes_there - 1))
+        self.held_out = range(len(self.trained), scenes_there)  # one at least
 
     @property
     def inputs(self) -> int:
@@ -143,11 +144,6 @@ class SceneBatches:
             pressed=self._pressed[scenes].float().flatten(1)[:, nodes].view(count, *self.nodes),
             contacts=self._contacts[scenes],
         )
-
-
-def trained_of(scenes: int) -> int:
-    """How many of some scenes are trained on: all but the held-out ones, of which there is one."""
-    return min(int(scenes * (1 - HELD_OUT)), scenes - 1)
 
 
 class _Channel:

@@ -10,7 +10,7 @@ from typing import Final, cast
 import torch
 from tactomo_models.arrays import FloatArray
 from tactomo_models.errors import ModelError
-from tactomo_models.methods.trained_networks import SensorNetworks, outputs_of
+from tactomo_models.methods.trained_networks import outputs_of
 from tactomo_models.physics.artifact import load_or_build_artifact
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.sensor.description import SensorDescription
@@ -22,12 +22,7 @@ from tactomo_lab.scenes.presets import PresetName
 from tactomo_lab.training.batches import SceneBatches
 from tactomo_lab.training.export import export, notes_of
 from tactomo_lab.training.networks import FusionNetwork, PaperNetwork
-from tactomo_lab.training.objectives import (
-    FusionObjective,
-    PaperObjective,
-    RefinerObjective,
-    linear_images,
-)
+from tactomo_lab.training.objectives import FusionObjective, PaperObjective, linear_images
 from tactomo_lab.training.train import Objective, Settings, Training, load_weights
 from tactomo_lab.training.training_scenes import read_manifest
 
@@ -65,9 +60,6 @@ CONFIGURATIONS: Final[dict[str, Configuration]] = {
     "ours": Configuration("network", "robust", BOTH, 24, _OURS),
     "ours-small": Configuration("network", "robust", BOTH, 12, _OURS),
     "ours-single": Configuration("network", "robust", (Channel.MAGNITUDE,), 24, _OURS),
-    "refiner": Configuration(
-        "refiner", "robust", BOTH, 24, Settings(epochs=16, batch=64, rate=1e-3)
-    ),
     "paper-single": Configuration(
         "cnn-single", "paper", (Channel.MAGNITUDE,), 12, _SHORT, hidden=256
     ),
@@ -118,12 +110,10 @@ def prepare(
 
     Args:
         configuration: what is to be made.
-        folder: of simulated scenes; with their images, for the paper's networks; with their
-            refiner inputs, for the refiner.
+        folder: of simulated scenes; with their images, for the paper's networks.
         description: the sensor.
         seed: of the network's first weights.
-        start: checkpoint whose averaged weights it begins with; a refiner may begin with those of
-            a network that is given no images.
+        start: checkpoint whose averaged weights it begins with.
 
     Raises:
         ModelError: the scenes are of another sensor or preset, or something is missing.
@@ -141,16 +131,6 @@ def prepare(
             load_weights(network, start)
         bases = dict(zip(configuration.channels, batches.bases, strict=True))
         return Prepared(configuration, description, network, FusionObjective(batches), scale, bases)
-    if configuration.kind == "refiner":
-        proposing = SensorNetworks(description).fusion
-        redrawn = RefinerObjective(folder, description, list(proposing.bases.values()), scale)
-        nodes = redrawn.nodes
-        network = FusionNetwork(redrawn.inputs, nodes, configuration.width, scale, images=2)
-        if start is not None:
-            other = FusionNetwork(redrawn.inputs, nodes, configuration.width, scale)
-            load_weights(other, start)
-            network.start_from(other)
-        return Prepared(configuration, description, network, redrawn, scale, proposing.bases)
     objective = PaperObjective(folder, multimodal=len(configuration.channels) == 2, scale=scale)
     paper = PaperNetwork(
         len(configuration.channels), objective.nodes, configuration.width, configuration.hidden
@@ -176,8 +156,6 @@ def export_trained(prepared: Prepared, training: Training, path: Path) -> None:
     else:
         network = cast(FusionNetwork, training.averaged)
         example["data"] = torch.zeros(1, network.inputs)
-        if network.images:
-            example["seen"] = torch.zeros(1, network.images, *network.nodes)
     notes = notes_of(
         configuration.kind,
         prepared.description,

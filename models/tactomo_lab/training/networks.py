@@ -14,8 +14,6 @@ from tactomo_models.arrays import FloatArray
 from torch import Tensor, nn
 from torch.nn import functional as fn
 
-MIN_ODDS = 1e-3  # of a shape that is certain: its cross entropy must stay finite
-
 
 class FusionNetwork(nn.Module):
     """Ours: from both channels' filtered voltages to the map, the pressed shape and a confidence.
@@ -28,15 +26,10 @@ class FusionNetwork(nn.Module):
         nodes: (rows, columns) of the map.
         width: channels at half of the map's resolution; twice that at a quarter.
         scale: relative conductivity change that counts as 1 inside.
-        images: how many images it is given beside the voltages: the map over the scale and the
-            pressed shape that another method has found.
     """
 
-    def __init__(
-        self, inputs: int, nodes: tuple[int, int], width: int, scale: float, images: int = 0
-    ) -> None:
+    def __init__(self, inputs: int, nodes: tuple[int, int], width: int, scale: float) -> None:
         super().__init__()
-        self.images = images
         self.inputs, self.nodes, self.width, self.scale = inputs, nodes, width, scale
         self.half = ((nodes[0] + 1) // 2, (nodes[1] + 1) // 2)
         self.quarter = ((self.half[0] + 1) // 2, (self.half[1] + 1) // 2)
@@ -49,7 +42,7 @@ class FusionNetwork(nn.Module):
             nn.GELU(),
             nn.Linear(16 * width, width * self.quarter[0] * self.quarter[1]),
         )
-        self.fine = nn.Sequential(_Conv(width // 3 + 4 * images, width), _Residual(width))
+        self.fine = nn.Sequential(_Conv(width // 3, width), _Residual(width))
         self.down = _Conv(width, wide, stride=2)
         self.coarse = nn.Sequential(_Conv(wide + width, wide), _Residual(wide), _Residual(wide))
         self.up = nn.Sequential(nn.Conv2d(wide, 4 * width, 1), nn.PixelShuffle(2))
@@ -59,56 +52,34 @@ class FusionNetwork(nn.Module):
             nn.PixelShuffle(2),
             nn.ReLU(),
         )
-        self.last = nn.Conv2d(width // 2 + images, 4 if images else 3, 3, padding=1)
+        self.last = nn.Conv2d(width // 2, 3, 3, padding=1)
         with torch.no_grad():  # begin with nothing pressed, as most of a map is
             assert self.last.bias is not None
-            self.last.bias[:3] = torch.tensor([-3.0, -3.0, 0.0])
+            self.last.bias.copy_(torch.tensor([-3.0, -3.0, 0.0]))
         self.trust = nn.Sequential(nn.Linear(2 * wide + inputs, 64), nn.GELU(), nn.Linear(64, 1))
 
-    def forward(self, x: Tensor, seen: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """From filtered data (n, K) to map and pressed shape (n, rows, columns), confidence (n,).
 
-        Images (n, images, rows, columns) of another method go in beside the data. The map is
-        |relative conductivity change|, the shape 0 to 1, the confidence the expected correlation
-        of the map with the truth.
+        The map is |relative conductivity change|, the shape 0 to 1, the confidence the expected
+        correlation of the map with the truth.
         """
-        size, shape, trust = self.raw(x, seen)
+        size, shape, trust = self.raw(x)
         return size * self.scale, torch.sigmoid(shape), torch.sigmoid(trust)
 
-    def raw(self, x: Tensor, seen: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    def raw(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The map over the scale, and the logarithmic odds of shape and confidence."""
         image = self.image(x).view(-1, self.width // 3, *self.half)
-        if seen is not None:
-            rows, columns = (
-                2 * half - nodes for half, nodes in zip(self.half, self.nodes, strict=True)
-            )
-            seen = fn.pad(seen, (0, columns, 0, rows))  # to whole squares of four nodes
-            image = torch.cat([image, fn.pixel_unshuffle(seen, 2)], dim=1)
         fine = self.fine(image)
         whole = self.whole(x).view(-1, self.width, *self.quarter)
         coarse = self.coarse(torch.cat([self.down(fine), whole], dim=1))
         up = self.up(coarse)[..., : self.half[0], : self.half[1]]
-        drawn = self.draw(self.join(torch.cat([up, fine], dim=1)))
-        drawn = self.last(drawn if seen is None else torch.cat([drawn, seen], dim=1))
-        shape, edge, size, *doubt = drawn[..., : self.nodes[0], : self.nodes[1]].unbind(1)
+        drawn = self.last(self.draw(self.join(torch.cat([up, fine], dim=1))))
+        shape, edge, size = drawn[..., : self.nodes[0], : self.nodes[1]].unbind(1)
         size = torch.sigmoid(edge) * fn.softplus(size)
-        if seen is not None:  # what is not doubted stays as it was seen
-            share = torch.sigmoid(doubt[0].float())
-            seen_size, seen_shape = seen[:, :2, : self.nodes[0], : self.nodes[1]].unbind(1)
-            size = torch.lerp(seen_size, size.float(), share)
-            drawn_shape = torch.lerp(seen_shape, torch.sigmoid(shape.float()), share)
-            shape = torch.logit(drawn_shape, eps=MIN_ODDS)
         pooled = torch.cat([coarse.mean((2, 3)), coarse.amax((2, 3)), x], dim=1).detach()
         trust = self.trust(pooled).squeeze(1)
         return size, shape, trust
-
-    def start_from(self, other: FusionNetwork) -> None:
-        """Begin as a network that is given no images: they count for nothing at first."""
-        with torch.no_grad():
-            for name, weight in self.state_dict().items():
-                known = other.state_dict()[name]
-                weight.zero_()
-                weight[tuple(slice(0, size) for size in known.shape)] = known
 
     def start_linear(self, images: FloatArray) -> None:
         """Let the first image channels begin as the best linear estimates (2, rows, columns, K)."""

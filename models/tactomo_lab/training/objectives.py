@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from scipy.linalg import block_diag
 from scipy.ndimage import gaussian_filter
-from tactomo_models.arrays import FloatArray
-from tactomo_models.methods.prefilter import BANDS
-from tactomo_models.sensor.description import SensorDescription
-from tactomo_models.sensor.symmetry import Symmetry, symmetries
 from torch import Tensor, nn
 
 from tactomo_lab.baselines.paper_network import FILTER_SIGMA, preprocessed
-from tactomo_lab.training.batches import Batch, SceneBatches, trained_of
+from tactomo_lab.training.batches import Batch, SceneBatches
 from tactomo_lab.training.preliminary import read_images
-from tactomo_lab.training.refiner_inputs import read_refiner_inputs
 from tactomo_lab.training.training_scenes import read_scenes
 
 MIN_CHANGE = 0.4  # squared sum of a map below which scenes count less: 25 nodes of half a range
@@ -86,85 +79,6 @@ def image_loss(made: tuple[Tensor, Tensor, Tensor], true: Tensor, pressed: Tenso
     told = nn.functional.binary_cross_entropy_with_logits(trust, right, reduction="none")
     of_trust = (told * (true.amax((1, 2)) > 0)).mean()
     return torch.as_tensor(of_map + SHAPE_SHARE * of_shape + TRUST_SHARE * of_trust)
-
-
-class RefinerObjective:
-    """The refining network's: better images from those that the physics has found.
-
-    Args:
-        folder: of simulated scenes whose refiner inputs are made, see `training.refiner_inputs`.
-        description: the sensor.
-        bases: (M, K) signal basis of each channel, as of the network that proposed.
-        scale: relative conductivity change that counts as 1.
-    """
-
-    def __init__(
-        self,
-        folder: Path,
-        description: SensorDescription,
-        bases: Sequence[FloatArray],
-        scale: float,
-    ) -> None:
-        seen_inputs = read_refiner_inputs(folder)
-        seen = np.stack([seen_inputs["map"] / np.float16(scale), seen_inputs["structure"]], axis=1)
-        self._inputs = torch.as_tensor(seen_inputs["inputs"])
-        self._seen = torch.as_tensor(seen)
-        self._map, self._pressed = (
-            torch.as_tensor(seen_inputs[k]) for k in ("true_map", "pressed")
-        )
-        self._contacts = torch.as_tensor(seen_inputs["contacts"].astype(np.int64))
-        self._snr_db = torch.as_tensor(seen_inputs["snr_db"])
-        self._turns = [
-            (torch.as_tensor(turn.nodes), _turned_inputs(turn, bases))
-            for turn in symmetries(description)
-        ]
-        self._scale = scale
-        self.scenes = trained_of(len(self._inputs))
-        self.nodes = (description.map.nodes_y, description.map.nodes_x)
-
-    @property
-    def inputs(self) -> int:
-        """Numbers that the network is given beside the images."""
-        return int(self._inputs.shape[1])
-
-    def loss(
-        self, network: nn.Module, chosen: Tensor, random: torch.Generator, device: str
-    ) -> Tensor:
-        """See `image_loss`."""
-        turn = int(torch.randint(len(self._turns), (1,), generator=random))
-        nodes, matrix = self._turns[turn]
-        seen, true, pressed = (
-            images[chosen].float().flatten(-2)[..., nodes].unflatten(-1, self.nodes)
-            for images in (self._seen, self._map, self._pressed)
-        )
-        made = network.raw((self._inputs[chosen] @ matrix.T).to(device), seen.to(device))
-        return image_loss(made, true.to(device) / self._scale, pressed.to(device))
-
-    def examine(self, network: nn.Module, device: str) -> dict[str, float]:
-        """Correlation with the truth, by noise, of what goes in and of what comes out."""
-        held_out = torch.arange(self.scenes, len(self._inputs))
-        before, after = [], []
-        for chosen in held_out.split(256):
-            seen = self._seen[chosen].float()
-            size, _, _ = network(self._inputs[chosen].to(device), seen.to(device))
-            truth = self._map[chosen].float()
-            before.append(correlations(seen[:, 0], truth))
-            after.append(correlations(size.cpu().float(), truth))
-        found, noise = {}, self._snr_db[held_out]
-        for low, high in ((30, 60), (15, 30), (8, 15)):
-            band = (noise >= low) & (noise < high)
-            found[f"{low}-{high} dB, seen"] = float(torch.cat(before)[band].mean())
-            found[f"{low}-{high} dB, refined"] = float(torch.cat(after)[band].mean())
-        return found
-
-
-def _turned_inputs(turn: Symmetry, bases: Sequence[FloatArray]) -> Tensor:
-    """Matrix (K, K) that takes filtered data to those of the turned scene."""
-    blocks = []
-    for basis in bases:
-        turned = basis[turn.scan] * turn.sign[:, None]
-        blocks += [np.linalg.pinv(basis) @ turned, np.eye(BANDS)]
-    return torch.as_tensor(block_diag(*blocks)).float()
 
 
 def correlations(images: Tensor, truths: Tensor) -> Tensor:

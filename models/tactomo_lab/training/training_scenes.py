@@ -265,7 +265,6 @@ def make_shards(
     shards: Iterable[tuple[int, int]],
     make: Callable[[int, int], dict[str, Any]],
     *,
-    is_there: Callable[[Path, int], bool] | None = None,
     jobs: int = -1,
 ) -> Iterator[int]:
     """Make what is missing of some shards, on several cores.
@@ -275,7 +274,6 @@ def make_shards(
         what: begins the names of the files.
         shards: number of the first scene of each, and how many scenes it has.
         make: makes the arrays of a shard from both.
-        is_there: whether a file with so many scenes need not be made; `is_whole` if None.
         jobs: processes; -1 for one on every core.
 
     Yields:
@@ -287,8 +285,7 @@ def make_shards(
     from joblib import Parallel, delayed
 
     sizes = dict(shards)
-    is_there = is_there or is_whole
-    missing = [n for n in sizes if not is_there(shard_path(folder, n, what), sizes[n])]
+    missing = [n for n in sizes if not is_whole(shard_path(folder, n, what), sizes[n])]
     yield sum(sizes.values()) - sum(sizes[first] for first in missing)
 
     def numbered(first: int, size: int) -> tuple[int, dict[str, Any]]:

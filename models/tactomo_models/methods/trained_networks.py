@@ -33,13 +33,13 @@ FORMAT = 1
 CHANNELS_KEY = "modalities"  # as the files of this format have it
 SHIPPED = Path(str(files("tactomo_models.methods"))) / "networks"
 NONE_TRAINED = "none is trained for this sensor"
-FUSION: Final = ("network", "refiner")
-"""Our kinds of networks. One of any other kind makes a map of an image of each channel."""
+FUSION: Final = "network"
+"""Our kind of network. One of any other kind makes a map of an image of each channel."""
 
 
 def outputs_of(kind: str) -> tuple[str, ...]:
     """Names of a network's outputs."""
-    return ("map", Channel.STRUCTURE, "confidence") if kind in FUSION else ("map",)
+    return ("map", Channel.STRUCTURE, "confidence") if kind == FUSION else ("map",)
 
 
 @dataclass(frozen=True)
@@ -92,10 +92,8 @@ class Network:
     def _input_shapes(
         self, description: SensorDescription, kind: str
     ) -> dict[str, tuple[int, ...]]:
-        if kind in FUSION:
-            components = description.measurements // 2 + BANDS
-            data: dict[str, tuple[int, ...]] = {"data": (len(self.channels) * components,)}
-            return data if kind == "network" else {**data, "seen": (2, *self._nodes)}
+        if kind == FUSION:
+            return {"data": (len(self.channels) * (description.measurements // 2 + BANDS),)}
         return dict.fromkeys(self.channels, self._nodes)
 
     @cached_property
@@ -120,14 +118,13 @@ class FusionNetwork:
     """Our network and its prefilters, for one sensor.
 
     Args:
-        network: of the kind "network", or "refiner", which is given another method's images, too.
+        network: of the kind `FUSION`.
     """
 
     def __init__(self, network: Network) -> None:
         magnitude_error = 0.1  # of the range: two in three of our network's err by no more
         self._network = network
-        self._scale = np.float32(network.notes["scale"])
-        self._sigma = magnitude_error * float(self._scale)
+        self._sigma = magnitude_error * float(network.notes["scale"])
         bases = np.load(io.BytesIO(b64decode(network.notes["bases"])), allow_pickle=False)
         #: (M, K) of each channel's prefilter
         self.bases = {name: bases[name].astype(np.float64) for name in network.channels}
@@ -140,7 +137,6 @@ class FusionNetwork:
         self,
         changes: Mapping[Channel, FloatArray],
         precision: Mapping[Channel, FloatArray],
-        seen: tuple[Image, Image] | None = None,
     ) -> NetworkImage:
         """Reconstruct a frame.
 
@@ -148,19 +144,14 @@ class FusionNetwork:
             changes: (M,) relative voltage changes, in the direction of pressing, of each channel
                 that has a scan.
             precision: (M,) inverse variance of each by noise; 0 where there is no voltage.
-            seen: map and structure (nodes_y, nodes_x) that the physics has found, for a network
-                that redraws them.
         """
         faint = 0.05  # share pressed below which nothing is: a solve goes by the area that is not 0
-        inputs: dict[str, Any] = {"data": self.filtered(changes, precision)}
-        if seen is not None:
-            inputs["seen"] = np.stack([seen[0] / self._scale, seen[1]])
-        made = self._network.run(inputs)
+        made = self._network.run({"data": self._filtered(changes, precision)})
         structure = made[Channel.STRUCTURE].copy()
         structure[structure < faint] = 0.0
         return NetworkImage(made["map"].copy(), structure, float(made["confidence"]), self._sigma)
 
-    def filtered(
+    def _filtered(
         self, changes: Mapping[Channel, FloatArray], precision: Mapping[Channel, FloatArray]
     ) -> FloatArray:
         """What the network is given of a frame's voltages, (K,); the arguments are `image`'s."""
@@ -183,7 +174,7 @@ class FusionNetwork:
 
 
 class SensorNetworks:
-    """The networks of one sensor, each loaded when it is first asked for.
+    """Our network of one sensor, loaded when it is first asked for.
 
     Args:
         description: the sensor.
@@ -194,30 +185,22 @@ class SensorNetworks:
 
     @cached_property
     def fusion(self) -> FusionNetwork:
-        """Ours alone.
+        """The network and its prefilters.
 
         Raises:
-            ArtifactError: there is none, or it cannot be used; as for the others.
+            ArtifactError: there is none, or it cannot be used.
         """
-        return FusionNetwork(load_network(self._description, "network"))
-
-    @cached_property
-    def refiner(self) -> FusionNetwork:
-        """The one that redraws what the physics has found."""
-        return FusionNetwork(load_network(self._description, "refiner"))
+        return FusionNetwork(load_network(self._description, FUSION))
 
     @cached_property
     def missing(self) -> str:
-        """Why the physics has to do without networks; empty where it need not."""
+        """Why the physics has to do without a network; empty where it need not."""
         if len(self._description.channels) < 2:
             return f"{NONE_TRAINED}: it has a single channel"
-        absent = [kind for kind in FUSION if find_network(self._description, kind) is None]
-        if len(absent) == 1:
-            return f"the {absent[0]} is not trained yet; see `tactomo models train`"
-        if absent:
-            return outgrown(self._description, "network") or NONE_TRAINED
+        if find_network(self._description, FUSION) is None:
+            return outgrown(self._description, FUSION) or NONE_TRAINED
         try:
-            _ = self.fusion, self.refiner
+            _ = self.fusion
         except ArtifactError as error:
             return str(error)
         return ""

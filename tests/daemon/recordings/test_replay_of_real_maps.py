@@ -69,7 +69,7 @@ def test_the_replay_of_a_pressed_skin_gives_the_same_maps(
     hardest = max(contact["pressure_kpa"] for contact in pressed["contacts"])
     assert 240 < hardest <= told["range_kpa"][1]
     assert np.nanmax(array_from_wire(pressed["pressure_kpa"])) == pytest.approx(hardest)
-    assert {"quiet", "hybrid", "fit", "network"} == {frame["tier"] for frame in live}
+    assert {"quiet", "fit", "network"} == {frame["tier"] for frame in live}
     again = replay(path, real=True).of("map")
     assert len(again) == len(live) == open_recording(path).summary.frames
     for one, other in zip(live, again, strict=True):

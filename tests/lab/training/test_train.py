@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -278,39 +277,8 @@ class TestCommand:
         command = ("models", "train", robust, "--configuration", "ours-small", "--epochs", 1)
         result = tactomo(*command, "--checkpoint", "ours.pt", "--description", square_file)
         assert result.returncode == 0, result.stderr
-        assert load_network(load_description(square_file), "network").path.is_relative_to(tmp_path)
-
-    def test_a_refiner_learns_from_what_the_physics_makes(
-        self,
-        tactomo: Run,
-        robust: Path,
-        square_file: Path,
-        tmp_path: Path,
-        monkeypatch: pytest.MonkeyPatch,
-    ) -> None:
-        """And with both networks a new sensor has the hybrid."""
-        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-        folder = tmp_path / "scenes"
-        shutil.copytree(robust, folder)
-        command = (
-            "models",
-            "train",
-            folder,
-            "--epochs",
-            1,
-            "--jobs",
-            1,
-            "--description",
-            square_file,
-        )
-        refiner = (*command, "--configuration", "refiner", "--start", folder / "ours.pt")
-        early = tactomo(*refiner)
-        assert early.returncode == 1
-        assert "there is no network for sensor 'small'" in early.stderr
-        assert tactomo(*command).returncode == 0
-        result = tactomo(*refiner)
-        assert result.returncode == 0, result.stderr
         description = load_description(square_file)
+        assert load_network(description, "network").path.is_relative_to(tmp_path)
         assert not SensorNetworks(description).missing
 
     def test_wrong_scenes_are_told(

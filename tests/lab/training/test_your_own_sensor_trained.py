@@ -15,12 +15,11 @@ FILE = "my_sheet.toml"
 SMALLER = {
     "--scenes 2000": "--scenes 60 --jobs 1",
     "--epochs 20": "--epochs 1 --batch 16",
-    "--epochs 3": "--epochs 1 --batch 16",
     "--count 5 --contacts 1-4": "--count 1 --contacts 1",
 }
 
 
-def test_networks_of_ones_own_make_auto_hybrid(
+def test_a_network_of_ones_own_proposes_to_auto(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -33,7 +32,7 @@ def test_networks_of_ones_own_make_auto_hybrid(
         newcomer.run(press)
         said = newcomer.wait_for(f"{status} --json", '"tier": "')
         assert "no network" not in said
-        newcomer.wait_for(f"{status} --json", "network")  # hybrid, or why it gave way to a network
+        newcomer.wait_for(f"{status} --json", '"network": {')  # the time of its stage
         newcomer.stop()
         (tmp_path / FILE).write_text(PAGE.file(FILE).replace("0.005 ", "0.004 "))
         newcomer.run(demo)

@@ -81,8 +81,8 @@ def test_a_network_reads_no_other_file_and_runs_no_code_of_its_own(
 
 
 def test_a_network_of_another_kind_is_refused(shipped: Path, paper: SensorDescription) -> None:
-    with pytest.raises(ArtifactError, match="is a network, not a refiner"):
-        Network(shipped, paper, "refiner")
+    with pytest.raises(ArtifactError, match="is a network, not a cnn-single"):
+        Network(shipped, paper, "cnn-single")
 
 
 def test_a_network_of_a_channel_that_the_sensor_lacks_is_refused(
@@ -115,16 +115,12 @@ def test_other_files_are_refused(paper: SensorDescription, tmp_path: Path, conte
 
 
 def test_networks_of_a_description_as_it_was_are_said_to_be(
-    paper: SensorDescription, shipped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    paper: SensorDescription,
 ) -> None:
     moved = variant(paper, electrodes={"pitch_m": 0.035})
     with pytest.raises(ArtifactError, match=r"trained before .* changed .*: train anew"):
         load_network(moved, "network")
     assert "was trained before" in SensorNetworks(moved).missing
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    own_path(moved, "network").parent.mkdir(parents=True)
-    own_path(moved, "network").write_bytes(b"")
-    assert "the refiner is not trained yet" in SensorNetworks(moved).missing
     renamed = moved.model_copy(update={"name": "other"})
     assert SensorNetworks(renamed).missing == NONE_TRAINED
 
@@ -171,7 +167,7 @@ def test_auto_does_without_a_network_that_is_damaged(
     assert len(frame.contacts) == 1
 
 
-@pytest.mark.parametrize(("method", "tier"), [("network", "network"), ("auto", "hybrid")])
+@pytest.mark.parametrize(("method", "tier"), [("network", "network"), ("auto", "fit")])
 def test_contacts_are_found_where_they_press(
     paper: SensorDescription,
     artifact: Artifact,

@@ -50,7 +50,7 @@ def reconstruct(
     scenes that have nothing to do with each other in files of their own.
 
     `misfit` is what the model left unexplained, in units of the scans' noise: about 1 is good, and
-    above 2 (1.5 over both channels, where networks took part) the frame is flagged.
+    above 2 (1.5 over both channels, where an unsure network stands in) the frame is flagged.
 
     `flags` adds up what stands in the way of trusting a frame: 1 structure missing, 2 magnitude
     missing, 4 invalid voltage, 8 no reference, 16 misfit high, 32 not converged, 64 reference
@@ -60,10 +60,11 @@ def reconstruct(
     Methods: *tikhonov* and *noser* are one linear step, regularised so that the image is as noisy,
     relative to its signal, as the scans are (noise figure 1); *fit* models a few outlines,
     *levelset* shapes of any form, both nonlinear and down to the scans' noise; *network* is our
-    fusion network alone. *auto* takes what a frame needs: where the sensor has its networks, one
-    proposes, outlines are fitted to the scans, and a second one refines what they show; else *fit*
-    or *levelset*. The laboratory adds *pls-paper*, the level set of the paper that tactomo is
-    compared with, and the paper's networks, *cnn-single* and *cnn-multimodal*.
+    fusion network alone. *auto* takes what a frame needs: *fit* or, where a few outlines explain
+    too little, *levelset*; where the sensor has a network, the network proposes what they start
+    from, and stands in where nothing that is fitted explains the scans. The laboratory adds
+    *pls-paper*, the level set of the paper that tactomo is compared with, and the paper's networks,
+    *cnn-single* and *cnn-multimodal*.
     """
     from rich.progress import Progress
     from tactomo_models import load_description
