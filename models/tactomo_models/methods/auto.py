@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
-from tactomo_models.arrays import FloatArray
+from tactomo_models.arrays import FloatArray, Image
 from tactomo_models.methods.fit import OutlineFit
 from tactomo_models.methods.method import Estimate, Skin, UnsolvableError
 from tactomo_models.methods.network import network_estimate, network_image
@@ -26,6 +26,12 @@ UNSURE_MISFIT: Final = 1.5  # of all channels together, from which the network i
 SURE_CONFIDENCE: Final = 0.9  # of a network, from which a map is trusted that no fit explains
 
 
+# Error of a network's map where a field explains the data, as a share of it, about. Half or twice as
+# much changes ICC by 0.003 at 20 dB.
+NETWORK_ERROR: Final = 0.2
+NEGLIGIBLE: Final = 0.1  # share of a network's map that is not worth asking for
+
+
 class Auto(OutlineFit):
     """The network proposes, the physics fits, the data judge."""
 
@@ -36,6 +42,7 @@ class Auto(OutlineFit):
         super().prepare(skin)
         missing = skin.networks.missing
         self._has_network = not missing
+        self._hedge: tuple[FieldAccount, Image] | None = None  # what a network drew beside it
         self._note = f"; no network: {missing}" if missing and NONE_TRAINED not in missing else ""
 
     def solve(
@@ -66,12 +73,28 @@ class Auto(OutlineFit):
         self, measurement: Measurement, fitted: FittedField, account: FieldAccount, how: str
     ) -> Estimate:
         own = super()._conclude(measurement, fitted, account, how)
-        unsure = fitted.misfit > UNSURE_MISFIT or Flag.MISFIT_HIGH in own.flags
-        if not (self._has_network and unsure):
+        if not self._has_network:
             return own
+        if fitted.misfit <= UNSURE_MISFIT and Flag.MISFIT_HIGH not in own.flags:
+            return self._hedged(own, account, measurement)
         # It has learnt scenes that no few contacts describe; where it is sure, so are we.
         made = network_estimate(self._skin, measurement, "no pressure field explains the data")
         flags = own.flags & Flag.NOT_CONVERGED
         if made.confidence < SURE_CONFIDENCE:
             flags |= Flag.MISFIT_HIGH
         return replace(made, misfit=fitted.misfit, flags=made.flags | flags)
+
+    def _hedged(self, own: Estimate, account: FieldAccount, measurement: Measurement) -> Estimate:
+        """The field's map, as far as the field is sure of itself; for the rest, the network's.
+
+        Noise that leaves open how large contacts are, and how hard they press, is where a network
+        knows what is likely. What the data decide is not touched: its share is the field's.
+        """
+        unsure = account.uncertainty**2
+        share = unsure / (unsure + NETWORK_ERROR**2)
+        if own.map is None or not share > NEGLIGIBLE:
+            return own
+        if self._hedge is None or self._hedge[0] is not account:
+            with measurement.timed("network"):
+                self._hedge = account, network_image(self._skin, measurement.changes).map
+        return replace(own, map=own.map + share * (self._hedge[1] - own.map))

@@ -386,9 +386,9 @@ class _Course:
             return [self._birth, self._escalate]
         inside: list[_Move] = [self._soften, self._hollow]
         inside = inside if Channel.MAGNITUDE in shape.residuals else []
-        form = [self._of_higher_order, self._modulate, *inside]
+        form = [self._of_higher_order, self._modulate, *inside, self._split]
         if shape.misfit > GOOD_MISFIT:
-            form += [self._split, self._birth_anywhere]
+            form.append(self._birth_anywhere)
         free = [self._escalate] if self.shape_model == ShapeModel.AS_NEEDED else []
         return [self._birth, *form, *free, *self._deaths(shape)]
 
@@ -491,16 +491,23 @@ class _Course:
 
     def _split(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
         """Two contacts for one, of the contact that stands it best."""
+        elongated = 0.4  # half the logarithm of the axes' ratio (2.2), from which it may be two
+        worth = 5.0  # of two small contacts for a long one: about as many parameters
         assert isinstance(shape.family, PressureField)
+        each, order = shape.family.split(shape.parameters), shape.family.order
         if shape.family.count == MAX_CONTACTS:
             return None
-        each, order = shape.family.split(shape.parameters), shape.family.order
+        long = np.hypot(each[:, E1], each[:, E2]) > elongated
+        asked = np.arange(len(each)) if shape.misfit > GOOD_MISFIT else np.flatnonzero(long)
         halved = [
-            self._evaluate(_halved(each, k), order, shape.log_ratio, frame)
-            for k in range(len(each))
+            (half, bool(long[k]))
+            for k in asked
+            if (half := self._evaluate(_halved(each, k), order, shape.log_ratio, frame))
         ]
-        best = min((h for h in halved if h), key=lambda half: half.cost, default=None)
-        return _Candidate(best, SURE_GAIN * _scale(shape, frame)) if best else None
+        if not halved:
+            return None
+        best, is_long = min(halved, key=lambda one: one[0].cost)
+        return _Candidate(best, (worth if is_long else SURE_GAIN) * _scale(shape, frame))
 
     def _escalate(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
         """The same as a level set."""

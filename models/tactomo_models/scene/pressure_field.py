@@ -46,7 +46,7 @@ HERTZ = 0.5
 PRIOR_SIGMA = np.array([5.0, 5.0, 0.6, 0.3, 0.3, 0.05, 0.05, 0.07, 0.07, 1.0, 0.12, 0.5])
 NOWHERE = 1e-6  # distance from a contact's centre, over its size, that has no direction
 GRADED_WIDTH = 0.7
-RIM = 0.5  # of the nodes' distance: how far inside its edge a falling pressure is averaged
+RIM = 0.1  # of the nodes' distance: how far inside its edge a falling pressure is averaged
 
 
 @dataclass(frozen=True)
