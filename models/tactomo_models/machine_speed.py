@@ -1,7 +1,7 @@
 """What a budget of time buys on the machine at hand: how much work, and which method.
 
 A reconstructor's budget counts modelled work, so that a recording reconstructs exactly as the live
-stream did (`shape_fit.Budget`). The machine's speed turns time into such a budget, once, before the
+stream did (`field_fit.Budget`). The machine's speed turns time into such a budget, once, before the
 reconstructor is given it and before it is recorded: a replay needs no such measure, and takes the
 same steps on any machine.
 

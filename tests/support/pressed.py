@@ -1,9 +1,17 @@
-"""Contacts of a pressure field, for tests that begin there."""
+"""Sensors of one and two sheets, contacts on them, and the data that they make."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
+from measured import measured
+from tactomo_models import Channel, SensorDescription
 from tactomo_models.arrays import FloatArray
+from tactomo_models.physics.forward import ForwardModel
+from tactomo_models.scene.field_fit import Budget, Family, FieldFit, FittedField, Measured
 from tactomo_models.scene.pressure_field import (
     COLUMNS,
     E1,
@@ -13,9 +21,28 @@ from tactomo_models.scene.pressure_field import (
     PEAK,
     SIZE,
     UNIT_M,
+    PressureField,
     X,
     Y,
 )
+from tactomo_models.scene.sheet_response import GradedResponse
+from variants import variant
+
+PLENTY_S = 30.0
+TABLE_KPA = (0.0, 50.0, 130.0, 200.0)  # no peak and no mean of peaks is on one of its knots
+RISING = {"pressure_kpa": TABLE_KPA, "relative_change": (0.0, 0.1, 0.5, 1.0)}
+FALLING = {"pressure_kpa": TABLE_KPA, "relative_change": (0.0, -0.05, -0.2, -0.4)}
+LATE = {"pressure_kpa": (0.0, 100.0, 200.0), "relative_change": (0.0, 0.0, 0.25)}
+SATURATING = {"pressure_kpa": (0.0, 40.0, 220.0), "conductivity_ratio": (1.0, 20.0, 100.0)}
+SENSORS: dict[str, tuple[dict[str, Any] | None, dict[str, Any] | None]] = {
+    "both": (LATE, {"conductivity_ratio": 100.0}),
+    "both falling": (FALLING, {"conductivity_ratio": 0.01}),
+    "both graded": (RISING, {"conductivity_ratio": None, "response": SATURATING}),
+    "one graded": (RISING, None),
+    "one falling": (FALLING, None),
+    "structure alone": (None, {"conductivity_ratio": 100.0}),
+    "resistive structure alone": (None, {"conductivity_ratio": 0.01}),
+}
 
 
 def contact(
@@ -41,3 +68,77 @@ def contact(
 def contacts(*each: FloatArray) -> FloatArray:
     """Parameters (K, COLUMNS) of all."""
     return np.array(each).reshape(-1, COLUMNS)
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A sensor's fit and field, and the data that contacts on it make."""
+
+    fit: FieldFit
+    field: PressureField
+
+    @classmethod
+    def of(cls, forward: ForwardModel, description: SensorDescription) -> Sensor:
+        magnitude = description.magnitude
+        graded = GradedResponse.of(magnitude.response) if magnitude else None
+        return cls(FieldFit(forward, description), PressureField.on(forward, graded))
+
+    def family(self, each: FloatArray, order: int) -> PressureField:
+        return self.field.of(each, order, fits_peaks=Channel.MAGNITUDE in self.fit.responses)
+
+    def no_data(self) -> Measured:
+        none = np.zeros(len(self.fit.forward.bare_voltages))
+        return {name: measured(none) for name in self.fit.responses}
+
+    def at(self, each: FloatArray, order: int, data: Measured) -> FittedField:
+        family = self.family(each, order)
+        return evaluated(self.fit, family, family.join(each), data)
+
+    def changes(self, fitted: FittedField) -> dict[Channel, FloatArray]:
+        """Relative changes (M,) of each sheet's voltages."""
+        bare = self.fit.forward.bare_voltages
+        return {
+            name: (solution.voltages - bare) / np.abs(bare)
+            for name, solution in fitted.solutions.items()
+        }
+
+    def settled(self, start: FittedField, data: Measured) -> FittedField:
+        """The minimum below a start, closer than a frame would ever ask for it."""
+        for _ in range(100):
+            better = self.fit.refine(start, data, Budget(PLENTY_S), 0.0, steps=1)
+            if better.cost > start.cost * (1 - 1e-6) and better.damping < 1e3:
+                return better
+            start = better
+        return start
+
+
+def evaluated(
+    fit: FieldFit,
+    family: Family,
+    parameters: FloatArray,
+    data: Measured,
+    log_ratio: float | None = None,
+) -> FittedField:
+    ratio = fit.likely if log_ratio is None else log_ratio
+    fitted = fit.evaluate(family, parameters, ratio, data, len(fit.forward.bare.pressable))
+    assert fitted is not None
+    return fitted
+
+
+def data_of(
+    exact: Mapping[Channel, FloatArray], sigma: float, rng: np.random.Generator | None = None
+) -> Measured:
+    """Data of a noise, of which there is none without a generator."""
+    noise = 0.0 if rng is None else sigma
+    rng = rng or np.random.default_rng(0)
+    return {
+        name: measured(change + noise * rng.standard_normal(len(change)), 1 / sigma)
+        for name, change in exact.items()
+    }
+
+
+def described(small: SensorDescription, name: str) -> SensorDescription:
+    magnitude, structure = SENSORS[name]
+    return variant(
+        small, magnitude={"response": magnitude} if magnitude else None, structure=structure
+    )

@@ -24,7 +24,7 @@ class Variant:
 
     Attributes:
         method: its name.
-        budget_s: by a model of the work (`shape_fit.Budget`); None leaves it to what plays the
+        budget_s: by a model of the work (`field_fit.Budget`); None leaves it to what plays the
             frames.
     """
 

@@ -141,7 +141,7 @@ class Method(Protocol):
             measurement: of at least one channel, in which something presses.
             previous: this method's estimate of the frame before; None where there is none to go
                 on from: start cold.
-            budget_s: compute time to spend, by a model of the work (`shape_fit.Budget`).
+            budget_s: compute time to spend, by a model of the work (`field_fit.Budget`).
 
         Raises:
             UnsolvableError: the measurement lacks what the method needs.

@@ -5,7 +5,7 @@ plastic. One signed level-set function tells both kinds and keeps them from over
 
     f(x) = sum_i mu_i p_i(x)            the paper, equation 7; 0 where there is nothing
     h = H(f - 1/2) - H(-f - 1/2)        1 in what conducts better, -1 in what conducts worse
-    sigma = c in the one, 1 / c in the other, the edges between as in `shape_fit.conductivity`
+    sigma = c in the one, 1 / c in the other, the edges between as in `sheet_response`
 """
 
 from __future__ import annotations

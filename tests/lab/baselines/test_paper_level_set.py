@@ -41,7 +41,9 @@ def coefficients(equations: PaperLevelSet, x_m: float, y_m: float, radius_m: flo
 def test_the_prediction_is_equation_8(equations: PaperLevelSet, artifact: Artifact) -> None:
     """Linear in the bare Jacobian, two phases, the change of one inside and nothing outside."""
     mu = coefficients(equations, 0.02, -0.01, 0.02)
-    inside = equations.family.render(mu)[0]
+    drawing = equations.family.draw(mu)
+    inside = np.zeros(artifact.jacobian.shape[1])
+    inside[drawing.nodes] = drawing.share
     volts = np.abs(equations.forward.bare_voltages)
     change = 2 * (100 - 1) / (100 + 1) * inside
     np.testing.assert_allclose(equations.predict(mu), volts * (artifact.jacobian @ change))

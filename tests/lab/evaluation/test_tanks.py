@@ -23,6 +23,7 @@ from tactomo_lab.evaluation.tanks import (
 )
 from tactomo_models import (
     Artifact,
+    Channel,
     DataError,
     Reconstructor,
     Reference,
@@ -35,7 +36,8 @@ from tactomo_models.batch import reconstruct_file
 from tactomo_models.methods.objects import SignedLevelSet
 from tactomo_models.physics.bare_sheet import volts_per_unit
 from tactomo_models.physics.forward import ForwardModel
-from tactomo_models.scene.shape_fit import ShapeFit, conductivity
+from tactomo_models.scene.field_fit import FieldFit, FittedField
+from taylor import taylor_orders
 
 
 @pytest.fixture(scope="module")
@@ -138,65 +140,54 @@ def test_a_small_budget_is_kept_and_the_next_frames_go_on(
 
 
 @pytest.fixture(scope="module")
-def signed(tank: SensorDescription, tank_artifact: Artifact) -> tuple[ShapeFit, SignedLevelSet]:
+def signed(tank: SensorDescription, tank_artifact: Artifact) -> tuple[FieldFit, SignedLevelSet]:
     forward = ForwardModel(tank, tank_artifact.bare)
-    return ShapeFit(forward, 100.0), SignedLevelSet(forward)
+    return FieldFit(forward), SignedLevelSet(forward)
 
 
-def _one_of_each(fit: ShapeFit) -> FloatArray:
+def _one_of_each(fit: FieldFit) -> FloatArray:
     x, y = fit.forward.bare.points[:, fit.forward.bare.pressable]
     better = np.clip(1.5 - np.hypot(x + 0.06, y) / 0.03, 0, 1)
     worse = np.clip(1.5 - np.hypot(x - 0.05, y - 0.03) / 0.03, 0, 1)
     return np.asarray(better - worse)
 
 
-def test_taylor_of_both_kinds(signed: tuple[ShapeFit, SignedLevelSet]) -> None:
+def test_taylor_of_both_kinds(signed: tuple[FieldFit, SignedLevelSet]) -> None:
     """|F(x + t v) - F(x) - t J v| falls with t squared."""
     fit, level_set = signed
-    size = len(fit.forward.bare_voltages)
-    weight = np.ones(size)
-    parameters = level_set.parameters_of(_one_of_each(fit))
-    data = measured(np.zeros(size), weight)
-    start = fit.evaluate(level_set, parameters, 3.0, data)
-    assert start is not None
-    assert start.pressed.min() < -0.9
-    assert start.pressed.max() > 0.9
-    direction = np.random.default_rng(0).standard_normal(len(parameters) + 1)
-    along = fit.jacobian(start, weight) @ direction
-    left = []
-    for t in (1e-3, 5e-4, 2.5e-4):
-        there = fit.evaluate(
-            level_set, parameters + t * direction[:-1], 3.0 + t * direction[-1], data
-        )
-        assert there is not None
-        left.append(np.linalg.norm(there.residual - start.residual - t * along))
-    rates = np.log2(np.array(left[:-1]) / left[1:])
-    assert np.all(rates > 1.8), rates
+    data = {Channel.STRUCTURE: measured(np.zeros(len(fit.forward.bare_voltages)))}
 
+    def at(parameters: FloatArray) -> FittedField:
+        fitted = fit.evaluate(level_set, parameters[:-1], float(parameters[-1]), data)
+        assert fitted is not None
+        return fitted
 
-@given(h=st.floats(-1, 1), log_ratio=st.floats(-4.6, 4.6).filter(lambda r: abs(r) > 0.1))
-def test_what_conducts_worse_is_one_over_what_conducts_better(h: float, log_ratio: float) -> None:
-    nodes = np.array([h, -h])
-    sigma, by_h, by_log_ratio = conductivity(nodes, log_ratio)
-    assert sigma[0] * sigma[1] == pytest.approx(1)
-    assert np.exp(-abs(log_ratio)) * 0.999 <= sigma.min() <= 1 <= sigma.max()
-    step = 1e-6
-    moved = conductivity(nodes + step * np.sign(nodes), log_ratio)[0]
-    np.testing.assert_allclose(moved - sigma, by_h * step * np.sign(nodes), rtol=1e-3, atol=1e-11)
-    moved = conductivity(nodes, log_ratio + step)[0]
-    np.testing.assert_allclose(moved - sigma, by_log_ratio * step, rtol=1e-3, atol=1e-10)
+    start = np.append(level_set.parameters_of(_one_of_each(fit)), 3.0)
+    share = at(start).drawing.share
+    assert share.min() < -0.9
+    assert share.max() > 0.9
+    direction = np.random.default_rng(0).standard_normal(len(start))
+    orders = taylor_orders(
+        lambda parameters: at(parameters).residual,
+        start,
+        fit.jacobian(at(start), data) @ direction,
+        direction,
+        np.array([1e-3, 5e-4, 2.5e-4]),
+    )
+    assert orders == pytest.approx(2, abs=0.2)
 
 
 @settings(max_examples=25)
 @given(st.lists(st.floats(-3, 3), min_size=81, max_size=81))
-def test_no_node_is_both(signed: tuple[ShapeFit, SignedLevelSet], parameters: list[float]) -> None:
+def test_no_node_is_both(signed: tuple[FieldFit, SignedLevelSet], parameters: list[float]) -> None:
     """Turned over, each object becomes one of the other kind in the same place."""
     level_set = signed[1]
-    h, moving = level_set.render(np.array(parameters))
-    opposite, _ = level_set.render(-np.array(parameters))
-    np.testing.assert_allclose(opposite, -h, atol=1e-12)
-    assert np.abs(h).max() <= 1
-    assert moving[h != 0].all()
+    shares = np.zeros((2, len(signed[0].forward.bare.pressable)))
+    for share, sign in zip(shares, (1, -1), strict=True):
+        drawing = level_set.draw(sign * np.array(parameters))
+        share[drawing.nodes] = drawing.share
+    np.testing.assert_allclose(shares[1], -shares[0], atol=1e-12)
+    assert np.abs(shares).max() <= 1
 
 
 @pytest.mark.long

@@ -4,92 +4,88 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from measured import measured
+from pressed import Sensor, contact, contacts, data_of, described
+from tactomo_models import Channel, SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_models.methods.warm_started_fit import ShapeModel, WarmStartedFit
 from tactomo_models.physics.forward import ForwardModel
-from tactomo_models.scans.changes import Changes
-from tactomo_models.scene.outlines import MAX_PARAMETERS, SIZE, UNIT_M, Outlines, X, Y, outlines_on
-from tactomo_models.scene.shape_fit import Budget, Shape, ShapeFit
+from tactomo_models.scene.field_fit import Budget, FittedField, Measured
+from tactomo_models.scene.pressure_field import EDGE, HOLE, PEAK, UNIT_M, PressureField, X, Y
 
-RATIO = 100.0
 NOISE = 1e-3  # of each relative change
 PLENTY_S = 10.0
 
-Disc = tuple[float, float, float]  # x, y and radius, metres
-
-LEFT: Disc = (-0.012, -0.004, 0.007)
-RIGHT: Disc = (0.013, 0.006, 0.006)
+LEFT = contact(-0.012, -0.004, 0.007)
+RIGHT = contact(0.013, 0.006, 0.006)
 
 
-class Sheet:
-    """Frames of discs on a sheet, with noise that is another in each."""
+class Skin:
+    """Frames of contacts on a sensor, with noise that is another in each."""
 
-    def __init__(self, forward: ForwardModel) -> None:
-        self._fit = ShapeFit(forward, RATIO)
-        self._forward = forward
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor = sensor
         self._rng = np.random.default_rng(2)
 
-    def frame(self, *discs: Disc) -> Changes:
-        bare = self._forward.bare_voltages
-        family = outlines_on(self._forward).of(0, len(discs))
-        none = measured(np.zeros(len(bare)))
-        shape = self._fit.evaluate(family, family.join(contacts(*discs)), np.log(RATIO), none)
-        assert shape is not None
-        change = (shape.solution.voltages - bare) / np.abs(bare)
-        return measured(change + NOISE * self._rng.standard_normal(len(bare)), 1 / NOISE)
+    def frame(self, *each: FloatArray, noise: float = NOISE) -> Measured:
+        pressed = contacts(*each)
+        field = self.sensor.at(pressed, 2, self.sensor.no_data())
+        return data_of(self.sensor.changes(field), noise, self._rng)
 
 
-def contacts(*discs: Disc) -> FloatArray:
-    each = np.zeros((len(discs), MAX_PARAMETERS))
-    for k, (x_m, y_m, radius_m) in enumerate(discs):
-        each[k, [X, Y, SIZE]] = x_m / UNIT_M, y_m / UNIT_M, np.log(radius_m)
-    return each
-
-
-def places_of(shape: Shape) -> list[tuple[float, float]]:
+def places_of(shape: FittedField) -> list[tuple[float, float]]:
     """Centres from left to right, metres."""
-    assert isinstance(shape.family, Outlines)
+    assert isinstance(shape.family, PressureField)
     each = shape.family.split(shape.parameters)
     return sorted((float(x) * UNIT_M, float(y) * UNIT_M) for x, y in each[:, [X, Y]])
 
 
-@pytest.fixture
-def sheet(forward: ForwardModel) -> Sheet:
-    return Sheet(forward)
+@pytest.fixture(
+    scope="module",
+    params=["structure alone", "resistive structure alone", "both", "both falling", "one graded"],
+)
+def sensor(
+    request: pytest.FixtureRequest, forward: ForwardModel, small: SensorDescription
+) -> Sensor:
+    return Sensor.of(forward, described(small, request.param))
 
 
 @pytest.fixture
-def fit(forward: ForwardModel) -> WarmStartedFit:
-    return WarmStartedFit(forward, RATIO)
+def skin(sensor: Sensor) -> Skin:
+    return Skin(sensor)
 
 
-def follow(fit: WarmStartedFit, frame: Changes) -> tuple[Shape, str]:
+@pytest.fixture
+def fit(sensor: Sensor) -> WarmStartedFit:
+    return WarmStartedFit(sensor.fit)
+
+
+def follow(fit: WarmStartedFit, frame: Measured) -> tuple[FittedField, str]:
     return fit.follow(frame, Budget(PLENTY_S))
 
 
-def assert_at(shape: Shape, *discs: Disc) -> None:
+def assert_at(shape: FittedField, *each: FloatArray) -> None:
     assert shape.converged
     assert shape.misfit < 1.5
-    np.testing.assert_allclose(places_of(shape), sorted(disc[:2] for disc in discs), atol=2e-4)
+    places = sorted((one[X] * UNIT_M, one[Y] * UNIT_M) for one in each)
+    np.testing.assert_allclose(places_of(shape), places, atol=3e-4)
 
 
-def test_nothing_is_no_contact(fit: WarmStartedFit, sheet: Sheet) -> None:
-    shape, how = follow(fit, sheet.frame())
+def test_nothing_is_no_contact(fit: WarmStartedFit, skin: Skin) -> None:
+    shape, how = follow(fit, skin.frame())
     assert_at(shape)
     assert how.startswith("cold start")
 
 
-def test_contacts_are_found_from_nothing(fit: WarmStartedFit, sheet: Sheet) -> None:
-    shape, how = follow(fit, sheet.frame(LEFT, RIGHT))
+def test_contacts_are_found_from_nothing(fit: WarmStartedFit, skin: Skin) -> None:
+    shape, how = follow(fit, skin.frame(LEFT, RIGHT))
     assert_at(shape, LEFT, RIGHT)
     assert how.startswith("cold start")
 
 
 def test_a_still_scene_is_not_solved_again(
-    fit: WarmStartedFit, sheet: Sheet, solves: list[int]
+    fit: WarmStartedFit, skin: Skin, solves: list[int]
 ) -> None:
-    first, second = sheet.frame(LEFT), sheet.frame(LEFT)
+    first, second = skin.frame(LEFT), skin.frame(LEFT)
     shape, _ = follow(fit, first)
     solves.clear()
     again, how = follow(fit, second)
@@ -98,58 +94,96 @@ def test_a_still_scene_is_not_solved_again(
     np.testing.assert_array_equal(again.parameters, shape.parameters)
 
 
-def test_a_contact_that_moves_is_followed(fit: WarmStartedFit, sheet: Sheet) -> None:
-    moved = (LEFT[0] + 3e-4, LEFT[1] + 2e-4, LEFT[2])
-    first, second = sheet.frame(LEFT), sheet.frame(moved)
+def test_a_contact_that_moves_is_followed(fit: WarmStartedFit, skin: Skin) -> None:
+    moved = LEFT.copy()
+    moved[[X, Y]] += 0.1, 0.06
+    first, second = skin.frame(LEFT), skin.frame(moved)
     follow(fit, first)
     shape, how = follow(fit, second)
     assert how.startswith("warm start")
     assert_at(shape, moved)
 
 
-def test_a_contact_comes_and_another_goes(fit: WarmStartedFit, sheet: Sheet) -> None:
-    for discs in ((LEFT,), (LEFT, RIGHT), (RIGHT,), ()):
-        shape, _ = follow(fit, sheet.frame(*discs))
-        assert_at(shape, *discs)
+def test_a_contact_comes_and_another_goes(fit: WarmStartedFit, skin: Skin) -> None:
+    for each in ((LEFT,), (LEFT, RIGHT), (RIGHT,), ()):
+        shape, _ = follow(fit, skin.frame(*each))
+        assert_at(shape, *each)
 
 
 def test_work_that_a_budget_cuts_short_goes_on_in_the_next_frame(
-    fit: WarmStartedFit, sheet: Sheet
+    fit: WarmStartedFit, skin: Skin
 ) -> None:
-    frame = sheet.frame(LEFT, RIGHT)
-    shapes = [fit.follow(frame, Budget(0.01))[0] for _ in range(40)]
+    frame = skin.frame(LEFT, RIGHT)
+    shapes = [fit.follow(frame, Budget(0.01))[0] for _ in range(60)]
     assert not shapes[0].converged
     assert_at(shapes[-1], LEFT, RIGHT)
 
 
 def test_what_is_proposed_is_judged_by_the_data(
-    forward: ForwardModel, sheet: Sheet, solves: list[int]
+    sensor: Sensor, skin: Skin, solves: list[int]
 ) -> None:
-    frame, effort = sheet.frame(LEFT, RIGHT), []
-    for proposal in (contacts(LEFT, RIGHT), contacts((0.02, -0.018, 0.004)), contacts()):
+    frame, effort = skin.frame(LEFT, RIGHT), []
+    for each in (contacts(LEFT, RIGHT), contacts(contact(0.02, -0.018, 0.004)), contacts()):
         solves.clear()
-        fit = WarmStartedFit(forward, RATIO)
-        shape, how = fit.follow(frame, Budget(PLENTY_S), proposal.copy)
+        fit = WarmStartedFit(sensor.fit)
+        shape, how = fit.follow(frame, Budget(PLENTY_S), each.copy)
         assert_at(shape, LEFT, RIGHT)
         effort.append((how.split(",")[0], len(solves)))
-    (good, few), (bad, many), (nothing, _) = effort
-    assert (good, bad, nothing) == ("proposed", "cold start", "cold start")
-    assert few < many
+    (good, few), (_, many), (nothing, most) = effort
+    assert (good, nothing) == ("proposed", "cold start")
+    if sensor.fit.likely > 0:  # circles are as quickly found as ellipses made round otherwise
+        assert few < min(many, most)
 
 
-def test_what_is_forgotten_starts_cold(fit: WarmStartedFit, sheet: Sheet) -> None:
-    follow(fit, sheet.frame(LEFT))
+def test_what_is_forgotten_starts_cold(fit: WarmStartedFit, skin: Skin) -> None:
+    follow(fit, skin.frame(LEFT))
     fit.forget()
-    shape, how = follow(fit, sheet.frame(LEFT))
+    shape, how = follow(fit, skin.frame(LEFT))
     assert how.startswith("cold start")
     assert_at(shape, LEFT)
 
 
 @pytest.mark.parametrize("model", [ShapeModel.OUTLINES, ShapeModel.LEVEL_SET])
 def test_a_scene_is_described_as_is_asked_for(
-    forward: ForwardModel, sheet: Sheet, model: ShapeModel
+    sensor: Sensor, skin: Skin, model: ShapeModel
 ) -> None:
-    shape, how = follow(WarmStartedFit(forward, RATIO, model), sheet.frame(LEFT))
-    assert isinstance(shape.family, Outlines) == (model is ShapeModel.OUTLINES)
+    shape, how = follow(WarmStartedFit(sensor.fit, model), skin.frame(LEFT))
+    assert isinstance(shape.family, PressureField) == (model is ShapeModel.OUTLINES)
     assert how.endswith("level set") == (model is ShapeModel.LEVEL_SET)
     assert shape.misfit < 1.5
+
+
+@pytest.fixture(scope="module", params=["both", "both falling", "one graded", "one falling"])
+def graded(request: pytest.FixtureRequest, forward: ForwardModel, small: SensorDescription) -> Skin:
+    return Skin(Sensor.of(forward, described(small, request.param)))
+
+
+@pytest.mark.parametrize(("edge", "hole"), [(0.0, 0.0), (0.5, 0.0), (0.0, 1.0)])
+def test_edges_and_holes_are_what_the_data_say(graded: Skin, edge: float, hole: float) -> None:
+    """And the peak with them, to a tenth; frames after the first go on asking."""
+    pressed = contact(-0.004, 0.002, 0.012, peak=0.85, edge=edge, hole=hole)
+    fit = WarmStartedFit(graded.sensor.fit)
+    for _ in range(6):
+        shape, _ = follow(fit, graded.frame(pressed, noise=2e-4))
+    assert isinstance(shape.family, PressureField)
+    (one,) = shape.family.split(shape.parameters)
+    assert (one[EDGE] > 0, one[HOLE]) == (edge > 0, hole)
+    assert one[PEAK] == pytest.approx(pressed[PEAK], rel=0.1)
+    assert shape.converged
+
+
+def test_a_sheet_that_is_lost_and_comes_back_changes_no_contact(
+    forward: ForwardModel, small: SensorDescription
+) -> None:
+    """The magnitude channel misses frames: outlines go on, and pressures come back."""
+    skin = Skin(Sensor.of(forward, described(small, "both")))
+    fit = WarmStartedFit(skin.sensor.fit)
+    before, _ = follow(fit, skin.frame(LEFT, RIGHT))
+    for lost in (1, 10, 11):
+        for _ in range(lost):
+            structure = skin.frame(LEFT, RIGHT)[Channel.STRUCTURE]
+            alone, _ = follow(fit, {Channel.STRUCTURE: structure})
+            assert_at(alone, LEFT, RIGHT)
+        back, _ = follow(fit, skin.frame(LEFT, RIGHT))
+        assert_at(back, LEFT, RIGHT)
+        assert back.parameters == pytest.approx(before.parameters, abs=0.1)
