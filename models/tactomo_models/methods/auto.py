@@ -26,8 +26,8 @@ UNSURE_MISFIT: Final = 1.5  # of all channels together, from which the network i
 SURE_CONFIDENCE: Final = 0.9  # of a network, from which a map is trusted that no fit explains
 
 
-# Error of a network's map where a field explains the data, as a share of it, about. Half or twice as
-# much changes ICC by 0.003 at 20 dB.
+# Error of a network's map where a field explains the data, as a share of it, about. Half or twice
+# as much changes ICC by 0.003 at 20 dB.
 NETWORK_ERROR: Final = 0.2
 NEGLIGIBLE: Final = 0.1  # share of a network's map that is not worth asking for
 

@@ -7,6 +7,8 @@ either one is the fit of both kinds (`objects`).
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from tactomo_protocol import Channel
 
@@ -122,9 +124,12 @@ class OutlineFit:
         self._frames_held += 1
         if self._last is not None and self._frames_held <= max_held:
             with measurement.timed("contacts"):
-                held = self._field_fit.compare(self._last[0], measurement.changes)
-            if held.misfit <= BAD_MISFIT:
-                account = self._last[1]
+                held = self._with_outlines_of(self._last[0], measurement.changes)
+                account = self._accountant.account(held, measurement.changes)
+            if held.misfit <= BAD_MISFIT and not account.goes_wrong_way:
+                sigmas = self._last[1].areas.sigmas
+                if len(sigmas) == len(account.areas):  # outlines are no surer than they were
+                    account = replace(account, areas=replace(account.areas, sigmas=sigmas))
                 return Estimate(
                     map=account.map,
                     areas=account.areas,
@@ -136,6 +141,17 @@ class OutlineFit:
                     reason="the last shape: the structure scan is missing",
                 )
         raise UnsolvableError("the structure channel is missing")
+
+    def _with_outlines_of(self, last: FittedField, measured: Measured) -> FittedField:
+        """Contacts as they were, with pressures as they are now."""
+        family, parameters = last.family, last.parameters
+        if isinstance(family, PressureField):
+            family = family.with_peaks_alone(parameters)
+            parameters = family.join(family.fixed)
+        held = self._field_fit.evaluate(family, parameters, last.log_ratio, measured)
+        assert held is not None
+        steps = 3  # pressures alone are nearly linear
+        return self._field_fit.refine(held, measured, Budget(1.0), 0.0, steps)
 
     def _linear_image(self, change: FloatArray) -> FloatArray:
         return self._images.image(Channel.STRUCTURE, change).astype(np.float64)

@@ -501,7 +501,7 @@ class _Course:
         asked = np.arange(len(each)) if shape.misfit > GOOD_MISFIT else np.flatnonzero(long)
         halved = [
             (half, bool(long[k]))
-            for k in asked
+            for k in asked.tolist()
             if (half := self._evaluate(_halved(each, k), order, shape.log_ratio, frame))
         ]
         if not halved:

@@ -15,6 +15,7 @@ import numpy as np
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
+from tactomo_models.scans.changes import WRONG_WAY
 from tactomo_models.scene.areas import AreaFinder, Areas
 from tactomo_models.scene.field_fit import FieldFit, FittedField, Measured, covariance_of
 from tactomo_models.scene.pressure import FieldContacts
@@ -31,7 +32,7 @@ from tactomo_models.scene.pressure_field import (
 )
 from tactomo_models.scene.sheet_response import GradedResponse, SaturatingResponse
 
-# Tuned on tuning scenes of every kind, so that two of three errors are within a standard uncertainty.
+# Tuned on tuning scenes of every kind, so that two of three errors are within one sigma.
 OUTLINE_ERROR = 0.05  # of an outline's radius that no noise accounts for, over the nodes' distance
 CENTRE_SCATTER = 0.85  # of centres, over what errors that all go together would make of them
 SAMPLES = 3  # per side of a map cell: what an outline covers of it is right to 3 %
@@ -265,6 +266,11 @@ class FieldAccountant:
             index = family.index
             by_peak = np.zeros_like(by_peak)
             by_peak[np.arange(count), index[owner, PEAK]] = family.unit_kpa
+            known["goes_wrong_way"] = self._goes_wrong_way(
+                J[:, index[owner, PEAK]],
+                fitted.residual,
+                each[owner, PEAK] <= family.peak_limits[0],
+            )
         peak_size, peak_slope = (np.abs(v) for v in self._graded.relative_change(peaks))
         scale = areas.areas_m2 / area  # the map's, over the mesh's
         by_force = signed * pressure[:, None] + share[:, None] * by_pressure
@@ -277,6 +283,18 @@ class FieldAccountant:
             edge=edges,
         )
         return known
+
+    @staticmethod
+    def _goes_wrong_way(by_peak: FloatArray, residual: FloatArray, is_least: BoolArray) -> bool:
+        """Tell whether a contact that hardly presses would have to press less than nothing.
+
+        Args:
+            by_peak: (sum M, K) derivative of the weighted residual by each contact's peak.
+            residual: (sum M,) weighted.
+            is_least: (K,) whether a peak is as small as it may be.
+        """
+        power = np.maximum((by_peak**2).sum(axis=0), 1e-12)
+        return bool((is_least & (by_peak.T @ residual > WRONG_WAY * np.sqrt(power))).any())
 
     @staticmethod
     def _owners(each: FloatArray, areas: Areas, highest_m: FloatArray) -> IntArray:

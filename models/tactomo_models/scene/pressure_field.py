@@ -150,6 +150,12 @@ class PressureField:
         free[:, columns] = True
         return replace(self, free=free)
 
+    def with_peaks_alone(self, parameters: FloatArray) -> PressureField:
+        """Contacts of these parameters, of which nothing but the peaks is fitted any more."""
+        free = np.zeros_like(self.free)
+        free[:, PEAK] = True
+        return replace(self, fixed=self.split(parameters), free=free)
+
     @property
     def index(self) -> IntArray:
         """(K, COLUMNS) where each parameter stands in the vector of all; -1 where it is fixed."""
