@@ -1,0 +1,241 @@
+"""What a fitted field says: images, areas, magnitudes, peaks and forces, and how surely."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from pressed import Sensor, contact, contacts, data_of, described
+from tactomo_models import Channel, SensorDescription
+from tactomo_models.arrays import FloatArray
+from tactomo_models.physics.forward import ForwardModel
+from tactomo_models.scene.areas import AreaFinder
+from tactomo_models.scene.field_account import (
+    OUTLINE_ERROR,
+    Doubt,
+    FieldAccount,
+    FieldAccountant,
+)
+from tactomo_models.scene.field_fit import FittedField, Measured
+from tactomo_models.scene.level_set import LevelSet
+from tactomo_models.scene.pressure_field import (
+    COLUMNS,
+    EDGE,
+    EDGE_LIMITS,
+    HERTZ,
+    PEAK,
+    PRIOR_SIGMA,
+    SIZE,
+    PressureField,
+)
+
+RADIUS_M = 0.012
+AREA_M2 = np.pi * RADIUS_M**2
+PEAK_SHARE = 0.8
+PEAK_KPA = PEAK_SHARE * 200
+KINDS = {
+    "flat": contact(0.003, -0.002, RADIUS_M, peak=PEAK_SHARE),
+    "soft": contact(0.003, -0.002, RADIUS_M, peak=PEAK_SHARE, edge=0.5),
+    "ring": contact(0.003, -0.002, RADIUS_M, peak=PEAK_SHARE, hole=1.0),
+}
+GRADED = ["both", "both falling", "both graded", "one graded", "one falling"]
+
+
+@pytest.fixture(scope="module", params=GRADED)
+def sensor(
+    request: pytest.FixtureRequest, forward: ForwardModel, small: SensorDescription
+) -> Sensor:
+    return Sensor.of(forward, described(small, request.param))
+
+
+def accountant(sensor: Sensor) -> FieldAccountant:
+    return FieldAccountant(sensor.fit, AreaFinder(sensor.fit.forward))
+
+
+def explained(
+    sensor: Sensor, *each: FloatArray, sigma: float = 0.003
+) -> tuple[FittedField, Measured]:
+    """A field and the data that it explains without a rest."""
+    field = sensor.at(contacts(*each), 2, sensor.no_data())
+    data = data_of(sensor.changes(field), 0.003)
+    return sensor.fit.compare(field, data), data
+
+
+def account_of(sensor: Sensor, *each: FloatArray) -> FieldAccount:
+    return accountant(sensor).account(*explained(sensor, *each))
+
+
+def magnitude_at(sensor: Sensor, pressure_kpa: FloatArray) -> FloatArray:
+    response = sensor.fit.responses[Channel.MAGNITUDE]
+    ones = np.ones(len(pressure_kpa))
+    return np.abs(response.conductivity(ones, pressure_kpa, 1.0)[0] - 1)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_numbers_are_those_of_the_contact(sensor: Sensor, kind: str) -> None:
+    """Area, centre, peak, force and mean magnitude, by integrals over the unit disc."""
+    account = account_of(sensor, KINDS[kind])
+    rho = np.sqrt(np.linspace(0, 1, 20001))  # of even shares of the disc's area
+    pressed = rho > 0.5 if kind == "ring" else rho >= 0
+    gamma = HERTZ if kind == "soft" else 0.0
+    pressure = PEAK_KPA * (1 - rho[pressed] ** 2) ** gamma
+    area = AREA_M2 * pressed.mean()
+    assert account.areas.areas_m2 == pytest.approx([area], rel=0.03)
+    assert account.areas.centres_m[0] == pytest.approx([0.003, -0.002], abs=2e-4)
+    assert account.contacts is not None
+    assert account.contacts.peak_kpa == pytest.approx([PEAK_KPA])
+    assert account.contacts.edge == pytest.approx([gamma])
+    assert account.contacts.force_n == pytest.approx([1e3 * area * pressure.mean()], rel=0.05)
+    size = magnitude_at(sensor, pressure)
+    # The mesh shows a falling pressure at nodes 3 mm apart, and a table bends between them.
+    assert account.magnitudes == pytest.approx([size.mean()], rel=0.1 if kind == "soft" else 1e-6)
+    assert account.contacts.peak_magnitude == pytest.approx(
+        magnitude_at(sensor, np.array([PEAK_KPA]))
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_images_show_what_presses(sensor: Sensor, kind: str) -> None:
+    account = account_of(sensor, KINDS[kind])
+    finder = AreaFinder(sensor.fit.forward)
+    x, y = finder.map_places
+    off = np.hypot(x - 0.003, y + 0.002)
+    away = off > RADIUS_M + 0.003
+    for image in (account.map, account.structure, account.pressure_kpa):
+        assert not image[away].any()
+        assert image.min() >= 0
+    assert account.pressure_kpa.max() == pytest.approx(PEAK_KPA, rel=0.03)
+    assert account.structure.max() <= 1 + 1e-12
+    hole = off < 0.003
+    assert (account.pressure_kpa[hole].max() == 0) == (kind == "ring")
+    cell = (x[0, 1] - x[0, 0]) * (y[1, 0] - y[0, 0])
+    assert account.contacts is not None
+    force = 1e3 * account.pressure_kpa.sum() * cell
+    assert force == pytest.approx(account.contacts.force_n[0], rel=0.05)
+
+
+def test_each_contact_has_its_own_numbers(sensor: Sensor) -> None:
+    each = (
+        contact(-0.014, -0.004, 0.007, peak=0.9),
+        contact(0.013, 0.008, 0.006, peak=0.6, edge=0.5),
+    )
+    account = account_of(sensor, *each)
+    assert account.contacts is not None
+    order = account.areas.centres_m[:, 0].argsort()
+    assert account.contacts.peak_kpa[order] == pytest.approx([180, 120])
+    assert account.contacts.edge[order] == pytest.approx([0, 0.5])
+    areas = np.pi * np.array([0.007, 0.006]) ** 2
+    assert account.areas.areas_m2[order] == pytest.approx(areas, rel=0.05)
+
+
+def test_nothing_pressed_is_no_area(sensor: Sensor) -> None:
+    account = account_of(sensor)
+    assert len(account.areas) == len(account.magnitudes) == 0
+    assert not account.map.any()
+    assert not account.pressure_kpa.any()
+
+
+def test_without_a_magnitude_scan_areas_have_no_magnitude(
+    forward: ForwardModel, small: SensorDescription
+) -> None:
+    sensor = Sensor.of(forward, described(small, "structure alone"))
+    account = account_of(sensor, KINDS["flat"])
+    assert account.areas.areas_m2 == pytest.approx([AREA_M2], rel=0.03)
+    assert np.isfinite(account.areas.sigmas).all()
+    assert np.isnan(account.magnitudes).all()
+    assert np.isnan(account.magnitude_sigmas).all()
+    assert account.contacts is None
+
+
+def test_a_level_set_has_its_account(sensor: Sensor) -> None:
+    centre = np.array([[0.003, -0.002]])
+    level_set = LevelSet(sensor.fit.forward).owned_by(centre, sensor.field)
+    off = np.hypot(sensor.field.x_m - 0.003, sensor.field.y_m + 0.002)
+    parameters = level_set.parameters_of(np.clip(1 - off / 0.02, 0, 1), np.array([PEAK_SHARE]))
+    field = sensor.fit.evaluate(level_set, parameters, sensor.fit.likely, sensor.no_data())
+    assert field is not None
+    data = data_of(sensor.changes(field), 0.003)
+    account = accountant(sensor).account(sensor.fit.compare(field, data), data)
+    assert account.contacts is not None
+    assert account.contacts.peak_kpa == pytest.approx([PEAK_KPA])
+    assert np.isnan(account.contacts.edge).all()
+    assert account.magnitudes == pytest.approx(magnitude_at(sensor, np.array([PEAK_KPA])))
+    assert account.areas.centres_m[0] == pytest.approx(centre[0], abs=2e-3)
+    for sigma in (account.magnitude_sigmas, account.contacts.force_sigma_n, *account.areas.sigmas):
+        assert (np.isfinite(sigma) & (sigma > 0)).all()
+
+
+NUMBERS: dict[str, Callable[[FieldAccount], tuple[FloatArray, FloatArray]]] = {
+    "x": lambda a: (a.areas.centres_m[:, 0], a.areas.sigmas[:, 0]),
+    "area": lambda a: (a.areas.areas_m2, a.areas.sigmas[:, 2]),
+    "magnitude": lambda a: (a.magnitudes, a.magnitude_sigmas),
+    "peak magnitude": lambda a: (a.contacts.peak_magnitude, a.contacts.peak_magnitude_sigma),  # type: ignore[union-attr]
+    "force": lambda a: (a.contacts.force_n, a.contacts.force_sigma_n),  # type: ignore[union-attr]
+}
+BY_RADIUS = {"area": 2, "magnitude": -2, "peak magnitude": -2}  # powers by which numbers go
+
+
+@pytest.mark.parametrize("kind", ["flat", "soft"])
+def test_numbers_scatter_as_their_uncertainties_say(sensor: Sensor, kind: str) -> None:
+    """Edges are as wide apart as is likely; a mesh knows a radius no better than it says."""
+    sigma, spacing_m, rng = 0.02, 0.003, np.random.default_rng(9)
+    accounts, off = accountant(sensor), []
+    for _ in range(100):
+        true = contacts(KINDS[kind])
+        if kind == "soft":
+            edge = HERTZ + PRIOR_SIGMA[EDGE] * rng.standard_normal()
+            true[0, EDGE] = np.clip(edge, *EDGE_LIMITS)
+        truth = sensor.at(true, 1, sensor.no_data())
+        data = data_of(sensor.changes(truth), sigma, rng)
+        exact = accounts.account(truth, sensor.no_data())
+        found = sensor.settled(sensor.fit.compare(truth, data), data)
+        account = accounts.account(found, data)
+        assert len(account.areas) == 1
+        radius = 1 + OUTLINE_ERROR * spacing_m / RADIUS_M * rng.standard_normal()
+        off.append(
+            [
+                float(
+                    (of(account)[0] - radius ** BY_RADIUS.get(name, 0) * of(exact)[0])[0]
+                    / of(account)[1][0]
+                )
+                for name, of in NUMBERS.items()
+            ]
+        )
+    within = dict(zip(NUMBERS, np.mean(np.abs(off) < 1, axis=0), strict=True))
+    # Where a peak's range cuts off what noise alone would have it, it is better known than it says.
+    assert min(within.values()) > 0.5, within
+    assert max(within.values()) < 0.88, within
+
+
+def test_another_account_that_is_as_likely_is_half_of_what_is_shown(sensor: Sensor) -> None:
+    """Disc or ring: images are the mean, and uncertainties know of both."""
+    field, data = explained(sensor, KINDS["flat"])
+    difference = np.zeros((1, COLUMNS))
+    difference[0, [PEAK, EDGE, SIZE]] = 0.1, 0.5, 0.05
+    accounts = accountant(sensor)
+    assert isinstance(field.family, PressureField)
+    each = field.family.split(field.parameters)
+    other, _ = explained(sensor, *(each + difference))
+    own, apart = accounts.account(field, data), accounts.account(other, data)
+    both = accounts.account(field, data, [Doubt(1.0, difference)])
+    for name in ("map", "structure", "pressure_kpa"):
+        mean = (getattr(own, name) + getattr(apart, name)) / 2
+        np.testing.assert_allclose(getattr(both, name), mean, atol=1e-6)
+    for of in NUMBERS.values():
+        (a, _), (b, _), (shown, sigma) = of(own), of(apart), of(both)
+        assert (
+            shown == pytest.approx((a + b) / 2, abs=1e-9 + 1e-3 * abs(b - a)[0])
+            or of is NUMBERS["x"]
+        )
+        assert sigma >= abs(b - a) / 2 * (1 - 1e-3)
+
+
+def test_what_is_hardly_likely_is_not_drawn(sensor: Sensor) -> None:
+    field, data = explained(sensor, KINDS["flat"])
+    difference = np.zeros((1, COLUMNS))
+    difference[0, EDGE] = 0.5
+    accounts = accountant(sensor)
+    own = accounts.account(field, data)
+    for doubt in (Doubt(1e-3, difference), Doubt(1.0, np.zeros((2, COLUMNS)))):  # of two contacts
+        np.testing.assert_array_equal(accounts.account(field, data, [doubt]).map, own.map)
