@@ -122,12 +122,13 @@ class OutlineFit:
         """Bridge a lost structure scan with the last field, as long as it explains the other."""
         max_held = 10  # frames without a structure scan that the last field stands in for: 0.5 s
         self._frames_held += 1
-        if self._last is not None and self._frames_held <= max_held:
+        last = self._last
+        if last is not None and len(last[1].areas) and self._frames_held <= max_held:
             with measurement.timed("contacts"):
-                held = self._with_outlines_of(self._last[0], measurement.changes)
+                held = self._with_outlines_of(last[0], measurement.changes)
                 account = self._accountant.account(held, measurement.changes)
             if held.misfit <= BAD_MISFIT and not account.goes_wrong_way:
-                sigmas = self._last[1].areas.sigmas
+                sigmas = last[1].areas.sigmas
                 if len(sigmas) == len(account.areas):  # outlines are no surer than they were
                     account = replace(account, areas=replace(account.areas, sigmas=sigmas))
                 return Estimate(

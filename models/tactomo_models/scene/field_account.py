@@ -277,6 +277,8 @@ class FieldAccountant:
         known["contacts"] = FieldContacts(
             peak_magnitude=peak_size,
             peak_magnitude_sigma=np.hypot(peak_slope * sigma(by_peak), by_outline * peak_size),
+            felt=peak_size,
+            felt_sigma=peak_slope * sigma(by_peak),
             peak_kpa=peaks,
             force_n=1e3 * (weight @ (share * pressure)) * scale,
             force_sigma_n=1e3 * sigma(weight @ by_force) * scale,
@@ -325,6 +327,8 @@ def _mean(one: FieldAccount, other: FieldAccount, share: float) -> FieldAccount:
         contacts = FieldContacts(
             peak_magnitude=mean(a.peak_magnitude, b.peak_magnitude),
             peak_magnitude_sigma=spread(a.peak_magnitude_sigma, a.peak_magnitude, b.peak_magnitude),
+            felt=a.felt,
+            felt_sigma=a.felt_sigma,
             peak_kpa=mean(a.peak_kpa, b.peak_kpa),
             force_n=mean(a.force_n, b.force_n),
             force_sigma_n=spread(a.force_sigma_n, a.force_n, b.force_n),

@@ -66,6 +66,8 @@ class FieldContacts:
     Attributes:
         peak_magnitude: (K,) |relative conductivity change| under the highest pressure.
         peak_magnitude_sigma: (K,) standard uncertainties.
+        felt: (K,) the same by the likeliest account of how pressures fall towards the edge.
+        felt_sigma: (K,) its standard uncertainty, by which something is felt or not.
         peak_kpa: (K,) highest pressures.
         force_n: (K,) forces.
         force_sigma_n: (K,) standard uncertainties.
@@ -74,6 +76,8 @@ class FieldContacts:
 
     peak_magnitude: FloatArray
     peak_magnitude_sigma: FloatArray
+    felt: FloatArray
+    felt_sigma: FloatArray
     peak_kpa: FloatArray
     force_n: FloatArray
     force_sigma_n: FloatArray
@@ -190,11 +194,12 @@ def pressures_of(
         nothing = np.full(len(magnitude), np.nan)
         unknown = (PressureRange.UNKNOWN,) * len(magnitude)
         return Pressures(nothing, nothing, nothing, nothing, unknown, nothing, nothing, nothing)
-    highest, highest_sigma = magnitude, magnitude_sigma
+    highest, highest_sigma = felt, felt_sigma = magnitude, magnitude_sigma
     if field is not None:
         highest, highest_sigma = field.peak_magnitude, field.peak_magnitude_sigma
+        felt, felt_sigma = field.felt, field.felt_sigma
     ago = [PressureRange.UNKNOWN] * len(magnitude) if last is None else last
-    each = zip(highest.tolist(), highest_sigma.tolist(), ago, strict=True)
+    each = zip(felt.tolist(), felt_sigma.tolist(), ago, strict=True)
     ranges = tuple(curve.range_of(*one) for one in each)
     within = np.array([r is PressureRange.WITHIN for r in ranges], bool)
     above = np.array([r is PressureRange.ABOVE for r in ranges], bool)
