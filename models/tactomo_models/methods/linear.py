@@ -14,6 +14,7 @@ from tactomo_protocol import Channel
 from tactomo_models.arrays import FloatArray, Image
 from tactomo_models.methods.magnitudes import (
     BAD_MISFIT,
+    Magnitudes,
     bare_tangent,
     known_magnitudes,
     leaves_unexplained,
@@ -29,6 +30,7 @@ from tactomo_models.physics.tikhonov import (
     prior_weight,
     tikhonov_matrix,
 )
+from tactomo_models.scans.changes import Changes
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
 
@@ -89,14 +91,17 @@ class Tikhonov:
         self._skin = skin
         self._images = LinearImages(skin, self.prior)
         self._jacobian_by_node = np.ascontiguousarray(skin.artifact.jacobian.T)
+        self._node_areas_m2 = skin.forward.node_areas_m2
         for channel in skin.channels:
             self._images.matrix(channel)
+        if Channel.MAGNITUDE in skin.channels:  # of each voltage's noise, what the image has
+            self._voltages_by_node = self._jacobian_by_node.astype(np.float32)
+            self._image_noise = self._node_areas_m2 @ self._images.matrix(Channel.MAGNITUDE) ** 2
 
     def solve(
         self, measurement: Measurement, previous: Estimate | None, budget_s: float
     ) -> Estimate:
         """Linear images of both channels; areas above half of the clearest one's peak."""
-        unexplained_part = 0.5  # of the misfit of nothing, that areas of a linear image may leave
         changes, areas = measurement.changes, self._skin.areas
         with measurement.timed(self.prior):
             images = {name: self._images.image(name, each.change) for name, each in changes.items()}
@@ -107,17 +112,15 @@ class Tikhonov:
             # The rest of the image is blur: a contact there would be as large as the sheet.
             inside = np.where(np.abs(shown) > 0.5 * peak, 1.0, 0.0)
             found = areas.find(areas.on_map(inside), inside)
-            fitted, flags = None, Flag(0)
+            fitted, unexplained = None, False
             if Channel.MAGNITUDE in changes:
                 magnitude = changes[Channel.MAGNITUDE]
                 if len(found):
                     fitted = linear_magnitudes(
                         bare_tangent(self._jacobian_by_node, found), magnitude
                     )
-                # Its outlines are a guess, so all that can be asked is that they explain most.
-                bad = max(BAD_MISFIT, unexplained_part * magnitude.misfit)
-                if leaves_unexplained(fitted, magnitude, self._skin.magnitude_sign, bad):
-                    flags = Flag.MISFIT_HIGH
+                image = images[Channel.MAGNITUDE]
+                unexplained = self._leaves_unexplained(image, fitted, magnitude)
         size, sigma = known_magnitudes(fitted, self._skin.magnitude_sign, len(found))
         return Estimate(
             map=maps.get(Channel.MAGNITUDE),
@@ -127,9 +130,41 @@ class Tikhonov:
             magnitude_sigmas=sigma,
             tells_pressure=False,  # a linear image spreads and pales
             misfit=fitted.misfit if fitted else float("nan"),
-            flags=flags,
+            flags=Flag.MISFIT_HIGH if unexplained else Flag(0),
             made_by=self.prior,
         )
+
+    def _leaves_unexplained(
+        self, image: Image, fitted: Magnitudes | None, magnitude: Changes
+    ) -> bool:
+        """Tell whether the magnitude channel's changes say that something else presses.
+
+        The image is asked, once what goes against pressing is cut off, to stand out of its noise
+        and to make the changes but for a remainder; the areas, which come from the structure
+        channel where there is one, to make most of them. The figures are from tuning scenes; the
+        last one matters most where there are many contacts.
+
+        Args:
+            image: (P,) of the magnitude channel.
+            fitted: the areas' magnitudes; None where there is no area.
+            magnitude: the channel's changes.
+        """
+        least_snr = 3.5  # of the image, amplitude: Rose's criterion asks for 3 to 5
+        remainder = 0.02  # of the changes' energy, that the image may leave beside their noise
+        unexplained_part = 0.3  # of the misfit of nothing, that the areas may leave
+        sure = 3.0  # standard deviations of the noise's energy
+        variance = magnitude.noise_variance * (magnitude.weight > 0)
+        if self._node_areas_m2 @ image**2 < least_snr**2 * (self._image_noise @ variance):
+            return True
+        weight = np.sqrt(magnitude.precision)
+        measured, made = weight * magnitude.change, weight * (image @ self._voltages_by_node)
+        explained = (made @ measured) ** 2 / (made @ made)
+        energy, noise = measured @ measured, magnitude.precision * variance
+        by_noise = noise.sum() + sure * np.sqrt(2 * noise @ noise)
+        if energy - explained > by_noise + remainder * energy:
+            return True
+        bad = max(BAD_MISFIT, unexplained_part * magnitude.misfit)
+        return leaves_unexplained(fitted, magnitude, self._skin.magnitude_sign, bad)
 
 
 class Noser(Tikhonov):

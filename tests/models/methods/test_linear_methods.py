@@ -7,7 +7,14 @@ import math
 import numpy as np
 import pytest
 from noisy_skin import Skin
-from tactomo_models import Artifact, Press, Reconstructor, SensorDescription
+from tactomo_models import (
+    Artifact,
+    Flag,
+    Press,
+    Reconstructor,
+    SensorDescription,
+    SkinSimulator,
+)
 from tactomo_models.physics.artifact import central_target, nominal_noise
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.tikhonov import (
@@ -74,6 +81,24 @@ def test_two_presses_are_found_without_a_forward_solve(
         )
         assert distance < 0.01
         assert abs(contact.magnitude - magnitude_of(paper, press)) < 3 * contact.magnitude_sigma
+
+
+@pytest.mark.parametrize("method", ["tikhonov", "noser"])
+def test_an_image_that_leaves_the_changes_unexplained_is_flagged(
+    paper: SensorDescription, artifact: Artifact, simulator: SkinSimulator, method: str
+) -> None:
+    """One contact is shown well; beside it a smaller one pales; the rest is noise."""
+    large, smaller = Press(0.03, 0.04, 180.0, 0.02), Press(-0.035, -0.03, 170.0, 0.012)
+    for noise_share, presses, flagged in (
+        (1e-4, [large], False),
+        (1e-4, [large, smaller], True),
+        (1e-2, [large], True),
+    ):
+        skin = Skin(simulator, noise_share)
+        reconstructor = Reconstructor(paper, artifact, method=method)
+        reconstructor.set_reference(skin.reference())
+        frames = [reconstructor.reconstruct(**skin.scan(*presses)) for _ in range(5)]
+        assert [bool(frame.flags & Flag.MISFIT_HIGH) for frame in frames] == [flagged] * 5
 
 
 def test_noser_sees_the_middle_better_than_tikhonov(
