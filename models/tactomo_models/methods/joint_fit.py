@@ -50,6 +50,7 @@ QUESTIONS = (Question(EDGE, HERTZ, 1.0), Question(HOLE, 1.0, 6.0))  # rings are 
 FALLEN_PEAK = 1.25  # peak of a pressure that falls, over the even one of about the same mean
 CLEARLY = 12.0  # rise of the cost, to second order, from which a question need not be asked
 MEMORY = 0.7  # of the logarithm of the odds, from one asking to the next
+HOPELESS = 20.0  # gains of the last step, that another account is still dearer: no more is tried
 STEPS = 4  # of a refinement, and of an answer
 
 
@@ -186,8 +187,15 @@ class JointFit:
         other = self._fit.evaluate(family, family.join(each), fitted.log_ratio, measured)
         if other is None:
             return None
-        other = self._fit.refine(other, measured, budget, 0.0, 2 * STEPS)
-        return other if other.converged or other.cost < fitted.cost else None
+        for _ in range(2 * STEPS):
+            before = other.cost
+            other = self._fit.refine(other, measured, budget, 0.0, 1)
+            is_hopeless = other.cost - fitted.cost > HOPELESS * (before - other.cost)
+            if other.converged or is_hopeless:
+                return other
+            if budget.over:
+                break
+        return other if other.cost < fitted.cost else None
 
 
 def _contacts_of(fitted: FittedField) -> FloatArray:
