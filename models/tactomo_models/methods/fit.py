@@ -37,6 +37,7 @@ class OutlineFit:
         self._images = LinearImages(skin, "noser")
         self._frames_held = 0  # since the last structure scan
         self._last: tuple[FittedField, FieldAccount] | None = None
+        self._odds: list[float] = []  # of what the last account was made with
         if before is not None and before.forward is skin.forward:
             return
         self._field_fit = FieldFit(skin.forward, skin.description)
@@ -77,10 +78,13 @@ class OutlineFit:
         return self._fit.follow(changes, budget, self._proposer(measurement))
 
     def _account(self, fitted: FittedField, measured: Measured) -> FieldAccount:
-        """The account of a field; that of the frame before while the field has not moved."""
-        if self._last is not None and self._last[0].drawing is fitted.drawing:
-            return self._last[1]
+        """The account of a field; that of the frame before while neither field nor doubts moved."""
         doubts = self._fit.doubts if isinstance(self._fit, WarmStartedFit) else []
+        odds = [doubt.odds for doubt in doubts]
+        last = self._last
+        if last is not None and last[0].drawing is fitted.drawing and self._odds == odds:
+            return last[1]
+        self._odds = odds
         known = {name: measured[name] for name in fitted.residuals}
         account = self._accountant.account(fitted, known, doubts)
         self._last = fitted, account

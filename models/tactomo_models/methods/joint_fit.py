@@ -37,8 +37,8 @@ class Question:
         column: of their parameters.
         value: that the column then has.
         worth: by how much the cost must fall for it, times what errors that go together make of
-            one unit. Of an edge, 0 to 2 trades 0.02 of ICC of soft presses on hand-made skins for
-            0.005 of flat ones at 20 dB.
+            one unit. Of an edge, 0 for 2 trades 0.005 of ICC of flat presses at 20 dB for 0.02 of
+            soft ones on hand-made skins; 4 is the other way round.
     """
 
     column: int
@@ -46,7 +46,7 @@ class Question:
     worth: float
 
 
-QUESTIONS = (Question(EDGE, HERTZ, 1.0), Question(HOLE, 1.0, 6.0))  # rings are rarer than balls
+QUESTIONS = (Question(EDGE, HERTZ, 2.0), Question(HOLE, 1.0, 6.0))  # rings are rarer than balls
 FALLEN_PEAK = 1.25  # peak of a pressure that falls, over the even one of about the same mean
 CLEARLY = 12.0  # rise of the cost, to second order, from which a question need not be asked
 MEMORY = 0.7  # of the logarithm of the odds, from one asking to the next
@@ -90,12 +90,14 @@ class JointFit:
         if not fitted.converged:
             while not (fitted.converged or budget.over):
                 fitted = self._fit.refine(fitted, measured, budget, 0.0, STEPS)
-            # Asked at once and then ever more seldom: what moves costs no more for that.
+            self._settled_on = measured
+            # Asked at once and then ever more seldom, since what moves shall cost no more for it.
+            # What stays is not asked again: a sheet's unevenness would say the same each time.
             due = self._frames_moved & (self._frames_moved - 1) == 0
             self._frames_moved += 1
             if due and isinstance(fitted.family, PressureField) and fitted.family.count:
                 fitted = self._answered(fitted, measured, budget, scale(fitted))
-        self._fitted, self._settled_on = fitted, measured
+        self._fitted = fitted
         return fitted
 
     def is_fit_of(self, drawing: Drawing) -> None:
