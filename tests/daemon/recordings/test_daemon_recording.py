@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from recorded_grasp import write_grasp
 from tactomo.config import load_config
 from tactomo.errors import ConfigError, PortError, RecordingError
 from tactomo.imaging import frame_marks
-from tactomo.recordings.recording import open_recording
-from tactomo.recordings.recording_writer import write_recording
+from tactomo.recordings.recording import open_recording, read_mark
+from tactomo.recordings.recording_writer import pack_mark, write_recording
+from tactomo.scans import Mark, ScanKey
 from tactomo.service import daemon
 from tactomo.service.daemon import Daemon
 from tactomo_client.frame import frame_from_message
@@ -209,6 +211,14 @@ def test_what_a_time_bought_is_given_again_on_any_machine(
     elsewhere = here.model_copy(update={"overhead_s": 0.0, "speed": 0.1, "rows": rows[1:]})
     again = replay(path, machine_speed=elsewhere)
     assert [(mark.tier, mark.budget_ms) for mark in open_recording(again.path).marks()] == marks
+
+
+def test_a_recording_whose_frames_were_made_by_the_hybrid_opens(tmp_path: Path) -> None:
+    """Earlier versions wrote that name for `auto` and what it did."""
+    path = write_grasp(tmp_path / "old.mcap", range(3), lambda _: {"tier": "hybrid"})
+    assert {frame.tier for frame in open_frames(path).frames()} == {"hybrid"}
+    mark = pack_mark(Mark((ScanKey(Channel.STRUCTURE, 7, 350_000),), "hybrid", None))
+    assert read_mark(mark).tier == "auto"
 
 
 def test_a_recording_knows_what_is_in_it(bench: Start, tmp_path: Path) -> None:
