@@ -73,8 +73,8 @@ class Auto(OutlineFit):
         self, measurement: Measurement, fitted: FittedField, account: FieldAccount, how: str
     ) -> Estimate:
         own = super()._conclude(measurement, fitted, account, how)
-        if not self._has_network:
-            return own
+        if not self._has_network or len(account.areas) == 0:
+            return own  # where no contact explains anything, no network knows better
         if fitted.misfit <= UNSURE_MISFIT and Flag.MISFIT_HIGH not in own.flags:
             return self._hedged(own, account, measurement)
         # It has learnt scenes that no few contacts describe; where it is sure, so are we.

@@ -51,6 +51,7 @@ FALLEN_PEAK = 1.25  # peak of a pressure that falls, over the even one of about 
 CLEARLY = 12.0  # rise of the cost, to second order, from which a question need not be asked
 MEMORY = 0.7  # of the logarithm of the odds, from one asking to the next
 HOPELESS = 20.0  # gains of the last step, that another account is still dearer: no more is tried
+FOLLOWED = 3.0  # of the cost, what a parameter gains by following a new frame's noise, at most
 STEPS = 4  # of a refinement, and of an answer
 
 
@@ -76,7 +77,11 @@ class JointFit:
         self.doubts: dict[int, Doubt] = {}
 
     def follow(
-        self, start: FittedField, measured: Measured, budget: Budget, scale: Callable[..., float]
+        self,
+        start: FittedField,
+        measured: Measured,
+        budget: Budget,
+        scale: Callable[[FittedField], float],
     ) -> FittedField:
         """Fit one frame more.
 
@@ -88,17 +93,36 @@ class JointFit:
         """
         fitted = self._continued(start, measured)
         if not fitted.converged:
+            started = fitted.cost
             while not (fitted.converged or budget.over):
                 fitted = self._fit.refine(fitted, measured, budget, 0.0, STEPS)
+            # A budget of a step or so a frame lets it follow each frame's noise, no more.
+            follows = started - fitted.cost < FOLLOWED * len(fitted.parameters)
+            fitted = replace(fitted, converged=fitted.converged or follows)
             self._settled_on = measured
-            # Asked at once and then ever more seldom, since what moves shall cost no more for it.
-            # What stays is not asked again: a sheet's unevenness would say the same each time.
-            due = self._frames_moved & (self._frames_moved - 1) == 0
-            self._frames_moved += 1
-            if due and isinstance(fitted.family, PressureField) and fitted.family.count:
-                fitted = self._answered(fitted, measured, budget, scale(fitted))
+            fitted = self._questioned(fitted, measured, budget, scale)
         self._fitted = fitted
         return fitted
+
+    def _questioned(
+        self,
+        fitted: FittedField,
+        measured: Measured,
+        budget: Budget,
+        scale: Callable[[FittedField], float],
+    ) -> FittedField:
+        """The field that questions leave: asked at once and then ever more seldom.
+
+        What moves shall cost no more for them, and what stays is not asked again: a sheet's
+        unevenness would say the same each time.
+        """
+        family = fitted.family
+        is_askable = isinstance(family, PressureField) and family.count > 0
+        if not (is_askable and fitted.converged) or budget.over:
+            return fitted
+        due = self._frames_moved & (self._frames_moved - 1) == 0
+        self._frames_moved += 1
+        return self._answered(fitted, measured, budget, scale(fitted)) if due else fitted
 
     def is_fit_of(self, drawing: Drawing) -> None:
         """Say what drawing the next frame will start with if nothing has moved on the one sheet."""

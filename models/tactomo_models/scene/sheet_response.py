@@ -18,6 +18,8 @@ from tactomo_models.arrays import FloatArray
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.sensor.response import MagnitudeResponse, StructureChannel
 
+ROUNDING = 1e-12  # of a change: at the onset it is 0
+
 
 class SheetResponse(Protocol):
     """How one sheet's conductivity, over its own at rest, follows from the pressure."""
@@ -78,6 +80,7 @@ class GradedResponse:
         piece = np.clip(piece, 0, len(self.pressure_kpa) - 2)
         slope = (np.diff(self.change) / np.diff(self.pressure_kpa))[piece]
         change = self.change[piece] + slope * (pressure_kpa - self.pressure_kpa[piece])
+        change = np.where(np.abs(change) < ROUNDING, 0.0, change)
         # A falling table must not fall through zero.
         least = -0.99
         return np.maximum(change, least), np.where(change > least, slope, 0.0)
