@@ -23,7 +23,6 @@ from tactomo_models.scene.field_fit import FittedField
 from tactomo_models.scene.pressure_field import ellipses_of
 
 UNSURE_MISFIT: Final = 1.5  # of all channels together, from which the network is asked
-SURE_CONFIDENCE: Final = 0.9  # of a network, from which a map is trusted that no fit explains
 
 
 # Error of a network's map where a field explains the data, as a share of it, about. Half or twice
@@ -77,12 +76,10 @@ class Auto(OutlineFit):
             return own  # where no contact explains anything, no network knows better
         if fitted.misfit <= UNSURE_MISFIT and Flag.MISFIT_HIGH not in own.flags:
             return self._hedged(own, account, measurement)
-        # It has learnt scenes that no few contacts describe; where it is sure, so are we.
+        # It has learnt scenes that no few contacts describe; but where data are left unexplained,
+        # sheets may contradict each other, and no network is sure enough to hide that.
         made = network_estimate(self._skin, measurement, "no pressure field explains the data")
-        flags = own.flags & Flag.NOT_CONVERGED
-        if made.confidence < SURE_CONFIDENCE:
-            flags |= Flag.MISFIT_HIGH
-        return replace(made, misfit=fitted.misfit, flags=made.flags | flags)
+        return replace(made, misfit=fitted.misfit, flags=made.flags | own.flags)
 
     def _hedged(self, own: Estimate, account: FieldAccount, measurement: Measurement) -> Estimate:
         """The field's map, as far as the field is sure of itself; for the rest, the network's.

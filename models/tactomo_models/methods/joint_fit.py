@@ -94,13 +94,13 @@ class JointFit:
         fitted = self._continued(start, measured)
         if not fitted.converged:
             started = fitted.cost
-            while not (fitted.converged or budget.over):
-                fitted = self._fit.refine(fitted, measured, budget, 0.0, STEPS)
+            fitted = self._fit.refine(fitted, measured, budget, 0.0)
             # A budget of a step or so a frame lets it follow each frame's noise, no more.
             follows = started - fitted.cost < FOLLOWED * len(fitted.parameters)
             fitted = replace(fitted, converged=fitted.converged or follows)
             self._settled_on = measured
-            fitted = self._questioned(fitted, measured, budget, scale)
+            if start.converged:  # else its form may answer for an edge
+                fitted = self._questioned(fitted, measured, budget, scale)
         self._fitted = fitted
         return fitted
 

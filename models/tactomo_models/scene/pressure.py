@@ -212,7 +212,7 @@ def pressures_of(
         by_curve = peak / np.maximum(field.peak_kpa, 1e-12)
         force = field.force_n * by_curve
         force_sigma = np.hypot(field.force_sigma_n * by_curve, force * own / peak)
-        kpa = 1e-3 * force / areas_m2
+        kpa = np.minimum(1e-3 * force / areas_m2, peak)  # but for rounding it is
         sigma = peak_sigma * kpa / peak
     else:
         kpa, sigma, force = peak, peak_sigma, 1e3 * peak * areas_m2
