@@ -101,7 +101,10 @@ class OutlineFit:
         self, measurement: Measurement, fitted: FittedField, account: FieldAccount, how: str
     ) -> Estimate:
         """The estimate that a field and the account of it come to."""
-        flags = Flag(0) if fitted.converged else Flag.NOT_CONVERGED
+        unfinished = 1.2  # misfit below which what is still being refined explains the data already
+        flags = Flag(0)
+        if not fitted.converged and fitted.misfit > unfinished:
+            flags |= Flag.NOT_CONVERGED
         if self._leaves_unexplained(fitted, account):
             flags |= Flag.MISFIT_HIGH
         return Estimate(
