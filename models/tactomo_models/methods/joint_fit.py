@@ -37,8 +37,8 @@ class Question:
         column: of their parameters.
         value: that the column then has.
         worth: by how much the cost must fall for it, times what errors that go together make of
-            one unit. Of an edge, 0 for 2 trades 0.005 of ICC of flat presses at 20 dB for 0.02 of
-            soft ones on hand-made skins; 4 is the other way round.
+            one unit. Of an edge even pressures gain up to 4 by chance and by uneven sheets: 2 for 4
+            trades 0.003 of ICC of flat presses, and surer peaks, for 0.01 of soft ones.
     """
 
     column: int
@@ -46,7 +46,8 @@ class Question:
     worth: float
 
 
-QUESTIONS = (Question(EDGE, HERTZ, 2.0), Question(HOLE, 1.0, 6.0))  # rings are rarer than balls
+QUESTIONS = (Question(EDGE, HERTZ, 3.0), Question(HOLE, 1.0, 6.0))  # rings are rarer than balls
+ONE_SHEET_WORTH = 1 / 3  # share of it on one sheet, whose outlines are as open as its edges
 FALLEN_PEAK = 1.25  # peak of a pressure that falls, over the even one of about the same mean
 CLEARLY = 12.0  # rise of the cost, to second order, from which a question need not be asked
 MEMORY = 0.7  # of the logarithm of the odds, from one asking to the next

@@ -26,6 +26,7 @@ from tactomo_models.arrays import FloatArray
 from tactomo_models.methods.contact_search import ContactSearch, MissingContact
 from tactomo_models.methods.joint_fit import (
     FALLEN_PEAK,
+    ONE_SHEET_WORTH,
     QUESTIONS,
     JointFit,
     Question,
@@ -487,7 +488,7 @@ class _Course:
         each[asked, column] = question.value
         each[asked, PEAK] = np.minimum(FALLEN_PEAK * each[asked, PEAK], shape.family.peak_limits[1])
         other = self._evaluate(each, shape.family.order, shape.log_ratio, frame)
-        return _Candidate(other, question.worth * scale) if other else None
+        return _Candidate(other, ONE_SHEET_WORTH * question.worth * scale) if other else None
 
     def _split(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
         """Two contacts for one, of the contact that stands it best."""
