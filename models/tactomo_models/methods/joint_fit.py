@@ -38,7 +38,7 @@ class Question:
         value: that the column then has.
         worth: by how much the cost must fall for it, times what errors that go together make of
             one unit. Of an edge even pressures gain up to 4 by chance and by uneven sheets: 2 for 4
-            trades 0.003 of ICC of flat presses, and surer peaks, for 0.01 of soft ones.
+            loses 0.003 of ICC of flat presses, and surer peaks, for 0.01 of soft ones.
     """
 
     column: int
@@ -46,8 +46,8 @@ class Question:
     worth: float
 
 
-QUESTIONS = (Question(EDGE, HERTZ, 3.0), Question(HOLE, 1.0, 6.0))  # rings are rarer than balls
-ONE_SHEET_WORTH = 1 / 3  # share of it on one sheet, whose outlines are as open as its edges
+QUESTIONS = (Question(EDGE, HERTZ, 4.0), Question(HOLE, 1.0, 6.0))  # rings are rarer than balls
+ONE_SHEET_WORTH = 0.25  # share of it on one sheet, whose outlines are as open as its edges
 FALLEN_PEAK = 1.25  # peak of a pressure that falls, over the even one of about the same mean
 CLEARLY = 12.0  # rise of the cost, to second order, from which a question need not be asked
 MEMORY = 0.7  # of the logarithm of the odds, from one asking to the next
