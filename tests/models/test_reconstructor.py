@@ -245,6 +245,69 @@ def test_the_last_shape_is_not_held_for_ever(reconstructor: Reconstructor, skin:
     assert tiers[-1] == "network"
 
 
+@pytest.mark.parametrize("method", ["auto", "fit", "levelset"])
+@pytest.mark.parametrize("lost", [1, 10, 11])
+def test_a_sheet_lost_in_mid_press_is_held_or_flagged_and_comes_back(
+    reconstructor: Reconstructor, skin: Skin, method: str, lost: int
+) -> None:
+    """Half a second is bridged; after that, and for the other sheet, nothing is made up."""
+    reconstructor.method = method
+    (before,) = settle(reconstructor, skin, CENTRE).contacts
+    for channel in ("structure", "magnitude"):
+        missing = Flag.STRUCTURE_MISSING if channel == "structure" else Flag.MAGNITUDE_MISSING
+        for k in range(lost):
+            frame = reconstructor.reconstruct(**{**skin.scan(CENTRE), channel: None})  # type: ignore[arg-type]
+            assert missing in frame.flags
+            if channel == "magnitude":
+                assert frame.map is None
+                assert all(math.isnan(contact.pressure_kpa) for contact in frame.contacts)
+            elif k < 10:
+                (held,) = frame.contacts
+                assert held.id == before.id
+                assert held.pressure_kpa == pytest.approx(180, abs=12)
+        (after,) = settle(reconstructor, skin, CENTRE, frames=4).contacts
+        assert after.id == before.id
+        assert after.pressure_kpa == pytest.approx(180, abs=12)
+
+
+def test_sheets_that_are_lost_by_turns_raise_nothing(
+    reconstructor: Reconstructor, skin: Skin
+) -> None:
+    settle(reconstructor, skin, CENTRE)
+    for k in range(24):
+        scans: dict[str, np.ndarray | None] = {**skin.scan(press_mm(2 * k, 0))}
+        if k % 4 in (1, 3):
+            scans["magnitude"] = None
+        if k % 4 in (2, 3):
+            scans["structure"] = None
+        frame = reconstructor.reconstruct(**scans)  # type: ignore[arg-type]
+        assert (Flag.MAGNITUDE_MISSING in frame.flags) == (scans["magnitude"] is None)
+        assert (Flag.STRUCTURE_MISSING in frame.flags) == (scans["structure"] is None)
+        assert (frame.map is None) == (scans["magnitude"] is None)
+    last = settle(reconstructor, skin, press_mm(46, 0), frames=4)
+    assert error_mm(nearest(last, press_mm(46, 0)), press_mm(46, 0)) < 2
+
+
+def test_one_graded_sheet_that_is_lost_shows_nothing_and_comes_back() -> None:
+    sensor = load_description("graded_square")
+    skin = Skin(SkinSimulator(sensor))
+    reconstructor = Reconstructor(sensor)
+    reconstructor.set_reference(skin.reference())
+    press = press_mm(15, -10, 150)
+    for lost in (0, 11):
+        for _ in range(lost):
+            frame = reconstructor.reconstruct(None, None)
+            assert frame.map is None
+            assert frame.contacts == ()
+            assert Flag.MAGNITUDE_MISSING in frame.flags
+        for _ in range(4):
+            frame = reconstructor.reconstruct(skin.scan(press)["magnitude"], None)
+        assert not frame.flags
+        (contact,) = frame.contacts
+        assert error_mm(contact, press) < 2
+        assert abs(contact.pressure_kpa - 150) < 2 * contact.pressure_sigma_kpa
+
+
 def test_without_magnitude_the_outline_goes_on_flagged(
     reconstructor: Reconstructor, skin: Skin
 ) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from tactomo_models.arrays import FloatArray
 
-STEPS = np.array([1e-3, 1e-4, 1e-5])
+STEPS = np.array([3e-4, 3e-5, 3e-6])
 
 
 def taylor_orders(

@@ -22,6 +22,7 @@ from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scene.field_account import FieldAccount, FieldAccountant
 from tactomo_models.scene.field_fit import Budget, FieldFit, FittedField, Measured
+from tactomo_models.scene.level_set import LevelSet
 from tactomo_models.scene.pressure_field import PressureField
 
 
@@ -156,6 +157,8 @@ class OutlineFit:
         if isinstance(family, PressureField):
             family = family.with_peaks_alone(parameters)
             parameters = family.join(family.fixed)
+        elif isinstance(family, LevelSet):
+            family = family.with_peaks_alone(parameters)
         held = self._field_fit.evaluate(family, parameters, last.log_ratio, measured)
         assert held is not None
         steps = 3  # pressures alone are nearly linear

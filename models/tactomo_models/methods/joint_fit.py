@@ -97,7 +97,11 @@ class JointFit:
             started = fitted.cost
             fitted = self._fit.refine(fitted, measured, budget, 0.0)
             # A budget of a step or so a frame lets it follow each frame's noise, no more.
-            follows = started - fitted.cost < FOLLOWED * len(fitted.parameters)
+            # A step that was refused, or short by its damping, says nothing; nor do a level set's
+            # many coefficients, which gain more than noise while its few pressures are far off.
+            gain = started - fitted.cost
+            few = isinstance(fitted.family, PressureField) and fitted.damping <= 1
+            follows = few and 0 < gain < FOLLOWED * len(fitted.parameters)
             fitted = replace(fitted, converged=fitted.converged or follows)
             self._settled_on = measured
             if start.converged:  # else its form may answer for an edge

@@ -44,6 +44,11 @@ def test_opposite_drive_gives_192_voltages() -> None:
     assert len(scan_pairs(16, drive_offset=8).drive) == 192
 
 
+def structure_table(ratios: str) -> str:
+    """A structure channel's table of conductivity ratios, as a description has it."""
+    return f"[structure.response]\npressure_kpa = [0, 50, 100]\nconductivity_ratio = {ratios}"
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -104,6 +109,18 @@ def test_opposite_drive_gives_192_voltages() -> None:
         ),
         (("0.0, 0.0, 0.25]", "0.0, 0.3, 0.25]"), ["relative_change", "only rise or only fall"]),
         (("0.0, 0.0, 0.25]", "0.0, 0.25]"), ["as many entries"]),
+        (
+            ("conductivity_ratio = 100.0", structure_table("[1.0, 30.0, 20.0]")),
+            ["structure.response", "conductivity_ratio", "only rise or only fall"],
+        ),
+        (
+            ("conductivity_ratio = 100.0", structure_table("[2.0, 30.0, 100.0]")),
+            ["structure.response", "conductivity_ratio", "start at 1"],
+        ),
+        (
+            ("conductivity_ratio = 100.0", structure_table("[1.0, 0.5, -0.1]")),
+            ["structure.response", "conductivity_ratio", "above 0"],
+        ),
         (("conductivity_ratio = 100.0", "conductivity_ratio = 1.0"), ["differ from 1"]),
         (
             ("conductivity_ratio = 100.0", "conductivity_ratio = 0.01\neither_way = true"),
