@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -16,6 +17,7 @@ from tactomo.cli.options import (
     examples,
     typer_app,
 )
+from tactomo.cli.plot.plot import prepare_picture
 
 from tactomo_lab.commands.evaluate import (
     Seeds,
@@ -28,6 +30,8 @@ from tactomo_lab.commands.evaluate import (
 if TYPE_CHECKING:
     from tactomo_lab.scenes.measures import FrameScore, Summary
 
+EVEN_FIT = "tactomo_lab.baselines.even_fit:EvenFit"
+
 app = typer_app()
 
 
@@ -36,6 +40,7 @@ app = typer_app()
         "tactomo evaluate field",
         "tactomo evaluate field --rows soft,graded --method fit --count 30",
         "tactomo evaluate field --seeds reporting --count 50 --json > field.json",
+        "tactomo evaluate field --rows soft --picture soft_press.png",
     ),
 )
 def field(
@@ -44,6 +49,13 @@ def field(
     rows: Annotated[str | None, typer.Option(help="Which rows, with commas. [all of them]")] = None,
     method: Method = "auto",
     sensor: Description = DEFAULT_DESCRIPTION,
+    picture: Annotated[
+        Path | None,
+        typer.Option(
+            help="Draw one soft contact, the middle one by correlation: truth, an even pressure "
+            "fitted, the method: .png, .svg or .pdf. Needs matplotlib."
+        ),
+    ] = None,
     as_json: JsonOutput = False,
 ) -> None:
     """Reconstruct what one pressure field has to explain: soft presses, one graded sheet, crowds.
@@ -59,8 +71,10 @@ def field(
     """
     from tactomo_models import ModelError, load_description
 
-    from tactomo_lab.evaluation.field import ROWS, STILL_ROWS, scores_of_row
+    from tactomo_lab.evaluation.field import ROWS, STILL_ROWS, middle_press, scores_of_row
 
+    if picture is not None:
+        prepare_picture(picture)
     description = load_description(sensor)
     scores: dict[str, list[FrameScore]] = {}
     for row in _chosen(rows, ROWS):
@@ -76,6 +90,11 @@ def field(
         typer.echo(json.dumps(told, indent=2))
     else:
         _print(settings, scores)
+    if picture is not None:
+        from tactomo_lab.commands.pictures import draw_press
+
+        draw_press(middle_press(description, (EVEN_FIT, method), seeds, count), picture)
+        typer.echo(f"wrote {picture}", err=True)
 
 
 def _chosen(text: str | None, known: tuple[str, ...]) -> list[str]:

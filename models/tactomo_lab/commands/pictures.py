@@ -6,12 +6,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from tactomo.cli.plot.plot import save_figure
+from tactomo_models.scene.press import strongest
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+    from tactomo_models import SensorDescription
+
     from tactomo_lab.evaluation.still import Outcome
 
 ROWS = 4  # scenes of each kind
+CHANGE = "|Δσ|/σ₀"
 
 
 def draw_outcomes(outcomes: Sequence[Outcome], output: Path) -> None:
@@ -23,10 +29,15 @@ def draw_outcomes(outcomes: Sequence[Outcome], output: Path) -> None:
     from matplotlib.figure import Figure
 
     by_icc = sorted(outcomes, key=lambda outcome: outcome.score.icc)
-    middle = max(0, (len(by_icc) - ROWS) // 2)
-    kinds = {"worst": by_icc[:ROWS], "in the middle": by_icc[middle : middle + ROWS]}
-    figure = Figure(figsize=(15, 2.3 * min(ROWS, len(by_icc))), layout="constrained")
-    halves: Any = figure.subfigures(1, len(kinds))
+    middle = max(ROWS, (len(by_icc) - ROWS) // 2)  # none of the worst once more
+    kinds = {
+        "the worst": by_icc[:ROWS],
+        f"in the middle of {len(by_icc)}": by_icc[middle : middle + ROWS],
+    }
+    kinds = {kind: chosen for kind, chosen in kinds.items() if chosen}
+    size = (8.5 * len(kinds), 2.3 * min(ROWS, len(by_icc)) + 0.5)
+    figure = Figure(figsize=size, layout="constrained")
+    halves: Any = figure.subfigures(1, len(kinds), squeeze=False)[0]
     for half, (kind, chosen) in zip(halves, kinds.items(), strict=True):
         half.suptitle(kind)
         grid = half.subplots(len(chosen), 4, squeeze=False)
@@ -39,21 +50,74 @@ def _draw_outcome(axes: Any, outcome: Outcome) -> None:
     score, truth, frame = outcome.score, outcome.scene.truth, outcome.frame
     top = max(truth.map.max(), 0.0 if frame.map is None else float(frame.map.max()))
     sensor = outcome.scene.description
-    x, y = sensor.map_x_m * 1e3, sensor.map_y_m * 1e3
     images = (
-        (truth.map, top, f"truth |Δσ|/σ₀: {score.scene}, {score.snr_db:g} dB"),
-        (frame.map, top, f"found, + centres: ICC {score.icc:.2f}"),
-        (truth.pressed, 1.0, f"true shape: {score.shape}, contrast {score.contrast:.0f}"),
-        (frame.structure, 1.0, f"found: ICC {score.icc_structure:.2f}"),
+        (truth.map, top, f"{score.scene}, {score.snr_db:g} dB\ntrue {CHANGE}"),
+        (frame.map, top, f"found {CHANGE}, + centres\ncorrelation {score.icc:.3f}"),
+        (truth.pressed, 1.0, f"{score.shape}, contrast {score.contrast:.0f}\ntrue shape"),
+        (frame.structure, 1.0, f"found shape\ncorrelation {score.icc_structure:.3f}"),
     )
     for panel, (image, highest, title) in zip(axes, images, strict=True):
         panel.set_title(title, fontsize=8)
-        panel.set(xticks=[], yticks=[], aspect="equal")
-        panel.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
-        if image is not None:
-            panel.imshow(
-                image, origin="lower", extent=(x[0], x[-1], y[0], y[-1]), vmin=0, vmax=highest
-            )
+        drawn = _show(panel, image, sensor, highest)
+        if panel in (axes[1], axes[3]):  # of the truth beside it, too
+            bar = axes[0].figure.colorbar(drawn, ax=panel, shrink=0.8, pad=0.02)
+            bar.ax.tick_params(labelsize=6)
+            bar.set_label(CHANGE if panel is axes[1] else "share pressed", fontsize=7)
     for contact in frame.contacts:
         axes[1].plot(contact.x_m * 1e3, contact.y_m * 1e3, "r+", markersize=6)
-    axes[3].set_xlabel(", ".join(score.flags), fontsize=6, color="tab:red")
+    axes[3].set_xlabel("\n".join(score.flags), fontsize=6, color="tab:red")
+
+
+def draw_press(outcomes: Sequence[Outcome], output: Path) -> None:
+    """Draw one contact: the truth, an even pressure fitted, the field; and a cut through it, kPa.
+
+    Args:
+        outcomes: of one scene, the even pressure first.
+        output: the picture.
+
+    Raises:
+        TactomoError: the picture cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    scene = outcomes[0].scene
+    (press,) = scene.layout.presses
+    sensor, truth = scene.description, scene.truth
+    figure = Figure(figsize=(15, 4), layout="constrained")
+    axes: Any = figure.subplots(1, 4)
+    maps = [truth.map] + [outcome.frame.map for outcome in outcomes]
+    highest = max(float(image.max()) for image in maps if image is not None)
+    names = ("an even pressure fitted", f"the field fitted ({outcomes[-1].method})")
+    titles = [f"truth, {scene.layout}\npeak {press.pressure_kpa:.0f} kPa"]
+    titles += [_told(name, outcome) for name, outcome in zip(names, outcomes, strict=True)]
+    for panel, image, title in zip(axes, maps, titles, strict=False):
+        panel.set_title(title, fontsize=10)
+        drawn = _show(panel, image, sensor, highest)
+        panel.axhline(press.y_m * 1e3, color="white", linestyle=":", linewidth=1)
+    figure.colorbar(drawn, ax=axes[:3], shrink=0.8, pad=0.01, label=CHANGE)
+    x = np.linspace(press.x_m - 0.03, press.x_m + 0.03, 301)
+    pressure, coverage = strongest([press], x, np.full_like(x, press.y_m), edge_m=1e-9)
+    axes[3].plot(x * 1e3, pressure * coverage, "k", label="truth")
+    row = int(np.argmin(np.abs(sensor.map_y_m - press.y_m)))
+    for name, outcome in zip(names, outcomes, strict=True):
+        if outcome.frame.pressure_kpa is not None:
+            axes[3].plot(sensor.map_x_m * 1e3, outcome.frame.pressure_kpa[row], label=name)
+    axes[3].set(xlim=(x[0] * 1e3, x[-1] * 1e3), ylim=(0, None), xlabel="x (mm)")
+    axes[3].set_title("pressure along the dotted line (kPa)", fontsize=10)
+    axes[3].legend(fontsize=8, loc="lower center")
+    save_figure(figure, output)
+
+
+def _told(name: str, outcome: Outcome) -> str:
+    peaks = [f"{c.peak_kpa:.0f} ± {c.peak_sigma_kpa:.0f} kPa" for c in outcome.frame.contacts]
+    return f"{name}\ncorrelation {outcome.score.icc:.3f}, peak {', '.join(peaks) or 'none'}"
+
+
+def _show(panel: Any, image: NDArray[Any] | None, sensor: SensorDescription, highest: float) -> Any:
+    """Draw an image in millimetres, nothing where there is none; what a colour bar is made of."""
+    x, y = sensor.map_x_m * 1e3, sensor.map_y_m * 1e3
+    shown = np.full((len(y), len(x)), np.nan) if image is None else image
+    panel.set(xticks=[], yticks=[], aspect="equal")
+    return panel.imshow(
+        shown, origin="lower", extent=(x[0], x[-1], y[0], y[-1]), vmin=0, vmax=highest
+    )

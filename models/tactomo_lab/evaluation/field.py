@@ -7,7 +7,7 @@ name.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import count as count_from
 from itertools import islice
 from math import ceil
@@ -19,7 +19,7 @@ from tactomo_protocol import Channel
 
 from tactomo_lab.evaluation.moving import draw_sequence, play
 from tactomo_lab.evaluation.stability import make_case
-from tactomo_lab.evaluation.still import reconstruct_scenes
+from tactomo_lab.evaluation.still import Outcome, reconstruct_scenes
 from tactomo_lab.scenes.measures import FrameScore
 from tactomo_lab.scenes.still_scenes import (
     SCENE_SHAPES,
@@ -110,6 +110,30 @@ def scenes_of_row(
     if row == "ordinary":
         return {f"{row} {snr_db:g} dB": still(SCENE_SHAPES, snr_db) for snr_db in ORDINARY_DB}
     return {row: still(("rectangle", "ring"), SHAPES_DB)}
+
+
+def middle_press(
+    description: SensorDescription,
+    methods: Sequence[str],
+    seed_set: SeedSet,
+    count: int,
+    cache: Path | None = None,
+) -> list[Outcome]:
+    """One soft contact as each method has it: the scene whose ICC by the last one is the middle.
+
+    Args:
+        description: the sensor; needs both channels.
+        methods: names of at least one.
+        seed_set: see `still_scenes.scenes`.
+        count: soft scenes to choose from; those of one contact are looked at.
+        cache: folder of simulated voltages; in the user's cache if None.
+    """
+    soft = scenes_of_row(description, "soft", seed_set, count, cache)["soft"]
+    single = (scene for scene in soft if len(scene.layout.presses) == 1)
+    outcomes = list(reconstruct_scenes(single, *methods))
+    by_scene = [outcomes[at : at + len(methods)] for at in range(0, len(outcomes), len(methods))]
+    by_scene.sort(key=lambda same: same[-1].score.icc)
+    return by_scene[len(by_scene) // 2]
 
 
 def _layouts(

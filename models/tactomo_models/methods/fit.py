@@ -13,6 +13,7 @@ import numpy as np
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
+from tactomo_models.methods.joint_fit import QUESTIONS, Question
 from tactomo_models.methods.linear import LinearImages
 from tactomo_models.methods.magnitudes import BAD_MISFIT
 from tactomo_models.methods.method import Estimate, Skin, UnsolvableError
@@ -30,6 +31,7 @@ class OutlineFit:
     """A few contacts: their outlines, and how hard each presses."""
 
     shape_model = ShapeModel.OUTLINES
+    questions: tuple[Question, ...] = QUESTIONS
 
     def prepare(self, skin: Skin) -> None:
         """Make the fit of this sensor, unless the last tare was of the same."""
@@ -48,7 +50,7 @@ class OutlineFit:
         if structure is not None and structure.either_way:
             self._fit = ObjectFit(self._field_fit, self._linear_image)
         else:
-            self._fit = WarmStartedFit(self._field_fit, self.shape_model)
+            self._fit = WarmStartedFit(self._field_fit, self.shape_model, self.questions)
             self._typical_peak = self._fit.typical_peak
 
     def solve(

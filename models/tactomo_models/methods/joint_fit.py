@@ -62,10 +62,13 @@ class JointFit:
     Args:
         fit: what fits fields to the sensor's sheets.
         field: a field without contacts.
+        questions: what is asked of the contacts.
     """
 
-    def __init__(self, fit: FieldFit, field: PressureField) -> None:
-        self._fit, self._field = fit, field
+    def __init__(
+        self, fit: FieldFit, field: PressureField, questions: tuple[Question, ...] = QUESTIONS
+    ) -> None:
+        self._fit, self._field, self._questions = fit, field, questions
         self.forget()
 
     def forget(self) -> None:
@@ -174,7 +177,7 @@ class JointFit:
         self, fitted: FittedField, measured: Measured, budget: Budget, scale: float
     ) -> FittedField:
         """Ask each question once more; the field that the answers leave."""
-        for question in QUESTIONS:
+        for question in self._questions:
             other = self._other(fitted, question, measured, budget, scale)
             if other is None:
                 continue

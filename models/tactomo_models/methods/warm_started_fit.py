@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TypeAlias
 
 import numpy as np
@@ -115,10 +115,10 @@ class _Frame:
 class _Tools:
     """What every fit on one sensor shares."""
 
-    def __init__(self, fit: FieldFit) -> None:
+    def __init__(self, fit: FieldFit, questions: tuple[Question, ...]) -> None:
         graded = fit.responses.get(Channel.MAGNITUDE)
         assert graded is None or isinstance(graded, GradedResponse)
-        self.fit = fit
+        self.fit, self.questions = fit, questions
         self.field = PressureField.on(fit.forward, graded)
         self.level_set = LevelSet(fit.forward)
         self._typical = {Channel.STRUCTURE: float(np.exp(fit.likely))}
@@ -141,11 +141,17 @@ class WarmStartedFit:
     Args:
         fit: what fits fields to the sensor's sheets.
         shape_model: how a scene may be described.
+        questions: what is asked of the contacts' pressures.
     """
 
-    def __init__(self, fit: FieldFit, shape_model: ShapeModel = ShapeModel.AS_NEEDED) -> None:
-        self._course = _Course(_Tools(fit), shape_model)
-        self._joint = JointFit(fit, self._course.tools.field)
+    def __init__(
+        self,
+        fit: FieldFit,
+        shape_model: ShapeModel = ShapeModel.AS_NEEDED,
+        questions: tuple[Question, ...] = QUESTIONS,
+    ) -> None:
+        self._course = _Course(_Tools(fit, questions), shape_model)
+        self._joint = JointFit(fit, self._course.tools.field, questions)
 
     @property
     def typical_peak(self) -> float:
@@ -385,8 +391,8 @@ class _Course:
             return []
         if self.shape_model == ShapeModel.LEVEL_SET:
             return [self._birth, self._escalate]
-        inside: list[_Move] = [self._soften, self._hollow]
-        inside = inside if Channel.MAGNITUDE in shape.residuals else []
+        questions = self.tools.questions if Channel.MAGNITUDE in shape.residuals else ()
+        inside: list[_Move] = [partial(self._with, question) for question in questions]
         form = [self._of_higher_order, self._modulate, *inside, self._split]
         if shape.misfit > GOOD_MISFIT:
             form.append(self._birth_anywhere)
@@ -464,17 +470,11 @@ class _Course:
         other = self._evaluate(each, shape.family.order, shape.log_ratio, frame)
         return _Candidate(other, needed * asked.sum()) if other else None
 
-    def _soften(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
+    def _with(self, question: Question, shape: FittedField, frame: _Frame) -> _Candidate | None:
         """Pressures that fall towards the edge, or rings, unless the data are clearly against it.
 
         What presses is likely of one kind, so all contacts are asked at once.
         """
-        return self._with(QUESTIONS[0], shape, frame)
-
-    def _hollow(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
-        return self._with(QUESTIONS[1], shape, frame)
-
-    def _with(self, question: Question, shape: FittedField, frame: _Frame) -> _Candidate | None:
         assert isinstance(shape.family, PressureField)
         column, scale = question.column, _scale(shape, frame)
         frame.budget.spend(shape)

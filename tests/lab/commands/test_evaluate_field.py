@@ -25,8 +25,10 @@ def test_in_numbers_and_words(tactomo: Run, tmp_path: Path) -> None:
     for line in told["lines"].values():
         assert line["scenes"] == len(line["scores"]) == 1
         assert line["icc"] == pytest.approx(line["scores"][0]["icc"])
-    words = tactomo(*ask, "--method", "tikhonov")
+    picture = tmp_path / "soft.png"
+    words = tactomo(*ask, "--method", "tikhonov", "--picture", picture)
     assert words.returncode == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
     assert "Simulated, not measured: small, tuning seeds" in words.stdout
     assert "area in σ" in words.stdout
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tactomo_lab.evaluation.field import STILL_ROWS, scenes_of_row, scores_of_row
+from tactomo_lab.commands.evaluate_field import EVEN_FIT
+from tactomo_lab.evaluation.field import STILL_ROWS, middle_press, scenes_of_row, scores_of_row
 from tactomo_lab.evaluation.moving import draw_sequence
 from tactomo_lab.scenes.measures import summarise
 from tactomo_lab.scenes.still_scenes import EvaluationScene
@@ -84,6 +85,17 @@ def test_a_ball_has_its_peak_and_the_mean_over_its_area(
     cell_m2 = np.diff(small.map_x_m)[0] * np.diff(small.map_y_m)[0]
     in_all = scene.truth.map.sum() * cell_m2
     assert contact.magnitude * contact.area_m2 == pytest.approx(in_all, rel=1e-6)
+
+
+def test_an_even_pressure_is_fitted_to_the_middle_press(
+    small: SensorDescription, folder: Path
+) -> None:
+    """By the fit of old, beside the field that knows of an edge."""
+    even, field = middle_press(small, (EVEN_FIT, "fit"), "tuning", 4, folder)
+    assert even.scene is field.scene
+    assert len(even.scene.layout.presses) == 1
+    assert [contact.edge for contact in even.frame.contacts] == [0]
+    assert field.frame.contacts[0].edge > 0
 
 
 def test_a_sensor_of_one_channel_has_no_rows(small: SensorDescription) -> None:
