@@ -18,6 +18,7 @@ Where contacts overlap, what is pressed is pressed once, with the mean of their 
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -219,11 +220,9 @@ class PressureField:
         """Draw the field on the nodes."""
         each = self.split(parameters)
         near = self._near(each)
-        drawn = _Contacts(self, each, self.x_m[near], self.y_m[near])
-        there = (drawn.wide > -1).any(axis=0)
-        if not there.all():
-            near = near[there]
-            drawn = _Contacts(self, each, self.x_m[near], self.y_m[near])
+        outlines = _Outlines(self, each, self.x_m[near], self.y_m[near])
+        there = (outlines.t + self.offset_m / self.half_width_m > -1).any(axis=0)
+        near, drawn = near[there], _Contacts(self, each, outlines.at(there))
 
         def slopes() -> tuple[FloatArray, FloatArray, FloatArray]:
             enclosed, share, pressure = drawn.slopes()
@@ -238,7 +237,8 @@ class PressureField:
 
         Outlines are as sharp as the points can show them.
         """
-        drawn = _Contacts(replace(self, half_width_m=step_m), each, x_m, y_m, is_sharp=True)
+        sharp = replace(self, half_width_m=step_m)
+        drawn = _Contacts(sharp, each, _Outlines(sharp, each, x_m, y_m), is_sharp=True)
         return 1 - np.prod(1 - drawn.whole, axis=0), drawn.share, drawn.pressure_kpa
 
     def _near(self, each: FloatArray) -> IntArray:
@@ -260,13 +260,11 @@ class _Contacts:
         self,
         of: PressureField,
         each: FloatArray,
-        x_m: FloatArray,
-        y_m: FloatArray,
+        outlines: _Outlines,
         *,
         is_sharp: bool = False,
     ) -> None:
-        self._of, self._each = of, each
-        self.outline = _Outlines(of, each, x_m, y_m)
+        self._of, self._each, self.outline = of, each, outlines
         step = _linear_step if is_sharp else heaviside
         self.wide = self.outline.t + of.offset_m / of.half_width_m
         self._wide, self.whole = step(self.wide), step(self.outline.t / GRADED_WIDTH)
@@ -368,6 +366,15 @@ class _Outlines:
         self._depth = np.where(self.log_q > -1, -self.log_q, inner)
         self._depth_slope = -inner
         self.t = self._depth * self._scale / of.half_width_m
+
+    def at(self, points: BoolArray) -> _Outlines:
+        """The same at some of the points."""
+        kept = copy(self)
+        by_point = vars(self).keys() - {"_of", "_each", "_B", "_dB"}
+        for name in by_point:
+            values = getattr(self, name)
+            setattr(kept, name, None if values is None else values[..., points])
+        return kept
 
     def slopes(self) -> tuple[FloatArray, FloatArray]:
         """Derivatives (K, forms, n) of t and of log q; each parameter moves u by du and B by dB."""
