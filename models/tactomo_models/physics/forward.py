@@ -158,6 +158,7 @@ class ForwardModel:
         # electrode, or a triangle that cannot be pressed, is part of the balance.
         left = np.abs(law @ self.bare.potentials).max(axis=1)
         self._last_areas: _PressedAreas | None = None
+        self._last_touched: tuple[IntArray, tuple[IntArray, IntArray, IntArray]] | None = None
         self._closed = left < 1e-9 * (abs(law) @ np.abs(self.bare.potentials)).max(axis=1)
 
     def solve(
@@ -293,8 +294,7 @@ class ForwardModel:
         Returns:
             (M, K), or (M, n) by the nodes' relative conductivity (the paper's equation 2).
         """
-        triangles = self._around(where)
-        nodes, corners = _renumbered(self._corner_support[triangles], len(self.bare.support))
+        triangles, nodes, corners = self._touched(where)
         fields = self.potentials(solution, nodes) @ self._pair_matrix.T  # (nodes, pairs)
         gradient = self._gradient[triangles] @ fields[corners]  # (t, 2, pairs)
         share = self._shares(where, triangles, solution.mixed)
@@ -307,6 +307,17 @@ class ForwardModel:
                 strip = slice(start, start + _STRIP)
                 summed += weight[strip].T @ self._field_products(gradient[strip])
         return np.asarray((summed[:, self._product_of] * self._sign).T)
+
+    def _touched(self, where: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+        """Indexed triangles around pressable nodes, the different ones of their corners, and which.
+
+        Sheets that are differentiated at the very same nodes share what was found.
+        """
+        if self._last_touched is None or self._last_touched[0] is not where:
+            triangles = self._around(where)
+            corners = _renumbered(self._corner_support[triangles], len(self.bare.support))
+            self._last_touched = where, (triangles, *corners)
+        return self._last_touched[1]
 
     def _shares(
         self, where: IntArray, triangles: IntArray, mixed: FloatArray | None
