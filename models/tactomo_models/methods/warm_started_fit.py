@@ -22,7 +22,7 @@ from typing import TypeAlias
 import numpy as np
 from tactomo_protocol import Channel
 
-from tactomo_models.arrays import FloatArray
+from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.methods.contact_search import ContactSearch, MissingContact
 from tactomo_models.methods.joint_fit import (
     FALLEN_PEAK,
@@ -63,6 +63,9 @@ TRIALS = 4  # of so many steps that a candidate may take
 MAX_CONTACTS = 12
 # Gains and losses are in squared misfit, and count by how well the data are explained otherwise.
 SURE_GAIN = 30.0  # of a contact: the best of 500 places gains some 15 by noise alone
+CROWD = 4  # contacts among which two may pass for one
+CROWD_GAIN = 15.0  # of a split among them: two for one gain 30 and more there
+LONG_GAIN = 5.0  # of two small contacts for a long one: about as many parameters
 SMALL_M = 0.006  # contacts of a smaller radius are asked whether they are needed
 
 Propose = Callable[[], FloatArray]  # (K, COLUMNS), see `pressure_field.ellipses_of`
@@ -206,6 +209,7 @@ class _Course:
         self._from_nothing = True  # or from the shape of frames before
         self.doubts: dict[int, Doubt] = {}  # of contacts like these, by what is in doubt
         self._adopted: Drawing | None = None
+        self._halved: tuple[FittedField, list[tuple[FittedField, int]]] | None = None
         self._cold_start: _Course | None = None
         self._start_over()
 
@@ -393,7 +397,7 @@ class _Course:
             return [self._birth, self._escalate]
         questions = self.tools.questions if Channel.MAGNITUDE in shape.residuals else ()
         inside: list[_Move] = [partial(self._with, question) for question in questions]
-        form = [self._of_higher_order, self._modulate, *inside, self._split]
+        form = [self._of_higher_order, self._modulate, *inside, *self._splits(shape)]
         if shape.misfit > GOOD_MISFIT:
             form.append(self._birth_anywhere)
         free = [self._escalate] if self.shape_model == ShapeModel.AS_NEEDED else []
@@ -490,25 +494,47 @@ class _Course:
         other = self._evaluate(each, shape.family.order, shape.log_ratio, frame)
         return _Candidate(other, ONE_SHEET_WORTH * question.worth * scale) if other else None
 
-    def _split(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
-        """Two contacts for one, of the contact that stands it best."""
+    def _splits(self, shape: FittedField) -> list[_Move]:
+        """Moves that make two contacts of one: those that stand it best, one after the other."""
         elongated = 0.4  # half the logarithm of the axes' ratio (2.2), from which it may be two
-        worth = 5.0  # of two small contacts for a long one: about as many parameters
-        assert isinstance(shape.family, PressureField)
-        each, order = shape.family.split(shape.parameters), shape.family.order
-        if shape.family.count == MAX_CONTACTS:
-            return None
+        asked_of_crowd = 3  # contacts: with each, one crowded scene in ten more is counted right
+        each = _each(shape)
+        if not 0 < len(each) < MAX_CONTACTS:
+            return []
         long = np.hypot(each[:, E1], each[:, E2]) > elongated
-        asked = np.arange(len(each)) if shape.misfit > GOOD_MISFIT else np.flatnonzero(long)
-        halved = [
-            (half, bool(long[k]))
-            for k in asked.tolist()
-            if (half := self._evaluate(_halved(each, k), order, shape.log_ratio, frame))
-        ]
-        if not halved:
-            return None
-        best, is_long = min(halved, key=lambda one: one[0].cost)
-        return _Candidate(best, (worth if is_long else SURE_GAIN) * _scale(shape, frame))
+        crowd = len(each) >= CROWD
+        asked = (
+            np.arange(len(each)) if shape.misfit > GOOD_MISFIT or crowd else np.flatnonzero(long)
+        )
+        count = asked_of_crowd if crowd else 1
+
+        def split(rank: int) -> _Move:
+            def move(shape: FittedField, frame: _Frame) -> _Candidate | None:
+                ranked = self._halves(shape, asked, frame)
+                if rank >= len(ranked):
+                    return None
+                half, k = ranked[rank]
+                gain = LONG_GAIN if long[k] else CROWD_GAIN if crowd else SURE_GAIN
+                return _Candidate(half, gain * _scale(shape, frame))
+
+            return move
+
+        return [split(rank) for rank in range(min(count, len(asked)))]
+
+    def _halves(
+        self, shape: FittedField, asked: IntArray, frame: _Frame
+    ) -> list[tuple[FittedField, int]]:
+        """What each contact that is asked makes as two, the best first, and which it is."""
+        if self._halved is None or self._halved[0] is not shape:
+            assert isinstance(shape.family, PressureField)
+            each, order = _each(shape), shape.family.order
+            halves = [
+                (half, k)
+                for k in asked.tolist()
+                if (half := self._evaluate(_halved(each, k), order, shape.log_ratio, frame))
+            ]
+            self._halved = shape, sorted(halves, key=lambda one: one[0].cost)
+        return self._halved[1]
 
     def _escalate(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
         """The same as a level set."""
