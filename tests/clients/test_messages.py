@@ -30,6 +30,7 @@ from tactomo_client.messages import (
 )
 
 RESERVED = {"schema", "sensor", "kind", "clock_id", *HEADER}
+OPTIONAL = {"delay_ns", "dated_by", "skew_ms", "confidence"}  # header fields of types of their own
 
 scalars = st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text()
 values = st.recursive(
@@ -51,7 +52,7 @@ def arrays() -> st.SearchStrategy[np.ndarray[Any, Any]]:
     sensor=st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", fullmatch=True),
     kind=st.sampled_from(KINDS),
     extra=st.dictionaries(
-        st.text().filter(lambda k: k not in RESERVED),
+        st.text().filter(lambda k: k not in RESERVED | OPTIONAL),
         values.filter(lambda v: v == v),
         max_size=4,
     ),

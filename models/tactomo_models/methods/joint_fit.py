@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from tactomo_protocol import Channel
 
 from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.scans.stillness import is_still
@@ -50,9 +51,9 @@ QUESTIONS = (Question(EDGE, HERTZ, 4.0), Question(HOLE, 1.0, 6.0))  # rings are 
 ONE_SHEET_WORTH = 0.25  # share of it on one sheet, whose outlines are as open as its edges
 FALLEN_PEAK = 1.25  # peak of a pressure that falls, over the even one of about the same mean
 CLEARLY = 12.0  # rise of the cost, to second order, from which a question need not be asked
-MEMORY = 0.7  # of the logarithm of the odds, from one asking to the next
 HOPELESS = 20.0  # gains of the last step, that another account is still dearer: no more is tried
 FOLLOWED = 3.0  # of the cost, what a parameter gains by following a new frame's noise, at most
+OTHER = 1.25  # ratio of the graded sheet's signals, from which a press is another one
 STEPS = 4  # of a refinement, and of an answer
 
 
@@ -78,6 +79,7 @@ class JointFit:
         self._settled_on: Measured = {}
         self._evidence: dict[int, float] = {}  # logarithm of the odds against each column's value
         self._frames_moved = 0  # with these contacts
+        self._asked_signal = 0.0  # of the graded sheet, when a question was asked last
         self.doubts: dict[int, Doubt] = {}
 
     def follow(
@@ -128,8 +130,15 @@ class JointFit:
         is_askable = isinstance(family, PressureField) and family.count > 0
         if not (is_askable and fitted.converged) or budget.over:
             return fitted
+        signal = measured[Channel.MAGNITUDE].misfit
+        if not self._asked_signal / OTHER < signal < self._asked_signal * OTHER:
+            # Another press: what the last one left open, or decided, says little of this one.
+            self._evidence.clear()
+            self.doubts.clear()
+            self._frames_moved = 0
         due = self._frames_moved & (self._frames_moved - 1) == 0
         self._frames_moved += 1
+        self._asked_signal = signal if due else self._asked_signal
         return self._answered(fitted, measured, budget, scale(fitted)) if due else fitted
 
     def is_fit_of(self, drawing: Drawing) -> None:
@@ -185,8 +194,9 @@ class JointFit:
             # For the even pressure, whichever of the two is the present account.
             falls = bool(one[:, question.column].any())
             rise = (fitted.cost - other.cost if falls else other.cost - fitted.cost) / scale
-            known = MEMORY * self._evidence.get(question.column, 0.0)
-            evidence = float(np.clip(known + (question.worth + rise) / 2, -50.0, 50.0))
+            odds = float(np.clip((question.worth + rise) / 2, -50.0, 50.0))
+            # A mean and no sum: where a contact stays, errors of the sheet repeat themselves.
+            evidence = (odds + self._evidence.get(question.column, odds)) / 2
             self._evidence[question.column] = evidence
             if falls == (evidence > 0):
                 fitted, one, two = other, two, one

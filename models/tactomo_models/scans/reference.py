@@ -157,8 +157,10 @@ def _noise_against(
     e², the reference, a mean of n, has s²/n + e², a scan s² + e², and their difference s² + s²/n,
     which leaves s² and n. Where e² is much the larger, the difference alone is to be trusted.
     """
+    with np.errstate(all="ignore"):  # a scan may hold anything
+        difference = scans - reference
     own, one, both = (
-        noise_of_reciprocity(description, volts) for volts in (reference, scans, scans - reference)
+        noise_of_reciprocity(description, volts) for volts in (reference, scans, difference)
     )
     if own is None or one is None or both is None:
         return None

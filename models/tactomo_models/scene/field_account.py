@@ -51,6 +51,8 @@ class FieldAccount:
         magnitude_sigmas: (K,) their standard uncertainties.
         contacts: what it says of each area's pressure.
         goes_wrong_way: whether a conductivity goes where no pressure takes it.
+        uncertainty: of areas and magnitudes together, as a share of them, by noise alone and not by
+            other accounts; NaN where they are not known.
     """
 
     areas: Areas
@@ -61,15 +63,7 @@ class FieldAccount:
     magnitude_sigmas: FloatArray
     contacts: FieldContacts | None
     goes_wrong_way: bool
-
-    @property
-    def uncertainty(self) -> float:
-        """Of areas and magnitudes together, as a share of them; NaN where they are not known."""
-        if len(self.areas) == 0:
-            return float("nan")
-        of_area = self.areas.sigmas[:, 2] / self.areas.areas_m2
-        of_size = self.magnitude_sigmas / np.maximum(self.magnitudes, 1e-12)
-        return float(np.sqrt(np.mean(of_area**2 + np.minimum(of_size, 1.0) ** 2)))
+    uncertainty: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -118,6 +112,7 @@ class FieldAccountant:
         """
         negligible = 0.02  # odds of what need not be drawn
         shown, family, weight = self._drawn(fitted, measured, None), fitted.family, 1.0
+        shown = replace(shown, uncertainty=_uncertainty(shown))
         if not isinstance(family, PressureField):
             return shown
         each = family.split(fitted.parameters)
@@ -274,12 +269,17 @@ class FieldAccountant:
         peak_size, peak_slope = (np.abs(v) for v in self._graded.relative_change(peaks))
         scale = areas.areas_m2 / area  # the map's, over the mesh's
         by_force = signed * pressure[:, None] + share[:, None] * by_pressure
+        means = (weight @ (share * pressure)) / area
+        by_mean_kpa = (weight @ by_force - means[:, None] * (weight @ signed)) / area[:, None]
+        by_outline_kpa = by_outline * peak_size / np.maximum(peak_slope, 1e-12)
         known["contacts"] = FieldContacts(
             peak_magnitude=peak_size,
             peak_magnitude_sigma=np.hypot(peak_slope * sigma(by_peak), by_outline * peak_size),
             felt=peak_size,
             felt_sigma=peak_slope * sigma(by_peak),
             peak_kpa=peaks,
+            mean_kpa=means,
+            mean_sigma_kpa=np.hypot(sigma(by_mean_kpa), by_outline_kpa * means / peaks),
             force_n=1e3 * (weight @ (share * pressure)) * scale,
             force_sigma_n=1e3 * sigma(weight @ by_force) * scale,
             edge=edges,
@@ -324,12 +324,15 @@ def _mean(one: FieldAccount, other: FieldAccount, share: float) -> FieldAccount:
     contacts = one.contacts
     if one.contacts is not None and other.contacts is not None:
         a, b = one.contacts, other.contacts
+        is_evener = b.edge < a.edge
         contacts = FieldContacts(
             peak_magnitude=mean(a.peak_magnitude, b.peak_magnitude),
             peak_magnitude_sigma=spread(a.peak_magnitude_sigma, a.peak_magnitude, b.peak_magnitude),
-            felt=a.felt,
-            felt_sigma=a.felt_sigma,
+            felt=np.where(is_evener, b.felt, a.felt),
+            felt_sigma=np.where(is_evener, b.felt_sigma, a.felt_sigma),
             peak_kpa=mean(a.peak_kpa, b.peak_kpa),
+            mean_kpa=mean(a.mean_kpa, b.mean_kpa),
+            mean_sigma_kpa=spread(a.mean_sigma_kpa, a.mean_kpa, b.mean_kpa),
             force_n=mean(a.force_n, b.force_n),
             force_sigma_n=spread(a.force_sigma_n, a.force_n, b.force_n),
             edge=a.edge,
@@ -354,3 +357,12 @@ def _mean(one: FieldAccount, other: FieldAccount, share: float) -> FieldAccount:
         magnitude_sigmas=spread(one.magnitude_sigmas, one.magnitudes, other.magnitudes),
         contacts=contacts,
     )
+
+
+def _uncertainty(account: FieldAccount) -> float:
+    areas = account.areas
+    if len(areas) == 0:
+        return float("nan")
+    of_area = areas.sigmas[:, 2] / areas.areas_m2
+    of_size = account.magnitude_sigmas / np.maximum(account.magnitudes, 1e-12)
+    return float(np.sqrt(np.mean(of_area**2 + np.minimum(of_size, 1.0) ** 2)))

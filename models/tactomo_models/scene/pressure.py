@@ -66,9 +66,12 @@ class FieldContacts:
     Attributes:
         peak_magnitude: (K,) |relative conductivity change| under the highest pressure.
         peak_magnitude_sigma: (K,) standard uncertainties.
-        felt: (K,) the same by the likeliest account of how pressures fall towards the edge.
-        felt_sigma: (K,) its standard uncertainty, by which something is felt or not.
+        felt: (K,) the same by the likely account in which the pressure falls least towards the
+            edge: it tells best whether anything is felt at all.
+        felt_sigma: (K,) its standard uncertainty by noise.
         peak_kpa: (K,) highest pressures.
+        mean_kpa: (K,) mean pressures.
+        mean_sigma_kpa: (K,) their standard uncertainties: how a pressure falls matters less there.
         force_n: (K,) forces.
         force_sigma_n: (K,) standard uncertainties.
         edge: (K,) gamma; 0 flat, 1/2 Hertz.
@@ -79,6 +82,8 @@ class FieldContacts:
     felt: FloatArray
     felt_sigma: FloatArray
     peak_kpa: FloatArray
+    mean_kpa: FloatArray
+    mean_sigma_kpa: FloatArray
     force_n: FloatArray
     force_sigma_n: FloatArray
     edge: FloatArray
@@ -212,8 +217,9 @@ def pressures_of(
         by_curve = peak / np.maximum(field.peak_kpa, 1e-12)
         force = field.force_n * by_curve
         force_sigma = np.hypot(field.force_sigma_n * by_curve, force * own / peak)
-        kpa = np.minimum(1e-3 * force / areas_m2, peak)  # but for rounding it is
-        sigma = peak_sigma * kpa / peak
+        kpa = np.minimum(field.mean_kpa * by_curve, peak)  # but for rounding it is
+        kpa = np.where(above, peak, kpa)  # at least that, somewhere
+        sigma = np.where(within, np.hypot(field.mean_sigma_kpa * by_curve, own), np.nan)
     else:
         kpa, sigma, force = peak, peak_sigma, 1e3 * peak * areas_m2
         by_area = magnitude * area_sigmas_m2 / areas_m2
