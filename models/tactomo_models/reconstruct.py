@@ -36,6 +36,7 @@ from tactomo_models.sensor.description import SensorDescription
 
 DEFAULT_BUDGET_S: Final = 0.05
 FALLBACK: Final = "tikhonov"
+STEADY: Final = 5.0  # standard uncertainties that a steady press's magnitude changes by, at most
 
 
 class Reconstructor:
@@ -85,7 +86,7 @@ class Reconstructor:
         self._failures: dict[str, str] = {}  # of methods prepared since the tare; empty if good
         self._previous: Estimate | None = None
         self._tracker = ContactTracker()
-        self._ranges: dict[int, PressureRange] = {}  # that each identity was last seen in
+        self._ranges: dict[int, tuple[PressureRange, float]] = {}  # and magnitude, of each identity
         self._name = method if isinstance(method, str) else type(method).__name__
         if isinstance(method, str):
             check_method(method, description)
@@ -292,17 +293,21 @@ class Reconstructor:
             areas, size, sigma = self._areas_of(estimate)
             ids = self._tracker.update(areas.centres_m, areas.areas_m2)
             account = estimate.account
-            contacts = contacts_of(
-                areas,
-                ids,
-                size,
-                sigma,
-                self.curve,
-                last=self._ranges,
-                field=account.contacts if account else None,
-            )
-            seen = self._ranges | {contact.id: contact.pressure_range for contact in contacts}
-            self._ranges = {known: seen[known] for known in self._tracker.ids if known in seen}
+            field = account.contacts if account else None
+            felt, noise = (size, sigma) if field is None else (field.felt, field.felt_sigma)
+            # A press that is clearly another one than a frame ago has no range to keep.
+            last = {
+                known: self._ranges[known][0]
+                for known, now, by_chance in zip(ids, felt, STEADY * noise, strict=True)
+                if known in self._ranges and abs(now - self._ranges[known][1]) <= by_chance
+            }
+            contacts = contacts_of(areas, ids, size, sigma, self.curve, last=last, field=field)
+            seen = {
+                contact.id: (contact.pressure_range, float(now))
+                for contact, now in zip(contacts, felt, strict=True)
+            }
+            kept = self._ranges | seen
+            self._ranges = {known: kept[known] for known in self._tracker.ids if known in kept}
         pressure = None
         if estimate.tells_pressure and has_magnitude:
             pressure = pressure_map(areas, contacts, account.pressure_kpa if account else None)
