@@ -144,6 +144,7 @@ def test_a_guided_session_makes_pressures_right(
     assert all(contact.pressure_kpa is None for contact in below)
     hard = bench.contact(300)
     assert hard.pressure_range == "above"
+    assert hard.pressure_kpa is not None
     # The curve ends at the hardest reading, or before it where noise has exchanged the hardest.
     assert max(HELD_OUT_KPA) <= hard.pressure_kpa <= max(LEVELS_KPA) + 0.1
     bench.close()
