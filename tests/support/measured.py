@@ -18,7 +18,6 @@ def measured(change: FloatArray, weight: FloatArray | float = 1.0) -> Changes:
         change,
         weights,
         even,
-        variance,
         False,
         1.0,
         weights**2,

@@ -3,24 +3,23 @@
 What is there, and of what form, is found on the sheet that shows outlines best. Here follow the
 pressures, the outlines as all sheets have them, and two questions that the graded sheet answers:
 does the pressure fall towards the edge, and does a ring press with its rim alone? An answer is an
-odds ratio that grows or shrinks from frame to frame; while it is open, the other account of the
-contacts has its share in what is shown.
+odds ratio; while it is open, the other account of the contacts has its share in what is shown.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from tactomo_protocol import Channel
 
-from tactomo_models.arrays import BoolArray, FloatArray
-from tactomo_models.scans.stillness import is_still
+from tactomo_models.arrays import FloatArray
+from tactomo_models.scans.stillness import are_still
 from tactomo_models.scene.field_account import Doubt
 from tactomo_models.scene.field_fit import Budget, Family, FieldFit, FittedField, Measured
 from tactomo_models.scene.level_set import LevelSet
 from tactomo_models.scene.pressure_field import (
+    COLUMNS,
     EDGE,
     HERTZ,
     HOLE,
@@ -87,7 +86,7 @@ class JointFit:
         start: FittedField,
         measured: Measured,
         budget: Budget,
-        scale: Callable[[FittedField], float],
+        doubt: float,
     ) -> FittedField:
         """Fit one frame more.
 
@@ -95,7 +94,7 @@ class JointFit:
             start: what was found on one sheet.
             measured: the changes of all sheets.
             budget: compute time that may be spent; one step is always taken.
-            scale: what one unit of squared misfit means, for a field that is fitted.
+            doubt: see `unit_of_gain`.
         """
         fitted = self._continued(start, measured)
         if not fitted.converged:
@@ -110,7 +109,7 @@ class JointFit:
             fitted = replace(fitted, converged=fitted.converged or follows)
             self._settled_on = measured
             if start.converged:  # else its form may answer for an edge
-                fitted = self._questioned(fitted, measured, budget, scale)
+                fitted = self._questioned(fitted, measured, budget, doubt)
         self._fitted = fitted
         return fitted
 
@@ -119,7 +118,7 @@ class JointFit:
         fitted: FittedField,
         measured: Measured,
         budget: Budget,
-        scale: Callable[[FittedField], float],
+        doubt: float,
     ) -> FittedField:
         """The field that questions leave: asked at once and then ever more seldom.
 
@@ -139,7 +138,9 @@ class JointFit:
         due = self._frames_moved & (self._frames_moved - 1) == 0
         self._frames_moved += 1
         self._asked_signal = signal if due else self._asked_signal
-        return self._answered(fitted, measured, budget, scale(fitted)) if due else fitted
+        if not due:
+            return fitted
+        return self._answered(fitted, measured, budget, unit_of_gain(fitted, doubt))
 
     def is_fit_of(self, drawing: Drawing) -> None:
         """Say what drawing the next frame will start with if nothing has moved on the one sheet."""
@@ -149,7 +150,7 @@ class JointFit:
         before = self._fitted
         if before is not None and self._given is start.drawing:
             fitted = self._fit.compare(before, measured)
-            if self._is_still(measured):
+            if are_still(self._settled_on, measured):
                 return replace(fitted, converged=before.converged)
             if before.solutions.keys() == measured.keys():
                 return fitted
@@ -177,11 +178,6 @@ class JointFit:
             peaks = self._fitted.parameters[len(coefficients) :]
         return owned, np.append(coefficients, peaks)
 
-    def _is_still(self, measured: Measured) -> bool:
-        return measured.keys() == self._settled_on.keys() and all(
-            is_still(self._settled_on[name], changes) for name, changes in measured.items()
-        )
-
     def _answered(
         self, fitted: FittedField, measured: Measured, budget: Budget, scale: float
     ) -> FittedField:
@@ -190,7 +186,7 @@ class JointFit:
             other = self._other(fitted, question, measured, budget, scale)
             if other is None:
                 continue
-            one, two = _contacts_of(fitted), _contacts_of(other)
+            one, two = contacts_of(fitted), contacts_of(other)
             # For the even pressure, whichever of the two is the present account.
             falls = bool(one[:, question.column].any())
             rise = (fitted.cost - other.cost if falls else other.cost - fitted.cost) / scale
@@ -214,19 +210,18 @@ class JointFit:
     ) -> FittedField | None:
         """The field as it else might be; None where nothing is in question, or time is short."""
         assert isinstance(fitted.family, PressureField)
-        each, column = _contacts_of(fitted), question.column
-        asked = each[:, column] > 0
-        value, peak = 0.0, 1 / FALLEN_PEAK
-        if not asked.any():
-            slopes, bends = further(self._fit, fitted, measured, slice(column, column + 1))
+        each: FloatArray | None = contacts_of(fitted)
+        assert each is not None
+        falls = each[:, question.column] > 0
+        if falls.any():
+            each[falls, question.column] = 0.0
+            peaks = 1 / FALLEN_PEAK * each[falls, PEAK]
+            each[falls, PEAK] = np.clip(peaks, *fitted.family.peak_limits)
+        else:
             budget.spend(fitted)
-            asked = is_open(question, slopes, bends, scale)
-            asked &= (each[:, [EDGE, HOLE]] == 0).all(axis=1)
-            value, peak = question.value, FALLEN_PEAK
-        if not asked.any():
+            each = fallen(question, self._fit, fitted, measured, scale)
+        if each is None:
             return None
-        each[asked, column] = value
-        each[asked, PEAK] = np.clip(peak * each[asked, PEAK], *fitted.family.peak_limits)
         family = self._field.of(each, fitted.family.order)
         other = self._fit.evaluate(family, family.join(each), fitted.log_ratio, measured)
         if other is None:
@@ -242,16 +237,43 @@ class JointFit:
         return other if other.cost < fitted.cost else None
 
 
-def _contacts_of(fitted: FittedField) -> FloatArray:
-    assert isinstance(fitted.family, PressureField)
+def contacts_of(fitted: FittedField) -> FloatArray:
+    """(K, COLUMNS) of a field's contacts; none of a level set."""
+    if not isinstance(fitted.family, PressureField):
+        return np.zeros((0, COLUMNS))
     return fitted.family.split(fitted.parameters)
 
 
-def is_open(question: Question, slopes: FloatArray, bends: FloatArray, scale: float) -> BoolArray:
-    """Tell of which contacts (K,) a question is worth asking; see `further`."""
+def unit_of_gain(fitted: FittedField, doubt: float) -> float:
+    """What one unit of squared misfit means, by what a field leaves unexplained.
+
+    Args:
+        fitted: the field.
+        doubt: what errors that go together make of it.
+    """
+    return max(doubt, fitted.misfit**2 / 2)
+
+
+def fallen(
+    question: Question, fit: FieldFit, fitted: FittedField, measured: Measured, scale: float
+) -> FloatArray | None:
+    """The contacts (K, COLUMNS) of a field with an edge, or with holes, as many as may have one.
+
+    What presses is likely of one kind, so they are all asked at once. None where the data are
+    clearly against it.
+    """
+    assert isinstance(fitted.family, PressureField)
+    each, column = contacts_of(fitted), question.column
+    slopes, bends = further(fit, fitted, measured, slice(column, column + 1))
     rise = 2 * question.value * slopes[:, 0] + question.value**2 * bends[:, 0, 0]
     # Far from where it was made a parabola knows little: a falling one is always worth asking.
-    return np.asarray((rise < CLEARLY * scale) | (slopes[:, 0] < 0))
+    asked = (rise < CLEARLY * scale) | (slopes[:, 0] < 0)
+    asked &= (each[:, [EDGE, HOLE]] == 0).all(axis=1)
+    if not asked.any():
+        return None
+    each[asked, column] = question.value
+    each[asked, PEAK] = np.minimum(FALLEN_PEAK * each[asked, PEAK], fitted.family.peak_limits[1])
+    return each
 
 
 def further(

@@ -25,15 +25,16 @@ from tactomo_protocol import Channel
 from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.methods.contact_search import ContactSearch, MissingContact
 from tactomo_models.methods.joint_fit import (
-    FALLEN_PEAK,
     ONE_SHEET_WORTH,
     QUESTIONS,
     JointFit,
     Question,
+    contacts_of,
+    fallen,
     further,
-    is_open,
+    unit_of_gain,
 )
-from tactomo_models.scans.stillness import is_still
+from tactomo_models.scans.stillness import are_still
 from tactomo_models.scene.field_account import Doubt
 from tactomo_models.scene.field_fit import Budget, FieldFit, FittedField, Measured
 from tactomo_models.scene.level_set import LevelSet
@@ -186,9 +187,8 @@ class WarmStartedFit:
         # what form is found on it, and then all sheets judge together.
         outlines = {Channel.STRUCTURE: measured[Channel.STRUCTURE]}
         shape, how = self._course.follow(_Frame(outlines, budget, propose))
-        joint = self._joint.follow(
-            shape, measured, budget, lambda fitted: _scale(fitted, _Frame(measured, budget, None))
-        )
+        every = _Frame(measured, budget, None)
+        joint = self._joint.follow(shape, measured, budget, every.doubt)
         self._joint.is_fit_of(self._course.adopt(joint, outlines))
         return replace(joint, converged=joint.converged and shape.converged), how
 
@@ -278,7 +278,7 @@ class _Course:
         if before is None:
             return self._from_scratch(frame)
         shape = self.tools.fit.compare(before, frame.measured)
-        still = self._is_still(frame.measured)
+        still = are_still(self._settled_on, frame.measured)
         if before.converged and still:
             return replace(shape, converged=True), "still"
         shape = replace(shape, converged=False)
@@ -313,12 +313,6 @@ class _Course:
             if proposed is not None and proposed.cost < nothing.cost:
                 return proposed, "proposed"
         return nothing, "cold start"
-
-    def _is_still(self, measured: Measured) -> bool:
-        """Tell whether this frame differs by noise alone from the one that the shape is of."""
-        return measured.keys() == self._settled_on.keys() and all(
-            is_still(self._settled_on[name], changes) for name, changes in measured.items()
-        )
 
     def _improve(self, shape: FittedField, frame: _Frame) -> FittedField:
         """Refine, and try one candidate after another, until none is left or the budget ends."""
@@ -371,7 +365,7 @@ class _Course:
 
     def _doubt(self, shape: FittedField, other: FittedField, gain: float, frame: _Frame) -> None:
         """Remember another account of the same contacts, as likely as the data leave it."""
-        if len(one := _each(shape)) != len(two := _each(other)):
+        if len(one := contacts_of(shape)) != len(two := contacts_of(other)):
             return
         if not (one[:, EDGE:] != two[:, EDGE:]).any():
             return
@@ -475,22 +469,13 @@ class _Course:
         return _Candidate(other, needed * asked.sum()) if other else None
 
     def _with(self, question: Question, shape: FittedField, frame: _Frame) -> _Candidate | None:
-        """Pressures that fall towards the edge, or rings, unless the data are clearly against it.
-
-        What presses is likely of one kind, so all contacts are asked at once.
-        """
+        """Pressures that fall towards the edge, or rings, where the data leave that open."""
         assert isinstance(shape.family, PressureField)
-        column, scale = question.column, _scale(shape, frame)
+        scale = _scale(shape, frame)
         frame.budget.spend(shape)
-        columns = slice(column, column + 1)
-        slopes, bends = further(self.tools.fit, shape, frame.measured, columns)
-        each = shape.family.split(shape.parameters)
-        asked = is_open(question, slopes, bends, scale)
-        asked &= (each[:, EDGE] == 0) & (each[:, HOLE] == 0)
-        if not asked.any():
+        each = fallen(question, self.tools.fit, shape, frame.measured, scale)
+        if each is None:
             return None
-        each[asked, column] = question.value
-        each[asked, PEAK] = np.minimum(FALLEN_PEAK * each[asked, PEAK], shape.family.peak_limits[1])
         other = self._evaluate(each, shape.family.order, shape.log_ratio, frame)
         return _Candidate(other, ONE_SHEET_WORTH * question.worth * scale) if other else None
 
@@ -498,7 +483,7 @@ class _Course:
         """Moves that make two contacts of one: those that stand it best, one after the other."""
         elongated = 0.4  # half the logarithm of the axes' ratio (2.2), from which it may be two
         asked_of_crowd = 3  # contacts: with each, one crowded scene in ten more is counted right
-        each = _each(shape)
+        each = contacts_of(shape)
         if not 0 < len(each) < MAX_CONTACTS:
             return []
         long = np.hypot(each[:, E1], each[:, E2]) > elongated
@@ -527,7 +512,7 @@ class _Course:
         """What each contact that is asked makes as two, the best first, and which it is."""
         if self._halved is None or self._halved[0] is not shape:
             assert isinstance(shape.family, PressureField)
-            each, order = _each(shape), shape.family.order
+            each, order = contacts_of(shape), shape.family.order
             halves = [
                 (half, k)
                 for k in asked.tolist()
@@ -605,16 +590,8 @@ class _Course:
 _Move: TypeAlias = Callable[[FittedField, _Frame], _Candidate | None]
 
 
-def _each(shape: FittedField) -> FloatArray:
-    """(K, COLUMNS) of a field's contacts; none of a level set."""
-    if not isinstance(shape.family, PressureField):
-        return np.zeros((0, COLUMNS))
-    return shape.family.split(shape.parameters)
-
-
 def _scale(shape: FittedField, frame: _Frame) -> float:
-    """What one unit of squared misfit means, by what a shape leaves unexplained."""
-    return max(frame.doubt, shape.misfit**2 / 2)
+    return unit_of_gain(shape, frame.doubt)
 
 
 def _in_words(shape: FittedField) -> str:

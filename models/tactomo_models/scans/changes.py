@@ -51,7 +51,6 @@ class Changes:
         weight: (M,) inverse standard deviations, of noise and of model error; 0 where invalid.
         variance_inflation: (M,) factor by which the variance of an estimate exceeds what
             independent errors of that size would give it: model errors go together.
-        frame_variance: (M,) variances of each of two frames' changes, where the scene is still.
         noise_variance: (M,) that of the changes by noise, as the tare knows it: where it was of a
             single scan, no more than an upper bound.
         tolerance: (M,) square of a change too far below the model's error to be worth a solve.
@@ -66,7 +65,6 @@ class Changes:
     change: FloatArray
     weight: FloatArray
     variance_inflation: FloatArray
-    frame_variance: FloatArray
     quiet: bool
     signal: float
     precision: FloatArray
@@ -207,8 +205,6 @@ class MeasuredChannel:
             change=change,
             weight=valid / np.sqrt(noise + error),
             variance_inflation=1 + (CORRELATED - 1) * error / (noise + error),
-            # What is far below the model's error is not worth a solve either.
-            frame_variance=noise + still_share * error,
             noise_variance=noise,
             tolerance=still_share * error,
             modes=self._modes,

@@ -10,10 +10,12 @@ scene look still: no noise is taken from them but as an upper bound.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
 
 import numpy as np
 from scipy.special import fdtri
+from tactomo_protocol import Channel
 
 from tactomo_models.scans.changes import Changes
 
@@ -37,6 +39,13 @@ def is_still(settled: Changes, new: Changes) -> bool:
     noise = min((total - smooth) / others, 2.0)
     tolerated = 2 * float((new.tolerance / new.noise_variance)[valid].sum())
     return smooth <= _noise_limit(modes, others) * modes * noise + tolerated
+
+
+def are_still(settled: Mapping[Channel, Changes], new: Mapping[Channel, Changes]) -> bool:
+    """Tell whether scans of all channels are of the same scene; not if their channels differ."""
+    return new.keys() == settled.keys() and all(
+        is_still(settled[name], changes) for name, changes in new.items()
+    )
 
 
 @cache

@@ -1,8 +1,8 @@
 """What a fitted pressure field says: images, and each contact with its numbers and uncertainties.
 
-Everything follows from the field and from the covariance of its parameters. An edge or a hole that
-was not fitted, because the data did not pay for it, is still uncertain as far as the data leave it
-open: peak, area and force know their share of that.
+Everything follows from the field and from the covariance of its parameters. Where the data leave
+another account of the same contacts possible, images and numbers are the mean of all, and the
+uncertainties know how far they are apart.
 """
 
 from __future__ import annotations
@@ -213,10 +213,8 @@ class FieldAccountant:
         }
         if count == 0:
             return known
-        family, drawing, parameters = fitted.family, fitted.drawing, fitted.parameters
+        family, drawing = fitted.family, fitted.drawing
         precision = self._fit.prior(fitted)[0]
-        if isinstance(family, PressureField):
-            each = family.split(parameters)
         J = self._fit.jacobian(fitted, measured, drawing)
         covariance = covariance_of(J, precision, measured, fitted.misfit)[:-1, :-1]
         _, by_share, by_pressure = drawing.slopes()
@@ -248,15 +246,14 @@ class FieldAccountant:
         size, slope = (np.abs(v) for v in self._graded.relative_change(pressure))
         known["magnitudes"] = (weight @ (share * size)) / area
         by_magnitude = signed * (size[:, None]) + (share * slope)[:, None] * by_pressure
-        by_mean = (weight @ by_magnitude - known["magnitudes"][:, None] * (weight @ signed)) / area[
-            :, None
-        ]
+        by_area = weight @ signed
+        by_mean = (weight @ by_magnitude - known["magnitudes"][:, None] * by_area) / area[:, None]
         known["magnitude_sigmas"] = np.hypot(sigma(by_mean), by_outline * known["magnitudes"])
-        scale = areas.areas_m2 / area  # the map's, over the mesh's
         highest = np.where(mine, share * pressure, -1.0).argmax(axis=1)  # a node of each area
         peaks, by_peak, edges = pressure[highest], by_pressure[highest], nothing
         if isinstance(family, PressureField):
-            owner = self._owners(each, areas, places[:, highest])
+            each = family.split(fitted.parameters)
+            owner = self._owners(each, places[:, highest])
             peaks, edges = family.unit_kpa * each[owner, PEAK], each[owner, EDGE]
             index = family.index
             by_peak = np.zeros_like(by_peak)
@@ -269,8 +266,9 @@ class FieldAccountant:
         peak_size, peak_slope = (np.abs(v) for v in self._graded.relative_change(peaks))
         scale = areas.areas_m2 / area  # the map's, over the mesh's
         by_force = signed * pressure[:, None] + share[:, None] * by_pressure
-        means = (weight @ (share * pressure)) / area
-        by_mean_kpa = (weight @ by_force - means[:, None] * (weight @ signed)) / area[:, None]
+        total = weight @ (share * pressure)
+        means = total / area
+        by_mean_kpa = (weight @ by_force - means[:, None] * by_area) / area[:, None]
         by_outline_kpa = by_outline * peak_size / np.maximum(peak_slope, 1e-12)
         known["contacts"] = FieldContacts(
             peak_magnitude=peak_size,
@@ -280,7 +278,7 @@ class FieldAccountant:
             peak_kpa=peaks,
             mean_kpa=means,
             mean_sigma_kpa=np.hypot(sigma(by_mean_kpa), by_outline_kpa * means / peaks),
-            force_n=1e3 * (weight @ (share * pressure)) * scale,
+            force_n=1e3 * total * scale,
             force_sigma_n=1e3 * sigma(weight @ by_force) * scale,
             edge=edges,
         )
@@ -299,7 +297,7 @@ class FieldAccountant:
         return bool((is_least & (by_peak.T @ residual > WRONG_WAY * np.sqrt(power))).any())
 
     @staticmethod
-    def _owners(each: FloatArray, areas: Areas, highest_m: FloatArray) -> IntArray:
+    def _owners(each: FloatArray, highest_m: FloatArray) -> IntArray:
         """Contact (K,) of the field that presses hardest in each area."""
         apart = np.hypot(
             UNIT_M * each[:, X] - highest_m[0][:, None], UNIT_M * each[:, Y] - highest_m[1][:, None]

@@ -10,6 +10,7 @@ outlines explain, such as an L or two contacts that merge.
 from __future__ import annotations
 
 from copy import copy
+from functools import cache
 
 import numpy as np
 
@@ -112,6 +113,7 @@ class LevelSet:
         else:
             pressure = self._field.unit_kpa * parameters[kernels + self._owner[nodes]]
 
+        @cache
         def slopes() -> tuple[FloatArray, FloatArray, FloatArray]:
             by_share = np.zeros((len(nodes), len(parameters)))
             by_share[:, :kernels] = self._slope(f[nodes])[:, None] * self.kernels[nodes]

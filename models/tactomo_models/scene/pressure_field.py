@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -224,6 +224,7 @@ class PressureField:
         there = (outlines.t + self.offset_m / self.half_width_m > -1).any(axis=0)
         near, drawn = near[there], _Contacts(self, each, outlines.at(there))
 
+        @cache
         def slopes() -> tuple[FloatArray, FloatArray, FloatArray]:
             enclosed, share, pressure = drawn.slopes()
             return enclosed[self.free].T, share[self.free].T, pressure[self.free].T
