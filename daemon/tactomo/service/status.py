@@ -153,12 +153,13 @@ def process_fields() -> dict[str, Any]:
     return {
         "pid": os.getpid(),
         "cpu_s": time.process_time(),
-        "memory_bytes": _resident_bytes(),
+        "memory_bytes": resident_bytes(),
         "threads": threading.active_count(),
     }
 
 
-def _resident_bytes() -> int | None:
+def resident_bytes() -> int | None:
+    """Return the memory that this process holds; None where the system does not say."""
     try:
         pages = int(Path("/proc/self/statm").read_text("ascii").split()[1])
     except (OSError, IndexError, ValueError):

@@ -15,6 +15,7 @@ budget of a live daemon. What keeps nothing between frames takes the same in *an
 
 from __future__ import annotations
 
+import gc
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,6 +25,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from tactomo.cli.bench.machine_speed import warned_if_busy
+from tactomo.service.status import resident_bytes
 from tactomo.twin import make_skin
 from tactomo.twin.device import NOISE_SHARE
 from tactomo_models import (
@@ -70,6 +72,7 @@ def method_times(
     Returns:
         A row for each method, number of contacts and state ("cold", "still", "moving", "any"): the
         number of frames, p50 and p99 of their times (ms), how many bare products these are worth,
+        what memory the method has taken by then (MB, its models included; None where nobody says),
         and if they could not be measured (None) a note why. The rows as a table to print.
 
     Raises:
@@ -140,23 +143,31 @@ def _time_product(description: SensorDescription) -> Row:
 
 def _time_method(method: str, scenes: _Scenes) -> Iterator[Row]:
     """Time a method on each scene; a frame in which nothing presses is the same by any method."""
+    gc.collect()  # what the method before it has left is not this one's
+    before = resident_bytes()
+
+    def row(contacts: int, state: str, seconds: Sequence[float]) -> Row:
+        now = resident_bytes()
+        memory_mb = None if now is None or before is None else (now - before) / 1e6
+        return {**_row(method, contacts, state, seconds), "memory_mb": memory_mb}
+
     try:
         reconstructor = Reconstructor(scenes.description, method=method)
         reconstructor.set_reference(scenes.reference)
         if method == "auto":
-            yield _row(method, 0, "any", _frames(reconstructor, scenes.still(0, FRAMES)))
+            yield row(0, "any", _frames(reconstructor, scenes.still(0, FRAMES)))
         for contacts in range(1, len(PLACES) + 1):
             same = method in SAME_IN_ANY
             reconstructor.budget_s = BUDGET_S
             _frames(reconstructor, scenes.still(contacts, 1))  # makes what is kept
             seconds = _frames(reconstructor, scenes.still(contacts, FRAMES), cold=True)
-            yield _row(method, contacts, "any" if same else "cold", seconds)
+            yield row(contacts, "any" if same else "cold", seconds)
             reconstructor.budget_s = None
             for state, draw in (("still", scenes.still), ("moving", scenes.moving)):
                 if not same:
                     reconstructor.reset()
                     seconds = _frames(reconstructor, draw(contacts, SETTLE_FRAMES + FRAMES))
-                    yield _row(method, contacts, state, seconds[SETTLE_FRAMES:])
+                    yield row(contacts, state, seconds[SETTLE_FRAMES:])
     except ModelError as error:  # such as a network that nobody trained for this sensor
         yield _row(method, 1, "any", note=str(error))
 
@@ -232,18 +243,20 @@ def _row(
 ) -> Row:
     row: Row = {"method": method, "contacts": contacts, "state": state, "frames": len(seconds)}
     p50, p99 = 1e3 * np.percentile(seconds, (50, 99)) if seconds else (None, None)
-    return {**row, "p50_ms": p50 and float(p50), "p99_ms": p99 and float(p99), "note": note}
+    times = {"p50_ms": p50 and float(p50), "p99_ms": p99 and float(p99)}
+    return {**row, **times, "memory_mb": None, "note": note}
 
 
 def _table_of(rows: Sequence[Row]) -> Table:
     from rich.table import Table
 
     table = Table(title="one frame, one thread; products: times the p50 of a bare product")
-    numbers = ("p50 products", "p99 products", "p50 ms", "p99 ms", "frames")
+    numbers = ("p50 products", "p99 products", "p50 ms", "p99 ms", "MB", "frames")
     for heading in ("method", "contacts", "scene", *numbers, "note"):
         table.add_column(heading, justify="right" if heading in numbers else "left")
     for row in rows:
-        times = [row[key] for key in ("of_product", "p99_of_product", "p50_ms", "p99_ms")]
+        keys = ("of_product", "p99_of_product", "p50_ms", "p99_ms", "memory_mb")
+        times = [row[key] for key in keys]
         # Three significant digits, thousands apart, and no power of ten.
         shown = ["" if t is None else f"{t:,.0f}" if t >= 100 else f"{t:.3g}" for t in times]
         what = (row["method"], str(row["contacts"]), row["state"])

@@ -82,9 +82,41 @@ def test_methods_of_ones_own_have_rows_and_what_cannot_be_timed_says_why(
     failing, peer = ("own_timed:Failing", 1, "any"), ("pyEIT", 1, "any")
     assert rows.keys() == {("bare product", 0, "any"), *mine, failing, peer}
     assert all(rows[each]["of_product"] > 0 for each in mine)
+    assert all(rows[each]["memory_mb"] < 500 for each in mine)
     assert "ZeroDivisionError: on purpose" in rows[failing]["note"]
     assert rows[peer]["note"] == "pip install 'tactomo[compare]'"
     assert rows[peer]["p50_ms"] is rows[failing]["of_product"] is None
+
+
+def test_an_earlier_run_is_set_beside_this_one(sensor: Path, tmp_path: Path) -> None:
+    asked = ("--no-live", "-d", str(sensor), "--method", "tikhonov")
+    earlier = CliRunner().invoke(app, ["bench", *asked, "--json"])
+    kept = json.loads(earlier.stdout)
+    for row in kept["methods"]:
+        if row["method"] == "tikhonov":
+            row["of_product"] /= 1000
+            row["p99_of_product"] *= 1000
+    kept["methods"] = [row for row in kept["methods"] if row["contacts"] != 2]
+    (tmp_path / "times.json").write_text(json.dumps(kept), "utf-8")
+    again = ("--compare", str(tmp_path / "times.json"))
+    now = json.loads(CliRunner().invoke(app, ["bench", *asked, *again, "--json"]).stdout)
+    compared = {row["what"]: row for row in now["compared"]}
+    assert "tikhonov, contacts 2, any" not in compared
+    figures = compared["tikhonov, contacts 1, any"]
+    assert figures["p50"][1] > 10 * figures["p50"][0]
+    assert figures["p99"][1] < figures["p99"][0] / 10
+    assert figures["memory_mb"] is not None
+    shown = CliRunner().invoke(app, ["bench", *asked, *again])
+    assert "tikhonov, contacts 1, any" in shown.stdout.split("and now")[1]
+
+
+def test_what_is_no_earlier_run_is_refused_before_the_work(tactomo: Run, tmp_path: Path) -> None:
+    for content in ("no JSON", "[]", '{"live": []}'):
+        (tmp_path / "times.json").write_text(content, "utf-8")
+        result = tactomo("bench", "--compare", "times.json")
+        assert result.returncode == 1
+        assert "tactomo bench --json" in result.stderr
+    assert tactomo("bench", "--compare", "times.json", "--machine-speed").returncode == 2
 
 
 def test_without_the_laboratory_the_table_says_how_to_get_it(

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from tactomo.cli.bench.comparison import compared, read_results, table_of
 from tactomo.cli.laboratory import installed_measurement, measurement, not_installed
 from tactomo.cli.options import (
     DEFAULT_DESCRIPTION,
@@ -57,6 +58,7 @@ class Phase:
     latency_p99_ms: float
     stage_ms: dict[str, dict[str, float]]
     tiers: dict[str, int]
+    memory_mb: float | None
 
 
 @dataclass
@@ -69,6 +71,7 @@ class Results:
     late_scans: int | None = None
     dropped_scans: int | None = None
     methods: list[dict[str, Any]] = field(default_factory=list)
+    compared: list[dict[str, Any]] = field(default_factory=list)
     chart: list[dict[str, Any]] = field(default_factory=list)
 
 
@@ -80,6 +83,7 @@ app = typer_app()
         "tactomo bench",
         "tactomo bench --seconds 20 --ports 1",
         "tactomo bench --json > times.json",
+        "tactomo bench --compare times.json",
         "tactomo bench --no-live --method my_module:MyMethod --method auto",
         "tactomo bench --chart speed_accuracy.png --count 25",
         "tactomo bench --chart mine.png --method my_module:MyMethod --method auto",
@@ -105,6 +109,10 @@ def bench(
     ] = True,
     method: Annotated[
         list[str] | None, methods_option(" [every installed one]", rich_help_panel=METHODS)
+    ] = None,
+    compare: Annotated[
+        Path | None,
+        typer.Option(help="Set the figures beside those of an earlier run, kept with --json."),
     ] = None,
     chart: Annotated[
         Path | None,
@@ -145,7 +153,8 @@ def bench(
 
     With the laboratory installed, every method is then timed on simulated scans, on one thread,
     beside a bare matrix-vector product and pyEIT (`pip install 'tactomo[compare]'`): nothing
-    pressed, cold, still and moving; in ms, and in such products. Takes another one or two minutes.
+    pressed, cold, still and moving; in ms, and in such products, and what memory it takes. Takes
+    another one or two minutes. `--compare` sets all that beside an earlier run.
 
     With `--chart`, every method reconstructs simulated scenes of the reporting seeds: still ones
     at 40, 20 and 10 dB, each from a cold start, and moving ones under a daemon's budgets. Takes
@@ -163,6 +172,9 @@ def bench(
         raise typer.BadParameter("--machine-speed and --chart are two runs")
     if machine_speed and method:
         raise typer.BadParameter("--machine-speed measures every method, without --method")
+    if compare is not None and (machine_speed or chart is not None):
+        raise typer.BadParameter("--compare goes with latencies and methods alone")
+    earlier = None if compare is None else read_results(compare)
     results = Results(machine(), description)
     if chart is not None:
         _chart(results, chart, count, method or [], as_json)
@@ -180,10 +192,14 @@ def bench(
             _measure_twin(results, ports, rate, seconds, line.update)
         if time_methods is not None:
             results.methods, table = time_methods(description, method or [], line.update)
+    if earlier is not None:
+        results.compared = compared(earlier, asdict(results))
     if as_json:
         typer.echo(json.dumps(asdict(results), indent=2))
     else:
         _print(results, table)
+        if compare is not None:
+            _console(results).print(table_of(results.compared, compare))
 
 
 def _chart(results: Results, picture: Path, count: int, methods: list[str], as_json: bool) -> None:
@@ -305,8 +321,18 @@ class _Stream:
                 moves(min(1.0, (time.monotonic() - begin_s) / seconds))
         passed_s = time.monotonic() - begin_s
         p50, p99 = np.percentile(ages_ms, (50, 99)).tolist()
-        stages = request("status", control)["stage_ms"]
-        return Phase(scene, len(ages_ms), len(ages_ms) / passed_s, p50, p99, stages, tiers)
+        status = request("status", control)
+        memory_bytes = status["process"]["memory_bytes"]
+        return Phase(
+            scene=scene,
+            frames=len(ages_ms),
+            frames_per_s=len(ages_ms) / passed_s,
+            latency_p50_ms=p50,
+            latency_p99_ms=p99,
+            stage_ms=status["stage_ms"],
+            tiers=tiers,
+            memory_mb=memory_bytes and memory_bytes / 1e6,
+        )
 
     def _during(self, seconds: float) -> Iterator[Any]:
         end_s = time.monotonic() + seconds
@@ -352,7 +378,7 @@ def _live_table(results: Results) -> Table:
         title="live: last byte read to contacts in another process",
         min_width=80,
     )
-    for name in ("scene", "frames/s", "p50 ms", "p99 ms", "frames by tier"):
+    for name in ("scene", "frames/s", "p50 ms", "p99 ms", "daemon MB", "frames by tier"):
         table.add_column(name, justify="left" if name in ("scene", "frames by tier") else "right")
     for phase in results.live:
         table.add_row(
@@ -360,6 +386,7 @@ def _live_table(results: Results) -> Table:
             f"{phase.frames_per_s:.1f}",
             f"{phase.latency_p50_ms:.1f}",
             f"{phase.latency_p99_ms:.1f}",
+            f"{phase.memory_mb:.0f}" if phase.memory_mb else "-",
             ", ".join(f"{tier} {count}" for tier, count in phase.tiers.items()),
         )
     return table
