@@ -61,6 +61,8 @@ def write_whole(path: Path, write: Callable[[IO[bytes]], object]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with part.open("wb") as file:
             write(file)
+            file.flush()
+            os.fsync(file.fileno())  # else a power cut may leave an empty file under that name
         part.replace(path)
     except BaseException:  # Ctrl-C included
         with suppress(OSError):

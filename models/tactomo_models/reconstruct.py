@@ -177,8 +177,11 @@ class Reconstructor:
 
     def solve(self, measurement: Measurement) -> Reconstruction:
         """The second half of `reconstruct`: what follows from a measurement."""
+        if not measurement.changes and measurement.flags & Flag.NO_REFERENCE:
+            return self._nothing(measurement, "no reference yet")
         if not measurement.changes:
-            return self._nothing(measurement, "no usable scan")
+            flagged = replace(measurement, flags=measurement.flags | Flag.NO_USABLE_SCAN)
+            return self._nothing(flagged, "no usable scan")
         if measurement.is_quiet:
             self._previous = None
             self._tracker.update(np.zeros((0, 2)), np.zeros(0))

@@ -134,7 +134,11 @@ def python_view(frame: Frame) -> dict[str, Any]:
 def cpp_view(said: dict[str, Any]) -> dict[str, Any]:
     """The frame that the probe printed, in the words of `python_view`."""
     view = {**said, "flags": sorted(set(said["flags"]))}
-    del view["age_ns"], view["exceeds_150"]  # they go by the time at which they are asked for
+    del (
+        view["age_ns"],
+        view["exceeds_150"],
+        view["is_known"],
+    )  # they go by the time at which they are asked for
     for name in ("tier", "tier_reason"):
         view[name] = said[name] or None
     return view
@@ -403,6 +407,8 @@ def test_a_limit_is_judged_as_in_python(sensor: FakeSensor, probe: Path) -> None
     unknown = Contact(3, 0.0, 30.0, 700.0, None, None, None)
     cases: list[tuple[list[Contact], list[str], str]] = [
         ([], [], "no"),
+        ([], ["electrode_fault", "saturated"], "cannot tell"),
+        ([], ["electrode_fault", "no_usable_scan"], "cannot tell"),
         ([light], [], "no"),
         ([light], ["misfit_high"], "cannot tell"),
         ([light, unknown], [], "cannot tell"),
@@ -416,9 +422,11 @@ def test_a_limit_is_judged_as_in_python(sensor: FakeSensor, probe: Path) -> None
             sensor.wait_for_subscriber(PATIENCE_S)
         for contacts, flags, answer in cases:
             sensor.publish(contacts, flags=flags)
-            assert next(python).exceeds(150).value == answer
+            frame = next(python)
+            assert frame.exceeds(150).value == answer
             said = skin.wait(lambda said: said["frame"], "the frame")
             assert said["frame"]["exceeds_150"] == answer
+            assert said["frame"]["is_known"] == frame.is_known
 
 
 def test_an_old_frame_is_stale_and_silence_makes_one_stale(sensor: FakeSensor, probe: Path) -> None:

@@ -59,6 +59,10 @@ def test_it_prints_contacts_and_tells_stale_from_nothing_pressed(
     assert answer() == "contact 5 at x=-1.0 mm y=2.0 mm, 300 mm2, pressure unknown misfit_high"
     sensor.publish([])
     assert answer() == "nothing pressed"
+    sensor.publish([], flags=["electrode_fault"])
+    assert answer() == "nothing pressed electrode_fault"
+    sensor.publish([], flags=["electrode_fault", "no_usable_scan"])
+    assert answer() == "not known electrode_fault no_usable_scan"
     sensor.publish([], acquired_monotonic_ns=time.monotonic_ns() - 10**10)
     assert answer() == "stale"
     assert "is the daemon running?" in script.stdout.readline()

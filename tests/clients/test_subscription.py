@@ -79,6 +79,27 @@ def test_an_old_frame_or_a_flag_is_no_no(sensor: FakeSensor) -> None:
         assert next(frames).exceeds(150) is Answer.YES
 
 
+@pytest.mark.parametrize(
+    ("flags", "is_known"),
+    [
+        ([], True),
+        (["magnitude_missing", "electrode_fault"], True),
+        (["magnitude_missing", "no_usable_scan"], False),
+        (["reference_disputed"], False),
+        (["of_tomorrow"], False),
+    ],
+)
+def test_no_contacts_is_nothing_pressed_only_where_touches_are_seen(
+    sensor: FakeSensor, flags: list[str], is_known: bool
+) -> None:
+    with subscribe("left", address=sensor.address, timeout_s=10) as frames:
+        sensor.wait_for_subscriber()
+        sensor.publish(flags=flags)
+        assert next(frames).is_known is is_known
+        sensor.publish(flags=flags, acquired_monotonic_ns=time.monotonic_ns() - 2_000_000_000)
+        assert not next(frames).is_known
+
+
 def newest_sequence(frames: Subscription[Frame]) -> int:
     frame = frames.latest()
     return 0 if frame is None else frame.sequence

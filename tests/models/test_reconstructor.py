@@ -325,14 +325,26 @@ def test_without_anything_there_is_no_map(reconstructor: Reconstructor) -> None:
     frame = reconstructor.reconstruct(None, None)
     assert frame.map is None
     assert frame.structure is None
-    assert frame.flags == Flag.MAGNITUDE_MISSING | Flag.STRUCTURE_MISSING
+    missing = Flag.MAGNITUDE_MISSING | Flag.STRUCTURE_MISSING
+    assert frame.flags == missing | Flag.NO_USABLE_SCAN
+
+
+@pytest.mark.parametrize("value", [math.nan, 0.0, 1e-9, 1.0, 1e12])
+def test_where_no_voltage_can_be_right_no_contacts_says_nothing(
+    reconstructor: Reconstructor, skin: Skin, value: float
+) -> None:
+    for _ in range(4):
+        absurd = {name: np.full_like(each, value) for name, each in skin.scan(CENTRE).items()}
+        frame = reconstructor.reconstruct(**absurd)
+        assert not frame.contacts
+        assert Flag.NO_USABLE_SCAN in frame.flags
 
 
 def test_without_a_reference_there_is_no_map(
     paper: SensorDescription, artifact: Artifact, skin: Skin
 ) -> None:
     frame = Reconstructor(paper, artifact).reconstruct(**skin.scan(CENTRE))
-    assert Flag.NO_REFERENCE in frame.flags
+    assert frame.flags == Flag.NO_REFERENCE  # and no channel is missing: its scans come
     assert frame.map is None
 
 

@@ -173,6 +173,7 @@ void print_frame(const tactomo::Frame& frame) {
     print_member("misfit", frame.misfit);
     print_member("confidence", frame.confidence);
     print_member("exceeds_150", name_of(frame.exceeds(150)));
+    std::printf(", \"is_known\": %s", frame.is_known() ? "true" : "false");
     print_member("age_ns", std::int64_t{frame.age().count()});
     print_image("map", frame.map);
     print_image("pressure_kpa", frame.pressure_kpa);

@@ -23,6 +23,12 @@ if TYPE_CHECKING:
 Image: TypeAlias = "NDArray[np.float32]"
 
 
+TOUCHES_SEEN = frozenset(
+    ("magnitude_missing", "invalid_voltage", "electrode_fault", "saturated", "channels_skewed")
+)
+"""Flags under which every touch is still seen: see STREAM.md. Of any other nobody knows."""
+
+
 class Answer(Enum):
     """What `exceeds` answers: compare it, as in ``is Answer.NO``.
 
@@ -156,6 +162,14 @@ class Frame:
     def is_stale(self) -> bool:
         """Whether this frame is older than the subscription's `stale_after_s`."""
         return self.age_s > self._stale_after_s
+
+    @property
+    def is_known(self) -> bool:
+        """Whether every touch would be among `contacts`: if there is none, nothing presses.
+
+        False where the frame is stale, or a flag says that touches may be missing.
+        """
+        return self.flags <= TOUCHES_SEEN and not self.is_stale
 
     def exceeds(self, limit_kpa: float) -> Answer:
         """Return whether any contact presses with `limit_kpa` or more.

@@ -27,6 +27,14 @@ FLAG_ADVICE: Mapping[str, tuple[str, str]] = {
         "the reference does not look like this sensor unloaded",
         "take everything off the skin and run `tactomo tare`; is it the right sensor?",
     ),
+    "reference_disputed": (
+        "at the start the skin did not look as it did before",
+        "take everything off; if contacts are still shown then, run `tactomo tare`",
+    ),
+    "no_usable_scan": (
+        "nothing is measured: that no contact is shown says nothing",
+        "check the cables, and run `tactomo doctor` to find the leads",
+    ),
     "misfit_high": (
         "the model does not explain the data",
         "take everything off and run `tactomo tare`; if it stays, run `tactomo doctor`",
@@ -129,22 +137,12 @@ def _of_method(status: Mapping[str, Any]) -> Iterator[HealthIssue]:
 
 
 def _of_flags(status: Mapping[str, Any]) -> Iterator[HealthIssue]:
-    flags = status.get("flags") or []
-    for flag in flags:
-        if "no_reference" in flags and _comes(flag, status):
-            continue
+    for flag in status.get("flags") or []:
         what, step = FLAG_ADVICE.get(flag, (flag.replace("_", " "), ""))
         if flag == "no_reference" and status.get("state") == "taring":
             what, step = TARING
         because = status.get("tier_reason") if flag == "electrode_fault" else None
         yield HealthIssue("warning", f"{what} ({because})" if because else what, step)
-
-
-def _comes(flag: str, status: Mapping[str, Any]) -> bool:
-    """Whether `flag` calls a channel missing whose scans come: it has no reference yet."""
-    channel, _, missing = flag.partition("_")
-    rates = status.get("rates") or {}
-    return missing == "missing" and bool(rates.get(f"{channel}_hz"))
 
 
 def _of_losses(status: Mapping[str, Any]) -> Iterator[HealthIssue]:

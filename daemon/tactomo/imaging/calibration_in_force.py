@@ -38,6 +38,7 @@ class CalibrationInForce:
 
     Attributes:
         in_force: the calibration that is used; None for the description's curve.
+        device_ids: of those that have spoken.
 
     """
 
@@ -55,13 +56,13 @@ class CalibrationInForce:
         self._marks = marks
         self._on_event = on_event
         self._own = calibration
-        self._device_ids: frozenset[str] = frozenset()  # of those that have spoken
+        self.device_ids: frozenset[str] = frozenset()
         self._refused: _Foreign | None = None
         self._judge()
 
     def meet(self, device_ids: Collection[str]) -> None:
         """Take note of who speaks: a calibration holds for the devices that it was made with."""
-        self._device_ids = frozenset(device_ids)
+        self.device_ids = frozenset(device_ids)
         self._judge()
 
     def replace(self, calibration: PressureCalibration | None) -> None:
@@ -118,7 +119,7 @@ class CalibrationInForce:
         if calibration is None:
             return None
         subject = calibration.subject
-        why = subject.foreign(self._device_ids)
+        why = subject.foreign(self.device_ids)
         if not why:
             return None
         return _Foreign(

@@ -7,12 +7,15 @@ For use by the pipeline thread; nothing in here waits. What others may read (`re
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import Any, Final
 
 import structlog
+from tactomo_client.frame import TOUCHES_SEEN
 from tactomo_client.messages import CONTACTS, MAP, SCAN
 from tactomo_models import (
     BaselineTracker,
+    Flag,
     Reconstruction,
     Reconstructor,
     Reference,
@@ -35,6 +38,7 @@ from tactomo.imaging.frames import (
     scan_fields,
     scan_header,
 )
+from tactomo.imaging.kept_reference import KeptReference, KnownSkin
 from tactomo.imaging.method_in_force import Effort, MethodInForce
 from tactomo.imaging.tare import Taring
 from tactomo.recordings.recorder import Recorder
@@ -60,6 +64,7 @@ class Imaging:
         calibration: of pressure, the sensor's own; None for the description's curve.
         tare_scans: dual scans for a reference.
         baseline: whether and how fast the reference follows the skin.
+        kept: the sensor's last reference; None where it is neither used nor kept.
         recorder: is told of which scans frames were made.
         publisher: gets the frames.
         on_event: told what people should know.
@@ -84,6 +89,7 @@ class Imaging:
         calibration: PressureCalibration | None,
         tare_scans: int,
         baseline: BaselineConfig,
+        kept: KeptReference | None,
         recorder: Recorder,
         publisher: Publisher,
         on_event: OnEvent,
@@ -107,9 +113,12 @@ class Imaging:
             tare_scans,
             description.channels,
             self.frame_rate,
-            lambda reference: self.use_reference(reference, time.time_ns()),
+            self._take,
+            self._fall_back,
             on_event,
         )
+        self._kept = kept
+        self._is_disputed = False  # the skin at the start was not as the reference in force has it
         self._recorder = recorder
         self._publisher = publisher
         self._on_event = on_event
@@ -142,6 +151,47 @@ class Imaging:
         else:
             self._note_reference(self._tracker.begin(reference))
 
+    def _take(self, reference: Reference, is_asked: bool) -> bool:
+        """Use a reference that was taken; at the start only if the skin is as last known.
+
+        Returns whether it is in force.
+        """
+        known = None if is_asked or self.reference is not None else self._known()
+        if known is not None and self._is_loaded(known, reference):
+            self._prefer(known, "the skin does not look as it did")
+            return False
+        self._is_disputed = False
+        self.use_reference(reference, time.time_ns())
+        if self._kept is not None:
+            self._kept.keep(reference, self.calibration.device_ids)
+        return True
+
+    def _fall_back(self, why: str) -> bool:
+        """Use the reference that is kept, since none can be taken; returns whether there is one."""
+        known = self._known()
+        if known is not None:
+            self._prefer(known, why)
+        return known is not None
+
+    def _known(self) -> KnownSkin | None:
+        return None if self._kept is None else self._kept.read(self.calibration.device_ids)
+
+    def _is_loaded(self, known: KnownSkin, now: Reference) -> bool:
+        """Whether what was taken differs from the skin as last known by more than drift."""
+        tracker = self._tracker or BaselineTracker(self._reconstructor)
+        tracker.begin(known.reference)
+        return tracker.explains(now, known.age_s) is False
+
+    def _prefer(self, known: KnownSkin, why: str) -> None:
+        self._is_disputed = True
+        self.use_reference(known.reference, known.realtime_ns)
+        self._on_event(
+            "reference_disputed",
+            "warning",
+            f"{why}: the reference of {known.words} is used",
+            "take everything off the skin; if contacts are still shown then: `tactomo tare`",
+        )
+
     def _note_reference(self, reference: Reference) -> None:
         """Say, and record, that this reference is in force."""
         self.reference = reference
@@ -170,11 +220,22 @@ class Imaging:
         volts = {scan.channel: scan.volts for scan in dual.scans}
         self._publish_scan(dual, timing, volts)
         frame = self._reconstruct(volts, _saturated(dual), is_exact=mark is not None)
+        if frame is not None and self._is_disputed:
+            frame = self._judge_dispute(frame)
         self._marks.mark(dual, timing, *self.method.effective)  # first: what was seen is recorded
         if frame is not None:
             self._contacts = len(frame.contacts)
             self._publish_frame(dual, timing, frame)
         self.taring.add(volts, lost, self._contacts)
+
+    def _judge_dispute(self, frame: Reconstruction) -> Reconstruction:
+        """Flag a frame, unless it settles the dispute: the skin is again as it was known."""
+        if frame.tier == "quiet" and TOUCHES_SEEN.issuperset(frame.flags.names()):
+            self._is_disputed = False
+            detail = "the skin is at rest by the reference that was kept"
+            self._on_event("reference_confirmed", "info", detail)
+            return frame
+        return replace(frame, flags=frame.flags | Flag.REFERENCE_DISPUTED)
 
     def _obey(self, mark: Mark) -> None:
         """Put in force what was in force when this dual scan was recorded."""
@@ -225,6 +286,8 @@ class Imaging:
         """Take over the reference that the tracker has put in force, and tell where it refuses."""
         if tracker.reference is not None and tracker.reference is not self.reference:
             self._note_reference(tracker.reference)
+            if self._kept is not None:
+                self._kept.follow(tracker.reference, self.calibration.device_ids)
         if tracker.refusal and self._refusal_limit.allows():
             self._on_event(
                 "baseline_refused",

@@ -41,7 +41,10 @@ class Taring:
         scans: dual scans for each reference.
         channels: those of the sensor.
         frame_rate: how often frames come.
-        put_in_force: called with a reference that was taken.
+        put_in_force: called with a reference that was taken and whether somebody asked for it;
+            returns whether it is in force, and not an older one.
+        fall_back: called with why none was taken while there is none; returns whether an older
+            one is in force now.
         on_event: told what a tare became.
 
     """
@@ -51,13 +54,15 @@ class Taring:
         scans: int,
         channels: Collection[Channel],
         frame_rate: Rate,
-        put_in_force: Callable[[Reference], None],
+        put_in_force: Callable[[Reference, bool], bool],
+        fall_back: Callable[[str], bool],
         on_event: OnEvent,
     ) -> None:
         self._scans = scans
         self._channels = channels
         self._frame_rate = frame_rate
         self._put_in_force = put_in_force
+        self._fall_back = fall_back
         self._on_event = on_event
         self._has_reference = False
         self._tare: Tare | None = None
@@ -116,7 +121,8 @@ class Taring:
             self._refuse(tare, CommandError(str(error), "", "tare_refused"))
             return
         self._tare = None
-        self._put_in_force(reference)
+        if not self._put_in_force(reference, bool(tare.answers)):
+            return
         shown = f", while {contacts} contact(s) were shown" if contacts else ""
         self._on_event("tared", "info", f"{reference.scans} dual scans{shown}")
         for answer in tare.answers:  # when all is in force: a status asked for now shows it
@@ -125,7 +131,7 @@ class Taring:
     def _refuse(self, tare: Tare, refusal: CommandError) -> None:
         self._tare = None
         self._on_event("tare_refused", "warning", refusal.cause, refusal.next_step)
-        if not self._has_reference:
+        if not self._has_reference and not self._fall_back(refusal.cause):
             self.start()  # without a reference there is nothing else to do
         for answer in tare.answers:
             answer.set_exception(refusal)

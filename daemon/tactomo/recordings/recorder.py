@@ -115,6 +115,15 @@ class Recorder(Worker):
         """
         return self._ask(self._end)
 
+    def do(self, work: Callable[[], None]) -> None:
+        """Have other work with files done by the thread that may wait for disks.
+
+        Raises:
+            RecordingError: the thread has died.
+
+        """
+        self._ask(work)
+
     def set_calibration(self, text: str) -> None:
         """Have the files to come tell this pressure calibration; for the pipeline's thread."""
         self._origin = replace(self._origin, calibration=text)

@@ -62,6 +62,7 @@ from tactomo.endpoint import allow_connections
 from tactomo.errors import CommandError, ConfigError
 from tactomo.events import EventBook, Severity
 from tactomo.imaging.imaging import Imaging
+from tactomo.imaging.kept_reference import KeptReference
 from tactomo.imaging.pipeline import Pipeline
 from tactomo.protocols import find_protocol, protocol_named
 from tactomo.recordings.recorder import Recorder
@@ -146,6 +147,9 @@ class Daemon:
             calibration,
             config.tare_scans,
             config.baseline,
+            None
+            if replay is not None
+            else KeptReference(config.name, description, self._recorder, self._on_event),
             self._recorder,
             self._publisher,
             self._on_event,

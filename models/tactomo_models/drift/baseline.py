@@ -179,6 +179,26 @@ class BaselineTracker:
             self._take_note(time_s, measurement, frame, scans)
         return frame
 
+    def explains(self, seen: Reference, elapsed_s: float) -> bool | None:
+        """Whether a mean of scans is the reference, drifted for so long; None: no common channel.
+
+        For a tracker that has just begun.
+        """
+        measurement = self._reconstructor.compare(seen.magnitude, seen.structure)
+        if not measurement.changes:
+            return None
+        if measurement.is_quiet:
+            return True
+        for name, changes in measurement.changes.items():
+            channel = self._channels[name]
+            channel.begin(0.0)
+            creep = self._memory.creep(elapsed_s, name)
+            scan = getattr(seen, name)
+            found = channel.explain(elapsed_s, scan, changes, creep, self._time_constant_s)
+            if found.misfit >= 1 or found.excess >= 1:
+                return False
+        return True
+
     def _move(self, time_s: float) -> None:
         """Put the baseline as it is now in force."""
         assert self.reference is not None

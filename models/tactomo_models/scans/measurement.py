@@ -156,7 +156,7 @@ class Comparator:
             if name not in self._description.channels:
                 continue
             if scan is None or name not in self.channels:
-                absent = missing(name) if scan is None else missing(name) | Flag.NO_REFERENCE
+                absent = missing(name) if scan is None else Flag.NO_REFERENCE
                 flags, own_flags = flags | absent, own_flags | absent
                 continue
             result = self.channels[name].compare(scan, saturated=name in saturated)

@@ -55,6 +55,8 @@ class Flag(IntFlag):
     SATURATED = 1024  # the converter clipped; what it clipped is left out
     LOW_CONFIDENCE = 2048  # the network expects its own map to be wrong
     CHANNELS_SKEWED = 4096  # the two scans are not of one instant; set by who pairs them
+    NO_USABLE_SCAN = 8192  # nothing was measured: that no contact is shown says nothing
+    REFERENCE_DISPUTED = 16384  # the skin at the start was not as last known; set by who tares
 
     def names(self) -> list[str]:
         """Names of the flags that are set, in lower case, as the stream carries them."""

@@ -16,13 +16,15 @@ import tactomo.twin.control
 from tables import table as cells_of
 from tactomo.errors import CommandError
 from tactomo_client import status
+from tactomo_client.frame import TOUCHES_SEEN
 from tactomo_models import Flag
 from tactomo_models.methods.auto import UNSURE_MISFIT
 from tactomo_models.methods.magnitudes import BAD_MISFIT
 from tactomo_models.methods.registry import METHODS
 
 UNITS = {"ns": "ns", "us": "µs", "ms": "ms", "s": "s", "mm": "mm", "mm2": "mm²", "kpa": "kPa"}
-DOCUMENT = (Path(__file__).parents[3] / "clients" / "STREAM.md").read_text("utf-8")
+DOCUMENT_FOLDER = Path(__file__).parents[3] / "clients"
+DOCUMENT = (DOCUMENT_FOLDER / "STREAM.md").read_text("utf-8")
 
 
 def table(heading: str, column: str = "Name") -> set[str]:
@@ -83,6 +85,18 @@ def test_the_python_client_has_every_field_of_a_status() -> None:
 
 def test_every_flag_is_explained() -> None:
     assert table("## Flags", "Flag") == {flag.name.lower() for flag in Flag if flag.name}
+
+
+def test_the_clients_know_of_which_flags_touches_are_seen() -> None:
+    rows = cells_of("clients/STREAM.md", "## Flags")
+    seen = {name for name, row in rows.items() if row["Touches seen"] == "yes"}
+    assert seen == TOUCHES_SEEN
+    header = DOCUMENT_FOLDER / "cpp" / "include" / "tactomo" / "frame.hpp"
+    array = re.search(r"touches_seen\{([^}]*)\}", header.read_text("utf-8"))
+    assert array
+    assert set(re.findall(r'"(\w+)"', array[1])) == seen
+    after = DOCUMENT.partition("\n## Stale, or nothing pressed?\n")[2].partition("\n1. ")[0]
+    assert set(re.findall(r"`(\w+)`", after)) == seen | {"is_known"}
 
 
 def test_every_method_is_listed_that_may_have_made_a_frame() -> None:

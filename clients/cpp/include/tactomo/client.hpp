@@ -3,7 +3,7 @@
 //     tactomo::Subscription skin{"left_forearm"};
 //     while (running) {
 //         const tactomo::Frame* frame = skin.latest();        // never waits, never throws
-//         if (!frame || frame->is_stale()) stop();            // not known is not "nothing pressed"
+//         if (!frame || !frame->is_known()) stop();            // not known is not "nothing pressed"
 //         else for (const tactomo::Contact& contact : frame->contacts) react(contact);
 //     }
 //

@@ -118,6 +118,10 @@ private:
     bool known_ = false;
 };
 
+/// Flags under which every touch is still seen: see STREAM.md. Of any other nobody knows.
+inline constexpr std::array<std::string_view, 5> touches_seen{
+    "magnitude_missing", "invalid_voltage", "electrode_fault", "saturated", "channels_skewed"};
+
 /// What the skin felt at one instant, and how far to trust it. clients/STREAM.md has the fields.
 struct Frame {
     Text<64> sensor;
@@ -158,6 +162,15 @@ struct Frame {
 
     /// Whether it is too old to say anything: no contacts then means "not known".
     bool is_stale() const noexcept { return age() > stale_after; }
+
+    /// Whether every touch would be among `contacts`: if there is none, nothing presses. False where
+    /// the frame is stale, or a flag says that touches may be missing.
+    bool is_known() const noexcept {
+        return !is_stale() && std::all_of(flags.begin(), flags.end(), [](const Text<48>& flag) {
+            return std::find(touches_seen.begin(), touches_seen.end(), flag.view()) !=
+                   touches_seen.end();
+        });
+    }
 
     /// Whether any contact presses with limit_kpa or more: yes if one does; no only if none does, the
     /// frame is fresh and nothing flags it.

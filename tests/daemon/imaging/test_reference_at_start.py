@@ -1,0 +1,123 @@
+"""The reference across restarts: what lies on the skin at a start is no bare skin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from tactomo.imaging.kept_reference import reference_path
+from tactomo_client.frame import TOUCHES_SEEN
+from tactomo_models import Press, SkinSimulator, load_description
+from tactomo_models.arrays import FloatArray
+from tactomo_protocol import Channel
+
+Start = Callable[..., Any]
+Volts = Mapping[Channel, FloatArray]
+HELD = [Press(x, y, 180.0) for x in (-0.03, 0.03) for y in (-0.03, 0.03)]
+
+
+@cache
+def volts(is_held: bool) -> Volts:
+    skin = SkinSimulator(load_description("paper_square"), spacing_m=0.008)  # coarse, but quick
+    return skin.voltages(HELD if is_held else [])
+
+
+@pytest.fixture
+def begin(bench: Start) -> Callable[..., Any]:
+    """Start a daemon that tares on these voltages, or on one after the other of them."""
+
+    def start(*seen: Volts) -> Any:
+        b = bench(real=True, tare_scans=max(3, len(seen)))
+        b.skin.introduce()
+        for index in range(b.daemon.config.tare_scans):
+            b.step(volts=seen[index % len(seen)])
+        return b
+
+    return start
+
+
+def once(begin: Callable[..., Any]) -> None:
+    """Have a daemon tare on the bare skin and stop."""
+    b = begin(volts(False))
+    b.listener.event("tared")
+    b.daemon.stop()
+    assert reference_path("left").exists()
+
+
+def is_known(frame: Mapping[str, Any]) -> bool:
+    return TOUCHES_SEEN.issuperset(frame["flags"])
+
+
+def test_contacts_held_down_through_a_restart_are_still_there(begin: Any) -> None:
+    once(begin)
+    b = begin(volts(True))
+    assert "tactomo tare" in b.listener.event("reference_disputed")["next_step"]
+    frame = b.step(volts=volts(True))
+    assert len(frame["contacts"]) == 4
+    assert "reference_disputed" in frame["flags"]
+    assert not is_known(frame)
+    released = b.step(volts=volts(False))
+    b.listener.event("reference_confirmed")
+    assert (released["contacts"], released["flags"]) == ([], [])
+
+
+def test_a_tare_on_command_overrides_the_reference_that_was_kept(begin: Any) -> None:
+    once(begin)
+    b = begin(volts(True))
+    b.listener.event("reference_disputed")
+    with ThreadPoolExecutor(1) as pool:
+        answer = pool.submit(b.ask, "tare")
+        while not answer.done():
+            b.step(volts=volts(True))
+    frame = b.step(volts=volts(True))
+    assert frame["contacts"] == []
+    assert "reference_disputed" not in frame["flags"]
+    b.daemon.stop()
+    again = begin(volts(True))  # it is what the sensor was last known as
+    again.listener.event("tared")
+
+
+def test_a_skin_that_has_warmed_since_is_tared_anew(begin: Any) -> None:
+    once(begin)
+    with np.load(reference_path("left")) as kept:
+        arrays = {**kept, "realtime_ns": kept["realtime_ns"] - 3600 * 10**9}
+    np.savez(reference_path("left"), **arrays)
+    b = begin({name: 0.96 * each for name, each in volts(False).items()})
+    b.listener.event("tared")
+    assert b.step(volts={n: 0.96 * each for n, each in volts(False).items()})["tier"] == "quiet"
+
+
+def test_where_somebody_moves_at_the_start_the_reference_that_was_kept_is_used(begin: Any) -> None:
+    once(begin)
+    b = begin(*[volts(False)] * 10, *[volts(True)] * 10)
+    assert "moved" in b.listener.event("reference_disputed")["detail"]
+    assert len(b.step(volts=volts(True))["contacts"]) == 4
+
+
+def test_a_damaged_file_is_told_and_does_no_harm(begin: Any) -> None:
+    once(begin)
+    reference_path("left").write_bytes(b"no archive")
+    b = begin(volts(False))
+    assert str(reference_path("left")) in b.listener.event("reference_not_kept")["detail"]
+    b.listener.event("tared")
+
+
+def test_a_folder_that_cannot_be_written_is_told(begin: Any) -> None:
+    reference_path("left").parent.parent.mkdir(parents=True, exist_ok=True)
+    reference_path("left").parent.write_text("a file where the folder should be")
+    b = begin(volts(False))
+    b.listener.event("reference_not_kept")
+
+
+@pytest.mark.parametrize("value", [0.0, 2000.0])
+def test_where_nothing_can_be_measured_no_contacts_is_not_known(begin: Any, value: float) -> None:
+    b = begin(volts(False))
+    b.listener.event("tared")
+    frame = b.step(volts=dict.fromkeys(volts(False), np.full(208, value)))
+    assert frame["contacts"] == []
+    assert "no_usable_scan" in frame["flags"]
+    assert not is_known(frame)
