@@ -14,6 +14,8 @@ from typing import Any, Final, Literal, NamedTuple, Protocol
 Severity = Literal["info", "warning", "error"]
 
 EVENT_PERIOD_S: Final = 1.0
+LONGEST_PERIOD_S: Final = 60.0
+"""Between two events of one trouble that goes on: it must not bury all others."""
 LOGGED_AT_ONCE: Final = 5
 """Lines of one event that the log takes in a row; then one in `LOG_PERIOD_S`."""
 LOG_PERIOD_S: Final = 300.0
@@ -29,17 +31,25 @@ class OnEvent(Protocol):
 
 
 class RateLimit:
-    """Lets one event of a kind pass per second, or other period; for use by one thread."""
+    """Lets one event of a kind pass per period; for use by one thread.
+
+    While one comes whenever it may, the period doubles each time, up to `LONGEST_PERIOD_S`; after
+    as long without any it is the first one again.
+    """
 
     def __init__(self, period_s: float = EVENT_PERIOD_S) -> None:
-        self._period_s = period_s
-        self._passed_s = -period_s
+        self._first_s = self._period_s = period_s
+        self._passed_s = -LONGEST_PERIOD_S - period_s
 
     def allows(self) -> bool:
         """Whether an event may be told now; if so, the next one waits."""
         now_s = time.monotonic()
-        if now_s - self._passed_s < self._period_s:
+        since_s = now_s - self._passed_s
+        if since_s < self._period_s:
             return False
+        goes_on = since_s < 2 * self._period_s
+        longest_s = max(LONGEST_PERIOD_S, self._first_s)
+        self._period_s = min(2 * self._period_s, longest_s) if goes_on else self._first_s
         self._passed_s = now_s
         return True
 

@@ -6,8 +6,10 @@ which a percentile does not mind.
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import deque
+from collections.abc import Mapping
 from statistics import median_low
 from typing import Final
 
@@ -22,6 +24,8 @@ WAITS: Final = 5
 FEW: Final = 3.0
 """As many of its own periods late, and something has stopped."""
 LONGEST_PERIOD_S: Final = 60.0
+MINUTE_S: Final = 60.0
+LOOK_S: Final = 1.0
 
 
 class Durations:
@@ -108,3 +112,25 @@ class Rate:
             return 0.0
         span_ns = int(recent.max() - recent.min())
         return (recent.size - 1) / span_ns * 1e9 if span_ns else 0.0
+
+
+class LastMinute:
+    """How far counts have risen within the last minute, if they are looked at each second.
+
+    So what was damaged or left out an hour ago is not taken for present. For any thread.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._seen: deque[tuple[float, Mapping[str, int]]] = deque([(time.monotonic(), {})])
+
+    def rise(self, counts: Mapping[str, int]) -> dict[str, int]:
+        """Return by how much each count, now at this, is above what it was a minute ago."""
+        now_s = time.monotonic()
+        with self._lock:
+            if now_s - self._seen[-1][0] >= LOOK_S:
+                self._seen.append((now_s, counts))
+            while len(self._seen) > 1 and now_s - self._seen[1][0] >= MINUTE_S:
+                self._seen.popleft()
+            before = self._seen[0][1]
+        return {name: count - before.get(name, 0) for name, count in counts.items()}

@@ -27,8 +27,9 @@ STATUS = {
             "url": "/dev/ttyACM0",
             "connected": True,
             "device": {"device_id": "twin-paper_square", "channels": ["magnitude"]},
-            "packets": 99,
-            "corrupt": 3,
+            "packets": 9999,
+            "corrupt": 300,
+            "received_last_minute": {"packets": 99, "corrupt": 3},
         },
         {"url": "/dev/ttyACM1", "connected": False, "device": None},
     ],
@@ -63,7 +64,7 @@ def test_status_shows_what_matters(tactomo: Run, control: Any) -> None:
     result = tactomo("status", "--control", control.address)
     assert result.returncode == 0
     for words in (
-        *("left_forearm: running", "/dev/ttyACM0 (open)", "3 corrupt", "(not open)"),
+        *("left_forearm: running", "/dev/ttyACM0 (open)", "300 corrupt", "(not open)"),
         *("p50 4.25 ms", "structure_missing", "19.96 frames/s", "2 dual scans dropped"),
         *("20 dual scans", "/tmp/a.mcap (2.5 MB)", "auto; the newest frame by levelset"),
         *("refused: [neither] contact nor drift", "magnitude -1.23%, unevenly 0.09%"),
@@ -112,12 +113,31 @@ def test_status_begins_with_what_is_wrong_and_what_to_do(tactomo: Run, control: 
         "check the ports below",
         "/dev/ttyACM1 is closed: no device",
         "plug it in, or check the cable; it is tried again until it is there",
-        "/dev/ttyACM0: 3 of 102 packets came damaged",
+        "/dev/ttyACM0: 3 of 102 packets came damaged within the last minute",
         "check the cable, its shield and the baud rate",
     ]
     assert "port_lost, 4 min ago: gone" in result.stdout
     assert "port_lost 2, tared 1" in result.stdout
     assert "pid 7, 10.0 % of a core on average, 90 MB, 6 threads" in result.stdout
+
+
+def test_what_is_lost_is_told_by_counts_of_the_last_minute(tactomo: Run, control: Any) -> None:
+    """Whatever the rates say: a dead channel's is 0, and what was long ago is over."""
+    idle = {"url": "/dev/ttyACM0", "connected": True, "state": "idle", "problem": None}
+    control.answers["status"] = {
+        **STATUS,
+        **{"ports": [idle], "rates": {"magnitude_hz": 0.0}, "dropped_scans": 7058, "frames": 9000},
+        "last_minute": {"frames": 600, "dropped_scans": 150, "incomplete_scans": 600},
+    }
+    shown = tactomo("status", "--control", control.address).stdout
+    assert "150 of 750 dual scans within the last minute were left out" in shown
+    assert "600 of 750 dual scans within the last minute lacked a channel" in shown
+    assert "/dev/ttyACM0 is idle\n" in shown
+    over = {"last_minute": {"frames": 600, "dropped_scans": 0, "incomplete_scans": 0}}
+    control.answers["status"] |= over
+    shown = tactomo("status", "--control", control.address).stdout
+    assert "left out" not in shown
+    assert "since the start 7058 dual scans dropped" in shown
 
 
 def test_before_the_first_tare_it_says_that_one_is_being_taken(tactomo: Run, control: Any) -> None:

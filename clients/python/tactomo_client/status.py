@@ -129,6 +129,8 @@ class Port:
     packets: int = 0
     corrupt: int = 0
     """Packets that failed a check."""
+    received_last_minute: Mapping[str, int] = field(default_factory=dict)
+    """By how much `packets` and `corrupt` have risen within it."""
     refusal: str | None = None
     """Why the device's scans are not used, if they are not."""
     unused_scans: int = 0
@@ -232,6 +234,8 @@ class Recorder:
     deleted: int = 0
     """Files that were deleted to keep to the rules."""
     failures: int = 0
+    failure: str | None = None
+    """Why the last recording did not go on; None once there is another."""
     waits_for: str | None = None
     """Why a recording that is wanted does not run, until it begins again by itself."""
 
@@ -288,7 +292,8 @@ class Status(Received):
     sensor: str = ""
     version: str = ""
     state: str = ""
-    """``waiting_for_port``, ``waiting_for_data``, ``taring``, ``running`` or ``stale``."""
+    """``waiting_for_port``, ``waiting_for_data``, ``taring``, ``running``, ``late`` (scans come,
+    frames lag) or ``stale``."""
     uptime_s: float = 0.0
     flags: frozenset[str] = frozenset()
     """The newest frame's, as are `tier` and `misfit`."""
@@ -302,6 +307,8 @@ class Status(Received):
     """Dual scans left out because newer ones had come."""
     incomplete_scans: int = 0
     """Dual scans of which one channel did not come."""
+    last_minute: Mapping[str, int] = field(default_factory=dict)
+    """By how much `frames`, `dropped_scans` and `incomplete_scans` have risen within it."""
     late_scans: int = 0
     scan_tally: ScanTally = field(default_factory=ScanTally)
     channel_skew_ms: Percentiles | None = None

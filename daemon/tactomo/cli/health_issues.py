@@ -69,10 +69,12 @@ FLAG_ADVICE: Mapping[str, tuple[str, str]] = {
         "check the sync line between the two boards",
     ),
 }
+FASTER = "give the daemon more of the processor, or choose a faster method or a budget"
 STATES: Mapping[str, tuple[str, str]] = {
     "waiting_for_port": ("a port is not there yet", "check the ports below"),
     "waiting_for_data": ("no scan has come yet", "check the ports below"),
     "stale": ("scans have stopped coming", "check the ports below"),
+    "late": ("scans come, and frames come late", FASTER),
 }
 TARING = ("a reference is being taken", "leave the skin alone until it runs")
 
@@ -117,10 +119,12 @@ def _of_port(port: Mapping[str, Any]) -> Iterator[HealthIssue]:
     url = port.get("url")
     step = PORT_STATES.get(str(port.get("state")))
     if step is not None:
-        yield HealthIssue("error", f"{url} is {port['state']}: {port.get('problem') or '-'}", step)
-    packets, corrupt = port.get("packets") or 0, port.get("corrupt") or 0
+        because = f": {port['problem']}" if port.get("problem") else ""
+        yield HealthIssue("error", f"{url} is {port['state']}{because}", step)
+    recent = port.get("received_last_minute") or {}
+    packets, corrupt = recent.get("packets") or 0, recent.get("corrupt") or 0
     if corrupt > CORRUPT_NOTED * (packets + corrupt):
-        share = f"{corrupt} of {packets + corrupt} packets came damaged"
+        share = f"{corrupt} of {packets + corrupt} packets came damaged within the last minute"
         step = "check the cable, its shield and the baud rate"
         yield HealthIssue("warning", f"{url}: {share}", step)
     timer_ms = port.get("latency_timer_ms") or 0
@@ -146,21 +150,21 @@ def _of_flags(status: Mapping[str, Any]) -> Iterator[HealthIssue]:
 
 
 def _of_losses(status: Mapping[str, Any]) -> Iterator[HealthIssue]:
-    rate_hz = (status.get("rates") or {}).get("magnitude_hz") or 0.0
-    expected = rate_hz * (status.get("uptime_s") or 0.0)
-    dropped = status.get("dropped_scans") or 0
-    if expected and dropped > DROPPED_NOTED * expected:
-        step = "give the daemon more of the processor, or choose a faster method or a budget"
-        yield HealthIssue(
-            "warning", f"{dropped} dual scans were left out, {expected:.0f} came", step
-        )
-    incomplete = status.get("incomplete_scans") or 0
-    if expected and incomplete > DROPPED_NOTED * expected:
+    recent = status.get("last_minute") or {}
+    dropped, incomplete = recent.get("dropped_scans") or 0, recent.get("incomplete_scans") or 0
+    came = (recent.get("frames") or 0) + dropped
+    of = f"of {came} dual scans within the last minute"
+    if dropped > DROPPED_NOTED * came:
+        yield HealthIssue("warning", f"{dropped} {of} were left out", FASTER)
+    if incomplete > DROPPED_NOTED * came:
         step = "check the cable of the channel that is missing; if it comes late, sync_wait_ms"
-        yield HealthIssue("warning", f"{incomplete} dual scans lacked a channel", step)
+        yield HealthIssue("warning", f"{incomplete} {of} lacked a channel", step)
 
 
 def _of_recorder(recorder: Mapping[str, Any]) -> Iterator[HealthIssue]:
     if recorder.get("waits_for"):
         step = "free some space or mend the disk; recording begins again by itself"
         yield HealthIssue("error", f"nothing is recorded: {recorder['waits_for']}", step)
+    elif recorder.get("failure"):
+        step = "free some space or mend the disk, then record anew: `tactomo record start`"
+        yield HealthIssue("error", f"a recording ended early: {recorder['failure']}", step)

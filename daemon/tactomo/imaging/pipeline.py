@@ -13,6 +13,7 @@ import contextlib
 import queue
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from typing import Any, Final, NamedTuple
@@ -65,9 +66,7 @@ class Pipeline(Worker):
         sync: pairs the scans; it counts those that it drops.
         skew: how far apart the channels are.
         wall_clock: whether it was set.
-        dropped: dual scans left out because newer ones had come.
-        overflowed: deliveries lost because this thread did not come round to them for seconds;
-            written by the port threads under a lock.
+        delivered_ns: when the newest scan was delivered, monotonic; 0 before the first.
         incomplete: dual scans of which one channel did not come that had come before, or is lost.
         scan_rates: how often each channel's scans come.
         finished: set once every replayed port has ended and what came of it was published.
@@ -86,8 +85,7 @@ class Pipeline(Worker):
         on_event: OnEvent,
     ) -> None:
         super().__init__("pipeline")
-        self.dropped = 0
-        self.overflowed = 0
+        self.delivered_ns = 0
         self.incomplete = 0
         self.scan_rates = {channel: Rate() for channel in channels}
         self.finished = threading.Event()
@@ -108,8 +106,12 @@ class Pipeline(Worker):
         self._zero_counters = zero_counters
         self._zero_limit = RateLimit(ZERO_PERIOD_S)
         self._on_event = on_event
-        self._received = [0] * ports  # scans, each counted by its port's thread
-        self._used = self._left_out = self._discarded = 0  # scans, too
+        # Scans: each port's thread counts its own; the port threads share a lock for what is
+        # discarded because this thread did not come round to it for seconds.
+        self._received: list[Counter[Channel]] = [Counter() for _ in range(ports)]
+        self._discarded: Counter[Channel] = Counter()
+        self._used = self._left_out = self._in_hand = 0
+        self._skipped = 0  # dual scans left out because newer ones had come
         self._drop_limit = RateLimit()
         self._dropped_told = 0
         self._is_excused = False  # the dual scans to be dropped next are not worth a warning
@@ -122,21 +124,40 @@ class Pipeline(Worker):
         )
         self._overflow_lock = threading.Lock()
 
+    @property
+    def received(self) -> dict[Channel, int]:
+        """How many scans of each channel were delivered; for any thread."""
+        return {
+            channel: sum(port[channel] for port in self._received) for channel in self._channels
+        }
+
+    @property
+    def dropped(self) -> int:
+        """Dual scans left out because newer ones had come; for any thread."""
+        return self._skipped + max(self._discarded.values(), default=0)
+
     def tally(self) -> dict[str, int]:
-        """Return what became of every scan that was delivered; for any thread."""
+        """Return what became of every scan that was delivered, each counted; for any thread.
+
+        It adds up but for the few scans that change places meanwhile.
+        """
         sync = self.sync
-        outcome = {
+        with self._deliveries.mutex:
+            queued = sum(len(each.scans) for each in self._deliveries.queue if each is not None)
+        return {
+            "received": sum(self.received.values()),
             "used": self._used,
             "late": sync.late,
             "repeated": sync.repeated,
-            "dropped": self._left_out + self._discarded + sync.unmarked,
+            "dropped": self._left_out + self._discarded.total() + sync.unmarked,
+            "waiting": queued + sync.waiting + self._in_hand,
         }
-        received = sum(self._received)
-        return {"received": received, **outcome, "waiting": received - sum(outcome.values())}
 
     def deliver(self, delivery: Delivery) -> None:
         """Take what a port read; called by port threads. Waits only if nothing may be lost."""
-        self._received[delivery.port] += len(delivery.scans)
+        if delivery.scans:
+            self._received[delivery.port].update(scan.channel for scan in delivery.scans)
+            self.delivered_ns = time.monotonic_ns()
         while not self._stopping.is_set():
             try:
                 self._deliveries.put(delivery, timeout=IDLE_S if self._is_lossless else 0)
@@ -185,6 +206,7 @@ class Pipeline(Worker):
             before = self._sync_state()
             ready = self._gather()
             self._tell_changes(before)
+            self._in_hand = sum(len(dual.scans) for dual in ready)
             for dual in ready if self._is_lossless else self._newest(ready):
                 if self._stopping.is_set():
                     break
@@ -212,6 +234,7 @@ class Pipeline(Worker):
         timing = recorded or self.skew.timing(dual)
         self.skew.note(timing)
         self._imaging.process(dual, timing, self.sync.lost)
+        self._in_hand -= len(dual.scans)
         self._used += len(dual.scans)
 
     def _begin(self) -> None:
@@ -279,8 +302,10 @@ class Pipeline(Worker):
             self.sync.lost.update(set(self._channels) - announced)
 
     def _newest(self, ready: list[DualScan]) -> list[DualScan]:
-        self.dropped += max(0, len(ready) - 1)
-        self._left_out += sum(len(dual.scans) for dual in ready[:-1])
+        left_out = sum(len(dual.scans) for dual in ready[:-1])
+        self._skipped += max(0, len(ready) - 1)
+        self._in_hand -= left_out
+        self._left_out += left_out
         if ready and self._is_excused:  # a new reference takes a while to prepare for
             self._is_excused, self._dropped_told = False, self.dropped
         if self.dropped > self._dropped_told and self._drop_limit.allows():
@@ -351,8 +376,8 @@ class Pipeline(Worker):
     def _discard_oldest(self) -> None:
         with self._overflow_lock, contextlib.suppress(queue.Empty):
             oldest = self._deliveries.get_nowait()
-            self.overflowed += 1
-            self._discarded += 0 if oldest is None else len(oldest.scans)
+            if oldest is not None:
+                self._discarded.update(scan.channel for scan in oldest.scans)
 
     def _ask(self, command: Callable[[], Any]) -> Future[Any]:
         done: Future[Any] = Future()

@@ -57,6 +57,7 @@ class Recorder(Worker):
         files: how many files were begun since the start.
         deleted: how many were deleted to keep to the rules.
         failures: how often a recording could not go on.
+        failure: why the last recording did not go on; empty once there is another.
         waits_for: why a recording that is wanted does not run; empty while none does.
 
     """
@@ -67,6 +68,7 @@ class Recorder(Worker):
         self.files = 0
         self.deleted = 0
         self.failures = 0
+        self.failure = ""
         self.waits_for = ""
         self._origin = origin  # replaced by the pipeline's thread, see `set_calibration`
         self._rules = rules
@@ -140,6 +142,7 @@ class Recorder(Worker):
         if not self.is_alive and not self._is_dead:
             self._is_dead, self.active = True, None
             self.failures += 1
+            self.failure = _DIED
             self._on_event("recording_failed", "error", _DIED, _REPORT)
         waits_s = 0.0 if busy_since_s is None else time.monotonic() - busy_since_s
         if (waits_s > STALL_S) != self._is_stalled:
@@ -218,7 +221,7 @@ class Recorder(Worker):
         folder = self._rules.folder_path if path is None else None
         self._with_maps = with_maps
         self.active = self._create(path)
-        self._folder, self.waits_for = folder, ""
+        self._folder, self.waits_for, self.failure = folder, "", ""
         self._on_event("recording_started", "info", str(self.active.path))
         self._delete_old()
         return {"path": str(self.active.path)}
@@ -347,7 +350,7 @@ class Recorder(Worker):
         except (OSError, RecordingError) as error:
             self._wait(str(error))
             return
-        self.waits_for = ""
+        self.waits_for = self.failure = ""
         self._on_event("recording_resumed", "info", str(self.active.path))
         self._delete_old()
 
@@ -404,6 +407,7 @@ class Recorder(Worker):
         if recording.tell_once():
             self.failures += 1
             detail = f"{recording.path}: {reason}, after {recording.bytes_written} bytes"
+            self.failure = detail
             self._on_event("recording_failed", "error", detail, self._wait(reason))
 
 
@@ -423,7 +427,8 @@ def _reason(error: Exception) -> str:
 
 
 def _no_room(free: int, reserve: int) -> str:
-    return f"{free / 1e6:.0f} MB are free on the disk, {reserve / 1e6:.0f} MB are kept in reserve"
+    kept = max(reserve, MIN_ROOM)
+    return f"{free / 1e6:.3g} MB are free on the disk, and {kept / 1e6:.3g} MB of it are left free"
 
 
 def _wait_for(answer: Future[Any]) -> None:

@@ -20,7 +20,7 @@ from tactomo.imaging.imaging import Imaging
 from tactomo.imaging.pipeline import Pipeline
 from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording import REPLAY_SCHEME
-from tactomo.timing import Durations
+from tactomo.timing import Durations, LastMinute
 
 VERSION: Final = version("tactomo")  # read from a file, which may fail later
 STALE_S: Final = 1.0
@@ -50,6 +50,8 @@ class Status:
         self._events = events
         self._methods = methods
         self._started_s = time.monotonic()
+        self._last_minute = LastMinute()
+        self._ports_last_minute = {port.url: LastMinute() for port in ports}
 
     def fields(self, latency: Durations, subscribers: int) -> dict[str, Any]:
         """Return the fields of a `status` message; the publisher's part is handed in."""
@@ -57,6 +59,11 @@ class Status:
         active = self._recorder.active
         reference = imaging.reference
         stages = {stage: times.percentiles_ms() for stage, times in imaging.stages.items()}
+        losses = {
+            "frames": imaging.frame_rate.count,
+            "dropped_scans": pipeline.dropped,
+            "incomplete_scans": pipeline.incomplete,
+        }
         return {
             "version": VERSION,
             "state": self.state(),
@@ -66,12 +73,11 @@ class Status:
                 **pressure_fields(self._sensor, imaging.calibration.in_force),
             },
             "source": {"kind": source(self._ports)},
-            "ports": [port_fields(port) for port in self._ports],
+            "ports": [self._port(port) for port in self._ports],
             "rates": self._rates(),
-            "scans": {c: rate.count for c, rate in pipeline.scan_rates.items()},
-            "frames": imaging.frame_rate.count,
-            "dropped_scans": pipeline.dropped + pipeline.overflowed,
-            "incomplete_scans": pipeline.incomplete,
+            "scans": pipeline.received,
+            **losses,
+            "last_minute": self._last_minute.rise(losses),
             "late_scans": pipeline.sync.late,
             "scan_tally": pipeline.tally(),
             "channel_skew_ms": pipeline.skew.sizes.percentiles_ms(),
@@ -110,8 +116,9 @@ class Status:
             is_waiting = any(port.state == "closed" for port in self._ports)
             return "waiting_for_port" if is_waiting else "waiting_for_data"
         stale_s = max(STALE_S, self._imaging.frame_rate.pace.few_s)
-        if time.monotonic_ns() - last_ns > stale_s * 1e9:
-            return "stale"
+        now_ns = time.monotonic_ns()
+        if now_ns - last_ns > stale_s * 1e9:
+            return "stale" if now_ns - self._pipeline.delivered_ns > stale_s * 1e9 else "late"
         return "taring" if self._imaging.taring.is_on else "running"
 
     def summary(self, subscriptions: int) -> str:
@@ -123,12 +130,18 @@ class Status:
         rate_hz = self._imaging.frame_rate.per_second()
         return f"{state}: {rate_hz:.0f} frames/s, {subscriptions} subscriptions"
 
+    def _port(self, port: PortReader) -> dict[str, Any]:
+        fields = port_fields(port)
+        counts = {name: fields[name] for name in ("packets", "corrupt")}
+        return {**fields, "received_last_minute": self._ports_last_minute[port.url].rise(counts)}
+
     def _recorder_fields(self) -> dict[str, Any]:
         recorder = self._recorder
         return {
             "files": recorder.files,
             "deleted": recorder.deleted,
             "failures": recorder.failures,
+            "failure": recorder.failure or None,
             "waits_for": recorder.waits_for or None,
         }
 

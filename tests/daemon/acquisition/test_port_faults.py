@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tactomo import timing
+from tactomo.cli.health_issues import health_issues
 from tactomo.config import load_config
 from tactomo.errors import PortBusyError, PortError
 from tactomo.service.daemon import Daemon
@@ -48,6 +50,26 @@ def test_garbage_is_counted_and_told_and_costs_nothing_else(bench: Start) -> Non
     (port,) = b.ask("status")["ports"]
     assert port["corrupt"] == 1
     assert port["connected"]
+
+
+def test_damage_that_is_over_is_not_told_as_present(
+    bench: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(timing, "LOOK_S", 0.0)
+    b = bench()
+    b.tare()
+    b.skin.lines[0].say(b"\x00garbage\x00")
+    b.listener.event("corrupt_packets")
+    status = b.ask("status")
+    assert status["ports"][0]["received_last_minute"]["corrupt"] == 1
+    assert any("damaged" in issue.what for issue in health_issues(status))
+    monkeypatch.setattr(timing, "MINUTE_S", 0.5)
+    b.step()
+    status = b.until(
+        lambda: (s := b.ask("status"))["ports"][0]["last_minute"]["corrupt"] == 0 and s
+    )
+    assert status["ports"][0]["corrupt"] == 1
+    assert not any("damaged" in issue.what for issue in health_issues(status))
 
 
 def test_a_flood_of_garbage_makes_few_events(bench: Start) -> None:

@@ -7,6 +7,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
+from tactomo.imaging import pipeline as module
 from tactomo.imaging.pipeline import Pipeline
 from tactomo.recordings.replay import Replay
 from tactomo.scans import ChannelScan, Delivery, DualScan
@@ -59,6 +61,8 @@ def test_the_newest_wins_where_frames_take_long() -> None:
     wait_until(lambda: pipeline.tally()["received"] == 2 and pipeline.turns > 1, "the first frame")
     for counter in range(1, 6):
         pipeline.deliver(dual(counter))
+    held = pipeline.tally()  # one dual scan in hand, the others in the queue: each is counted
+    assert held == {**dict.fromkeys(held, 0), "received": 12, "waiting": 12}
     frames.go.set()
     wait_until(lambda: pipeline.tally()["waiting"] == 0, "all of them")
     pipeline.stop()
@@ -67,6 +71,24 @@ def test_the_newest_wins_where_frames_take_long() -> None:
     assert pipeline.dropped >= 3
     tally = pipeline.tally()
     assert (tally["used"], tally["dropped"]) == (2 * len(frames.counters), 2 * pipeline.dropped)
+
+
+def test_what_overflows_is_counted_as_received_and_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "QUEUED_DELIVERIES", 3)
+    frames = Frames()
+    pipeline = started(frames)
+    pipeline.deliver(dual(0))
+    wait_until(lambda: pipeline.turns > 1, "the first frame")
+    for counter in range(1, 11):
+        pipeline.deliver(dual(counter))
+    assert pipeline.dropped == 7
+    assert pipeline.received == dict.fromkeys(BOTH, 11)
+    tally = pipeline.tally()
+    assert tally["received"] == sum(tally.values()) - tally["received"] == 22
+    frames.go.set()
+    wait_until(lambda: pipeline.tally()["waiting"] == 0, "all of them")
+    pipeline.stop()
+    assert len(frames.counters) + pipeline.dropped == 11
 
 
 def test_lossless_every_one_is_made() -> None:

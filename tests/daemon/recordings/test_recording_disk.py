@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tactomo.cli.health_issues import health_issues
 from tactomo.recordings import active_recording, recorder
 from tactomo.recordings.recording import open_recording
 from tactomo.recordings.recovery import recover
@@ -146,7 +147,9 @@ def test_a_recording_to_one_file_ends_with_the_room_and_can_be_recovered(
     (small_disk / "filler").write_bytes(bytes(shutil.disk_usage(small_disk).free - 300_000))
     step_until(b, lambda: told(b, "recording_failed"))
     assert "No space" in told(b, "recording_failed")[0]["detail"]
-    assert b.ask("status")["recorder"]["waits_for"] is None
+    told_by_status = b.ask("status")
+    assert told_by_status["recorder"]["waits_for"] is None
+    assert any("No space" in issue.what for issue in health_issues(told_by_status))
     found = counters(path)
     assert found == list(range(first, first + len(found)))
     assert len(found) > 5

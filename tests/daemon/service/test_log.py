@@ -10,11 +10,13 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import structlog
-from tactomo.events import LOG_PERIOD_S, LOGGED_AT_ONCE, EventBook
+from tactomo import events
+from tactomo.events import LOG_PERIOD_S, LOGGED_AT_ONCE, EventBook, RateLimit
 from tactomo.log import configure_logging
 
 log = structlog.get_logger()
@@ -157,3 +159,18 @@ def test_a_late_joiner_finds_what_happened(bench: Callable[..., Any]) -> None:
     assert status["frames"] == len(daemon.listener.of("map"))
     assert status["process"]["pid"] == os.getpid()
     assert status["process"]["memory_bytes"] > 10_000_000
+
+
+def test_a_trouble_that_goes_on_is_told_ever_more_rarely(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = 1000.0
+    monkeypatch.setattr(events, "time", SimpleNamespace(monotonic=lambda: now_s))
+    limit, told_s = RateLimit(), []
+    for _ in range(3000):
+        if limit.allows():
+            told_s.append(now_s - 1000.0)
+        now_s += 0.1
+    assert told_s == pytest.approx([0, 1, 3, 7, 15, 31, 63, 123, 183, 243], abs=2.0)
+    now_s += 200.0
+    assert limit.allows()
+    now_s += 1.1
+    assert limit.allows()

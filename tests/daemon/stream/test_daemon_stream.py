@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zmq
+from tactomo.service import status
 from tactomo_client import subscribe
 from tactomo_client.messages import array_from_wire, decode_message, topic
 
@@ -127,6 +128,23 @@ def test_the_newest_scan_wins_when_the_reconstruction_lags(bench: Start) -> None
     assert len(frames) < 40
     b.listener.event("scans_dropped")
     assert b.ask("status")["dropped_scans"] == 40 - len(frames)
+
+
+def test_where_frames_lag_the_state_is_late_and_not_that_no_scans_come(
+    bench: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(status, "STALE_S", 0.2)
+    b = bench(seconds=1.5, tare_scans=2)
+    b.skin.introduce()
+    for _ in range(3):
+        b.skin.scan()
+
+    def state() -> str:
+        b.skin.scan()
+        return str(b.ask("status")["state"])
+
+    b.until(lambda: state() == "late")
+    b.until(lambda: b.ask("status")["state"] == "stale")  # and nothing comes any more
 
 
 def test_every_scan_is_reconstructed_if_asked_for(bench: Start) -> None:

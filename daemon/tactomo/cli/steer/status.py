@@ -123,8 +123,8 @@ def _rows(status: dict[str, Any]) -> list[tuple[str, str]]:
         ),
         (
             "lost",
-            f"{status.get('dropped_scans', 0)} dual scans dropped, "
-            f"{status.get('incomplete_scans', 0)} incomplete",
+            f"since the start {status.get('dropped_scans', 0)} dual scans dropped, "
+            f"{status.get('incomplete_scans', 0)} incomplete, of {status.get('frames', 0)} frames",
         ),
         ("reference", f"{reference['scans']} dual scans" if reference else "none yet"),
         ("baseline", _baseline(status.get("baseline") or {})),
@@ -165,7 +165,9 @@ def _recording(recording: dict[str, Any] | None, recorder: dict[str, Any]) -> st
     if recording:
         return f"{recording['path']} ({recording['bytes'] / 1e6:.1f} MB)"
     waits_for = recorder.get("waits_for")
-    return f"{_warn('waits')}: {waits_for}" if waits_for else "off"
+    if waits_for:
+        return f"{_warn('waits')}: {waits_for}"
+    return f"{_warn('off')}: {recorder['failure']}" if recorder.get("failure") else "off"
 
 
 def _events(events: dict[str, Any]) -> str:
