@@ -66,7 +66,7 @@ def test_damage_that_is_over_is_not_told_as_present(
     monkeypatch.setattr(timing, "MINUTE_S", 0.5)
     b.step()
     status = b.until(
-        lambda: (s := b.ask("status"))["ports"][0]["last_minute"]["corrupt"] == 0 and s
+        lambda: (s := b.ask("status"))["ports"][0]["received_last_minute"]["corrupt"] == 0 and s
     )
     assert status["ports"][0]["corrupt"] == 1
     assert not any("damaged" in issue.what for issue in health_issues(status))
