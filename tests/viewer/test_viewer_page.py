@@ -369,6 +369,57 @@ def test_rate_latency_method_and_quality_are_shown(page: Page) -> None:
     wait_until(lambda: page["quality"].text == "good")
 
 
+def test_a_linear_map_is_not_called_good(page: Page) -> None:
+    page.skin.press(0, 0)
+    page.skin.frame |= {"tier": "tikhonov"}
+    page.open()
+    wait_until(lambda: "linear" in page["quality"].text)
+    page.skin.frame |= {"tier": "fit"}
+    wait_until(lambda: page["quality"].text == "good")
+
+
+def test_no_contacts_is_nothing_pressed_only_where_touches_are_seen(page: Page) -> None:
+    page.skin.frame = {"flags": ["electrode_fault"]}
+    page.open()
+    wait_until(lambda: page["no-contacts"].text == "Nothing pressed.")
+    page.skin.frame = {"flags": ["electrode_fault", "no_usable_scan"]}
+    wait_until(lambda: page["no-contacts"].text == "Not known.")
+
+
+def test_what_comes_under_a_pointer_that_rests_is_read_out(page: Page) -> None:
+    page.skin.press(-50, 0)
+    page.open()
+    wait_until(lambda: page.browser.execute_script("return tactomo.state.drawn?.contacts.length"))
+    x, y = page.browser.execute_script("return tactomo.mmToPixel(30, 30)")
+    canvas = page["map"]
+    width, height = canvas.size["width"], canvas.size["height"]
+    actions = webdriver.ActionChains(page.browser)
+    actions.move_to_element_with_offset(canvas, round(x - width / 2), round(y - height / 2))
+    actions.perform()
+    wait_until(lambda: page["readout"].text.endswith(": 0 kPa"))
+    page.skin.press(30, 30)
+    wait_until(lambda: page["readout"].text.endswith(": 200 kPa"))
+
+
+def test_the_end_of_a_replay_is_no_alarm(page: Page) -> None:
+    page.skin.press(0, 0)
+    page.open()
+    wait_until(lambda: page["quality"].text == "good")
+    page.skin.sends_frames = False
+    ended = {"url": "replay:///a.mcap?port=0", "connected": False, "state": "ended"}
+    page.skin.status |= {"state": "stale", "source": {"kind": "replay"}, "ports": [ended]}
+    wait_until(lambda: "at its end" in page["banner"].text)
+    assert page["banner"].get_attribute("data-level") == "info"
+    wait_until(lambda: page["state"].text == "replay ended")
+
+
+def test_frames_that_come_late_are_not_told_as_no_scans(page: Page) -> None:
+    page.open()
+    page.skin.status |= {"state": "late"}
+    wait_until(lambda: "late" in page["banner"].text)
+    assert "no scans" not in page["banner"].text
+
+
 def test_without_magnitudes_it_says_so(page: Page) -> None:
     page.skin.press(0, 0)
     page.skin.contacts = [Contact(1, 0, 0, 452.0, None, None, None)]
@@ -384,7 +435,8 @@ def test_status_is_shown_part_by_part(page: Page) -> None:
         "rates": {"magnitude_hz": 0.0, "structure_hz": 19.96, "frames_hz": 20.0},
         "reference": {"scans": 20, "taken_realtime_ns": time.time_ns()},
         "recording": {"path": "/data/a.mcap", "bytes": 1_500_000},
-        "incomplete_scans": 3,
+        "incomplete_scans": 999,
+        "last_minute": {"frames": 1200, "dropped_scans": 0, "incomplete_scans": 3},
     }
     page.open()
     wait_until(lambda: "21.2, 44.0 ms" in page["stages"].text)
@@ -392,6 +444,7 @@ def test_status_is_shown_part_by_part(page: Page) -> None:
     assert channels[:2] == ["magnitude", "no scans"]
     assert "20.0 scans/s" in channels
     assert "/dev/ttySKIN" in channels
+    assert "3 in the last minute" in channels
     assert page["reference"].text.startswith("Reference of 20 scans")
     assert page["record"].text == "Stop · 1.5 MB"
     assert page["source"].text == "simulated skin"
@@ -404,6 +457,8 @@ def test_a_recording_that_waits_says_why(page: Page) -> None:
     wait_until(lambda: page["recorder-waits"].text == "Recording waits: the disk is full.")
     page.skin.status |= {"recorder": {"waits_for": None}}
     wait_until(lambda: page["recorder-waits"].text == "")
+    page.skin.status |= {"recorder": {"waits_for": None, "failure": "/a.mcap: No space left"}}
+    wait_until(lambda: "No space left" in page["recorder-waits"].text)
 
 
 def test_foreign_text_stays_text(page: Page) -> None:

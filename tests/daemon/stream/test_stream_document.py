@@ -91,10 +91,11 @@ def test_the_clients_know_of_which_flags_touches_are_seen() -> None:
     rows = cells_of("clients/STREAM.md", "## Flags")
     seen = {name for name, row in rows.items() if row["Touches seen"] == "yes"}
     assert seen == TOUCHES_SEEN
-    header = DOCUMENT_FOLDER / "cpp" / "include" / "tactomo" / "frame.hpp"
-    array = re.search(r"touches_seen\{([^}]*)\}", header.read_text("utf-8"))
-    assert array
-    assert set(re.findall(r'"(\w+)"', array[1])) == seen
+    for place in ("cpp/include/tactomo/frame.hpp", "viewer/tactomo_viewer/page/health.js"):
+        source = (DOCUMENT_FOLDER / place).read_text("utf-8")
+        listed = re.search(r"touches_seen[ ={[]+([^;]*);", source, re.I)
+        assert listed
+        assert set(re.findall(r'"(\w+)"', listed[1])) == seen, place
     after = DOCUMENT.partition("\n## Stale, or nothing pressed?\n")[2].partition("\n1. ")[0]
     assert set(re.findall(r"`(\w+)`", after)) == seen | {"is_known"}
 

@@ -22,6 +22,14 @@ const FLAGS = {
   channels_skewed: ["Channels of two instants", "The two channels' scans of one counter were taken at different times: do not act on this map. Check the sync line between the boards."],
 };
 
+// Flags under which every touch is still seen (clients/STREAM.md); of any other nobody knows.
+const TOUCHES_SEEN = ["magnitude_missing", "invalid_voltage", "electrode_fault", "saturated", "channels_skewed"];
+
+/** Whether no contacts in a fresh frame means that nothing presses. */
+export function areTouchesSeen(frame) {
+  return frame.flags.every((flag) => TOUCHES_SEEN.includes(flag));
+}
+
 /** A flag's name and meaning for people. */
 export function explainFlag(flag) {
   return FLAGS[flag] ?? [flag.replaceAll("_", " "), ""];
@@ -59,6 +67,13 @@ export function verdict(state, now) {
   }
   if (fields.state.startsWith("waiting")) {
     return banner("no-data", "warning", "No data yet.", portsInWords(fields.ports));
+  }
+  if (fields.ports?.length && fields.ports.every((port) => port.state === "ended")) {
+    return banner("ended", "info", "The replay is at its end.", "The map shows its last frame.");
+  }
+  if (fields.state === "late") {
+    return banner("late", "error", "Frames come late.",
+      "Scans come faster than they are reconstructed: choose a faster method, or give the daemon more of the processor.");
   }
   const age = ageOf(frame, now);
   if (age > staleAfter(fields)) {

@@ -5,7 +5,8 @@ import { explainFlag } from "./health.js";
 const EVENTS_SHOWN = 50;
 const TROUBLE_SHOWN_S = 3600;
 const SOURCES = { twin: "simulated skin", device: "device", replay: "replay" };
-const STATES = { waiting_for_port: "no port yet", waiting_for_data: "no data yet", taring: "taring", running: "running", stale: "stale" };
+const STATES = { waiting_for_port: "no port yet", waiting_for_data: "no data yet", taring: "taring", running: "running", late: "late", ended: "replay ended", stale: "stale" };
+const LINEAR = ["tikhonov", "noser"];  // one step, which runs contacts together
 
 export const byId = (id) => document.getElementById(id);
 
@@ -56,11 +57,13 @@ export function showQuality(frame, trusted) {
   setText(byId("made-by"), frame.tier ?? "–");
   setText(byId("made-by-reason"), frame.tier_reason ?? "");
   const list = byId("quality");
-  const key = trusted ? frame.flags.join() : "not known";
+  const isLinear = LINEAR.includes(frame.tier);
+  const key = trusted ? `${isLinear} ${frame.flags}` : "not known";
   if (list.dataset.flags === key) return;
   list.dataset.flags = key;
   const chips = !trusted ? [chip("not known", "The newest frame is out of date.", "warn")]
     : frame.flags.length ? frame.flags.map((flag) => chip(...explainFlag(flag), "warn"))
+    : isLinear ? [chip("linear: coarse", "One linear step: contacts near each other run together, weak ones are missed.", "warn")]
     : [chip("good", "Nothing to be wary of.", "good")];
   list.replaceChildren(...chips);
 }
@@ -88,8 +91,9 @@ export function showStatus(status) {
   setText(record, recording ? `Stop · ${bytes(recording.bytes)}` : "Record");
   record.title = recording ? recording.path : "Record what the ports say to a file";
   const waits = byId("recorder-waits");
-  waits.hidden = !recorder?.waits_for;
-  setText(waits, waits.hidden ? "" : `Recording waits: ${recorder.waits_for}.`);
+  setText(waits, recorder?.waits_for ? `Recording waits: ${recorder.waits_for}.`
+    : recorder?.failure ? `A recording ended early: ${recorder.failure}.` : "");
+  waits.hidden = !waits.textContent;
   showMethods(status);
 }
 
@@ -124,7 +128,7 @@ function showStages(stages) {
   });
 }
 
-function showChannels({ ports, rates, events, dropped_scans: dropped, incomplete_scans: incomplete }) {
+function showChannels({ ports, rates, events, last_minute: minute }) {
   const lines = [];
   for (const name of ["magnitude", "structure"]) {
     const hz = rates?.[`${name}_hz`];
@@ -134,8 +138,10 @@ function showChannels({ ports, rates, events, dropped_scans: dropped, incomplete
   for (const port of ports ?? []) {
     lines.push(portLine(port));
   }
-  if (incomplete) lines.push(["warn", "incomplete dual scans", String(incomplete)]);
-  if (dropped) lines.push(["warn", "dropped dual scans", String(dropped)]);
+  for (const what of ["incomplete", "dropped"]) {
+    const count = minute?.[`${what}_scans`];
+    if (count) lines.push(["warn", `${what} dual scans`, `${count} in the last minute`]);
+  }
   // What happened before this page was opened is among them.
   for (const { name, severity, age_s: age } of events?.troubles ?? []) {
     if (age > TROUBLE_SHOWN_S) continue;
@@ -158,10 +164,11 @@ function showChannels({ ports, rates, events, dropped_scans: dropped, incomplete
   });
 }
 
-function portLine({ url, connected, refusal, device, bytes: received, corrupt }) {
+function portLine({ url, connected, refusal, device, bytes: received, received_last_minute: minute }) {
   if (!connected) return ["bad", url, "not connected"];
   if (refusal) return ["bad", url, refusal];
-  const parts = [device?.device_id, bytes(received), corrupt ? `${corrupt} corrupt` : ""];
+  const corrupt = minute?.corrupt;
+  const parts = [device?.device_id, bytes(received), corrupt ? `${corrupt} corrupt in the last minute` : ""];
   return [corrupt ? "warn" : "good", url, parts.filter(Boolean).join(", ")];
 }
 

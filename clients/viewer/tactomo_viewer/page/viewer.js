@@ -1,6 +1,6 @@
 // The page's main part: takes what the link brings, and has it drawn once a screen refresh.
 
-import { ageOf, verdict } from "./health.js";
+import { ageOf, areTouchesSeen, verdict } from "./health.js";
 import { Link } from "./link.js";
 import { MapView } from "./map_view.js";
 import { byId, fixed, setText, showContacts, showEvent, showQuality, showState, showStatus } from "./panels.js";
@@ -120,6 +120,7 @@ function draw() {
     presses: touch.presses,
     cursor: touch.cursor,
   });
+  showReadout();
   if (frame === state.drawn) return;
   state.drawn = frame;
   notePainted(frame);
@@ -207,7 +208,7 @@ function refresh() {
   document.body.dataset.health = found?.name ?? (state.status ? "good" : "connecting");
   const linked = link.isOpen && state.status && ageOf(state.status, now) < 3000;
   if (!linked) showState("gone", found ? "disconnected" : "connecting");
-  else if (found?.name === "stale") showState("stale");
+  else if (["stale", "ended"].includes(found?.name)) showState(found.name);
   else showState(state.status.fields.state);
   for (const id of ["tare", "record", "method"]) {
     byId(id).disabled = !linked || Boolean(state.hello?.read_only);
@@ -263,9 +264,9 @@ function showNumbers(now, trusted) {
   const known = trusted && !frame.flags.includes("no_reference");
   const contacts = known ? [...frame.contacts].sort((a, b) => a.id - b.id) : [];
   showContacts(contacts, unit, (contact) => cellText(contact, unit));
-  setText(byId("no-contacts"), known ? "Nothing pressed." : "Not known.");
+  setText(byId("no-contacts"), known && areTouchesSeen(frame) ? "Nothing pressed." : "Not known.");
   showQuality(frame, trusted);
-  byId("map").ariaLabel = known
+  byId("map").ariaLabel = known && (contacts.length || areTouchesSeen(frame))
     ? `Pressure map, ${frame.contacts.length || "no"} contact${frame.contacts.length === 1 ? "" : "s"}`
     : "Pressure map, not known";
 }
@@ -329,11 +330,20 @@ for (const input of document.querySelectorAll(".toolbar input, .toolbar select")
   input.addEventListener("change", () => { redraw(); refresh(); });
 }
 
+let pointer = null;  // where it is, in mm: what comes under it while it rests is read out, too
+
 byId("map").addEventListener("pointermove", ({ offsetX, offsetY }) => {
-  const [x, y] = view.pixelToMm(offsetX, offsetY);
-  setText(byId("readout"), view.isOnSheet(x, y) ? readout(x, y) : "");
+  pointer = view.pixelToMm(offsetX, offsetY);
+  showReadout();
 });
-byId("map").addEventListener("pointerleave", () => setText(byId("readout"), ""));
+byId("map").addEventListener("pointerleave", () => {
+  pointer = null;
+  showReadout();
+});
+
+function showReadout() {
+  setText(byId("readout"), pointer && view.isOnSheet(...pointer) ? readout(...pointer) : "");
+}
 
 function readout(x, y) {
   const unit = chosen("unit");
