@@ -3,32 +3,22 @@
 Every log line is an event name and key-value pairs. Everything goes to standard error, so that a
 program's own output stays clean.
 
-journald takes a line's priority from `<N>` in front of it (sd-daemon(3)), so that
-`journalctl -p err` shows what is wrong, and has times of its own. One event is one line there; of a
-traceback, each line has the priority.
+journald has times of its own. One event is one line there; of a traceback, each line has the
+priority.
 """
 
 from __future__ import annotations
 
 import logging
-import os
 import sys
-from collections.abc import Mapping
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import structlog
 
+from tactomo.journal import is_journal, with_priority
+
 LogLevel = Literal["debug", "info", "warning", "error"]
 LogFormat = Literal["auto", "text", "json", "journal"]
-
-PRIORITIES: Final[Mapping[str, int]] = {
-    "critical": 2,
-    "error": 3,
-    "warning": 4,
-    "info": 6,
-    "debug": 7,
-}
-"""Syslog's numbers."""
 
 _logfmt = structlog.processors.LogfmtRenderer()
 
@@ -49,21 +39,6 @@ def configure_logging(level: LogLevel = "info", form: LogFormat = "auto") -> Non
         logger_factory=structlog.PrintLoggerFactory(sys.stderr),
         cache_logger_on_first_use=False,
     )
-
-
-def is_journal() -> bool:
-    """Whether standard error goes to journald: systemd names the device and inode of its pipe."""
-    try:
-        status = os.fstat(2)
-    except OSError:
-        return False
-    return os.environ.get("JOURNAL_STREAM") == f"{status.st_dev}:{status.st_ino}"
-
-
-def with_priority(text: str, level: str) -> str:
-    """Return text with journald's mark of this level in front of each line."""
-    mark = f"<{PRIORITIES[level]}>"
-    return "\n".join(mark + line for line in text.splitlines())
 
 
 def _renderers(form: LogFormat) -> list[structlog.typing.Processor]:

@@ -29,7 +29,7 @@ def main() -> None:
 
 def _print_error(what: Exception | str) -> None:
     """Print an error, or the traceback of a mistake of ours; as an error, where journald reads."""
-    from tactomo.log import is_journal, with_priority
+    from tactomo.journal import is_journal, with_priority
 
     text = what if isinstance(what, str) else "".join(traceback.format_exception(what)).rstrip()
     print(with_priority(text, "error") if is_journal() else text, file=sys.stderr)

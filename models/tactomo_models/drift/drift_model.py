@@ -13,10 +13,11 @@ from typing import Final
 
 import numpy as np
 import scipy.linalg
+import scipy.sparse as sp
 
 from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.physics.artifact import Artifact
-from tactomo_models.physics.bare_sheet import scan_voltages, transfer_resistances
+from tactomo_models.physics.bare_sheet import scan_voltages, transfer_slopes
 from tactomo_models.physics.mesh import SheetMesh, mesh_sheet
 from tactomo_models.scans.changes import noise_limit
 from tactomo_models.sensor.description import SensorDescription
@@ -24,7 +25,6 @@ from tactomo_models.sensor.description import SensorDescription
 SMOOTH_SHARE: Final = 0.25  # of the sheet's width: how far conductivity wanders together
 HIGHEST_ORDER: Final = 4  # half waves across the sheet
 CELLS: Final = 20  # across the sheet: creep is told apart by them
-PROBE: Final = 0.01  # relative change by which the smooth modes are differentiated
 OUT_OF_BOUNDS: Final = 2.5  # standard deviations that no drift reaches
 
 
@@ -48,7 +48,7 @@ class Explained:
 class DriftSubspace:
     """The modes of one sensor's drift: the gain, the smooth ones, and one for each cell's creep.
 
-    Making it takes half a second.
+    Making it takes a tenth of a second.
 
     Attributes:
         modes: (M, K) change of the logarithm of each voltage by a unit of each mode: a factor e
@@ -62,10 +62,10 @@ class DriftSubspace:
     def __init__(self, description: SensorDescription, artifact: Artifact) -> None:
         self._size_m = (description.width_m, description.height_m)
         x, y = artifact.bare.points[:, artifact.bare.pressable]
-        own = np.zeros((len(x), CELLS**2))
-        own[np.arange(len(x)), self._cell_of(x, y)] = 1.0
+        places = self._cell_of(x, y), np.arange(len(x))
+        own = sp.csr_matrix((np.ones(len(x)), places), (CELLS**2, len(x)))
         predicted = scan_voltages(description, artifact.bare.transfer)
-        cells = (artifact.jacobian @ own) * np.sign(predicted)[:, None]
+        cells = (own @ artifact.jacobian.T).T * np.sign(predicted)[:, None]
         smooth = self._smooth_modes(description)
         self.modes = np.hstack([np.ones((len(cells), 1)), smooth, cells])
         self.smooth = slice(1, 1 + smooth.shape[1])
@@ -82,17 +82,10 @@ class DriftSubspace:
         coarse = 2.0  # times the map's spacing: enough for what is smooth
         spacing_m = coarse * description.width_m / (description.map.nodes_x - 1)
         sheet = mesh_sheet(description, spacing_m, refinements=1)
-        fields = self._smooth_fields(sheet)
-        derivatives = []
-        for field in fields:
-            up, down = (
-                scan_voltages(
-                    description, transfer_resistances(description, sheet, np.exp(step * field))
-                )
-                for step in (PROBE, -PROBE)
-            )
-            derivatives.append(np.log(up / down) / (2 * PROBE))
-        return np.stack(derivatives, axis=1)
+        fields = np.stack(self._smooth_fields(sheet))
+        transfer, slopes = transfer_slopes(description, sheet, fields)
+        voltages = scan_voltages(description, transfer)
+        return np.stack([scan_voltages(description, each) / voltages for each in slopes], axis=1)
 
     def _smooth_fields(self, sheet: SheetMesh) -> list[FloatArray]:
         """Fields (T,) that together vary over `SMOOTH_SHARE`, with unit variance in all."""

@@ -269,8 +269,8 @@ def _open(path: Path) -> ort.InferenceSession:
     options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
     options.log_severity_level = 3
     try:
-        model = path.read_bytes()
-        return ort.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+        path.open("rb").close()  # for an error of the system's; from bytes, a session keeps them
+        return ort.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     except FileNotFoundError as error:
         raise ArtifactError(f"there is no network at {path}; name another file") from error
     except OSError as error:

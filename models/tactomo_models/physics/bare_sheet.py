@@ -121,6 +121,28 @@ def transfer_resistances(
     return _transfer(description, _fields(description, system))
 
 
+def transfer_slopes(
+    description: SensorDescription, sheet: SheetMesh, changes: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Transfer resistances of an even sheet, and their derivatives by changes of conductivity.
+
+    Args:
+        description: the sensor.
+        sheet: its mesh of T triangles.
+        changes: (K, T) of conductivity, relative to the description's.
+
+    Returns:
+        (L, L) as `transfer_resistances`, and (K, L, L): dR = -u^T dA u, with the fields u.
+    """
+    even = assemble_sheet(description, sheet, np.ones(changes.shape[1]))
+    fields = _fields(description, even)
+    slopes = np.zeros((len(changes), *[description.electrode_count] * 2))
+    for slope, change in zip(slopes, changes, strict=True):
+        moved = assemble_sheet(description, sheet, 1 + change) - even  # it is linear in that
+        slope[:-1, :-1] = -fields.T @ (moved @ fields)
+    return _transfer(description, fields), slopes
+
+
 def scan_voltages(description: SensorDescription, transfer: FloatArray) -> FloatArray:
     """Voltages (M,) in scan order that transfer resistances (L, L) lead to, relative.
 

@@ -10,7 +10,12 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 from tactomo_models import Artifact, SensorDescription, load_description
 from tactomo_models.arrays import FloatArray
-from tactomo_models.physics.bare_sheet import scan_voltages, solve_bare_sheet, transfer_resistances
+from tactomo_models.physics.bare_sheet import (
+    scan_voltages,
+    solve_bare_sheet,
+    transfer_resistances,
+    transfer_slopes,
+)
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import SheetMesh, mesh_sheet
 from variants import variant
@@ -110,6 +115,22 @@ def test_the_derivative_by_parameters_is_the_one_by_nodes_times_theirs(
     np.testing.assert_allclose(
         model.jacobian(here, where, onto), by_nodes @ onto, atol=1e-12 * np.abs(by_nodes).max()
     )
+
+
+def test_the_slopes_of_transfer_resistances_pass_a_taylor_test(
+    sheet: SheetMesh, small: SensorDescription
+) -> None:
+    changes = np.random.default_rng(7).normal(size=(2, sheet.mesh.t.shape[1]))
+    transfer, slopes = transfer_slopes(small, sheet, changes)
+    steps = 10.0 ** -np.arange(2, 5)
+    for change, slope in zip(changes, slopes, strict=True):
+        left = [
+            np.linalg.norm(
+                transfer_resistances(small, sheet, 1 + e * change) - transfer - e * slope
+            )
+            for e in steps
+        ]
+        assert orders(left, steps) == pytest.approx(2, abs=0.1)
 
 
 def solve_directly(model: ForwardModel, sheet: SheetMesh, change: FloatArray) -> FloatArray:
