@@ -154,7 +154,7 @@ size_t tactomo_encode_scan(const tactomo_scan *scan, uint8_t *out, size_t room)
 {
     tactomo_frame frame;
     if (scan->channel > TACTOMO_STRUCTURE || !is_format(scan->sample_format) ||
-        !is_count(scan->count))
+        !is_count(scan->count) || scan->device_us >> TACTOMO_CLOCK_BITS != 0)
         return 0;
     tactomo_frame_begin(&frame, out, room, TACTOMO_SCAN);
     tactomo_frame_u8(&frame, scan->channel);
@@ -219,7 +219,8 @@ static bool is_sound_hello(const tactomo_hello *hello)
            is_offset(hello->drive_offset, hello->electrodes) &&
            is_offset(hello->measure_offset, hello->electrodes) &&
            is_finite(hello->volts_per_count) && hello->volts_per_count > 0.0 &&
-           is_finite(hello->scan_rate_hz) && hello->scan_rate_hz >= 0.0;
+           (hello->scan_rate_hz == 0.0 || (hello->scan_rate_hz >= TACTOMO_LOWEST_RATE_HZ &&
+                                           hello->scan_rate_hz <= TACTOMO_HIGHEST_RATE_HZ));
 }
 
 static void put_text(tactomo_frame *frame, const char *text, uint8_t length)

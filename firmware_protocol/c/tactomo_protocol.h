@@ -50,8 +50,13 @@ enum {
     TACTOMO_MOST_SAMPLES = 1024,
     TACTOMO_LONGEST_TEXT = 64,      /* bytes of device_id and of firmware */
     TACTOMO_LONGEST_ENCODED = 4137, /* bytes between two delimiters */
-    TACTOMO_COMMAND_PAYLOAD = 16
+    TACTOMO_COMMAND_PAYLOAD = 16,
+    TACTOMO_CLOCK_BITS = 53 /* of device_us: 285 years */
 };
+
+/* Rates that a hello may state, beside 0. */
+#define TACTOMO_LOWEST_RATE_HZ 1e-3
+#define TACTOMO_HIGHEST_RATE_HZ 1e6
 
 /* Bytes of a frame, both delimiters included, are at most: */
 #define TACTOMO_FRAME_BOUND(payload) ((payload) + ((payload) + 253) / 254 + 2)
@@ -69,7 +74,7 @@ typedef struct {
     uint8_t sample_format;
     uint16_t count;     /* samples, 1 to 1024 */
     uint32_t counter;   /* of dual scans */
-    uint64_t device_us; /* when the first sample was taken, µs since power-up */
+    uint64_t device_us; /* when the first sample was taken, µs since power-up; below 2^53 */
     const void *samples; /* int16_t, int32_t or float, as sample_format says */
 } tactomo_scan;
 
@@ -82,7 +87,7 @@ typedef struct {
     uint8_t drive_offset;
     uint8_t measure_offset;
     double volts_per_count; /* V */
-    double scan_rate_hz;    /* 0 if a trigger from outside sets it */
+    double scan_rate_hz;    /* 0 if a trigger from outside sets it, else 0.001 to 1e6 */
     const char *device_id;  /* UTF-8, 1 to 64 bytes: unique and lasting */
     const char *firmware;   /* likewise: its version, for people */
 } tactomo_hello;

@@ -145,7 +145,8 @@ HELLO = ("3", "2", "208", "16", "1", "1", f64_bits(1e-6), f64_bits(20.0), "6161"
         *((3, value) for value in (0, 1)),
         *((field, value) for field in (4, 5) for value in (0, 16)),
         *((6, f64_bits(value)) for value in (0.0, -1.0, float("inf"), float("nan"))),
-        *((7, f64_bits(value)) for value in (-1.0, float("inf"), float("nan"))),
+        *((7, f64_bits(value)) for value in (-1.0, 5e-324, 9e-4, 1.1e6, 1e308)),
+        *((7, f64_bits(value)) for value in (float("inf"), float("nan"))),
         *((field, "-") for field in (8, 9)),
         *((field, "61" * 65) for field in (8, 9)),
         *((8, text_bytes(text)) for text in ("a\x1bb", "\x7f", "\x85", "\udcff", "ab\udcc3")),
@@ -162,7 +163,11 @@ def test_a_hello_against_the_rules_is_not_encoded(
 
 
 @pytest.mark.parametrize(
-    "scan", ["2 0 0 0 1 1", "0 0 0 0 0 1", "0 0 0 0 4 1", "0 0 0 0 1 0", "0 0 0 0 1 1025"]
+    "scan",
+    [
+        *("2 0 0 0 1 1", "0 0 0 0 0 1", "0 0 0 0 4 1", "0 0 0 0 1 0", "0 0 0 0 1 1025"),
+        *(f"0 0 0 {2**53} 1 1", f"0 0 0 {2**64 - 1} 1 1"),
+    ],
 )
 def test_a_scan_against_the_rules_is_not_encoded(sanitized: Speaker, scan: str) -> None:
     assert answered(sanitized.ask("scan 1 0 0 0 1 1 0000"))

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from protocol_vectors import stream_vectors
 from tactomo_protocol import (
     MAX_FRAME_BYTES,
     Acknowledge,
@@ -105,7 +106,7 @@ BAD_FIELDS = [
     (replace(SCAN, counter=-1), "Scan.counter", "from 0 to 4294967295"),
     (replace(SCAN, counter=2**32), "Scan.counter", "from 0 to 4294967295"),
     (replace(SCAN, counter=1.5), "Scan.counter", "an integer"),  # type: ignore[arg-type]
-    (replace(SCAN, device_us=2**64), "Scan.device_us", "from 0 to 18446744073709551615"),
+    (replace(SCAN, device_us=2**53), "Scan.device_us", "from 0 to 9007199254740991"),
     (replace(SCAN, flags=ScanFlag(256)), "Scan.flags", "from 0 to 255"),
     (replace(SCAN, samples=np.zeros(4)), "Scan.samples.dtype", "int16, int32 or float32"),  # type: ignore[arg-type]
     (replace(SCAN, samples=np.zeros(4, ">i4")), "Scan.samples.dtype", "int16, int32 or float32"),
@@ -137,8 +138,10 @@ BAD_FIELDS = [
     (replace(HELLO, sample_format=4), "Hello.sample_format", "3 (FLOAT32)"),  # type: ignore[arg-type]
     (replace(HELLO, volts_per_count=0.0), "Hello.volts_per_count", "above 0 V"),
     (replace(HELLO, volts_per_count=math.nan), "Hello.volts_per_count", "finite"),
-    (replace(HELLO, scan_rate_hz=-1.0), "Hello.scan_rate_hz", "not below 0 Hz"),
-    (replace(HELLO, scan_rate_hz=math.inf), "Hello.scan_rate_hz", "finite"),
+    (replace(HELLO, scan_rate_hz=-1.0), "Hello.scan_rate_hz", "0, or from 0.001"),
+    (replace(HELLO, scan_rate_hz=5e-324), "Hello.scan_rate_hz", "0, or from 0.001"),
+    (replace(HELLO, scan_rate_hz=1e308), "Hello.scan_rate_hz", "to 1000000 Hz"),
+    (replace(HELLO, scan_rate_hz=math.inf), "Hello.scan_rate_hz", "to 1000000 Hz"),
     (Command(256, 0), "Command.code", "from 0 to 255"),
     (Command(CommandCode.START, -1), "Command.request", "from 0 to 255"),
     (Command(CommandCode.SET_RATE, 0), "Command.rate_hz", "above 0 Hz"),
@@ -164,6 +167,35 @@ def test_a_field_that_the_wire_cannot_carry_is_named(
     assert allowed in str(raised.value)
     assert repr(raised.value.value) in str(raised.value)
     assert isinstance(raised.value, ValueError)
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("version_2", ["version 2", "not 1"]),
+        ("scan_clock_largest", ["scan", "device_us", "18446744073709551615", "9007199254740991"]),
+        ("scan_count_wrong", ["scan", "length"]),
+        ("scan_channel_2", ["scan", "channel", "2"]),
+        ("hello_rate_nan", ["hello", "scan_rate_hz", "nan", "0.001"]),
+        ("hello_offset_16", ["hello", "drive_offset", "16"]),
+    ],
+)
+def test_the_rule_that_an_intact_frame_breaks_is_named(name: str, told: list[str]) -> None:
+    streams = {stream["name"]: stream["stream"] for stream in stream_vectors()}
+    decoder = Decoder()
+    decoder.feed(bytes.fromhex(streams[name]))
+    for part in told:
+        assert part in decoder.fault
+    assert Decoder().fault == ""
+
+
+def test_damage_breaks_no_rule() -> None:
+    decoder = Decoder()
+    frame = bytearray(encode(SCAN))
+    frame[9] ^= 1
+    decoder.feed(frame)
+    assert decoder.counts.crc_errors == 1
+    assert decoder.fault == ""
 
 
 def test_the_largest_packet_fits_the_stated_frame_size() -> None:

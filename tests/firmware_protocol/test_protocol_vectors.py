@@ -74,6 +74,7 @@ def read_scan(p: bytes) -> JsonMap:
     assert u(p, 2, 1) <= 1
     assert 1 <= count <= 1024
     assert len(p) == 20 + count * size
+    assert u(p, 8, 8) < 2**53
     raw = [u(p, 20 + i * size, size) for i in range(count)]
     signed = [value - (value >> (8 * size - 1) << 8 * size) for value in raw]
     return {
@@ -96,7 +97,7 @@ def read_hello(p: bytes) -> JsonMap:
         assert not any(ord(c) < 32 or 127 <= ord(c) < 160 for c in text.decode())
     volts, rate = (struct.unpack_from("<d", p, at)[0] for at in (8, 16))
     assert 0 < volts < float("inf")
-    assert 0 <= rate < float("inf")
+    assert rate == 0 or 0.001 <= rate <= 1_000_000
     electrodes, drive, measure = u(p, 6, 1), u(p, 7, 1), u(p, 24, 1)
     assert electrodes >= 2
     assert 1 <= drive < electrodes

@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import strategies as st
 from tactomo_protocol import (
+    MAX_DEVICE_US,
+    MAX_RATE_HZ,
     MAX_SAMPLES,
+    MIN_RATE_HZ,
     Acknowledge,
     AckStatus,
     Channel,
@@ -35,7 +38,7 @@ def scans(draw: st.DrawFn, max_samples: int = MAX_SAMPLES) -> Scan:
     return Scan(
         channel=draw(st.sampled_from(Channel)),
         counter=draw(st.integers(0, 2**32 - 1)),
-        device_us=draw(st.integers(0, 2**64 - 1)),
+        device_us=draw(st.integers(0, MAX_DEVICE_US)),
         flags=ScanFlag(draw(U8)),
         samples=np.frombuffer(data, dtype),
     )
@@ -62,7 +65,7 @@ def hellos(draw: st.DrawFn) -> Hello:
         samples_per_scan=draw(st.integers(1, MAX_SAMPLES)),
         sample_format=draw(st.sampled_from(SampleFormat)),
         volts_per_count=draw(POSITIVE),
-        scan_rate_hz=draw(st.just(0.0) | POSITIVE),
+        scan_rate_hz=draw(st.just(0.0) | st.floats(MIN_RATE_HZ, MAX_RATE_HZ)),
     )
 
 

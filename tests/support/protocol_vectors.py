@@ -11,8 +11,9 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 from zlib import crc32
@@ -20,8 +21,11 @@ from zlib import crc32
 import numpy as np
 from cobs import cobs
 from tactomo_protocol import (
+    MAX_DEVICE_US,
     MAX_FRAME_BYTES,
+    MAX_RATE_HZ,
     MAX_SAMPLES,
+    MIN_RATE_HZ,
     PROTOCOL_VERSION,
     Acknowledge,
     AckStatus,
@@ -133,9 +137,10 @@ def _packets() -> Iterator[tuple[str, str, Packet]]:
         "strings of 64 bytes, the widest ranges",
         Hello(
             "d" * 64, "µ" * 32, (Channel.MAGNITUDE,), 255, 254, 254, MAX_SAMPLES,
-            SampleFormat.FLOAT32, 1.0, 1000.0,
+            SampleFormat.FLOAT32, 1.0, MAX_RATE_HZ,
         ),
     )  # fmt: skip
+    yield "hello_slowest", "a scan in 1000 s", replace(ONE_PORT_HELLO, scan_rate_hz=MIN_RATE_HZ)
     yield "scan_magnitude", "a whole scan", _full_scan(Channel.MAGNITUDE, 12)
     yield "scan_structure", "its other half: the same counter", _full_scan(Channel.STRUCTURE, 12)
     yield (
@@ -159,7 +164,11 @@ def _packets() -> Iterator[tuple[str, str, Packet]]:
         "scan_last_counter",
         "the counter before it wraps to 0; the largest clock; flag bits without a name",
         Scan(
-            Channel.STRUCTURE, 2**32 - 1, 2**64 - 1, ScanFlag(255), np.array([258], dtype=np.int16)
+            Channel.STRUCTURE,
+            2**32 - 1,
+            MAX_DEVICE_US,
+            ScanFlag(255),
+            np.array([258], dtype=np.int16),
         ),
     )
     yield (
@@ -345,12 +354,24 @@ def _refused_frames(first: Scan, second: Scan, a: bytes, b: bytes) -> Iterator[_
     yield between("scan_count_0", "no samples", _changed(scan, 18, 0)[:20])
     yield between("scan_count_wrong", "five samples stated, four there", _changed(scan, 18, 5))
     yield between("scan_trailing_byte", "longer than its header and samples", scan + b"\x01")
+    yield between("scan_clock_beyond", "2^53 µs", scan[:8] + bytes(6) + b"\x20\0" + scan[16:])
+    yield between(
+        "scan_clock_largest", "2^64 - 1 µs: a clock of 64 bits", scan[:8] + b"\xff" * 8 + scan[16:]
+    )
     yield between("hello_no_channels", "", _changed(hello, 2, 0))
     yield between("hello_channel_2", "a bit that names no channel", _changed(hello, 2, 5))
     yield between("hello_offset_16", "beyond its 16 electrodes", _changed(hello, 7, 16))
     yield between(
         "hello_volts_nan", "a scale that is no number", hello[:8] + b"\xff" * 8 + hello[16:]
     )
+    for name, rate_hz in (
+        ("nan", math.nan),
+        ("negative", -20.0),
+        ("too_fast", 1e308),
+        ("too_slow", 5e-324),
+    ):
+        changed = hello[:16] + struct.pack("<d", rate_hz) + hello[24:]
+        yield between(f"hello_rate_{name}", f"a rate of {rate_hz:g} Hz", changed)
     yield between("hello_not_utf8", "a byte that no UTF-8 holds", _changed(hello, 26, 0xFF))
     yield between("hello_escape", "a control character in a name", _changed(hello, 26, 0x1B))
     yield between("hello_string_beyond", "a length past the end", _changed(hello, 25, 60))

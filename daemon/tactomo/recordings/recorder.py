@@ -250,6 +250,8 @@ class Recorder(Worker):
         if free < max(reserve * reserves, MIN_ROOM):
             raise RecordingError(_no_room(free, reserve), "make room on the disk", "cannot_write")
         if path is None:
+            with contextlib.suppress(OSError):  # `create` says what is the matter
+                folder.mkdir(parents=True, exist_ok=True)  # the daemon's own
             path = next_path(folder, self._origin.sensor, time.time())
         origin = self._origin  # read once: a calibration may be put in force meanwhile
         writer = create(path, origin)

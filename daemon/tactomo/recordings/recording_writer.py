@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shlex
 import time
 from collections.abc import Iterable
 from importlib.metadata import version
@@ -230,18 +231,23 @@ class RecordingWriter:
 
 
 def create(path: Path, origin: Origin) -> RecordingWriter:
-    """Begin a recording's file, and its folder if need be.
+    """Begin a recording's file, in a folder that is there.
 
     Raises:
         RecordingError: the file exists or cannot be created.
 
     """
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         return RecordingWriter(path, origin)
     except FileExistsError as error:
         raise RecordingError(
             f"{path} exists already", "give another path", "cannot_write"
+        ) from error
+    except FileNotFoundError as error:
+        raise RecordingError(
+            f"cannot create {path}: there is no folder {path.parent}",
+            f"make it first: `mkdir -p {shlex.quote(str(path.parent))}`",
+            "cannot_write",
         ) from error
     except (OSError, ValueError) as error:  # ValueError: a NUL byte in the path
         raise RecordingError(

@@ -16,7 +16,7 @@ from concurrent.futures import Future
 from typing import Annotated, Any, Final, NamedTuple
 
 import zmq
-from pydantic import ConfigDict, Field
+from pydantic import AfterValidator, ConfigDict, Field
 from tactomo_client import MessageError
 from tactomo_client.messages import decode_request, encode_error, encode_reply
 
@@ -54,10 +54,17 @@ class _Strict(Arguments):
     model_config = ConfigDict(strict=True)
 
 
+def _absolute(path: str) -> str:
+    # The daemon's own folder is nobody else's business, nor is it where the client is.
+    if not path.startswith("/"):
+        raise ValueError("give an absolute path on the daemon's computer, such as /data/grasp.mcap")
+    return path
+
+
 class RecordStart(_Strict):
     """Where to record to, and whether with maps; what is not given is as configured."""
 
-    path: Annotated[str, Field(min_length=1, max_length=4096)] | None = None
+    path: Annotated[str, Field(max_length=4096), AfterValidator(_absolute)] | None = None
     maps: bool | None = None
 
 

@@ -17,9 +17,10 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
 import zmq
+from tactomo_client import MessageError
 from tactomo_client.messages import CONTACTS, EVENT, STATUS, clock_id, encode_message, topic
 
-from tactomo.events import OnEvent
+from tactomo.events import OnEvent, RateLimit
 from tactomo.stream.access_control import STREAM
 from tactomo.stream.subscriptions import SUBSCRIBERS_CUT, Subscribers
 from tactomo.timing import Durations
@@ -65,12 +66,13 @@ class Publisher(Worker):
         status: returns the current fields of a `status` message; called by the thread.
         on_frame: called by the thread with kind and bytes of each frame's message, before it is
             sent: whatever was seen is in the recording.
-        on_event: told of a flood of subscriptions.
+        on_event: told of a flood of subscriptions, and of messages that cannot be sent.
 
     Attributes:
         address: where it is bound, once open.
         subscribers: subscriptions in force.
-        header: the newest frame's; written by the pipeline thread, sent with status and events.
+        header: the newest frame's; written by the pipeline thread, sent with status and events. One
+            that cannot be sent gives way to none.
         latency: from the last byte of a dual scan to the sending of its contacts.
 
     """
@@ -97,6 +99,7 @@ class Publisher(Worker):
         self._lock = threading.Lock()
         self._readers: Subscribers  # this thread's own, as are _socket and _cuts_*
         self._cuts_seen = self._cuts_told = 0
+        self._unsent_limit = RateLimit()
         self._prefixes: frozenset[bytes] = frozenset()  # a copy for the other threads
         self._last_status = b""
         self._queue: deque[_Outgoing] = deque(maxlen=MAX_QUEUED)
@@ -206,14 +209,30 @@ class Publisher(Worker):
             self._send(self._queue.popleft())
 
     def _send(self, message: _Outgoing) -> bytes:
+        """Send a message; one that breaks STREAM.md is left out, and its sequence number tells."""
         envelope = self._stamp(message.sequence, message.header)
-        data = encode_message(self._sensor, message.kind, {**envelope, **message.fields})
+        try:
+            data = encode_message(self._sensor, message.kind, {**envelope, **message.fields})
+        except MessageError as error:
+            self._tell_unsent(message, error)
+            return b""
         if message.kind not in (STATUS, EVENT):
             self._on_frame(message.kind, data)
         self._socket.send(data, zmq.DONTWAIT)
         if message.kind == CONTACTS and envelope["age_ns"] is not None:
             self.latency.add((envelope["age_ns"] - envelope["delay_ns"]) * 1e-9)
         return data
+
+    def _tell_unsent(self, message: _Outgoing, error: MessageError) -> None:
+        if self.header is message.header:
+            self.header = NO_FRAME_YET  # or the event could not be sent either
+        if self._unsent_limit.allows():
+            self._on_event(
+                "message_unsent",
+                "error",
+                f"a {message.kind} message was left out: {error}",
+                "this is a mistake in tactomo: please report it with a recording",
+            )
 
     def _send_status(self) -> None:
         self._last_status = self._send(self._number(STATUS, self.header, self._status()))

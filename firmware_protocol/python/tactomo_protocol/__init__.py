@@ -11,9 +11,12 @@ The specification is `firmware_protocol/PROTOCOL.md`; test vectors lie beside it
 """
 
 from .codec import (
+    MAX_DEVICE_US,
     MAX_FRAME_BYTES,
+    MAX_RATE_HZ,
     MAX_SAMPLES,
     MAX_STRING_BYTES,
+    MIN_RATE_HZ,
     PROTOCOL_VERSION,
     Decoder,
     DecoderCounts,
@@ -37,9 +40,12 @@ from .packets import (
 )
 
 __all__ = [
+    "MAX_DEVICE_US",
     "MAX_FRAME_BYTES",
+    "MAX_RATE_HZ",
     "MAX_SAMPLES",
     "MAX_STRING_BYTES",
+    "MIN_RATE_HZ",
     "PROTOCOL_VERSION",
     "SCAN_COUNTERS",
     "AckStatus",

@@ -34,9 +34,13 @@ from .packets import (
 PROTOCOL_VERSION = 1
 MAX_SAMPLES = 1024
 MAX_STRING_BYTES = 64
+MAX_DEVICE_US = 2**53 - 1
+"""285 years: exact as a double, and as nanoseconds still a signed 64-bit number."""
+MIN_RATE_HZ, MAX_RATE_HZ = 1e-3, 1e6
+"""A scan in 1000 s, which C's 32-bit timer still spans; one a microsecond, the clock's unit."""
 
 _SCAN, _HELLO, _ACKNOWLEDGE, _COMMAND = 0x01, 0x02, 0x03, 0x81
-_KNOWN_TYPES = (_SCAN, _HELLO, _ACKNOWLEDGE, _COMMAND)
+_KNOWN_TYPES = {_SCAN: "scan", _HELLO: "hello", _ACKNOWLEDGE: "acknowledge", _COMMAND: "command"}
 
 # Each layout starts with the version and the type, as the payload does.
 _PREFIX = struct.Struct("<BB")
@@ -51,7 +55,7 @@ _MAX_BODY = _MAX_PAYLOAD - _PREFIX.size - _CRC_BYTES
 _MAX_ENCODED: int = cobs.max_encoded_length(_MAX_PAYLOAD)
 MAX_FRAME_BYTES = _MAX_ENCODED + 2
 
-_U8, _U16, _U32, _U64 = 2**8 - 1, 2**16 - 1, 2**32 - 1, 2**64 - 1
+_U8, _U16, _U32 = 2**8 - 1, 2**16 - 1, 2**32 - 1
 
 
 class FieldError(ValueError):
@@ -104,10 +108,16 @@ class Decoder:
 
     Holds at most one frame's bytes between calls. What comes before the first delimiter is the
     rest of a frame whose start was missed: it is dropped and not counted.
+
+    Attributes:
+        counts: of all that was fed.
+        fault: which rule the last intact frame that gave no packet breaks, for the firmware's
+            author; empty before there is one.
     """
 
     def __init__(self) -> None:
         self.counts = DecoderCounts()
+        self.fault = ""
         self._pending = bytearray()
         self._dropping = True  # until the next delimiter
 
@@ -152,13 +162,15 @@ class Decoder:
         version, kind = _PREFIX.unpack_from(content)
         if version != PROTOCOL_VERSION:
             self.counts.wrong_version += 1
+            self.fault = f"it speaks version {version} of the protocol, not {PROTOCOL_VERSION}"
             return None
         if kind not in _KNOWN_TYPES:
             self.counts.unknown_type += 1
         try:
             return _unpack(kind, content)
-        except ValueError:
+        except ValueError as error:
             self.counts.malformed += 1
+            self.fault = f"{_KNOWN_TYPES[kind]} packet: {error}"
             return None
 
 
@@ -198,7 +210,7 @@ def _pack_scan(scan: Scan) -> bytes:
         _channel("Scan.channel", scan.channel).number,
         _integer("Scan.flags", scan.flags, 0, _U8),
         _integer("Scan.counter", scan.counter, 0, _U32),
-        _integer("Scan.device_us", scan.device_us, 0, _U64),
+        _integer("Scan.device_us", scan.device_us, 0, MAX_DEVICE_US),
         sample_format,
         0,
         len(scan.samples),
@@ -207,11 +219,12 @@ def _pack_scan(scan: Scan) -> bytes:
 
 
 def _unpack_scan(content: bytes) -> Scan:
-    _require(len(content) >= _SCAN_HEAD.size)
+    _check_size(len(content) >= _SCAN_HEAD.size)
     _, _, channel, flags, counter, device_us, code, _, count = _SCAN_HEAD.unpack_from(content)
     dtype = SampleFormat(code).dtype
-    _require(1 <= count <= MAX_SAMPLES)
-    _require(len(content) == _SCAN_HEAD.size + count * dtype.itemsize)
+    _integer("Scan.device_us", device_us, 0, MAX_DEVICE_US)
+    _integer("len(Scan.samples)", count, 1, MAX_SAMPLES)
+    _check_size(len(content) == _SCAN_HEAD.size + count * dtype.itemsize)
     samples = np.frombuffer(content, dtype.newbyteorder("<"), count, _SCAN_HEAD.size)
     return Scan(
         Channel.of_number(channel),
@@ -240,13 +253,13 @@ def _pack_hello(hello: Hello) -> bytes:
 
 
 def _unpack_hello(content: bytes) -> Hello:
-    _require(len(content) >= _HELLO_HEAD.size)
+    _check_size(len(content) >= _HELLO_HEAD.size)
     _, _, mask, code, samples, electrodes, drive, volts, rate, measure = _HELLO_HEAD.unpack_from(
         content
     )
     device_id, end = _unpack_string(content, _HELLO_HEAD.size)
     firmware, end = _unpack_string(content, end)
-    _require(end == len(content))
+    _check_size(end == len(content))
     hello = Hello(
         device_id=device_id,
         firmware=firmware,
@@ -278,8 +291,10 @@ def _check_hello(hello: Hello) -> None:
     _member("Hello.sample_format", hello.sample_format, SampleFormat)
     if not (_is_finite(hello.volts_per_count) and hello.volts_per_count > 0):
         raise FieldError("Hello.volts_per_count", hello.volts_per_count, "finite and above 0 V")
-    if not (_is_finite(hello.scan_rate_hz) and hello.scan_rate_hz >= 0):
-        raise FieldError("Hello.scan_rate_hz", hello.scan_rate_hz, "finite and not below 0 Hz")
+    rate_hz = hello.scan_rate_hz
+    if not (_is_finite(rate_hz) and (rate_hz == 0 or MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ)):
+        allowed = f"0, or from {MIN_RATE_HZ:g} to {MAX_RATE_HZ:.0f} Hz"
+        raise FieldError("Hello.scan_rate_hz", rate_hz, allowed)
 
 
 def _pack_acknowledge(acknowledge: Acknowledge) -> bytes:
@@ -293,7 +308,7 @@ def _pack_acknowledge(acknowledge: Acknowledge) -> bytes:
 
 
 def _unpack_acknowledge(content: bytes) -> Acknowledge:
-    _require(len(content) == _ACKNOWLEDGE_BODY.size)
+    _check_size(len(content) == _ACKNOWLEDGE_BODY.size)
     _, _, request, command, status = _ACKNOWLEDGE_BODY.unpack(content)
     return Acknowledge(request, _command_code(command), AckStatus(status))
 
@@ -314,7 +329,7 @@ def _pack_command(command: Command) -> bytes:
 
 
 def _unpack_command(content: bytes) -> Command:
-    _require(len(content) == _COMMAND_BODY.size)
+    _check_size(len(content) == _COMMAND_BODY.size)
     _, _, code, request, rate_hz = _COMMAND_BODY.unpack(content)
     # A bad rate is the device's to refuse, with an acknowledgement; elsewhere it means nothing.
     return Command(_command_code(code), request, rate_hz if code == CommandCode.SET_RATE else 0.0)
@@ -353,7 +368,7 @@ def _pack_string(text: str) -> bytes:
 
 
 def _unpack_string(content: bytes, start: int) -> tuple[str, int]:
-    _require(start < len(content))
+    _check_size(start < len(content))
     end = start + 1 + content[start]  # beyond the content: the caller's check of the end fails
     return content[start + 1 : end].decode(), end
 
@@ -402,6 +417,6 @@ def _is_finite(value: float) -> bool:
         return False
 
 
-def _require(condition: bool) -> None:
-    if not condition:
+def _check_size(is_right: bool) -> None:
+    if not is_right:
         raise ValueError("the body has the wrong length")

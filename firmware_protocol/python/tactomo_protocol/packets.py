@@ -98,7 +98,7 @@ class Scan:
     """One channel's voltages of one scan.
 
     `counter` (u32, wraps to 0) is shared by the scans of both channels that belong together.
-    `device_us` (u64) is the device's clock, in µs, when the scan's first sample was taken.
+    `device_us` (below 2^53) is the device's clock, in µs, when the scan's first sample was taken.
     `samples` is 1-D, 1 to 1024 values of int16, int32 or float32; decoded ones are read-only.
     """
 
@@ -137,7 +137,7 @@ class Hello:
     `channels` are those that this port carries, ascending. Drive k injects into electrode k and
     draws from k + `drive_offset`; a sample is V(m) - V(m + `measure_offset`). A sample times
     `volts_per_count` is in volts, for every sample format. `scan_rate_hz` is 0 when an external
-    trigger paces the scans.
+    trigger paces the scans, else from 0.001 to 1,000,000.
     """
 
     device_id: str

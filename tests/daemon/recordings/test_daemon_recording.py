@@ -18,6 +18,7 @@ from tactomo.recordings.recording_writer import pack_mark, write_recording
 from tactomo.scans import Mark, ScanKey
 from tactomo.service import daemon
 from tactomo.service.daemon import Daemon
+from tactomo_client import ControlError
 from tactomo_client.frame import frame_from_message
 from tactomo_client.messages import array_from_wire
 from tactomo_client.recording import open_recording as open_frames
@@ -346,6 +347,20 @@ def test_a_file_that_exists_is_not_written_over(bench: Start, tmp_path: Path) ->
     with pytest.raises(Exception, match="exists already"):
         b.ask("record_start", path=str(path))
     assert path.read_text() == "precious"
+
+
+def test_a_path_is_absolute_and_its_folder_is_there(
+    bench: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    b = bench()
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(ControlError, match="absolute path"):
+        b.ask("record_start", path="skin.mcap")
+    with pytest.raises(ControlError, match="no folder") as caught:
+        b.ask("record_start", path=str(tmp_path / "new" / "folder" / "skin.mcap"))
+    assert f"mkdir -p {tmp_path}/new/folder" in caught.value.next_step
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_one_recording_at_a_time_and_as_many_as_wanted(bench: Start, tmp_path: Path) -> None:
