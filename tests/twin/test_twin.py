@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 import serial
+from hostile_page import post
 from small_sensor import SMALL
 from tactomo.errors import AddressError, ConfigError, TactomoError
 from tactomo.twin import Drift, Scene, TwinConfig
 from tactomo_client import ControlError
+from tactomo_client.messages import encode_request
 from tactomo_models import Press, SkinSimulator, load_description
 from tactomo_models.arrays import FloatArray
 from tactomo_protocol import (
@@ -460,3 +462,10 @@ def test_a_wrong_setup_is_refused(wrong: dict[str, Any], says: str) -> None:
 def test_a_sensor_of_one_channel_has_no_two_ports() -> None:
     with pytest.raises(ConfigError, match="1 channel"):
         TwinConfig(load_description("tank_disc"), ports=2)
+
+
+def test_a_web_pages_press_is_not_obeyed(bench: Start) -> None:
+    b = bench()
+    press = encode_request("press", {"x_mm": 0.0, "y_mm": 0.0})
+    assert b"ok" not in post(b.twin.control, [b"", press])
+    assert b.ask("scene")["presses"] == []

@@ -110,7 +110,8 @@ class Scan:
 
     def volts(self, volts_per_count: float) -> NDArray[np.float64]:
         """The samples in volts, given the scale that the device's `Hello` states."""
-        return self.samples.astype(np.float64) * volts_per_count
+        with np.errstate(invalid="ignore", over="ignore"):  # signalling NaN; an absurd scale
+            return self.samples.astype(np.float64) * volts_per_count
 
     def _header(self) -> tuple[str | int, ...]:
         return (self.channel, self.counter, self.device_us, self.flags)

@@ -19,6 +19,7 @@ import pytest
 import zmq
 from daemon_process import DaemonProcess
 from ears import Ears
+from hostile_page import SUBSCRIBE, post
 from tactomo.stream import keys as key_files
 from tactomo_client import Keys, KeysError, subscribe
 from tactomo_client.fake import FakeSensor
@@ -330,3 +331,15 @@ def test_a_flood_of_connections_leaves_the_daemon_running(tmp_path: Path) -> Non
         daemon.kill()
         for descriptor in (device, host):
             os.close(descriptor)
+
+
+def test_a_web_pages_subscription_gets_nothing(
+    proxy: Callable[..., Running], reader: Callable[..., Any], left: FakeSensor
+) -> None:
+    running = proxy(left)
+    socket = reader(running.address, b"left/")
+    wait_until(
+        lambda: socket.poll(0),
+        meanwhile=lambda: left.publish_message("status", {"state": "running"}),
+    )
+    assert b"left" not in post(running.address, [SUBSCRIBE + b"left/"])

@@ -1,0 +1,26 @@
+"""A web page reaches no ZeroMQ socket, although a browser sends its requests to any port."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from hostile_page import SUBSCRIBE, post
+from tactomo_client.messages import encode_request
+
+Start = Callable[..., Any]
+
+
+def test_a_posted_command_is_not_obeyed(bench: Start) -> None:
+    b = bench()
+    before = b.ask("status")["tier_requested"]
+    answer = post(b.daemon.control_address, [b"", encode_request("set_tier", {"tier": "noser"})])
+    assert b"ok" not in answer
+    assert b.ask("status")["tier_requested"] == before
+
+
+def test_a_posted_subscription_gets_nothing(bench: Start) -> None:
+    b = bench()
+    subscribers = b.ask("status")["subscribers"]
+    assert b"left/status" not in post(b.daemon.stream_address, [SUBSCRIBE])
+    assert b.ask("status")["subscribers"] == subscribers
