@@ -173,7 +173,7 @@ def _secure(socket: zmq.Socket[bytes], endpoint: str, purpose: str, secret: byte
     socket.setsockopt(zmq.TCP_KEEPALIVE_IDLE, 30)
     socket.setsockopt(zmq.TCP_KEEPALIVE_INTVL, 10)
     socket.setsockopt(zmq.TCP_KEEPALIVE_CNT, 3)
-    # A socket of a domain refuses ZMTP 1.0, which has no handshake: a web page's POST passes for it.
+    # A socket with a domain refuses ZMTP 1.0, which has no greeting: a page's POST passes for it.
     socket.setsockopt_string(zmq.ZAP_DOMAIN, purpose)
     if secret is not None and not endpoint.startswith(IPC):
         socket.setsockopt(zmq.CURVE_SERVER, 1)

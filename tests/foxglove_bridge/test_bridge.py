@@ -11,12 +11,14 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from http.client import HTTPConnection
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from foxglove_client import FoxgloveClient
+from foxglove_client import PROTOCOL, FoxgloveClient
 from recorded_grasp import contacts_of, images_of
 from tactomo.imaging.frames import description_fields
 from tactomo_client import MessageError
@@ -24,6 +26,7 @@ from tactomo_client.fake import FakeSensor
 from tactomo_client.messages import encode_message
 from tactomo_foxglove import Bridge, BridgeError, Placement
 from tactomo_models import load_description
+from waiting import PATIENCE_S
 
 PRESSED = 50
 DESCRIPTION = description_fields(load_description("paper_square"))
@@ -317,3 +320,56 @@ def test_wrong_usage(tactomo: Callable[..., Any]) -> None:
     assert result.returncode == 1
     assert "cannot write nowhere/skin.json" in result.stderr
     assert time.monotonic() - began < 10
+
+
+APP = "https://app.foxglove.dev"
+MINE = "http://localhost:8080"
+
+
+def answer_to(url: str, **headers: str) -> int:
+    """Ask for a websocket as a browser does for a page; return the status of the answer."""
+    where = urlsplit(url)
+    connection = HTTPConnection(where.hostname or "", where.port, timeout=PATIENCE_S)
+    upgrade = {
+        **{"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"},
+        **{"Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Protocol": PROTOCOL},
+    }
+    connection.request("GET", "/", headers={**upgrade, **headers})
+    status = connection.getresponse().status
+    connection.close()
+    return status
+
+
+@pytest.mark.parametrize(
+    ("origin", "status"),
+    [
+        *((origin, 101) for origin in (APP, MINE, "file://", "foxglove://app")),
+        *((origin, 403) for origin in ("http://127.0.0.1:8000", "https://evil.example", "null")),
+        *((origin, 403) for origin in (f"{APP}.evil.example", "HTTP://evil.example", "http:")),
+    ],
+)
+def test_a_page_from_elsewhere_may_not_look(source: Publishing, origin: str, status: int) -> None:
+    with bridged(source.sensor.address, origins=[MINE]) as bridge:
+        assert answer_to(bridge.url, Origin=origin) == status
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [("localhost", 101), ("[::1]:8765", 101), ("evil.example", 403), ("", 403), ("[", 403)],
+)
+def test_a_name_that_was_made_to_point_here_is_not_served(
+    source: Publishing, host: str, status: int
+) -> None:
+    with bridged(source.sensor.address) as bridge:
+        assert answer_to(bridge.url, Host=host, Origin=APP) == status
+
+
+@pytest.mark.parametrize("head", [b"\0" * 20, b"GET / HTTP/1.1\r\n\r\n", b"x" * 100_000])
+def test_what_is_no_request_goes_no_further(source: Publishing, head: bytes) -> None:
+    with bridged(source.sensor.address) as bridge, FoxgloveClient(bridge.url) as client:
+        where = urlsplit(bridge.url)
+        with socket.create_connection((where.hostname, where.port), PATIENCE_S) as connection:
+            with suppress(ConnectionError):
+                connection.sendall(head)
+                assert b"101" not in connection.recv(100)
+        client.wait("/left/contacts", anew=True)

@@ -1,7 +1,7 @@
 """What a web page may try on the sockets of this computer, from another origin than theirs.
 
-ZeroMQ takes whoever does not greet it for a peer of ZMTP 1.0, which has no greeting: an HTTP request
-reads as frames, each of a length and a flags byte before its content. Where they end in the
+ZeroMQ takes whoever does not greet it for a peer of ZMTP 1.0, which has no greeting: an HTTP
+request reads as frames, each of a length and a flags byte before its content. Where they end in the
 request's head is known to whoever has seen one such head, and then the body holds any message.
 """
 

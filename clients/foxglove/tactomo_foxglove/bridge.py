@@ -1,8 +1,9 @@
 """The bridge: what a daemon publishes, served over Foxglove's WebSocket protocol.
 
 One thread, `run`'s caller, reads the stream and draws; foxglove-sdk's own threads send to whoever
-looks. Each of those has a queue of a second or so, of which the oldest is dropped: who is slow sees
-the newest, and nobody waits. Nothing that a client sends reaches the daemon.
+looks, through a door (`door`) that no web page but Foxglove's passes. Each of those who look has a
+queue of a second or so, of which the oldest is dropped: who is slow sees the newest, and nobody
+waits. Nothing that a client sends reaches the daemon.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, Self
+from urllib.parse import urlencode
 
 import foxglove
 import zmq
@@ -21,6 +23,7 @@ from tactomo_client.connection import connect_subscriber
 from tactomo_client.frame import frame_from_message
 from tactomo_client.messages import EVENT, MAP, STATUS, Message, decode_message, topic
 
+from tactomo_foxglove.door import FOXGLOVE_ORIGIN, Door, hidden_address
 from tactomo_foxglove.messages import known
 from tactomo_foxglove.placement import Placement
 from tactomo_foxglove.topics import SensorTopics
@@ -48,6 +51,7 @@ class Bridge:
         port: the port to listen on; 0 takes a free one.
         keys: for a daemon beyond this computer.
         placement: where the sensor hangs; of several, all hang there.
+        origins: of further web pages that may look, such as ``http://localhost:8080``.
 
     Raises:
         BridgeError: the address cannot be listened on.
@@ -62,13 +66,14 @@ class Bridge:
         port: int = DEFAULT_PORT,
         keys: Keys | None = None,
         placement: Placement | None = None,
+        origins: Sequence[str] = (),
     ) -> None:
         topics = [topic(sensor, kind) for sensor in sensors for kind in (MAP, STATUS, EVENT)]
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
         self._connection = connect_subscriber(self._socket, stream, topics, keys=keys)
         try:
             self._context = foxglove.Context()  # its channels close when it is gone
-            self._server = _serve(sensors, host, port, self._context)
+            self._door, self._server = _serve(sensors, host, port, origins, self._context)
         except ClientError:
             self._connection.close()
             raise
@@ -84,13 +89,13 @@ class Bridge:
     def url(self) -> str:
         """Where Foxglove finds it."""
         host = f"[{self.host}]" if ":" in self.host else self.host
-        return f"ws://{host}:{self._server.port}"
+        return f"ws://{host}:{self._door.port}"
 
     @property
-    def app_url(self) -> str | None:
+    def app_url(self) -> str:
         """The page of Foxglove's web app that opens it."""
-        url: str | None = self._server.app_url()
-        return url
+        query = urlencode({"ds": "foxglove-websocket", "ds.url": self.url})
+        return f"{FOXGLOVE_ORIGIN}?{query}"
 
     def run(self, stop: threading.Event) -> None:
         """Serve until `stop` is set.
@@ -114,6 +119,7 @@ class Bridge:
     def close(self) -> None:
         """Stop serving; clients are told goodbye."""
         self._server.stop()
+        self._door.close()
         self._connection.close()
 
     def __enter__(self) -> Self:
@@ -208,19 +214,23 @@ def _is_due(last_s: float | None) -> bool:
 
 
 def _serve(
-    sensors: Sequence[str], host: str, port: int, context: foxglove.Context
-) -> WebSocketServer:
+    sensors: Sequence[str], host: str, port: int, origins: Sequence[str], context: foxglove.Context
+) -> tuple[Door, WebSocketServer]:
+    behind = hidden_address()
     try:
-        return foxglove.start_server(
+        door = Door(host, port, {FOXGLOVE_ORIGIN, *origins})
+        server = foxglove.start_server(
             name=f"tactomo: {', '.join(sensors)}",
-            host=host,
-            port=port,
+            host=behind,
+            port=0,
             context=context,
             message_backlog_size=BACKLOG,
         )
-    except RuntimeError as error:
+    except (OSError, OverflowError, RuntimeError) as error:
         raise BridgeError(
-            f"cannot listen on {host} port {port}: {str(error).rpartition(': ')[2]}",
+            f"cannot listen on {host} port {port}: {getattr(error, 'strerror', None) or error}",
             "stop the program that uses it, or give another with --foxglove-port (0: a free one)",
             name="cannot_listen",
         ) from error
+    door.open(behind, server.port)
+    return door, server

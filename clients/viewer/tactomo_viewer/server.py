@@ -9,8 +9,6 @@ was served here (`Origin`). Served beyond this computer, the viewer only shows.
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import ipaddress
 import signal
 from collections.abc import AsyncIterator
 from importlib import resources
@@ -19,6 +17,7 @@ from urllib.parse import urlsplit
 from aiohttp import WSCloseCode, web
 from aiohttp.typedefs import Handler, Middleware
 from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM, ClientError, Keys, aio
+from tactomo_client.web_access import is_loopback, names_this_computer
 
 from tactomo_viewer.browser import Browser
 from tactomo_viewer.feed import Feed
@@ -178,19 +177,12 @@ def _url(runner: web.AppRunner) -> str:
     return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
 
 
-def is_loopback(host: str) -> bool:
-    """Return whether only this computer can reach what listens on `host`."""
-    with contextlib.suppress(ValueError):
-        return ipaddress.ip_address(host).is_loopback
-    return host == "localhost"
-
-
 def _only_for(served_host: str) -> Middleware:
     """Return the middleware that turns away whoever poses as the page, and adds the headers."""
 
     @web.middleware
     async def check(request: web.Request, handler: Handler) -> web.StreamResponse:
-        if not _names_this_computer(request.host, served_host):
+        if not names_this_computer(request.host, served_host):
             raise web.HTTPForbidden(text=f"not served under the name {request.host!r}\n")
         origin = request.headers.get("Origin")
         if request.path == "/socket" and (
@@ -203,17 +195,6 @@ def _only_for(served_host: str) -> Middleware:
         return response
 
     return check
-
-
-def _names_this_computer(host_header: str, served_host: str) -> bool:
-    try:
-        name = urlsplit(f"//{host_header}").hostname or ""
-    except ValueError:
-        return False
-    with contextlib.suppress(ValueError):
-        ipaddress.ip_address(name)
-        return True
-    return name in ("localhost", served_host.lower())
 
 
 def _file(content: bytes, content_type: str) -> Handler:

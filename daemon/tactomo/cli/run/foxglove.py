@@ -59,6 +59,13 @@ def foxglove(
             metavar="X,Y,Z[,ROLL,PITCH,YAW]", help="Pose in that frame, metres and degrees."
         ),
     ] = "0,0,0",
+    allow_origin: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="URL",
+            help="A web page's origin that may look, too, such as http://localhost:8080; several.",
+        ),
+    ] = None,
     keys: KeysFolder = None,
     announce: Announce = False,
 ) -> None:
@@ -67,6 +74,7 @@ def foxglove(
     In Foxglove (the desktop app, or a browser on this computer): *Open connection*, *Foxglove
     WebSocket*, ws://127.0.0.1:8765; then *Import from file* under *Layouts*, with the file that
     `--layout` writes. It only shows: nothing that is done there reaches the sensor.
+    No web page but Foxglove's may look, unless its origin is allowed.
 
     Needs foxglove-sdk: `pip install 'tactomo[foxglove]'`. Recordings open there, too, after
     `tactomo export RECORDING OUT.mcap`.
@@ -82,7 +90,13 @@ def foxglove(
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     with Bridge(
-        names, stream, host, foxglove_port, as_keys(keys), placement_of(parent, pose)
+        names,
+        stream,
+        host,
+        foxglove_port,
+        as_keys(keys),
+        placement_of(parent, pose),
+        allow_origin or (),
     ) as bridge:
         _print_addresses(bridge, layout, announce)
         bridge.run(stop)
@@ -92,8 +106,7 @@ def _print_addresses(bridge: Bridge, layout: Path | None, announce: bool) -> Non
     from tactomo.cli.children import print_ready
 
     typer.echo(f"foxglove: {bridge.url}")
-    if bridge.app_url:
-        typer.echo(f"or open   {bridge.app_url}")
+    typer.echo(f"or open   {bridge.app_url}")
     if layout is not None:
         typer.echo(f"layout:   {layout} (import it under Layouts)")
     if announce:
