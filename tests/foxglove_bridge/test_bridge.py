@@ -368,8 +368,8 @@ def test_a_name_that_was_made_to_point_here_is_not_served(
 def test_what_is_no_request_goes_no_further(source: Publishing, head: bytes) -> None:
     with bridged(source.sensor.address) as bridge, FoxgloveClient(bridge.url) as client:
         where = urlsplit(bridge.url)
-        with socket.create_connection((where.hostname, where.port), PATIENCE_S) as connection:
-            with suppress(ConnectionError):
-                connection.sendall(head)
-                assert b"101" not in connection.recv(100)
+        address = where.hostname, where.port
+        with socket.create_connection(address, PATIENCE_S) as line, suppress(ConnectionError):
+            line.sendall(head)
+            assert b"101" not in line.recv(100)
         client.wait("/left/contacts", anew=True)
