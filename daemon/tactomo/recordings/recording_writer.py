@@ -26,7 +26,10 @@ from tactomo.errors import RecordingError
 from tactomo.recordings.recording import DRIFT_ARRAYS, REFERENCE_ARRAYS, Origin
 from tactomo.scans import Mark
 
-CHUNK_BYTES: Final = 1 << 20
+CHUNK_NS: Final = 200_000_000
+"""Of a recording's time in one chunk, so in a recovered file, too: damage costs all of a chunk."""
+CHUNK_PORT_BYTES: Final = 8192
+"""Likewise where a replay takes no time: at 20 dual scans a second of 416 voltages 0.2 s."""
 MAX_PENDING_BYTES: Final = 4 << 20
 HELLO_PERIOD_S: Final = 1.0
 
@@ -94,7 +97,7 @@ def message_entry(kind: str, data: bytes, monotonic_ns: int, realtime_ns: int) -
 
 
 class _File:
-    """A file as the MCAP writer sees it: `write` collects, `flush` writes, wholly or not.
+    """A file as the MCAP writer sees it: `write` collects, `hand_over` writes, wholly or not.
 
     It is a bare descriptor: a buffered file that hangs in a write would keep the interpreter from
     ending.
@@ -109,13 +112,16 @@ class _File:
     def write(self, data: bytes) -> int:
         self._pending += data
         if len(self._pending) > MAX_PENDING_BYTES:
-            self.flush()
+            self.hand_over()
         return len(data)
 
     def tell(self) -> int:
         return self._length + len(self._pending)
 
     def flush(self) -> None:
+        """Do nothing: the MCAP writer asks for it at the end of each chunk."""
+
+    def hand_over(self) -> None:
         begin = self._length
         try:
             while self._pending:
@@ -151,7 +157,9 @@ class RecordingWriter:
         self._name_is_safe = False
         self._file = _File(path)
         self._clock_offset_ns = time.time_ns() - time.monotonic_ns()
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES)  # type: ignore[arg-type]
+        self._writer = Writer(self._file)  # type: ignore[arg-type]
+        self._chunk_begun_ns: int | None = None
+        self._chunk_port_bytes = 0
         try:
             self._begin(origin)
         except BaseException:
@@ -185,10 +193,23 @@ class RecordingWriter:
 
     def write(self, topic: str, data: bytes, log_time_ns: int, realtime_ns: int) -> None:
         """Add one message with its time on the steady clock and on the wall clock."""
+        begun_ns = self._chunk_begun_ns
+        is_long = begun_ns is not None and log_time_ns - begun_ns >= CHUNK_NS
+        if is_long or self._chunk_port_bytes >= CHUNK_PORT_BYTES:
+            self._end_chunk()
+        if self._chunk_begun_ns is None:
+            self._chunk_begun_ns = log_time_ns
+        if topic.startswith("port/"):
+            self._chunk_port_bytes += len(data)
         self._writer.add_message(self._channels[topic], log_time_ns, data, realtime_ns)
 
+    def _end_chunk(self) -> None:
+        self._chunk_begun_ns, self._chunk_port_bytes = None, 0
+        self._writer.flush()  # type: ignore[no-untyped-call]
+
     def note(self, name: str, facts: dict[str, str]) -> None:
-        """Add a metadata record."""
+        """Add a metadata record, after the chunks: between them it would pass for a gap."""
+        self._end_chunk()
         self._writer.add_metadata(name, facts)
 
     def flush(self) -> int:
@@ -196,7 +217,8 @@ class RecordingWriter:
 
         Returns the length of the file.
         """
-        self._writer.flush()  # type: ignore[no-untyped-call]
+        self._end_chunk()
+        self._file.hand_over()
         return self._file.tell()
 
     def sync(self) -> None:
@@ -220,7 +242,7 @@ class RecordingWriter:
         """Finish the file with its index; returns its length."""
         try:
             self._writer.finish()  # type: ignore[no-untyped-call]
-            self._file.flush()
+            self._file.hand_over()
             return self._file.tell()
         finally:
             self.abandon()

@@ -20,11 +20,12 @@ from tactomo.service import daemon
 from tactomo.service.daemon import Daemon
 from tactomo_client import ControlError
 from tactomo_client.frame import frame_from_message
+from tactomo_client.intact_chunks import intact_chunks
 from tactomo_client.messages import array_from_wire
 from tactomo_client.recording import open_recording as open_frames
 from tactomo_models import Reference
 from tactomo_models.machine_speed import MachineSpeed, Row
-from tactomo_protocol import Channel, Scan, ScanFlag, encode
+from tactomo_protocol import Channel, Decoder, Scan, ScanFlag, encode
 
 Start = Callable[..., Any]
 Replay = Callable[..., Any]
@@ -429,6 +430,29 @@ def test_a_recording_of_another_sensor_is_refused(tmp_path: Path) -> None:
     memory: Any = object()
     with pytest.raises(ConfigError, match="192 voltages a scan, paper_square has 208"):
         Daemon(load_config(ports=[f"replay://{path}"]), reconstructor=memory)
+
+
+def test_a_replay_without_pauses_writes_chunks_as_small_as_a_live_one(
+    replay: Replay, tmp_path: Path
+) -> None:
+    path = tmp_path / "tank.mcap"
+    imported(path)
+    again = replay(path, lossless=True)
+    for written in (path, again.path):
+        with written.open("rb") as file:
+            chunks = [chunk.messages for chunk in intact_chunks(file)]
+        times_us = [
+            [packet.device_us for packet in scans_in(chunk)] for chunk in chunks if scans_in(chunk)
+        ]
+        assert len(times_us) > 5
+        assert max(max(times) - min(times) for times in times_us) <= 500_000
+
+
+def scans_in(chunk: list[Any]) -> list[Scan]:
+    """Return the scans of a chunk whose every message of a port holds whole packets."""
+    decoder = Decoder()
+    packets = [p for m in chunk if len(m.data) > 500 for p in decoder.feed(m.data)]
+    return [packet for packet in packets if isinstance(packet, Scan)]
 
 
 def test_replay_keeps_the_recordings_time(replay: Replay, tmp_path: Path) -> None:

@@ -428,3 +428,21 @@ def test_the_command_says_what_was_kept_and_lost(tactomo: Run, tmp_path: Path) -
     folder = tactomo("recover", ".")
     assert folder.returncode == 1
     assert folder.stderr.strip().endswith("Is a directory; give the path of a .mcap file")
+
+
+def test_a_recovered_file_has_chunks_as_small_as_a_live_one(tmp_path: Path) -> None:
+    """A flipped bit in it costs 0.25 s, and not all of it."""
+    live, whole = tmp_path / "live.mcap", tmp_path / "whole.mcap"
+    write(live)
+    recover(live, whole)
+    assert recover(whole, tmp_path / "once_more.mcap").is_intact
+    with whole.open("rb") as file:
+        chunks = [chunk.messages for chunk in intact_chunks(file) if chunk.messages]
+    times_ns = [[message.log_time for message in chunk] for chunk in chunks]
+    assert max(max(times) - min(times) for times in times_ns) <= 250_000_000
+    data = bytearray(whole.read_bytes())
+    data[len(data) // 3] ^= 1
+    flipped, again = tmp_path / "flipped.mcap", tmp_path / "again.mcap"
+    flipped.write_bytes(data)
+    (gap,) = recover(flipped, again).gaps
+    assert gap.seconds <= 0.25 + PERIOD_NS * 1e-9
