@@ -15,7 +15,7 @@ import pytest
 import tactomo_models
 from daemon_process import DaemonProcess
 from ears import Ears, Heard
-from pty_skin import Playing, PtySkin, Scenes, moving, still
+from pty_skin import Playing, Scenes, moving, still
 from tactomo.recordings.recording import open_recording
 from tactomo_protocol import Decoder, Scan
 from waiting import wait_until
@@ -71,19 +71,27 @@ def counters(path: Path) -> set[int]:
 @pytest.mark.faults
 @pytest.mark.timeout(300)
 @pytest.mark.fault(
-    "SIGKILL while recording",
+    "SIGKILL while recording, {loops} busy loops",
     "the file opens again; at most the last 0.25 s are lost, nothing before",
-    f"{KILLS} daemons killed at a random moment, 100 dual scans/s",
+    f"{KILLS} daemons killed at a random moment, a contact that moves, 100 dual scans/s",
 )
+@pytest.mark.parametrize("loops", [0, 4])
 def test_killed_while_recording(
-    tared: Start, skin: PtySkin, scenes: Scenes, play: Play, figure: Figure, tmp_path: Path
+    tared: Start,
+    scenes: Scenes,
+    play: Play,
+    busy: Callable[[int], None],
+    figure: Figure,
+    tmp_path: Path,
+    loops: int,
 ) -> None:
     lost_s = []
+    busy(loops)
     for number in range(KILLS):
         path = tmp_path / f"killed-{number}.mcap"
-        daemon = tared()
+        daemon = tared(recording={"sync_s": 0.3})  # else none comes before the end
         daemon.ask("record_start", path=str(path))
-        playing = play(still(scenes.rest), 100.0)
+        playing = play(moving(scenes.one), 100.0)
         time.sleep(0.5 + np.random.default_rng(number).uniform(0, 0.5))
         killed_ns = time.monotonic_ns()
         daemon.kill()

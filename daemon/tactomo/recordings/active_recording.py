@@ -58,6 +58,8 @@ class ActiveRecording:
         self._has_ended = False
         self._is_told = False
         self._synced_s = self._begin_s
+        self._syncing: threading.Thread | None = None
+        self._sync_error: OSError | None = None
 
     @property
     def age_s(self) -> float:
@@ -101,16 +103,32 @@ class ActiveRecording:
             self._queued_bytes -= sum(len(entry.data) + ENTRY_BYTES for entry in entries)
 
     def sync(self, period_s: float) -> None:
-        """Have what was written outlive a loss of power, once a period; 0 leaves that to chance."""
-        if period_s and time.monotonic() - self._synced_s >= period_s:
-            self._writer.sync()
+        """Have what was written outlive a loss of power, once a period; 0 leaves that to chance.
+
+        Another thread waits for the disk, which may take a second: what comes meanwhile is written,
+        or a process killed then would lose it. Raises OSError where the last one has failed.
+        """
+        if self._sync_error is not None:
+            raise self._sync_error
+        is_on = self._syncing is not None and self._syncing.is_alive()
+        if period_s and not is_on and time.monotonic() - self._synced_s >= period_s:
             self._synced_s = time.monotonic()
+            self._syncing = threading.Thread(target=self._sync, name="sync", daemon=True)
+            self._syncing.start()
+
+    def _sync(self) -> None:
+        try:
+            self._writer.sync()
+        except OSError as error:
+            self._sync_error = error
 
     def finish(self, sync: bool) -> None:
         """Write what was added so far and close the file with its index."""
         with self._lock:
             self._has_ended = True
         self.write()
+        if self._syncing is not None:
+            self._syncing.join()
         if sync:
             self._writer.sync()
         self.bytes_written = self._writer.close()

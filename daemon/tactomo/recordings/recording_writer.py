@@ -23,13 +23,13 @@ from tactomo_models import Reference
 from tactomo_protocol import Hello, Scan, encode
 
 from tactomo.errors import RecordingError
-from tactomo.recordings.recording import DRIFT_ARRAYS, REFERENCE_ARRAYS, Origin
+from tactomo.recordings.recording import DRIFT_ARRAYS, REFERENCE_ARRAYS, REPLAY_SCHEME, Origin
 from tactomo.scans import Mark
 
 CHUNK_NS: Final = 200_000_000
 """Of a recording's time in one chunk, so in a recovered file, too: damage costs all of a chunk."""
 CHUNK_PORT_BYTES: Final = 8192
-"""Likewise where a replay takes no time: at 20 dual scans a second of 416 voltages 0.2 s."""
+"""Likewise of a replay, which may take no time: at 20 dual scans a second of 416 voltages 0.2 s."""
 MAX_PENDING_BYTES: Final = 4 << 20
 HELLO_PERIOD_S: Final = 1.0
 
@@ -160,6 +160,8 @@ class RecordingWriter:
         self._writer = Writer(self._file)  # type: ignore[arg-type]
         self._chunk_begun_ns: int | None = None
         self._chunk_port_bytes = 0
+        is_replay = any(port.startswith(f"{REPLAY_SCHEME}:") for port in origin.ports)
+        self._most_port_bytes = CHUNK_PORT_BYTES if is_replay else MAX_PENDING_BYTES
         try:
             self._begin(origin)
         except BaseException:
@@ -195,7 +197,7 @@ class RecordingWriter:
         """Add one message with its time on the steady clock and on the wall clock."""
         begun_ns = self._chunk_begun_ns
         is_long = begun_ns is not None and log_time_ns - begun_ns >= CHUNK_NS
-        if is_long or self._chunk_port_bytes >= CHUNK_PORT_BYTES:
+        if is_long or self._chunk_port_bytes >= self._most_port_bytes:
             self._end_chunk()
         if self._chunk_begun_ns is None:
             self._chunk_begun_ns = log_time_ns

@@ -7,6 +7,7 @@ hangs, or shut down as one that is pulled out. Mounting takes root.
 from __future__ import annotations
 
 import fcntl
+import os
 import shutil
 import struct
 import subprocess
@@ -240,6 +241,32 @@ def test_a_disk_that_dies(bench: Start, ext4_disk: Path, tmp_path: Path) -> None
     b.step()
     b.ask("record_stop")
     assert open_recording(tmp_path / "elsewhere.mcap").summary.frames == 1
+
+
+def test_what_comes_while_the_disk_is_asked_to_keep_it_is_written(
+    bench: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A killed process loses nothing of it, however long that takes."""
+    asked, answered = threading.Event(), threading.Event()
+    keep = os.fdatasync
+
+    def slow(descriptor: int) -> None:
+        asked.set()
+        assert answered.wait(60)
+        keep(descriptor)
+
+    monkeypatch.setattr(os, "fdatasync", slow)
+    b = bench(recording={"sync_s": 0.05})
+    b.tare()
+    path = tmp_path / "kept.mcap"
+    b.ask("record_start", path=str(path))
+    b.step()
+    assert asked.wait(60)
+    b.step()
+    b.until(lambda: b.skin.counter in counters(path))
+    answered.set()
+    b.ask("record_stop")
+    assert open_recording(path).summary.is_complete
 
 
 def test_a_deleted_file_or_folder_is_noticed(bench: Start, tmp_path: Path) -> None:
