@@ -47,6 +47,8 @@ def write_arrays(path: Path, arrays: dict[str, Any]) -> None:
 def write_whole(path: Path, write: Callable[[IO[bytes]], object]) -> None:
     """Write a file and make its folder; a half-written one is never left under that name.
 
+    A link is followed. What is no file, such as /dev/null, is written to and not replaced.
+
     Args:
         path: the file.
         write: writes its content.
@@ -56,6 +58,11 @@ def write_whole(path: Path, write: Callable[[IO[bytes]], object]) -> None:
     """
     if path.is_dir():  # "." has no name that another could be made of
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    path = path.resolve()
+    if path.exists() and not path.is_file():
+        with path.open("wb") as device:
+            write(device)
+        return
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

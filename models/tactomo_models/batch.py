@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from tactomo_models.archive import read_arrays
+from tactomo_models.archive import read_arrays, write_arrays
 from tactomo_models.arrays import FloatArray
 from tactomo_models.errors import DataError
 from tactomo_models.reconstruct import Reconstructor
@@ -51,6 +51,8 @@ def reconstruct_file(
             or the output cannot be written.
         ModelError: the method is unknown, or lacks what it needs.
     """
+    if not target.parent.is_dir():
+        raise DataError(f"cannot write {target}: there is no folder {target.parent}; make it first")
     scans, reference = read_scans(source, description)
     total = max(len(channel) for channel in scans.values())
     frames: list[Reconstruction] = []
@@ -67,8 +69,7 @@ def reconstruct_file(
                 progress(index + 1, total)
     arrays: dict[str, Any] = {"seconds": seconds, **frame_arrays(frames, description)}
     try:
-        with target.open("wb") as file:
-            np.savez_compressed(file, **arrays)
+        write_arrays(target, arrays)
     except OSError as error:
         raise DataError(
             f"cannot write {target}: {error.strerror}; name a file in a folder that you may write"

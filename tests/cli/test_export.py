@@ -31,6 +31,7 @@ from recorded_grasp import (
 from small_sensor import SMALL
 from tactomo_models import Press, SkinSimulator, load_description
 from tactomo_protocol import Channel
+from terminal import Terminal
 from waiting import wait_until
 
 Run = Callable[..., Any]
@@ -208,13 +209,39 @@ def test_what_was_there_stays_where_writing_fails(tactomo: Run, grasp: Path) -> 
         before = resource.getrlimit(resource.RLIMIT_FSIZE)
         resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))
         try:
-            result = tactomo("export", grasp, name)
+            result = tactomo("export", grasp, name, "--force")
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
         assert result.returncode == 1, name
         assert f"cannot write {name}" in result.stderr
         assert grasp.with_name(name).read_text() == "precious"
     assert len(list(grasp.parent.iterdir())) == 4
+
+
+def test_what_is_there_is_written_over_only_if_one_says_so(tactomo: Run, grasp: Path) -> None:
+    for name in ("contacts.csv", "layout.json"):
+        grasp.with_name(name).write_text("precious")
+    into_csv = ("export", grasp, "contacts.csv")
+    with_layout = ("export", grasp, "fox.mcap", "--layout", "layout.json")
+    for arguments, name in ((into_csv, "contacts.csv"), (with_layout, "layout.json")):
+        result = tactomo(*arguments)
+        assert result.returncode == 1
+        assert f"{name} exists already" in result.stderr
+        assert "--force" in result.stderr
+        assert grasp.with_name(name).read_text() == "precious"
+        assert tactomo(*arguments, "--force").returncode == 0
+        assert grasp.with_name(name).read_text() != "precious"
+
+
+def test_at_a_terminal_it_asks(grasp: Path) -> None:
+    target = grasp.with_name("contacts.csv")
+    for answer in ("n", "y"):
+        target.write_text("precious")
+        with Terminal("export", str(grasp), str(target)) as terminal:
+            terminal.wait_for("write over it?")
+            terminal.enter(answer)
+            assert terminal.wait() == (answer == "n")
+        assert (target.read_text() == "precious") == (answer == "n")
 
 
 def bare_recording(tactomo: Run, tmp_path: Path, scans_pressed: int) -> Path:

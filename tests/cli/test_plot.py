@@ -118,6 +118,7 @@ def test_nothing_pressed_is_a_page_too(tactomo: Run, tmp_path: Path) -> None:
     [
         (["grasp.mcap", "--what", "maps,music"], 2, "choose from maps"),
         (["grasp.mcap", "-o", "page.gif"], 1, "not a kind of picture"),
+        (["grasp.mcap", "-o", "new/page.png"], 1, "there is no folder new"),
         (["grasp.mcap", "--from", "100"], 1, "no frames"),
         (["none.mcap"], 1, "none.mcap"),
     ],
@@ -129,6 +130,19 @@ def test_what_goes_wrong_is_told(
     result = tactomo("plot", *arguments)
     assert result.returncode == status
     assert says in result.stderr.replace("\n", " ")
+
+
+def test_a_picture_that_is_there_is_drawn_over_only_if_one_says_so(
+    tactomo: Run, grasp: Path
+) -> None:
+    page = grasp.with_name("page.png")
+    page.write_text("precious")
+    result = tactomo("plot", grasp, "-o", page)
+    assert result.returncode == 1
+    assert "--force" in result.stderr
+    assert page.read_text() == "precious"
+    assert tactomo("plot", grasp, "-o", page, "--force").returncode == 0
+    assert page.read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_sensor_without_magnitude_shows_areas(grasp: Path) -> None:

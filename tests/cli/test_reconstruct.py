@@ -138,6 +138,50 @@ def test_bad_scans_are_flagged_in_the_file(tactomo: Run, tmp_path: Path) -> None
     assert flags[5] & (Flag.NOISE_HIGH | Flag.STRUCTURE_MISSING)
 
 
+def scans_file(path: Path) -> None:
+    rest = SkinSimulator(load_description("paper_square"), spacing_m=0.008).voltages([])
+    references = {f"{name}_reference": volts for name, volts in rest.items()}
+    scans = {str(name): np.stack([volts, volts]) for name, volts in rest.items()}
+    np.savez(path, **scans, **references)  # type: ignore[arg-type]
+
+
+def test_only_its_own_output_is_written_over_unasked(tactomo: Run, tmp_path: Path) -> None:
+    scans_file(tmp_path / "in.npz")
+    scans = (tmp_path / "in.npz").read_bytes()
+    command = ("reconstruct", "in.npz", "out.npz", "--method", "tikhonov")
+    assert tactomo(*command).returncode == 0
+    assert tactomo(*command).returncode == 0  # it can be computed again
+    swapped = tactomo("reconstruct", "out.npz", "in.npz")
+    assert swapped.returncode == 1
+    assert "in.npz exists already" in swapped.stderr
+    assert (tmp_path / "in.npz").read_bytes() == scans
+    assert tactomo("reconstruct", "in.npz", "new/out.npz").returncode == 1
+    assert not (tmp_path / "new").exists()
+
+
+def test_what_is_no_file_is_not_replaced_by_one(tactomo: Run, tmp_path: Path) -> None:
+    scans_file(tmp_path / "in.npz")
+    (tmp_path / "nothing").symlink_to("/dev/null")
+    command = ("reconstruct", "in.npz", "nothing", "--method", "tikhonov")
+    assert tactomo(*command).returncode == 0
+    assert Path("/dev/null").is_char_device()
+    assert (tmp_path / "nothing").is_symlink()
+
+
+def test_half_a_file_is_never_left(
+    tactomo: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scans_file(tmp_path / "in.npz")
+
+    def interrupted(file: Any, **_: Any) -> None:
+        file.write(b"half of it")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(np, "savez_compressed", interrupted)
+    assert tactomo("reconstruct", "in.npz", "out.npz", "--method", "tikhonov").returncode != 0
+    assert [path.name for path in tmp_path.iterdir()] == ["in.npz"]
+
+
 def test_help_lists_every_flag(tactomo: Run) -> None:
     said = " ".join(tactomo("reconstruct", "--help").stdout.replace("│", " ").split())
     for flag in Flag:

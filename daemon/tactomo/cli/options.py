@@ -153,6 +153,9 @@ Announce: TypeAlias = Annotated[
         "--announce", help="Print one line of JSON with the addresses when ready, for programs."
     ),
 ]
+Force: TypeAlias = Annotated[
+    bool, typer.Option("--force", "-f", help="Write over a file that is there, without asking.")
+]
 RecordingFile: TypeAlias = Annotated[Path, typer.Argument(help="A recording (.mcap).")]
 
 

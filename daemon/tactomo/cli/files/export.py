@@ -14,7 +14,7 @@ from tactomo.cli.files.recorded_frames import (
     ToOption,
     recorded_frames,
 )
-from tactomo.cli.options import RecordedDescription, examples, typer_app
+from tactomo.cli.options import Force, RecordedDescription, examples, typer_app
 from tactomo.cli.plot.plot import prepare_file
 from tactomo.cli.run.foxglove import need_foxglove, placement_of, write_layout
 from tactomo.errors import TactomoError
@@ -63,6 +63,7 @@ def export(
             help="For .mcap: pose in that frame, metres and degrees.",
         ),
     ] = "0,0,0",
+    force: Force = False,
 ) -> None:
     """Write the frames of a recording for other programs; the extension of OUT says for which.
 
@@ -82,7 +83,8 @@ def export(
     kind = _kind(output)
     if output.exists() and recording.exists() and output.samefile(recording):
         raise typer.BadParameter(f"{output} is the recording itself; name another file")
-    prepare_file(output)
+    for file in (output, *([layout] if layout else [])):
+        prepare_file(file, force=force)
     write = _writer(kind, parent, pose, output.parent)
     with recorded_frames(recording, description, start_s, end_s, output.parent) as frames:
         count = _write(output, lambda file: write(frames, file))

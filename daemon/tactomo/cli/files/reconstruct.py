@@ -7,7 +7,15 @@ from typing import Annotated
 
 import typer
 
-from tactomo.cli.options import DEFAULT_DESCRIPTION, Description, Method, examples, typer_app
+from tactomo.cli.options import (
+    DEFAULT_DESCRIPTION,
+    Description,
+    Force,
+    Method,
+    examples,
+    typer_app,
+)
+from tactomo.cli.plot.plot import prepare_file
 
 app = typer_app()
 
@@ -27,8 +35,11 @@ def reconstruct(
         Path | None,
         typer.Option(help="Of pressure, by `tactomo calibrate`. [the description's response]"),
     ] = None,
+    force: Force = False,
 ) -> None:
     """Reconstruct a file of scans, without a daemon.
+
+    OUT may be an earlier one of this command; anything else is written over with `--force` only.
 
     IN holds `magnitude` and `structure` (T, M) volts and `magnitude_reference`,
     `structure_reference` (M,); structure may be missing. OUT gets `map` (T, ny, nx), the relative
@@ -71,6 +82,7 @@ def reconstruct(
     from tactomo_models.batch import reconstruct_file
     from tactomo_models.calibration.calibration_file import calibration_of
 
+    prepare_file(maps, force=force or _is_of_reconstruct(maps))
     sensor = load_description(description)
     curve = None if calibration is None else calibration_of(sensor, calibration).curve
     with Progress(transient=True) as progress:
@@ -86,3 +98,14 @@ def reconstruct(
     if failures:
         typer.echo(f"{failures[0]}; {len(failures)} frame(s) are tikhonov's instead", err=True)
     typer.echo(f"wrote {maps}: {len(frames)} frames")
+
+
+def _is_of_reconstruct(path: Path) -> bool:
+    """Whether a file is what this command writes, which can be computed again."""
+    from tactomo_models import DataError
+    from tactomo_models.archive import read_arrays
+
+    try:
+        return {"seconds", "misfit", "contact_frame"} <= read_arrays(path).keys()
+    except (OSError, DataError):
+        return False

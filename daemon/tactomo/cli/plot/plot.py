@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +14,7 @@ from tactomo.cli.files.recorded_frames import (
     ToOption,
     recorded_frames,
 )
-from tactomo.cli.options import RecordedDescription, examples, typer_app
+from tactomo.cli.options import Force, RecordedDescription, examples, typer_app
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
@@ -43,6 +45,7 @@ def plot(
     start_s: FromOption = 0.0,
     end_s: ToOption = None,
     description: RecordedDescription = None,
+    force: Force = False,
 ) -> None:
     """Draw a recording on one page.
 
@@ -56,7 +59,7 @@ def plot(
     first, by the same code as live. Needs matplotlib: `pip install 'tactomo[plot]'`.
     """
     panels = _panels(what)
-    prepare_picture(output)
+    prepare_picture(output, force=force)
     from tactomo.cli.plot.course import Course, read_course, read_maps
     from tactomo.cli.plot.page import draw_page
 
@@ -86,15 +89,13 @@ def _panels(what: str) -> tuple[str, ...]:
     return tuple(panel for panel in PANELS if panel in requested)
 
 
-def prepare_picture(output: Path) -> None:
+def prepare_picture(output: Path, *, force: bool = True) -> None:
     """Make sure before the work that a picture of it can be drawn, without a display.
 
     Raises:
-        TactomoError: matplotlib is not installed, or the picture could not be written.
+        TactomoError: matplotlib is not installed, or as `prepare_file`.
     """
     next_step = "give a .png, .svg or .pdf in a folder that you may write"
-    if not output.parent.is_dir():
-        raise TactomoError(f"cannot write {output}: there is no folder {output.parent}", next_step)
     if output.suffix.lower() not in (".png", ".svg", ".pdf"):
         raise TactomoError(f"cannot write {output}: not a kind of picture", next_step)
     try:
@@ -105,7 +106,7 @@ def prepare_picture(output: Path) -> None:
             "pip install 'tactomo[plot]', or `make setup` in a checkout",
         ) from error
     matplotlib.use("Agg")
-    prepare_file(output)
+    prepare_file(output, force=force)
 
 
 def prepare_folder(folder: Path) -> None:
@@ -123,13 +124,23 @@ def prepare_folder(folder: Path) -> None:
     prepare_picture(folder / "figure.png")
 
 
-def prepare_file(output: Path) -> None:
+def prepare_file(output: Path, *, force: bool = True) -> None:
     """Make sure before the work that a file can be written; what it holds stays as it is.
 
+    What is there is written over with `force`, or where somebody at the terminal says so. Folders
+    are not made. An empty file holds nothing.
+
     Raises:
-        TactomoError: it cannot be.
+        TactomoError: it cannot be, or may not.
     """
+    if not output.parent.is_dir():
+        make = f"make it first: `mkdir -p {shlex.quote(str(output.parent))}`"
+        raise TactomoError(f"cannot write {output}: there is no folder {output.parent}", make)
     is_new = not output.exists()
+    if not force and not is_new and output.stat().st_size:
+        can_ask = sys.stdin.isatty() and sys.stderr.isatty()
+        if not can_ask or not typer.confirm(f"{output} exists: write over it?", err=True):
+            raise TactomoError(f"{output} exists already", "name another file, or add --force")
     try:
         output.open("ab").close()
         if is_new:
@@ -146,8 +157,11 @@ def save_figure(figure: Figure, output: Path, dpi: int = 150) -> None:
     Raises:
         TactomoError: it cannot be written.
     """
+    from tactomo_models.archive import write_whole
+
+    kind = output.suffix[1:].lower()
     try:
-        figure.savefig(output, dpi=dpi)
+        write_whole(output, lambda file: figure.savefig(file, dpi=dpi, format=kind))
     except (OSError, ValueError) as error:
         raise TactomoError(
             f"cannot write {output}: {error}", "give a .png, .svg or .pdf that you may write"
