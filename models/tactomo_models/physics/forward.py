@@ -26,7 +26,7 @@ from tactomo_models.physics.condensation import Condensation
 from tactomo_models.physics.greens import GreensFunction
 from tactomo_models.sensor.description import SensorDescription
 
-_STRIP = 128  # triangles, or spots, at once: what that takes stays in the cache
+_STRIP = 256  # triangles, or spots, at once: what that takes stays in the cache
 
 
 @dataclass(frozen=True)
@@ -300,16 +300,20 @@ class ForwardModel:
         triangles, nodes, corners = self._touched(where)
         fields = self.potentials(solution, nodes) @ self._pair_matrix.T  # (nodes, pairs)
         gradient = self._gradient[triangles] @ fields[corners]  # (t, 2, pairs)
-        share = self._shares(where, triangles, solution.mixed)
+        node, share = self._shares(where, triangles, solution.mixed)
         if onto is None:
-            summed = share @ self._field_products(gradient)
+            pressable = node < len(where)
+            places = node[pressable], pressable.nonzero()[0]
+            by_triangle = sp.csr_matrix((share[pressable], places), (len(where), len(triangles)))
+            summed = (by_triangle @ self._field_products(gradient).T).T
         else:
-            weight = share.T @ onto  # (t, K)
-            summed = np.zeros((weight.shape[1], self._products.shape[1]))
+            onto = np.append(onto, np.zeros((1, onto.shape[1])), axis=0)
+            weight = (share[:, :, None] * onto[node]).sum(axis=1)  # (t, K)
+            summed = np.zeros((self._products.shape[1], onto.shape[1]))
             for start in range(0, len(triangles), _STRIP):
                 strip = slice(start, start + _STRIP)
-                summed += weight[strip].T @ self._field_products(gradient[strip])
-        return np.asarray((summed[:, self._product_of] * self._sign).T)
+                summed += self._field_products(gradient[strip]) @ weight[strip]
+        return np.asarray(summed[self._product_of] * self._sign[:, None])
 
     def _touched(self, where: IntArray) -> tuple[IntArray, IntArray, IntArray]:
         """Indexed triangles around pressable nodes, the different ones of their corners, and which.
@@ -324,27 +328,34 @@ class ForwardModel:
 
     def _shares(
         self, where: IntArray, triangles: IntArray, mixed: FloatArray | None
-    ) -> sp.csr_matrix:
-        """Minus the area (n, t) of each triangle whose conductivity goes with each node's."""
-        position = _positions(where, len(self.bare.pressable) + 1)  # the last: not pressable
-        corner = position[self._corner_pressable[triangles]]
-        triangle, which = np.nonzero(corner >= 0)
-        area = -self._area[triangles[triangle]] / 3
+    ) -> tuple[IntArray, FloatArray]:
+        """Where triangles' corners stand among nodes, and minus the area that goes with each.
+
+        Returns:
+            (t, 3) places in `where`, its length for other nodes; (t, 3) areas by which the
+            conductivities of triangles go with those of their corners.
+        """
+        position = np.full(len(self.bare.pressable) + 1, len(where))  # the last: not pressable
+        position[where] = np.arange(len(where))
+        node = position[self._corner_pressable[triangles]]
+        share = np.repeat(-self._area[triangles, None] / 3, 3, axis=1)
         if mixed is not None:  # d sigma / d sigma_i = (sigma / sigma_i)^2 / 3
             at_corners = self._at_corners(triangles, mixed)
-            mean = 1 / (1 / at_corners).mean(axis=1)
-            share = (mean[triangle] / at_corners[triangle, which]) ** 2
-            area *= np.where(self._better(triangles, at_corners)[triangle], share, 1.0)
-        return sp.csr_matrix(
-            (area, (corner[triangle, which], triangle)), (len(where), len(triangles))
-        )
+            inverse = 1 / at_corners
+            weighted = inverse / inverse.mean(axis=1)[:, None]
+            weighted[~self._better(triangles, at_corners)] = 1.0
+            share *= weighted**2
+        return node, share
 
     def _field_products(self, gradient: FloatArray) -> FloatArray:
-        """Products (t, q) of the fields (t, 2, pairs) of two pairs each."""
-        x, y = gradient.transpose(1, 0, 2)
+        """Products (q, t) of the fields (t, 2, pairs) of two pairs each."""
+        x, y = np.ascontiguousarray(gradient.transpose(1, 2, 0))
         one, other = self._products
-        product = x.take(one, axis=1) * x.take(other, axis=1)
-        product += y.take(one, axis=1) * y.take(other, axis=1)
+        product = x[one]
+        product *= x[other]
+        across = y[one]
+        across *= y[other]
+        product += across
         return np.asarray(product)
 
     @property
