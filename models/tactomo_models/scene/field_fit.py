@@ -29,6 +29,9 @@ from tactomo_models.sensor.description import SensorDescription
 
 MAX_PRESSED = 1000  # nodes that one solve may change: some 5 ms, two fifths of a sheet
 SETTLED = 5e-3  # share of the cost below which another gain is not worth a step
+# The same as the last step's Jacobian foresees it. With 5e-3 another 5 % of the work is saved, but
+# one of 36 scenes then goes another way, at a correlation lower by 0.13.
+FORESEEN = 1e-3
 WORST_DAMPING = 1e6  # no step downhill even at this: a minimum
 STEP_LIMIT = 0.5  # largest change of a parameter in one step
 
@@ -170,9 +173,7 @@ class FieldFit:
             {name: fitted.solutions[name] for name in measured},
             measured,
         )
-        same = measured.keys() == fitted.solutions.keys()
-        damping = 1.0 if fitted.converged else fitted.damping
-        return replace(judged, damping=damping, jacobian=fitted.jacobian if same else None)
+        return replace(judged, damping=1.0 if fitted.converged else fitted.damping)
 
     def evaluate(
         self,
@@ -284,10 +285,26 @@ class FieldFit:
             gain = fitted.cost - better.cost
             # No gain because the budget ended says nothing about a minimum.
             settled = 0 < gain < SETTLED * fitted.cost or better.damping >= WORST_DAMPING
+            if gain > 0 and not settled:
+                settled = self._foreseen(better) < FORESEEN * better.cost
             fitted = replace(better, converged=settled)
             if settled or budget.over:
                 break
         return fitted
+
+    def _foreseen(self, fitted: FittedField) -> float:
+        """What one more step would gain, by the Jacobian of the last one: no solve."""
+        assert fitted.jacobian is not None
+        normal, gradient = self._normal_equations(fitted, fitted.jacobian)
+        return float(gradient @ np.linalg.solve(normal, gradient))
+
+    def _normal_equations(
+        self, fitted: FittedField, J: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Matrix (N + 1, N + 1) and gradient (N + 1,) of half the linearised cost."""
+        precision, offset = self.prior(fitted)
+        normal = J.T @ J + np.diag(precision)
+        return normal, J.T @ fitted.residual + precision * offset
 
     def prior(self, fitted: FittedField) -> tuple[FloatArray, FloatArray]:
         """Inverse variances (N + 1,) of parameters and log ratio, and their offsets from it."""
@@ -299,9 +316,7 @@ class FieldFit:
     def _step(self, fitted: FittedField, measured: Measured, budget: Budget) -> FittedField:
         """Damp until a step leads downhill: the better estimate, or the old one."""
         J = self.jacobian(fitted, measured)
-        precision, offset = self.prior(fitted)
-        normal = J.T @ J + np.diag(precision)
-        gradient = J.T @ fitted.residual + precision * offset
+        normal, gradient = self._normal_equations(fitted, J)
         damping = fitted.damping
         while damping < WORST_DAMPING:
             step = -np.linalg.solve(normal + damping * np.eye(len(normal)), gradient)

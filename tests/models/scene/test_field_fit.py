@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from measured import measured
@@ -155,6 +157,27 @@ def test_the_fit_explains_what_its_own_model_made(sensor: Sensor, scene: str) ->
             pressed @ sensor.fit.forward.node_areas_m2 for _, pressed in (one, other)
         )
         assert found_force == pytest.approx(force, rel=0.06)
+
+
+def test_no_step_is_taken_that_would_gain_nothing(sensor: Sensor) -> None:
+    """From next to the minimum one step is enough, and the last Jacobian tells so."""
+    order, each = SCENES["circle"]
+    truth = sensor.at(each, order, sensor.no_data())
+    data = data_of(sensor.changes(truth), 0.003, np.random.default_rng(4))
+    best = sensor.settled(sensor.fit.compare(truth, data), data)
+    beside = best.parameters + 0.01 * (np.arange(len(best.parameters)) == X)
+    start = sensor.fit.evaluate(best.family, beside, best.log_ratio, data)
+    assert start is not None
+    start = replace(start, damping=1e-3)
+    budget, work = Budget(PLENTY_S), Budget(PLENTY_S)
+    work.spend(start)
+    found = sensor.fit.refine(start, data, budget, good_enough=0.0)
+    assert found.converged
+    assert start.cost - found.cost > 0.01 * start.cost
+    solves = (PLENTY_S - budget.left_s) / (PLENTY_S - work.left_s)
+    assert solves == pytest.approx(2, abs=0.5)  # one of them stands for the Jacobian
+    again = sensor.fit.refine(found, data, Budget(PLENTY_S), good_enough=0.0)
+    assert found.cost - again.cost < 2e-3 * found.cost
 
 
 def on_nodes(fitted: FittedField) -> FloatArray:
