@@ -15,13 +15,15 @@ measurements", Springer (2004), polarisation tensors.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from tactomo_protocol import Channel
 
-from tactomo_models.arrays import FloatArray
-from tactomo_models.physics.forward import ForwardModel, Solution
-from tactomo_models.scene.pressure_field import Drawing
+from tactomo_models.scene.field_fit import FieldFit, FittedField, Measured
+
+MOST_MISSING = 8  # places that are told of
 
 
 @dataclass(frozen=True)
@@ -41,52 +43,67 @@ class MissingContact:
 
 
 class ContactSearch:
-    """Looks for a contact in what is left unexplained of one sheet.
+    """Looks for contacts in what is left unexplained.
 
     Args:
-        forward: the model of the sheet.
-        ratio: conductivity of a typical contact over the bare sheet's.
+        fit: of the sensor's sheets.
+        ratios: conductivity of a typical contact over the bare sheet's, of each sheet.
     """
 
-    def __init__(self, forward: ForwardModel, ratio: float) -> None:
+    def __init__(self, fit: FieldFit, ratios: Mapping[Channel, float]) -> None:
         grid = 2.0  # distance of the spots that are looked at, in distances of map nodes
         reach = 3.0  # radius over which the field is averaged there, likewise
-        self._forward = forward
-        self._dipole = 2 * (ratio - 1) / (ratio + 1)
-        description = forward.description
+        self._fit, self._forward = fit, fit.forward
+        self._dipoles = {name: 2 * (ratio - 1) / (ratio + 1) for name, ratio in ratios.items()}
+        description = self._forward.description
         spacing = description.width_m / (description.map.nodes_x - 1)
-        x, y = forward.bare.points[:, forward.bare.pressable]
+        bare = self._forward.bare
+        x, y = bare.points[:, bare.pressable]
         cell = np.round(np.stack([x, y]) / (grid * spacing)).astype(int)
         _, chosen = np.unique(cell, axis=1, return_index=True)
         self._nodes = np.sort(chosen)
         self._x, self._y = x[self._nodes], y[self._nodes]
-        self._probes = forward.probes(self._x, self._y, reach * spacing)
+        self._probes = self._forward.probes(self._x, self._y, reach * spacing)
 
-    def best(
-        self, solution: Solution, residual: FloatArray, drawing: Drawing, weight: FloatArray
-    ) -> MissingContact:
-        """The disc that would explain most of a residual.
+    def missing(self, fitted: FittedField, measured: Measured) -> list[MissingContact]:
+        """The discs that would explain most of what a field leaves, the best first.
+
+        What the known contacts would make of a disc by moving aside is allowed for: its
+        signature counts as far as theirs do not span it (orthogonal matching pursuit: Pati et
+        al., Asilomar 1993).
 
         Args:
-            solution: of what is known to be pressed.
-            residual: (M,) noise-weighted misfit that it leaves.
-            drawing: what is known to be pressed.
-            weight: (M,) inverse standard deviations of the data.
+            fitted: what is known to be pressed.
+            measured: what it is fitted to.
         """
         largest_m = 0.02  # radius of a contact to begin with
-        by_area = self._forward.spot_sensitivity(self._probes, solution)
-        by_area *= (self._dipole * weight / np.abs(self._forward.bare_voltages))[:, None]
-        power = np.maximum((by_area**2).sum(axis=0), 1e-30)
-        area = -(by_area.T @ residual) / power
+        apart_m = 0.012  # of two places: nearer ones mean the same contact
+        J = self._fit.jacobian(fitted, measured)
+        precision, offset = self._fit.prior(fitted)
+        normal = J.T @ J + np.diag(precision)
+        aside = np.linalg.solve(normal, J.T @ fitted.residual + precision * offset)
         pressed = np.zeros(self._forward.bare.pressable.shape)
-        pressed[drawing.nodes] = np.abs(drawing.enclosed)
-        bare = pressed[self._nodes] < 0.1
-        gain = np.where(bare & (area > 0), area**2 * power, 0.0)
-        best = int(gain.argmax())
-        radius = float(np.sqrt(max(area[best], 0.0) / np.pi))
-        return MissingContact(
-            float(self._x[best]),
-            float(self._y[best]),
-            min(radius, largest_m),
-            float(gain[best]),
-        )
+        pressed[fitted.drawing.nodes] = np.abs(fitted.drawing.enclosed)
+        gain = np.where(pressed[self._nodes] < 0.1, 1e-9, 0.0)
+        clearest, area = 0.0, np.zeros(len(gain))
+        for name, own in zip(measured, np.split(J, len(measured)), strict=True):
+            scale = self._dipoles[name] * measured[name].weight
+            by_area = self._forward.spot_sensitivity(self._probes, fitted.solutions[name])
+            by_area *= (scale / np.abs(self._forward.bare_voltages))[:, None]
+            cross = own.T @ by_area
+            spanned = (cross * np.linalg.solve(normal, cross)).sum(axis=0)
+            power = np.maximum((by_area**2).sum(axis=0) - spanned, 1e-30)
+            unexplained = by_area.T @ fitted.residuals[name] - cross.T @ aside
+            needed = np.maximum(-unexplained / power, 0.0)
+            gain = np.where(gain > 0, gain + needed**2 * power, 0.0)
+            if abs(self._dipoles[name]) > clearest:
+                clearest, area = abs(self._dipoles[name]), needed
+        found: list[MissingContact] = []
+        for spot in np.argsort(-gain):
+            if gain[spot] == 0 or len(found) == MOST_MISSING:
+                break
+            x, y = float(self._x[spot]), float(self._y[spot])
+            if all(np.hypot(x - other.x_m, y - other.y_m) > apart_m for other in found):
+                radius = min(float(np.sqrt(area[spot] / np.pi)), largest_m)
+                found.append(MissingContact(x, y, radius, float(gain[spot])))
+        return found

@@ -65,7 +65,8 @@ MAX_CONTACTS = 12
 # Gains and losses are in squared misfit, and count by how well the data are explained otherwise.
 SURE_GAIN = 30.0  # of a contact: the best of 500 places gains some 15 by noise alone
 CROWD = 4  # contacts among which two may pass for one
-CROWD_GAIN = 15.0  # of a split among them: two for one gain 30 and more there
+CROWD_GAIN = 15.0  # of two for one among them: they gain 30 and more there
+ASKED_OF_CROWD = 3  # splits and births: with each, one crowded scene in ten more is counted right
 LONG_GAIN = 5.0  # of two small contacts for a long one: about as many parameters
 SMALL_M = 0.006  # contacts of a smaller radius are asked whether they are needed
 
@@ -125,18 +126,18 @@ class _Tools:
         self.fit, self.questions = fit, questions
         self.field = PressureField.on(fit.forward, graded)
         self.level_set = LevelSet(fit.forward)
-        self._typical = {Channel.STRUCTURE: float(np.exp(fit.likely))}
+        typical = {Channel.STRUCTURE: float(np.exp(fit.likely))}
         if graded is not None:
             peak_kpa = np.array(self.field.typical_peak * self.field.unit_kpa)
-            self._typical[Channel.MAGNITUDE] = 1 + float(graded.relative_change(peak_kpa)[0])
-        self._searches: dict[Channel, ContactSearch] = {}
+            typical[Channel.MAGNITUDE] = 1 + float(graded.relative_change(peak_kpa)[0])
+        self.search = ContactSearch(fit, typical)
 
-    def search(self, measured: Measured) -> tuple[Channel, ContactSearch]:
-        """The channel that answers most, which shows best what is missing, and its search."""
-        name = max(measured, key=lambda name: abs(np.log(self._typical[name])))
-        if name not in self._searches:
-            self._searches[name] = ContactSearch(self.fit.forward, self._typical[name])
-        return name, self._searches[name]
+    def outlines_of(self, shape: FittedField, sheets: Measured) -> FittedField:
+        """The same contacts on one sheet, which says nothing of their pressures."""
+        assert isinstance(shape.family, PressureField)
+        each = shape.family.split(shape.parameters)
+        family = shape.family.of(each, shape.family.order, fits_peaks=False)
+        return self.fit.restricted(shape, family, family.join(each), sheets)
 
 
 class WarmStartedFit:
@@ -184,12 +185,19 @@ class WarmStartedFit:
         if len(measured) == 1:
             return self._course.follow(_Frame(measured, budget, propose))
         # The saturating sheet shows outlines best, and alone it costs half: what is there and of
-        # what form is found on it, and then all sheets judge together.
-        outlines = {Channel.STRUCTURE: measured[Channel.STRUCTURE]}
-        shape, how = self._course.follow(_Frame(outlines, budget, propose))
-        every = _Frame(measured, budget, None)
-        joint = self._joint.follow(shape, measured, budget, every.doubt)
-        self._joint.is_fit_of(self._course.adopt(joint, outlines))
+        # what form is found on it, and then all sheets judge together. In a crowd, what one sheet
+        # takes for one contact may be two on the other: there both search.
+        for _ in range(2):
+            both = self._course.searches_both
+            shape, how = self._course.follow(
+                _Frame(measured if both else _outlines(measured), budget, propose)
+            )
+            doubt = _Frame(measured, budget, None).doubt
+            asks = both or len(contacts_of(shape)) < CROWD
+            joint = self._joint.follow(shape, measured, budget, doubt, asks)
+            self._joint.is_fit_of(self._course.adopt(joint, measured))
+            if budget.over or self._course.searches_both == both:
+                break
         return replace(joint, converged=joint.converged and shape.converged), how
 
     @property
@@ -209,6 +217,7 @@ class _Course:
         self._from_nothing = True  # or from the shape of frames before
         self.doubts: dict[int, Doubt] = {}  # of contacts like these, by what is in doubt
         self._adopted: Drawing | None = None
+        self._lacking: tuple[FittedField, list[MissingContact]] | None = None
         self._halved: tuple[FittedField, list[tuple[FittedField, int]]] | None = None
         self._cold_start: _Course | None = None
         self._start_over()
@@ -234,16 +243,26 @@ class _Course:
             self._cold_start = None
         return shape, f"{how}, {_in_words(shape)}"
 
+    @property
+    def searches_both(self) -> bool:
+        """Whether both sheets search, or the one that shows outlines best."""
+        return self._shape is not None and len(self._shape.solutions) > 1
+
     def adopt(self, joint: FittedField, measured: Measured) -> Drawing:
         """Go on from what all channels have made of the shape in force, and return its drawing."""
         assert self._shape is not None
         family = joint.family
         if isinstance(family, PressureField) and joint.drawing is not self._adopted:
-            each = family.split(joint.parameters)
-            family = family.of(each, family.order, fits_peaks=False)
-            parameters = family.join(each)
-            known = self.tools.fit.restricted(joint, family, parameters, measured)
-            self._shape = replace(known, converged=self._shape.converged)
+            crowded, settled = family.count >= CROWD, self._shape.converged
+            sheets = measured if crowded else _outlines(measured)
+            shape = joint if crowded else self.tools.outlines_of(joint, sheets)
+            if crowded != self.searches_both:  # a crowd is searched anew, others are as they were
+                self._start_over()
+                self._moved = self._settled = True
+                self._tried_misfit = 0.0 if crowded else shape.misfit
+                self._settled_on = sheets
+                settled &= not crowded
+            self._shape = replace(shape, converged=settled)
             self._adopted = joint.drawing
         return self._shape.drawing
 
@@ -275,6 +294,9 @@ class _Course:
         """The last frame's shape where it still holds; else the best of what may be left of it."""
         max_left = 0.25  # of the cost of nothing, that contacts which moved leave to a new frame
         before = self._shape
+        if before is not None and len(before.solutions) > len(frame.measured):  # a scan was lost
+            known = isinstance(before.family, PressureField)
+            before = self.tools.outlines_of(before, frame.measured) if known else None
         if before is None:
             return self._from_scratch(frame)
         shape = self.tools.fit.compare(before, frame.measured)
@@ -389,11 +411,11 @@ class _Course:
             return []
         if self.shape_model == ShapeModel.LEVEL_SET:
             return [self._birth, self._escalate]
-        questions = self.tools.questions if Channel.MAGNITUDE in shape.residuals else ()
+        questions = self.tools.questions if [*shape.residuals] == [Channel.MAGNITUDE] else ()
         inside: list[_Move] = [partial(self._with, question) for question in questions]
         form = [self._of_higher_order, self._modulate, *inside, *self._splits(shape)]
-        if shape.misfit > GOOD_MISFIT:
-            form.append(self._birth_anywhere)
+        if shape.misfit > GOOD_MISFIT or shape.family.count >= CROWD:
+            form += [self._birth_anywhere(rank) for rank in range(ASKED_OF_CROWD)]
         free = [self._escalate] if self.shape_model == ShapeModel.AS_NEEDED else []
         return [self._birth, *form, *free, *self._deaths(shape)]
 
@@ -404,28 +426,44 @@ class _Course:
     def _birth(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
         """A further contact, away from those that are known."""
         near_m = 0.012  # what is missing this near an outline is more likely a part of its form
-        return self._with_another(shape, frame, near_m)
+        # Circles leave much unexplained that a better form will explain: no contact is made of it.
+        each, needed = contacts_of(shape), SURE_GAIN * _scale(shape, frame)
+        circles = isinstance(shape.family, PressureField) and shape.family.order < 2 and len(each)
+        sure = 2 * needed if circles else needed
+        for found in self._missing(shape, frame):
+            if found.gain > sure and _gap_m(each, found) > near_m:
+                return self._with_another(shape, found, needed, frame)
+        return None
 
-    def _birth_anywhere(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
-        return self._with_another(shape, frame, -np.inf)
+    def _birth_anywhere(self, rank: int) -> _Move:
+        """A further contact, beside or between others."""
+        likely = 0.5  # gain to first order, over what is needed; 0.2 finds no more
 
-    def _with_another(
-        self, shape: FittedField, frame: _Frame, least_gap_m: float
-    ) -> _Candidate | None:
+        def move(shape: FittedField, frame: _Frame) -> _Candidate | None:
+            needed = (CROWD_GAIN if self.searches_both else SURE_GAIN) * _scale(shape, frame)
+            missing = self._missing(shape, frame)
+            if rank >= len(missing) or missing[rank].gain < likely * needed:
+                return None
+            return self._with_another(shape, missing[rank], needed, frame)
+
+        return move
+
+    def _missing(self, shape: FittedField, frame: _Frame) -> list[MissingContact]:
+        """Contacts that may be missing, the likeliest first."""
         smallest_m = 0.003  # radius below which it is an error of the model, not a contact
         if not isinstance(shape.family, PressureField) or shape.family.count == MAX_CONTACTS:
-            return None
-        name, search = self.tools.search(frame.measured)
-        found = search.best(
-            shape.solutions[name], shape.residuals[name], shape.drawing, frame.measured[name].weight
-        )
-        frame.budget.spend(shape)  # about what a search takes, too
+            return []
+        if self._lacking is None or self._lacking[0] is not shape:
+            found = self.tools.search.missing(shape, frame.measured)
+            frame.budget.spend(shape)  # about what a search takes, too
+            self._lacking = shape, [each for each in found if each.radius_m > smallest_m]
+        return self._lacking[1]
+
+    def _with_another(
+        self, shape: FittedField, found: MissingContact, gain: float, frame: _Frame
+    ) -> _Candidate | None:
+        assert isinstance(shape.family, PressureField)
         each = shape.family.split(shape.parameters)
-        worth = SURE_GAIN * _scale(shape, frame)
-        # Circles leave much unexplained that a better form will explain: no contact is made of it.
-        sure = worth * (2 if shape.family.order < 2 and len(each) else 1)
-        if found.gain < sure or found.radius_m < smallest_m or _gap_m(each, found) <= least_gap_m:
-            return None
         further = np.zeros((1, COLUMNS))
         further[0, [X, Y, SIZE, PEAK]] = (
             found.x_m / UNIT_M,
@@ -435,7 +473,7 @@ class _Course:
         )
         order = shape.family.order
         other = self._evaluate(np.vstack([each, further]), order, shape.log_ratio, frame)
-        return _Candidate(other, worth) if other else None
+        return _Candidate(other, gain) if other else None
 
     def _of_higher_order(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
         worth = 2.5  # of one more parameter of a form
@@ -482,7 +520,6 @@ class _Course:
     def _splits(self, shape: FittedField) -> list[_Move]:
         """Moves that make two contacts of one: those that stand it best, one after the other."""
         elongated = 0.4  # half the logarithm of the axes' ratio (2.2), from which it may be two
-        asked_of_crowd = 3  # contacts: with each, one crowded scene in ten more is counted right
         each = contacts_of(shape)
         if not 0 < len(each) < MAX_CONTACTS:
             return []
@@ -491,7 +528,7 @@ class _Course:
         asked = (
             np.arange(len(each)) if shape.misfit > GOOD_MISFIT or crowd else np.flatnonzero(long)
         )
-        count = asked_of_crowd if crowd else 1
+        count = ASKED_OF_CROWD if crowd else 1
 
         def split(rank: int) -> _Move:
             def move(shape: FittedField, frame: _Frame) -> _Candidate | None:
@@ -591,7 +628,14 @@ _Move: TypeAlias = Callable[[FittedField, _Frame], _Candidate | None]
 
 
 def _scale(shape: FittedField, frame: _Frame) -> float:
-    return unit_of_gain(shape, frame.doubt)
+    unit = unit_of_gain(shape, frame.doubt)
+    # Many contacts on both sheets that are explained better than noise and model allow for tell
+    # that these were overrated, and gains underrated: without it 0.01 of crowds' ICC is lost.
+    return unit * min(1.0, shape.misfit**2) if len(shape.residuals) > 1 else unit
+
+
+def _outlines(measured: Measured) -> Measured:
+    return {Channel.STRUCTURE: measured[Channel.STRUCTURE]}
 
 
 def _in_words(shape: FittedField) -> str:

@@ -35,14 +35,9 @@ def test_the_search_finds_the_contact_that_is_missing(
         return field_
 
     volts = fitted(KNOWN, MISSING).solutions[Channel.STRUCTURE].voltages
-    changes = measured((volts - bare) / np.abs(bare), 100.0)
-    known = fit.compare(fitted(KNOWN), {Channel.STRUCTURE: changes})
-    found = ContactSearch(forward, ratio).best(
-        known.solutions[Channel.STRUCTURE],
-        known.residuals[Channel.STRUCTURE],
-        known.drawing,
-        changes.weight,
-    )
+    changes = {Channel.STRUCTURE: measured((volts - bare) / np.abs(bare), 100.0)}
+    known = fit.compare(fitted(KNOWN), changes)
+    found = ContactSearch(fit, {Channel.STRUCTURE: ratio}).missing(known, changes)[0]
     assert np.hypot(found.x_m - 0.012, found.y_m - 0.006) < 0.005
     assert found.radius_m == pytest.approx(0.004, rel=0.35)
     assert found.gain > 10

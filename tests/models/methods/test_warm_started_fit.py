@@ -8,7 +8,9 @@ from pressed import Sensor, contact, contacts, data_of, described
 from tactomo_models import Channel, SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_models.methods.warm_started_fit import ShapeModel, WarmStartedFit
+from tactomo_models.physics.bare_sheet import solve_bare_sheet
 from tactomo_models.physics.forward import ForwardModel
+from tactomo_models.physics.mesh import mesh_sheet
 from tactomo_models.scene.field_fit import Budget, FittedField, Measured
 from tactomo_models.scene.pressure_field import EDGE, HOLE, PEAK, UNIT_M, PressureField, X, Y
 
@@ -224,3 +226,52 @@ def test_a_flat_press_that_lands_is_not_soft_for_want_of_time(
     (one,) = shape.family.split(shape.parameters)
     assert one[[EDGE, HOLE]] == pytest.approx([0, 0])
     assert one[PEAK] == pytest.approx(pressed[PEAK], rel=0.05)
+
+
+CORNERS = tuple(
+    contact(x, y, 0.008)
+    for x, y in ((-0.046, -0.045), (-0.042, 0.046), (0.042, -0.044), (0.046, 0.045))
+)
+BESIDE = contact(-0.014, -0.002, 0.008), contact(0.014, 0.0, 0.008)
+
+
+@pytest.fixture(scope="module")
+def large(paper: SensorDescription) -> Sensor:
+    """A sheet of sixteen electrodes: eight tell no six contacts."""
+    forward = ForwardModel(paper, solve_bare_sheet(paper, mesh_sheet(paper, refinements=1)))
+    return Sensor.of(forward, paper)
+
+
+@pytest.fixture
+def stacked(large: Sensor) -> Skin:
+    return Skin(large)
+
+
+def test_two_in_a_crowd_are_not_taken_for_one(stacked: Skin) -> None:
+    """Both sheets search, also when what is proposed is one for two; and stay with it."""
+    fit = WarmStartedFit(stacked.sensor.fit)
+    proposed = contacts(*CORNERS, contact(0.0, 0.0, 0.012))
+    for _ in range(4):
+        frame = stacked.frame(*CORNERS, *BESIDE, noise=2e-4)
+        shape, how = fit.follow(frame, Budget(PLENTY_S), lambda: proposed)
+    assert_at(shape, *CORNERS, *BESIDE)
+    assert "still" in how
+
+
+def test_a_crowd_that_moves_shrinks_or_misses_a_sheet_is_followed(stacked: Skin) -> None:
+    """What both sheets have found is kept on one, and by the sheets that come back."""
+    fit = WarmStartedFit(stacked.sensor.fit)
+    follow(fit, stacked.frame(*CORNERS, *BESIDE, noise=2e-4))
+    one, other = BESIDE
+    for k in range(4):
+        moved = one.copy()
+        moved[Y] += 0.001 * (k + 1) / UNIT_M
+        frame = stacked.frame(*CORNERS, moved, other, noise=2e-4)
+        shape, _ = follow(fit, frame)
+    assert_at(shape, *CORNERS, moved, other)
+    alone, _ = follow(fit, {Channel.STRUCTURE: frame[Channel.STRUCTURE]})
+    assert len(places_of(alone)) == 6
+    back, _ = follow(fit, stacked.frame(*CORNERS, moved, other, noise=2e-4))
+    assert_at(back, *CORNERS, moved, other)
+    few, _ = follow(fit, stacked.frame(*CORNERS[:2], noise=2e-4))
+    assert_at(few, *CORNERS[:2])
