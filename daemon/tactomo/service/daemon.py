@@ -189,6 +189,7 @@ class Daemon:
                 "reload_calibration": lambda _: self._reload_calibration(),
             },
             on_idle=self._check,
+            on_event=self._on_event,
         )
         self._status = Status(
             description,
@@ -354,9 +355,12 @@ class Daemon:
         self._control.cut_connections()
 
     def _turns(self) -> Mapping[str, int]:
-        """Return how often each thread went round its loop, of those that are not at their end."""
+        """Return how often each thread went round its loop, of those that are not at their end.
+
+        Control is not among them: nothing that is asked of it may end the stream.
+        """
         ports = [port for port in self._ports if not port.has_ended]
-        watched = (self._pipeline, self._control, self._publisher, *ports)
+        watched = (self._pipeline, self._publisher, *ports)
         return {worker.name: worker.turns for worker in watched}
 
     def _summary(self) -> str:

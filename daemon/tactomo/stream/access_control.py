@@ -11,6 +11,7 @@ It is read again when it changes. A client that was taken off it is cut off with
 from __future__ import annotations
 
 import contextlib
+import os
 import shlex
 import threading
 import time
@@ -48,7 +49,8 @@ def load_server_keys(secret: Path, clients: Path) -> ServerKeys:
     """Read a server's secret key.
 
     Raises:
-        KeysError: it cannot be used, see `read_secret`, or there is no such folder of clients.
+        KeysError: it cannot be used, see `read_secret`, or there is no such folder of clients, or
+            others than its owner may write to that.
 
     """
     if not clients.is_dir():
@@ -56,7 +58,27 @@ def load_server_keys(secret: Path, clients: Path) -> ServerKeys:
             f"there is no folder {clients} of clients that may come in",
             f"make it: `mkdir -p {shlex.quote(str(clients))}`; then {how_to_allow(clients)}",
         )
+    check_closed(clients)
     return ServerKeys(read_secret(secret)[1], clients)
+
+
+def check_closed(clients: Path) -> None:
+    """Raise KeysError where others than root and this process's user may add keys to a list."""
+    folders = [clients, clients / MAY_COMMAND, *clients.glob(f"**/*{PUBLIC_SUFFIX}")]
+    for path in folders:
+        try:
+            info = path.stat()
+        except OSError:  # none may command, or removed in this very moment
+            continue
+        if info.st_mode & 0o022 or info.st_uid not in (0, os.geteuid()):
+            quoted = shlex.quote(str(path))
+            raise KeysError(
+                f"{path} belongs to user {info.st_uid} and has the mode {info.st_mode & 0o777:o}: "
+                "others could let themselves in",
+                f"take out what is not yours, then `chown {os.geteuid()} {quoted}` and "
+                f"`chmod go-w {quoted}`",
+                "clients_not_closed",
+            )
 
 
 class AllowList:
@@ -87,7 +109,20 @@ class AllowList:
             signature = _signature([*files[STREAM], *files[CONTROL]])
             if signature != self._signature:
                 self._signature = signature
-                self._take({domain: self._keys(paths) for domain, paths in files.items()})
+                keys = {domain: self._keys(paths) for domain, paths in files.items()}
+                self._take(keys if self._is_closed() else self._known(keys))
+
+    def _is_closed(self) -> bool:
+        try:
+            check_closed(self._folder)
+        except KeysError as error:
+            self._on_event("client_key_unusable", "warning", error.cause, error.next_step)
+            return False
+        return True
+
+    def _known(self, keys: dict[str, frozenset[bytes]]) -> dict[str, frozenset[bytes]]:
+        """Return those that are allowed already: of an open list, nobody new comes in."""
+        return {domain: found & self._allowed[domain] for domain, found in keys.items()}
 
     def _take(self, keys: dict[str, frozenset[bytes]]) -> None:
         before = self._allowed

@@ -1,8 +1,8 @@
 """The control thread: the only one that touches the control socket.
 
-Requests come from anybody on this computer, or who has a key, so each is bounded in size and
-checked whole before anything happens. A command whose outcome takes time (`tare`) is answered when
-it is known, and holds up no other client meanwhile.
+Requests come from anybody on this computer, or who has a key, so each is bounded in size and parts
+and checked whole before anything happens. A command whose outcome takes time (`tare`) is answered
+when it is known, and holds up no other client meanwhile.
 """
 
 from __future__ import annotations
@@ -21,10 +21,12 @@ from tactomo_client import MessageError
 from tactomo_client.messages import decode_request, encode_error, encode_reply
 
 from tactomo.config import BudgetMs
-from tactomo.endpoint import bind, rebind
+from tactomo.endpoint import rebind
 from tactomo.errors import CommandError, TactomoError
+from tactomo.events import OnEvent
 from tactomo.stream.access_control import CONTROL
 from tactomo.stream.commands import Arguments, Nothing, obey
+from tactomo.stream.peers import Peers
 from tactomo.worker import Worker
 
 MAX_REQUEST_BYTES: Final = 64 * 1024
@@ -106,19 +108,24 @@ class Control(Worker):
     Args:
         handlers: one for each of COMMANDS; called by the thread with the checked arguments.
         on_idle: called by the thread several times a second.
+        on_event: told of connections that were cut.
 
     Attributes:
         address: where it is bound, once open.
 
     """
 
-    def __init__(self, handlers: Mapping[str, Handler], on_idle: Callable[[], None]) -> None:
+    def __init__(
+        self, handlers: Mapping[str, Handler], on_idle: Callable[[], None], on_event: OnEvent
+    ) -> None:
         super().__init__("control")
         self.address = ""
+        self._on_event = on_event
         self._handlers = handlers
         self._on_idle = on_idle
         self._pending: list[_Pending] = []
         self._socket: zmq.Socket[bytes]
+        self._peers: Peers
         self._cut = threading.Event()
 
     def open(
@@ -132,13 +139,15 @@ class Control(Worker):
         self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_REQUEST_BYTES)
         self._socket.setsockopt(zmq.RCVHWM, QUEUED_PER_CLIENT)
         self._socket.setsockopt(zmq.SNDHWM, QUEUED_PER_CLIENT)
-        self.address = bind(self._socket, endpoint, CONTROL, secret=secret)
+        self._peers = Peers(self._socket, endpoint, CONTROL, self._on_event, secret)
+        self.address = self._peers.address
 
     def cut_connections(self) -> None:
         """Have every client connect anew, those who still may; for any thread."""
         self._cut.set()
 
     def _close(self) -> None:
+        self._peers.close()
         self._socket.close(LINGER_MS)
 
     def _run(self) -> None:
@@ -150,6 +159,7 @@ class Control(Worker):
             if self._cut.is_set():
                 self._cut.clear()
                 rebind(self._socket, self.address)
+            self._peers.check()
             self._on_idle()
         for waiting in self._pending:
             if not waiting.future.done():
@@ -157,8 +167,11 @@ class Control(Worker):
         self._answer_pending()
 
     def _receive(self) -> None:
+        parts = self._peers.receive()
+        if parts is None:
+            return
         # The envelope (identity, then an empty part) is handed back as it came.
-        *envelope, data = self._socket.recv_multipart()
+        *envelope, data = parts
         try:
             outcome = self._obey(*decode_request(data))
         except (MessageError, TactomoError) as error:

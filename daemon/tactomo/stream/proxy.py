@@ -95,7 +95,7 @@ class Proxy:
             self._access.start()
         self._outlet: zmq.Socket[bytes] = self._context.socket(zmq.XPUB)
         self._outlet.setsockopt(zmq.SNDHWM, QUEUED_PER_SUBSCRIBER)
-        self._readers = Subscribers(self._outlet, self._endpoint, STREAM, secret, "--bind")
+        self._readers = Subscribers(self._outlet, self._endpoint, STREAM, _tell, secret, "--bind")
         self.address = self._readers.address
         for source in self.sources:
             self._inlets.append(_Inlet(self._context, source, self._source_keys))
@@ -113,6 +113,7 @@ class Proxy:
             for inlet in self._inlets:
                 if inlet.socket in ready:
                     self._pass_messages(inlet)
+            self._readers.check()
             self._look_after()
 
     def stop(self) -> None:
@@ -124,6 +125,7 @@ class Proxy:
         for inlet in self._inlets:
             inlet.close()
         if self.address:
+            self._readers.close()
             self._outlet.close(LINGER_MS)
         if self._access is not None:
             self._access.stop()

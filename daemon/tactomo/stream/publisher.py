@@ -27,6 +27,8 @@ from tactomo.timing import Durations
 from tactomo.worker import Worker
 
 STATUS_PERIOD_S: Final = 1.0
+CHECK_S: Final = 0.05
+"""How often subscribers are looked at: what comes of one meanwhile is memory."""
 LINGER_MS: Final = 200
 """How long messages that were sent may take to leave when the daemon stops."""
 QUEUED_PER_SUBSCRIBER: Final = 64
@@ -117,13 +119,14 @@ class Publisher(Worker):
         """Bind the stream's socket; raise AddressError where the address cannot be had."""
         self._socket = context.socket(zmq.XPUB)
         self._socket.setsockopt(zmq.SNDHWM, QUEUED_PER_SUBSCRIBER)
-        self._readers = Subscribers(self._socket, endpoint, STREAM, secret)
+        self._readers = Subscribers(self._socket, endpoint, STREAM, self._on_event, secret)
         self.address = self._readers.address
         self._wake_reader, self._wake_writer = os.pipe()
         os.set_blocking(self._wake_reader, False)
         os.set_blocking(self._wake_writer, False)
 
     def _close(self) -> None:
+        self._readers.close()
         self._socket.close(LINGER_MS)
         for descriptor in (self._wake_reader, self._wake_writer):
             os.close(descriptor)
@@ -184,7 +187,8 @@ class Publisher(Worker):
         poller.register(self._wake_reader, zmq.POLLIN)
         status_at_s = time.monotonic()
         while not self._stopping.is_set():
-            wait_s = max(0.0, status_at_s - time.monotonic())
+            wait_s = min(CHECK_S, max(0.0, status_at_s - time.monotonic()))
+            self._readers.check()
             for ready, _ in poller.poll(math.ceil(wait_s * 1e3)):
                 if ready is self._socket:
                     self._read_subscriptions()

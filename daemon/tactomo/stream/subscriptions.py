@@ -14,7 +14,9 @@ from typing import Final
 
 import zmq
 
-from tactomo.endpoint import bind, rebind
+from tactomo.endpoint import rebind
+from tactomo.events import OnEvent
+from tactomo.stream.peers import Peers
 
 MAX_PREFIX_BYTES: Final = 1024
 MAX_BYTES: Final = 1 << 20
@@ -45,6 +47,7 @@ class Subscribers:
         socket: zmq.Socket[bytes],
         endpoint: str,
         purpose: str,
+        on_event: OnEvent,
         secret: bytes | None = None,
         option: str = "",
     ) -> None:
@@ -54,7 +57,8 @@ class Subscribers:
         # 1, libzmq 4.3.5 makes a peer that is never heard after a CURVE handshake.)
         socket.setsockopt(zmq.RCVHWM, 16)
         socket.setsockopt(zmq.MAXMSGSIZE, MAX_PREFIX_BYTES)
-        self.address = bind(socket, endpoint, purpose, secret=secret, option=option)
+        self._peers = Peers(socket, endpoint, purpose, on_event, secret, option)
+        self.address = self._peers.address
         self.prefixes: Counter[bytes] = Counter()
         self.cuts = 0
         self._socket = socket
@@ -79,6 +83,14 @@ class Subscribers:
             self._cut_at_s = time.monotonic() + CUT_PERIOD_S
             self.cuts += 1
             self.cut()
+
+    def check(self) -> None:
+        """Cut who sends without end; to be called several times a second."""
+        self._peers.check()
+
+    def close(self) -> None:
+        """Watch the connections no more; before the socket is closed."""
+        self._peers.close()
 
     def cut(self) -> None:
         """End every connection; those who may come back do so by themselves."""

@@ -132,7 +132,8 @@ class ControlSocket:
     def answer(self) -> None:
         """Answer every request that waits; returns at once when there is none."""
         while self._socket.poll(0):
-            self._socket.send(self._reply(self._socket.recv()))
+            request = self._socket.recv_multipart()
+            self._socket.send(self._reply(request[0] if len(request) == 1 else b""))
 
     def close(self) -> None:
         """Unbind."""

@@ -426,6 +426,33 @@ def test_a_doorkeeper_that_dies_is_noticed_and_can_be_stopped(
     context.term()
 
 
+@pytest.mark.parametrize("mode", [0o777, 0o775, 0o757])
+@pytest.mark.parametrize("place", ["", "may_command", "may_command/desk.key"])
+def test_a_list_that_others_can_write_to_is_refused(
+    bench: Start, robot: Robot, mode: int, place: str
+) -> None:
+    robot.allow(robot.client("desk"), may_command=True)
+    (key_files.clients_folder(robot.folder, SERVER) / place).chmod(mode)
+    with pytest.raises(KeysError, match=f"{mode:o}") as caught:
+        bench(**robot.config)
+    assert "chmod go-w" in caught.value.next_step
+
+
+def test_nobody_new_comes_in_by_a_list_that_was_opened(guarded: Any, robot: Robot) -> None:
+    folder = key_files.clients_folder(robot.folder, SERVER)
+    folder.chmod(0o777)
+    ros = robot.allow(robot.client("ros"))
+    assert "chmod go-w" in guarded.listener.event("client_key_unusable")["next_step"]
+    assert guarded.ask("status")  # who was in stays in
+    with (
+        pytest.raises(KeysError),
+        subscribe(
+            SERVER, address=guarded.daemon.stream_address, timeout_s=PATIENCE_S, keys=ros
+        ) as skin,
+    ):
+        next(iter(skin))
+
+
 def test_a_bad_file_on_the_list_locks_nobody_else_out(guarded: Any, robot: Robot) -> None:
     listed = key_files.clients_folder(robot.folder, SERVER)
     (listed / "broken.key").write_text("public-key = nonsense\n")

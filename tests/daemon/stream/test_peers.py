@@ -1,0 +1,111 @@
+"""Messages of too many parts, and messages without an end: nobody waits, and memory is bounded."""
+
+from __future__ import annotations
+
+import os
+import pty
+import socket
+import struct
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+import zmq
+from daemon_process import DaemonProcess
+from tactomo_client import request
+from tactomo_client.messages import decode_reply, encode_request
+from waiting import wait_until
+
+PART, LAST = b"\x01\x01x", b"\x00\x01x"
+PARTS = 1_000_000
+MAX_GROWN_MB = 500.0
+"""What one connection can send until it is looked at on a busy computer; alone, 50 to 250 MB."""
+MAX_KEPT_MB = 100.0
+
+
+@pytest.fixture
+def daemon(tmp_path: Path) -> Iterator[DaemonProcess]:
+    device, host = pty.openpty()
+    process = DaemonProcess(tmp_path, [os.ttyname(host)])
+    yield process
+    process.kill()
+    for descriptor in (device, host):
+        os.close(descriptor)
+
+
+@contextmanager
+def peer(address: str, kind: bytes) -> Iterator[socket.socket]:
+    """Connect as a ZeroMQ socket of some kind does, and send what one likes."""
+    where = urlsplit(address)
+    name = b"\x0bSocket-Type" + struct.pack(">I", len(kind)) + kind
+    with socket.create_connection((where.hostname, where.port or 0)) as line:
+        line.sendall(b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32))
+        line.sendall(bytes([4, 6 + len(name)]) + b"\5READY" + name)
+        greeted = b""
+        while b"READY" not in greeted:
+            greeted += line.recv(4096)
+        yield line
+
+
+@pytest.mark.parametrize("parts", [PARTS, 4 * PARTS])
+def test_a_message_of_a_million_parts_holds_up_nobody(daemon: DaemonProcess, parts: int) -> None:
+    slowest_s = 0.0
+    with peer(daemon.control, b"DEALER") as line:
+        with suppress(ConnectionError):
+            line.sendall(PART * (parts - 1) + LAST)
+        end_s = time.monotonic() + 3.0
+        while time.monotonic() < end_s:
+            begin_s = time.monotonic()
+            request("status", daemon.control, 10.0)
+            slowest_s = max(slowest_s, time.monotonic() - begin_s)
+    assert slowest_s < 2.0
+
+
+@pytest.mark.parametrize(("socket_name", "kind"), [("control", b"DEALER"), ("stream", b"SUB")])
+@pytest.mark.parametrize("size", [1, 1000])
+def test_a_message_without_an_end_is_cut(
+    daemon: DaemonProcess, socket_name: str, kind: bytes, size: int
+) -> None:
+    before_mb, highest_mb = daemon.rss_mb, 0.0
+    part = PART if size == 1 else struct.pack(">BQ", 3, size) + bytes(size)
+    portion = part * (60_000 // len(part))
+    with peer(getattr(daemon, socket_name), kind) as line, suppress(ConnectionError):
+        for _ in range(1000):  # 60 MB, which would take 1.2 GB
+            line.sendall(portion)
+            highest_mb = max(highest_mb, daemon.rss_mb)
+    wait_until(lambda: "connection_cut" in daemon.status()["events"]["counts"], "the cut")
+    wait_until(lambda: daemon.rss_mb - before_mb < MAX_KEPT_MB, "memory to be given back")
+    assert highest_mb - before_mb < MAX_GROWN_MB
+
+
+def test_who_asks_a_lot_and_reads_the_answers_is_not_cut(daemon: DaemonProcess) -> None:
+    dealer: Any = zmq.Context.instance().socket(zmq.DEALER)
+    dealer.setsockopt(zmq.LINGER, 0)
+    dealer.connect(daemon.control)
+    padding = "x" * 50_000
+    for _ in range(200):  # 10 MB
+        dealer.send_multipart([b"", encode_request("status", {})])
+        dealer.send_multipart([b"", encode_request(padding, {})])
+        for _ in range(2):
+            assert dealer.poll(30_000)
+            dealer.recv_multipart()
+    dealer.send_multipart([b"", encode_request("status", {})])
+    assert dealer.poll(30_000)
+    assert "connection_cut" not in decode_reply(dealer.recv_multipart()[1])["events"]["counts"]
+    dealer.close()
+
+
+def test_a_few_parts_more_are_no_reason_to_be_silent(daemon: DaemonProcess) -> None:
+    dealer: Any = zmq.Context.instance().socket(zmq.DEALER)
+    dealer.setsockopt(zmq.LINGER, 0)
+    dealer.connect(daemon.control)
+    for _ in range(20):
+        dealer.send_multipart([b"x"] * 9)
+    dealer.send_multipart([b"", encode_request("status", {})])
+    assert dealer.poll(30_000)
+    assert decode_reply(dealer.recv_multipart()[1])["state"]
+    dealer.close()
