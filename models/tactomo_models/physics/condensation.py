@@ -38,7 +38,7 @@ class Condensed:
     def times(self, potentials: FloatArray) -> FloatArray:
         """Currents (r, k) into all rims, by the potentials (r, k) there."""
         each = zip(self.rims, self._by_area(potentials), strict=True)
-        return np.concatenate([rim @ of_rim for rim, of_rim in each])
+        return _joined([rim @ of_rim for rim, of_rim in each])
 
     def inwards(self, potentials: FloatArray) -> FloatArray:
         """Potentials (n, k) of all nodes in the order of the layers, by the rims' (r, k)."""
@@ -51,7 +51,11 @@ class Condensed:
         return np.concatenate(found)
 
     def _by_area(self, potentials: FloatArray) -> list[FloatArray]:
-        return np.split(potentials, np.cumsum([len(rim) for rim in self.rims[:-1]]))
+        each, start = [], 0  # `np.split` takes longer than all that is done with them
+        for rim in self.rims:
+            each.append(potentials[start : start + len(rim)])
+            start += len(rim)
+        return each
 
 
 class Condensation:
@@ -113,7 +117,7 @@ class Condensation:
         for layer in reversed(range(len(self._size))):
             block = flat[self._offset[layer] : self._offset[layer + 1]]
             block = block.reshape(-1, self._size[layer])
-            coupling, own = np.split(block, self._outer[layer : layer + 1])
+            coupling, own = block[: self._outer[layer]], block[self._outer[layer] :]
             own -= given
             if self._is_rim[layer]:
                 rims.insert(0, own)
@@ -127,6 +131,10 @@ class Condensation:
             inner[0].insert(0, (lower, coupled))
             given = coupled.T @ coupled
         return Condensed(rims, inner[1:])
+
+
+def _joined(each: list[FloatArray]) -> FloatArray:
+    return each[0] if len(each) == 1 else np.concatenate(each)
 
 
 def _depths(neighbours: IntArray, rim: BoolArray) -> IntArray:

@@ -79,8 +79,8 @@ class _PressedAreas:
         rim: (r,) positions of those on rims.
         potentials: (r, L - 1) u0.
         green: (r, r) G.
-        bare_currents: (r, L - 1) S0 u0.
-        bare_response: (r, r) S0 G.
+        both: (r, r + L - 1) G and u0 side by side.
+        bare_both: (r, r + L - 1) S0 G and S0 u0.
     """
 
     triangles: IntArray
@@ -89,8 +89,8 @@ class _PressedAreas:
     rim: IntArray
     potentials: FloatArray
     green: FloatArray
-    bare_currents: FloatArray
-    bare_response: FloatArray
+    both: FloatArray
+    bare_both: FloatArray
 
 
 class ForwardModel:
@@ -190,17 +190,18 @@ class ForwardModel:
             return Solution(self.bare_voltages, nowhere, none, nowhere, none)
         areas = self._areas(triangles)
         at_corners = self._at_corners(triangles, change)
-        conductivity = at_corners.mean(axis=1)
+        conductivity = at_corners.sum(axis=1) / 3
         if mix_resistivities:
             better = self._better(triangles, at_corners)
-            conductivity[better] = 1 / (1 / at_corners[better]).mean(axis=1)
+            conductivity[better] = 3 / (1 / at_corners[better]).sum(axis=1)
         condensed = areas.condensation.condense(
             conductivity[:, None, None] * self._stiffness[triangles]
         )
-        system = condensed.times(areas.green) - areas.bare_response
-        system[np.diag_indices(len(system))] += 1.0
-        currents = areas.bare_currents - condensed.times(areas.potentials)
-        injected = np.asarray(np.linalg.solve(system, currents), np.float64)
+        added = condensed.times(areas.both) - areas.bare_both  # (S - S0) (G, u0)
+        rim = len(areas.rim)
+        system = added[:, :rim]
+        system[np.diag_indices(rim)] += 1.0
+        injected = np.asarray(np.linalg.solve(system, -added[:, rim:]), np.float64)
         transfer = self.bare.transfer.copy()
         transfer[:-1, :-1] += areas.potentials.T @ injected
         return Solution(
@@ -244,16 +245,18 @@ class ForwardModel:
             condensation.corners,
             depth,
         )
-        potentials, green = self.bare.potentials[near], self._green(near, near[on_rim])
+        potentials = self.bare.potentials[near]
+        both = np.concatenate([self._green(near, near[on_rim]), potentials], axis=1)
+        rim = np.count_nonzero(on_rim)
         return _PressedAreas(
             triangles=triangles,
             condensation=condensation,
             nodes=nodes,
             rim=near[on_rim],
             potentials=potentials[on_rim],
-            green=green[on_rim],
-            bare_currents=law @ potentials,
-            bare_response=law @ green,
+            green=both[on_rim, :rim],
+            both=both[on_rim],
+            bare_both=law @ both,
         )
 
     def _green(self, rows: IntArray, columns: IntArray | None = None) -> FloatArray:

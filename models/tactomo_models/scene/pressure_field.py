@@ -18,7 +18,6 @@ Where contacts overlap, what is pressed is pressed once, with the mean of their 
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 
@@ -206,30 +205,36 @@ class PressureField:
         max_elongated = 0.9  # half the logarithm of the ratio of an ellipse's axes
         each = self.split(parameters)
         for column, nodes in ((X, self.x_m), (Y, self.y_m)):
-            each[:, column] = np.clip(each[:, column], nodes.min() / UNIT_M, nodes.max() / UNIT_M)
-        largest = LARGEST_CIRCLE if self.order < 2 else SIZE_LIMITS[1]
-        each[:, SIZE] = np.clip(each[:, SIZE], SIZE_LIMITS[0], largest)
+            _limit(each[:, column], nodes.min() / UNIT_M, nodes.max() / UNIT_M)
+        _limit(each[:, SIZE], SIZE_LIMITS[0], LARGEST_CIRCLE if self.order < 2 else SIZE_LIMITS[1])
         elongation = np.maximum(np.hypot(each[:, E1], each[:, E2]), 1e-12)
         each[:, E1:HARMONIC] *= np.minimum(1, max_elongated / elongation)[:, None]
-        each[:, HARMONIC:PEAK] = np.clip(each[:, HARMONIC:PEAK], -MAX_BULGE, MAX_BULGE)
-        each[:, PEAK] = np.clip(each[:, PEAK], *self.peak_limits)
-        each[:, EDGE] = np.where(each[:, EDGE] > 0, np.clip(each[:, EDGE], *EDGE_LIMITS), 0.0)
+        _limit(each[:, HARMONIC:PEAK], -MAX_BULGE, MAX_BULGE)
+        _limit(each[:, PEAK], *self.peak_limits)
+        flat = each[:, EDGE] <= 0
+        _limit(each[:, EDGE], *EDGE_LIMITS)
+        each[flat, EDGE] = 0.0
         return self.join(each)
 
     def draw(self, parameters: FloatArray) -> Drawing:
         """Draw the field on the nodes."""
         each = self.split(parameters)
         near = self._near(each)
-        outlines = _Outlines(self, each, self.x_m[near], self.y_m[near])
-        there = (outlines.t + self.offset_m / self.half_width_m > -1).any(axis=0)
-        near, drawn = near[there], _Contacts(self, each, outlines.at(there))
+        drawn = _Contacts(self, each, _Outlines(self, each, self.x_m[near], self.y_m[near]))
+        there = np.flatnonzero((drawn.wide > -1).any(axis=0))
 
         @cache
         def slopes() -> tuple[FloatArray, FloatArray, FloatArray]:
-            enclosed, share, pressure = drawn.slopes()
-            return enclosed[self.free].T, share[self.free].T, pressure[self.free].T
+            enclosed, share, pressure = (of[self.free][:, there].T for of in drawn.slopes())
+            return enclosed, share, pressure
 
-        return Drawing(near, drawn.enclosed, drawn.share, drawn.pressure_kpa, slopes)
+        return Drawing(
+            nodes=near[there],
+            enclosed=drawn.enclosed[there],
+            share=drawn.share[there],
+            pressure_kpa=drawn.pressure_kpa[there],
+            slopes=slopes,
+        )
 
     def sampled(
         self, each: FloatArray, x_m: FloatArray, y_m: FloatArray, step_m: float
@@ -250,8 +255,14 @@ class PressureField:
             + np.abs(each[:, HARMONIC:PEAK]).sum(axis=1)
         )
         reach = longest + 2 * (self.half_width_m + self.offset_m)
-        apart = np.hypot(self.x_m - UNIT_M * each[:, X, None], self.y_m - UNIT_M * each[:, Y, None])
-        return np.flatnonzero((apart < reach[:, None]).any(axis=0))
+        dx, dy = self.x_m - UNIT_M * each[:, X, None], self.y_m - UNIT_M * each[:, Y, None]
+        return np.flatnonzero((dx * dx + dy * dy < reach[:, None] ** 2).any(axis=0))
+
+
+def _limit(values: FloatArray, least: float, most: float) -> None:
+    """Bring values to limits in place: for a few values twice as fast as `np.clip`."""
+    np.maximum(values, least, out=values)
+    np.minimum(values, most, out=values)
 
 
 class _Contacts:
@@ -346,7 +357,7 @@ class _Outlines:
         dx = x_m - UNIT_M * each[:, X, None]
         dy = y_m - UNIT_M * each[:, Y, None]
         self._r = np.stack([dx, dy], axis=1)  # (K, 2, n)
-        self._B, self._dB = _axes(each)
+        self._B = _axes(each)
         self._u = self._B @ self._r
         self._u[:, 0] += NOWHERE * (np.abs(self._u).max(axis=1) < NOWHERE)  # any direction will do
         self._v = self._B @ self._u
@@ -368,26 +379,18 @@ class _Outlines:
         self._depth_slope = -inner
         self.t = self._depth * self._scale / of.half_width_m
 
-    def at(self, points: BoolArray) -> _Outlines:
-        """The same at some of the points."""
-        kept = copy(self)
-        by_point = vars(self).keys() - {"_of", "_each", "_B", "_dB"}
-        for name in by_point:
-            values = getattr(self, name)
-            setattr(kept, name, None if values is None else values[..., points])
-        return kept
-
     def slopes(self) -> tuple[FloatArray, FloatArray]:
         """Derivatives (K, forms, n) of t and of log q; each parameter moves u by du and B by dB."""
         B, u, v = self._B, self._u, self._v
+        dB = _slopes_of_axes(self._each)
         K, _, n = self._r.shape
         forms = min(self._of.forms, HARMONIC)
         du = np.empty((K, forms, 2, n))
         du[:, X] = -UNIT_M * B[:, :, 0, None]
         du[:, Y] = -UNIT_M * B[:, :, 1, None]
-        du[:, SIZE:] = self._dB[:, : forms - SIZE] @ self._r[:, None]
+        du[:, SIZE:] = dB[:, : forms - SIZE] @ self._r[:, None]
         dv = B[:, None] @ du
-        dv[:, SIZE:] += self._dB[:, : forms - SIZE] @ u[:, None]
+        dv[:, SIZE:] += dB[:, : forms - SIZE] @ u[:, None]
         radial = np.einsum("kip,knip->knp", u, du)
         along = np.einsum("kip,knip->knp", v, dv)
         by_log_q = radial
@@ -406,22 +409,27 @@ class _Outlines:
         return by_phi / self._of.half_width_m, by_log_q
 
 
-def _axes(each: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """B (K, 2, 2), and its derivatives (K, 3, 2, 2) by size, e1 and e2."""
-    e1, e2, size = (each[:, k, None, None] for k in (E1, E2, SIZE))
+FIRST, SECOND = np.array([[1.0, 0.0], [0.0, -1.0]]), np.array([[0.0, 1.0], [1.0, 0.0]])  # of E
+
+
+def _axes(each: FloatArray) -> FloatArray:
+    """B (K, 2, 2)."""
+    e1, e2, size = each[:, [E1, E2, SIZE]].T[:, :, None, None]
+    e = np.maximum(np.hypot(e1, e2), 1e-6)
+    E = e1 * FIRST + e2 * SECOND
+    return np.asarray(np.exp(-size) * (np.cosh(e) * np.eye(2) - np.sinh(e) / e * E))
+
+
+def _slopes_of_axes(each: FloatArray) -> FloatArray:
+    """Derivatives (K, 3, 2, 2) of B by size, e1 and e2."""
+    e1, e2, size = each[:, [E1, E2, SIZE]].T[:, :, None, None]
     e = np.maximum(np.hypot(e1, e2), 1e-6)
     ratio = np.sinh(e) / e
     bend = np.where(e < 1e-3, 1 / 3, (np.cosh(e) - ratio) / e**2)  # (d ratio / d e) / e
-    unit = np.eye(2)
-    first, second = np.array([[1.0, 0.0], [0.0, -1.0]]), np.array([[0.0, 1.0], [1.0, 0.0]])
+    common = ratio * np.eye(2) - bend * (e1 * FIRST + e2 * SECOND)
     shrink = np.exp(-size)
-    E = e1 * first + e2 * second
-    B = shrink * (np.cosh(e) * unit - ratio * E)
-
-    def by(ei: FloatArray, direction: FloatArray) -> FloatArray:
-        return np.asarray(shrink * (ei * (ratio * unit - bend * E) - ratio * direction))
-
-    return B, np.stack([-B, by(e1, first), by(e2, second)], axis=1)
+    by_e = (shrink * (ei * common - ratio * of) for ei, of in ((e1, FIRST), (e2, SECOND)))
+    return np.stack([-_axes(each), *by_e], axis=1)
 
 
 def heaviside(t: FloatArray) -> FloatArray:

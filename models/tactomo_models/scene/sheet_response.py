@@ -9,6 +9,7 @@ put it, whatever the contrast. On a graded sheet, whose contrast is mild, conduc
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -71,14 +72,18 @@ class GradedResponse:
         """Pressure at which the table ends."""
         return float(self.pressure_kpa[-1])
 
+    @cached_property
+    def _slopes(self) -> FloatArray:
+        """(n - 1,) of the table's pieces."""
+        return np.asarray(np.diff(self.change) / np.diff(self.pressure_kpa))
+
     def relative_change(self, pressure_kpa: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Relative conductivity change, and its slope by the pressure, each of the same shape.
 
         Beyond the table its last piece goes on: there a pressure is a lower bound.
         """
-        piece = np.searchsorted(self.pressure_kpa, pressure_kpa, side="right") - 1
-        piece = np.clip(piece, 0, len(self.pressure_kpa) - 2)
-        slope = (np.diff(self.change) / np.diff(self.pressure_kpa))[piece]
+        piece = np.searchsorted(self.pressure_kpa[1:-1], pressure_kpa, side="right")
+        slope = self._slopes[piece]
         change = self.change[piece] + slope * (pressure_kpa - self.pressure_kpa[piece])
         change = np.where(np.abs(change) < ROUNDING, 0.0, change)
         # A falling table must not fall through zero.
@@ -119,14 +124,18 @@ class SaturatingResponse:
         logs = np.log(channel.response.conductivity_ratio)
         return cls(np.asarray(channel.response.pressure_kpa), logs / logs[-1])
 
+    @cached_property
+    def _slopes(self) -> FloatArray:
+        """(n,) of the table's pieces, and beyond it."""
+        return np.append(np.diff(self.share) / np.diff(self.pressure_kpa), 0.0)
+
     def saturation(self, pressure_kpa: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Share of the full change, in logarithm, and its slope, each of the pressure's shape."""
         if len(self.share) == 0:
             return np.ones_like(pressure_kpa), np.zeros_like(pressure_kpa)
         share = np.interp(pressure_kpa, self.pressure_kpa, self.share)
-        slopes = np.append(np.diff(self.share) / np.diff(self.pressure_kpa), 0.0)
-        piece = np.searchsorted(self.pressure_kpa, pressure_kpa, side="right") - 1
-        return share, slopes[np.clip(piece, 0, len(slopes) - 1)]
+        piece = np.searchsorted(self.pressure_kpa[1:], pressure_kpa, side="right")
+        return share, self._slopes[piece]
 
     def conductivity(
         self, share: FloatArray, pressure_kpa: FloatArray, log_ratio: float
