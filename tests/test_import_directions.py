@@ -44,7 +44,7 @@ ORDER = {
         *("calibration", "health", "drift", "reconstruct", "batch", "machine_speed"),
     ),
     "tactomo": (
-        *("errors", "log", "events", "endpoint", "timing", "scans", "worker"),
+        *("errors", "journal", "log", "events", "endpoint", "timing", "scans", "worker"),
         *("protocols", "config", "recordings", "acquisition", "stream", "imaging"),
         *("service", "twin", "cli", "__main__"),
     ),

@@ -23,7 +23,7 @@ from tactomo_models.physics.artifact import (
     nominal_noise_v,
 )
 from tactomo_models.physics.forward import ForwardModel
-from tactomo_models.robust import robust_sigma
+from tactomo_models.robust import median, robust_sigma
 from tactomo_models.scans.plausibility import (
     Flag,
     ScanCheck,
@@ -194,7 +194,7 @@ class MeasuredChannel:
         grown = verdict.noise**2
         variance = self._variance * grown
         # Small changes share in the error of the large ones beside them.
-        typical = float(np.median(square[valid])) / median_square
+        typical = median(square[valid]) / median_square
         noise, error = self._noise * grown, self._error_share**2 * (square + typical)
         statistic = float((square / variance).sum())
         quiet = statistic < noise_limit(count)
