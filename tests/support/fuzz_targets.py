@@ -404,7 +404,13 @@ def _parse_load_cell(data: bytes) -> bool:
     return taken
 
 
-SEEN = Seen(np.arange(200) / 20, np.linspace(0, 0.2, 200), np.full(200, 0.01), np.ones(200, int))
+SEEN = Seen(
+    np.arange(200) / 20,
+    np.linspace(0, 0.2, 200),
+    np.full(200, 0.01),
+    np.full(200, 300.0),
+    np.ones(200, int),
+)
 
 
 def _config_examples() -> list[bytes]:

@@ -106,6 +106,7 @@ def seen(end_s: float, load: FloatArray, contacts: int = 1) -> Seen:
         times_s=times_s,
         magnitude=np.where(touched, load * 1e-3, np.nan),
         magnitude_sigma=np.where(touched, 0.004, np.nan),
+        contact_mm2=np.where(touched, 300.0, np.nan),
         contacts=np.where(touched, contacts, 0),
     )
 
@@ -158,3 +159,18 @@ def test_nothing_held_still_is_told(log: Path) -> None:
     log.write_text("time_s,pressure_kpa\n" + rows)
     with pytest.raises(CalibrationError, match="nothing was held still"):
         joined_readings(read_load_cell(log), seen(10, np.full(200, 100.0)))
+
+
+def test_one_indenter_presses_one_area(log: Path) -> None:
+    """Where a contact is shown too small its magnitude is too large; two indenters are two areas."""
+    log.write_text(
+        "pressure_kpa,area_mm2,magnitude,magnitude_sigma,contact_mm2\n"
+        "100,300,0.10,0.01,300\n150,300,0.18,0.01,250\n200,300,0.16666667,0.01,360\n"
+        "100,100,0.11,0.01,91\n150,100,0.15,0.01,100\n200,100,0.18181818,0.01,110\n"
+        "120,700,0.30,0.01,500\n"
+    )
+    readings = direct_readings(read_load_cell(log)).readings
+    magnitudes = [reading.magnitude for reading in readings]
+    assert magnitudes == pytest.approx([0.1, 0.15, 0.2, 0.1001, 0.15, 0.2, 0.3])
+    assert readings[0].magnitude_sigma == pytest.approx(0.005)
+    assert readings[-1].magnitude_sigma == 0.01, "one reading does not tell what is typical"

@@ -130,6 +130,7 @@ def seen_of(frames: Sequence[tuple[float, Frame]]) -> Seen:
         times_s=np.array([time_s for time_s, _ in trusted]),
         magnitude=np.array([_number(c.magnitude if c else None) for c in single]),
         magnitude_sigma=np.array([_number(c.magnitude_sigma if c else None) for c in single]),
+        contact_mm2=np.array([_number(c.area_mm2 if c else None) for c in single]),
         contacts=np.array([len(frame.contacts) for _, frame in trusted]),
     )
 

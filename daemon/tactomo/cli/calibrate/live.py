@@ -36,7 +36,7 @@ SHARES: Final = (-0.3, -0.05, 0.1, 0.25, 0.4, 0.6, 0.8, 1.0)
 """Of the way from the onset to the top, that are suggested going up; and down again."""
 COLUMNS: Final = (
     *("realtime_s", "pressure_kpa", "force_n", "area_mm2", "magnitude", "magnitude_sigma"),
-    *("direction", "x_mm", "y_mm"),
+    *("direction", "x_mm", "y_mm", "contact_mm2"),
 )
 
 
@@ -45,7 +45,7 @@ class Held:
     """A press that was still for a while.
 
     Attributes:
-        magnitude, magnitude_sigma: means.
+        magnitude, magnitude_sigma, contact_mm2: means.
         x_mm, y_mm: its place.
         frames: how many were averaged.
         realtime_s: of the last one.
@@ -53,6 +53,7 @@ class Held:
 
     magnitude: float
     magnitude_sigma: float
+    contact_mm2: float
     x_mm: float
     y_mm: float
     frames: int
@@ -271,17 +272,9 @@ class _Session:
         return "" if _are_still(frames) else "moving: hold it still"
 
     def _keep(self, held: Held, force_n: float) -> None:
-        from tactomo_models.calibration.curve import Reading
-
         assert self._area_mm2 is not None
         kpa = 1e3 * force_n / self._area_mm2
         before = [reading.pressure_kpa for reading in self.readings]
-        reading = Reading(
-            pressure_kpa=kpa,
-            magnitude=held.magnitude,
-            magnitude_sigma=held.magnitude_sigma,
-            direction=_direction([*before, kpa]),
-        )
         row = {
             "realtime_s": f"{held.realtime_s:.3f}",
             "pressure_kpa": f"{kpa:.6g}",
@@ -289,21 +282,23 @@ class _Session:
             "area_mm2": f"{self._area_mm2:.6g}",
             "magnitude": f"{held.magnitude:.6g}",
             "magnitude_sigma": f"{held.magnitude_sigma:.6g}",
-            "direction": reading.direction,
+            "direction": _direction([*before, kpa]),
             "x_mm": f"{held.x_mm:.2f}",
             "y_mm": f"{held.y_mm:.2f}",
+            "contact_mm2": f"{held.contact_mm2:.6g}",
         }
         _append(self._log, row)
-        self.readings.append(reading)
+        self.readings = _read_log(self._log)  # each says more of the area of all
         self._console.print(f"{kpa:.0f} kPa, taken")
 
     def _undo(self) -> None:
         if not self.readings:
             self._console.print("there is nothing to undo")
             return
-        dropped = self.readings.pop()
+        dropped = self.readings[-1]
         lines = self._log.read_text("utf-8").splitlines(keepends=True)
         self._log.write_text("".join(lines[:-1]), "utf-8")
+        self.readings = _read_log(self._log)
         self._console.print(f"dropped the reading at {dropped.pressure_kpa:.0f} kPa")
 
     def _print_progress(self) -> None:
@@ -366,6 +361,7 @@ def _mean_of(frames: Sequence[Frame]) -> Held:
         # Errors of the model do not average out: the uncertainty stays one frame's.
         magnitude=statistics.fmean(c.magnitude or 0.0 for c in contacts),
         magnitude_sigma=statistics.fmean(c.magnitude_sigma or 0.0 for c in contacts),
+        contact_mm2=statistics.fmean(c.area_mm2 for c in contacts),
         x_mm=statistics.fmean(c.x_mm for c in contacts),
         y_mm=statistics.fmean(c.y_mm for c in contacts),
         frames=len(frames),
