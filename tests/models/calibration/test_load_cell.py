@@ -162,7 +162,7 @@ def test_nothing_held_still_is_told(log: Path) -> None:
 
 
 def test_one_indenter_presses_one_area(log: Path) -> None:
-    """Where a contact is shown too small its magnitude is too large; two indenters are two areas."""
+    """Where a contact is shown too small its magnitude is too large; two indenters differ."""
     log.write_text(
         "pressure_kpa,area_mm2,magnitude,magnitude_sigma,contact_mm2\n"
         "100,300,0.10,0.01,300\n150,300,0.18,0.01,250\n200,300,0.16666667,0.01,360\n"
