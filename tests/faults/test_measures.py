@@ -12,6 +12,7 @@ import zmq
 from daemon_process import SENSOR, DaemonProcess
 from ears import Ears, percentiles
 from pty_skin import Playing, PtySkin, Scenes, Volts, moving, still
+from stream_rules import Subscriber
 from tactomo_client.messages import decode_message, topic
 from waiting import wait_until
 
@@ -148,6 +149,11 @@ class Newest:
         self._socket.close()
 
 
+def published_until(newest: Newest, counter: int) -> int:
+    """Wait for the frame of a dual scan; return how many were published up to it."""
+    return next(count for count, at in iter(newest.take, None) if at == counter)
+
+
 def wait_for_sent(playing: Playing, scans: int) -> None:
     wait_until(lambda: len(playing.sent) >= scans, f"{scans} scans to be sent", 3600.0, 0.1)
 
@@ -157,7 +163,7 @@ def wait_for_sent(playing: Playing, scans: int) -> None:
 @pytest.mark.measure(
     "Soak: a million dual scans as fast as they are taken",
     "memory flat (within 10 MB from 10 % on), threads and descriptors as at the start; every dual "
-    "scan published or counted as dropped, exactly",
+    "scan published or counted as dropped, exactly; every message as STREAM.md has it",
     "lossless over two pseudo-terminals; in each 1000 dual scans 10 in a row with a moving contact",
 )
 def test_soak(
@@ -165,9 +171,10 @@ def test_soak(
 ) -> None:
     daemon = tared(lossless=True)
     newest = Newest(daemon.stream)
-    wait_until(lambda: daemon.status()["subscribers"] == 1, "the subscription")
+    subscriber = Subscriber(daemon.stream, may_miss=True)
+    wait_until(lambda: daemon.status()["subscribers"] == 2, "the subscriptions")
     play(iter([scenes.rest]), None).join()
-    before, _ = newest.take()
+    before = published_until(newest, skin.counter - 1)
     dropped = daemon.status()["dropped_scans"]
     scans = max(5_000, round(SOAK_SCANS * scale))
     threads, descriptors = daemon.threads, daemon.descriptors
@@ -184,18 +191,21 @@ def test_soak(
             flush=True,
         )
     playing.join()
-    last = skin.counter - 1
-    published = next(count for count, at in iter(newest.take, None) if at == last) - before
+    published = published_until(newest, skin.counter - 1) - before
     took_s = time.monotonic() - begin_s
     status = daemon.status()
+    at_end = daemon.threads, daemon.descriptors
     newest.close()
+    subscriber.close()
     dropped = status["dropped_scans"] - dropped
     figure(
         f"{scans} sent = {published} published + {dropped} dropped in {took_s / 60:.1f} min "
         f"({scans / took_s:.0f}/s); memory {rss_mb[0]:.1f} MB at 10 %, {rss_mb[4]:.1f} at 50 %, "
-        f"{rss_mb[9]:.1f} at 100 %; threads {threads} and {daemon.threads}, descriptors "
-        f"{descriptors} and {daemon.descriptors}"
+        f"{rss_mb[9]:.1f} at 100 %; threads and descriptors {threads}, "
+        f"{descriptors} and {at_end[0]}, {at_end[1]}; {sum(subscriber.messages.values())} messages "
+        f"read, {len(subscriber.faults)} against the page"
     )
+    assert not subscriber.faults
     assert published + dropped == scans
     assert max(rss_mb) - rss_mb[0] < MEMORY_MB
-    assert (daemon.threads, daemon.descriptors) == (threads, descriptors)
+    assert at_end == (threads, descriptors)

@@ -17,13 +17,15 @@ import msgpack  # type: ignore[import-untyped]
 import zmq
 from tables import table
 from tactomo_client.frame import frame_from_message
-from tactomo_client.messages import MAP, STATUS, decode_message
+from tactomo_client.messages import EVENT, MAP, STATUS, decode_message
 from tactomo_client.status import Status
 
 PAGE = "clients/STREAM.md"
 INT64, UINT64 = range(-(2**63), 2**63), range(2**64)
 MAX_ENTRIES, MAX_DEPTH, MAX_NAME_BYTES = 4096, 16, 48
 NAMES = ("session", "tier", "flags", "name", "state")
+CHANGING_PLACES = 64
+"""Scans that are between two places of the tally when it is read: some reads of two ports."""
 ITEM_BYTES = {"<f4": 4, "<f8": 8}
 INSIDE = {
     ("map", "contacts"): "Each contact:",
@@ -37,16 +39,24 @@ INSIDE = {
 class Subscriber:
     """Hears every kind from a thread of its own, until closed; usable in a `with` block.
 
+    Args:
+        address: of the stream.
+        may_miss: whether a gap in `sequence` is none of the daemon's faults, because frames come
+            faster than this reads them.
+
     Attributes:
         messages: how many came, by kind.
+        missed: how many did not, by their sequence.
         faults: which rules they broke, in words; the first hundred.
 
     """
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, *, may_miss: bool = False) -> None:
         self.messages: dict[str, int] = {}
+        self.missed = 0
         self.faults: list[str] = []
         self._sequence: dict[tuple[str, str], int] = {}
+        self._may_miss = may_miss
         self._address = address
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="stream-rules")
@@ -94,6 +104,9 @@ class Subscriber:
         yield from broken_fields(kind, fields, "### Envelope", f"### `{kind}`")
         yield from self._broken_order(kind, fields)
         yield from broken_contacts(kind, fields.get("contacts", []))
+        yield from broken_words(kind, fields)
+        if kind == STATUS:
+            yield from broken_tally(fields["scan_tally"])
         read_by_the_client(parts[0])
 
     def _broken_order(self, kind: str, fields: dict[str, Any]) -> Iterator[str]:
@@ -101,7 +114,9 @@ class Subscriber:
         before, now = self._sequence.get(at), fields["sequence"]
         is_repeated = kind == STATUS and now == before
         if before is not None and now != before + 1 and not is_repeated:
-            yield f"{kind}: sequence {now} after {before}"
+            if now <= before or not self._may_miss:
+                yield f"{kind}: sequence {now} after {before}"
+            self.missed += max(0, now - before - 1)
         self._sequence[at] = now
         age_ns = fields["age_ns"]
         if age_ns is not None and age_ns < 0:
@@ -194,6 +209,41 @@ def broken_contacts(kind: str, contacts: list[dict[str, Any]]) -> Iterator[str]:
             yield f"{kind}: a contact of {contact['area_mm2']} mm2"
         if contact["pressure_range"] not in ("within", "below", "above", "unknown"):
             yield f"{kind}: pressure_range {contact['pressure_range']}"
+
+
+def broken_words(kind: str, fields: dict[str, Any]) -> Iterator[str]:
+    """Yield names that the page does not have, and contacts where there can be none."""
+    flags = set(fields["flags"])
+    if unlisted := flags - names_in("## Flags", "Flag"):
+        yield f"{kind}: flags {unlisted}"
+    if kind == EVENT and fields["name"] not in names_in("### `event`", "Event"):
+        yield f"event {fields['name']}"
+    if kind == STATUS and fields["state"] not in states():
+        yield f"state {fields['state']}"
+    is_empty = fields["tier"] == "quiet" or "no_usable_scan" in flags
+    if fields.get("contacts") and is_empty:
+        yield f"{kind}: contacts, and {fields['tier']} {flags}"
+
+
+@cache
+def names_in(heading: str, column: str) -> frozenset[str]:
+    """Return the names in the first column of a table of the page."""
+    return frozenset(table(PAGE, heading, column))
+
+
+@cache
+def states() -> frozenset[str]:
+    """Return the states of a daemon that the page has."""
+    return frozenset(
+        re.findall(r"`(\w+)`", table(PAGE, "### `status`", "Name")["state"]["Meaning"])
+    )
+
+
+def broken_tally(tally: dict[str, int]) -> Iterator[str]:
+    """Yield where single scans are lost from sight."""
+    places = sum(tally.values()) - tally["received"]
+    if abs(places - tally["received"]) > CHANGING_PLACES:
+        yield f"scan_tally: {tally}"
 
 
 def read_by_the_client(data: bytes) -> None:

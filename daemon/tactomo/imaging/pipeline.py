@@ -206,7 +206,6 @@ class Pipeline(Worker):
             before = self._sync_state()
             ready = self._gather()
             self._tell_changes(before)
-            self._in_hand = sum(len(dual.scans) for dual in ready)
             for dual in ready if self._is_lossless else self._newest(ready):
                 if self._stopping.is_set():
                     break
@@ -251,16 +250,21 @@ class Pipeline(Worker):
         ready: list[DualScan] = []
         try:
             delivery = self._deliveries.get(timeout=self._wait_s())
-            while True:
+            for _ in range(QUEUED_DELIVERIES):  # what comes meanwhile is for the next turn
                 if delivery is not None:
-                    ready += self._join(delivery)
+                    ready += self._taken_in_hand(self._join(delivery))
                 delivery = self._deliveries.get_nowait()
+            ready += self._taken_in_hand([] if delivery is None else self._join(delivery))
         except queue.Empty:
             pass
         if self._replay is None:
-            ready += self.sync.advance(time.monotonic_ns())
+            ready += self._taken_in_hand(self.sync.advance(time.monotonic_ns()))
         self.incomplete += sum(map(self._lacks_a_channel, ready))
         return ready
+
+    def _taken_in_hand(self, duals: list[DualScan]) -> list[DualScan]:
+        self._in_hand += sum(len(dual.scans) for dual in duals)
+        return duals
 
     def _lacks_a_channel(self, dual: DualScan) -> bool:
         """Tell whether one did not come; of two, one begins a little before the other."""
