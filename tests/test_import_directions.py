@@ -41,7 +41,7 @@ ORDER = {
     "tactomo_models": (
         *("errors", "arrays", "archive", "toml_file", "robust"),
         *("sensor", "physics", "scans", "scene", "methods", "simulation"),
-        *("calibration", "health", "drift", "reconstruct", "batch", "machine_speed"),
+        *("calibration", "health", "drift", "reconstruct", "known_skin", "batch", "machine_speed"),
     ),
     "tactomo": (
         *("errors", "journal", "log", "events", "endpoint", "timing", "scans", "worker"),

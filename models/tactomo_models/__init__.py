@@ -20,8 +20,8 @@ health           what is wrong with a skin or its leads
 drift            a reference that follows the skin
 ===============  =================================================================================
 
-Above them: `reconstruct` turns scans into frames, `batch` does so for a file, `machine_speed` says
-what a budget of time buys.
+Above them: `reconstruct` turns scans into frames, `batch` does so for a file, `known_skin` tells
+whether something lies on a skin at a start, `machine_speed` says what a budget of time buys.
 """
 
 from tactomo_protocol import Channel

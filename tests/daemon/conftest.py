@@ -11,7 +11,6 @@ import pytest
 import zmq
 from daemon_bench import Bench, Heard, Line, Listener, Memory, Skin
 from tactomo.config import load_config
-from tactomo.imaging.kept_reference import reference_path
 from tactomo.log import configure_logging
 from tactomo.recordings.recording_set import open_replayable
 from tactomo.service.daemon import Daemon
@@ -89,8 +88,6 @@ def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Cal
             "baseline": {"track": real},  # that takes a real one
             **config,
         }
-        if not real:  # it cannot judge the reference that the daemon before has kept
-            reference_path("left").unlink(missing_ok=True)
         memory: Any = None if real else Memory(seconds)
         daemon = Daemon(
             load_config(None, **settings), reconstructor=memory, machine_speed=machine_speed

@@ -23,6 +23,7 @@ from tactomo_models import (
 )
 from tactomo_models.arrays import FloatArray
 from tactomo_models.calibration.calibration_file import PressureCalibration
+from tactomo_models.known_skin import SkinAtStart, skin_at_start
 from tactomo_models.machine_speed import MachineSpeed
 from tactomo_protocol import Channel, ScanFlag
 
@@ -152,14 +153,23 @@ class Imaging:
             self._note_reference(self._tracker.begin(reference))
 
     def _take(self, reference: Reference, is_asked: bool) -> bool:
-        """Use a reference that was taken; at the start only if the skin is as last known.
+        """Use a reference that was taken; at the start only if nothing lies on the skin.
 
         Returns whether it is in force.
         """
         known = None if is_asked or self.reference is not None else self._known()
-        if known is not None and self._is_loaded(known, reference):
-            self._prefer(known, "the skin does not look as it did")
-            return False
+        if known is not None:
+            found = skin_at_start(self._reconstructor, known.reference, reference, known.age_s)
+            if found is SkinAtStart.LOADED:
+                self._prefer(known, "something seems to lie on the skin")
+                return False
+            if found is SkinAtStart.OTHER:
+                self._on_event(
+                    "skin_changed",
+                    "warning",
+                    f"neither contacts nor drift explain how the skin differs from {known.words}",
+                    "if something lies on it, take it off; then `tactomo tare`",
+                )
         self._is_disputed = False
         self.use_reference(reference, time.time_ns())
         if self._kept is not None:
@@ -175,12 +185,6 @@ class Imaging:
 
     def _known(self) -> KnownSkin | None:
         return None if self._kept is None else self._kept.read(self.calibration.device_ids)
-
-    def _is_loaded(self, known: KnownSkin, now: Reference) -> bool:
-        """Whether what was taken differs from the skin as last known by more than drift."""
-        tracker = self._tracker or BaselineTracker(self._reconstructor)
-        tracker.begin(known.reference)
-        return tracker.explains(now, known.age_s) is False
 
     def _prefer(self, known: KnownSkin, why: str) -> None:
         self._is_disputed = True

@@ -90,7 +90,8 @@ class Daemon:
     Args:
         config: what it serves.
         reconstructor: what makes maps of voltages; by default the description's own, with an
-            artifact that is built if need be.
+            artifact that is built if need be. Only that one can tell a load at the start by the
+            reference of before.
         machine_speed: what turns a budget of time into one of work; by default what was measured on
             this machine, if that was.
 
@@ -147,9 +148,7 @@ class Daemon:
             calibration,
             config.tare_scans,
             config.baseline,
-            None
-            if replay is not None
-            else KeptReference(config.name, description, self._recorder, self._on_event),
+            self._make_kept_reference() if replay is None and reconstructor is None else None,
             self._recorder,
             self._publisher,
             self._on_event,
@@ -332,6 +331,9 @@ class Daemon:
         self._recorder.start()  # when nothing can fail any more: no file for each attempt
         for worker in self._workers:
             worker.start()
+
+    def _make_kept_reference(self) -> KeptReference:
+        return KeptReference(self.config.name, self._description, self._recorder, self._on_event)
 
     def _make_metrics(self) -> MetricsServer:
         # Imported where it is asked for: it needs an extra.

@@ -179,14 +179,12 @@ class BaselineTracker:
             self._take_note(time_s, measurement, frame, scans)
         return frame
 
-    def explains(self, seen: Reference, elapsed_s: float) -> bool | None:
-        """Whether a mean of scans is the reference, drifted for so long; None: no common channel.
+    def explains_as_drift(self, seen: Reference, elapsed_s: float) -> bool:
+        """Whether a mean of scans is the reference, drifted for so long; or nothing can be told.
 
         For a tracker that has just begun.
         """
         measurement = self._reconstructor.compare(seen.magnitude, seen.structure)
-        if not measurement.changes:
-            return None
         if measurement.is_quiet:
             return True
         for name, changes in measurement.changes.items():

@@ -91,6 +91,17 @@ def test_a_skin_that_has_warmed_since_is_tared_anew(begin: Any) -> None:
     assert b.step(volts={n: 0.96 * each for n, each in volts(False).items()})["tier"] == "quiet"
 
 
+def test_another_skin_is_not_taken_for_a_load(begin: Any) -> None:
+    once(begin)
+    description = load_description("paper_square")
+    other = SkinSimulator(description, 0.008, unevenness=0.03, seed=5).voltages([])
+    b = begin(other)
+    b.listener.event("skin_changed")
+    b.listener.event("tared")
+    frame = b.step(volts=other)
+    assert (frame["contacts"], frame["flags"]) == ([], [])
+
+
 def test_where_somebody_moves_at_the_start_the_reference_that_was_kept_is_used(begin: Any) -> None:
     once(begin)
     b = begin(*[volts(False)] * 10, *[volts(True)] * 10)
