@@ -18,6 +18,7 @@ from c_firmware import FOLLOWER, LEADER, SimulatedDevice, Speaker, build
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tactomo_protocol import (
+    MIN_RATE_HZ,
     Acknowledge,
     AckStatus,
     Channel,
@@ -248,6 +249,41 @@ def test_a_scan_that_a_newer_one_has_overtaken_keeps_its_counter_and_is_late(
     scan = follower.send(older)
     assert scan is not None
     assert (scan.counter, scan.flags) == (0, ScanFlag.LATE)
+
+
+def test_at_rate_0_a_scan_is_late_only_when_the_next_has_begun(sanitized: Speaker) -> None:
+    follower = SimulatedDevice(sanitized, role=FOLLOWER)
+    follower.tell(Command(START, 1))
+    counter, started_us = follower.begin_scan(), follower.timer_us
+    follower.pass_time(3_600_000_000 // 4)
+    scan = follower.send(counter, started_us=started_us)
+    assert scan is not None
+    assert scan.flags == 0
+
+
+def test_a_device_alone_takes_no_dual_scans_while_stopped_so_it_counts_none(
+    scanning: SimulatedDevice,
+) -> None:
+    scanning.dual_scan()
+    scanning.tell(Command(STOP, 2))
+    for _ in range(10):
+        scanning.pass_time(PERIOD_US)
+        assert not scanning.is_due
+    scanning.tell(Command(START, 3))
+    assert scanning.begin_scan() == 1
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "status"),
+    [(1e308, BAD), (5e-324, OK), (1e-9, OK)],
+)
+def test_a_rate_that_cannot_be_kept_is_refused_or_the_slowest(
+    scanning: SimulatedDevice, rate_hz: float, status: AckStatus
+) -> None:
+    said = scanning.tell(Command(SET_RATE, 2, rate_hz))
+    assert statuses(said) == [status]
+    hellos = [packet for packet in said if isinstance(packet, Hello)]
+    assert [hello.scan_rate_hz for hello in hellos] == ([MIN_RATE_HZ] if status is OK else [])
 
 
 def test_missed_scans_are_not_made_up(scanning: SimulatedDevice) -> None:

@@ -15,6 +15,7 @@ from hostile_page import post
 from small_sensor import SMALL
 from tactomo.errors import AddressError, ConfigError, TactomoError
 from tactomo.twin import Drift, Scene, TwinConfig
+from tactomo.twin.firmware import RATE_HZ_MIN
 from tactomo_client import ControlError
 from tactomo_client.messages import encode_request
 from tactomo_models import Press, SkinSimulator, load_description
@@ -139,6 +140,14 @@ def test_what_the_device_cannot_do_is_refused(bench: Start) -> None:
         AckStatus.BAD_ARGUMENT,
         AckStatus.UNKNOWN_COMMAND,
     ]
+
+
+def test_a_rate_slower_than_it_can_is_its_slowest(bench: Start) -> None:
+    host = bench().host()
+    host.send(CommandCode.SET_RATE, 1, rate_hz=1e-9)
+    host.wait_for(lambda: host.kind(Acknowledge))
+    assert host.kind(Acknowledge)[0].status == AckStatus.OK
+    host.wait_for(lambda: host.kind(Hello)[-1].scan_rate_hz == RATE_HZ_MIN)
 
 
 def test_a_scan_that_takes_longer_is_late_and_says_so(bench: Start) -> None:

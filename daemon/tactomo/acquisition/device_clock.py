@@ -52,6 +52,9 @@ EARLY_PATIENCE_NS: Final = 1_000_000_000
 LATE_PATIENCE_NS: Final = 10_000_000_000
 """They do if so many come, and no other, for so long. No buffer lasts 10 s; a stall may, but ends
 in a burst."""
+APART_US: Final = 10_000_000
+"""What one channel's times may lie behind the other's, beyond two of its scans: the scans of one
+dual scan come in either order, but soon after one another."""
 
 
 class ClockState(StrEnum):
@@ -107,26 +110,26 @@ class DeviceClock:
         self._fit = _Fit()
         self._newest_us: dict[Channel, int] = {}
         self._backward = 0  # scans in a row that were taken before their predecessors
+        self._apart = 0  # scans by another clock than the other channel's, in a row of dual scans
         self._odd = 0  # scans in a row that came too early, or (positive) far too late
         self._odd_since_ns = 0
 
     @property
     def state(self) -> ClockState:
         """Whether the device's clock is used."""
-        return self._fit.state
+        return ClockState.UNUSABLE if self._apart >= ODD_SCANS else self._fit.state
 
     @property
     def line(self) -> Line | None:
         """The computer's time less the device's, and its rate; None while it is not used."""
-        fit = self._fit
-        return fit.line if fit.state is ClockState.SETTLED else None
+        return self._fit.line if self.state is ClockState.SETTLED else None
 
     def date(self, channel: Channel, device_us: int, arrived_ns: int) -> int | None:
         """Take note of a scan that arrived; return how many nanoseconds it was held up.
 
         None where the device's clock cannot tell. Never negative: nothing comes before it is sent.
         """
-        if self._has_gone_back(channel, device_us):
+        if self._is_of_another_clock(channel, device_us) or self._has_gone_back(channel, device_us):
             return None
         lag_ns = arrived_ns - device_us * 1000
         delay_ns = self._fit.delay_of(arrived_ns, lag_ns)
@@ -153,8 +156,22 @@ class DeviceClock:
             self._jump()
         return True
 
+    def _is_of_another_clock(self, channel: Channel, device_us: int) -> bool:
+        """Tell a scan from long before the other channel's: a device has one clock for both."""
+        own_us = self._newest_us.get(channel, device_us)
+        other_us = max((us for c, us in self._newest_us.items() if c is not channel), default=None)
+        if other_us is None or device_us < own_us:  # the first ones, or a reset
+            return False
+        if other_us - device_us <= APART_US + 2 * (device_us - own_us):
+            self._apart = self._apart if device_us < other_us else max(0, self._apart - 1)
+            return False
+        self._newest_us[channel] = device_us
+        self._apart = min(2 * ODD_SCANS, self._apart + 2)
+        return True
+
     def _jump(self) -> None:
         self.jumps += 1
+        self._apart = 0
         self._fit, self._odd = _Fit(), 0
 
     def _is_odd(self, delay_ns: int, arrived_ns: int) -> bool:

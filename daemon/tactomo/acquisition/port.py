@@ -48,6 +48,12 @@ TROUBLE_PERIOD_S: Final = 30.0
 """How often at most a device is said to be in trouble: some come and go for hours."""
 
 
+FAULT_LASTS_S: Final = 3.0
+"""How long after the last sight of it firmware counts as faulty: three hellos."""
+UNANSWERED_S: Final = 3.0
+"""How long a device may leave commands unanswered: it is asked again in half that time."""
+
+
 class PortReader(Worker):
     """One port. `open` it, `start` its thread, `stop` it.
 
@@ -121,6 +127,11 @@ class PortReader(Worker):
         self._clock_told = (self.clock.state, 0)
         self._clock_limit = RateLimit()
         self._is_zeroing = threading.Event()
+        self._fault, self._fault_s = "", 0.0  # what was last against the protocol, and when
+        self._fault_limits: dict[str, RateLimit] = {}
+        self._faulty_told = 0
+        self._unanswered_s: float | None = None  # since when no command has been acknowledged
+        self._is_unanswered_told = False
 
     @property
     def counts(self) -> DecoderCounts:
@@ -222,7 +233,8 @@ class PortReader(Worker):
 
     def _greet_newcomer(self) -> None:
         """Make a new start with whichever device is at the port now."""
-        self._is_known = False
+        self._is_known = self._is_unanswered_told = False
+        self._unanswered_s = None
         self._protocol.restart()
         self._liveness.opened(time.monotonic())
         self._ask()
@@ -235,6 +247,7 @@ class PortReader(Worker):
             self._is_zeroing.clear()
             self._send(self._protocol.zero_counters())
         self._tell_trouble(self._liveness.judge(now_s))
+        self._tell_unanswered(now_s)
         if self._liveness.is_reopening_due(now_s):
             self._reopen()
 
@@ -257,10 +270,12 @@ class PortReader(Worker):
         self.bytes_read += len(data)
         recording = self._record(data, realtime_ns, monotonic_ns)
         scans = []
-        understood = self.counts.packets
+        now_s, found = monotonic_ns * 1e-9, 0
+        understood = self.counts.packets + self.counts.faulty
         packets = self._protocol.feed(data)
         for packet in packets:
-            volts = self._handle(packet)
+            volts = self._handle(packet, now_s)
+            found += isinstance(packet, Scan) and self._is_known and self._fault_s != now_s
             if volts is not None and isinstance(packet, Scan):
                 scans.append(
                     ChannelScan(
@@ -279,14 +294,14 @@ class PortReader(Worker):
                         else None,
                     )
                 )
-        now_s = monotonic_ns * 1e-9
-        found = sum(isinstance(packet, Scan) for packet in packets)
-        self._liveness.heard(now_s, self.counts.packets - understood, found)
+        intact = self.counts.packets + self.counts.faulty - understood
+        self._liveness.heard(now_s, intact, found)
         if packets:
             self._deliver(Delivery(self.index, clock_ns, tuple(scans), self.hello))
         if not self._is_replay:
             self._send(self._protocol.replies())
         self._tell_corrupt()
+        self._tell_faulty(now_s)
         self._tell_clock()
         self._tell_protocols_trouble()
 
@@ -315,29 +330,42 @@ class PortReader(Worker):
             previous.add(entries[-1])
         return active.add(*entries)
 
-    def _handle(self, packet: Packet) -> FloatArray | None:
+    def _handle(self, packet: Packet, now_s: float) -> FloatArray | None:
         """Take note of a packet; returns a scan's volts if they may be used."""
         if isinstance(packet, Hello):
             self._greet(packet)
-        elif isinstance(packet, Acknowledge) and _is_refusal(packet):
-            self._on_event(
-                "command_refused",
-                "warning",
-                f"{self.url}: the device answered command {packet.command} with "
-                f"{packet.status.name}",
-            )
+        elif isinstance(packet, Acknowledge):
+            self._unanswered_s = None
+            if _is_refusal(packet):
+                self._on_event(
+                    "command_refused",
+                    "warning",
+                    f"{self.url}: the device answered command {packet.command} with "
+                    f"{packet.status.name}",
+                )
         elif isinstance(packet, Scan):
             self._asked_s = time.monotonic()
             hello = self.hello
             is_usable = self._is_known and not self.refusal
-            if hello is not None and is_usable and self._fits(packet, hello):
-                return packet.volts(hello.volts_per_count)
+            if hello is not None and is_usable:
+                fault = unlike_hello(packet, hello)
+                if fault:
+                    self._note_fault("scan", fault, now_s)
+                elif packet.channel in self._description.channels:
+                    return packet.volts(hello.volts_per_count)
             self.unused += 1
         return None
 
-    def _fits(self, scan: Scan, hello: Hello) -> bool:
-        is_known = scan.channel in self._description.channels
-        return is_known and len(scan.samples) == hello.samples_per_scan
+    def _note_fault(self, kind: str, fault: str, now_s: float) -> None:
+        """Take note of, and tell, what a device's firmware does against its protocol."""
+        self._fault, self._fault_s = fault, now_s
+        if self._fault_limits.setdefault(kind, RateLimit(TROUBLE_PERIOD_S)).allows():
+            self._on_event(
+                "firmware_fault",
+                "warning",
+                f"{self.url}: {fault}; what is so is not used",
+                "the line is good: correct the firmware, by firmware_protocol/PROTOCOL.md",
+            )
 
     def _greet(self, hello: Hello) -> None:
         self._is_known = True
@@ -392,6 +420,8 @@ class PortReader(Worker):
             self._asked_s = time.monotonic()
             if not self._connection.is_open or not self._connection.write(message):
                 return
+            if self._protocol.acknowledges and self._unanswered_s is None:
+                self._unanswered_s = self._asked_s
 
     def _trouble(self, state: DeviceState) -> str:
         """Return in words what is the matter with a device in this state; empty if nothing is."""
@@ -400,9 +430,30 @@ class PortReader(Worker):
             return f"nothing came for {self._liveness.silence_s:.3g} s"
         if state is DeviceState.GARBAGE:
             return f"bytes come, but no packet of protocol {self.protocol} at {self._baud} baud"
+        if state is DeviceState.IDLE and self._has_fault:
+            return self._fault
         if state is DeviceState.IDLE and (hello is None or hello.scan_rate_hz > 0):
             return "the device speaks, but sends no scans"
         return ""
+
+    @property
+    def _has_fault(self) -> bool:
+        """Whether the firmware has just now done something against its protocol."""
+        return bool(self._fault) and time.monotonic() - self._fault_s < FAULT_LASTS_S
+
+    def _tell_unanswered(self, now_s: float) -> None:
+        """Tell, once, that a device that speaks acknowledges nothing."""
+        since_s, speaks = self._unanswered_s, (DeviceState.RUNNING, DeviceState.IDLE)
+        is_due = since_s is not None and now_s - since_s > UNANSWERED_S
+        if is_due and not self._is_unanswered_told and self._liveness.state in speaks:
+            self._is_unanswered_told = True
+            self._on_event(
+                "command_unanswered",
+                "warning",
+                f"{self.url}: the device speaks, and acknowledges no command",
+                "check the line from the computer to the device (its RX), and that the firmware "
+                "answers within 100 ms",
+            )
 
     def _tell_trouble(self, state: DeviceState) -> None:
         """Tell when a device falls into trouble and when it is out of it again."""
@@ -430,7 +481,7 @@ class PortReader(Worker):
                     "wrong baud rate, or another device: set `baud` or `protocol` to the device's; "
                     "`tactomo ports --ask` tells what is where",
                 )
-            else:
+            elif not self._has_fault:
                 self._on_event(
                     "device_idle",
                     "warning",
@@ -466,8 +517,10 @@ class PortReader(Worker):
                 "device_clock_unusable",
                 "warning",
                 f"{self.url}: the device's clock stands still, or is off by more than "
-                f"{MAX_RATE * 1e6:g} ppm; what buffers hold up is not seen in the ages",
-                "correct the firmware's clock: microseconds, read as the scan begins",
+                f"{MAX_RATE * 1e6:g} ppm, or its channels go by two; what buffers hold "
+                "up is not seen in the ages",
+                "correct the firmware's clock: one for both channels, in microseconds, read as the "
+                "scan begins",
             )
         self._clock_told = (clock.state, jumps)
 
@@ -488,7 +541,7 @@ class PortReader(Worker):
         self._trouble_of_protocol = trouble
 
     def _tell_corrupt(self) -> None:
-        corrupt = self.counts.corrupt
+        corrupt = self.counts.damaged
         if corrupt > self._corrupt_told and self._corrupt_limit.allows():
             self._on_event(
                 "corrupt_packets",
@@ -497,6 +550,23 @@ class PortReader(Worker):
                 "check the cable, its shield and the baud rate",
             )
             self._corrupt_told = corrupt
+
+    def _tell_faulty(self, now_s: float) -> None:
+        faulty = self.counts.faulty
+        if faulty > self._faulty_told and self._protocol.fault:
+            self._note_fault("packet", self._protocol.fault, now_s)
+        self._faulty_told = faulty
+
+
+def unlike_hello(scan: Scan, hello: Hello) -> str:
+    """Return in what a scan is not as its device's hello says; empty where it is."""
+    if scan.channel not in hello.channels:
+        return f"scans of the {scan.channel} channel come, which its hello does not name"
+    if len(scan.samples) != hello.samples_per_scan:
+        return f"scans of {len(scan.samples)} samples come; its hello says {hello.samples_per_scan}"
+    if scan.samples.dtype != hello.sample_format.dtype:
+        return f"scans of {scan.samples.dtype} come; its hello says {hello.sample_format.dtype}"
+    return ""
 
 
 def _is_refusal(answer: Acknowledge) -> bool:

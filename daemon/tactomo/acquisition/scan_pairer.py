@@ -15,6 +15,7 @@ device, the recording's own for a replay, whatever speed it runs at.
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Final, NamedTuple
 
 from tactomo_protocol import SCAN_COUNTERS, Channel
@@ -23,6 +24,11 @@ from tactomo.scans import ChannelScan, DualScan, Mark, ScanKey
 
 LOST_AFTER_NS: Final = 1_000_000_000
 LOST_AFTER_FRAMES: Final = 3
+FOUND_SHARE: Final = 0.75
+"""A lost channel is waited for again once a scan comes within this share of the wait: one about as
+late as the wait is long would be lost and back without end."""
+REMEMBERED: Final = 256
+"""Scans of a channel, to tell one that comes again from one that comes after its successor."""
 START_GRACE_NS: Final = 3_000_000_000
 """How long after the first scan a channel that was never heard still counts as about to come."""
 STALE_US: Final = 2_000_000
@@ -38,7 +44,7 @@ class ScanPairer:
 
     Attributes:
         lost: channels that nobody waits for at present.
-        late: scans dropped because their dual scan had gone on without them.
+        late: scans dropped because their dual scan, or their channel, had gone on without them.
         repeated: scans dropped because they had come before.
         unmarked: scans dropped because the recorded run did not use them.
         resets: how often a counter went back with its clock: the device was reset.
@@ -98,6 +104,7 @@ class CounterPairer(ScanPairer):
         self._wait_ns = wait_ns
         self._waiting: dict[_Instant, ChannelScan] = {}  # in order of arrival
         self._newest: dict[Channel, ChannelScan] = {}
+        self._came: dict[Channel, deque[ScanKey]] = {}  # the newest few
         self._epochs: dict[Channel, int] = {}
         self._joined_ns: dict[Channel, int] = {}  # when each channel was last part of a dual scan
         self._missed: dict[Channel, int] = dict.fromkeys(expected, 0)  # dual scans in a row
@@ -105,9 +112,13 @@ class CounterPairer(ScanPairer):
 
     def push(self, scan: ChannelScan) -> list[DualScan]:
         """Take one scan and return the dual scans that are complete now, in order."""
+        keys = self._came.setdefault(scan.channel, deque(maxlen=REMEMBERED))
+        is_repeated = scan.key in keys
         if not self._is_new(scan):
-            self.repeated += 1
+            self.repeated += is_repeated
+            self.late += not is_repeated
             return []
+        keys.append(scan.key)
         if len(self._expected) == 1:
             return [_dual(scan)]
         for channel in self._expected:
@@ -185,8 +196,8 @@ class CounterPairer(ScanPairer):
         gone, gone_ns = self._gone
         if instant.is_after(gone):
             return True
-        in_time = scan.clock_ns - gone_ns <= self._wait_ns
-        if instant == gone and scan.channel in self.lost and in_time:
+        is_soon = scan.clock_ns - gone_ns <= FOUND_SHARE * self._wait_ns
+        if instant == gone and scan.channel in self.lost and is_soon:
             self._found(scan)  # had anybody waited for it, it would have come in time
         return False
 

@@ -23,7 +23,7 @@ MIN_LIMIT_NS: Final = 5_000_000
 UNDATED_NS: Final = 1_000_000_000
 """What arrivals alone may be apart by, beyond a period."""
 MAX_GAP_NS: Final = 2_000_000_000
-"""Scans farther apart than this are not compared: one channel is silent."""
+"""Scans of two counters farther apart than this are not compared: one channel is silent."""
 _SMOOTHING: Final = 0.125
 
 
@@ -95,7 +95,7 @@ class Skew:
         is_dated = skew_ns is not None
         if skew_ns is None:
             skew_ns = scan.acquired_ns - other.acquired_ns
-        if abs(skew_ns) > MAX_GAP_NS:
+        if abs(skew_ns) > MAX_GAP_NS and not (is_dated and scan.counter == other.counter):
             return
         step_ns = skew_ns - counts_between(other.counter, scan.counter) * period_ns
         limit_ns = self._limit_ns(scan, other) + (0 if is_dated else UNDATED_NS)

@@ -16,6 +16,7 @@ import numpy as np
 from tactomo_models import SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_protocol import (
+    MAX_DEVICE_US,
     MAX_SAMPLES,
     SCAN_COUNTERS,
     Decoder,
@@ -53,6 +54,8 @@ class PortProtocol:
         has_clock: whether scans say by the device's own clock when they were taken.
         counts: what was understood and what was not, over all connections.
         trouble: why scans cannot be used at present; None where they can, or none came yet.
+        acknowledges: whether a device answers every command.
+        fault: which rule of the protocol the last intact message broke; empty for none.
 
     """
 
@@ -63,6 +66,8 @@ class PortProtocol:
     preamble_period_s: float = 1.0
     says_hello: bool = False
     has_clock: bool = False
+    acknowledges: bool = False
+    fault: str = ""
     counts: DecoderCounts
     trouble: Trouble | None = None
 
@@ -244,6 +249,8 @@ class ForeignProtocol(PortProtocol):
             raise ValueError(
                 f"volts of shape {samples.shape}, not ({self.description.measurements},)"
             )
+        if not 0 <= reading.device_us <= MAX_DEVICE_US:
+            raise ValueError(f"device_us is {reading.device_us}, not from 0 to {MAX_DEVICE_US}")
         self.device_us = reading.device_us
         counter, self._counter = self._counter, (self._counter + 1) % SCAN_COUNTERS
         return Scan(self._channel, counter, reading.device_us, ScanFlag(0), samples)

@@ -27,6 +27,7 @@ class NativeProtocol(PortProtocol):
     preamble_period_s = math.inf  # the device itself says hello every second
     says_hello = True
     has_clock = True
+    acknowledges = True
 
     def __init__(self, description: SensorDescription | None = None) -> None:
         self._decoder = Decoder()
@@ -43,6 +44,7 @@ class NativeProtocol(PortProtocol):
         for packet in packets:
             if isinstance(packet, Hello):
                 self._hello = packet
+        self.fault = self._decoder.fault
         return packets
 
     def introduction(self) -> list[bytes]:

@@ -205,9 +205,9 @@ class Firmware:
             self._greet([port])
 
     def _set_rate(self, rate_hz: float) -> AckStatus:
-        if not RATE_HZ_MIN <= rate_hz <= RATE_HZ_MAX:
+        if not 0 < rate_hz <= RATE_HZ_MAX:
             return AckStatus.BAD_ARGUMENT
-        self.rate_hz = rate_hz
+        self.rate_hz = max(RATE_HZ_MIN, rate_hz)
         self._next_hello_s = self._next_sample_s = self._clock()
         return AckStatus.OK
 

@@ -96,11 +96,19 @@ class DecoderCounts:
     unknown_type: int = 0  # returned as `UnknownPacket`; not an error
 
     @property
+    def damaged(self) -> int:
+        """Frames that the line spoilt."""
+        return self.crc_errors + self.cobs_errors + self.oversize
+
+    @property
+    def faulty(self) -> int:
+        """Intact frames that break the specification: the line is good, and the sender is not."""
+        return self.malformed + self.wrong_version
+
+    @property
     def corrupt(self) -> int:
         """Frames that arrived and yielded no packet."""
-        return (
-            self.crc_errors + self.cobs_errors + self.malformed + self.oversize + self.wrong_version
-        )
+        return self.damaged + self.faulty
 
 
 class Decoder:

@@ -288,3 +288,26 @@ def test_no_point_lies_below_the_hull_and_its_edge_is_the_least_of_lines(
     scale = sum(p.lag_ns for p in points) + abs(best) * sum(p.arrived_ns for p in points)
     for change in (-0.1, -1e-3, 1e-3, 0.1):
         assert distance(best) <= distance(best + change * (abs(best) + 1e-3)) + 1e-9 * scale
+
+
+@pytest.mark.parametrize("apart_us", [20_000_000, 3_600_000_000, 2**52])
+def test_a_channel_by_another_clock_is_not_dated_and_told(apart_us: int) -> None:
+    clock = DeviceClock()
+    for n in range(1000):
+        arrived_ns = BOOT_NS + n * 50_000_000
+        clock.date(MAGNITUDE, apart_us + n * 50_000, arrived_ns)
+        assert clock.date(Channel.STRUCTURE, n * 50_000, arrived_ns) is None
+    assert clock.state is ClockState.UNUSABLE
+    assert clock.line is None
+
+
+def test_channels_in_either_order_and_gaps_are_of_one_clock() -> None:
+    clock = DeviceClock()
+    at_us = 0
+    for n in range(1000):
+        at_us += 50_000 if n % 100 else 40_000_000
+        arrived_ns = BOOT_NS + at_us * 1000
+        for channel in list(Channel)[:: 1 if n % 3 else -1]:
+            own_us = at_us - (20_000 if channel is MAGNITUDE else 0)
+            clock.date(channel, own_us, arrived_ns)
+    assert clock.state is ClockState.SETTLED

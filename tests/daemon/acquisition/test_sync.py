@@ -6,6 +6,7 @@ from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tactomo.acquisition.scan_pairer import CounterPairer
@@ -213,11 +214,31 @@ def test_a_board_that_was_reset_alone_is_paired_only_when_both_began_anew() -> N
     assert pairs[-2:] == [[[4, 4]], [[5, 5]]]
 
 
-def test_an_old_scan_that_comes_again_is_no_restart() -> None:
+@pytest.mark.parametrize(("old", "repeated"), [(7, 1), (6, 0)])
+def test_an_old_scan_is_no_restart_but_a_repetition_or_late(old: int, repeated: int) -> None:
     sync = CounterPairer(BOTH, WAIT_NS)
-    told = [scan(BOTH[0], n, n, n * 50_000) for n in (7, 8, 6, 9)]
+    told = [scan(BOTH[0], n, n, n * 50_000) for n in (7, 8, old, 9)]
     feed(sync, *told)
-    assert (sync.repeated, sync.resets, sync.zeroed) == (1, 0, 0)
+    assert (sync.repeated, sync.late, sync.resets, sync.zeroed) == (repeated, 1 - repeated, 0, 0)
+
+
+@pytest.mark.parametrize("jitter_ns", [0, 7_000_000])
+def test_a_channel_about_as_late_as_the_wait_is_lost_once(jitter_ns: int) -> None:
+    """33 ms behind, or 29.5 to 36.5, where 30 are waited for: it does not flap."""
+    sync, rng, changes = CounterPairer(BOTH, 30_000_000), np.random.default_rng(0), 0
+    events = []
+    for n in range(2000):
+        at_ns = n * 50_000_000
+        late_ns = at_ns + 33_000_000 + int(rng.uniform(-jitter_ns / 2, jitter_ns / 2))
+        events.append(scan(BOTH[0], n, at_ns, n * 50_000))
+        events.append(scan(BOTH[1], n, late_ns, n * 50_000))
+    for each in sorted(events, key=lambda event: event.clock_ns):
+        before = set(sync.lost)
+        sync.advance(each.clock_ns)
+        sync.push(each)
+        changes += before != sync.lost
+    assert sync.lost == {BOTH[1]}
+    assert changes == 1
 
 
 def test_a_sensor_of_one_channel_is_told_no_scan_twice() -> None:

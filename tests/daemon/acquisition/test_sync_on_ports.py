@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from tactomo_client.messages import array_from_wire
-from tactomo_protocol import Channel, Scan, ScanFlag
+from tactomo_protocol import Channel, SampleFormat, Scan, ScanFlag
 
 Start = Callable[..., Any]
 
@@ -74,6 +75,7 @@ def test_a_channel_that_comes_after_the_tare_says_that_it_has_no_reference(bench
     for _ in range(3):
         b.step(channels=(Channel.MAGNITUDE,))
     b.listener.event("tared")
+    structure.say(both)
     b.step(channels=(Channel.STRUCTURE, Channel.MAGNITUDE))
     assert b.listener.event("channel_back")["next_step"].startswith("tare")
 
@@ -128,6 +130,7 @@ def test_voltages_that_are_no_numbers_are_left_to_the_models_and_never_tared(
     good = np.full(208, 1e5, np.float32)
     bad = good.copy()
     bad[17] = np.nan
+    line.say(replace(line.hello, sample_format=SampleFormat.FLOAT32))
     answer = b.daemon._pipeline.tare()
     b.until(lambda: b.daemon._imaging.taring.is_on)  # a scan that comes first is none of the tare's
     for number in range(counter, counter + 3):
