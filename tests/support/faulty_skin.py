@@ -10,7 +10,7 @@ from tactomo_models import SensorDescription, SkinSimulator
 from tactomo_models.arrays import BoolArray
 from tactomo_models.physics.bare_sheet import exchanged
 from tactomo_models.physics.forward import ForwardModel
-from tactomo_models.physics.greens import GreensFunction
+from tactomo_models.physics.greens import PackedGreensFunction
 
 
 def touches(description: SensorDescription, electrode: int) -> BoolArray:
@@ -23,7 +23,6 @@ def shorted(simulator: SkinSimulator, first: int, second: int) -> SkinSimulator:
     """The same skin with two electrodes connected: a rank-one change of the bare sheet."""
     forward = simulator._forward
     bare = forward.bare
-    assert isinstance(bare.green, GreensFunction)
     between = np.zeros(len(bare.transfer))
     between[first], between[second] = 1, -1
     electrodes = bare.transfer @ between
@@ -37,7 +36,9 @@ def shorted(simulator: SkinSimulator, first: int, second: int) -> SkinSimulator:
             bare,
             transfer=bare.transfer - np.outer(electrodes, electrodes) / resistance,
             potentials=bare.potentials - np.outer(nodes, electrodes[:-1]) / resistance,
-            green=bare.green.whole() - np.outer(nodes, nodes) / resistance,
+            green=PackedGreensFunction(
+                bare.green.rows(np.arange(len(nodes))) - np.outer(nodes, nodes) / resistance
+            ),
         ),
     )
     return made

@@ -20,6 +20,7 @@ from tactomo_models.arrays import FloatArray
 from tactomo_models.errors import ArtifactError, DataError
 from tactomo_models.physics.bare_sheet import BareSheet, solve_bare_sheet
 from tactomo_models.physics.forward import ForwardModel
+from tactomo_models.physics.greens import PackedGreensFunction
 from tactomo_models.physics.mesh import mesh_sheet
 from tactomo_models.physics.tikhonov import even_scale, prior_weight, tikhonov_matrix
 from tactomo_models.sensor.description import SensorDescription
@@ -137,6 +138,7 @@ def save_artifact(artifact: Artifact, path: Path) -> None:
     }
     for name in _BARE_ARRAYS:
         arrays[name] = getattr(artifact.bare, name)
+    arrays["green"] = artifact.bare.green.rows(np.arange(len(artifact.bare.support)))
     try:
         write_whole(path, lambda file: np.savez(file, **arrays))
     except OSError as error:
@@ -145,7 +147,7 @@ def save_artifact(artifact: Artifact, path: Path) -> None:
         ) from error
 
 
-_BARE_ARRAYS = ("points", "triangles", "pressable", "support", "green", "potentials", "transfer")
+_BARE_ARRAYS = ("points", "triangles", "pressable", "support", "potentials", "transfer")
 
 
 def load_artifact(path: Path, description: SensorDescription) -> Artifact:
@@ -183,7 +185,11 @@ def _from_arrays(arrays: dict[str, FloatArray], description: SensorDescription) 
     artifact = Artifact(
         sensor=str(arrays["sensor"]),
         sha256=str(arrays["sha256"]),
-        bare=BareSheet(map_weights=weights, **{name: arrays[name] for name in _BARE_ARRAYS}),  # type: ignore[arg-type]
+        bare=BareSheet(
+            map_weights=weights,
+            green=PackedGreensFunction(arrays["green"]),
+            **{name: arrays[name] for name in _BARE_ARRAYS},  # type: ignore[arg-type]
+        ),
         jacobian=arrays["jacobian"],
         tikhonov=arrays["tikhonov"],
         regularisation=float(arrays["regularisation"]),

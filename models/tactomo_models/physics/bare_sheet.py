@@ -22,7 +22,7 @@ from skfem.helpers import dot, grad
 from threadpoolctl import threadpool_limits
 
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
-from tactomo_models.physics.greens import GreensFunction
+from tactomo_models.physics.greens import GreensFunction, PackedGreensFunction
 from tactomo_models.physics.mesh import SheetMesh
 from tactomo_models.sensor.description import SensorDescription
 
@@ -49,7 +49,7 @@ class BareSheet:
     triangles: IntArray
     pressable: IntArray
     support: IntArray
-    green: FloatArray | GreensFunction
+    green: PackedGreensFunction | GreensFunction
     potentials: FloatArray
     transfer: FloatArray
     map_weights: sp.csr_matrix
@@ -72,7 +72,7 @@ def solve_bare_sheet(
         conductivity: (N,) of an uneven sheet, relative to the description's; 1 if None.
         impedance: (L,) contact impedances, relative to the description's; 1 if None.
         quick: leave the Green's function in pieces: a tenth of the time and memory, but a newly
-            pressed area then costs a millisecond more, and there are no `ForwardModel.probes`.
+            pressed area then costs a millisecond more.
     """
     mesh = sheet.mesh
     # The integral of a linear conductivity over a triangle is that of its corners' mean.
@@ -85,13 +85,13 @@ def solve_bare_sheet(
     fields = _fields(description, system)
     with threadpool_limits(1):
         green = GreensFunction(system, support, mesh.p[:, support])
-        whole = green if quick else green.whole()
+        kept = green if quick else green.packed()
     return BareSheet(
         points=mesh.p,
         triangles=mesh.t.astype(np.intp),
         pressable=pressable,
         support=support,
-        green=whole,
+        green=kept,
         potentials=fields[support],
         transfer=_transfer(description, fields),
         map_weights=_map_weights(description, mesh)[:, pressable].tocsr(),

@@ -23,7 +23,6 @@ import scipy.sparse as sp
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 from tactomo_models.physics.bare_sheet import BareSheet, scan_voltages, volts_per_unit
 from tactomo_models.physics.condensation import Condensation
-from tactomo_models.physics.greens import GreensFunction
 from tactomo_models.sensor.description import SensorDescription
 
 _STRIP = 256  # triangles, or spots, at once: what that takes stays in the cache
@@ -246,7 +245,7 @@ class ForwardModel:
             depth,
         )
         potentials = self.bare.potentials[near]
-        both = np.concatenate([self._green(near, near[on_rim]), potentials], axis=1)
+        both = np.concatenate([self.bare.green.between(near, near[on_rim]), potentials], axis=1)
         rim = np.count_nonzero(on_rim)
         return _PressedAreas(
             triangles=triangles,
@@ -258,16 +257,6 @@ class ForwardModel:
             both=both[on_rim],
             bare_both=law @ both,
         )
-
-    def _green(self, rows: IntArray, columns: IntArray | None = None) -> FloatArray:
-        """Block of the bare sheet's Green's function, or rows; `take` is faster than `np.ix_`."""
-        green = self.bare.green
-        if isinstance(green, GreensFunction):
-            every = np.arange(len(self.bare.support))
-            return green.between(rows, every if columns is None else columns)
-        if columns is None:
-            return np.asarray(green[rows])
-        return np.asarray(green.ravel().take(rows[:, None] * len(green) + columns))
 
     def _around(self, nodes: IntArray) -> IntArray:
         """Indexed triangles with any of these pressable nodes as a corner."""
@@ -282,7 +271,7 @@ class ForwardModel:
         potentials = np.empty((len(nodes), self.bare.potentials.shape[1]))
         potentials[~outside] = solution.potentials[position[~outside]]
         others = nodes[outside]
-        moved = self._green(others, solution.rim) @ solution.injected
+        moved = self.bare.green.between(others, solution.rim) @ solution.injected
         potentials[outside] = self.bare.potentials[others] + moved
         return potentials
 
@@ -395,7 +384,7 @@ class ForwardModel:
         Unlike `jacobian` it looks anywhere, at the price of resolution: it is for finding where a
         contact is missing in a solution, not for fitting it.
         """
-        moved = self._green(solution.rim).T @ solution.injected  # G is symmetric
+        moved = self.bare.green.rows(solution.rim).T @ solution.injected  # G is symmetric
         field = self._pair_matrix @ (probes.bare + probes.gradient @ moved).T
         x, y = np.split(field, 2, axis=1)  # (pairs, C) each
         one, other = self._products

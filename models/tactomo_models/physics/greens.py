@@ -20,6 +20,36 @@ import scipy.sparse.linalg as spla
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 
 
+class PackedGreensFunction:
+    """The whole function in half its memory: it is symmetric.
+
+    A block of it is a look-up: for one contact 5 us more than in all of it.
+
+    Args:
+        whole: (S, S) potentials at nodes for unit currents into others.
+    """
+
+    def __init__(self, whole: FloatArray) -> None:
+        self._lower = np.concatenate([row[: place + 1] for place, row in enumerate(whole)])
+        place = np.arange(len(whole))
+        self._start = place * (place + 1) // 2  # of each row
+
+    def between(self, rows: IntArray, columns: IntArray) -> FloatArray:
+        """Potentials (r, c) at some of the nodes for unit currents into others, by their places."""
+        row = rows[:, None]
+        lower, upper = self._start[row] + columns, self._start[columns] + row
+        return np.asarray(self._lower.take(np.where(row >= columns, lower, upper)))
+
+    def rows(self, rows: IntArray) -> FloatArray:
+        """Potentials (r, S) at all nodes for unit currents into some."""
+        found = np.empty((len(rows), len(self._start)))
+        for potentials, row in zip(found, rows, strict=True):
+            start = self._start[row]
+            potentials[: row + 1] = self._lower[start : start + row + 1]
+            potentials[row + 1 :] = self._lower[self._start[row + 1 :] + row]
+        return found
+
+
 class GreensFunction:
     """Potentials at nodes of a sheet for unit currents into others.
 
@@ -68,10 +98,13 @@ class GreensFunction:
         onto = self._between[np.ix_(used, used)] @ there[:, used].toarray().T
         return np.asarray(self._within[rows][:, columns].toarray() + here[:, used] @ onto)
 
-    def whole(self) -> FloatArray:
-        """All of it, (S, S): hundreds of megabytes, of which a block is a look-up."""
-        every = np.arange(self._weights.shape[0])
-        return self.between(every, every)
+    def rows(self, rows: IntArray) -> FloatArray:
+        """Potentials (r, S) at all nodes for unit currents into some."""
+        return self.between(rows, np.arange(self._weights.shape[0]))
+
+    def packed(self) -> PackedGreensFunction:
+        """All of it, of which a block is a look-up: up to hundreds of megabytes."""
+        return PackedGreensFunction(self.rows(np.arange(self._weights.shape[0])))
 
 
 def _boxes(points: FloatArray) -> IntArray:
