@@ -15,6 +15,7 @@ import tactomo.stream.control
 import tactomo.twin.control
 from tables import table as cells_of
 from tactomo.errors import CommandError
+from tactomo.service import metrics
 from tactomo_client import status
 from tactomo_client.frame import TOUCHES_SEEN
 from tactomo_models import Flag
@@ -98,6 +99,11 @@ def test_the_clients_know_of_which_flags_touches_are_seen() -> None:
         assert set(re.findall(r'"(\w+)"', listed[1])) == seen, place
     after = DOCUMENT.partition("\n## Stale, or nothing pressed?\n")[2].partition("\n1. ")[0]
     assert set(re.findall(r"`(\w+)`", after)) == seen | {"is_known"}
+
+
+def test_every_state_is_listed_and_scraped() -> None:
+    told = re.findall(r"`(\w+)`", of_status("### `status`")["state"])
+    assert tuple(told) == metrics.STATES
 
 
 def test_every_method_is_listed_that_may_have_made_a_frame() -> None:
