@@ -16,8 +16,11 @@ from tactomo.acquisition.scan_pairer import counts_between
 from tactomo.scans import ChannelScan, DualScan, Timing
 from tactomo.timing import Durations
 
-IN_A_ROW: Final = 5
-"""Findings that must agree before the channels count as out of step, or in step again."""
+IN_A_ROW: Final = 9
+"""Findings that must agree before the channels count as out of step, or in step again. Each scan is
+in two of them, so these are five dual scans."""
+ALIKE: Final = 0.05
+"""Share by which they may differ: the period is an estimate, and counters may be far apart."""
 MIN_LIMIT_NS: Final = 5_000_000
 """The least delays of two ports are unknown and may differ by some milliseconds."""
 UNDATED_NS: Final = 1_000_000_000
@@ -46,6 +49,7 @@ class Skew:
         self._compared: ChannelScan | None = None  # the newest one that found its counterpart
         self._periods_ns: dict[Channel, float] = {}
         self._in_a_row = 0  # findings that contradict `is_skewed`
+        self._row_ns = 0.0  # by how much the first of them did
 
     def take(self, scan: ChannelScan) -> None:
         """Hold a scan, in order of arrival, against the other channel's newest."""
@@ -100,10 +104,16 @@ class Skew:
         step_ns = skew_ns - counts_between(other.counter, scan.counter) * period_ns
         limit_ns = self._limit_ns(scan, other) + (0 if is_dated else UNDATED_NS)
         self.out_of_step_ns = round(step_ns if scan.channel == Channel.MAGNITUDE else -step_ns)
-        self._conclude(abs(step_ns) > limit_ns)
+        self._conclude(self.out_of_step_ns, limit_ns)
 
-    def _conclude(self, is_skewed: bool) -> None:
-        self._in_a_row = self._in_a_row + 1 if is_skewed != self.is_skewed else 0
+    def _conclude(self, step_ns: float, limit_ns: float) -> None:
+        """Count findings; boards that missed pulses stay apart by as much, an overload's do not."""
+        is_skewed = abs(step_ns) > limit_ns
+        alike_ns = max(limit_ns / 2, ALIKE * abs(self._row_ns))
+        is_another = is_skewed and abs(step_ns - self._row_ns) > alike_ns
+        if is_another or is_skewed == self.is_skewed:
+            self._in_a_row, self._row_ns = 0, step_ns
+        self._in_a_row += is_skewed != self.is_skewed
         if self._in_a_row >= IN_A_ROW:
             self.is_skewed, self._in_a_row = is_skewed, 0
 

@@ -133,3 +133,13 @@ def test_clocks_that_stand_still_tell_nothing() -> None:
             skew.take(scan(channel, number + 7 * port, number * PERIOD_NS, port, None, 0))
     assert not skew.is_skewed
     assert math.isfinite(skew.out_of_step_ns)
+
+
+def test_an_overload_that_holds_boards_up_by_more_or_less_is_no_missed_pulse() -> None:
+    """A board that waits for its line before it reads its clock, at 300 scans a second."""
+    skew, rng = Skew(), np.random.default_rng(3)
+    for number in range(600):
+        at_ns = 10**12 + number * PERIOD_NS // 15
+        skew.take(scan(MAGNITUDE, number, at_ns))
+        skew.take(scan(STRUCTURE, number, at_ns + int(rng.uniform(0, 60_000_000)), 1))
+        assert not skew.is_skewed
