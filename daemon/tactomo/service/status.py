@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Sequence
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any, Final
 
 from tactomo_models import SensorDescription
@@ -20,6 +19,7 @@ from tactomo.imaging.imaging import Imaging
 from tactomo.imaging.pipeline import Pipeline
 from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording import REPLAY_SCHEME
+from tactomo.service.memory import resident_bytes
 from tactomo.timing import Durations, LastMinute
 
 VERSION: Final = version("tactomo")  # read from a file, which may fail later
@@ -169,15 +169,6 @@ def process_fields() -> dict[str, Any]:
         "memory_bytes": resident_bytes(),
         "threads": threading.active_count(),
     }
-
-
-def resident_bytes() -> int | None:
-    """Return the memory that this process holds; None where the system does not say."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text("ascii").split()[1])
-    except (OSError, IndexError, ValueError):
-        return None
-    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def source(ports: list[PortReader]) -> str:

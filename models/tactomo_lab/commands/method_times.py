@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from tactomo.cli.bench.machine_speed import warned_if_busy
-from tactomo.service.status import resident_bytes
+from tactomo.service.memory import resident_bytes, return_freed_memory
 from tactomo.twin import make_skin
 from tactomo.twin.device import NOISE_SHARE
 from tactomo_models import (
@@ -78,6 +78,7 @@ def method_times(
     Raises:
         ModelError: there is no such sensor.
     """
+    return_freed_memory()  # else a method is measured in what the one before it has left
     report("methods: the models, pyEIT")
     description = load_description(name)
     if not methods:

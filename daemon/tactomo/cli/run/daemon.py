@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -207,24 +206,11 @@ def _run_daemon(settings: DaemonConfig) -> int:
     """Serve until the daemon is stopped, and return its exit status."""
     from tactomo.log import configure_logging
     from tactomo.service.daemon import Daemon
+    from tactomo.service.memory import return_freed_memory
 
-    _return_freed_memory()
+    return_freed_memory()
     configure_logging(settings.log_level, settings.log_format)
     return Daemon(settings).run()
-
-
-def _return_freed_memory() -> None:
-    """Let what is freed go back to the system, where the C library keeps it for each thread.
-
-    30 of 260 MB; a frame takes no longer.
-    """
-    import ctypes
-
-    mmap_threshold, arena_max, large_bytes = -3, -8, 1 << 20  # of glibc's malloc.h
-    with suppress(AttributeError, OSError):  # another C library has no mallopt
-        set_option = ctypes.CDLL(None).mallopt
-        set_option(arena_max, 1)
-        set_option(mmap_threshold, large_bytes)
 
 
 def _speed(text: str) -> float:
