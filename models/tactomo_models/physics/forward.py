@@ -397,16 +397,17 @@ class ForwardModel:
         return self.jacobian(unpressed, np.arange(len(self.bare.pressable)))
 
 
-def _rim_law(stiffness: FloatArray, corners: IntArray, depth: IntArray) -> sp.csr_matrix:
+def _rim_law(stiffness: FloatArray, corners: IntArray, depth: IntArray) -> FloatArray:
     """Rows of the rims' nodes, by them and their neighbours inside, of triangles assembled."""
+    # Full, although most are zero: a sparse matrix takes longer to make than this to multiply.
     rim, near = depth == 0, depth <= 1
     triangle, corner = np.nonzero(rim[corners])
     rows = (rim.cumsum() - 1)[corners[triangle, corner]]
     columns = (near.cumsum() - 1)[corners[triangle]]
-    values = stiffness[triangle, corner]
-    return sp.csr_matrix(
-        (values.ravel(), (np.repeat(rows, 3), columns.ravel())), (rim.sum(), near.sum())
-    )
+    shape = np.count_nonzero(rim), np.count_nonzero(near)
+    place = (rows[:, None] * shape[1] + columns).ravel()
+    values = stiffness[triangle, corner].ravel()
+    return np.bincount(place, values, shape[0] * shape[1]).reshape(shape)
 
 
 def _assembled(stiffness: FloatArray, corners: IntArray, nodes: int) -> sp.csr_matrix:
