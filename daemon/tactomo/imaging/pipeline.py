@@ -105,6 +105,7 @@ class Pipeline(Worker):
         self.wall_clock = WallClock(on_event)
         self._zero_counters = zero_counters
         self._zero_limit = RateLimit(ZERO_PERIOD_S)
+        self._reset_limit, self._zeroed_limit = RateLimit(), RateLimit()
         self._on_event = on_event
         # Scans: each port's thread counts its own; the port threads share a lock for what is
         # discarded because this thread did not come round to it for seconds.
@@ -330,15 +331,20 @@ class Pipeline(Worker):
     def _tell_changes(self, before: _SyncState) -> None:
         now = self._sync_state()
         self._tell_lost(before.lost, now.lost)
-        if now.resets > before.resets:
+        if now.resets > before.resets and self._reset_limit.allows():
             self._on_event(
                 "device_restarted",
                 "warning",
-                "a device was reset: its scan counter and its clock went back",
+                "a device was reset: its scan counter and its clock went back; "
+                f"{now.resets} times since the start",
                 "check its supply; tare again if it lost its settings",
             )
-        if now.zeroed > before.zeroed:
-            self._on_event("counters_zeroed", "info", "the scan counter went back, the clock on")
+        if now.zeroed > before.zeroed and self._zeroed_limit.allows():
+            self._on_event(
+                "counters_zeroed",
+                "info",
+                f"the scan counter went back, the clock on; {now.zeroed} times since the start",
+            )
         if now.is_skewed:
             self._bring_in_step(is_news=not before.is_skewed)
         elif before.is_skewed:
