@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fake_control import FakeControl
 from tactomo_client import Contact, ControlError
-from tactomo_client.fake import FakeControl, FakeSensor
+from tactomo_client.fake import FakeSensor
 from tactomo_models import SkinSimulator, load_description
 from tactomo_models.calibration.calibration_file import calibration_path, read_calibration
 from tactomo_models.scene.press import Press

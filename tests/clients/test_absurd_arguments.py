@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fake_control import FakeControl
 from tactomo_client import Daemon, aio, request, subscribe
-from tactomo_client.fake import FakeControl, FakeSensor
+from tactomo_client.fake import FakeSensor
 
 NOWHERE = "tcp://127.0.0.1:1"
 NO_NUMBERS: list[Any] = ["0.5", "soon", True, b"1", [1.0], 1j]

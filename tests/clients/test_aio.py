@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from typing import Any
 
 import pytest
+from fake_control import FakeControl
 from tactomo_client import (
     Contact,
     ControlError,
@@ -21,7 +22,7 @@ from tactomo_client import (
     TareRefused,
     aio,
 )
-from tactomo_client.fake import FakeControl, FakeSensor
+from tactomo_client.fake import FakeSensor
 from tactomo_client.reception import Kind
 
 Run = Callable[[Coroutine[Any, Any, None]], None]

@@ -13,10 +13,11 @@ from typing import Any
 
 import pytest
 import tactomo_client
+from fake_control import FakeControl
 from tactomo.recordings.recording import Origin
 from tactomo.recordings.recording_writer import RecordingWriter, message_entry
 from tactomo_client import Contact, ControlError, aio
-from tactomo_client.fake import FakeControl, FakeSensor
+from tactomo_client.fake import FakeSensor
 from tactomo_client.messages import MAP, encode_message
 
 README = (Path(__file__).parents[2] / "clients" / "python" / "README.md").read_text("utf-8")

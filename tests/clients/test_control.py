@@ -7,9 +7,9 @@ import threading
 import time
 
 import pytest
+from fake_control import FakeControl
 from tactomo_client import ControlError, Daemon, MessageError, NoAnswer, request, subscribe
 from tactomo_client.control import TARE_TIMEOUT_S
-from tactomo_client.fake import FakeControl
 
 PATIENCE_S = 60.0
 

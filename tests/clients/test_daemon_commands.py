@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fake_control import FakeControl
 from tables import table
 from tactomo_client import (
     AlreadyRecording,
@@ -17,7 +18,6 @@ from tactomo_client import (
     NotRecording,
     errors,
 )
-from tactomo_client.fake import FakeControl
 
 PATIENCE_S = 30.0
 

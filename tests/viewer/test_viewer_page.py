@@ -20,12 +20,13 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 from aiohttp import web
+from fake_control import FakeControl
 from selenium import webdriver
 from selenium.webdriver import Keys
 from selenium.webdriver.common.by import By
 from selenium.webdriver.remote.webelement import WebElement
 from tactomo_client import Contact, ControlError
-from tactomo_client.fake import FakeControl, FakeSensor
+from tactomo_client.fake import FakeSensor
 from tactomo_models.arrays import Image
 from tactomo_viewer.server import Viewer
 from waiting import wait_until

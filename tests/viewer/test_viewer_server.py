@@ -20,8 +20,9 @@ import numpy as np
 import pytest
 import tactomo_viewer
 from aiohttp.test_utils import TestClient, TestServer
+from fake_control import FakeControl
 from tactomo_client import ClientError, Contact, ControlError
-from tactomo_client.fake import FakeControl, FakeSensor
+from tactomo_client.fake import FakeSensor
 from tactomo_viewer import ViewerError
 from viewer_process import viewer_process
 

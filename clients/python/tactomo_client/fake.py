@@ -1,4 +1,4 @@
-"""A sensor and a control socket for tests: real sockets that do what a test tells them to.
+"""A sensor for tests: a real socket that says what a test tells it to.
 
 A controller is tested against it without a skin, a twin or a daemon::
 
@@ -15,7 +15,6 @@ To have something live to look at instead, run `tactomo demo`.
 from __future__ import annotations
 
 import dataclasses
-import threading
 import time
 import uuid
 from collections import Counter
@@ -26,16 +25,12 @@ import zmq
 from numpy.typing import NDArray
 
 from tactomo_client.arguments import checked_seconds
-from tactomo_client.errors import ControlError
 from tactomo_client.frame import Contact
 from tactomo_client.messages import (
     CONTACTS,
     MAP,
     clock_id,
-    decode_request,
-    encode_error,
     encode_message,
-    encode_reply,
 )
 
 
@@ -49,7 +44,7 @@ class FakeSensor:
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.XPUB)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.XPUB_VERBOSER, 1)
-        self.address = _bind(self._socket, address)
+        self.address = bind_when_free(self._socket, address)
 
     def wait_for_subscriber(self, timeout_s: float = 10.0) -> bytes:
         """Wait until somebody subscribes and return the topic; raise TimeoutError otherwise.
@@ -126,59 +121,7 @@ class FakeSensor:
         self.close()
 
 
-class FakeControl:
-    """A control socket at an ephemeral port that notes what it is asked, in a thread of its own.
-
-    Args:
-        answers: for each command its result, the ControlError to refuse it with, or the bytes to
-            send as they are. A command that is not in it is carried out with an empty result.
-        address: where to bind.
-
-    Attributes:
-        requests: the commands and arguments that came, in order.
-    """
-
-    def __init__(
-        self,
-        answers: Mapping[str, Mapping[str, Any] | ControlError | bytes] | None = None,
-        address: str = "tcp://127.0.0.1:*",
-    ) -> None:
-        self.answers = dict(answers or {})
-        self.requests: list[tuple[str, dict[str, Any]]] = []
-        self._stop = threading.Event()
-        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REP)
-        self._socket.setsockopt(zmq.LINGER, 1000)
-        self.address = _bind(self._socket, address)
-        self._thread = threading.Thread(target=self._run, name="fake control")
-        self._thread.start()
-
-    def close(self) -> None:
-        """Stop answering and give the port back."""
-        self._stop.set()
-        self._thread.join()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def _run(self) -> None:
-        with self._socket as socket:
-            while not self._stop.is_set():
-                if socket.poll(20):
-                    socket.send(self._reply(socket.recv()))
-
-    def _reply(self, data: bytes) -> bytes:
-        command, arguments = decode_request(data)
-        self.requests.append((command, arguments))
-        answer = self.answers.get(command, {})
-        if isinstance(answer, ControlError):
-            return encode_error(answer.name, answer.cause, answer.next_step)
-        return answer if isinstance(answer, bytes) else encode_reply(answer)
-
-
-def _bind(socket: zmq.Socket[bytes], address: str) -> str:
+def bind_when_free(socket: zmq.Socket[bytes], address: str) -> str:
     """Bind and return where; waits up to 10 s for a port that a closed socket still gives back."""
     deadline = time.monotonic() + 10.0
     while True:
