@@ -11,11 +11,10 @@ interpolated in the logarithm of time, in which creep is a straight line.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -288,8 +287,6 @@ def simulate_day(
     seed_set: SeedSet,
     number: int,
     hours: float = 24.0,
-    cache: Path | None = None,
-    progress: Callable[[float], None] = lambda _: None,
 ) -> Day:
     """Draw a day and solve it; what was solved is kept.
 
@@ -298,8 +295,6 @@ def simulate_day(
         seed_set: tune on the one, report the other.
         number: of the day.
         hours: its length.
-        cache: folder of what was simulated; the user's cache if None.
-        progress: called with the share that is done.
     """
     require_both_channels(description)
     rng = np.random.default_rng(seed_of(seed_set, "drift", number))
@@ -307,7 +302,6 @@ def simulate_day(
     step_at_s = float(rng.uniform(0.2, 0.8) * hours * 3600)
     skin = DriftingSkin(description, presses, seed_of(seed_set, "drifting skin", number), step_at_s)
     plan = list(_plan(presses, hours))
-    solves = sum(len(times) for _, times in plan)
 
     def simulate() -> dict[str, FloatArray]:
         arrays: dict[str, list[FloatArray]] = {name: [] for name in description.channels}
@@ -315,12 +309,11 @@ def simulate_day(
             for time_s in times_s:
                 for name, volts in skin.solve(float(time_s), pressed).items():
                     arrays[name].append(volts)
-                progress(len(arrays[name]) / solves)
         return {name: np.array(volts) for name, volts in arrays.items()}
 
     what = f"{SIMULATION} drift {seed_set} {number} {hours} {presses!r} {DRIFT!r} {step_at_s} "
     what += f"{STEP_K} {STEP_S} {IMPEDANCE_WANDER} {description.model_dump_json()}"
-    arrays = cached(cache, what, simulate)
+    arrays = cached(what, simulate)
     stretches, begin = [], 0
     for pressed, times_s in plan:
         end = begin + len(times_s)

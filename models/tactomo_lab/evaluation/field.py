@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 from itertools import count as count_from
 from itertools import islice
 from math import ceil
-from pathlib import Path
 from typing import Final
 
 from tactomo_models.sensor.description import SensorDescription
@@ -48,7 +47,6 @@ def scores_of_row(
     method: str,
     seed_set: SeedSet,
     count: int,
-    cache: Path | None = None,
 ) -> dict[str, Iterator[FrameScore]]:
     """Frames of a row as a method reconstructs them, by the name of the line that they are on.
 
@@ -58,15 +56,14 @@ def scores_of_row(
         method: the name of one.
         seed_set: see `still_scenes.scenes`.
         count: scenes of each line; of moving ones one for each `SCENES_A_SEQUENCE`.
-        cache: folder of simulated voltages; in the user's cache if None.
 
     Raises:
         DataError: the sensor has a single channel, or no room for what presses.
         ModelError: the method is not to be had for this sensor, or is the user's own and failed.
     """
     if row == "moving":
-        return {row: _moving(description, method, seed_set, count, cache)}
-    lines = scenes_of_row(description, row, seed_set, count, cache)
+        return {row: _moving(description, method, seed_set, count)}
+    lines = scenes_of_row(description, row, seed_set, count)
     return {line: _still(scenes, method) for line, scenes in lines.items()}
 
 
@@ -76,11 +73,11 @@ def _still(scenes: Iterator[EvaluationScene], method: str) -> Iterator[FrameScor
 
 
 def _moving(
-    description: SensorDescription, method: str, seed_set: SeedSet, count: int, cache: Path | None
+    description: SensorDescription, method: str, seed_set: SeedSet, count: int
 ) -> Iterator[FrameScore]:
     """Frames in which no scan is lost: a map of half a measurement is another question."""
     for number in range(ceil(count / SCENES_A_SEQUENCE)):
-        sequence = draw_sequence(description, seed_set, number, cache=cache)
+        sequence = draw_sequence(description, seed_set, number)
         for step, score in zip(sequence.steps, play(sequence, method), strict=True):
             if not step.lost:
                 yield score
@@ -91,7 +88,6 @@ def scenes_of_row(
     row: str,
     seed_set: SeedSet,
     count: int,
-    cache: Path | None = None,
 ) -> dict[str, Iterator[EvaluationScene]]:
     """Scenes of one of `STILL_ROWS`, by the line's name; the same ones every time.
 
@@ -99,9 +95,9 @@ def scenes_of_row(
     """
     require_both_channels(description)
     if row in REGIME_ROWS:
-        cases = (_of_regime(description, row, seed_set, number, cache) for number in range(count))
+        cases = (_of_regime(description, row, seed_set, number) for number in range(count))
         return {row: cases}
-    simulation = Simulation(description, cache)
+    simulation = Simulation(description)
 
     def still(shapes: tuple[SceneShape, ...], snr_db: float) -> Iterator[EvaluationScene]:
         for layout in islice(_layouts(description, seed_set, shapes), count):
@@ -117,7 +113,6 @@ def middle_press(
     methods: Sequence[str],
     seed_set: SeedSet,
     count: int,
-    cache: Path | None = None,
 ) -> list[Outcome]:
     """One soft contact as each method has it: the scene whose ICC by the last one is the middle.
 
@@ -126,9 +121,8 @@ def middle_press(
         methods: names of at least one.
         seed_set: see `still_scenes.scenes`.
         count: soft scenes to choose from; those of one contact are looked at.
-        cache: folder of simulated voltages; in the user's cache if None.
     """
-    soft = scenes_of_row(description, "soft", seed_set, count, cache)["soft"]
+    soft = scenes_of_row(description, "soft", seed_set, count)["soft"]
     single = (scene for scene in soft if len(scene.layout.presses) == 1)
     outcomes = list(reconstruct_scenes(single, *methods))
     by_scene = [outcomes[at : at + len(methods)] for at in range(0, len(outcomes), len(methods))]
@@ -148,10 +142,10 @@ def _layouts(
 
 
 def _of_regime(
-    description: SensorDescription, regime: str, seed_set: SeedSet, number: int, cache: Path | None
+    description: SensorDescription, regime: str, seed_set: SeedSet, number: int
 ) -> EvaluationScene:
     """A case of a regime of single frames."""
-    case = make_case(description, regime, seed_set, number, cache)
+    case = make_case(description, regime, seed_set, number)
     plan, (scans,) = case.plan, case.frames
     (presses,) = plan.frames
     return EvaluationScene(

@@ -11,7 +11,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from tactomo_models.errors import MethodError
@@ -184,7 +183,6 @@ def draw_sequence(
     *,
     snr_db: float = 40.0,
     snr_of: SnrOf = "change",
-    cache: Path | None = None,
 ) -> Sequence:
     """Draw and simulate a moving scene: about a minute, or read from the cache.
 
@@ -194,7 +192,6 @@ def draw_sequence(
         number: of the scene.
         snr_db: signal-to-noise ratio in decibels.
         snr_of: what the noise is measured by; see `scenes.noise_std`.
-        cache: folder of simulated voltages; in the user's cache if None.
 
     Raises:
         DataError: the sensor has a single channel.
@@ -218,7 +215,7 @@ def draw_sequence(
 
     what = f"{SIMULATION} {seed_set} {number} {steps!r} {true_sensor.model_dump_json()}"
     sheet_seed = seed_of(seed_set, "moving sheet", number)
-    volts = kept_volts(cache, what, lambda: _simulate(true_sensor, steps, sheet_seed))
+    volts = kept_volts(what, lambda: _simulate(true_sensor, steps, sheet_seed))
     under_load = np.array([bool(step.presses) for step in steps])
     loaded = replace(volts, pressed={n: scans[under_load] for n, scans in volts.pressed.items()})
     return Sequence(

@@ -18,7 +18,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations, product
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -95,7 +94,6 @@ def paper_scenes(
     *,
     contacts: Iterable[int] = COUNTS,
     snr_db: float = 40.0,
-    cache: Path | None = None,
 ) -> Iterator[EvaluationScene]:
     """Test scenes of Fig. 5, drawn as the paper's training scenes are but from other seeds.
 
@@ -105,7 +103,6 @@ def paper_scenes(
         count: scenes of each number of contacts; the paper has 100.
         contacts: how many contacts.
         snr_db: of the voltage changes.
-        cache: folder of simulated voltages; in the user's cache if None.
 
     Raises:
         DataError: the sensor has a single channel, or no room for that many contacts.
@@ -113,7 +110,7 @@ def paper_scenes(
     require_both_channels(description)
     assert description.magnitude is not None
     opposite = description.magnitude.response.sign > 0  # the paper's conductivity falls
-    simulation = Simulation(description, cache, even=True)
+    simulation = Simulation(description, even=True)
     for contact_count in contacts:
         for number in range(count):
             rng = np.random.default_rng(seed_of(seed_set, "paper", contact_count, number))
@@ -235,7 +232,6 @@ class Rig:
         seed_set: see `scenes.scenes`.
         sheet: number of the sensor, each uneven in its own way.
         snr_db: of the voltages at rest.
-        cache: folder of simulated voltages; in the user's cache if None.
 
     Raises:
         DataError: the sensor has a single channel.
@@ -248,13 +244,11 @@ class Rig:
         sheet: int,
         *,
         snr_db: float = RIG_SNR_DB,
-        cache: Path | None = None,
     ) -> None:
         require_both_channels(description)
         self.description = description
         self.sheet = sheet
         self._seed_set = seed_set
-        self._folder = cache
         rest = self._clean(())
         volts = SimulatedVolts(rest, rest)
         self._noise = {name: noise_std(volts, name, snr_db, "voltage") for name in BOTH_CHANNELS}
@@ -274,7 +268,7 @@ class Rig:
         def simulate() -> dict[str, FloatArray]:
             return {str(name): scan for name, scan in self._skin.voltages(presses).items()}
 
-        volts = cached(self._folder, what, simulate)
+        volts = cached(what, simulate)
         return {name: volts[name] for name in BOTH_CHANNELS}
 
     def _noisy(self, clean: Volts, presses: tuple[Press, ...], scans: int) -> Volts:

@@ -13,7 +13,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -83,7 +82,6 @@ def make_case(
     regime: str,
     seed_set: SeedSet,
     number: int,
-    cache: Path | None = None,
 ) -> Case:
     """Draw, simulate and measure a case; the same one every time.
 
@@ -92,7 +90,6 @@ def make_case(
         regime: one of `REGIMES`.
         seed_set: see `scenes.scenes`.
         number: of the case.
-        cache: folder of simulated voltages; in the user's cache if None.
 
     Raises:
         DataError: the sensor has a single channel, or no room for what presses.
@@ -106,7 +103,7 @@ def make_case(
         true = with_contrast(true, plan.contrast)
     seed = seed_of(seed_set, f"stability {regime} sheet", number)
     what = f"{SIMULATION} {seed_set} {regime} {number} {plan!r} {true.model_dump_json()}"
-    volts = kept_volts(cache, what, lambda: _simulate(plan, true, _fine_mesh(description), seed))
+    volts = kept_volts(what, lambda: _simulate(plan, true, _fine_mesh(description), seed))
     rng = np.random.default_rng(seed_of(seed_set, f"stability {regime} noise", number))
     reference, frames = _measure(plan, volts, description, rng)
     return Case(
@@ -304,7 +301,6 @@ def evaluate_regimes(
     count: int,
     *,
     jobs: int = 1,
-    cache: Path | None = None,
 ) -> Iterator[list[Outcome]]:
     """Reconstruct cases of some regimes by some methods.
 
@@ -315,7 +311,6 @@ def evaluate_regimes(
         seed_set: see `scenes.scenes`.
         count: cases of each regime.
         jobs: processes that share the cases.
-        cache: folder of simulated voltages; in the user's cache if None.
 
     Yields:
         Each case's outcomes, of the methods that its sensor has; in the order of regimes and
@@ -326,7 +321,7 @@ def evaluate_regimes(
     """
     require_both_channels(description)
     _artifact(description)  # built once, by this process
-    work = partial(_evaluate_case, description, tuple(methods), seed_set, cache)
+    work = partial(_evaluate_case, description, tuple(methods), seed_set)
     which = [(regime, number) for regime in regimes for number in range(count)]
     if jobs == 1:
         yield from map(work, which)
@@ -340,10 +335,9 @@ def _evaluate_case(
     description: SensorDescription,
     methods: tuple[str, ...],
     seed_set: SeedSet,
-    cache: Path | None,
     which: tuple[str, int],
 ) -> list[Outcome]:
-    case = make_case(description, which[0], seed_set, which[1], cache)
+    case = make_case(description, which[0], seed_set, which[1])
     missing = left_out(case.description, methods)  # a regime may have a sensor of its own
     return reconstruct_case(case, *(method for method in methods if method not in missing))
 

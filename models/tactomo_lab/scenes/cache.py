@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,18 +15,16 @@ from tactomo_models.physics.artifact import cache_folder
 Arrays = dict[str, Any]
 
 
-def cached(folder: Path | None, what: str, make: Callable[[], Arrays]) -> Arrays:
-    """Arrays from an earlier call, or made anew and kept.
+def cached(what: str, make: Callable[[], Arrays]) -> Arrays:
+    """Arrays from an earlier call, or made anew and kept in the user's cache.
 
     A file that cannot be read or written costs time and nothing else.
 
     Args:
-        folder: where files are kept; `scenes` in the user's cache if None.
         what: all that the arrays depend on.
         make: makes them.
     """
-    folder = folder or cache_folder() / "scenes"
-    path = folder / f"{hashlib.sha256(what.encode()).hexdigest()[:32]}.npz"
+    path = cache_folder() / "scenes" / f"{hashlib.sha256(what.encode()).hexdigest()[:32]}.npz"
     with suppress(OSError, DataError):
         return read_arrays(path)
     arrays = make()

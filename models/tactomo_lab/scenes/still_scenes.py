@@ -15,7 +15,6 @@ import hashlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -124,7 +123,6 @@ def scenes(
     contacts: Iterable[int] = CONTACTS,
     snr_db: float = 40.0,
     snr_of: SnrOf = "change",
-    cache: Path | None = None,
 ) -> Iterator[EvaluationScene]:
     """Scenes of a seed set, `count` of each number of contacts; the same ones every time.
 
@@ -136,13 +134,12 @@ def scenes(
         contacts: how many contacts.
         snr_db: signal-to-noise ratio in decibels.
         snr_of: what the noise is measured by; see `noise_std`.
-        cache: folder of simulated voltages; in the user's cache if None.
 
     Raises:
         DataError: the sensor has a single channel, or no room for that many contacts.
     """
     require_both_channels(description)
-    simulation = Simulation(description, cache)
+    simulation = Simulation(description)
     for contact_count in contacts:
         for number in range(count):
             layout = draw_layout(description, seed_set, contact_count, number)
@@ -258,16 +255,12 @@ class Simulation:
 
     Args:
         description: the sensor; needs both channels.
-        folder: of simulated voltages; in the user's cache if None.
         even: whether sheets and electrodes are as even as the model's, instead of each scene's
             own.
     """
 
-    def __init__(
-        self, description: SensorDescription, folder: Path | None, *, even: bool = False
-    ) -> None:
+    def __init__(self, description: SensorDescription, *, even: bool = False) -> None:
         self._description = description
-        self._folder = folder
         self._even = even
 
     @cached_property
@@ -278,7 +271,7 @@ class Simulation:
         """Noise-free voltages of a scene."""
         what = f"{SIMULATION} {layout!r} {self._description.model_dump_json()}"
         what += " even" if self._even else ""
-        return kept_volts(self._folder, what, lambda: self._simulate(layout))
+        return kept_volts(what, lambda: self._simulate(layout))
 
     def _simulate(self, layout: Layout) -> SimulatedVolts:
         sensor = with_contrast(self._description, layout.contrast)
@@ -303,13 +296,10 @@ class SimulatedVolts:
     pressed: Volts
 
 
-def kept_volts(
-    folder: Path | None, what: str, simulate: Callable[[], SimulatedVolts]
-) -> SimulatedVolts:
+def kept_volts(what: str, simulate: Callable[[], SimulatedVolts]) -> SimulatedVolts:
     """Voltages of a sensor's channels from an earlier call, or simulated and kept.
 
     Args:
-        folder: see `cached`.
         what: all that the voltages depend on.
         simulate: makes them.
     """
@@ -319,7 +309,7 @@ def kept_volts(
         rest = {f"{name}_rest": scan for name, scan in volts.rest.items()}
         return rest | {f"{name}_pressed": scans for name, scans in volts.pressed.items()}
 
-    arrays = cached(folder, what, make)
+    arrays = cached(what, make)
     channels = [name for name in BOTH_CHANNELS if f"{name}_rest" in arrays]
     return SimulatedVolts(
         rest={name: arrays[f"{name}_rest"] for name in channels},

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from tactomo_lab.evaluation.drifting import (
@@ -20,10 +18,10 @@ from tactomo_protocol import Channel
 
 @pytest.mark.slow
 def test_an_hour_of_drift_leaves_no_ghost_and_erases_nothing(
-    paper: SensorDescription, artifact: Artifact, tmp_path: Path
+    paper: SensorDescription, artifact: Artifact
 ) -> None:
-    day = simulate_day(paper, "tuning", 3, hours=0.75, cache=tmp_path)
-    again = simulate_day(paper, "tuning", 3, hours=0.75, cache=tmp_path)
+    day = simulate_day(paper, "tuning", 3, hours=0.75)
+    again = simulate_day(paper, "tuning", 3, hours=0.75)
     np.testing.assert_array_equal(
         day.stretches[-1].volts[Channel.STRUCTURE], again.stretches[-1].volts[Channel.STRUCTURE]
     )
@@ -36,10 +34,10 @@ def test_an_hour_of_drift_leaves_no_ghost_and_erases_nothing(
 @pytest.mark.long
 @pytest.mark.timeout(7200)
 def test_a_day_of_drift_leaves_no_ghost_and_erases_nothing(
-    paper: SensorDescription, artifact: Artifact, tmp_path: Path
+    paper: SensorDescription, artifact: Artifact
 ) -> None:
     """Ten minutes, most of which it simulates."""
-    day = simulate_day(paper, "tuning", 0, cache=tmp_path)
+    day = simulate_day(paper, "tuning", 0)
     tracked = summarise_day(list(live(day, artifact=artifact)), day.hours)
     assert tracked.missed == tracked.erased == 0
     assert tracked.ghosts_per_hour == 0

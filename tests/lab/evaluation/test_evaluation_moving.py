@@ -204,9 +204,12 @@ def test_phases_by_hand() -> None:
 
 
 @pytest.mark.long
-def test_a_sequence_is_drawn_once_and_kept(small: SensorDescription, tmp_path: Path) -> None:
-    first, again = (draw_sequence(small, "tuning", 0, cache=tmp_path) for _ in range(2))
-    assert len(list(tmp_path.iterdir())) == 1
+def test_a_sequence_is_drawn_once_and_kept(
+    small: SensorDescription, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CACHE_DIRECTORY", str(tmp_path))
+    first, again = (draw_sequence(small, "tuning", 0) for _ in range(2))
+    assert len(list((tmp_path / "scenes").iterdir())) == 1
     assert first.steps == again.steps
     np.testing.assert_array_equal(
         first.volts.pressed[Channel.STRUCTURE], again.volts.pressed[Channel.STRUCTURE]

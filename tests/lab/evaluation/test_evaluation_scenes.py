@@ -180,24 +180,15 @@ def test_every_sheet_is_uneven_in_its_own_way(paper: SensorDescription, mesh: Sh
         assert 0.01 < np.std(sheet / first[Channel.STRUCTURE]) < 0.2
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("scenes")
-
-
-def one(
-    paper: SensorDescription, folder: Path, snr_db: float = 40, snr_of: SnrOf = "change"
-) -> EvaluationScene:
-    (scene,) = scenes(paper, "tuning", 1, contacts=(2,), snr_db=snr_db, snr_of=snr_of, cache=folder)
+def one(paper: SensorDescription, snr_db: float = 40, snr_of: SnrOf = "change") -> EvaluationScene:
+    (scene,) = scenes(paper, "tuning", 1, contacts=(2,), snr_db=snr_db, snr_of=snr_of)
     return scene
 
 
 @pytest.mark.parametrize("snr_of", ["change", "voltage"])
-def test_noise_is_what_the_ratio_says(
-    paper: SensorDescription, folder: Path, snr_of: SnrOf
-) -> None:
+def test_noise_is_what_the_ratio_says(paper: SensorDescription, snr_of: SnrOf) -> None:
     """Of one size in volts on every voltage, in scan and reference."""
-    clean, noisy = one(paper, folder, np.inf), one(paper, folder, 20, snr_of)
+    clean, noisy = one(paper, np.inf), one(paper, 20, snr_of)
     for name in BOTH_CHANNELS:
         rest, pressed = getattr(clean.reference, name), getattr(clean, name)
         signal = rest if snr_of == "voltage" else pressed - rest
@@ -213,23 +204,26 @@ def test_noise_is_what_the_ratio_says(
 
 
 def test_the_same_scene_comes_out_of_the_cache(
-    paper: SensorDescription, folder: Path, tmp_path: Path
+    paper: SensorDescription, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = one(paper, folder)
-    written = {file: file.stat().st_mtime_ns for file in folder.iterdir()}
-    assert written
-    again = one(paper, folder)
-    assert {file: file.stat().st_mtime_ns for file in folder.iterdir()} == written
-    for file in folder.iterdir():  # a disc that damages it costs time only
-        (tmp_path / file.name).write_bytes(file.read_bytes()[:100])
-    mended = one(paper, tmp_path)
+    monkeypatch.setenv("CACHE_DIRECTORY", str(tmp_path))
+    first = one(paper)
+    (file,) = (tmp_path / "scenes").iterdir()
+    written_ns = file.stat().st_mtime_ns
+    again = one(paper)
+    assert file.stat().st_mtime_ns == written_ns
+    file.write_bytes(file.read_bytes()[:100])  # a disc that damages it costs time only
+    mended = one(paper)
     for scene in (again, mended):
         np.testing.assert_array_equal(scene.structure, first.structure)
 
 
-def test_what_the_cache_cannot_keep_is_simulated(paper: SensorDescription, folder: Path) -> None:
-    uncached = one(paper, Path("/proc/nowhere"))
-    np.testing.assert_array_equal(uncached.magnitude, one(paper, folder).magnitude)
+def test_what_the_cache_cannot_keep_is_simulated(
+    paper: SensorDescription, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = one(paper)
+    monkeypatch.setenv("CACHE_DIRECTORY", "/proc/nowhere")
+    np.testing.assert_array_equal(one(paper).magnitude, kept.magnitude)
 
 
 def test_a_sensor_of_one_channel_has_no_scenes() -> None:

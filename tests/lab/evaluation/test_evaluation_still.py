@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from tactomo_lab.evaluation.still import reconstruct_scenes
@@ -13,10 +11,10 @@ from tactomo_models import Artifact, Reconstructor, SensorDescription
 
 @pytest.mark.slow
 def test_scenes_do_not_know_of_each_other(
-    paper: SensorDescription, artifact: Artifact, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    paper: SensorDescription, artifact: Artifact, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tactomo_lab.evaluation.still.load_or_build_artifact", lambda _: artifact)
-    drawn = list(scenes(paper, "tuning", 2, contacts=(1, 2), cache=tmp_path))[:3]
+    drawn = list(scenes(paper, "tuning", 2, contacts=(1, 2)))[:3]
     assert len({scene.layout.opposite for scene in drawn}) == 2  # or the test would show less
     for outcome in reconstruct_scenes(drawn, "tikhonov"):
         alone = Reconstructor(outcome.scene.description, artifact, method=outcome.frame.tier)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from tactomo_lab.commands.evaluate_field import EVEN_FIT
@@ -15,22 +13,17 @@ from tactomo_models import DataError, SensorDescription
 from variants import variant
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("scenes")
-
-
-def one_of(small: SensorDescription, row: str, folder: Path) -> dict[str, EvaluationScene]:
-    lines = scenes_of_row(small, row, "tuning", 1, folder)
+def one_of(small: SensorDescription, row: str) -> dict[str, EvaluationScene]:
+    lines = scenes_of_row(small, row, "tuning", 1)
     return {line: scene for line, scenes in lines.items() for scene in scenes}
 
 
 @pytest.mark.parametrize("row", STILL_ROWS)
 def test_a_scene_of_each_row_is_reconstructed_and_scored(
-    small: SensorDescription, folder: Path, row: str
+    small: SensorDescription, row: str
 ) -> None:
-    scenes = one_of(small, row, folder)
-    lines = scores_of_row(small, row, "tikhonov", "tuning", 1, folder)
+    scenes = one_of(small, row)
+    lines = scores_of_row(small, row, "tikhonov", "tuning", 1)
     assert list(lines) == list(scenes)
     for line, scores in lines.items():
         (score,) = scores
@@ -40,20 +33,16 @@ def test_a_scene_of_each_row_is_reconstructed_and_scored(
 
 
 @pytest.mark.slow
-def test_a_moving_scene_is_scored_where_no_scan_is_lost(
-    small: SensorDescription, folder: Path
-) -> None:
-    sequence = draw_sequence(small, "tuning", 0, cache=folder)
-    (scores,) = scores_of_row(small, "moving", "tikhonov", "tuning", 1, folder).values()
+def test_a_moving_scene_is_scored_where_no_scan_is_lost(small: SensorDescription) -> None:
+    sequence = draw_sequence(small, "tuning", 0)
+    (scores,) = scores_of_row(small, "moving", "tikhonov", "tuning", 1).values()
     frames = list(scores)
     assert len(frames) == sum(not step.lost for step in sequence.steps)
     assert 0 < summarise(frames).icc < 1
 
 
-def test_ordinary_scenes_are_the_same_ones_at_each_noise(
-    small: SensorDescription, folder: Path
-) -> None:
-    quiet, noisy, noisiest = one_of(small, "ordinary", folder).values()
+def test_ordinary_scenes_are_the_same_ones_at_each_noise(small: SensorDescription) -> None:
+    quiet, noisy, noisiest = one_of(small, "ordinary").values()
     assert quiet.layout == noisy.layout == noisiest.layout
     assert [scene.snr_db for scene in (quiet, noisy, noisiest)] == [40, 20, 10]
     assert quiet.reference.magnitude_noise is not None
@@ -63,8 +52,8 @@ def test_ordinary_scenes_are_the_same_ones_at_each_noise(
     )
 
 
-def test_one_graded_sheet_has_no_structure_scan(small: SensorDescription, folder: Path) -> None:
-    (scene,) = one_of(small, "graded", folder).values()
+def test_one_graded_sheet_has_no_structure_scan(small: SensorDescription) -> None:
+    (scene,) = one_of(small, "graded").values()
     assert scene.structure is None
     assert scene.reference.structure is None
     assert scene.description.magnitude is not None
@@ -75,10 +64,8 @@ def test_one_graded_sheet_has_no_structure_scan(small: SensorDescription, folder
     assert 0.5 * highest < scene.truth.map.max() <= highest
 
 
-def test_a_ball_has_its_peak_and_the_mean_over_its_area(
-    small: SensorDescription, folder: Path
-) -> None:
-    (scene,) = one_of(small, "soft", folder).values()
+def test_a_ball_has_its_peak_and_the_mean_over_its_area(small: SensorDescription) -> None:
+    (scene,) = one_of(small, "soft").values()
     (press,), (contact,) = scene.layout.presses, scene.truth.contacts
     assert press.profile == "dome"
     assert contact.pressure_kpa == press.pressure_kpa
@@ -87,11 +74,9 @@ def test_a_ball_has_its_peak_and_the_mean_over_its_area(
     assert contact.magnitude * contact.area_m2 == pytest.approx(in_all, rel=1e-6)
 
 
-def test_an_even_pressure_is_fitted_to_the_middle_press(
-    small: SensorDescription, folder: Path
-) -> None:
+def test_an_even_pressure_is_fitted_to_the_middle_press(small: SensorDescription) -> None:
     """By the fit of old, which is sure of it; the field, which may take it for soft, is not."""
-    even, field = middle_press(small, (EVEN_FIT, "fit"), "tuning", 4, folder)
+    even, field = middle_press(small, (EVEN_FIT, "fit"), "tuning", 4)
     assert even.scene is field.scene
     assert len(even.scene.layout.presses) == 1
     (sure,), (unsure,) = even.frame.contacts, field.frame.contacts

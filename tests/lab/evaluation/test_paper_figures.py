@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,13 +40,8 @@ SHORT = [replace(case, pressures_kpa=((200.0,),)) for case in SINGLE[:2]]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("scans")
-
-
-@pytest.fixture(scope="module")
-def rig(small: SensorDescription, folder: Path) -> Rig:
-    return Rig(small, "tuning", 0, cache=folder)
+def rig(small: SensorDescription) -> Rig:
+    return Rig(small, "tuning", 0)
 
 
 @pytest.fixture(scope="module")
@@ -93,8 +87,8 @@ def test_cases_fit_on_the_sheet_and_lie_apart(paper: SensorDescription) -> None:
     assert places == {(18.0 * i, 18.0 * j) for i in range(-2, 3) for j in range(-2, 3)}
 
 
-def test_scenes_of_the_simulation_study(small: SensorDescription, folder: Path) -> None:
-    drawn = list(paper_scenes(small, "tuning", 1, cache=folder, snr_db=np.inf))
+def test_scenes_of_the_simulation_study(small: SensorDescription) -> None:
+    drawn = list(paper_scenes(small, "tuning", 1, snr_db=np.inf))
     assert [len(scene.layout.presses) for scene in drawn] == [1, 2, 3, 4]
     for scene in drawn:
         assert {press.shape for press in scene.layout.presses} == {"ellipse"}
@@ -105,12 +99,12 @@ def test_scenes_of_the_simulation_study(small: SensorDescription, folder: Path) 
         np.testing.assert_array_equal(scene.reference.magnitude, drawn[0].reference.magnitude)
         assert scene.description.magnitude is not None
         assert scene.description.magnitude.response.sign == -1
-    other = next(paper_scenes(small, "reporting", 1, cache=folder))
+    other = next(paper_scenes(small, "reporting", 1))
     assert other.layout.presses != drawn[0].layout.presses
 
 
-def test_points_of_the_simulation_study(small: SensorDescription, folder: Path) -> None:
-    drawn = list(paper_scenes(small, "tuning", 1, contacts=(1, 2), cache=folder))
+def test_points_of_the_simulation_study(small: SensorDescription) -> None:
+    drawn = list(paper_scenes(small, "tuning", 1, contacts=(1, 2)))
     points = cells(reconstruct_scenes(drawn, "tikhonov", "noser"))
     assert [(p.method, p.contacts) for p in points] == [
         ("tikhonov", 1),
@@ -123,12 +117,12 @@ def test_points_of_the_simulation_study(small: SensorDescription, folder: Path) 
         assert point.summary.icc == outcome.score.icc > 0.3
 
 
-def test_a_rig_measures_one_uneven_sensor(small: SensorDescription, rig: Rig, folder: Path) -> None:
+def test_a_rig_measures_one_uneven_sensor(small: SensorDescription, rig: Rig) -> None:
     presses = presses_of(small, SINGLE[0], (200.0,))
     scan = rig.scan(presses)
-    again = Rig(small, "tuning", 0, cache=folder).scan(presses)
-    quiet = Rig(small, "tuning", 0, snr_db=np.inf, cache=folder)
-    other = Rig(small, "tuning", 1, snr_db=np.inf, cache=folder)
+    again = Rig(small, "tuning", 0).scan(presses)
+    quiet = Rig(small, "tuning", 0, snr_db=np.inf)
+    other = Rig(small, "tuning", 1, snr_db=np.inf)
     for name in BOTH_CHANNELS:
         np.testing.assert_array_equal(scan[name], again[name])
         rest = getattr(quiet.reference, name)

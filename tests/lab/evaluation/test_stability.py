@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -84,27 +83,22 @@ def centre(plan: Plan) -> tuple[float, float]:
     return first.x_m, first.y_m
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("cases")
+def case_of(small: SensorDescription, regime: str, number: int = 0) -> Case:
+    return make_case(small, regime, "tuning", number)
 
 
-def case_of(small: SensorDescription, folder: Path, regime: str, number: int = 0) -> Case:
-    return make_case(small, regime, "tuning", number, folder)
-
-
-def test_a_case_is_measured_as_planned(small: SensorDescription, folder: Path) -> None:
-    lost = case_of(small, folder, "lost-scans", 1)
+def test_a_case_is_measured_as_planned(small: SensorDescription) -> None:
+    lost = case_of(small, "lost-scans", 1)
     assert [set(scans) for scans in lost.frames[-3:]] == [
         set(BOTH_CHANNELS),
         {"magnitude"},
         {"magnitude"},
     ]
-    late = case_of(small, folder, "one-scan-apart")
+    late = case_of(small, "one-scan-apart")
     before, last = late.frames[-2:]
     np.testing.assert_array_equal(before[Channel.STRUCTURE], last[Channel.STRUCTURE])
     assert change(before[Channel.MAGNITUDE], last[Channel.MAGNITUDE]) > 3e-4
-    rest = case_of(small, folder, "drift-at-rest")
+    rest = case_of(small, "drift-at-rest")
     assert not rest.truth.pressed.any()
     assert rest.reference.structure is not None
     assert 0.005 < change(rest.frames[0][Channel.STRUCTURE], rest.reference.structure) < 0.2
@@ -114,10 +108,8 @@ def change(volts: FloatArray, others: FloatArray) -> float:
     return float(np.linalg.norm(volts - others) / np.linalg.norm(others))
 
 
-def test_a_lead_opens_on_one_sheet_in_the_last_frame(
-    small: SensorDescription, folder: Path
-) -> None:
-    case = case_of(small, folder, "intermittent")
+def test_a_lead_opens_on_one_sheet_in_the_last_frame(small: SensorDescription) -> None:
+    case = case_of(small, "intermittent")
     assert case.plan.lead
     (broken,) = case.plan.at_fault
     (good,) = set(BOTH_CHANNELS) - {broken}
@@ -127,8 +119,8 @@ def test_a_lead_opens_on_one_sheet_in_the_last_frame(
     assert np.abs(last[broken][driven]).max() < 0.1 * np.abs(before[broken][driven]).max()
 
 
-def test_the_wrong_sign_is_told(small: SensorDescription, folder: Path) -> None:
-    case = case_of(small, folder, "wrong-sign")
+def test_the_wrong_sign_is_told(small: SensorDescription) -> None:
+    case = case_of(small, "wrong-sign")
     true = with_opposite_magnitude(small) if case.plan.opposite else small
     assert case.description.magnitude
     assert true.magnitude
@@ -195,11 +187,10 @@ def by(method: str, case: Case, artifact: Artifact) -> Outcome:
 def test_regularisation_is_so_many_times_what_the_rule_chooses(
     small: SensorDescription,
     small_artifact: Artifact,
-    folder: Path,
     method: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    case = case_of(small, folder, "wrong-lambda")
+    case = case_of(small, "wrong-lambda")
     factor = case.plan.regularisation
     assert factor == 0.01
     wrong = by(method, case, small_artifact).frame.map
@@ -219,9 +210,9 @@ def test_regularisation_is_so_many_times_what_the_rule_chooses(
 
 
 def test_a_case_is_judged_by_its_last_frame(
-    small: SensorDescription, small_artifact: Artifact, folder: Path
+    small: SensorDescription, small_artifact: Artifact
 ) -> None:
-    case = case_of(small, folder, "jump")
+    case = case_of(small, "jump")
     outcome = by("tikhonov", case, small_artifact)
     alone = Reconstructor(case.description, small_artifact, method=outcome.frame.tier)
     alone.set_reference(case.reference)
@@ -234,21 +225,21 @@ def test_a_case_is_judged_by_its_last_frame(
 
 
 def test_what_is_right_where_the_magnitude_channel_shows_nothing(
-    small: SensorDescription, small_artifact: Artifact, folder: Path
+    small: SensorDescription, small_artifact: Artifact
 ) -> None:
     """The pressed shape counts; at rest, whether a contact is reported; a lack of a map warns."""
-    light = case_of(small, folder, "light")
+    light = case_of(small, "light")
     assert not light.truth.map.any()
     outcome = by("tikhonov", light, small_artifact)
     assert outcome.frame.structure is not None
     expected = np.corrcoef(outcome.frame.structure.ravel(), light.truth.pressed.ravel())[0, 1]
     assert outcome.score.icc == pytest.approx(expected)
-    drifted = case_of(small, folder, "drift-at-rest")
+    drifted = case_of(small, "drift-at-rest")
     ghosts = by("tikhonov", drifted, small_artifact).score
     assert (ghosts.icc == 0) is (ghosts.found > 0)
     still = replace(drifted, frames=({n: getattr(drifted.reference, n) for n in BOTH_CHANNELS},))
     assert by("tikhonov", still, small_artifact).score.icc == 1
-    nothing = replace(case_of(small, folder, "ordinary"), frames=({},))
+    nothing = replace(case_of(small, "ordinary"), frames=({},))
     absent = by("tikhonov", nothing, small_artifact).score
     assert absent.bad
     assert absent.warned
@@ -286,24 +277,20 @@ def test_a_sensor_of_one_channel_has_no_cases(small: SensorDescription) -> None:
         make_case(single, "ordinary", "tuning", 0)
 
 
-def test_a_regime_may_have_a_sensor_that_a_method_does_not_serve(
-    small: SensorDescription, folder: Path
-) -> None:
+def test_a_regime_may_have_a_sensor_that_a_method_does_not_serve(small: SensorDescription) -> None:
     methods = ("tikhonov", "network")  # which needs both channels
-    ((outcome,),) = evaluate_regimes(small, ["graded"], methods, "tuning", 1, cache=folder)
+    ((outcome,),) = evaluate_regimes(small, ["graded"], methods, "tuning", 1)
     assert outcome.score.method == "tikhonov"
     assert outcome.case.description.channels == (Channel.MAGNITUDE,)
 
 
 @pytest.mark.long
-def test_more_processes_do_the_same(small: SensorDescription, tmp_path: Path) -> None:
+def test_more_processes_do_the_same(small: SensorDescription) -> None:
     regimes, methods = ("near-touch", "dead-lead"), ("tikhonov", "auto")
     alone, shared = (
         [
             [outcome.score for outcome in case]
-            for case in evaluate_regimes(
-                small, regimes, methods, "tuning", 2, jobs=jobs, cache=tmp_path
-            )
+            for case in evaluate_regimes(small, regimes, methods, "tuning", 2, jobs=jobs)
         ]
         for jobs in (1, 2)
     )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -67,10 +65,10 @@ def test_every_method_has_a_point_and_auto_one_for_every_budget() -> None:
 
 @pytest.mark.slow
 def test_still_scenes_are_measured_under_each_budget(
-    paper: SensorDescription, artifact: Artifact, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    paper: SensorDescription, artifact: Artifact, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tactomo_lab.evaluation.still.load_or_build_artifact", lambda _: artifact)
-    drawn = list(scenes(paper, "tuning", 1, contacts=(3,), snr_db=20, cache=tmp_path))
+    drawn = list(scenes(paper, "tuning", 1, contacts=(3,), snr_db=20))
     asked = [Variant("tikhonov"), Variant("fit", 0.001), Variant("fit", 0.2)]
     done: list[None] = []
     linear, hasty, patient = measure_still(drawn, asked, lambda: done.append(None))
