@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import cycle, product
+from itertools import cycle
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -29,11 +29,6 @@ ICC_TICKS: Final = (-0.5, 0, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0
 MAX_ICC: Final = 0.9995  # drawn there if it is more
 PAPER_MS: Final = 6000.0  # the paper, section V: whole tomography, hardware; it prints no ICC
 FRAME_MS: Final = 50.0  # between two scans at 20 a second
-# Places of a label by its point, in points of print, near ones first.
-OFFSETS: Final = tuple(
-    sorted(product(range(-99, 100, 9), range(-63, 64, 9)), key=lambda at: np.hypot(*at))
-)
-NEAR: Final = 26.0  # farther away, a budget's label would be taken for another point's
 
 
 def draw_chart(points: Sequence[Point], title: str) -> Figure:
@@ -51,10 +46,21 @@ def draw_chart(points: Sequence[Point], title: str) -> Figure:
     for axes, panel in zip(grid.flat, groups, strict=False):
         _draw_panel(axes, panel, styles)
     _set_axes(grid, points)
-    figure.draw_without_rendering()  # places are known from here on
-    for axes, panel in zip(grid.flat, groups, strict=False):
-        _label(axes, panel, styles)
+    _name_methods(figure, points, styles)
     return figure
+
+
+def _name_methods(figure: Figure, points: Sequence[Point], styles: dict[str, Style]) -> None:
+    """Say below the panels which marker is which method."""
+    from matplotlib.lines import Line2D
+
+    measured = {point.variant.method for point in points}
+    handles = [
+        Line2D([], [], color=colour, marker=marker, label=method)
+        for method, (colour, marker) in styles.items()
+        if method in measured
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=6, fontsize=8)
 
 
 def _draw_panel(axes: Any, panel: Sequence[Point], styles: dict[str, Style]) -> None:
@@ -100,7 +106,7 @@ def _draw_time(axes: Any, ms: float, what: str) -> None:
 def _draw_method(
     axes: Any, series: Sequence[Point], front: Sequence[Point], styles: dict[str, Style]
 ) -> None:
-    """Draw a method's points, joined from its smallest budget to its largest."""
+    """Draw a method's points, joined from its smallest budget to its largest, with the budgets."""
     colour, marker = styles[series[0].variant.method]
     axes.plot(
         [p.p50_s * 1e3 for p in series],
@@ -124,6 +130,17 @@ def _draw_method(
             alpha=1.0 if best else PALE,
             zorder=4 if best else 3,
         )
+        if len(series) > 1:
+            axes.annotate(
+                point.variant.budget_name,
+                (point.p50_s * 1e3, _shown(point.icc)),
+                xytext=(0, -MARKER),
+                textcoords="offset points",
+                ha="center",
+                va="top",
+                fontsize=6,
+                color=colour,
+            )
 
 
 def _styles(points: Sequence[Point]) -> dict[str, Style]:
@@ -172,85 +189,3 @@ def _stretch(icc: FloatArray) -> FloatArray:
 
 def _unstretch(stretched: FloatArray) -> FloatArray:
     return np.asarray(1 - 10.0**-stretched)
-
-
-def _label(axes: Any, panel: Sequence[Point], styles: dict[str, Style]) -> None:
-    """Name each method once, at its most accurate point, and the budgets of those that have one."""
-    front = pareto_front(panel)
-    taken = [_box(axes, point) for point in panel]
-    taken += [text.get_window_extent() for text in axes.texts]
-    best = {m: _most_accurate(panel, m) for m in dict.fromkeys(p.variant.method for p in panel)}
-    for method, point in best.items():
-        if point is not None:
-            alpha = 1.0 if any(p.variant.method == method for p in front) else 0.7
-            style = {"color": styles[method][0], "fontsize": 9, "alpha": alpha}
-            _place(axes, panel, point, str(method), taken, np.inf, **style)
-    methods = [point.variant.method for point in panel]
-    for point in panel:
-        if methods.count(point.variant.method) > 1:
-            alpha = 1.0 if point in front else 0.6
-            style = {"color": styles[point.variant.method][0], "fontsize": 6, "alpha": alpha}
-            _place(axes, panel, point, point.variant.budget_name, taken, NEAR, **style)
-
-
-def _most_accurate(panel: Sequence[Point], method: str) -> Point | None:
-    own = [p for p in panel if p.variant.method == method and np.isfinite(p.icc)]
-    return max(own, key=lambda p: p.icc, default=None)
-
-
-def _box(axes: Any, point: Point) -> Any:
-    """Return where a point's marker is, in pixels."""
-    from matplotlib.transforms import Bbox
-
-    x, y = axes.transData.transform((point.p50_s * 1e3, _shown(point.icc)))
-    half = MARKER / 2 * axes.figure.dpi / 72
-    return Bbox([[x - half, y - half], [x + half, y + half]])
-
-
-def _place(
-    axes: Any,
-    panel: Sequence[Point],
-    point: Point,
-    text: str,
-    taken: list[Any],
-    farthest: float,
-    **style: Any,
-) -> None:
-    """Write text by a point, at the nearest place where it covers nothing; else not at all."""
-    from matplotlib.patheffects import withStroke
-
-    label = axes.annotate(
-        text,
-        (point.p50_s * 1e3, _shown(point.icc)),
-        xytext=(0, 0),
-        textcoords="offset points",
-        ha="center",
-        va="center",
-        path_effects=[withStroke(linewidth=2, foreground="white")],  # lines end short of it
-        **style,
-    )
-    inside, centred = axes.get_window_extent(), label.get_window_extent()
-    pixels = axes.figure.dpi / 72
-    strangers = [_box(axes, p) for p in panel if p.variant.method != point.variant.method]
-    free: list[tuple[float, tuple[int, int], Any]] = []
-    for offset in OFFSETS:
-        far = float(np.hypot(*offset))
-        box = centred.translated(*np.multiply(offset, pixels))
-        fits = inside.x0 < box.x0 and box.x1 < inside.x1 and inside.y0 < box.y0 < inside.y1
-        if far <= farthest and fits and not any(box.overlaps(other) for other in taken):
-            # By another method's point it would be taken for that one's name.
-            apart = min((_distance(box, other) for other in strangers), default=np.inf) / pixels
-            free.append((far + 2 * max(0.0, 1.5 * MARKER - apart), offset, box))
-    if not free:
-        label.remove()
-        return
-    _, offset, box = min(free, key=lambda place: place[0])
-    label.set_position(offset)
-    taken.append(box)
-
-
-def _distance(one: Any, other: Any) -> float:
-    """Return how far two boxes are apart."""
-    gap_x = max(one.x0 - other.x1, other.x0 - one.x1, 0.0)
-    gap_y = max(one.y0 - other.y1, other.y0 - one.y1, 0.0)
-    return float(np.hypot(gap_x, gap_y))

@@ -6,7 +6,6 @@ import csv
 import json
 from collections.abc import Callable
 from importlib import resources
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -46,26 +45,15 @@ def test_the_table_tells_what_is_on_the_front(tmp_path: Path) -> None:
     }
 
 
-@pytest.mark.slow
-def test_the_picture_names_every_method_and_no_label_covers_another() -> None:
-    points = [
-        point(method, 0.001 * 3**k, 1 - 0.5**k) for k, method in enumerate(available_methods())
-    ]
+def test_the_picture_names_every_method_and_budget() -> None:
     twins = [point(method, 0.02, 0.9) for method in available_methods()]
     budgets = [point("auto", 0.1, icc, budget_s=icc / 10) for icc in (0.1, 0.11, 0.3, 1.0)]
     impossible = [point("noser", 0.1, icc) for icc in (-0.2, float("nan"))]
-    for panel in (points, [*twins, *budgets], [*points, *impossible]):
-        figure = draw_chart(panel, "a title")
-        (axes,) = figure.axes
-        labels = [
-            text
-            for text in axes.texts
-            if text.get_text() in (*available_methods(), "10 ms", "100 ms")
-        ]
-        assert {label.get_text() for label in labels} >= set(available_methods())
-        boxes = [label.get_window_extent() for label in labels]
-        assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
-        assert all(axes.get_window_extent().containsx(box.x0) for box in boxes)
+    figure = draw_chart([*twins, *budgets, *impossible], "a title")
+    (axes,) = figure.axes
+    (legend,) = figure.legends
+    assert {text.get_text() for text in legend.get_texts()} == set(available_methods())
+    assert {"10 ms", "11 ms", "30 ms", "100 ms"} <= {text.get_text() for text in axes.texts}
     assert figure.get_suptitle() == "a title"
 
 
