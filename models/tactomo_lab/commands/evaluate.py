@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
@@ -28,10 +28,8 @@ if TYPE_CHECKING:
 
     from tactomo_lab.evaluation.moving import PhaseSummary
     from tactomo_lab.evaluation.still import Outcome
-    from tactomo_lab.scenes.measures import Summary
 
 Item = TypeVar("Item")
-Row = TypeVar("Row")
 
 app = typer_app(
     name="evaluate",
@@ -194,6 +192,17 @@ def _decibels(text: str) -> list[float]:
     return ratios
 
 
+def chosen_names(text: str | None, known: Iterable[str], option: str) -> list[str]:
+    """Return the names from "a,b", in that order; all where nothing was asked for."""
+    known = list(known)
+    names = known if text is None else [name.strip() for name in text.split(",")]
+    for name in names:
+        if name not in known:
+            choices = ", ".join(known)
+            raise typer.BadParameter(f"{option} {name!r}: give one or more of {choices}")
+    return list(dict.fromkeys(names))
+
+
 def shown(items: Iterable[Item], total: int | None, what: str) -> Iterator[Item]:
     """Pass items on, with a progress bar in the terminal; without an end if there is no total."""
     from rich.console import Console
@@ -260,30 +269,47 @@ def _print_scenes(settings: dict[str, Any], outcomes: Sequence[Outcome]) -> None
     )
 
 
-# The tables of a summary: headings and what stands under them.
-MAPS: dict[str, Callable[[Summary], str]] = {
+# What tables of a summary show under each heading; of a phase, what stands under the same ones.
+FIGURES: dict[str, Callable[[Any], str]] = {
     "scenes": lambda s: str(s.scenes),
+    "maps": lambda s: str(s.scenes),
+    "frames": lambda s: str(s.frames),
     "ICC": lambda s: f"{s.icc:.3f}",
     "worst": lambda s: f"{s.icc_worst:.2f}",
     "shape": lambda s: f"{s.icc_structure:.3f}",
-    "RIE": lambda s: f"{s.rie:.2f}",
+    "RIE": lambda s: f"{s.rie:.3f}",
     "flagged": lambda s: f"{s.distrusted:.0%}",
+    "silent": lambda s: f"{s.bad_unflagged:.0%}",
+    "alarms": lambda s: f"{s.good_flagged:.0%}",
     "wrong": lambda s: f"{s.confidently_wrong:.0%}",
     "ms": lambda s: f"{s.seconds * 1e3:.0f}",
     "p99": lambda s: f"{s.seconds_99 * 1e3:.0f}",
-}
-CONTACTS: dict[str, Callable[[Summary], str]] = {
     "count": lambda s: f"{s.count_right:.0%}",
     "missed": lambda s: f"{s.missed:.0%}",
     "false": lambda s: f"{s.false:.2f}",
     "mm": lambda s: f"{s.centre_mm:.2f}",
     "p95": lambda s: f"{s.centre_mm_95:.1f}",
+    "peak": lambda s: f"{s.peak_right:.0%}",
     "area": lambda s: f"{s.area_error:.0%}",
     "Δσ": lambda s: f"{s.magnitude_error:.1%}",
     "spread": lambda s: f"{s.magnitude_spread:.0%}",
     "kPa": lambda s: f"{s.pressure_error_kpa:.1f}",
     "in σ": lambda s: f"{s.within_sigma:.0%}",
+    "place in σ": lambda s: f"{s.place_within_sigma:.0%}",
+    "area in σ": lambda s: f"{s.area_within_sigma:.0%}",
+    "lost": lambda s: f"{s.recovery:.0f}",
+    "most": lambda s: f"{s.recovery_most:.0f}",
+    "ids": lambda s: str(s.switches),
 }
+MAPS = ("scenes", "ICC", "worst", "shape", "RIE", "flagged", "wrong", "ms", "p99")
+CONTACTS = (
+    *("count", "missed", "false", "mm", "p95", "area"),
+    *("Δσ", "spread", "kPa", "in σ"),
+)
+PHASES = (
+    *("frames", "ICC", "worst", "shape", "count", "lost", "most", "ids"),
+    *("flagged", "wrong", "ms", "p99"),
+)
 
 
 def _print_moving(settings: dict[str, Any], title: str, phases: dict[str, PhaseSummary]) -> None:
@@ -299,26 +325,8 @@ def _print_moving(settings: dict[str, Any], title: str, phases: dict[str, PhaseS
     )
 
 
-PHASES: dict[str, Callable[[PhaseSummary], str]] = {
-    "frames": lambda s: str(s.frames),
-    "ICC": lambda s: f"{s.icc:.3f}",
-    "worst": lambda s: f"{s.icc_worst:.2f}",
-    "shape": lambda s: f"{s.icc_structure:.3f}",
-    "count": lambda s: f"{s.count_right:.0%}",
-    "lost": lambda s: f"{s.recovery:.0f}",
-    "most": lambda s: f"{s.recovery_most:.0f}",
-    "ids": lambda s: str(s.switches),
-    "flag": lambda s: f"{s.distrusted:.0%}",
-    "wrong": lambda s: f"{s.confidently_wrong:.0%}",
-    "ms": lambda s: f"{s.seconds * 1e3:.0f}",
-    "p99": lambda s: f"{s.seconds_99 * 1e3:.0f}",
-}
-
-
-def summary_table(
-    title: str, groups: dict[str, Row], columns: dict[str, Callable[[Row], str]]
-) -> Table:
-    """Return a table of summaries, by the name of each."""
+def summary_table(title: str, groups: Mapping[str, object], columns: Sequence[str]) -> Table:
+    """Return a table of summaries by the name of each, its columns some of `FIGURES`."""
     from rich import box
     from rich.table import Table
 
@@ -327,5 +335,5 @@ def summary_table(
     for name in columns:
         table.add_column(name, justify="right", no_wrap=True, min_width=3)
     for name, summary in groups.items():
-        table.add_row(name, *(show(summary).replace("nan", "-") for show in columns.values()))
+        table.add_row(name, *(FIGURES[column](summary).replace("nan", "-") for column in columns))
     return table

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,6 +20,7 @@ from tactomo.cli.plot.plot import prepare_picture
 
 from tactomo_lab.commands.evaluate import (
     Seeds,
+    chosen_names,
     print_settings,
     settings_of,
     shown,
@@ -28,7 +28,7 @@ from tactomo_lab.commands.evaluate import (
 )
 
 if TYPE_CHECKING:
-    from tactomo_lab.scenes.measures import FrameScore, Summary
+    from tactomo_lab.scenes.measures import FrameScore
 
 EVEN_FIT = "tactomo_lab.baselines.even_fit:EvenFit"
 
@@ -77,7 +77,7 @@ def field(
         prepare_picture(picture)
     description = load_description(sensor)
     scores: dict[str, list[FrameScore]] = {}
-    for row in _chosen(rows, ROWS):
+    for row in chosen_names(rows, ROWS, "--rows"):
         total = count if row in STILL_ROWS else None
         for line, frames in scores_of_row(description, row, method, seeds, count).items():
             try:
@@ -95,15 +95,6 @@ def field(
 
         draw_press(middle_press(description, (EVEN_FIT, method), seeds, count), picture)
         typer.echo(f"wrote {picture}", err=True)
-
-
-def _chosen(text: str | None, known: tuple[str, ...]) -> list[str]:
-    """The names from "a,b", in that order; all where nothing was asked for."""
-    names = [name.strip() for name in text.split(",")] if text is not None else list(known)
-    for name in names:
-        if name not in known:
-            raise typer.BadParameter(f"--rows {name!r}: give one or more of {', '.join(known)}")
-    return list(dict.fromkeys(names))
 
 
 def _as_json(scores: dict[str, list[FrameScore]]) -> dict[str, Any]:
@@ -133,22 +124,5 @@ def _print(settings: dict[str, Any], scores: dict[str, list[FrameScore]]) -> Non
     )
 
 
-MAPS: dict[str, Callable[[Summary], str]] = {
-    "maps": lambda s: str(s.scenes),
-    "ICC": lambda s: f"{s.icc:.3f}",
-    "RIE": lambda s: f"{s.rie:.3f}",
-    "worst": lambda s: f"{s.icc_worst:.2f}",
-    "flagged": lambda s: f"{s.distrusted:.0%}",
-    "silent": lambda s: f"{s.bad_unflagged:.0%}",
-    "alarms": lambda s: f"{s.good_flagged:.0%}",
-    "ms": lambda s: f"{s.seconds * 1e3:.0f}",
-    "p99": lambda s: f"{s.seconds_99 * 1e3:.0f}",
-}
-CONTACTS: dict[str, Callable[[Summary], str]] = {
-    "count": lambda s: f"{s.count_right:.0%}",
-    "mm": lambda s: f"{s.centre_mm:.2f}",
-    "peak": lambda s: f"{s.peak_right:.0%}",
-    "magnitude in σ": lambda s: f"{s.within_sigma:.0%}",
-    "place in σ": lambda s: f"{s.place_within_sigma:.0%}",
-    "area in σ": lambda s: f"{s.area_within_sigma:.0%}",
-}
+MAPS = ("maps", "ICC", "RIE", "worst", "flagged", "silent", "alarms", "ms", "p99")
+CONTACTS = ("count", "mm", "peak", "in σ", "place in σ", "area in σ")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,7 +21,7 @@ from tactomo.cli.options import (
 )
 from tactomo.cli.plot.plot import prepare_picture
 
-from tactomo_lab.commands.evaluate import Seeds, shown
+from tactomo_lab.commands.evaluate import Seeds, chosen_names, shown
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -71,7 +71,7 @@ def stability(
     from tactomo_lab.evaluation.regimes import REGIMES
     from tactomo_lab.evaluation.stability import evaluate_regimes
 
-    regimes = _chosen(regime, REGIMES) or list(REGIMES)
+    regimes = chosen_names(regime, REGIMES, "--regime")
     if picture is not None:
         prepare_picture(picture)
     description = load_description(sensor)
@@ -95,16 +95,6 @@ def stability(
 
         draw_overview(scores, picture)
         typer.echo(f"wrote {picture}", err=True)
-
-
-def _chosen(text: str | None, known: Iterable[str]) -> list[str]:
-    """The names from "a,b"; none where nothing was asked for."""
-    names = [name.strip() for name in text.split(",")] if text is not None else []
-    for name in names:
-        if name not in known:
-            choices = ", ".join(known)
-            raise typer.BadParameter(f"--regime {name!r}: give one or more of {choices}")
-    return list(dict.fromkeys(names))
 
 
 def _as_json(scores: Sequence[CaseScore]) -> dict[str, Any]:
