@@ -199,7 +199,6 @@ def load_config(path: str | Path | None = None, **overrides: Any) -> DaemonConfi
     Raises:
         ConfigError: the file cannot be read or is not TOML, or a key is unknown, missing or
             out of range.
-
     """
     given = {key: value for key, value in overrides.items() if value is not None}
     values = {} if path is None else _read_toml(Path(path))

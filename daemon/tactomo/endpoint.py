@@ -107,7 +107,6 @@ def bind(
     Raises:
         AddressError: the address is in use, cannot be had, or can be reached from other computers
             and there are no keys.
-
     """
     option = option or f"--{purpose}"
     try:
@@ -138,7 +137,6 @@ def rebind(socket: zmq.Socket[bytes], address: str) -> None:
 
     Raises:
         AddressError: another program has taken the address meanwhile.
-
     """
     socket.unbind(address)
     deadline_s = time.monotonic() + REBIND_S

@@ -27,7 +27,6 @@ class TactomoError(Exception):
         name: a short stable identifier such as ``port_busy``, for programs.
         cause: what went wrong, for people.
         next_step: what to do about it, for people; may be empty.
-
     """
 
     name = "tactomo_error"

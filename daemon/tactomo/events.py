@@ -79,7 +79,6 @@ class EventBook:
 
         Returns:
             None where the log is to be spared this one; else how many it was spared before.
-
         """
         now_s = time.monotonic()
         with self._lock:

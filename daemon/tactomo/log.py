@@ -31,7 +31,6 @@ def configure_logging(level: LogLevel = "info", form: LogFormat = "auto") -> Non
         form: ``text`` for people, ``journal`` for journald, ``json`` for collectors; ``auto`` takes
             ``journal`` where standard error is journald's, ``text`` where it is a terminal, and
             ``json`` elsewhere.
-
     """
     structlog.configure(
         processors=[structlog.processors.add_log_level, *_renderers(form)],

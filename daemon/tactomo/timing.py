@@ -34,7 +34,6 @@ class Durations:
     Attributes:
         count: how many there were in all.
         total_s: and how long they took together.
-
     """
 
     def __init__(self) -> None:
@@ -64,7 +63,6 @@ class Pace:
 
     Attributes:
         few_s: seconds after which it is late: a few of its periods. 0 before the first one.
-
     """
 
     def __init__(self) -> None:
@@ -88,7 +86,6 @@ class Rate:
     Attributes:
         count: how often it came in all.
         pace: how long the next one usually takes.
-
     """
 
     def __init__(self) -> None:

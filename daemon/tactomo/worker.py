@@ -23,7 +23,6 @@ class Worker:
     Attributes:
         name: the thread's.
         turns: how often the thread went round its loop; the watchdog goes by them.
-
     """
 
     def __init__(self, name: str, join_s: float | None = None) -> None:

@@ -45,7 +45,6 @@ class Door:
 
     Attributes:
         port: where it listens.
-
     """
 
     def __init__(self, host: str, port: int, origins: Collection[str]) -> None:

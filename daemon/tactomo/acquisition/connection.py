@@ -30,7 +30,6 @@ class Connection:
         is_open: whether the device is there at present.
         problem: why it is not open, for people; empty while it is.
         latency_timer_ms: an FTDI adapter's, as of the last opening; None for others.
-
     """
 
     def __init__(self, url: str, baud: int, on_event: OnEvent, root: Path = ROOT) -> None:
@@ -65,7 +64,6 @@ class Connection:
 
         Raises:
             ReplayEnded: the recording that is replayed is at its end.
-
         """
         try:
             port = self._port

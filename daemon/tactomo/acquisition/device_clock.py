@@ -100,7 +100,6 @@ class DeviceClock:
         jumps: how often the clock jumped, or went back.
         restarts: how often it went back, as it does where the device was reset.
         delays: by how much scans came later than need be, while the clock is used.
-
     """
 
     def __init__(self) -> None:

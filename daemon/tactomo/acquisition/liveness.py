@@ -50,7 +50,6 @@ class Liveness:
 
     Attributes:
         state: as of the last call.
-
     """
 
     def __init__(self, says_hello: bool = True, first_s: float = 0.0) -> None:

@@ -53,7 +53,6 @@ def open_serial(url: str, baud: int) -> serial.Serial:
         PortBusyError: another process holds it.
         PortError: it is no serial device or may not be opened.
         RecordingError: it is a replay of what is no recording.
-
     """
     is_replay = url.startswith(f"{REPLAY_SCHEME}://")
     make: Callable[..., Any] = ReplayPort if is_replay else serial.serial_for_url

@@ -79,7 +79,6 @@ class PortReader(Worker):
         reopened: how often the port was opened again because the device did not speak.
         clock: the device's, by which its scans are dated.
         has_ended: whether the replay behind the port is at its end.
-
     """
 
     def __init__(
@@ -180,7 +179,6 @@ class PortReader(Worker):
 
         Raises:
             PortError, RecordingError: the port cannot be opened, and nobody is to wait for it.
-
         """
         if or_wait:
             self._connection.try_open()

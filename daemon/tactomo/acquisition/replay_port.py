@@ -36,7 +36,6 @@ class ReplayPort(SerialBase):
 
     Attributes:
         clock_ns: when the bytes of the last read came, on the recording's steady clock.
-
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -74,7 +73,6 @@ class ReplayPort(SerialBase):
         Raises:
             ReplayEnded: every byte has been read.
             PortNotOpenError: the port is closed.
-
         """
         if not self.is_open:
             raise PortNotOpenError

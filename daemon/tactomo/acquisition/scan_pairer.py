@@ -49,7 +49,6 @@ class ScanPairer:
         unmarked: scans dropped because the recorded run did not use them.
         resets: how often a counter went back with its clock: the device was reset.
         zeroed: how often a counter alone went back.
-
     """
 
     def __init__(self) -> None:

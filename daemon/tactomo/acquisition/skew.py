@@ -38,7 +38,6 @@ class Skew:
         out_of_step_ns: by how much, when last measured; positive if the magnitude channel's
             counter is behind.
         sizes: of the skew of each dual scan, without its sign.
-
     """
 
     def __init__(self) -> None:

@@ -30,7 +30,6 @@ def rules(name: str, ports: Sequence[str], adapters: list[Adapter]) -> tuple[str
         name: of the skin.
         ports: paths as given.
         adapters: those that are plugged in.
-
     """
     lines, names = [], []
     for index, port in enumerate(ports):
@@ -56,7 +55,6 @@ def rule(mark: str, adapter: Adapter, adapters: list[Adapter]) -> list[str]:
 
     Raises:
         ServiceError: it can be known by nothing.
-
     """
     is_told_apart = not look_alikes(adapter, adapters)
     if _PLAIN.fullmatch(adapter.serial_number) and is_told_apart:

@@ -22,7 +22,6 @@ class WallClock:
     Attributes:
         jumps: how often it was set.
         last_jump_s: by how much the last time, positive if forwards; None if never.
-
     """
 
     def __init__(self, on_event: OnEvent) -> None:

@@ -43,7 +43,6 @@ class Child:
         arguments: its command line, without the program's name.
         ended: where it puts itself when it ends, for whoever waits for any child.
         verbose: pass on what it prints.
-
     """
 
     def __init__(
@@ -93,7 +92,6 @@ class Child:
 
         Raises:
             ChildError: it ended before, or takes too long.
-
         """
         if not self._changed.wait(START_S):
             raise ChildError(
@@ -108,7 +106,6 @@ class Child:
 
         Raises:
             ChildError: it failed.
-
         """
         if self.status != 0:
             self._reader.join()
@@ -161,7 +158,6 @@ class Family:
 
     Args:
         verbose: pass on what they print.
-
     """
 
     def __init__(self, verbose: bool = False) -> None:

@@ -39,7 +39,6 @@ class CalibrationInForce:
     Attributes:
         in_force: the calibration that is used; None for the description's curve.
         device_ids: of those that have spoken.
-
     """
 
     def __init__(
@@ -70,7 +69,6 @@ class CalibrationInForce:
 
         Raises:
             CommandError: it is another device's; what was in force stays so.
-
         """
         foreign = self._foreign(calibration)
         if foreign is not None:

@@ -30,7 +30,6 @@ class FrameMarks:
 
     Attributes:
         calibration: likewise, as of now.
-
     """
 
     def __init__(self, recorder: Recorder, calibration: str) -> None:

@@ -79,7 +79,6 @@ class Imaging:
         stages: how long each stage takes.
         frame_rate: how often a frame is published.
         acquired_monotonic_ns: when the newest dual scan was acquired; 0 before the first.
-
     """
 
     def __init__(
@@ -207,7 +206,6 @@ class Imaging:
 
         Raises:
             CommandError: it is another device's; what was in force stays so.
-
         """
         self.calibration.replace(calibration)
         self._publisher.tell_status()

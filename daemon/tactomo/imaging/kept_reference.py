@@ -60,7 +60,6 @@ class KeptReference:
         description: what it is made of; a reference of another one is not used.
         recorder: its thread writes, so that a stuck disk holds up nobody.
         on_event: told when it cannot be kept.
-
     """
 
     def __init__(

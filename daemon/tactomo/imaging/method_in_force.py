@@ -31,7 +31,6 @@ class MethodInForce:
         requested: what was asked for; the budget in milliseconds of this machine.
         effective: what frames get; the budget in milliseconds of modelled work.
         source: where the machine's speed is known from, in words.
-
     """
 
     def __init__(self, reconstructor: Reconstructor, machine_speed: MachineSpeed) -> None:
@@ -49,7 +48,6 @@ class MethodInForce:
 
         Raises:
             CommandError: it cannot be set up; what was in force stays so.
-
         """
         try:
             self._request(self.requested._replace(method=method))

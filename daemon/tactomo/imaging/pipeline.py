@@ -70,7 +70,6 @@ class Pipeline(Worker):
         incomplete: dual scans of which one channel did not come that had come before, or is lost.
         scan_rates: how often each channel's scans come.
         finished: set once every replayed port has ended and what came of it was published.
-
     """
 
     def __init__(
@@ -172,7 +171,6 @@ class Pipeline(Worker):
 
         Raises:
             CommandError: the references are those of the recording that is replayed.
-
         """
         if self._is_exact:
             raise CommandError(

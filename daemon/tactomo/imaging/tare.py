@@ -46,7 +46,6 @@ class Taring:
         fall_back: called with why none was taken while there is none; returns whether an older
             one is in force now.
         on_event: told what a tare became.
-
     """
 
     def __init__(
@@ -103,7 +102,6 @@ class Taring:
             volts: (M,) of each channel that is there.
             lost: channels that are not to be expected.
             contacts: how many were shown in this frame.
-
         """
         tare = self._tare
         needed = {channel for channel in self._channels if channel not in lost}

@@ -56,7 +56,6 @@ class PortProtocol:
         trouble: why scans cannot be used at present; None where they can, or none came yet.
         acknowledges: whether a device answers every command.
         fault: which rule of the protocol the last intact message broke; empty for none.
-
     """
 
     name: ClassVar[str]
@@ -148,7 +147,6 @@ class ForeignProtocol(PortProtocol):
         device_id: what the device is called in `status`.
         device_us: the newest reading's time, to go on from.
         clock_format: of several that a device's clock may have, a number that `parse` understands.
-
     """
 
     device_id: ClassVar[str]

@@ -39,7 +39,6 @@ class OpenEit(LineProtocol):
 
     Raises:
         ConfigError: the description is of no such board.
-
     """
 
     name = "openeit"

@@ -58,7 +58,6 @@ def find_protocol(name: str) -> ProtocolClass:
 
     Raises:
         ConfigError: there is no such protocol, or it cannot be imported.
-
     """
     if ":" not in name:
         return _registered(name)
@@ -88,7 +87,6 @@ def protocol_named(name: str, description: SensorDescription | None) -> PortProt
 
     Raises:
         ConfigError: there is no such protocol, or it cannot carry the description's channels.
-
     """
     kind = _registered(name)
     try:
@@ -108,7 +106,6 @@ def emulator_of(name: str) -> Callable[[SensorDescription, float], Any]:
 
     Raises:
         ConfigError: the protocol names none, or the one that it names cannot be imported.
-
     """
     path = _registered(name).emulator
     if not path:

@@ -133,7 +133,6 @@ class Sciospec(ForeignProtocol):
 
     Raises:
         ConfigError: the instrument cannot do what the description has.
-
     """
 
     name = "sciospec"

@@ -28,7 +28,6 @@ class ActiveRecording:
         bytes_written: length of the file at the last flush; written by the recorder's thread.
         is_overflowed: the queue was full once, and nothing is taken any more.
         is_empty: nothing was written yet; written by the recorder's thread.
-
     """
 
     def __init__(

@@ -44,7 +44,6 @@ def eit_files(folder: Path) -> list[Path]:
 
     Raises:
         EitFileError: there is none.
-
     """
     found = sorted(path for path in folder.iterdir() if path.suffix.lower() == SUFFIX)
     if not found:
@@ -61,7 +60,6 @@ def read_eit_files(paths: Sequence[Path]) -> dict[str, NDArray[Any]]:
     Raises:
         EitFileError: one of them cannot be read, is none, or is of another measurement; it says
             which line is wrong.
-
     """
     frames = [_read(path) for path in paths]
     for path, frame in zip(paths, frames, strict=True):

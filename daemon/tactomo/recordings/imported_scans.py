@@ -59,7 +59,6 @@ class Scans:
         time_s: (T,) seconds, rising, from 0; None where the file does not say.
         reference: (M,) volts of each channel whose unloaded scan the file holds.
         notes: what a user should know about how the file was read.
-
     """
 
     volts: Mapping[Channel, FloatArray]
@@ -77,7 +76,6 @@ class Scans:
 
         Raises:
             ImportFileError: neither is known.
-
         """
         if rate_hz is not None:
             return np.arange(self.count) / rate_hz
@@ -152,7 +150,6 @@ def read_scans(
     Raises:
         ImportFileError, EitFileError, DataError: it cannot be read, is neither layout, or does not
             fit the sensor.
-
     """
     arrays = load_arrays(path)
     path = path if isinstance(path, Path) else path[0]
@@ -178,7 +175,6 @@ def load_arrays(path: Path | Sequence[Path]) -> dict[str, NDArray[Any]]:
     Raises:
         ImportFileError, EitFileError: it cannot be read.
         DataError: it is no .npz file of numbers.
-
     """
     given = [path] if isinstance(path, Path) else path
     files = [file for each in given for file in (eit_files(each) if each.is_dir() else [each])]
@@ -237,7 +233,6 @@ def single_ended(
 
     Raises:
         ImportFileError: they do not fit the sensor, or are out of phase with the current.
-
     """
     injection, raw = _single_ended_arrays(path, arrays, layout)
     rows, signs = _injection_rows(path, injection - injection.min(), layout)
@@ -267,7 +262,6 @@ def electrode_potentials(
 
     Raises:
         ImportFileError: they do not fit the sensor.
-
     """
     injection, raw = _single_ended_arrays(path, arrays, layout)
     rows, signs = _injection_rows(path, injection - injection.min(), layout)

@@ -59,7 +59,6 @@ class Recorder(Worker):
         failures: how often a recording could not go on.
         failure: why the last recording did not go on; empty once there is another.
         waits_for: why a recording that is wanted does not run; empty while none does.
-
     """
 
     def __init__(self, origin: Origin, rules: RecordingConfig, on_event: OnEvent) -> None:
@@ -91,7 +90,6 @@ class Recorder(Worker):
         Raises:
             RecordingError: the file to be recorded to cannot be created. A folder that cannot be
                 used, or a disk without room, is told as an event and tried again.
-
         """
         super().start()
         if self._rules.file is not None:
@@ -122,7 +120,6 @@ class Recorder(Worker):
 
         Raises:
             RecordingError: the thread has died.
-
         """
         self._ask(work)
 
@@ -243,7 +240,6 @@ class Recorder(Worker):
         Raises:
             RecordingError: it cannot be created, or less than so many reserves are free.
             OSError: the folder cannot be read.
-
         """
         folder = self._rules.folder_path if path is None else path.parent
         free, reserve = self._room(folder)

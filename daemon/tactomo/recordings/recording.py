@@ -105,7 +105,6 @@ class Origin:
 
         Raises:
             RecordingError: it is not known here, or needs a description that is not here.
-
         """
         try:
             known = None if self.protocol == NATIVE else load_description(self.description)
@@ -224,7 +223,6 @@ class Recording:
 
         Args:
             speed: 1 as recorded, 10 ten times as fast, 0 as fast as it is taken.
-
         """
         path = quote(str(self.path.resolve()))
         ports = range(len(self.origin.ports))
@@ -237,7 +235,6 @@ def open_recording(path: str | Path) -> Recording:
     Raises:
         RecordingError: there is no such file, or it is no recording of tactomo's. A file that is
             cut off is no error: see `Summary.is_complete`.
-
     """
     return Recording(Path(path))
 

@@ -38,7 +38,6 @@ class RecordingSet(Recording):
     Raises:
         RecordingError: it holds no recordings that a daemon has cut, those of several sensors, or
             such as do not belong together.
-
     """
 
     def __init__(self, folder: Path) -> None:
@@ -104,7 +103,6 @@ def open_replayable(path: str | Path) -> Recording:
 
     Raises:
         RecordingError: it is neither.
-
     """
     return RecordingSet(Path(path)) if Path(path).is_dir() else open_recording(path)
 

@@ -149,7 +149,6 @@ class RecordingWriter:
 
     Raises:
         FileExistsError: the file exists: nothing is ever written over.
-
     """
 
     def __init__(self, path: Path, origin: Origin) -> None:
@@ -259,7 +258,6 @@ def create(path: Path, origin: Origin) -> RecordingWriter:
 
     Raises:
         RecordingError: the file exists or cannot be created.
-
     """
     try:
         return RecordingWriter(path, origin)
@@ -306,7 +304,6 @@ def write_recording(
 
     Raises:
         RecordingError: the file exists or cannot be written.
-
     """
     origin = Origin(sensor, description, description_sha256, ("import",), version("tactomo"))
     path = Path(path).absolute()

@@ -95,7 +95,6 @@ def recover(
     Raises:
         RecordingError: there is nothing of a recording in `damaged`, it cannot be read, or
             `output` exists or cannot be written.
-
     """
     part = output.with_name(f".{output.name}.{os.getpid()}.part")
     with open_file(damaged) as file:
@@ -251,7 +250,6 @@ def _read_origin(path: Path, file: IO[bytes]) -> Origin | None:
 
     Raises:
         RecordingError: it says that another program made it.
-
     """
     try:
         return open_recording(path).origin

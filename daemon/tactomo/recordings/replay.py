@@ -38,7 +38,6 @@ class ReplayClock:
         ports: how many ports are replayed.
         is_paced: whether their bytes come in their own time. Ports that are read as fast as they
             are taken run ahead of one another: only what the slowest one has passed is over.
-
     """
 
     def __init__(self, ports: int, is_paced: bool) -> None:
@@ -73,7 +72,6 @@ def read_replay(urls: Sequence[str], description: SensorDescription) -> Replay |
         ConfigError: only some of the ports are replayed, or not all from one recording, or that
             is of another sensor.
         RecordingError, PortError: a URL leads to no recording.
-
     """
     replayed = [url for url in urls if url.startswith(f"{REPLAY_SCHEME}://")]
     if not replayed:
@@ -112,7 +110,6 @@ def parse_replay_url(url: str) -> tuple[Recording, int, float]:
     Raises:
         PortError: the URL is malformed or asks for a port that was not recorded.
         RecordingError: its path is no recording.
-
     """
     parts = urlsplit(url)
     options = {"port": "0", "speed": "1", **dict(parse_qsl(parts.query))}

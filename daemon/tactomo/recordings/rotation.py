@@ -55,7 +55,6 @@ def list_recordings(folder: Path, sensor: str) -> list[KeptRecording]:
 
     Raises:
         OSError: the folder cannot be read.
-
     """
     return sorted(_recordings(folder, sensor)) if folder.is_dir() else []
 
@@ -81,7 +80,6 @@ def to_delete(recordings: list[KeptRecording], rules: RecordingConfig) -> list[D
     Args:
         recordings: all there are; the last one, which is being written, stays.
         rules: what is to be kept.
-
     """
     *closed, newest = recordings
     ages_s = _ages_s(recordings)

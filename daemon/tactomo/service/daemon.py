@@ -103,7 +103,6 @@ class Daemon:
 
     Attributes:
         session: identity of this run, as in every message.
-
     """
 
     def __init__(
@@ -227,7 +226,6 @@ class Daemon:
                 is waited for in any case.
             AddressError: an address is in use.
             RecordingError: the recording cannot be created.
-
         """
         with contextlib.ExitStack() as undo:
             self._open(undo)
@@ -487,7 +485,6 @@ def _find_calibration(
 
     Raises:
         CalibrationError: the configured one cannot be used.
-
     """
     unused: list[str] = []
     if description.magnitude is None:

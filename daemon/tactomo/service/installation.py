@@ -57,7 +57,6 @@ class File:
         path: below the root.
         text: what is to stand in it; None removes it.
         is_owners: whether what stands there already is left as it is.
-
     """
 
     path: Path
@@ -102,7 +101,6 @@ class Plan:
 
         Raises:
             ServiceError: a file cannot be written, or a command fails.
-
         """
         try:
             for file in self.files:
@@ -124,7 +122,6 @@ def plan_install(name: str, ports: Sequence[str], rules: str, root: Path, progra
         rules: for udev, see `tactomo.acquisition.udev.rules`; may be empty.
         root: ``/``, or where an image's disk is mounted.
         program: `tactomo` as the service is to call it.
-
     """
     files = [File(path, text) for path, text in _shared(root, program)]
     if rules:
@@ -139,7 +136,6 @@ def plan_uninstall(name: str | None, root: Path) -> Plan:
     Args:
         name: of the skin; None for all of them and what they share.
         root: as in `plan_install`.
-
     """
     names = installed(root) if name is None else [name]
     paths = [_rules_file(each) for each in names]
@@ -166,7 +162,6 @@ def this_program() -> str:
 
     Raises:
         ServiceError: it lies where a service cannot see it.
-
     """
     program = Path(sys.executable).with_name("tactomo")
     interpreter = os.path.realpath(sys.executable)

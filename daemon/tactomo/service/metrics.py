@@ -63,7 +63,6 @@ class MetricsServer(Worker):
 
     Attributes:
         address: where it can be scraped, once open.
-
     """
 
     def __init__(self, status: Status, latency: Durations, stages: Times) -> None:

@@ -47,7 +47,6 @@ class Supervision:
     Args:
         turns: returns how often each part's thread went round its loop, of those that should.
         summary: returns how the daemon is, in one line.
-
     """
 
     def __init__(self, turns: Callable[[], Mapping[str, int]], summary: Callable[[], str]) -> None:

@@ -51,7 +51,6 @@ def load_server_keys(secret: Path, clients: Path) -> ServerKeys:
     Raises:
         KeysError: it cannot be used, see `read_secret`, or there is no such folder of clients, or
             others than its owner may write to that.
-
     """
     if not clients.is_dir():
         raise KeysError(
@@ -86,7 +85,6 @@ class AllowList:
 
     Attributes:
         revocations: how often a key was taken away from either socket.
-
     """
 
     def __init__(self, folder: Path, on_event: OnEvent) -> None:
@@ -167,7 +165,6 @@ class AccessControl:
         keys: who may come in.
         on_event: told of those who were refused.
         on_revoked: called by whoever calls `check` when somebody was taken off the list.
-
     """
 
     def __init__(

@@ -39,7 +39,6 @@ def obey(
 
     Raises:
         CommandError: there is no such command, an argument is wrong, or the handler refuses.
-
     """
     if command not in commands:
         raise CommandError(

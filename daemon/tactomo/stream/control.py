@@ -112,7 +112,6 @@ class Control(Worker):
 
     Attributes:
         address: where it is bound, once open.
-
     """
 
     def __init__(

@@ -75,7 +75,6 @@ def make_pair(folder: Path, name: str, *, is_server: bool = False, force: bool =
     Raises:
         KeysError: there are keys of this name and `force` is not given, or the folder cannot be
             written to.
-
     """
     secret_file, public_file = secret_path(folder, name), public_path(folder, name)
     if not force and (secret_file.exists() or public_file.exists()):
@@ -111,7 +110,6 @@ def allow(
     Raises:
         KeysError: the file holds no public key, or a secret one; there is no such server; another
             key has this name; or the list cannot be written.
-
     """
     if public.suffix == SECRET_SUFFIX:
         raise KeysError(
@@ -145,7 +143,6 @@ def revoke(folder: Path, name: str, server: str) -> None:
 
     Raises:
         KeysError: it is not on it, there is no such server, or the list cannot be written.
-
     """
     _check_server(folder, server)
     places = [path for path in _places(folder, server, name) if path.exists()]

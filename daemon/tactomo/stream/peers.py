@@ -46,7 +46,6 @@ class Peers:
 
     Attributes:
         address: where the socket is bound.
-
     """
 
     def __init__(

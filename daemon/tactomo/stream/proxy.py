@@ -55,7 +55,6 @@ class Proxy:
 
     Attributes:
         address: where it is bound, once open.
-
     """
 
     def __init__(
@@ -86,7 +85,6 @@ class Proxy:
         Raises:
             AddressError: the address cannot be had, or needs keys.
             ControlError: a source's address is not one.
-
         """
         secret = None
         if self._keys is not None:

@@ -76,7 +76,6 @@ class Publisher(Worker):
         header: the newest frame's; written by the pipeline thread, sent with status and events. One
             that cannot be sent gives way to none.
         latency: from the last byte of a dual scan to the sending of its contacts.
-
     """
 
     def __init__(
@@ -155,7 +154,6 @@ class Publisher(Worker):
             kind: one of the stream's kinds.
             fields: the kind's own.
             header: acquisition, tier, flags and misfit; by default the newest frame's.
-
         """
         self._queue.append(self._number(kind, self.header if header is None else header, fields))
         if not self._stopping.is_set():

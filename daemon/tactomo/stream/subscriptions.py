@@ -39,7 +39,6 @@ class Subscribers:
         address: where the socket is bound.
         prefixes: how many ask for each prefix.
         cuts: how often all of them were cut off because there were too many.
-
     """
 
     def __init__(

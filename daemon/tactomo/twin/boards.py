@@ -20,7 +20,6 @@ class _Printer:
     Attributes:
         rate_hz: frames a second.
         is_streaming: whether it sends frames.
-
     """
 
     largest: float

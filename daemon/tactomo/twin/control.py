@@ -111,7 +111,6 @@ class ControlSocket:
 
     Raises:
         AddressError: the address is in use, or is no address.
-
     """
 
     def __init__(self, address: str, handlers: Mapping[str, Handler]) -> None:

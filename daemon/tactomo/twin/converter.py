@@ -29,7 +29,6 @@ class Drift:
             it is ``walk * sqrt(n)``.
         creep: relative change of the gain after a long time.
         creep_s: time constant of the creep, in seconds.
-
     """
 
     walk: float = 2e-6
@@ -67,7 +66,6 @@ class Converter:
         noise_v: standard deviation of the noise in volts, the same on every measurement.
         drift: how the gain wanders.
         seed: equal seeds give equal noise and drift.
-
     """
 
     def __init__(
@@ -94,7 +92,6 @@ class Converter:
             channel: the channel.
             counter: the scan's counter.
             time_s: device time of the scan, in seconds.
-
         """
         gain = self._gains.setdefault(channel, DriftingGain(self._seed, channel))
         noise = np.random.default_rng([self._seed, channel.number, counter, 1])

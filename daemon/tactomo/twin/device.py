@@ -114,7 +114,6 @@ class TwinConfig:
         play_once: stop after the file's last frame instead of beginning again.
         control: address of the control socket; port 0 takes a free one.
         link_folder: where to keep links with stable names to the lines.
-
     """
 
     description: SensorDescription
@@ -179,7 +178,6 @@ class Twin:
     Raises:
         AddressError: the control socket cannot be bound.
         TactomoError: the links cannot be made.
-
     """
 
     def __init__(self, config: TwinConfig, skin: SkinModel | None = None) -> None:

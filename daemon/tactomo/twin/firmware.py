@@ -81,7 +81,6 @@ class Firmware:
         converter: volts to counts.
         rate_hz: scans a second.
         clock: seconds since power-up.
-
     """
 
     def __init__(

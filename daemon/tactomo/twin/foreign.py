@@ -48,7 +48,6 @@ class Emulator(Protocol):
     Attributes:
         rate_hz: frames a second; the host may have changed it.
         is_streaming: whether it sends frames at present.
-
     """
 
     rate_hz: float
@@ -95,7 +94,6 @@ class ForeignFirmware(Firmware):
         sample: starts computing the skin's voltages at a device time in seconds.
         converter: its noise; unused for frames that are played.
         clock: seconds since power-up.
-
     """
 
     def __init__(

@@ -38,7 +38,6 @@ class SerialLine:
         sent: frames handed to the line whole.
         dropped: frames lost because the line was full.
         unheard: frames lost because nobody had the port open, or the cable was out.
-
     """
 
     def __init__(self, name: str, link_folder: Path | None = None) -> None:
@@ -177,7 +176,6 @@ def _claim(link: Path) -> socket.socket:
 
     Raises:
         TactomoError: a twin that runs has the name.
-
     """
     place = str(link.parent.resolve() / link.name).encode(errors="surrogateescape")
     name = b"\0tactomo-twin-" + hashlib.sha256(place).hexdigest().encode()

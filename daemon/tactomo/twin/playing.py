@@ -32,7 +32,6 @@ class PlayedFrame(Mapping[Channel, FloatArray]):
     Attributes:
         potentials: (injections, electrodes) volts against ground, where the file has them; the
             injections in the description's order.
-
     """
 
     def __init__(
@@ -69,7 +68,6 @@ class Player:
     Attributes:
         rate_hz: mean rate of the frames; None where the file does not say.
         is_over: whether the last frame has been said and none follows.
-
     """
 
     def __init__(self, path: Path, description: SensorDescription, once: bool = False) -> None:

@@ -199,7 +199,6 @@ def load_scene(path: str | Path) -> Scene:
     Raises:
         ConfigError: the file cannot be read, is not TOML, or a key is unknown, missing or out of
             range; the message names the key, its value and what is allowed.
-
     """
     try:
         return Scene.model_validate(read_toml(Path(path)))

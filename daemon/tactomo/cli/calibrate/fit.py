@@ -68,7 +68,6 @@ def _odd_lines(joined: Joined) -> list[str]:
 
 
 def _need(cell: LoadCell, path: Path, what: str) -> None:
-
     if what == "magnitude" and not (cell.magnitude >= 0).any():
         raise CalibrationError(
             f"{path} tells times and no magnitude; give the recording of that time by --recording"
@@ -83,7 +82,6 @@ def _need(cell: LoadCell, path: Path, what: str) -> None:
 def _with_recording(
     sensor: str, cell: LoadCell, path: Path, offset_s: float, description: str | None
 ) -> tuple[Subject, Joined]:
-
     recorded = open_recording(path).sensor
     if recorded and recorded != sensor:
         raise CalibrationError(
@@ -108,7 +106,6 @@ def _with_recording(
 
 
 def _devices_in(path: Path) -> tuple[str, ...]:
-
     (first, *_) = open_recording(path).files
     hellos = open_bytes(first).summary.hellos
     return tuple(sorted({hello.device_id for hello in hellos}))

@@ -54,7 +54,6 @@ def write_maps(moments: Iterable[Moment], output: IO[bytes], scratch: Path) -> i
         moments: the frames.
         output: the file.
         scratch: a folder with room for all of it, uncompressed.
-
     """
     with (
         tempfile.TemporaryDirectory(prefix=".tactomo-", dir=scratch) as folder,

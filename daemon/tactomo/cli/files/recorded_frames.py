@@ -55,7 +55,6 @@ class RecordedFrames:
         start_ns: when the recording begins, nanoseconds since 1970.
         start_s: the first frames that are wanted, seconds from there.
         end_s: where the frames end that are wanted.
-
     """
 
     path: Path
@@ -160,7 +159,6 @@ def recorded_frames(
 
     Raises:
         TactomoError: the recording cannot be read or reconstructed, or the times are no times.
-
     """
     from tactomo_client.recording import open_recording
     from tactomo_models import ModelError, load_description

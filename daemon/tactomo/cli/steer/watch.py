@@ -79,7 +79,6 @@ class View:
 
         Raises:
             KeysError: the server does not let us in.
-
         """
         before = self.frame
         while (item := self._news.wait(wait_s)) is not None:
