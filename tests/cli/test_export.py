@@ -185,7 +185,9 @@ def test_a_cut_recording_gives_what_is_there_and_says_so(tactomo: Run, grasp: Pa
     ("arguments", "status", "says"),
     [
         (["grasp.mcap", "out.txt"], 2, ".mcap, .csv, .npz"),
-        (["grasp.mcap", "grasp.mcap"], 2, "is the recording itself"),
+        (["grasp.mcap", "grasp.mcap", "--force"], 2, "is what is read"),
+        ([".", "grasp.mcap", "--force"], 2, "is what is read"),
+        (["grasp.mcap", "out.mcap", "--layout", "grasp.mcap", "--force"], 2, "is what is read"),
         (["grasp.mcap", "out.csv", "--from", "3", "--to", "2"], 2, "is not after --from"),
         (["grasp.mcap", "out.csv", "--from", "99"], 1, "no frames"),
         (["grasp.mcap", "nowhere/out.csv"], 1, "cannot write nowhere/out.csv"),
@@ -197,9 +199,11 @@ def test_a_cut_recording_gives_what_is_there_and_says_so(tactomo: Run, grasp: Pa
 def test_what_goes_wrong_is_told(
     tactomo: Run, tmp_path: Path, arguments: list[str], status: int, says: str
 ) -> None:
+    recording = (tmp_path / "grasp.mcap").read_bytes()
     result = tactomo("export", *arguments)
     assert result.returncode == status
     assert says in result.stderr.replace("\n", " ")
+    assert (tmp_path / "grasp.mcap").read_bytes() == recording
     assert sorted(path.name for path in tmp_path.iterdir()) == ["grasp.mcap"]
 
 

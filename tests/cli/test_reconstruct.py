@@ -154,6 +154,7 @@ def test_only_its_own_output_is_written_over_unasked(tactomo: Run, tmp_path: Pat
     swapped = tactomo("reconstruct", "out.npz", "in.npz")
     assert swapped.returncode == 1
     assert "in.npz exists already" in swapped.stderr
+    assert tactomo("reconstruct", "in.npz", "in.npz", "--force").returncode == 2
     assert (tmp_path / "in.npz").read_bytes() == scans
     assert tactomo("reconstruct", "in.npz", "new/out.npz").returncode == 1
     assert not (tmp_path / "new").exists()

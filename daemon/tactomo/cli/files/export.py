@@ -81,10 +81,8 @@ def export(
     recording's beginning. The size of a recording does not matter: memory stays small.
     """
     kind = _kind(output)
-    if output.exists() and recording.exists() and output.samefile(recording):
-        raise typer.BadParameter(f"{output} is the recording itself; name another file")
     for file in (output, *([layout] if layout else [])):
-        prepare_file(file, force=force)
+        prepare_file(file, force=force, source=recording)
     write = _writer(kind, parent, pose, output.parent)
     with recorded_frames(recording, description, start_s, end_s, output.parent) as frames:
         count = _write(output, lambda file: write(frames, file))

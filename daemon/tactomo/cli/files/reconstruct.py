@@ -82,7 +82,7 @@ def reconstruct(
     from tactomo_models.batch import reconstruct_file
     from tactomo_models.calibration.calibration_file import calibration_of
 
-    prepare_file(maps, force=force or _is_of_reconstruct(maps))
+    prepare_file(maps, force=force or _is_of_reconstruct(maps), source=scans)
     sensor = load_description(description)
     curve = None if calibration is None else calibration_of(sensor, calibration).curve
     with Progress(transient=True) as progress:

@@ -124,19 +124,25 @@ def prepare_folder(folder: Path) -> None:
     prepare_picture(folder / "figure.png")
 
 
-def prepare_file(output: Path, *, force: bool = True) -> None:
+def prepare_file(output: Path, *, force: bool = True, source: Path | None = None) -> None:
     """Make sure before the work that a file can be written; what it holds stays as it is.
 
     What is there is written over with `force`, or where somebody at the terminal says so. Folders
-    are not made. An empty file holds nothing.
+    are not made. An empty file holds nothing. The file that is read, or one of a folder that is, is
+    never written over.
 
     Raises:
+        typer.BadParameter: it is what is read, `source`.
         TactomoError: it cannot be, or may not.
     """
     if not output.parent.is_dir():
         make = f"make it first: `mkdir -p {shlex.quote(str(output.parent))}`"
         raise TactomoError(f"cannot write {output}: there is no folder {output.parent}", make)
     is_new = not output.exists()
+    if source is not None and not is_new:
+        for read in source.glob("*.mcap") if source.is_dir() else (source,):
+            if read.exists() and output.samefile(read):
+                raise typer.BadParameter(f"{output} is what is read; name another file")
     if not force and not is_new and output.stat().st_size:
         can_ask = sys.stdin.isatty() and sys.stderr.isatty()
         if not can_ask or not typer.confirm(f"{output} exists: write over it?", err=True):
