@@ -217,6 +217,7 @@ class _Course:
         self._from_nothing = True  # or from the shape of frames before
         self.doubts: dict[int, Doubt] = {}  # of contacts like these, by what is in doubt
         self._adopted: Drawing | None = None
+        self._earlier = np.zeros((0, COLUMNS))  # contacts of the frame before the last
         self._lacking: tuple[FittedField, list[MissingContact]] | None = None
         self._halved: tuple[FittedField, list[tuple[FittedField, int]]] | None = None
         self._cold_start: _Course | None = None
@@ -302,8 +303,9 @@ class _Course:
         shape = self.tools.fit.compare(before, frame.measured)
         still = are_still(self._settled_on, frame.measured)
         if before.converged and still:
+            self._earlier = contacts_of(before)
             return replace(shape, converged=True), "still"
-        shape = replace(shape, converged=False)
+        shape = self._gone_on(replace(shape, converged=False), frame)
         # What did not explain its own frame has no claim on the next one.
         suspect = before.misfit > SUSPECT_MISFIT and not still
         if suspect or shape.misfit > max(SUSPECT_MISFIT, 2 * before.misfit):
@@ -325,6 +327,25 @@ class _Course:
             other = self.tools.fit.compare(self._candidate.shape, frame.measured)
             self._candidate = replace(self._candidate, shape=replace(other, converged=False))
         return shape, "warm start"
+
+    def _gone_on(self, shape: FittedField, frame: _Frame) -> FittedField:
+        """The last shape, or with its contacts moved on as they last did, if that explains more."""
+        least = 0.03  # of a move that is more than noise, in the unit of places
+        each, earlier = contacts_of(shape), self._earlier
+        self._earlier = each.copy()
+        if len(each) == 0 or len(earlier) != len(each):
+            return shape
+        assert isinstance(shape.family, PressureField)
+        moves = (each - earlier)[:, [X, Y]]
+        if np.hypot(*moves.T).max() < least:
+            return shape
+        each[:, [X, Y]] += moves
+        parameters = shape.family.bounded(shape.family.join(each))
+        moved = self.tools.fit.evaluate(shape.family, parameters, shape.log_ratio, frame.measured)
+        if moved is None:
+            return shape
+        frame.budget.spend(moved)
+        return moved if moved.cost < shape.cost else shape
 
     def _from_scratch(self, frame: _Frame) -> tuple[FittedField, str]:
         """What is proposed, where that explains something; else nothing at all."""
@@ -368,6 +389,10 @@ class _Course:
     def _judge(self, candidate: _Candidate, shape: FittedField, frame: _Frame) -> FittedField:
         """Refine a candidate: it takes the shape's place, is given up, or goes on."""
         refined = self._refined(candidate.shape, frame)
+        wins = refined.cost < shape.cost - candidate.gain
+        if wins and self._settled_on is not frame.measured and len(shape.parameters):
+            # What follows this frame's noise must not win by that alone.
+            shape = self.tools.fit.refine(shape, frame.measured, frame.budget, 0.0, 1)
         if refined.cost < shape.cost - candidate.gain:
             self.doubts.clear()
         self._doubt(shape, refined, candidate.gain, frame)
@@ -414,8 +439,9 @@ class _Course:
         questions = self.tools.questions if [*shape.residuals] == [Channel.MAGNITUDE] else ()
         inside: list[_Move] = [partial(self._with, question) for question in questions]
         form = [self._of_higher_order, self._modulate, *inside, *self._splits(shape)]
-        if shape.misfit > GOOD_MISFIT or shape.family.count >= CROWD:
-            form += [self._birth_anywhere(rank) for rank in range(ASKED_OF_CROWD)]
+        crowd = shape.family.count >= CROWD
+        if shape.misfit > GOOD_MISFIT or crowd:
+            form += [self._birth_anywhere(k) for k in range(ASKED_OF_CROWD if crowd else 1)]
         free = [self._escalate] if self.shape_model == ShapeModel.AS_NEEDED else []
         return [self._birth, *form, *free, *self._deaths(shape)]
 
@@ -437,12 +463,13 @@ class _Course:
 
     def _birth_anywhere(self, rank: int) -> _Move:
         """A further contact, beside or between others."""
-        likely = 0.5  # gain to first order, over what is needed; 0.2 finds no more
+        # Gain to first order in a crowd, over what is needed; 0.2 finds no more.
+        likely = 0.5
 
         def move(shape: FittedField, frame: _Frame) -> _Candidate | None:
             needed = (CROWD_GAIN if self.searches_both else SURE_GAIN) * _scale(shape, frame)
-            missing = self._missing(shape, frame)
-            if rank >= len(missing) or missing[rank].gain < likely * needed:
+            missing, crowd = self._missing(shape, frame), len(contacts_of(shape)) >= CROWD
+            if rank >= len(missing) or missing[rank].gain < (likely if crowd else 1) * needed:
                 return None
             return self._with_another(shape, missing[rank], needed, frame)
 

@@ -407,7 +407,8 @@ def _rim_law(stiffness: FloatArray, corners: IntArray, depth: IntArray) -> Float
     shape = np.count_nonzero(rim), np.count_nonzero(near)
     place = (rows[:, None] * shape[1] + columns).ravel()
     values = stiffness[triangle, corner].ravel()
-    return np.bincount(place, values, shape[0] * shape[1]).reshape(shape)
+    law = np.bincount(place, values, shape[0] * shape[1]).reshape(shape)
+    return np.asarray(law, np.float64)
 
 
 def _assembled(stiffness: FloatArray, corners: IntArray, nodes: int) -> sp.csr_matrix:

@@ -204,6 +204,20 @@ def test_pressures_follow_what_moves_also_when_time_is_short(graded: Skin) -> No
     assert one[X] * UNIT_M == pytest.approx(pressed[X] * UNIT_M, abs=1e-3)
 
 
+def test_what_goes_on_as_it_did_costs_a_step_a_frame(graded: Skin) -> None:
+    """The start is where its contacts would be now; one that stops is not lost."""
+    fit, x_m = WarmStartedFit(graded.sensor.fit), -0.016
+    for k in range(16):
+        x_m += 0.002
+        pressed = contact(x_m, 0.002, 0.007)
+        shape, _ = fit.follow(graded.frame(pressed, noise=2e-4), Budget(0.0 if k else PLENTY_S))
+        if k > 6:  # the first frames do not know how fast it is
+            assert [x for x, _ in places_of(shape)] == pytest.approx([x_m], abs=2e-4)
+    for _ in range(3):
+        shape, _ = follow(fit, graded.frame(pressed, noise=2e-4))
+    assert_at(shape, pressed)
+
+
 def test_a_still_scene_settles_though_there_are_few_steps_a_frame(graded: Skin) -> None:
     """Each frame's noise is another: to follow it is no progress."""
     fit = WarmStartedFit(graded.sensor.fit)
