@@ -187,7 +187,7 @@ function touchedText(contact, unit) {
 function cellText(contact, unit) {
   const text = valueText(contact, unit).replace(/ (kPa|%)$/, "");
   if (text) return text;
-  if (unit === "kpa" && Number.isFinite(contact.max_kpa)) return `at most ${fixed(contact.max_kpa, 0)}`;
+  if (unit === "kpa" && Number.isFinite(contact.max_kpa)) return `≤ ${fixed(contact.max_kpa, 0)}`;
   return contact.pressure_range === "below" ? "touched" : "–";
 }
 
