@@ -140,7 +140,7 @@ def _draw(day: Day, tracked: Sequence[Seen], untracked: Sequence[Seen], output: 
     late = [each for each in untracked if each.truth > 0]
     bare = [e.magnitude for e in late]
     axes[1].plot([e.time_s / 3600 for e in late], bare, "x", ms=4, label="untracked")
-    axes[1].set_ylabel("magnitude of\nfirm presses")
+    axes[1].set_ylabel("|Δσ|/σ₀ of\nfirm presses")
     axes[1].legend(frameon=False, ncols=3)
     for each in day.skin.presses:
         for axis in axes:
@@ -150,5 +150,6 @@ def _draw(day: Day, tracked: Sequence[Seen], untracked: Sequence[Seen], output: 
         axes[2].plot([e.time_s / 3600 for e in seen], ghosts, color=colour, label=label)
     axes[2].set_ylabel("contacts where\nnothing presses")
     axes[2].set_xlabel("hours since the tare; grey: something presses (simulated)")
-    axes[2].legend(frameon=False)
+    axes[2].set_xlim(hours[0], hours[-1])
+    axes[2].legend(loc="center right")  # framed: nothing says where ghosts leave room
     save_figure(figure, output)

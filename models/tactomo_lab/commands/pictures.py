@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 ROWS = 4  # scenes of each kind
 CHANGE = "|Δσ|/σ₀"
+DPI = 120  # legible at a page's width, and a third smaller than at 150
 
 
 def draw_outcomes(outcomes: Sequence[Outcome], output: Path) -> None:
@@ -38,12 +39,13 @@ def draw_outcomes(outcomes: Sequence[Outcome], output: Path) -> None:
     size = (8.5 * len(kinds), 2.3 * min(ROWS, len(by_icc)) + 0.5)
     figure = Figure(figsize=size, layout="constrained")
     halves: Any = figure.subfigures(1, len(kinds), squeeze=False)[0]
+    size_mm = _size_mm(outcomes[0].scene.description)
     for half, (kind, chosen) in zip(halves, kinds.items(), strict=True):
-        half.suptitle(kind)
+        half.suptitle(f"{kind} (maps of {size_mm})")
         grid = half.subplots(len(chosen), 4, squeeze=False)
         for axes, outcome in zip(grid, chosen, strict=True):
             _draw_outcome(axes, outcome)
-    save_figure(figure, output)
+    save_figure(figure, output, dpi=DPI)
 
 
 def _draw_outcome(axes: Any, outcome: Outcome) -> None:
@@ -88,7 +90,7 @@ def draw_press(outcomes: Sequence[Outcome], output: Path) -> None:
     maps = [truth.map] + [outcome.frame.map for outcome in outcomes]
     highest = max(float(image.max()) for image in maps if image is not None)
     names = ("an even pressure fitted", f"the field fitted ({outcomes[-1].method})")
-    titles = [f"truth, {scene.layout}\npeak {press.pressure_kpa:.0f} kPa"]
+    titles = [f"truth, {scene.layout}, {_size_mm(sensor)}\npeak {press.pressure_kpa:.0f} kPa"]
     titles += [_told(name, outcome) for name, outcome in zip(names, outcomes, strict=True)]
     for panel, image, title in zip(axes, maps, titles, strict=False):
         panel.set_title(title, fontsize=10)
@@ -103,9 +105,14 @@ def draw_press(outcomes: Sequence[Outcome], output: Path) -> None:
         if outcome.frame.pressure_kpa is not None:
             axes[3].plot(sensor.map_x_m * 1e3, outcome.frame.pressure_kpa[row], label=name)
     axes[3].set(xlim=(x[0] * 1e3, x[-1] * 1e3), ylim=(0, None), xlabel="x (mm)")
+    axes[3].set_ylim(top=1.3 * axes[3].get_ylim()[1])  # the legend above the curves
     axes[3].set_title("pressure along the dotted line (kPa)", fontsize=10)
-    axes[3].legend(fontsize=8, loc="lower center")
+    axes[3].legend(fontsize=8, loc="upper center")
     save_figure(figure, output)
+
+
+def _size_mm(sensor: SensorDescription) -> str:
+    return f"{np.ptp(sensor.map_x_m) * 1e3:.0f} × {np.ptp(sensor.map_y_m) * 1e3:.0f} mm"
 
 
 def _told(name: str, outcome: Outcome) -> str:

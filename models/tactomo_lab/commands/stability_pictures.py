@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tactomo.cli.plot.plot import save_figure
 
+from tactomo_lab.commands.pictures import DPI
+
 if TYPE_CHECKING:
     from tactomo_lab.evaluation.stability import CaseScore
 
@@ -44,10 +46,11 @@ def draw_overview(scores: Sequence[CaseScore], output: Path) -> None:
                 _mark(axes, column + 0.44, row, f"{counts.bad_unwarned}/{counts.maps}")
     figure.colorbar(image, ax=axes, label="mean ICC with the truth", aspect=30)
     legend = (
-        "Red: maps with an ICC below 0.7 that no flag told to distrust, of all maps. Simulated."
+        "Red: maps with an ICC below 0.7 that no flag told to distrust, of all maps. "
+        "Blank: not for this sensor. Simulated."
     )
     figure.supxlabel(textwrap.fill(legend, int(13 * size[0])), fontsize=8)
-    save_figure(figure, output)
+    save_figure(figure, output, dpi=DPI)
 
 
 def _mark(axes: Any, x: float, y: float, words: str) -> None:
