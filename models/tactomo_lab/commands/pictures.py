@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 ROWS = 4  # scenes of each kind
 CHANGE = "|Δσ|/σ₀"
-DPI = 120  # legible at a page's width, and a third smaller than at 150
+DPI = 120  # legible at a page's width, and below 300 kB
 
 
 def draw_outcomes(outcomes: Sequence[Outcome], output: Path) -> None:
