@@ -35,11 +35,6 @@ def hidden_address() -> str:
 class Door:
     """Listens in the server's stead, from a thread of its own; `open` it to a server, `close` it.
 
-    Args:
-        host: the address to listen on.
-        port: the port to listen on; 0 takes a free one.
-        origins: of the pages that may come in.
-
     Raises:
         OSError: the address cannot be listened on.
 

@@ -52,11 +52,6 @@ class Connection:
 
     Close it, or let it go out of use.
 
-    Args:
-        owner: a new socket, a plain one or an asyncio one; the connection closes it.
-        address: where to connect.
-        keys: for a server that wants some.
-
     Attributes:
         socket: what to send and receive by, without waiting.
         owner: what to wait for.

@@ -25,11 +25,6 @@ def rules(name: str, ports: Sequence[str], adapters: list[Adapter]) -> tuple[str
     """Return a skin's rules, and the names under which its ports are to be opened.
 
     A port that has a lasting name already, or none to be known by, keeps the name that it has.
-
-    Args:
-        name: of the skin.
-        ports: paths as given.
-        adapters: those that are plugged in.
     """
     lines, names = [], []
     for index, port in enumerate(ports):

@@ -36,14 +36,7 @@ class ChildError(TactomoError):
 
 
 class Child:
-    """One running `tactomo` command.
-
-    Args:
-        name: what it is called in errors.
-        arguments: its command line, without the program's name.
-        ended: where it puts itself when it ends, for whoever waits for any child.
-        verbose: pass on what it prints.
-    """
+    """One running `tactomo` command."""
 
     def __init__(
         self, name: str, arguments: list[str], ended: queue.SimpleQueue[Child], verbose: bool
@@ -154,11 +147,7 @@ class Child:
 
 
 class Family:
-    """Children that are stopped together when the block ends, however it ends.
-
-    Args:
-        verbose: pass on what they print.
-    """
+    """Children that are stopped together when the block ends, however it ends."""
 
     def __init__(self, verbose: bool = False) -> None:
         self._verbose = verbose

@@ -24,10 +24,6 @@ REPEAT_S: Final = 60.0
 class FrameMarks:
     """Marks frames in the recording that runs.
 
-    Args:
-        recorder: has the recording.
-        calibration: the text of the pressure calibration in force; empty for none.
-
     Attributes:
         calibration: likewise, as of now.
     """

@@ -226,11 +226,6 @@ def single_ended(
 ) -> tuple[FloatArray, FloatArray | None, tuple[str, ...]]:
     """Return single-ended readings as differences (T, M), their times, and notes for people.
 
-    Args:
-        path: where they are from, for errors.
-        arrays: with `volts`, `injection` and maybe `t`.
-        layout: the sensor whose pattern the differences are to follow.
-
     Raises:
         ImportFileError: they do not fit the sensor, or are out of phase with the current.
     """

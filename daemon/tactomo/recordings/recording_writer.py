@@ -143,10 +143,6 @@ class _File:
 class RecordingWriter:
     """Writes one recording. Its methods raise OSError as files do.
 
-    Args:
-        path: the file to write.
-        origin: what it is a recording of.
-
     Raises:
         FileExistsError: the file exists: nothing is ever written over.
     """

@@ -56,11 +56,6 @@ Times = Callable[[], Mapping[str, Durations]]
 class MetricsServer(Worker):
     """`open` it, `start` its thread, `stop` it.
 
-    Args:
-        status: returns a `status` message's fields, envelope included.
-        latency: from the last byte of a dual scan to publication.
-        stages: returns how long each stage takes.
-
     Attributes:
         address: where it can be scraped, once open.
     """

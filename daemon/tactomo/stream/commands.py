@@ -31,12 +31,6 @@ def obey(
 ) -> Outcome:
     """Check a command's arguments, and return what its handler makes of them.
 
-    Args:
-        command: its name.
-        arguments: as they came.
-        commands: what each command takes.
-        handlers: one for each command; it gets the checked arguments.
-
     Raises:
         CommandError: there is no such command, an argument is wrong, or the handler refuses.
     """

@@ -85,14 +85,7 @@ class Converter:
     def convert(
         self, volts: FloatArray, *, channel: Channel, counter: int, time_s: float
     ) -> tuple[NDArray[np.int32], bool]:
-        """Return the counts of one scan, (M,), and whether any of them hit the end of the range.
-
-        Args:
-            volts: what the skin puts out, (M,) volts.
-            channel: the channel.
-            counter: the scan's counter.
-            time_s: device time of the scan, in seconds.
-        """
+        """Return the counts of one scan, (M,), and whether any of them hit the end of the range."""
         gain = self._gains.setdefault(channel, DriftingGain(self._seed, channel))
         noise = np.random.default_rng([self._seed, channel.number, counter, 1])
         seen_v = volts * gain.at(time_s, self.drift)

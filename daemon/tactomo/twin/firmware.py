@@ -74,13 +74,7 @@ class _Sample:
 class Firmware:
     """The device behind its lines. For use by one thread.
 
-    Args:
-        identity: what it says of itself.
-        ports: its lines.
-        sample: starts computing the skin's voltages at a device time in seconds.
-        converter: volts to counts.
-        rate_hz: scans a second.
-        clock: seconds since power-up.
+    `clock` has the seconds since power-up; at such a time `sample` starts computing voltages.
     """
 
     def __init__(

@@ -85,16 +85,7 @@ class Grounded:
 
 
 class ForeignFirmware(Firmware):
-    """An instrument behind its one line. For use by one thread.
-
-    Args:
-        emulator: its language.
-        identity: what the twin's status says of it.
-        port: its line.
-        sample: starts computing the skin's voltages at a device time in seconds.
-        converter: its noise; unused for frames that are played.
-        clock: seconds since power-up.
-    """
+    """An instrument behind its one line. For use by one thread."""
 
     def __init__(
         self,

@@ -57,11 +57,6 @@ class Player:
 
     Used by one thread; `is_over` may be read by others.
 
-    Args:
-        path: an .npz file.
-        description: the sensor that was measured.
-        once: end after the last frame instead of beginning again.
-
     Raises:
         ImportFileError: the file cannot be read, or does not fit the sensor.
 

@@ -23,11 +23,6 @@ def load_paper_network(
 ) -> Network:
     """Load one of a sensor's networks of the paper: `cnn-single` or `cnn-multimodal`.
 
-    Args:
-        description: the sensor.
-        kind: which network.
-        path: its file; the user's own or the shipped one if None.
-
     Raises:
         ArtifactError: there is none, or it cannot be used.
     """
@@ -35,11 +30,7 @@ def load_paper_network(
 
 
 class PaperNetwork:
-    """One of the paper's networks, with its pre-processing (section III-C, Fig. 3).
-
-    Args:
-        network: of the kind "cnn-single" or "cnn-multimodal".
-    """
+    """One of the paper's networks, with its pre-processing (section III-C, Fig. 3)."""
 
     def __init__(self, network: Network) -> None:
         self._network = network

@@ -50,13 +50,6 @@ def chart(
 ) -> tuple[list[dict[str, Any]], Table]:
     """Measure methods, and write the picture and a table (.csv) beside it.
 
-    Args:
-        name: of the sensor, or its description's path.
-        picture: a .png, .svg or .pdf.
-        count: still scenes of each number of contacts.
-        machine: what the times are those of.
-        methods: to be measured; every available one if there is none.
-
     Returns:
         A row for each point of the chart, and a table of the Pareto fronts to print.
 
@@ -95,11 +88,6 @@ def sequences(count: int) -> int:
 
 def measure_chart(name: str, count: int, methods: Sequence[str] = ()) -> list[Point]:
     """Measure methods, with a progress bar in the terminal.
-
-    Args:
-        name: of the sensor, or its description's path.
-        count: still scenes of each number of contacts.
-        methods: to be measured; every available one if there is none.
 
     Raises:
         ModelError: there are no scenes for such a sensor, or a method of the user's own failed.

@@ -64,11 +64,6 @@ def method_times(
 ) -> tuple[list[Row], Table]:
     """Time methods and what they are compared with.
 
-    Args:
-        name: of the sensor, or its description's path.
-        methods: to be timed; every available one if there is none.
-        report: hears what is going on.
-
     Returns:
         A row for each method, number of contacts and state ("cold", "still", "moving", "any"): the
         number of frames, p50 and p99 of their times (ms), how many bare products these are worth,

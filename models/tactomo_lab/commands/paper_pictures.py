@@ -102,11 +102,7 @@ def draw_images(
 ) -> None:
     """Figs. 8, 11 and 12: the truth above each method's images, a column for each press.
 
-    Args:
-        frames: of cases; those of the first sensor are drawn.
-        description: the sensor.
-        output: the picture.
-        traces: whether to draw the images' values row by row below, as Fig. 11 (b) has them.
+    With `traces` the images' values row by row below, as Fig. 11 (b) has them.
     """
     from matplotlib.figure import Figure
 
@@ -152,13 +148,7 @@ def _fill_images(
 
 
 def draw_traces(frames: Sequence[Frame], errors: Sequence[MagnitudeError], output: Path) -> None:
-    """Fig. 9: the images of the first sensor row by row, a colour for each pressure.
-
-    Args:
-        frames: of cases 1 to 4.
-        errors: magnitude errors of all sensors, to be told beside the paper's.
-        output: the picture.
-    """
+    """Fig. 9: the images of the first sensor row by row, a colour for each pressure."""
     from matplotlib.figure import Figure
 
     from tactomo_lab.evaluation.paper import PAPER_MAGNITUDE_ERROR

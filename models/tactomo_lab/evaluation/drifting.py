@@ -116,14 +116,7 @@ def _draw_press(description: SensorDescription, rng: np.random.Generator) -> Pre
 
 
 class DriftingSkin:
-    """A skin in time; times are seconds since its tare.
-
-    Args:
-        description: the sensor.
-        presses: one after another.
-        seed: of its unevenness and of how it drifts.
-        step_at_s: when the temperature steps.
-    """
+    """A skin in time; times are seconds since its tare."""
 
     def __init__(
         self,
@@ -288,14 +281,7 @@ def simulate_day(
     number: int,
     hours: float = 24.0,
 ) -> Day:
-    """Draw a day and solve it; what was solved is kept.
-
-    Args:
-        description: the sensor; it needs both channels.
-        seed_set: tune on the one, report the other.
-        number: of the day.
-        hours: its length.
-    """
+    """Draw a day and solve it; what was solved is kept."""
     require_both_channels(description)
     rng = np.random.default_rng(seed_of(seed_set, "drift", number))
     presses = draw_presses(description, hours, rng)
@@ -368,14 +354,7 @@ class Seen:
 def live(
     day: Day, *, track: bool = True, every: int = 1, artifact: Artifact | None = None
 ) -> Iterator[Seen]:
-    """Reconstruct a day, frame by frame, after one tare at its start.
-
-    Args:
-        day: it.
-        track: whether the baseline follows.
-        every: 1 for all frames, more for every so many and no bursts.
-        artifact: of the sensor; read or built if None.
-    """
+    """Reconstruct a day after one tare: all frames, or one of `every` and no bursts."""
     description = day.skin.description
     rng = np.random.default_rng(day.seed)
     reconstructor = Reconstructor(description, artifact or load_or_build_artifact(description))

@@ -48,14 +48,9 @@ def scores_of_row(
     seed_set: SeedSet,
     count: int,
 ) -> dict[str, Iterator[FrameScore]]:
-    """Frames of a row as a method reconstructs them, by the name of the line that they are on.
+    """Frames of one of `ROWS` as a method reconstructs them, by the name of their line.
 
-    Args:
-        description: the sensor; needs both channels, whatever sensor the row makes of it.
-        row: one of `ROWS`.
-        method: the name of one.
-        seed_set: see `still_scenes.scenes`.
-        count: scenes of each line; of moving ones one for each `SCENES_A_SEQUENCE`.
+    `count` is of the scenes of each line; of moving ones there is one for `SCENES_A_SEQUENCE`.
 
     Raises:
         DataError: the sensor has a single channel, or no room for what presses.
@@ -114,14 +109,7 @@ def middle_press(
     seed_set: SeedSet,
     count: int,
 ) -> list[Outcome]:
-    """One soft contact as each method has it: the scene whose ICC by the last one is the middle.
-
-    Args:
-        description: the sensor; needs both channels.
-        methods: names of at least one.
-        seed_set: see `still_scenes.scenes`.
-        count: soft scenes to choose from; those of one contact are looked at.
-    """
+    """One soft contact as each method has it: the scene whose ICC by the last one is the middle."""
     soft = scenes_of_row(description, "soft", seed_set, count)["soft"]
     single = (scene for scene in soft if len(scene.layout.presses) == 1)
     outcomes = list(reconstruct_scenes(single, *methods))

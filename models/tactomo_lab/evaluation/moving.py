@@ -186,13 +186,6 @@ def draw_sequence(
 ) -> Sequence:
     """Draw and simulate a moving scene: about a minute, or read from the cache.
 
-    Args:
-        description: the sensor; needs both channels.
-        seed_set: see `scenes.scenes`.
-        number: of the scene.
-        snr_db: signal-to-noise ratio in decibels.
-        snr_of: what the noise is measured by; see `scenes.noise_std`.
-
     Raises:
         DataError: the sensor has a single channel.
     """
@@ -301,13 +294,7 @@ class StepScore(FrameScore):
 def play(
     sequence: Sequence, method: str = "auto", budget_s: float | None = None
 ) -> Iterator[StepScore]:
-    """Reconstruct a moving scene frame by frame, on one thread.
-
-    Args:
-        sequence: the scene.
-        method: a reconstruction method, as `tactomo reconstruct` has them.
-        budget_s: compute time a frame may take; the daemon's own if None.
-    """
+    """Reconstruct a moving scene on one thread; no `budget_s` means the daemon's own."""
     sensor = sequence.description
     rng = np.random.default_rng(sequence.seed)
     reconstructor = Reconstructor(

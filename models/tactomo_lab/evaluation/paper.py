@@ -97,13 +97,6 @@ def paper_scenes(
 ) -> Iterator[EvaluationScene]:
     """Test scenes of Fig. 5, drawn as the paper's training scenes are but from other seeds.
 
-    Args:
-        description: the sensor; needs both channels.
-        seed_set: see `scenes.scenes`.
-        count: scenes of each number of contacts; the paper has 100.
-        contacts: how many contacts.
-        snr_db: of the voltage changes.
-
     Raises:
         DataError: the sensor has a single channel, or no room for that many contacts.
     """
@@ -227,11 +220,7 @@ def presses_of(
 class Rig:
     """The paper's experiment platform (Fig. 6), simulated: a tared sensor, pressed and measured.
 
-    Args:
-        description: the sensor; needs both channels.
-        seed_set: see `scenes.scenes`.
-        sheet: number of the sensor, each uneven in its own way.
-        snr_db: of the voltages at rest.
+    Each `sheet` is uneven in its own way; `snr_db` is of the voltages at rest.
 
     Raises:
         DataError: the sensor has a single channel.
@@ -411,12 +400,7 @@ class MagnitudeError:
 def magnitude_errors(
     frames: Iterable[Frame], description: SensorDescription
 ) -> list[MagnitudeError]:
-    """The magnitude error of each method on each sensor, over cases 1 to 4.
-
-    Args:
-        frames: of `SINGLE`.
-        description: the sensor.
-    """
+    """The magnitude error of each method on each sensor, over cases 1 to 4."""
     groups: dict[tuple[str, int], list[Frame]] = {}
     for frame in frames:
         groups.setdefault((frame.method, frame.sheet), []).append(frame)

@@ -107,13 +107,7 @@ class Plan:
 
 
 class Draw:
-    """Draws what a case is made of.
-
-    Args:
-        description: the sensor.
-        rng: of the case.
-        number: of the case: kinds of a regime take turns by it.
-    """
+    """Draws what a case is made of."""
 
     def __init__(
         self, description: SensorDescription, rng: np.random.Generator, number: int

@@ -128,13 +128,7 @@ def scan_order(lookup: IntArray, description: SensorDescription) -> tuple[IntArr
 def localise(
     presses: Presses, description: SensorDescription, artifact: Artifact | None = None
 ) -> list[Localisation]:
-    """Locate every press by each method, fitted to the presses of other folds only.
-
-    Args:
-        presses: the set.
-        description: the skin.
-        artifact: what is precomputed for it; read or built if None.
-    """
+    """Locate every press by each method, fitted to the presses of other folds only."""
     imager = _Imager(description, presses, artifact or load_or_build_artifact(description))
     positions = presses.positions_m
 

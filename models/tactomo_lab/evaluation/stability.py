@@ -85,12 +85,6 @@ def make_case(
 ) -> Case:
     """Draw, simulate and measure a case; the same one every time.
 
-    Args:
-        description: the sensor; needs both channels, whatever sensor the regime makes of it.
-        regime: one of `REGIMES`.
-        seed_set: see `scenes.scenes`.
-        number: of the case.
-
     Raises:
         DataError: the sensor has a single channel, or no room for what presses.
     """
@@ -238,11 +232,6 @@ def reconstruct_case(case: Case, *methods: str, artifact: Artifact | None = None
 
     One frame alone is run to its end, as a file's are; several have the daemon's budget.
 
-    Args:
-        case: what to reconstruct.
-        *methods: names of methods.
-        artifact: of the sensor; read or built if None.
-
     Raises:
         ModelError: a method's network is not there.
     """
@@ -303,14 +292,6 @@ def evaluate_regimes(
     jobs: int = 1,
 ) -> Iterator[list[Outcome]]:
     """Reconstruct cases of some regimes by some methods.
-
-    Args:
-        description: the sensor; needs both channels.
-        regimes: names of `REGIMES`.
-        methods: names of methods.
-        seed_set: see `scenes.scenes`.
-        count: cases of each regime.
-        jobs: processes that share the cases.
 
     Yields:
         Each case's outcomes, of the methods that its sensor has; in the order of regimes and

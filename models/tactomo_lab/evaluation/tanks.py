@@ -110,12 +110,7 @@ def pixels(rows: int, columns: int, radius_m: float) -> tuple[FloatArray, FloatA
 
 
 class TankImager:
-    """Reconstructs voltage changes against the model's own empty tank.
-
-    Args:
-        description: the tank.
-        artifact: what is precomputed for it; read or built if None.
-    """
+    """Reconstructs voltage changes against the model's own empty tank."""
 
     def __init__(self, description: SensorDescription, artifact: Artifact | None = None) -> None:
         self.description = description
@@ -153,11 +148,7 @@ def estimate_scale(imager: TankImager, changes: FloatArray) -> float:
     Metal and plastic conduct so much better or worse than saline that more of it would change
     little. Changes on too small a scale are explained as well, by smaller or weaker objects; on
     too large a scale by none. On simulated tanks of tuning seeds, eight at a time, the rule found
-    the true scale within 7 %.
-
-    Args:
-        imager: of the tanks.
-        changes: (n, M) on one unknown scale.
+    the true scale within 7 %. `changes` are (n, M).
     """
     largest = imager.largest_scale(changes)
     logs: list[float] = []  # of the misfits; their mean, so that no tank counts more than another
@@ -179,14 +170,7 @@ def evaluate_tanks(
     methods: Iterable[str],
     scale: float,
 ) -> Iterator[TankOutcome]:
-    """Reconstruct every tank by every method and compare with the truth.
-
-    Args:
-        imager: of the tanks.
-        tanks: what to reconstruct.
-        methods: of reconstruction.
-        scale: of the tanks' changes, see `estimate_scale`.
-    """
+    """Reconstruct every tank by every method and compare with the truth."""
     for name, change, truth in zip(tanks.names, tanks.changes, tanks.truth, strict=True):
         for method in methods:
             begin = time.perf_counter()

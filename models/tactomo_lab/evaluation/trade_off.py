@@ -79,13 +79,7 @@ class Point:
 def measure_still(
     scenes: Sequence[EvaluationScene], variants: Sequence[Variant], done: Done = lambda: None
 ) -> Iterator[Point]:
-    """Reconstruct still scenes of one signal-to-noise ratio, each from a cold start.
-
-    Args:
-        scenes: at least one.
-        variants: what is measured.
-        done: called after each frame.
-    """
+    """Reconstruct still scenes of one ratio, each cold; `done` is called after each frame."""
     scores: dict[Variant, list[SceneScore]] = {variant: [] for variant in variants}
     for outcome in reconstruct_scenes(scenes, *variants):
         scores[outcome.variant].append(outcome.score)
@@ -98,13 +92,7 @@ def measure_still(
 def measure_moving(
     sequences: Sequence[moving.Sequence], variants: Sequence[Variant], done: Done = lambda: None
 ) -> Iterator[Point]:
-    """Follow moving scenes of one signal-to-noise ratio frame by frame.
-
-    Args:
-        sequences: at least one.
-        variants: what is measured.
-        done: called after each frame.
-    """
+    """Follow moving scenes of one ratio frame by frame; `done` is called after each."""
     for variant in variants:
         played: list[list[moving.StepScore]] = []
         for sequence in sequences:

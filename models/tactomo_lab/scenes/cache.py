@@ -18,11 +18,8 @@ Arrays = dict[str, Any]
 def cached(what: str, make: Callable[[], Arrays]) -> Arrays:
     """Arrays from an earlier call, or made anew and kept in the user's cache.
 
-    A file that cannot be read or written costs time and nothing else.
-
-    Args:
-        what: all that the arrays depend on.
-        make: makes them.
+    `what` has all that they depend on. A file that cannot be read or written costs time and nothing
+    else.
     """
     path = cache_folder() / "scenes" / f"{hashlib.sha256(what.encode()).hexdigest()[:32]}.npz"
     with suppress(OSError, DataError):

@@ -91,12 +91,6 @@ def draw_scene(
 ) -> TrainingScene:
     """Draw one scene of a preset.
 
-    Args:
-        preset: "paper" or "robust".
-        description: the sensor; needs both channels.
-        seed: of the whole set.
-        number: of the scene in it.
-
     Raises:
         DataError: there is no room for so many contacts.
     """

@@ -108,12 +108,7 @@ class UnevenSkin:
     def voltages(
         self, presses: Sequence[Press], states: Mapping[Channel, SheetState] | None = None
     ) -> Volts:
-        """Noise-free voltages (M,) of each channel, volts.
-
-        Args:
-            presses: what presses.
-            states: of the sheets that are no longer as they were made.
-        """
+        """Noise-free voltages (M,) of each channel, volts."""
         states = states or {}
         volts = {name: self._at_rest(name, states.get(name, AS_MADE)) for name in self._sheets}
         if not presses:

@@ -297,12 +297,7 @@ class SimulatedVolts:
 
 
 def kept_volts(what: str, simulate: Callable[[], SimulatedVolts]) -> SimulatedVolts:
-    """Voltages of a sensor's channels from an earlier call, or simulated and kept.
-
-    Args:
-        what: all that the voltages depend on.
-        simulate: makes them.
-    """
+    """Voltages of a sensor's channels from an earlier call, or simulated and kept."""
 
     def make() -> dict[str, FloatArray]:
         volts = simulate()

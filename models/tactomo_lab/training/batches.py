@@ -54,14 +54,7 @@ class Batch:
 
 
 class SceneBatches:
-    """All scenes of a folder, as batches.
-
-    Args:
-        folder: of shards, see `training.simulate`.
-        description: the sensor.
-        channels: channels the network is given.
-        forward: model of the sheet, for its voltages.
-    """
+    """All scenes of a folder, as batches."""
 
     def __init__(
         self,

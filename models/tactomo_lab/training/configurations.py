@@ -108,13 +108,6 @@ def prepare(
 ) -> Prepared:
     """Read the scenes and make the network.
 
-    Args:
-        configuration: what is to be made.
-        folder: of simulated scenes; with their images, for the paper's networks.
-        description: the sensor.
-        seed: of the network's first weights.
-        start: checkpoint whose averaged weights it begins with.
-
     Raises:
         ModelError: the scenes are of another sensor or preset, or something is missing.
     """

@@ -33,13 +33,6 @@ def export(
 ) -> None:
     """Write a network, its weights in half precision; it computes in single precision.
 
-    Args:
-        network: trained.
-        example: named inputs, each of one scene.
-        outputs: names.
-        notes: see `notes_of`.
-        path: the .onnx file.
-
     Raises:
         ModelError: the file cannot be written.
     """

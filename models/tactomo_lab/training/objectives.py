@@ -24,11 +24,7 @@ PAPER_TESTED = 1 / 6  # share of the paper's scenes, the last ones, that are kep
 
 
 class FusionObjective:
-    """Our network's: maps and shapes from noisy, filtered voltages.
-
-    Args:
-        batches: the scenes.
-    """
+    """Our network's: maps and shapes from noisy, filtered voltages."""
 
     def __init__(self, batches: SceneBatches) -> None:
         self.batches = batches
@@ -95,13 +91,7 @@ def by_contacts(what: str, icc: Tensor, contacts: Tensor, most: int = 4) -> dict
 
 
 class PaperObjective:
-    """The paper's networks': magnitudes from two preliminary images, without noise.
-
-    Args:
-        folder: of simulated scenes whose images are made.
-        multimodal: whether the structure channel's image is given, too.
-        scale: relative conductivity change that counts as 1.
-    """
+    """The paper's networks': magnitudes from two preliminary images, without noise."""
 
     def __init__(self, folder: Path, *, multimodal: bool, scale: float) -> None:
         scenes, images = read_scenes(folder), read_images(folder)

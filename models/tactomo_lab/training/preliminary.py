@@ -37,11 +37,6 @@ IMAGES = "images"  # begins the names of the files that hold them
 def make_images(description: SensorDescription, folder: Path, *, jobs: int = -1) -> Iterator[int]:
     """Make what is missing of a folder's images.
 
-    Args:
-        description: the sensor.
-        folder: of simulated scenes.
-        jobs: processes; -1 for one on every core.
-
     Yields:
         How many scenes more have theirs: those of earlier runs first.
 

@@ -117,14 +117,9 @@ def train(
     checkpoint: Path | None = None,
     report: Callable[[int, int, float], None] = lambda step, steps, loss: None,
 ) -> Iterator[Epoch]:
-    """Train until all epochs are done, with a checkpoint after each.
+    """Train until all epochs are done, with a checkpoint after each; with no file there is none.
 
-    Args:
-        training: from `begin` or `load_checkpoint`.
-        objective: what is trained.
-        settings: how long and how fast.
-        checkpoint: file of the checkpoints; none if None.
-        report: called after each step with its number, how many the epoch has, and the loss.
+    `report` is given the number of a step, how many the epoch has, and the loss.
 
     Yields:
         Each epoch's outcome.

@@ -101,9 +101,6 @@ class _Sheet:
 class SceneSimulator:
     """Simulates training scenes of one sensor.
 
-    Args:
-        description: the sensor; needs both channels.
-
     Raises:
         DataError: it has one channel.
     """
@@ -235,14 +232,6 @@ def simulate(
 ) -> Iterator[int]:
     """Simulate what is missing of a set of scenes.
 
-    Args:
-        description: the sensor.
-        preset: what scenes are like.
-        folder: where the shards go.
-        scenes: how many; a set can be enlarged later.
-        seed: of the set.
-        jobs: processes; -1 for one on every core.
-
     Yields:
         How many scenes more are there: those of earlier runs first.
 
@@ -267,14 +256,9 @@ def make_shards(
     *,
     jobs: int = -1,
 ) -> Iterator[int]:
-    """Make what is missing of some shards, on several cores.
+    """Make what is missing of some shards, on several cores (`jobs`; -1: all).
 
-    Args:
-        folder: of the set.
-        what: begins the names of the files.
-        shards: number of the first scene of each, and how many scenes it has.
-        make: makes the arrays of a shard from both.
-        jobs: processes; -1 for one on every core.
+    Each shard is the number of its first scene, and how many it has; `what` begins its file's name.
 
     Yields:
         How many scenes more are there: those of earlier runs first.

@@ -65,14 +65,6 @@ def guided(
 ) -> PressureCalibration:
     """Take readings together with the user, and fit them.
 
-    Args:
-        sensor: its name.
-        stream: address of its daemon's stream.
-        keys: folder of keys, for a daemon beyond this computer.
-        area_mm2: of the indenter; requested at the terminal if None.
-        path: where the calibration will be kept; the readings are kept beside it.
-        fresh: begin anew.
-
     Raises:
         TactomoError: no daemon answers, or the sensor has no magnitude channel.
         CalibrationError: what was taken makes no curve yet.

@@ -104,14 +104,6 @@ def of_daemon(
 ) -> Evidence:
     """Listen to a running daemon.
 
-    Args:
-        sensor: its name in the stream.
-        stream: the stream's address.
-        seconds: how long.
-        description: the sensor's; what the daemon says if None.
-        keys: for a daemon beyond this computer.
-        progress: called with the seconds that have passed.
-
     Raises:
         DoctorError: no daemon answers, or it has no scans.
     """
