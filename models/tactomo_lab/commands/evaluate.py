@@ -271,8 +271,6 @@ def _print_scenes(settings: dict[str, Any], outcomes: Sequence[Outcome]) -> None
 
 # What tables of a summary show under each heading; of a phase, what stands under the same ones.
 FIGURES: dict[str, Callable[[Any], str]] = {
-    "scenes": lambda s: str(s.scenes),
-    "maps": lambda s: str(s.scenes),
     "frames": lambda s: str(s.frames),
     "ICC": lambda s: f"{s.icc:.3f}",
     "worst": lambda s: f"{s.icc_worst:.2f}",
@@ -301,7 +299,7 @@ FIGURES: dict[str, Callable[[Any], str]] = {
     "most": lambda s: f"{s.recovery_most:.0f}",
     "ids": lambda s: str(s.switches),
 }
-MAPS = ("scenes", "ICC", "worst", "shape", "RIE", "flagged", "wrong", "ms", "p99")
+MAPS = ("frames", "ICC", "worst", "shape", "RIE", "flagged", "wrong", "ms", "p99")
 CONTACTS = (
     *("count", "missed", "false", "mm", "p95", "area"),
     *("Δσ", "spread", "kPa", "in σ"),

@@ -124,5 +124,5 @@ def _print(settings: dict[str, Any], scores: dict[str, list[FrameScore]]) -> Non
     )
 
 
-MAPS = ("maps", "ICC", "RIE", "worst", "flagged", "silent", "alarms", "ms", "p99")
+MAPS = ("frames", "ICC", "RIE", "worst", "flagged", "silent", "alarms", "ms", "p99")
 CONTACTS = ("count", "mm", "peak", "in σ", "place in σ", "area in σ")

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from tactomo_models.errors import MethodError
@@ -27,12 +27,13 @@ from threadpoolctl import threadpool_limits
 from tactomo_lab.scenes.measures import (
     WRONG_ICC,
     FrameScore,
+    Summary,
     correlation,
     match,
-    mean,
     percentile,
     relative_error,
     score_contacts,
+    summarise,
 )
 from tactomo_lab.scenes.simulation import (
     TrueContact,
@@ -395,35 +396,19 @@ class _Identities:
 
 
 @dataclass(frozen=True)
-class PhaseSummary:
-    """One phase over many sequences; means where nothing else is said, NaN where unmeasured.
+class PhaseSummary(Summary):
+    """One phase over many sequences.
 
     Attributes:
-        frames: how many.
-        icc, icc_structure: of the magnitude map and of the pressed shape.
-        icc_worst: of the map, 5th percentile.
-        count_right: share of frames with the right number of contacts, of those where it is clear.
         recovery: longest run of frames in which the shape's ICC is below `WRONG_ICC`; median over
             the sequences.
         recovery_most: of the slowest sequence.
         switches: identities lost, in all.
-        distrusted: share of frames flagged as not to be trusted.
-        confidently_wrong: share of frames that are wrong and not flagged.
-        seconds, seconds_99: median and 99th percentile of the compute time.
     """
 
-    frames: int
-    icc: float
-    icc_worst: float
-    icc_structure: float
-    count_right: float
     recovery: float
     recovery_most: float
     switches: int
-    distrusted: float
-    confidently_wrong: float
-    seconds: float
-    seconds_99: float
 
 
 def summarise_phases(sequences: Iterable[Iterable[StepScore]]) -> dict[str, PhaseSummary]:
@@ -440,22 +425,12 @@ def summarise_phases(sequences: Iterable[Iterable[StepScore]]) -> dict[str, Phas
 
 def _summarise(played: list[list[StepScore]]) -> PhaseSummary:
     scores = [score for part in played for score in part]
-    icc = [score.icc for score in scores]
-    seconds = [score.seconds for score in scores]
     recovery = [_recovery(part) for part in played]
     return PhaseSummary(
-        frames=len(scores),
-        icc=mean(icc),
-        icc_worst=percentile(icc, 5),
-        icc_structure=mean(score.icc_structure for score in scores),
-        count_right=mean(score.count_right for score in scores),
+        **asdict(summarise(scores)),
         recovery=percentile(recovery, 50),
         recovery_most=percentile(recovery, 100),
         switches=sum(score.switches for score in scores),
-        distrusted=mean(score.distrusted for score in scores),
-        confidently_wrong=mean(score.confidently_wrong for score in scores),
-        seconds=percentile(seconds, 50),
-        seconds_99=percentile(seconds, 99),
     )
 
 

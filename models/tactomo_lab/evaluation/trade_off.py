@@ -86,7 +86,7 @@ def measure_still(
         done()
     for variant, own in scores.items():
         summary = summarise(own)
-        yield _point("still", scenes[0].snr_db, variant, summary.scenes, summary)
+        yield _point("still", scenes[0].snr_db, variant, summary)
 
 
 def measure_moving(
@@ -101,7 +101,7 @@ def measure_moving(
                 played[-1].append(score)
                 done()
         summary = moving.summarise_phases(played)["all"]
-        yield _point("moving", sequences[0].snr_db, variant, summary.frames, summary)
+        yield _point("moving", sequences[0].snr_db, variant, summary)
 
 
 def left_out(description: SensorDescription, methods: Iterable[str]) -> dict[str, str]:
@@ -119,14 +119,13 @@ def _point(
     scene: SceneKind,
     snr_db: float,
     variant: Variant,
-    frames: int,
-    summary: Summary | moving.PhaseSummary,
+    summary: Summary,
 ) -> Point:
     return Point(
         scene=scene,
         snr_db=snr_db,
         variant=variant,
-        frames=frames,
+        frames=summary.frames,
         icc=summary.icc,
         icc_worst=summary.icc_worst,
         count_right=summary.count_right,

@@ -240,7 +240,7 @@ class Summary:
     """Many frames' measures. Means, where nothing else is said; NaN where nothing was measured.
 
     Attributes:
-        scenes: how many frames, of a scene each where scenes are still.
+        frames: how many, of a scene each where scenes are still.
         icc, rie: of the magnitude map.
         icc_worst: of the worst scene in twenty (5th percentile).
         icc_structure: of the pressed shape.
@@ -265,7 +265,7 @@ class Summary:
         seconds, seconds_99: median and 99th percentile of the compute time.
     """
 
-    scenes: int
+    frames: int
     icc: float
     icc_worst: float
     rie: float
@@ -302,7 +302,7 @@ def summarise(scores: Sequence[FrameScore]) -> Summary:
     seconds = [one.seconds for one in scores]
     icc = [one.icc for one in scores]
     return Summary(
-        scenes=len(scores),
+        frames=len(scores),
         icc=mean(icc),
         icc_worst=percentile(icc, 5),
         rie=mean(one.rie for one in scores),

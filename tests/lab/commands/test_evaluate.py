@@ -22,7 +22,7 @@ def test_scenes_in_numbers(tactomo: Run, tmp_path: Path) -> None:
     told = json.loads(result.stdout)
     assert told["simulated"] is True
     assert (told["seeds"], told["method"], told["snr_of"]) == ("tuning", "tikhonov", "change")
-    assert told["all"]["scenes"] == len(told["scenes"]) == 4
+    assert told["all"]["frames"] == len(told["scenes"]) == 4
     assert set(told["by"]["SNR (dB)"]) == {"20", "40"}
     assert [one["scene"] for one in told["scenes"]] == ["tuning 1/0", "tuning 2/0"] * 2
     assert {one["tier"] for one in told["scenes"]} == {"tikhonov"}

@@ -23,7 +23,7 @@ def test_in_numbers_and_words(tactomo: Run, tmp_path: Path) -> None:
     assert (told["simulated"], told["seeds"], told["method"]) == (True, "tuning", "tikhonov")
     assert list(told["lines"]) == ["soft", "graded"]
     for line in told["lines"].values():
-        assert line["scenes"] == len(line["scores"]) == 1
+        assert line["frames"] == len(line["scores"]) == 1
         assert line["icc"] == pytest.approx(line["scores"][0]["icc"])
     picture = tmp_path / "soft.png"
     words = tactomo(*ask, "--method", "tikhonov", "--picture", picture)

@@ -110,7 +110,7 @@ def test_a_summary_by_hand(paper: SensorDescription) -> None:
             scene(paper, FOUND, found=3, distrusted=True, seconds=0.2),
         ]
     )
-    assert all_of.scenes == 3
+    assert all_of.frames == 3
     assert all_of.icc == pytest.approx((0.9 + 0.5 + 0.9) / 3)
     assert all_of.count_right == pytest.approx(1 / 3)
     assert all_of.missed == pytest.approx(1 / 5)
@@ -140,5 +140,5 @@ def test_groups(paper: SensorDescription) -> None:
     grouped = summaries(scores)
     assert list(grouped["contacts"]) == ["1", "2", "10"]
     assert list(grouped["contrast"]) == ["10-22", "22-46", "46-100"]
-    assert grouped["SNR (dB)"]["40"].scenes == 2
-    assert all(sum(s.scenes for s in rows.values()) == 3 for rows in grouped.values())
+    assert grouped["SNR (dB)"]["40"].frames == 2
+    assert all(sum(s.frames for s in rows.values()) == 3 for rows in grouped.values())
