@@ -101,7 +101,7 @@ def scenes(
     outcomes = list(shown(reconstruct_scenes(drawn, method), total, f"{seeds} scenes"))
     settings = settings_of(description.name, seeds, snr_of, method)
     if as_json:
-        typer.echo(json.dumps({**settings, "scenes_each": count, **_as_json(outcomes)}, indent=2))
+        print_json({**settings, "scenes_each": count, **_as_json(outcomes)})
     else:
         _print_scenes(settings, outcomes)
     if picture is not None:
@@ -162,7 +162,7 @@ def moving(
         settings |= {"snr_db": snr, "budget_ms": budget_ms}
         rows = {name: asdict(summary) for name, summary in phases.items()}
         frames = [[asdict(score) for score in scores] for scores in played]
-        typer.echo(json.dumps({**settings, "phases": rows, "sequences": frames}, indent=2))
+        print_json({**settings, "phases": rows, "sequences": frames})
     else:
         _print_moving(settings, f"{count} sequences, {snr:g} dB", phases)
 
@@ -211,6 +211,19 @@ def shown(items: Iterable[Item], total: int | None, what: str) -> Iterator[Item]
     yield from track(
         items, description=what, total=total, console=Console(stderr=True), transient=True
     )
+
+
+def print_json(told: dict[str, Any]) -> None:
+    """Print what programs read; what is not a finite number is null."""
+    typer.echo(json.dumps(_finite(told), indent=2))
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _as_json(outcomes: Sequence[Outcome]) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -13,7 +12,7 @@ import typer
 from tactomo.cli.options import DEFAULT_DESCRIPTION, Description, JsonOutput, examples, typer_app
 from tactomo.cli.plot.plot import prepare_picture, save_figure
 
-from tactomo_lab.commands.evaluate import Picture, Seeds, shown
+from tactomo_lab.commands.evaluate import Picture, Seeds, print_json, shown
 
 if TYPE_CHECKING:
     from tactomo_lab.evaluation.drifting import Day, DaySummary, Seen
@@ -72,20 +71,16 @@ def drift(
         told.append((name, summarise_day(tracked, hours), summarise_day(untracked, hours)))
     if as_json:
         settings = {"simulated": True, "sensor": description.name, "seeds": seeds, "hours": hours}
-        typer.echo(json.dumps({**settings, "days": [_as_json(*each) for each in told]}, indent=2))
+        rows = [
+            {"day": name, "tracked": asdict(tracked), "untracked": asdict(untracked)}
+            for name, tracked, untracked in told
+        ]
+        print_json({**settings, "days": rows})
     else:
         _print(description.name, hours, told)
     if picture is not None:
         _draw(*days[0], picture)
         typer.echo(f"wrote {picture}", err=True)
-
-
-def _as_json(name: str, tracked: DaySummary, untracked: DaySummary) -> dict[str, Any]:
-    def fields(summary: DaySummary) -> dict[str, Any]:
-        values = asdict(summary).items()
-        return {key: None if math.isnan(value) else value for key, value in values}
-
-    return {"day": name, "tracked": fields(tracked), "untracked": fields(untracked)}
 
 
 def _print(sensor: str, hours: float, told: Sequence[tuple[str, DaySummary, DaySummary]]) -> None:

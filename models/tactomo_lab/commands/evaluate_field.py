@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,6 +20,7 @@ from tactomo.cli.plot.plot import prepare_picture
 from tactomo_lab.commands.evaluate import (
     Seeds,
     chosen_names,
+    print_json,
     print_settings,
     settings_of,
     shown,
@@ -86,8 +86,7 @@ def field(
                 typer.echo(f"left out: {line}: {error}", err=True)
     settings = settings_of(description.name, seeds, "change", method)
     if as_json:
-        told = {**settings, "scenes_each": count, "lines": _as_json(scores)}
-        typer.echo(json.dumps(told, indent=2))
+        print_json({**settings, "scenes_each": count, "lines": _as_json(scores)})
     else:
         _print(settings, scores)
     if picture is not None:

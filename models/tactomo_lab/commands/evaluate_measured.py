@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,7 +11,7 @@ from tactomo.cli.options import Description, JsonOutput, examples, method_option
 from tactomo.cli.plot.plot import prepare_picture, save_figure
 from tactomo.errors import TactomoError
 
-from tactomo_lab.commands.evaluate import Picture, shown
+from tactomo_lab.commands.evaluate import Picture, print_json, shown
 
 if TYPE_CHECKING:
     from rich.status import Status
@@ -82,7 +81,7 @@ def tanks(
     outcomes = list(shown(evaluate_tanks(imager, measured, methods, scale), total, "tanks"))
     facts = {"simulated": False, "sensor": description.name, "scale": scale}
     if as_json:
-        typer.echo(json.dumps({**facts, **_tanks_as_json(methods, outcomes)}, indent=2))
+        print_json({**facts, **_tanks_as_json(methods, outcomes)})
     else:
         _print_tanks(facts, methods, outcomes)
     if picture is not None:
@@ -102,18 +101,10 @@ def _mean(outcomes: Sequence[TankOutcome], method: str) -> float:
 
 
 def _tanks_as_json(methods: Sequence[str], outcomes: Sequence[TankOutcome]) -> dict[str, Any]:
+    told = ("name", "method", "correlation", "misfit", "seconds")
     return {
         "mean_correlation": {method: _mean(outcomes, method) for method in methods},
-        "tanks": [
-            {
-                "name": outcome.name,
-                "method": outcome.method,
-                "correlation": outcome.correlation,
-                "misfit": None if outcome.misfit != outcome.misfit else outcome.misfit,
-                "seconds": outcome.seconds,
-            }
-            for outcome in outcomes
-        ],
+        "tanks": [{name: getattr(outcome, name) for name in told} for outcome in outcomes],
     }
 
 
@@ -193,7 +184,7 @@ def skin(
         found = localise(measured, description)
     if as_json:
         facts = {one.method: {"median_mm": one.median_mm, "most_mm": one.most_mm} for one in found}
-        typer.echo(json.dumps({"presses": len(measured.changes), "methods": facts}, indent=2))
+        print_json({"presses": len(measured.changes), "methods": facts})
         return
     table = Table(box=box.SIMPLE_HEAD)
     for heading in ("localisation error, mm", "median", "95 %"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -23,7 +22,7 @@ from tactomo.cli.options import (
 from tactomo.cli.plot.plot import prepare_folder
 from tactomo.errors import TactomoError
 
-from tactomo_lab.commands.evaluate import Seeds, shown
+from tactomo_lab.commands.evaluate import Seeds, print_json, shown
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -158,7 +157,7 @@ def paper(
                 draw(picture / f"figure_{number}.png")
                 drawn += 1
     if as_json:
-        typer.echo(json.dumps(_finite({**settings, "figures": facts}), indent=2))
+        print_json({**settings, "figures": facts})
     if picture is not None:
         typer.echo(f"wrote {drawn} pictures to {picture}", err=True)
 
@@ -414,12 +413,3 @@ def _print(part: _Part) -> None:
     console.print(part.table)
     if part.caption:
         console.print(f"[dim]{part.caption}[/]")
-
-
-def _finite(value: Any) -> Any:
-    """The same with None for what JSON cannot hold: an infinite ratio, a measure of nothing."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

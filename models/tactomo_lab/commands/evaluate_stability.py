@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -21,7 +19,7 @@ from tactomo.cli.options import (
 )
 from tactomo.cli.plot.plot import prepare_picture
 
-from tactomo_lab.commands.evaluate import Seeds, chosen_names, shown
+from tactomo_lab.commands.evaluate import Seeds, chosen_names, print_json, shown
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -87,7 +85,7 @@ def stability(
         "methods": chosen,
     }
     if as_json:
-        typer.echo(json.dumps({**settings, **_as_json(scores)}, indent=2))
+        print_json({**settings, **_as_json(scores)})
     else:
         _print(settings, scores)
     if picture is not None:
@@ -130,24 +128,8 @@ def _print(settings: dict[str, Any], scores: Sequence[CaseScore]) -> None:
         "[dim]Each cell: mean ICC; bad maps (ICC < 0.7) without a flag that tells to distrust, of "
         "all bad ones; good maps with one, of all good ones.[/]\n"
     )
-    for method, counts in rows["all"].items():
-        console.print(f"[bold]{method}[/]: {_headline(counts)}")
     method = IN_WORDS if IN_WORDS in methods else methods[0]
     console.print(_doings(method, [one for one in scores if one.method == method]))
-
-
-def _headline(counts: Trust) -> str:
-    good = counts.maps - counts.bad
-    return (
-        f"of {counts.bad} bad maps {counts.bad_unwarned}{_percent(counts.silent)} without a flag "
-        f"that tells to distrust, {counts.bad_unflagged} without any flag; of {good} good maps "
-        f"{counts.good_warned}{_percent(counts.alarms)} with one that does, "
-        f"{counts.good_flagged} with any flag."
-    )
-
-
-def _percent(share: float) -> str:
-    return "" if math.isnan(share) else f" ({share:.0%})"
 
 
 def _counts(rows: dict[str, dict[str, Trust]], methods: Sequence[str]) -> Table:

@@ -10,15 +10,15 @@ Times are this thread's processor time, the median of several runs, BLAS on one 
 
 from __future__ import annotations
 
-import json
 import statistics
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-import typer
 from tactomo.cli.options import DEFAULT_DESCRIPTION, Description, JsonOutput, examples, typer_app
+
+from tactomo_lab.commands.evaluate import print_json
 
 if TYPE_CHECKING:
     from tactomo_models import SensorDescription
@@ -78,7 +78,7 @@ def solves(description: Description = DEFAULT_DESCRIPTION, as_json: JsonOutput =
         rows = [*_by_area(sensor), *_by_mesh(sensor), *_by_sheet(sensor)]
     if as_json:
         told = {"machine": machine(), "description": description}
-        typer.echo(json.dumps({**told, "rows": [asdict(row) for row in rows]}, indent=2))
+        print_json({**told, "rows": [asdict(row) for row in rows]})
         return
     table = Table(title=f"one forward solve, {description}, one thread of {machine()}")
     for name in ("series", "sparse / solve", *(name for name in asdict(rows[0]) if "_" in name)):

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import typer
 from tactomo.cli.options import DEFAULT_DESCRIPTION, Description, JsonOutput, examples, typer_app
 from tactomo.errors import TactomoError
+
+from tactomo_lab.commands.evaluate import print_json
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -83,7 +84,7 @@ def simulate(
     if as_json:
         settings = {"folder": str(folder), "preset": preset, "seed": seed}
         counts = {"scenes": before + now, "new": now}
-        typer.echo(json.dumps({**settings, "sensor": description.name, **counts}))
+        print_json({**settings, "sensor": description.name, **counts})
     else:
         typer.echo(f"{folder}: {total} {preset} scenes, {now} of them new")
 
@@ -170,8 +171,8 @@ def train(
             "simulated": True,
             "output": str(written),
         }
-        history = [_as_json(epoch) for epoch in training.history]
-        typer.echo(json.dumps({**told, **asdict(settings), "history": history}, indent=2))
+        history = [asdict(epoch) for epoch in training.history]
+        print_json({**told, **asdict(settings), "history": history})
     else:
         typer.echo(f"wrote {written}: {written.stat().st_size / 1e6:.1f} MB")
 
@@ -245,11 +246,6 @@ def _in_words(epoch: Epoch, number: int) -> str:
         for noise, row in rows.items()
     ]
     return f"epoch {number}: loss {epoch.loss:.4f}; held-out ICC ({names}): {', '.join(parts)}"
-
-
-def _as_json(epoch: Epoch) -> dict[str, Any]:
-    held_out = {name: None if math.isnan(v) else v for name, v in epoch.held_out.items()}
-    return {"loss": epoch.loss, "held_out": held_out}
 
 
 def _follow(steps: Iterator[int], total: int, what: str, folder: Path) -> tuple[int, int]:

@@ -345,17 +345,6 @@ class Trust:
     good_warned: int
     good_flagged: int
 
-    @property
-    def silent(self) -> float:
-        """Share of the bad maps that nothing warned of; NaN where none is bad."""
-        return self.bad_unwarned / self.bad if self.bad else float("nan")
-
-    @property
-    def alarms(self) -> float:
-        """Share of the good maps that were warned of; NaN where none is good."""
-        good = self.maps - self.bad
-        return self.good_warned / good if good else float("nan")
-
 
 def trust(scores: Iterable[CaseScore]) -> Trust:
     """Count bad maps and warnings."""

@@ -260,10 +260,6 @@ def test_warnings_are_counted() -> None:
     counted = trust(scores)
     assert counted.icc == pytest.approx(4.34 / 7)
     assert counted == Trust(7, counted.icc, 3, 2, 1, 1, 2)
-    assert counted.silent == pytest.approx(2 / 3)
-    assert counted.alarms == pytest.approx(1 / 4)
-    assert np.isnan(trust([one(0.9)]).silent)
-    assert np.isnan(trust([one(0.1)]).alarms)
     scores += [replace(one(0.3), regime="b", method="fit")]
     by_regime = trust_by_regime(scores)
     assert list(by_regime) == ["a", "b", "all"]
