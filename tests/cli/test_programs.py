@@ -116,7 +116,6 @@ def test_the_twins_defaults_are_those_of_its_configuration() -> None:
     options = {option.name: option.default for option in twin_command().params}
     usual = TwinConfig(load_description("paper_square"))
     assert options["rate"] == usual.rate_hz
-    assert (options["drift"], options["creep"]) == (usual.drift.walk, usual.drift.creep)
     assert (options["unevenness"], options["seed"]) == (usual.unevenness, usual.seed)
     assert options["twin_control"] == usual.control
 

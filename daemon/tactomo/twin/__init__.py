@@ -17,12 +17,10 @@ frames (`playing`), and in the firmware's another instrument (`foreign`, and an 
 protocol).
 """
 
-from tactomo.twin.converter import Drift
 from tactomo.twin.device import SkinModel, Twin, TwinConfig, make_skin
 from tactomo.twin.scene import Indenter, Scene, ScriptedPress, Waypoint, load_scene
 
 __all__ = [
-    "Drift",
     "Indenter",
     "Scene",
     "ScriptedPress",

@@ -59,13 +59,6 @@ class NoiseArguments(Arguments):
     noise_v: float = Field(ge=0.0, le=1e3, allow_inf_nan=False)
 
 
-class DriftArguments(SkinDriftSettings):
-    """Change how the gains and the skin drift; 0 stops it. Leaves out what is not given."""
-
-    walk: float | None = Field(default=None, ge=0.0, le=1.0, allow_inf_nan=False)
-    creep: float | None = Field(default=None, ge=-0.5, le=0.5, allow_inf_nan=False)
-
-
 class MuteArguments(Arguments):
     """Send nothing of one channel for a while."""
 
@@ -94,7 +87,7 @@ COMMANDS: Mapping[str, type[BaseModel]] = {
     "clear": Nothing,
     "play": PlayArguments,
     "noise": NoiseArguments,
-    "drift": DriftArguments,
+    "drift": SkinDriftSettings,
     "mute": MuteArguments,
     "garbage": GarbageArguments,
     "unplug": PortArguments,

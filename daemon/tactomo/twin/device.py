@@ -9,7 +9,6 @@ voltages are there.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
 import socket
 import threading
@@ -37,7 +36,6 @@ from tactomo.protocols import NATIVE, emulator_of, find_protocol
 from tactomo.stream.commands import Nothing, explained
 from tactomo.twin.control import (
     ControlSocket,
-    DriftArguments,
     GarbageArguments,
     Handler,
     MuteArguments,
@@ -47,7 +45,7 @@ from tactomo.twin.control import (
     PressArguments,
     ReleaseArguments,
 )
-from tactomo.twin.converter import Converter, Drift
+from tactomo.twin.converter import Converter
 from tactomo.twin.firmware import (
     RATE_HZ_MAX,
     RATE_HZ_MIN,
@@ -104,7 +102,6 @@ class TwinConfig:
         rate_hz: scans a second, at first; the host may change it. None for those of the file that
             is played, or 20.
         noise_v: noise in volts rms; None for a usual converter's.
-        drift: how the gains drift.
         skin_drift: how the skin itself drifts; the scene's if that says so.
         unevenness: standard deviation of the sheet's conductivity, a ratio.
         seed: equal seeds give equal noise, drift and unevenness.
@@ -120,7 +117,6 @@ class TwinConfig:
     ports: int = 1
     rate_hz: float | None = None
     noise_v: float | None = None
-    drift: Drift = field(default_factory=Drift)
     skin_drift: SkinDrift = field(default_factory=SkinDrift)
     unevenness: float = UNEVENNESS
     seed: int = 0
@@ -331,15 +327,14 @@ class Twin:
         return Firmware(identity, ports, self._sample, self._converter, rate_hz, self._clock)
 
     def _make_converter(self) -> Converter:
-        if self._player is not None:  # noise and drift are in what was measured
-            return Converter(HEADROOM * self._player.largest_v, 0.0, Drift(0.0, 0.0))
+        if self._player is not None:  # noise is in what was measured
+            return Converter(HEADROOM * self._player.largest_v, 0.0)
         unloaded = self._skin.voltages([])
         largest_v = max(float(np.max(np.abs(volts))) for volts in unloaded.values())
         noise_v = self.config.noise_v
         return Converter(
             full_scale_v=HEADROOM * largest_v,
             noise_v=NOISE_SHARE * largest_v if noise_v is None else noise_v,
-            drift=self.config.drift,
             seed=self.config.seed,
         )
 
@@ -418,18 +413,13 @@ class Twin:
         self._converter.noise_v = arguments.noise_v
         return {}
 
-    def _set_drift(self, arguments: DriftArguments) -> dict[str, Any]:
-        gain = arguments.model_dump(include={"walk", "creep"}, exclude_none=True)
-        skin = arguments.model_dump(exclude={"walk", "creep"}, exclude_none=True)
-        if skin and self._drifting is None:
+    def _set_drift(self, arguments: SkinDriftSettings) -> dict[str, Any]:
+        if self._drifting is None:
             raise CommandError(
-                "this twin's skin is not simulated: it does not drift", "leave those out"
+                "this twin's skin is not simulated: it does not drift",
+                "start a twin without --play",
             )
-        self._converter.drift = dataclasses.replace(self._converter.drift, **gain)
-        if self._drifting is not None:
-            self._drifting.drift = SkinDriftSettings.model_validate(skin).skin_drift(
-                self._drifting.drift
-            )
+        self._drifting.drift = arguments.skin_drift(self._drifting.drift)
         return {}
 
     def _mute(self, arguments: MuteArguments) -> dict[str, Any]:

@@ -168,7 +168,7 @@ class Firmware:
 
     def _scan(self, channel: Channel, time_s: float, flags: ScanFlag, voltages: Voltages) -> Scan:
         counts, saturated = self._converter.convert(
-            voltages[channel], channel=channel, counter=self.counter, time_s=time_s
+            voltages[channel], channel=channel, counter=self.counter
         )
         return Scan(
             channel=channel,

@@ -60,12 +60,6 @@ def twin(
         float | None,
         typer.Option(min=0.0, help="Converter noise, µV rms. [60 dB below the signal]"),
     ] = None,
-    drift: Annotated[
-        float, typer.Option(min=0.0, help="Random walk of the gains: relative rms after 1 s.")
-    ] = 2e-6,
-    creep: Annotated[
-        float, typer.Option(help="Relative change of the gains over the first minutes.")
-    ] = 2e-5,
     unevenness: Annotated[
         float, typer.Option(min=0.0, max=0.5, help="Of the sheet's conductivity; 0.05 is 5 %.")
     ] = 0.03,
@@ -82,7 +76,7 @@ def twin(
     from tactomo_models import load_description
 
     from tactomo.cli.children import interrupt_on_sigterm, print_ready
-    from tactomo.twin import Drift, Twin, TwinConfig, load_scene
+    from tactomo.twin import Twin, TwinConfig, load_scene
 
     interrupt_on_sigterm()
     sensor = load_description(description)
@@ -92,7 +86,6 @@ def twin(
         ports=lines if ports is None else ports,
         rate_hz=rate,
         noise_v=None if noise_uv is None else noise_uv * 1e-6,
-        drift=Drift(walk=drift, creep=creep),
         unevenness=unevenness,
         seed=seed,
         scene=None if scene is None else load_scene(scene),
