@@ -35,13 +35,7 @@ FIGURES = (5, 7, 8, 9, 10, 11, 12)
 
 @dataclass(frozen=True)
 class _Part:
-    """What came out of one experiment.
-
-    Attributes:
-        title, table, caption: to print.
-        facts: the same for programs, by figure.
-        pictures: what draws each figure into a file.
-    """
+    """What came out of one experiment."""
 
     title: str
     table: Table
@@ -52,15 +46,7 @@ class _Part:
 
 @dataclass(frozen=True)
 class _Study:
-    """What was asked for.
-
-    Attributes:
-        description: the sensor.
-        seeds: set of seeds.
-        count: scenes of each number of contacts.
-        rigs: sensors to press.
-        methods: of reconstruction.
-    """
+    """What was asked for."""
 
     description: SensorDescription
     seeds: Any

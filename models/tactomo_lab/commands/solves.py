@@ -34,19 +34,7 @@ RUNS = (5, 51)
 
 @dataclass(frozen=True)
 class Row:
-    """What solving for one contact costs.
-
-    Attributes:
-        series: area, mesh or sheet.
-        sheet_mm: width of the sheet.
-        spacing_mm: distance of the mesh's nodes.
-        sheet_nodes: nodes of the whole mesh.
-        pressed_mm2: area of the contact.
-        rim_nodes: unknowns of the dense system.
-        solve_ms: one solve.
-        jacobian_ms: the Jacobian by a few parameters, after a solve.
-        sparse_ms: sparse factorisation and solution of the whole sheet, its assembly not counted.
-    """
+    """What solving for one contact costs; `sparse_ms` leaves the whole sheet's assembly out."""
 
     series: str
     sheet_mm: float

@@ -234,14 +234,7 @@ class Stretch:
 
 @dataclass(frozen=True)
 class Day:
-    """What a skin said during a day.
-
-    Attributes:
-        skin: it.
-        hours: how long the day is.
-        stretches: one after another.
-        seed: of the noise.
-    """
+    """What a skin said during a day."""
 
     skin: DriftingSkin
     hours: float

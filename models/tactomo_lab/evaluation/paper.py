@@ -275,14 +275,7 @@ class Rig:
 
 @dataclass(frozen=True)
 class Response:
-    """A point of Fig. 7.
-
-    Attributes:
-        sheet: number of the sensor.
-        pressure_kpa: of the indenter.
-        peak: maximum of each channel's Tikhonov image, relative conductivity change as a linear
-            image has it.
-    """
+    """A point of Fig. 7; `peak` is the largest value of each channel's Tikhonov image."""
 
     sheet: int
     pressure_kpa: float
@@ -307,16 +300,7 @@ def measure_response(rigs: Iterable[Rig]) -> Iterator[Response]:
 
 @dataclass(frozen=True)
 class Frame:
-    """What a method made of one press of one case.
-
-    Attributes:
-        case: what pressed.
-        pressures_kpa: of each of its areas.
-        sheet: number of the sensor.
-        method: of reconstruction.
-        made: its map and contacts.
-        truth: what a perfect reconstruction would show.
-    """
+    """What a method made of one press of one case."""
 
     case: Case
     pressures_kpa: tuple[float, ...]

@@ -226,13 +226,7 @@ class Draw:
 
 @dataclass(frozen=True)
 class Regime:
-    """One thing that goes wrong.
-
-    Attributes:
-        what: it is, in a sentence.
-        draw: draws a case.
-        sensor_of: the sensor whose cases these are, made of the one that is evaluated.
-    """
+    """One thing that goes wrong; `sensor_of` makes its cases' sensor of the one evaluated."""
 
     what: str
     draw: Callable[[Draw], Plan]

@@ -49,12 +49,7 @@ class Presses:
 
 @dataclass(frozen=True)
 class Localisation:
-    """How far a method's positions are from the robot's, on presses that it was not fitted to.
-
-    Attributes:
-        method: in words.
-        errors_m: (n,) distances.
-    """
+    """How far a method's positions are from the robot's, on presses that it was not fitted to."""
 
     method: str
     errors_m: FloatArray

@@ -54,16 +54,7 @@ class Tanks:
 
 @dataclass(frozen=True)
 class TankOutcome:
-    """What one method made of one tank.
-
-    Attributes:
-        name: of the tank.
-        method: of reconstruction.
-        correlation: with the truth.
-        misfit: of the data; NaN where it is not known.
-        seconds: compute time.
-        image: (rows, columns) the structure map on the truth's pixels; NaN off the disc.
-    """
+    """What one method made of one tank; `image` (rows, columns) is on the truth's pixels."""
 
     name: str
     method: str

@@ -48,20 +48,7 @@ def variants(methods: Iterable[str], budgets_s: Sequence[float] = BUDGETS_S) -> 
 
 @dataclass(frozen=True)
 class Point:
-    """How fast and how right a variant is on scenes of one kind.
-
-    Attributes:
-        scene: "still" or "moving".
-        snr_db: signal-to-noise ratio.
-        variant: method and budget.
-        frames: reconstructed.
-        icc: of the magnitude map, mean.
-        icc_worst: of the worst frame in twenty.
-        count_right: share of frames with the right number of contacts.
-        distrusted: share flagged as not to be trusted.
-        confidently_wrong: share that is wrong and not flagged.
-        p50_s, p99_s: compute time of a frame, one thread.
-    """
+    """How fast and how right a variant is on scenes of one kind; the measures are `Summary`'s."""
 
     scene: SceneKind
     snr_db: float

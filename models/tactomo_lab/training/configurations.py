@@ -31,16 +31,7 @@ BOTH: Final[tuple[Channel, ...]] = (Channel.MAGNITUDE, Channel.STRUCTURE)
 
 @dataclass(frozen=True)
 class Configuration:
-    """How a network is made.
-
-    Attributes:
-        kind: what it is used as.
-        preset: of the scenes it is trained on.
-        channels: channels it is given.
-        width: channels of its first convolutions.
-        hidden: neurons between the paper's fully connected blocks; unused by ours.
-        settings: how long and how fast; the default, which a user may shorten.
-    """
+    """How a network is made."""
 
     kind: str
     preset: PresetName
