@@ -44,8 +44,8 @@ test-train: $(TRAIN_READY)  ## the tests of training; installs PyTorch
 faults: $(READY) ## every fault and measure (an hour), then docs/reliability.md from them
 	$(BIN)/pytest tests/faults -m '' --reliability docs/reliability.md $(ARGS)
 
-soak: $(READY)   ## a million dual scans as fast as they are taken
-	$(BIN)/pytest tests/faults -m '' -k soak $(ARGS)
+soak: $(READY)   ## a million dual scans as fast as they are taken, and their row of that page
+	$(BIN)/pytest tests/faults -m '' -k soak --reliability docs/reliability.md $(ARGS)
 
 firmware:        ## the C firmware library's emulator of a skin: firmware_protocol/c/build
 	$(MAKE) -C firmware_protocol/c

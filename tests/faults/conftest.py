@@ -2,7 +2,8 @@
 
 A test is a row of the page: its marker `fault` (or `measure`) says what is done, what is promised
 and how it was tried; what it finds it tells the fixture `figure`. `make faults` runs all of them
-with `--reliability docs/reliability.md`, which is then written whole from what ran.
+with `--reliability docs/reliability.md`, which is then written whole from what ran, or, when `-k`
+chose a part of them, in its rows.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import pytest
 from daemon_process import DaemonProcess
 from ears import Ears
 from pty_skin import Playing, PtySkin, Scenes, Volts, still
-from reliability import FIGURE, Row, row_of, write_page
+from reliability import FIGURE, Row, replace_rows, row_of, write_page
 from tactomo_models import SensorDescription, load_description, load_or_build_artifact
 from waiting import wait_until
 
@@ -45,7 +46,8 @@ def pytest_runtest_makereport(
 def pytest_sessionfinish(session: pytest.Session) -> None:
     path = session.config.getoption("reliability")
     if path and session.config.stash[ROWS]:
-        write_page(Path(path), session.config.stash[ROWS], session.config.getoption("scale"))
+        write = replace_rows if session.config.getoption("keyword") else write_page
+        write(Path(path), session.config.stash[ROWS])
 
 
 @pytest.fixture

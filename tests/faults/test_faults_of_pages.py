@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-import json
-import signal
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 import zmq
-from daemon_process import DaemonProcess
 from hostile_page import SUBSCRIBE, Attacker, HostileSite
-from pty_skin import PtySkin
 from selenium import webdriver
+from tactomo.cli.children import Family
 from tactomo.stream import keys as key_files
 from tactomo_client import request
 from tactomo_client.messages import encode_request
-from viewer_process import viewer_process
-from waiting import PATIENCE_S, wait_until
-from whole_system import SENSOR, running_demo
+from waiting import PATIENCE_S
+from whole_system import ANYWHERE, SENSOR
 
-Start = Callable[..., DaemonProcess]
 Figure = Callable[[str], None]
 SET_TIER = [b"", encode_request("set_tier", {"tier": "noser"})]
 PRESS = [b"", encode_request("press", {"x_mm": 0.0, "y_mm": 0.0})]
@@ -48,92 +40,71 @@ def attacker(browser: webdriver.Chrome) -> Iterator[Attacker]:
     site.close()
 
 
-@contextmanager
-def bridge(stream: str) -> Iterator[str]:
-    """Serve a sensor to Foxglove; gives the address."""
-    command = [*(sys.executable, "-m", "tactomo.cli", "foxglove", SENSOR, "--announce")]
-    options = ["--stream", stream, "--foxglove-port", "0"]
-    with subprocess.Popen([*command, *options], stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        line = next((line for line in process.stdout if line.startswith("{")), "{}")
-        try:
-            yield json.loads(line)["url"]
-        finally:
-            process.send_signal(signal.SIGINT)
-            process.wait(PATIENCE_S)
+def a_clients_keys(robot: Path, desk: Path) -> list[str]:
+    """Make a daemon's keys and those of a client who may command; gives the daemon's options."""
+    key_files.make_pair(robot, SENSOR, is_server=True)
+    key_files.make_pair(desk, "desk")
+    public = key_files.public_path(robot, SENSOR)
+    (desk / public.name).write_bytes(public.read_bytes())
+    key_files.allow(robot, key_files.public_path(desk, "desk"), SENSOR, may_command=True)
+    secret, clients = key_files.secret_path(robot, SENSOR), key_files.clients_folder(robot, SENSOR)
+    return [*("--set", f'curve.secret="{secret}"'), *("--set", f'curve.clients="{clients}"')]
 
 
 @pytest.mark.slow
 @pytest.mark.browser
+@pytest.mark.parametrize("keys", ["without", "with"])
 @pytest.mark.fault(
-    "A hostile page: a browser shows a page of another port of this computer",
+    "A hostile page: a browser shows a page of another port of this computer; {keys} keys",
     "the page reads nothing, commands nothing and presses nothing",
     "headless Chromium; POSTs that read as ZeroMQ messages, and reach a socket without a guard, to "
-    "the stream and the control sockets of daemon and twin; websockets to the viewer and the "
-    "Foxglove bridge; the viewer's page read",
+    "the daemon's stream and control socket and to the twin's; websockets to the viewer and the "
+    "Foxglove bridge; the viewer's page read. Keys are for the daemon's sockets, viewer and bridge "
+    "then have a client's; the twin takes none",
 )
-def test_a_hostile_page(attacker: Attacker, figure: Figure) -> None:
-    with running_demo() as demo, bridge(demo.stream) as url:
-        before = request("status", demo.control, PATIENCE_S)
-        attacker.post(demo.control, SET_TIER)
-        attacker.post(demo.stream, [SUBSCRIBE])
-        attacker.post(demo.twin, PRESS)
-        sockets = {
-            "the viewer's": demo.page.replace("http", "ws") + "socket",
-            "the bridge's": url,
-        }
+def test_a_hostile_page(attacker: Attacker, tmp_path: Path, figure: Figure, keys: str) -> None:
+    robot, desk = tmp_path / "robot", tmp_path / "desk"
+    under = a_clients_keys(robot, desk) if keys == "with" else []
+    ours = ["--keys", str(desk)] if under else []
+    with Family() as family:
+        skin = family.start(
+            *("twin", "twin", "--link", str(tmp_path), "--twin-control", ANYWHERE, "--announce")
+        ).wait_ready()
+        lines = [word for path in skin["ports"] for word in ("--port", path)]
+        daemon = family.start(
+            *("daemon", "daemon", "--sensor", SENSOR, *lines, *under),
+            *("--stream", ANYWHERE, "--control", ANYWHERE),
+        ).wait_ready()
+        stream, control, twin = daemon["stream"], daemon["control"], skin["control"]
+
+        def status() -> dict[str, Any]:
+            return request("status", control, PATIENCE_S, keys=desk if ours else None)
+
+        before = status()
+        attacker.post(control, SET_TIER)
+        attacker.post(stream, [SUBSCRIBE])
+        attacker.post(twin, PRESS)
+        after = status()
+        is_obeyed = [
+            after["tier_requested"] != before["tier_requested"],
+            after["subscribers"] != before["subscribers"],
+            request("scene", twin, PATIENCE_S)["presses"] != [],
+        ]
+        page = family.start(
+            *("viewer", "viewer", "--sensor", SENSOR, "--viewer-port", "0", *ours),
+            *("--stream", stream, "--control", control, "--twin-control", twin),
+        ).wait_ready()["url"]
+        bridge = family.start(
+            *("bridge", "foxglove", SENSOR, "--foxglove-port", "0", "--announce", *ours),
+            *("--stream", stream),
+        ).wait_ready()["url"]
+        sockets = {"the viewer's": page.replace("http", "ws") + "socket", "the bridge's": bridge}
         opened = [name for name, at in sockets.items() if attacker.opens_socket(at, PROTOCOL)]
-        is_read = attacker.reads(demo.page)
-        after = request("status", demo.control, PATIENCE_S)
-        presses = request("scene", demo.twin, PATIENCE_S)["presses"]
-    figure(f"3 POSTs: none obeyed; websockets opened: {', '.join(opened) or 'none'}")
-    assert after["tier_requested"] == before["tier_requested"]
-    assert after["subscribers"] == before["subscribers"]
-    assert presses == []
-    assert opened == []
-    assert not is_read
-
-
-@pytest.mark.slow
-@pytest.mark.browser
-@pytest.mark.fault(
-    "A hostile page, against a daemon and a viewer with keys",
-    "likewise",
-    "the daemon's sockets on loopback under CURVE, the viewer beside them with a client's keys",
-)
-def test_a_hostile_page_and_keys(
-    attacker: Attacker, skin: PtySkin, start: Start, tmp_path: Path, figure: Figure
-) -> None:
-    folder, desk = tmp_path / "robot", tmp_path / "desk"
-    key_files.make_pair(folder, "left", is_server=True)
-    key_files.make_pair(desk, "desk")
-    public = key_files.public_path(folder, "left")
-    (desk / public.name).write_bytes(public.read_bytes())
-    key_files.allow(folder, key_files.public_path(desk, "desk"), "left", may_command=True)
-    curve = {
-        "secret": str(key_files.secret_path(folder, "left")),
-        "clients": str(key_files.clients_folder(folder, "left")),
-    }
-    daemon = start(skin.paths, curve=curve)
-
-    def status() -> dict[str, Any]:
-        return request("status", daemon.control, PATIENCE_S, keys=desk)
-
-    before = wait_until(status)
-    attacker.post(daemon.control, SET_TIER)
-    attacker.post(daemon.stream, [SUBSCRIBE])
-    viewer = viewer_process(stream=daemon.stream, control=daemon.control)
-    try:
-        assert viewer.stdout is not None
-        page = viewer.stdout.readline().split()[-1]
-        opened = attacker.opens_socket(page.replace("http", "ws") + "socket")
         is_read = attacker.reads(page)
-    finally:
-        viewer.terminate()
-        viewer.communicate()
-    after = status()
-    figure(f"2 POSTs: none obeyed; the viewer's websocket {'opened' if opened else 'refused'}")
-    assert after["tier_requested"] == before["tier_requested"]
-    assert after["subscribers"] == before["subscribers"]
-    assert not opened
+    figure(
+        f"{sum(is_obeyed)} of {len(is_obeyed)} POSTs obeyed; websockets opened: "
+        f"{', '.join(opened) or 'none'}; the page {'read' if is_read else 'not read'}"
+    )
+    assert not any(is_obeyed)
+    assert opened == []
     assert not is_read

@@ -20,9 +20,10 @@ _PAGE = """\
 What is done to the daemon, what it promises then, how that was tried, and what came of it. Written
 by `make faults`, which runs all of it again on the machine at hand ({minutes} minutes); do not edit
 it. Every fault is done to a real `tactomo daemon` process on real pseudo-terminals and real ZeroMQ
-sockets. The tests are in `tests/faults`; a row is a test.
+sockets. The tests are in `tests/faults`; a row is a test. A part of them (`make soak`, `-k`) writes
+its own rows anew. Long measures say at which scale (`--scale`) they were done.
 
-Machine: {machine}.{shortened}{failures}
+Machine: {machine}.
 
 ## Faults
 
@@ -47,7 +48,6 @@ class Row:
     promise: str
     tried: str
     figure: str
-    outcome: str
     seconds: float
 
 
@@ -65,18 +65,18 @@ def row_of(item: pytest.Item, report: pytest.TestReport) -> Row | None:
         figure = f"not tried: {_reason(report)}"
     if report.failed:
         figure = f"**not kept**: {_complaint(report)} ({item.stash.get(FIGURE, 'no figure')})"
-    return Row(marker.name, fault, promise, tried, figure, report.outcome, report.duration)
+    scale = item.config.getoption("scale")
+    if "scale" in getattr(item, "fixturenames", ()) and scale != 1 and not report.skipped:
+        figure = f"at scale {scale:g}: {figure}"
+    return Row(marker.name, fault, promise, tried, figure, report.duration)
 
 
-def write_page(path: Path, rows: list[Row], scale: float) -> None:
-    """Write the page whole; `scale` is how much of the long measures was done."""
-    failed = sum(row.outcome == "failed" for row in rows)
+def write_page(path: Path, rows: list[Row]) -> None:
+    """Write the page whole."""
     path.write_text(
         _PAGE.format(
             minutes=max(1, round(sum(row.seconds for row in rows) / 60)),
             machine=_machine(),
-            shortened="" if scale == 1 else f" The long measures at {scale:g} of their length.",
-            failures=f" **{failed} promises were not kept.**" if failed else "",
             faults=_table(("Fault", "Promise", "How it was tried", "Figure"), rows, "fault"),
             measures=_table(("Measure", "Aim", "How", "Figure"), rows, "measure"),
         ),
@@ -84,12 +84,25 @@ def write_page(path: Path, rows: list[Row], scale: float) -> None:
     )
 
 
+def replace_rows(path: Path, rows: list[Row]) -> None:
+    """Write these rows of the page anew, by their first cell; a row of no such name is left out."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    new = {line.split(" | ")[0]: line for line in map(_line, rows)}
+    text = "\n".join(new.get(line.split(" | ")[0], line) for line in lines)
+    path.write_text(text + "\n", encoding="utf-8")
+
+
 def _table(head: tuple[str, ...], rows: list[Row], table: str) -> str:
-    lines = [head, ("---",) * len(head)]
-    lines += [(r.fault, r.promise, r.tried, r.figure) for r in rows if r.table == table]
-    return "\n".join(
-        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
-    )
+    lines = [_cells(*head), _cells(*("---",) * len(head))]
+    return "\n".join(lines + [_line(row) for row in rows if row.table == table])
+
+
+def _line(row: Row) -> str:
+    return _cells(row.fault, row.promise, row.tried, row.figure)
+
+
+def _cells(*cells: str) -> str:
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
 
 def _reason(report: pytest.TestReport) -> str:

@@ -17,7 +17,7 @@ from waiting import PATIENCE_S
 WATCHDOG_S = 2.0
 
 # What `tactomo daemon` does, with a reconstructor that needs no artifact. One that `hangs` stays
-# for ever in the first frame of a loaded skin.
+# for ever in the first frame of a loaded skin; control hangs once it is asked for the status.
 PROGRAM = """
 import sys, threading
 from tactomo.config import load_config
@@ -31,8 +31,12 @@ class Hanging(Memory):
             threading.Event().wait()
         return super().reconstruct(magnitude, structure, **details)
 
+class Asked(Daemon):
+    def status(self):
+        threading.Event().wait()
+
 configure_logging("info", "json")
-sys.exit(Daemon(load_config(sys.argv[1]), reconstructor=Hanging()).run())
+sys.exit(Asked(load_config(sys.argv[1]), reconstructor=Hanging()).run())
 """
 
 
@@ -133,6 +137,17 @@ def test_a_pipeline_that_hangs_is_not_hidden_by_the_threads_that_do_not(
     log = process.log_path.read_text()
     assert '"threads": ["pipeline"]' in log
     assert "in reconstruct" in log, "where it hangs is in the log"
+
+
+def test_control_does_not_feed_the_watchdog(
+    supervised: tuple[DaemonProcess, Any], manager: ServiceManager
+) -> None:
+    process, _ = supervised
+    manager.wait("READY=1")
+    assert not process.answers(1.0), "control hangs"
+    fed_s = time.monotonic()
+    for _ in range(2):  # before the first of them, control may have got on
+        fed_s = manager.wait("WATCHDOG=1", fed_s)
 
 
 @pytest.mark.long
