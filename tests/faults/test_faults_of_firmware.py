@@ -44,11 +44,11 @@ def try_hostile_board(
 
 @pytest.mark.faults
 @pytest.mark.fault(
-    "A hostile board: packets whose checksums are right and whose contents are absurd",
+    "A hostile board on {ports} port(s): checksums that are right, contents that are absurd",
     "the daemon goes on; every message that it publishes keeps to STREAM.md",
     "acts of a second: clocks, counters, rates, scales, samples, channels, sizes, versions and "
     "types at their edges and beyond, a proper board in between; a subscriber to all kinds "
-    "holds each message against the page's tables; {ports} port(s), recording with maps",
+    "holds each message against the page's tables; recording with maps",
 )
 @pytest.mark.parametrize("ports", [1, 2])
 @pytest.mark.timeout(2 * LONG_S)

@@ -85,11 +85,17 @@ def write_page(path: Path, rows: list[Row]) -> None:
 
 
 def replace_rows(path: Path, rows: list[Row]) -> None:
-    """Write these rows of the page anew, by their first cell; a row of no such name is left out."""
+    """Write these rows of the page anew, found by their first cell."""
+    new = {_name(line): line for line in map(_line, rows)}
     lines = path.read_text(encoding="utf-8").splitlines()
-    new = {line.split(" | ")[0]: line for line in map(_line, rows)}
-    text = "\n".join(new.get(line.split(" | ")[0], line) for line in lines)
+    if missing := new.keys() - map(_name, lines):
+        raise pytest.UsageError(f"{path} has no row {missing}: run all of `make faults`")
+    text = "\n".join(new.get(_name(line), line) for line in lines)
     path.write_text(text + "\n", encoding="utf-8")
+
+
+def _name(line: str) -> str:
+    return line.split(" | ")[0]
 
 
 def _table(head: tuple[str, ...], rows: list[Row], table: str) -> str:
