@@ -18,15 +18,13 @@ SHIPPED: Final = Path(str(files("tactomo_lab.baselines"))) / "networks"
 FILTER_SIGMA: Final = 1.0  # nodes, of the Gaussian filter at the networks' output
 
 
-def load_paper_network(
-    description: SensorDescription, kind: str, path: Path | None = None
-) -> Network:
+def load_paper_network(description: SensorDescription, kind: str) -> Network:
     """Load one of a sensor's networks of the paper: `cnn-single` or `cnn-multimodal`.
 
     Raises:
         ArtifactError: there is none, or it cannot be used.
     """
-    return load_network(description, kind, path, SHIPPED)
+    return load_network(description, kind, None, SHIPPED)
 
 
 class PaperNetwork:

@@ -64,7 +64,6 @@ SCENES: Final = 100  # of each number of contacts, likewise
 
 PAPER_WIDTH_MM: Final = 150.0  # places and sizes are shares of it on another sensor
 RIG_SNR_DB: Final = 60.0  # of the voltages at rest: a tank that was measured had 58
-SHEETS: Final = 3
 RESPONSE_KPA: Final = tuple(float(kpa) for kpa in range(0, 201, 20))  # of Fig. 7
 CASE_KPA: Final = (140.0, 160.0, 180.0, 200.0)  # of Figs. 8 and 9
 TOP_SHARE: Final = 0.75  # of an image's maximum, above which values are averaged (V-C-2)

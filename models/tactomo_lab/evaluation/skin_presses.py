@@ -120,11 +120,9 @@ def scan_order(lookup: IntArray, description: SensorDescription) -> tuple[IntArr
     return np.array(order), np.array(sign)
 
 
-def localise(
-    presses: Presses, description: SensorDescription, artifact: Artifact | None = None
-) -> list[Localisation]:
+def localise(presses: Presses, description: SensorDescription) -> list[Localisation]:
     """Locate every press by each method, fitted to the presses of other folds only."""
-    imager = _Imager(description, presses, artifact or load_or_build_artifact(description))
+    imager = _Imager(description, presses, load_or_build_artifact(description))
     positions = presses.positions_m
 
     def mean(train: IntArray, test: IntArray) -> FloatArray:

@@ -29,6 +29,8 @@ from tactomo_models.scans.reference import Reference, noise_of_reciprocity
 from tactomo_models.scene.reconstruction import Reconstruction
 from tactomo_models.sensor.description import SensorDescription
 
+from tactomo_lab.scenes import measures
+
 BUDGET_S = 20.0  # a file has no deadline
 EXACT = 10**6  # scans that a reference without noise is the mean of
 # Scales that are tried, as shares of the one at which some voltage would have fallen to nothing.
@@ -185,6 +187,4 @@ def on_pixels(description: SensorDescription, nodes: Image, shape: tuple[int, ..
 def correlation(image: FloatArray, truth: FloatArray) -> float:
     """Pearson correlation over the pixels where the image is known; 0 for an even image."""
     on = np.isfinite(image)
-    if np.ptp(image[on]) == 0 or np.ptp(truth[on]) == 0:
-        return 0.0
-    return float(np.corrcoef(image[on], truth[on])[0, 1])
+    return measures.correlation(image[on], truth[on])

@@ -23,7 +23,6 @@ from tactomo_models.sensor.description import SensorDescription
 from tactomo_lab.scenes.still_scenes import CONTRAST, gap_m, outline_of, seed_of
 
 PresetName = Literal["paper", "robust"]
-PRESET_NAMES: Final[tuple[PresetName, ...]] = ("paper", "robust")
 SCENES: Final[dict[PresetName, int]] = {"paper": 12_000, "robust": 24_000}  # of a whole set
 
 SIDE_M = 0.150  # of the sheet that the lengths below are for

@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from tactomo_lab.scenes.presets import PRESET_NAMES, TrainingScene, draw_scene
+from tactomo_lab.scenes.presets import SCENES, TrainingScene, draw_scene
 from tactomo_lab.scenes.simulation import UnevenSkin, displaced, fine_mesh, with_opposite_magnitude
 from tactomo_lab.scenes.still_scenes import draw_layout, gap_m, outline_of
 from tactomo_lab.training.training_scenes import SceneSimulator
@@ -90,7 +90,7 @@ def test_a_scene_depends_on_preset_seed_and_number_alone(paper: SensorDescriptio
     def first_x(seed: int) -> list[float]:
         return [
             draw_scene(preset, paper, seed, number).presses[0].x_m
-            for preset in PRESET_NAMES
+            for preset in SCENES
             for number in (4, 5, 6)  # of robust, all with contacts
         ]
 
