@@ -27,9 +27,6 @@ from tactomo.protocols import NATIVE, find_protocol
 
 MAX_PORTS = 2
 
-_RENAMED = {"tier": "method"}
-"""Keys of earlier versions, and what they are called now."""
-
 
 def _sensor_name(name: str) -> str:
     try:
@@ -202,10 +199,6 @@ def load_config(path: str | Path | None = None, **overrides: Any) -> DaemonConfi
     """
     given = {key: value for key, value in overrides.items() if value is not None}
     values = {} if path is None else _read_toml(Path(path))
-    for old, new in _RENAMED.items():
-        if old in values or old in given:
-            where = "command line" if old in given else path
-            raise ConfigError(f"{where}: {old} is called {new} now", f"write {new} for {old}")
     try:
         return DaemonConfig.model_validate(_override(values, given))
     except ValidationError as error:

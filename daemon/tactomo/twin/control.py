@@ -98,10 +98,6 @@ COMMANDS: Mapping[str, type[BaseModel]] = {
 class ControlSocket:
     """A bound REP socket that hands checked commands to their handlers. For use by one thread.
 
-    Args:
-        address: where to bind; port 0 takes a free one, see `address`.
-        handlers: a handler for every name in COMMANDS; it gets the checked arguments.
-
     Raises:
         AddressError: the address is in use, or is no address.
     """
