@@ -367,6 +367,7 @@ def _draw_timing(axes: Any, course: Course, _: dict[str, Any]) -> None:
     axes.set_title(words, fontsize=8, loc="right", pad=2, color=INK)
     if known_ms:
         axes.set_yscale("log")
+        axes.yaxis.set_minor_formatter("")  # a decade or less would be labelled in full
     else:
         axes.set_ylim(0.0, 2.0 * float(np.median(periods_ms)) if len(periods_ms) else None)
     axes.set_ylabel("ms")
