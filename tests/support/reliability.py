@@ -130,8 +130,10 @@ def _machine() -> str:
         info = ""
     found = re.search(r"model name\s*:\s*(.+)", info)
     cores = len(os.sched_getaffinity(0))
+    load = os.getloadavg()[2]  # over 15 minutes; what else runs here shows in latencies
     memory_gb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
     return (
         f"{found[1] if found else platform.machine()}, {cores} cores, {memory_gb:.0f} GB, "
-        f"Linux {platform.release().split('-')[0]}, Python {platform.python_version()}"
+        f"Linux {platform.release().split('-')[0]}, Python {platform.python_version()}, "
+        f"load average {load:.1f}"
     )
