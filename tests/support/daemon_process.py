@@ -116,8 +116,8 @@ class DaemonProcess:
 
     @property
     def descriptors(self) -> int:
-        """How many file descriptors it has open."""
-        return len(os.listdir(f"/proc/{self.popen.pid}/fd"))
+        """How many file descriptors it has open; not those that it borrows for microseconds."""
+        return min(len(os.listdir(f"/proc/{self.popen.pid}/fd")) for _ in range(20))
 
     @property
     def cpu_s(self) -> float:
