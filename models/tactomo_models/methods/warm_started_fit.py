@@ -442,7 +442,9 @@ class _Course:
         crowd = shape.family.count >= CROWD
         if shape.misfit > GOOD_MISFIT or crowd:
             form += [self._birth_anywhere(k) for k in range(ASKED_OF_CROWD if crowd else 1)]
-        free = [self._escalate] if self.shape_model == ShapeModel.AS_NEEDED else []
+        # What pressures leave unexplained in a crowd is a matter of edges and holes first.
+        as_needed = self.shape_model == ShapeModel.AS_NEEDED and not self.searches_both
+        free = [self._escalate] if as_needed else []
         return [self._birth, *form, *free, *self._deaths(shape)]
 
     def _early_birth(self, shape: FittedField, frame: _Frame) -> _Candidate | None:

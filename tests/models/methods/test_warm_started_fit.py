@@ -289,3 +289,14 @@ def test_a_crowd_that_moves_shrinks_or_misses_a_sheet_is_followed(stacked: Skin)
     assert_at(back, *CORNERS, moved, other)
     few, _ = follow(fit, stacked.frame(*CORNERS[:2], noise=2e-4))
     assert_at(few, *CORNERS[:2])
+
+
+def test_rings_in_a_crowd_are_told_from_discs(stacked: Skin) -> None:
+    """Questions are asked once what is there is settled, also where no contact was missing."""
+    rings = [
+        contact(one[X] * UNIT_M, one[Y] * UNIT_M, 0.013, peak=0.7, hole=1.0) for one in CORNERS
+    ]
+    fit = WarmStartedFit(stacked.sensor.fit)
+    shape, _ = follow(fit, stacked.frame(*rings, noise=2e-4))
+    assert isinstance(shape.family, PressureField)
+    assert shape.family.split(shape.parameters)[:, HOLE] == pytest.approx(1.0)
