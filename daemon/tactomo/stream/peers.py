@@ -76,7 +76,10 @@ class Peers:
             self._discard()
             return None
         first = self._socket.recv(copy=False)
-        descriptor = first.get(zmq.SRCFD)
+        try:
+            descriptor = first.get(zmq.SRCFD)
+        except zmq.ZMQError:  # libzmq knows none of a peer of ZMTP 1.0
+            descriptor = None
         if descriptor in self._connections:
             self._connections[descriptor] = _state(_received(descriptor) or 0)
         parts = [first.bytes]
