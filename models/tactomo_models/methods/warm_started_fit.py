@@ -333,9 +333,7 @@ class _Course:
         least = 0.03  # of a move that is more than noise, in the unit of places
         each, earlier = contacts_of(shape), self._earlier
         self._earlier = each.copy()
-        assert self._shape is not None
-        explained = self._shape.misfit < SUSPECT_MISFIT  # else its moves were those of the fit
-        if len(each) == 0 or len(earlier) != len(each) or not explained:
+        if len(each) == 0 or len(earlier) != len(each):
             return shape
         assert isinstance(shape.family, PressureField)
         moves = (each - earlier)[:, [X, Y]]
