@@ -95,7 +95,7 @@ SCAN = Scan(Channel.STRUCTURE, 7, 350_000, ScanFlag(0), np.arange(208, dtype=np.
 PACKETS: tuple[Packet, ...] = (
     HELLO,
     SCAN,
-    Scan(Channel.MAGNITUDE, 2**32 - 1, 2**64 - 1, ScanFlag(1), np.zeros(3, np.float32)),
+    Scan(Channel.MAGNITUDE, 2**32 - 1, 2**53 - 1, ScanFlag(1), np.zeros(3, np.float32)),
     Acknowledge(1, CommandCode.START, AckStatus.OK),
     Command(CommandCode.SET_RATE, request=1, rate_hz=20.0),
 )

@@ -49,7 +49,7 @@ static void scan(const uint8_t *data, size_t n, uint8_t *out, size_t room)
     check(out, size, TACTOMO_SCAN_BOUND(scan.count * sample_bytes, 1u), TACTOMO_SCAN);
     if (size == 0 && room >= LONGEST_FRAME)
         assert(scan.channel > 1 || scan.count < 1 || scan.count > 1024 || sample_bytes == 0 ||
-               scan.sample_format < 1 || scan.sample_format > 3);
+               scan.sample_format < 1 || scan.sample_format > 3 || scan.device_us >> 53);
     free(samples);
 }
 

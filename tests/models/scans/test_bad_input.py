@@ -317,8 +317,9 @@ def test_interference_is_flagged_and_widens_the_uncertainty(
     def noisier(times: float) -> Change:
         return each(lambda v: v + times * 1e-3 * rms(v) * rng.standard_normal(len(v)))
 
-    calm = frame_of(paper, artifact, skin, PRESS)
-    some, much = (frame_of(paper, artifact, skin, PRESS, later=noisier(t)) for t in (4, 25))
+    solid = Press(0.02, -0.02, 180.0, radius_m=0.018)  # so large that it is told from a ring
+    calm = frame_of(paper, artifact, skin, solid)
+    some, much = (frame_of(paper, artifact, skin, solid, later=noisier(t)) for t in (4, 25))
     assert Flag.NOISE_HIGH not in some.flags
     assert Flag.NOISE_HIGH in much.flags
     sigma = [frame.contacts[0].magnitude_sigma for frame in (calm, some, much)]
