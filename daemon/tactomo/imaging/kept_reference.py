@@ -82,8 +82,11 @@ class KeptReference:
             return KnownSkin(self._reference(arrays), int(arrays["realtime_ns"]))
         except FileNotFoundError:
             return None
-        except (OSError, DataError, KeyError, TypeError, ValueError, OverflowError) as error:
+        except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:
             self._tell(f"cannot read {self._path}: {getattr(error, 'strerror', None) or error}")
+            return None
+        except DataError as error:
+            self._tell(str(error))
             return None
 
     def keep(self, reference: Reference, device_ids: Collection[str]) -> None:
@@ -114,9 +117,9 @@ class KeptReference:
         volts = {name: arrays[name] for name in REFERENCE_ARRAYS if name in arrays}
         for name, each in volts.items():
             if each.shape != wanted or each.dtype != np.float64 or not np.isfinite(each).all():
-                raise DataError(f"{name} is not {wanted[0]} numbers")
+                raise ValueError(f"{name} is not {wanted[0]} numbers")
         if not any(name in volts for name in self._description.channels):
-            raise DataError("it holds no channel of this sensor")
+            raise ValueError("it holds no channel of this sensor")
         both = {name: volts.get(name) for name in REFERENCE_ARRAYS}
         return Reference(scans=max(1, int(arrays["scans"])), **both)
 
