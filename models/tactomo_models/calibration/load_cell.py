@@ -217,8 +217,9 @@ def _of_one_area(
         own = own[contact_mm2[own] > 0]
         if len(own) < least:
             continue
+        typical_mm2 = np.median(contact_mm2[own])
         for i in own:
-            share = float(contact_mm2[i] / np.median(contact_mm2[own]))
+            share = float(contact_mm2[i] / typical_mm2)
             magnitude, sigma = readings[i].magnitude, readings[i].magnitude_sigma
             readings[i] = readings[i].model_copy(
                 update={

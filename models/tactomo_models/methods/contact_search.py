@@ -84,8 +84,8 @@ class ContactSearch:
         aside = np.linalg.solve(normal, J.T @ fitted.residual + precision * offset)
         pressed = np.zeros(self._forward.bare.pressable.shape)
         pressed[fitted.drawing.nodes] = np.abs(fitted.drawing.enclosed)
-        gain = np.where(pressed[self._nodes] < 0.1, 1e-9, 0.0)
-        clearest, area = 0.0, np.zeros(len(gain))
+        gain, area = np.zeros((2, len(self._nodes)))
+        clearest = max(measured, key=lambda name: abs(self._dipoles[name]))
         for name, own in zip(measured, np.split(J, len(measured)), strict=True):
             scale = self._dipoles[name] * measured[name].weight
             by_area = self._forward.spot_sensitivity(self._probes, fitted.solutions[name])
@@ -95,9 +95,9 @@ class ContactSearch:
             power = np.maximum((by_area**2).sum(axis=0) - spanned, 1e-30)
             unexplained = by_area.T @ fitted.residuals[name] - cross.T @ aside
             needed = np.maximum(-unexplained / power, 0.0)
-            gain = np.where(gain > 0, gain + needed**2 * power, 0.0)
-            if abs(self._dipoles[name]) > clearest:
-                clearest, area = abs(self._dipoles[name]), needed
+            gain += needed**2 * power
+            area = needed if name == clearest else area
+        gain[pressed[self._nodes] >= 0.1] = 0.0
         found: list[MissingContact] = []
         for spot in np.argsort(-gain):
             if gain[spot] == 0 or len(found) == MOST_MISSING:

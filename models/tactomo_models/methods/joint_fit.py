@@ -160,9 +160,15 @@ class JointFit:
             if before.solutions.keys() == measured.keys():
                 return fitted
         if start.solutions.keys() == measured.keys():  # found on all sheets
-            if before is None or len(before.parameters) != len(start.parameters):
-                self.forget()
-            return replace(start, converged=False)  # questions are left to ask
+            started = replace(start, converged=False)  # questions are left to ask
+        else:
+            started = self._on_all_sheets(start, measured)
+        if before is None or len(before.parameters) != len(started.parameters):
+            self.forget()
+        return started
+
+    def _on_all_sheets(self, start: FittedField, measured: Measured) -> FittedField:
+        """The same contacts, with pressures to fit."""
         if isinstance(start.family, PressureField):
             each = start.family.split(start.parameters)
             field = self._field.of(each, start.family.order)
@@ -171,8 +177,6 @@ class JointFit:
         else:
             assert isinstance(start.family, LevelSet)
             family, parameters = self._with_peaks(start.family, start.parameters)
-        if before is None or len(before.parameters) != len(parameters):
-            self.forget()
         started = self._fit.evaluate(family, parameters, start.log_ratio, measured)
         assert started is not None  # it was small enough for one sheet
         return started

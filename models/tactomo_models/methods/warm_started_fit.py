@@ -25,6 +25,7 @@ from tactomo_protocol import Channel
 from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.methods.contact_search import ContactSearch, MissingContact
 from tactomo_models.methods.joint_fit import (
+    FOLLOWED,
     ONE_SHEET_WORTH,
     QUESTIONS,
     JointFit,
@@ -187,14 +188,13 @@ class WarmStartedFit:
         # The saturating sheet shows outlines best, and alone it costs half: what is there and of
         # what form is found on it, and then all sheets judge together. In a crowd, what one sheet
         # takes for one contact may be two on the other: there both search.
+        every = _Frame(measured, budget, propose)
+        outlines = replace(every, measured=_outlines(measured))
         for _ in range(2):
             both = self._course.searches_both
-            shape, how = self._course.follow(
-                _Frame(measured if both else _outlines(measured), budget, propose)
-            )
-            doubt = _Frame(measured, budget, None).doubt
+            shape, how = self._course.follow(every if both else outlines)
             asks = both or len(contacts_of(shape)) < CROWD
-            joint = self._joint.follow(shape, measured, budget, doubt, asks)
+            joint = self._joint.follow(shape, measured, budget, every.doubt, asks)
             self._joint.is_fit_of(self._course.adopt(joint, measured))
             if budget.over or self._course.searches_both == both:
                 break
@@ -359,7 +359,6 @@ class _Course:
 
     def _improve(self, shape: FittedField, frame: _Frame) -> FittedField:
         """Refine, and try one candidate after another, until none is left or the budget ends."""
-        noise = 3.0  # what a parameter gains by following a new frame's noise, at most
         budget = frame.budget
         while True:
             if self._candidate is not None:
@@ -369,7 +368,7 @@ class _Course:
             elif not self._settled:
                 before, shape = shape, self._refined(shape, frame)
                 # A budget of a step or so a frame lets it follow each frame's noise, no more.
-                follows = before.cost - shape.cost < noise * len(shape.parameters)
+                follows = before.cost - shape.cost < FOLLOWED * len(shape.parameters)
                 self._settled = shape.converged or (budget.over and follows)
                 self._moved = True
             elif shape.misfit <= SLACK * self._tried_misfit or not self._propose(shape, frame):
@@ -393,10 +392,11 @@ class _Course:
         if wins and self._settled_on is not frame.measured and len(shape.parameters):
             # What follows this frame's noise must not win by that alone.
             shape = self.tools.fit.refine(shape, frame.measured, frame.budget, 0.0, 1)
-        if refined.cost < shape.cost - candidate.gain:
+            wins = refined.cost < shape.cost - candidate.gain
+        if wins:
             self.doubts.clear()
         self._doubt(shape, refined, candidate.gain, frame)
-        if refined.cost < shape.cost - candidate.gain:
+        if wins:
             self._start_over()
             self._tried_misfit = 0.0
             self._settled, self._moved = refined.converged, True
