@@ -14,11 +14,12 @@ INSTALL := $(BIN)/python -m pip install --no-compile
 SHOW := sed -un 's/^Collecting \([^=; ]*\).*/  \1/p; s/^Installing.*/  unpacking/p'
 BUILD := --quiet --no-build-isolation --no-deps
 LAB := models/tactomo_lab
+DIST := dist
 
 LOCKED := pyproject.toml --universal --python-version 3.11 --generate-hashes \
   --no-emit-package tactomo-client --no-emit-package tactomo --no-emit-package tactomo-lab
 
-.PHONY: help setup run test test-all test-long test-train faults soak firmware fuzz lint format bench deb lock clean
+.PHONY: help setup run test test-all test-long test-train faults soak firmware fuzz lint format bench wheels deb lock clean
 
 help:            ## list these targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -69,6 +70,14 @@ format: $(READY) ## let ruff rewrite what it can
 
 bench: $(READY)  ## latency and time per frame on this machine
 	$(BIN)/tactomo bench $(ARGS)
+
+# The wheels are made of the source archives, so that these are known to be whole.
+wheels: $(RUN_READY)  ## wheels and source archives of every distribution, in dist/
+	rm -f $(DIST)/*.whl $(DIST)/*.tar.gz
+	for each in $(dir $(wildcard pyproject.toml */*/pyproject.toml)); do \
+	  (cd $$each && $(abspath $(BIN))/python -m hatchling build -t sdist -d $(abspath $(DIST))); done
+	$(BIN)/python -m pip wheel $(BUILD) --wheel-dir $(DIST) $(DIST)/*.tar.gz
+	ls -lh $(DIST)
 
 deb: $(READY)    ## the Debian package, for this distribution and processor, in dist/
 	deploy/debian/build.sh $(BIN)/python

@@ -1,7 +1,7 @@
 """The daemon's configuration: a TOML file, and options that override it.
 
 Every key has a default but `ports`. Errors name the file, the key, its value and what is allowed.
-`deploy/daemon.example.toml` shows every key with its meaning.
+`tactomo service example` shows every key with its meaning.
 """
 
 from __future__ import annotations
@@ -222,7 +222,7 @@ def _known_keys(items: Sequence[ErrorDetails]) -> str:
         if item["type"] in ("extra_forbidden", "missing"):
             name = str(item["loc"][0]) if len(item["loc"]) > 1 else ""
             return f"known keys: {', '.join(tables.get(name, DaemonConfig).model_fields)}"
-    return "deploy/daemon.example.toml shows every key"
+    return "`tactomo service example` shows every key"
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
@@ -235,7 +235,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
     except ValueError as error:
         raise ConfigError(
             f"{path} is not valid TOML: {error}",
-            "compare it with deploy/daemon.example.toml",
+            "compare it with `tactomo service example`",
         ) from error
 
 

@@ -41,16 +41,14 @@ class Page:
         return found[0]
 
 
-def first_line_of_the_readme(demo: Demo, folder: Path) -> str:
+def first_line_of_the_readme(demo: Demo, folder: Path, python: Path = Path(sys.executable)) -> str:
     """Run the README's client on a demo that is pressed, and return the first line it prints."""
     code = next(block for block in Page("README.md").blocks("python") if "subscribe" in block)
     assert len(code.strip().splitlines()) <= 6
     code = code.replace("subscribe(", f"subscribe(address={demo.stream!r}, sensor=", 1)
     script = folder / "six_lines.py"
     script.write_text(re.sub(r'sensor="\w+"', f'sensor="{SENSOR}"', code))
-    with subprocess.Popen(
-        [sys.executable, "-u", script], stdout=subprocess.PIPE, text=True
-    ) as process:
+    with subprocess.Popen([python, "-u", script], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         line = process.stdout.readline()
         process.kill()

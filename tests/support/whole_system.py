@@ -6,7 +6,7 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,10 +40,12 @@ class Demo:
 
 
 @contextmanager
-def running_demo(*options: str) -> Iterator[Demo]:
+def running_demo(
+    *options: str, program: Sequence[str | Path] = (sys.executable, "-m", "tactomo.cli")
+) -> Iterator[Demo]:
     """Start `tactomo demo` on free ports and stop it as Ctrl-C would."""
     command = [
-        *(sys.executable, "-m", "tactomo.cli", "demo", "--announce", "--no-browser"),
+        *(*program, "demo", "--announce", "--no-browser"),
         *("--sensor", SENSOR, "--viewer-port", "0", "--stream", ANYWHERE, "--control", ANYWHERE),
         *("--twin-control", ANYWHERE, *options),
     ]

@@ -247,7 +247,7 @@ def _config(name: str, ports: Sequence[str], root: Path) -> str:
     stream, control = _free_addresses(root, name)
     return (
         f"# The skin {name}, served by {_unit(name)}. Every key and its meaning:\n"
-        "# daemon.example.toml of tactomo. After a change: "
+        "# `tactomo service example`. After a change: "
         f"systemctl restart {_unit(name)}\n"
         f"ports = {json.dumps(list(ports))}\n"
         "wait_for_ports = true\n"

@@ -23,7 +23,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -38,6 +38,11 @@ Millimetres = Annotated[float, Field(ge=-1000.0, le=1000.0, allow_inf_nan=False)
 RadiusMm = Annotated[float, Field(gt=0.0, le=1000.0, allow_inf_nan=False)]
 PressureKpa = Annotated[float, Field(ge=0.0, le=10_000.0, allow_inf_nan=False)]
 Seconds = Annotated[float, Field(ge=0.0, le=86_400.0, allow_inf_nan=False)]
+
+SHIPPED: Final = {
+    path.stem: path for path in sorted(Path(__file__).with_name("scenes").glob("*.toml"))
+}
+"""Files of the scenes that come with tactomo, by name."""
 
 
 class _Strict(BaseModel):
@@ -193,19 +198,20 @@ class Scene(_Strict):
         return now
 
 
-def load_scene(path: str | Path) -> Scene:
-    """Read a scene from a TOML file.
+def load_scene(source: str | Path) -> Scene:
+    """Read a scene by its shipped name or from a TOML file.
 
     Raises:
         ConfigError: the file cannot be read, is not TOML, or a key is unknown, missing or out of
             range; the message names the key, its value and what is allowed.
     """
+    path = SHIPPED.get(str(source), Path(source))
     try:
-        return Scene.model_validate(read_toml(Path(path)))
+        return Scene.model_validate(read_toml(path))
     except OSError as error:
         raise ConfigError(
             f"cannot read the scene {path}: {error.strerror}",
-            "give the path of a TOML file, such as those in deploy/scenes",
+            f"give the path of a TOML file, or one of: {', '.join(SHIPPED)}",
         ) from error
     except ValidationError as error:
         raise ConfigError(f"{path}: {explained(error)}", "correct the file") from error

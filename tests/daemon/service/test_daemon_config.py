@@ -66,7 +66,7 @@ def test_a_bad_file_is_refused_with_the_reason(tmp_path: Path, text: str, said: 
     [
         ("prot = 1", "known keys: name, "),
         ("[recording]\nrotat_mb = 1", "known keys: file, "),
-        ("tare_scans = 1", "deploy/daemon.example.toml"),
+        ("tare_scans = 1", "tactomo service example"),
     ],
 )
 def test_the_keys_that_there_are_are_told_where_one_is_not(

@@ -76,7 +76,7 @@ def daemon(
     At the start the skin must be free for a second: the first scans become the reference that
     changes are measured against. `tactomo tare` takes a new one at any time.
 
-    deploy/daemon.example.toml shows every key of the configuration. `--set` takes each of them:
+    `tactomo service example` shows every key of the configuration. `--set` takes each of them:
     `lossless=true`, `tare_scans=40`, `metrics=127.0.0.1:9460`, `recording.file=grasp.mcap`.
     """
     from tactomo.config import load_config

@@ -44,7 +44,7 @@ app = typer_app()
 @app.command(
     epilog=examples(
         "tactomo demo",
-        "tactomo demo --scene deploy/scenes/two_fingers_merge.toml",
+        "tactomo demo --scene two_fingers_merge",
         "tactomo demo --ports 1 --noise-uv 50",
         "tactomo demo --description graded_square",
     ),
@@ -59,7 +59,7 @@ def demo(
     ] = None,
     rate: Annotated[float, typer.Option(help="Dual scans a second.")] = 20.0,
     scene: Annotated[
-        Path | None, typer.Option(help="A scripted scene (TOML) that presses by itself.")
+        Path | None, typer.Option(help="A scripted scene, shipped or TOML, that presses by itself.")
     ] = None,
     noise_uv: Annotated[
         float | None, typer.Option(min=0.0, help="Converter noise, µV rms.")

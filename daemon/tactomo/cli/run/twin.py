@@ -24,7 +24,7 @@ app = typer_app()
 @app.command(
     epilog=examples(
         "tactomo twin --link /tmp/skin",
-        "tactomo twin --ports 1 --scene deploy/scenes/sliding_finger.toml",
+        "tactomo twin --ports 1 --scene sliding_finger",
         "tactomo poke press x_mm=10 y_mm=-20",
         "tactomo twin --description tank_disc --play tank.npz",
     ),
@@ -50,7 +50,7 @@ def twin(
     ] = False,
     scene: Annotated[
         Path | None,
-        typer.Option(help="A scripted scene (TOML); starts with the first scan that is received."),
+        typer.Option(help="A scripted scene, shipped or TOML; starts with the first scan."),
     ] = None,
     link: Annotated[
         Path | None,

@@ -110,6 +110,14 @@ def status(
     raise typer.Exit(1 if subprocess.run(command, check=False).returncode else 0)
 
 
+@app.command(epilog=examples("tactomo service example > skin.toml"))
+def example() -> None:
+    """Print a daemon's configuration with every key and its meaning."""
+    from tactomo.service.installation import shipped
+
+    typer.echo(shipped("daemon.example.toml"), nl=False)
+
+
 def _check_name(name: str) -> None:
     from tactomo_client import MessageError
     from tactomo_client.messages import check_sensor_name
