@@ -20,6 +20,7 @@ PACKAGES = {
     "tactomo_models": ROOT / "models/tactomo_models",
     "tactomo_viewer": ROOT / "clients/viewer/tactomo_viewer",
     "tactomo_foxglove": ROOT / "clients/foxglove/tactomo_foxglove",
+    "tactomo_ros2": ROOT / "clients/ros2/tactomo_ros2",
     "tactomo": ROOT / "daemon/tactomo",
     "tactomo_lab": ROOT / "models/tactomo_lab",
 }
@@ -30,9 +31,10 @@ ALLOWED: dict[str, set[str]] = {
     "tactomo_models": {"tactomo_protocol"},
     "tactomo_viewer": {"tactomo_client"},
     "tactomo_foxglove": {"tactomo_client"},
+    "tactomo_ros2": {"tactomo_client"},
     "tactomo": {
         *("tactomo_protocol", "tactomo_client", "tactomo_models"),
-        *("tactomo_viewer", "tactomo_foxglove"),
+        *("tactomo_viewer", "tactomo_foxglove", "tactomo_ros2"),
     },
     "tactomo_lab": {"tactomo_protocol", "tactomo_models", "tactomo"},
 }

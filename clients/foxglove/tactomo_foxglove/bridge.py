@@ -22,10 +22,10 @@ from tactomo_client import ClientError, Frame, Keys, MessageError
 from tactomo_client.connection import connect_subscriber
 from tactomo_client.frame import frame_from_message
 from tactomo_client.messages import EVENT, MAP, STATUS, Message, decode_message, topic
+from tactomo_client.placement import Placement
 
 from tactomo_foxglove.door import FOXGLOVE_ORIGIN, Door, hidden_address
 from tactomo_foxglove.messages import known
-from tactomo_foxglove.placement import Placement
 from tactomo_foxglove.topics import SensorTopics
 
 DEFAULT_HOST: Final = "127.0.0.1"

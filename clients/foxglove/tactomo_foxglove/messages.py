@@ -53,8 +53,7 @@ from tactomo_client.appearance import (
     pressure_words,
     shown_image,
 )
-
-from tactomo_foxglove.placement import Placement
+from tactomo_client.placement import Placement
 
 Pixels = NDArray[np.uint8]
 

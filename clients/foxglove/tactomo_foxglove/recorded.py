@@ -9,8 +9,8 @@ import foxglove
 from foxglove.channels import FrameTransformsChannel
 from foxglove.mcap import MCAPWriteOptions
 from tactomo_client import Frame
+from tactomo_client.placement import Placement
 
-from tactomo_foxglove.placement import Placement
 from tactomo_foxglove.topics import SensorTopics
 
 PROFILE = "tactomo-foxglove"

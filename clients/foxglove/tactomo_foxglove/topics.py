@@ -36,10 +36,10 @@ from foxglove.channels import (
     SceneUpdateChannel,
 )
 from tactomo_client import Contact, Frame
+from tactomo_client.placement import Placement
 
 from tactomo_foxglove import messages
 from tactomo_foxglove.messages import contact_numbers, known
-from tactomo_foxglove.placement import Placement
 
 _INTEGER: Final = {"type": "integer"}
 _NUMBER: Final = {"type": "number"}

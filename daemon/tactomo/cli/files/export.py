@@ -1,15 +1,19 @@
-"""`tactomo export`: a recording's frames for other programs: Foxglove, a spreadsheet, NumPy."""
+"""`tactomo export`: a recording's frames for other programs: Foxglove, ROS 2, tables, NumPy."""
 
 from __future__ import annotations
 
+import os
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Annotated
+from typing import IO, TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import typer
 
+from tactomo.cli.files.gaps import Gaps
 from tactomo.cli.files.recorded_frames import (
     FromOption,
+    Moment,
     RecordedFrames,
     ToOption,
     recorded_frames,
@@ -21,9 +25,13 @@ from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
     from tactomo_client import Frame
-    from tactomo_foxglove import Placement
+    from tactomo_client.placement import Placement
 
 KINDS = {".mcap": "frames for Foxglove", ".csv": "contacts", ".npz": "maps and contacts"}
+BAG = "a ROS 2 bag"
+Moments: TypeAlias = Iterator[Moment]
+Writer: TypeAlias = Callable[[RecordedFrames, Moments, Any], int]
+"""Writes moments into an open file, or a folder that it makes; returns how many there were."""
 
 app = typer_app()
 
@@ -31,6 +39,7 @@ app = typer_app()
 @app.command(
     epilog=examples(
         "tactomo export grasp.mcap grasp_foxglove.mcap --layout skin.json",
+        "tactomo export grasp.mcap grasp_bag --ros2",
         "tactomo export grasp.mcap contacts.csv --from 2 --to 10",
         "tactomo export grasp.mcap maps.npz",
     ),
@@ -44,8 +53,14 @@ def export(
         ),
     ],
     output: Annotated[
-        Path, typer.Argument(metavar="OUT", help="The file to write: .mcap, .csv or .npz.")
+        Path,
+        typer.Argument(
+            metavar="OUT", help="The file to write: .mcap, .csv or .npz; with --ros2 a new folder."
+        ),
     ],
+    ros2: Annotated[
+        bool, typer.Option("--ros2", help="Write a ROS 2 bag of standard messages.")
+    ] = False,
     start_s: FromOption = 0.0,
     end_s: ToOption = None,
     description: RecordedDescription = None,
@@ -53,14 +68,16 @@ def export(
         Path | None,
         typer.Option(help="For .mcap: write the layout, too, to import in Foxglove."),
     ] = None,
-    parent: Annotated[str, typer.Option(help="For .mcap: frame that the sensor hangs on.")] = (
-        "world"
-    ),
+    parent: Annotated[
+        str | None,
+        typer.Option(
+            help="For .mcap and --ros2: frame that the sensor hangs on. [world; a bag: not told]"
+        ),
+    ] = None,
     pose: Annotated[
         str,
         typer.Option(
-            metavar="X,Y,Z[,ROLL,PITCH,YAW]",
-            help="For .mcap: pose in that frame, metres and degrees.",
+            metavar="X,Y,Z[,ROLL,PITCH,YAW]", help="Pose in that frame, metres and degrees."
         ),
     ] = "0,0,0",
     force: Force = False,
@@ -70,6 +87,10 @@ def export(
     *.mcap* opens in Foxglove: 3D, Image and Plot panels show what `tactomo foxglove` shows live.
     Needs foxglove-sdk: `pip install 'tactomo[foxglove]'`.
 
+    *--ros2* writes a folder that `ros2 bag play` plays: maps and contacts as PointCloud2,
+    WrenchStamped and PoseWithCovarianceStamped, and diagnostics. Needs rosbags, and no ROS:
+    `pip install 'tactomo[ros2]'`.
+
     *.csv* has a row for each contact in each frame, and one with an empty `id` for a frame in which
     nothing is pressed. Units are in the names; what is unknown is empty. Numbers are exact.
 
@@ -78,86 +99,147 @@ def export(
 
     Frames are the recorded ones (`tactomo record --maps`). Without any, or with `--description`,
     the recording is reconstructed first, by the same code as live. Times are in seconds from the
-    recording's beginning. The size of a recording does not matter: memory stays small.
+    recording's beginning. The size of a recording does not matter: memory stays small. What a
+    recording lacks (lost frames, a clock that was set, restarts) is counted on standard error.
     """
-    kind = _kind(output)
-    for file in (output, *([layout] if layout else [])):
+    kind = BAG if ros2 else _kind(output)
+    if ros2:
+        _prepare_folder(output)
+    for file in (*([] if ros2 else [output]), *([layout] if layout else [])):
         prepare_file(file, force=force, source=recording)
     write = _writer(kind, parent, pose, output.parent)
+    gaps = Gaps()
     with recorded_frames(recording, description, start_s, end_s, output.parent) as frames:
-        count = _write(output, lambda file: write(frames, file))
+        moments = frames.moments("contacts" if kind == ".csv" else "map")
+        watched = gaps.watch(frames.with_progress(moments, "exporting"))
+        into = _write_folder if ros2 else _write_file
+        count = _written(output, lambda: into(output, lambda out: write(frames, watched, out)))
         if layout is not None:
             write_layout(layout, frames.sensor)
-    typer.echo(f"wrote {output}: {KINDS[kind]}, {count} frames")
+    for line in gaps.lines():
+        typer.echo(line, err=True)
+    typer.echo(f"wrote {output}: {KINDS.get(kind, kind)}, {count} frames")
 
 
 def _kind(output: Path) -> str:
     kind = output.suffix.lower()
     if kind not in KINDS:
-        raise typer.BadParameter(f"{output}: give a file that ends in {', '.join(KINDS)}")
+        raise typer.BadParameter(
+            f"{output}: give a file that ends in {', '.join(KINDS)}, or add --ros2"
+        )
     return kind
 
 
-def _writer(
-    kind: str, parent: str, pose: str, scratch: Path
-) -> Callable[[RecordedFrames, IO[bytes]], int]:
+def _writer(kind: str, parent: str | None, pose: str, scratch: Path) -> Writer:
     if kind == ".mcap":
         need_foxglove()
-        placement = placement_of(parent, pose)
-        return lambda frames, file: _write_mcap(frames, file, placement)
+        placement = placement_of(parent or "world", pose)
+        return lambda frames, moments, file: _write_mcap(frames, moments, file, placement)
     if kind == ".csv":
         return _write_csv
-    return lambda frames, file: _write_npz(frames, file, scratch)
+    if kind == ".npz":
+        return lambda _, moments, file: _write_npz(moments, file, scratch)
+    _need_rosbags()
+    hung = None if parent is None else placement_of(parent, pose)
+    return lambda frames, moments, folder: _write_bag(frames, moments, folder, hung)
 
 
-def _write(output: Path, write: Callable[[IO[bytes]], int]) -> int:
-    """Write a file as a whole; return how many frames went into it.
+def _prepare_folder(output: Path) -> None:
+    """Make sure that a folder can be written that is not there yet."""
+    if output.suffix.lower() in KINDS:
+        raise typer.BadParameter(f"{output}: a bag is a folder; name {output.with_suffix('')}")
+    if output.exists():
+        raise TactomoError(f"{output} exists already", "name another folder, or delete this one")
+    if not os.access(output.parent, os.W_OK):
+        raise TactomoError(f"cannot write {output}", "name a folder in one that you may write to")
+
+
+def _need_rosbags() -> None:
+    try:
+        import rosbags.rosbag2  # noqa: F401
+    except ImportError as error:
+        raise TactomoError(
+            "a ROS 2 bag needs rosbags, which is not installed", "pip install 'tactomo[ros2]'"
+        ) from error
+
+
+def _written(output: Path, write: Callable[[], int]) -> int:
+    """Write; return how many frames were written.
 
     Raises:
         TactomoError: it cannot be written, or there is no frame to be written.
     """
+    try:
+        return write()
+    except OSError as error:
+        raise TactomoError(
+            f"cannot write {output}: {error.strerror or error}",
+            "make room, or name a file that you may write",
+        ) from error
+
+
+def _checked(count: int) -> int:
+    if not count:
+        raise TactomoError(
+            "there are no frames between these times", "`tactomo info` tells how long it is"
+        )
+    return count
+
+
+def _write_file(output: Path, write: Callable[[IO[bytes]], int]) -> int:
+    """Write a file as a whole."""
     from tactomo_models.archive import write_whole
 
     count = 0
 
     def write_some(file: IO[bytes]) -> None:
         nonlocal count
-        if not (count := write(file)):
-            raise TactomoError(
-                "there are no frames between these times", "`tactomo info` tells how long it is"
-            )
+        count = _checked(write(file))
 
-    try:
-        write_whole(output, write_some)
-    except OSError as error:
-        raise TactomoError(
-            f"cannot write {output}: {error.strerror or error}",
-            "make room, or name a file that you may write",
-        ) from error
+    write_whole(output, write_some)
     return count
 
 
-def _write_mcap(frames: RecordedFrames, file: IO[bytes], placement: Placement) -> int:
+def _write_folder(output: Path, write: Callable[[Path], int]) -> int:
+    """Write a folder as a whole; under another name it would have files of that name."""
+    with tempfile.TemporaryDirectory(prefix=".tactomo-", dir=output.parent) as scratch:
+        count = _checked(write(Path(scratch) / output.name))
+        (Path(scratch) / output.name).rename(output)
+    return count
+
+
+def _timed(frames: RecordedFrames, moments: Moments) -> Iterator[tuple[int, Frame, float | None]]:
+    """Yield the moments with their times in nanoseconds since 1970."""
+    for time_s, frame, age_s in moments:
+        yield frames.start_ns + round(time_s * 1e9), frame, age_s
+
+
+def _write_mcap(
+    frames: RecordedFrames, moments: Moments, file: IO[bytes], placement: Placement
+) -> int:
     from tactomo_foxglove import write_mcap
 
     from tactomo.imaging.frames import description_fields
 
     about = {} if frames.description is None else description_fields(frames.description)
-
-    def timed() -> Iterator[tuple[int, Frame, float | None]]:
-        for time_s, frame, age_s in frames.with_progress(frames.moments(), "exporting"):
-            yield frames.start_ns + round(time_s * 1e9), frame, age_s
-
-    return write_mcap(timed(), file, frames.sensor, about, placement)
+    return write_mcap(_timed(frames, moments), file, frames.sensor, about, placement)
 
 
-def _write_csv(frames: RecordedFrames, file: IO[bytes]) -> int:
+def _write_bag(
+    frames: RecordedFrames, moments: Moments, folder: Path, placement: Placement | None
+) -> int:
+    from tactomo_ros2.bag import write_bag
+
+    return write_bag(_timed(frames, moments), folder, frames.sensor, placement)
+
+
+def _write_csv(_: RecordedFrames, moments: Moments, file: IO[bytes]) -> int:
     from tactomo.cli.files.csv import write_contacts
 
-    return write_contacts(frames.with_progress(frames.moments("contacts"), "exporting"), file)
+    return write_contacts(moments, file)
 
 
-def _write_npz(frames: RecordedFrames, file: IO[bytes], scratch: Path) -> int:
+def _write_npz(moments: Moments, file: IO[bytes], scratch: Path) -> int:
     from tactomo.cli.files.npz import write_maps
 
-    return write_maps(frames.with_progress(frames.moments(), "exporting"), file, scratch)
+    return write_maps(moments, file, scratch)

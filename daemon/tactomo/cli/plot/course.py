@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from tactomo.cli.files.gaps import missing
 from tactomo.cli.files.recorded_frames import Moment, RecordedFrames
 
 if TYPE_CHECKING:
@@ -61,22 +62,15 @@ def read_course(frames: RecordedFrames) -> Course:
         course.flags.append(frame.flags)
         course.misfits.append(frame.misfit)
         course.ages_s.append(moment.age_s)
-        lost = _missing(last, moment, "sequence")
+        lost = missing(last, moment, "sequence")
         course.lost.append(lost)
-        course.left_out.append(max(0, _missing(last, moment, "scan_counter") - lost))
+        course.left_out.append(max(0, missing(last, moment, "scan_counter") - lost))
         for contact in frame.contacts:
             track = course.tracks.setdefault(f"{contact.id}{run}", Track())
             track.times_s.append(moment.time_s)
             track.contacts.append(contact)
         last = moment
     return course
-
-
-def _missing(last: Moment | None, moment: Moment, counter: str) -> int:
-    if last is None or last.frame.session != moment.frame.session:
-        return 0
-    step = getattr(moment.frame, counter) - getattr(last.frame, counter)
-    return int(max(0, step - 1))
 
 
 def read_maps(frames: RecordedFrames, course: Course) -> list[Moment]:

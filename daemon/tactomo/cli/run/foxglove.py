@@ -21,7 +21,8 @@ from tactomo.cli.options import (
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
-    from tactomo_foxglove import Bridge, Placement
+    from tactomo_client.placement import Placement
+    from tactomo_foxglove import Bridge
 
 DEFAULT_PORT = 8765
 
@@ -131,7 +132,7 @@ def write_layout(path: Path, sensor: str) -> None:
 
 def placement_of(parent: str, pose: str) -> Placement:
     """Return the placement that the options mean."""
-    from tactomo_foxglove import Placement
+    from tactomo_client.placement import Placement
 
     try:
         return Placement.parse(parent, pose)

@@ -1,0 +1,291 @@
+"""A frame as ROS 2 messages of standard types, for bags and for live publishers alike.
+
+=========================  ====================================  ===================================
+topic                      type                                  message
+=========================  ====================================  ===================================
+/SENSOR/map                sensor_msgs/PointCloud2               the sheet's nodes, ny rows of nx
+/SENSOR/contacts           sensor_msgs/PointCloud2               a point for each contact; none:
+                                                                 nothing pressed, or not `is_known`
+/SENSOR/contact_wrenches   geometry_msgs/WrenchStamped           one for each contact, in its frame
+/SENSOR/contact_poses      geometry_msgs/                        likewise, in the sensor's frame
+                           PoseWithCovarianceStamped
+/tf                        tf2_msgs/TFMessage                    SENSOR to SENSOR/contact_ID
+/diagnostics               diagnostic_msgs/DiagnosticArray       trust, timing, identity
+=========================  ====================================  ===================================
+
+Stamps are when the scan was acquired. The frame SENSOR has its origin at the sheet's centre, x to
+the right, y up, z out of the pressed side (REP 103: metres, newtons; kilopascals are named so).
+What is unknown is NaN, or absent; docs/ros2.md says more.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import fields
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.typesys import Stores, get_typestore
+from tactomo_client import Contact, Frame
+from tactomo_client.placement import Placement
+
+TYPES: Final = get_typestore(Stores.ROS2_HUMBLE)
+"""Definitions; their hashes are the same up to Kilted and, but for Humble, part of the wire."""
+RANGES: Final = ("unknown", "within", "below", "above")
+"""`pressure_range` of a contact's point is an index into these."""
+CONTACT_POINT: Final = np.dtype(
+    [
+        *((axis, "<f4") for axis in "xyz"),
+        *(
+            (field.name, {"int": "<u4", "str": "u1"}.get(str(field.type), "<f8"))
+            for field in fields(Contact)
+        ),
+    ]
+)
+MAP_POINT: Final = np.dtype(
+    [
+        *((axis, "<f4") for axis in "xyz"),
+        *((name, "<f4") for name in ("pressure_kpa", "sigma_kpa", "magnitude", "structure")),
+        ("valid", "u1"),
+    ]
+)
+_POINT_FIELD: Final = {"u1": "UINT8", "u4": "UINT32", "f4": "FLOAT32", "f8": "FLOAT64"}
+
+
+class RosMessage(NamedTuple):
+    """A message as ROS 2 transports and bags carry it."""
+
+    topic: str
+    type: str
+    cdr: bytes
+
+
+def topic_types(sensor: str) -> dict[str, str]:
+    """Return the type of each topic of a sensor."""
+    name = topic_name(sensor)
+    return {
+        f"/{name}/map": "sensor_msgs/msg/PointCloud2",
+        f"/{name}/contacts": "sensor_msgs/msg/PointCloud2",
+        f"/{name}/contact_wrenches": "geometry_msgs/msg/WrenchStamped",
+        f"/{name}/contact_poses": "geometry_msgs/msg/PoseWithCovarianceStamped",
+        "/tf": "tf2_msgs/msg/TFMessage",
+        "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+    }
+
+
+def topic_name(sensor: str) -> str:
+    """Return a sensor's name as ROS topics may have it: letters, digits and single underscores."""
+    name = re.sub(r"[\W_]+", "_", sensor, flags=re.ASCII).strip("_")
+    return f"s{name}" if not name or name[0].isdigit() else name
+
+
+def ros_messages(
+    frame: Frame, time_ns: int, age_s: float | None, placement: Placement | None = None
+) -> Iterator[RosMessage]:
+    """Yield what a frame says; a frame without images has no map.
+
+    Args:
+        frame: the frame.
+        time_ns: when it was acquired, ROS time: nanoseconds since 1970.
+        age_s: how old it was when it was published; None where nobody knows it.
+        placement: where the sensor hangs; None where the robot's own description says so.
+    """
+    types = topic_types(frame.sensor)
+    cloud, contacts, wrenches, poses, tf, diagnostics = types
+    header = _new("std_msgs/msg/Header", stamp=_stamp(time_ns), frame_id=frame.sensor)
+    said: list[tuple[str, Any]] = [(diagnostics, _diagnostics(frame, header, age_s))]
+    if (points := _map_points(frame)) is not None:
+        said.append((cloud, _cloud(points, header)))
+    said.append((contacts, _cloud(_contact_points(frame), header)))
+    for contact in frame.contacts:
+        said.append((wrenches, _wrench(frame, contact, header.stamp)))
+        said.append((poses, _pose(contact, header)))
+    if transforms := _transforms(frame, header, placement):
+        said.append((tf, _new("tf2_msgs/msg/TFMessage", transforms=transforms)))
+    for topic, message in said:
+        yield RosMessage(topic, types[topic], bytes(TYPES.serialize_cdr(message, types[topic])))
+
+
+def _new(kind: str, **values: Any) -> Any:
+    return TYPES.types[kind](**values)
+
+
+def _stamp(time_ns: int) -> Any:
+    seconds, nanoseconds = divmod(time_ns, 1_000_000_000)
+    return _new("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+
+
+def _vector(x: float, y: float, z: float, kind: str = "Vector3") -> Any:
+    return _new(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
+
+
+def _cloud(points: NDArray[np.void], header: Any) -> Any:
+    """Return points of shape (n,), or (rows, columns) of a sheet, as a cloud."""
+    rows, columns = (1, len(points)) if points.ndim == 1 else points.shape
+    point_field = TYPES.types["sensor_msgs/msg/PointField"]
+    return _new(
+        "sensor_msgs/msg/PointCloud2",
+        header=header,
+        height=rows,
+        width=columns,
+        fields=[
+            point_field(
+                name=name,
+                offset=offset,
+                datatype=getattr(point_field, _POINT_FIELD[kind.str[1:]]),
+                count=1,
+            )
+            for name, (kind, offset, *_) in (points.dtype.fields or {}).items()
+        ],
+        is_bigendian=False,
+        point_step=points.itemsize,
+        row_step=columns * points.itemsize,
+        data=np.frombuffer(points.tobytes(), np.uint8),
+        is_dense="valid" not in (points.dtype.names or ()) or bool(points["valid"].all()),
+    )
+
+
+def _map_points(frame: Frame) -> NDArray[np.void] | None:
+    """Return the sheet's nodes, (ny, nx); None for a frame without images."""
+    images = {
+        "pressure_kpa": frame.pressure_kpa,
+        "magnitude": frame.map,
+        "structure": frame.structure,
+    }
+    shape = next((image.shape for image in images.values() if image is not None), None)
+    if shape is None or frame.x_mm is None or frame.y_mm is None:
+        return None
+    points = np.zeros(shape, MAP_POINT)
+    points["x"] = np.linspace(*frame.x_mm, shape[1]) * 1e-3
+    points["y"] = np.linspace(*frame.y_mm, shape[0])[:, None] * 1e-3
+    for name, image in images.items():
+        points[name] = np.nan if image is None else image
+    points["sigma_kpa"] = _sigma_kpa(frame, points)
+    points["valid"] = np.isfinite(points["pressure_kpa"]) & frame.is_known
+    return points
+
+
+def _sigma_kpa(frame: Frame, points: NDArray[np.void]) -> NDArray[np.float64]:
+    """Return for each pressed node the standard uncertainty of its contact's pressure, else NaN.
+
+    A node's contact is the one whose disc of equal area is the nearest.
+    """
+    sigma = np.full(points.shape, np.nan)
+    if frame.contacts:
+        x, y, area, of_contact = np.array(
+            [(c.x_mm, c.y_mm, c.area_mm2, c.pressure_sigma_kpa) for c in frame.contacts], float
+        ).T[..., None, None]
+        outside_mm = np.hypot(points["x"] * 1e3 - x, points["y"] * 1e3 - y) - np.sqrt(area / np.pi)
+        pressed = points["pressure_kpa"] > 0
+        sigma[pressed] = of_contact.ravel()[outside_mm.argmin(axis=0)][pressed]
+    return sigma
+
+
+def _contact_points(frame: Frame) -> NDArray[np.void]:
+    """Return a point for each contact, with all that is known of it."""
+    points = np.zeros(len(frame.contacts), CONTACT_POINT)
+    for point, contact in zip(points, frame.contacts, strict=True):
+        for field in fields(Contact):
+            value = getattr(contact, field.name)
+            if field.name == "pressure_range":
+                value = RANGES.index(value) if value in RANGES else 0
+            point[field.name] = np.nan if value is None else value
+        point["x"], point["y"] = contact.x_mm * 1e-3, contact.y_mm * 1e-3
+    return points
+
+
+def _wrench(frame: Frame, contact: Contact, stamp: Any) -> Any:
+    """Return the force on the sheet at a contact's centre: normal to it, into it is negative.
+
+    The sheet feels neither shear nor twist: the other components are 0 and say nothing.
+    """
+    force_n = np.nan if contact.force_n is None else contact.force_n
+    wrench = _new(
+        "geometry_msgs/msg/Wrench", force=_vector(0.0, 0.0, -force_n), torque=_vector(0.0, 0.0, 0.0)
+    )
+    header = _new("std_msgs/msg/Header", stamp=stamp, frame_id=_contact_frame(frame, contact))
+    return _new("geometry_msgs/msg/WrenchStamped", header=header, wrench=wrench)
+
+
+def _pose(contact: Contact, header: Any) -> Any:
+    """Return a contact's centre; it lies in the sheet's plane, turned as the sheet is."""
+    covariance = np.zeros(36)
+    covariance[[0, 7]] = [
+        np.nan if sigma is None else (sigma * 1e-3) ** 2
+        for sigma in (contact.x_sigma_mm, contact.y_sigma_mm)
+    ]
+    pose = _new(
+        "geometry_msgs/msg/Pose",
+        position=_vector(contact.x_mm * 1e-3, contact.y_mm * 1e-3, 0.0, "Point"),
+        orientation=_new("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+    )
+    with_covariance = _new("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance)
+    return _new("geometry_msgs/msg/PoseWithCovarianceStamped", header=header, pose=with_covariance)
+
+
+def _transforms(frame: Frame, header: Any, placement: Placement | None) -> list[Any]:
+    def transform(header: Any, child: str, placed: Placement) -> Any:
+        x, y, z, w = placed.quaternion
+        pose = _new(
+            "geometry_msgs/msg/Transform",
+            translation=_vector(placed.x_m, placed.y_m, placed.z_m),
+            rotation=_new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+        )
+        return _new(
+            "geometry_msgs/msg/TransformStamped",
+            header=header,
+            child_frame_id=child,
+            transform=pose,
+        )
+
+    hung = []
+    if placement is not None:
+        parent = _new("std_msgs/msg/Header", stamp=header.stamp, frame_id=placement.parent)
+        hung = [transform(parent, frame.sensor, placement)]
+    centres = [
+        (contact, Placement(frame.sensor, contact.x_mm * 1e-3, contact.y_mm * 1e-3))
+        for contact in frame.contacts
+    ]
+    return hung + [transform(header, _contact_frame(frame, c), centre) for c, centre in centres]
+
+
+def _contact_frame(frame: Frame, contact: Contact) -> str:
+    return f"{frame.sensor}/contact_{contact.id}"
+
+
+def _diagnostics(frame: Frame, header: Any, age_s: float | None) -> Any:
+    status: Any = TYPES.types["diagnostic_msgs/msg/DiagnosticStatus"]
+    numbers = {
+        "is_known": frame.is_known,
+        "age_s": age_s,
+        "contacts": len(frame.contacts),
+        "flags": " ".join(sorted(frame.flags)),
+        **{
+            name: getattr(frame, name)
+            for name in (
+                *("tier", "tier_reason", "misfit", "confidence", "session", "sequence"),
+                *("scan_counter", "acquired_realtime_ns", "acquired_monotonic_ns", "device_us"),
+                *("delay_ns", "skew_ms"),
+            )
+        },
+    }
+    told = "stale" if frame.is_stale else ", ".join(sorted(frame.flags)) or "ok"
+    return _new(
+        "diagnostic_msgs/msg/DiagnosticArray",
+        header=header,
+        status=[
+            status(
+                level=status.STALE if frame.is_stale else int(bool(frame.flags)),  # 1: WARN
+                name=f"tactomo: {frame.sensor}",
+                message=told,
+                hardware_id=frame.sensor,
+                values=[
+                    _new("diagnostic_msgs/msg/KeyValue", key=key, value=str(value))
+                    for key, value in numbers.items()
+                    if value is not None
+                ],
+            )
+        ],
+    )
