@@ -617,6 +617,116 @@ def test_a_page_that_is_put_away_lets_go_and_starts_afresh(page: Page) -> None:
     wait_until(lambda: page.health == "good" and not page.js("return tactomo.state.hello.old"))
 
 
+# The last minute
+
+
+def lanes_with(page: Page, colour: tuple[int, int, int]) -> list[bool]:
+    """Return for the strip's upper and lower lane whether a colour is in it."""
+    script = """
+        const c = document.getElementById('strip');
+        const [w, h] = [c.width, c.height];
+        const there = (y0, y1) => {
+          const {data} = c.getContext('2d').getImageData(0, y0, w, y1 - y0);
+          for (let i = 0; i < data.length; i += 4)
+            if (arguments[0].every((level, k) => Math.abs(data[i + k] - level) < 8)) return true;
+          return false;
+        };
+        return [there(0, Math.floor(0.4 * h)), there(Math.ceil(0.45 * h), Math.floor(0.8 * h))]"""
+    return list(page.js(script, colour))
+
+
+@pytest.mark.usefixtures("quiet_console")
+def test_the_strip_shows_each_contacts_pressure_and_force_and_the_events(page: Page) -> None:
+    page.open()
+    first, second = (86, 180, 233), (0, 158, 115)  # of contacts 1 and 2
+    assert lanes_with(page, first) == [False, False]
+    page.skin.press(36, -48)
+    (contact,) = page.skin.contacts
+    page.skin.contacts = [replace(contact, force_n=80.0)]
+    wait_until(lambda: lanes_with(page, first) == [True, True])
+    assert lanes_with(page, second) == [False, False]
+    page.skin.contacts.append(replace(contact, id=2))  # how hard in newtons is not known
+    wait_until(lambda: lanes_with(page, second)[0])
+    event = {"name": "port_lost", "severity": "error", "detail": "", "next_step": ""}
+    page.skin.events = [event]
+    at = "const e = tactomo.timeline.events; return e.length && performance.now() - e[0].at"
+    wait_until(lambda: 0 < page.js(at) < 5_000)
+    page.js(
+        "const strip = document.getElementById('strip');"
+        "strip.dispatchEvent(new PointerEvent('pointermove', {clientX:"
+        " strip.getBoundingClientRect().right - 16}))"
+    )
+    assert page["strip"].get_attribute("title") == "port lost"
+
+
+@pytest.mark.usefixtures("quiet_console")
+def test_what_was_is_looked_at_and_left_again(page: Page) -> None:
+    page.skin.press(36, -48)
+    page.open()
+    wait_until(lambda: sum(page.colour(30, -48)) > 350)
+    wait_until(lambda: page.js("return tactomo.timeline.frames.length") > 5)
+    page.skin.press(-30, 30, kpa=100)
+    wait_until(lambda: sum(page.colour(30, -48)) < 60)
+    page["pause"].click()
+    wait_until(lambda: page.health == "paused")
+    page["moment"].send_keys(Keys.HOME)
+    wait_until(lambda: sum(page.colour(30, -48)) > 350)
+    wait_until(lambda: "36.0" in page["contacts"].text)
+    assert page["moment"].get_attribute("aria-valuetext") == "60.0 s before the pause"
+    assert "ago" in page.banner
+    page.skin.sends_frames = False  # what goes wrong now is said while one looks back, too
+    wait_until(lambda: page.health == "stale")
+    assert sum(page.colour(30, -48)) > 350
+    page.skin.sends_frames = True
+    wait_until(lambda: page.health == "paused")
+    page["pause"].click()
+    wait_until(lambda: sum(page.colour(30, -48)) < 60)
+    wait_until(lambda: page.health == "good")
+
+
+def test_a_pointer_on_the_strip_looks_back(page: Page) -> None:
+    page.open()
+    wait_until(lambda: page.js("return tactomo.timeline.frames.length") > 5)
+    strip = page["strip"]
+    actions = webdriver.ActionChains(page.browser)
+    actions.move_to_element_with_offset(strip, 0, 0).click_and_hold().move_by_offset(5, 0)
+    actions.release().perform()
+    wait_until(lambda: page.health == "paused")
+    assert -33_000 < int(page["moment"].get_attribute("value") or 0) < -29_000
+
+
+def test_one_held_press_is_lifted_and_the_others_stay(page: Page) -> None:
+    page.open()
+    page.wait_until_pressable()
+    page.click(10, 20, modifiers=8)
+    page.click(-30, 0, modifiers=8)
+    buttons = "return [...document.querySelectorAll('#held button')].map(b => b.ariaLabel)"
+    wait_until(lambda: len(page.js(buttons)) == 2)
+    wait_until(lambda: len({press["id"] for press in page.presses()}) == 2)
+    first, second = dict.fromkeys(press["id"] for press in page.presses())
+    page["held"].find_elements(By.TAG_NAME, "button")[0].click()
+    wait_until(lambda: page.presses("release") == [{"id": first}])
+    assert page.js("return tactomo.touch.held.length") == 1
+    assert page.js(buttons) == ["Lift the press at x −30, y 0 mm"]
+    assert second not in {release["id"] for release in page.presses("release")}
+
+
+def test_a_ring_is_drawn_with_its_hole(page: Page) -> None:
+    page.open()
+    page.wait_until_pressable()
+    page["shape"].find_element(By.XPATH, "./option[@value='ring']").click()
+    page.click(0, 0, modifiers=8)
+    radius_mm = page.js("return Number(document.getElementById('size').value)") / 2
+
+    def is_drawn(r_mm: float) -> bool:  # dashed: somewhere around, a dash
+        angles = np.linspace(0, 2 * np.pi, 40)
+        return any(page.colour(r_mm * np.cos(a), r_mm * np.sin(a))[2] > 150 for a in angles)
+
+    wait_until(lambda: is_drawn(radius_mm))
+    assert is_drawn(radius_mm / 2)
+    assert not is_drawn(0.75 * radius_mm)
+
+
 # Buttons
 
 
@@ -769,6 +879,16 @@ def test_nothing_sticks_out_at_any_width(page: Page, width: int) -> None:
     assert page.js("return document.documentElement.scrollWidth") <= width
     right = page.js("return tactomo.mmToPixel(75, 0)[0]")
     assert 150 < right < page.js("return document.getElementById('map').clientWidth")
+
+
+def test_a_laptop_shows_contacts_method_and_health_without_scrolling(page: Page) -> None:
+    page.skin.press(0, 0)
+    (contact,) = page.skin.contacts
+    page.skin.contacts = [replace(contact, id=number) for number in range(1, 6)]
+    page.open(width=1280, height=800)
+    wait_until(lambda: page["count"].text == "5")
+    for name in ("contacts", "method", "made-by", "quality", "confidence", "moment"):
+        assert page[name].rect["y"] + page[name].rect["height"] <= 800, name
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

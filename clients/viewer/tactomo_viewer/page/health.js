@@ -71,6 +71,9 @@ export function verdict(state, now) {
   if (fields.ports?.length && fields.ports.every((port) => port.state === "ended")) {
     return banner("ended", "info", "The replay is at its end.", "The map shows its last frame.");
   }
+  if (fields.replay?.paused) {
+    return banner("replay-paused", "info", "The replay is paused.", "The map shows the frame at which it stands.");
+  }
   if (fields.state === "late") {
     return banner("late", "error", "Frames come late.",
       "Scans come faster than they are reconstructed: choose a faster method, or give the daemon more of the processor.");
@@ -90,7 +93,8 @@ function banner(name, level, title, detail) {
   return { name, level, title, detail };
 }
 
-function staleAfter({ ports }) {
+/** How old the newest frame may be, in ms, before the page calls it stale. */
+export function staleAfter({ ports }) {
   const rates = (ports ?? []).map((port) => port.device?.scan_rate_hz).filter((hz) => hz > 0);
   return Math.max(STALE_MS, (STALE_SCANS * 1000) / Math.min(...rates, Infinity));
 }

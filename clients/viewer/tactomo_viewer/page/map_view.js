@@ -8,6 +8,7 @@ const FINER = 5;           // intervals of the smooth image for each one of the 
 const OUTLINE_FINER = 3;
 const ELECTRODE_MM = [6, 2.4];  // drawn size: along the rim, across it
 const NARROW_PX = 520;     // below this the colour bar lies under the map
+const BESIDE_PX = 360;     // what stands above and below the map: header, toolbar, the last minute
 
 export class MapView {
   constructor(canvas) {
@@ -43,7 +44,7 @@ export class MapView {
       ? { left: 40, right: 14, top: 14, bottom: 88 }
       : { left: 52, right: 92, top: 18, bottom: 46 };
     const [wide, high] = [sheet.x[1] - sheet.x[0], sheet.y[1] - sheet.y[0]];
-    const tallest = Math.max(260, window.innerHeight - (narrow ? 220 : 190));
+    const tallest = Math.max(260, window.innerHeight - (narrow ? 220 : BESIDE_PX));
     const scale = Math.max(0.2, Math.min(
       (room - margin.left - margin.right) / wide,
       (tallest - margin.top - margin.bottom) / high,
@@ -222,6 +223,10 @@ export class MapView {
     c.beginPath();
     if (shape === "rectangle") c.rect(px - r, py - r, 2 * r, 2 * r);
     else c.arc(px, py, r, 0, 7);
+    if (shape === "ring") {  // its inner half is left out
+      c.moveTo(px + r / 2, py);
+      c.arc(px, py, r / 2, 0, 7);
+    }
     c.setLineDash([5, 4]);
     halo(c, 1.5, "#6fe3ff", "rgba(0, 0, 0, 0.55)");
     c.setLineDash([]);
@@ -379,7 +384,7 @@ export class MapView {
   }
 }
 
-function theme(element) {
+export function theme(element) {
   const style = getComputedStyle(element);
   const of = (name) => style.getPropertyValue(`--${name}`).trim();
   return {
@@ -387,6 +392,10 @@ function theme(element) {
     text: of("text"),
     dim: of("dim"),
     axis: of("axis"),
+    line: of("line"),
+    accent: of("accent"),
+    warn: of("warn"),
+    bad: of("bad"),
     electrode: of("electrode"),
     sheet: of("sheet"),
     pressed: of("pressed").split(" ").map(Number),
@@ -403,7 +412,7 @@ function halo(c, width, inner, outer) {
   c.stroke();
 }
 
-function line(c, x0, y0, x1, y1) {
+export function line(c, x0, y0, x1, y1) {
   c.beginPath();
   c.moveTo(x0, y0);
   c.lineTo(x1, y1);
@@ -415,7 +424,7 @@ function rgb(table, level) {
 }
 
 /** Round values from low to high, about `count` of them. */
-function ticks(low, high, count) {
+export function ticks(low, high, count) {
   const raw = (high - low) / count;
   const power = 10 ** Math.floor(Math.log10(raw));
   const step = power * ([1, 2, 2.5, 5, 10].find((s) => s * power >= raw) ?? 10);
@@ -424,6 +433,6 @@ function ticks(low, high, count) {
   return values;
 }
 
-function number(value) {
+export function number(value) {
   return String(Math.round(value * 1000) / 1000).replace("-", "−");
 }

@@ -5,7 +5,7 @@ import { explainFlag } from "./health.js";
 const EVENTS_SHOWN = 50;
 const TROUBLE_SHOWN_S = 3600;
 const SOURCES = { twin: "simulated skin", device: "device", replay: "replay" };
-const STATES = { waiting_for_port: "no port yet", waiting_for_data: "no data yet", taring: "taring", running: "running", late: "late", ended: "replay ended", stale: "stale" };
+const STATES = { waiting_for_port: "no port yet", waiting_for_data: "no data yet", taring: "taring", running: "running", late: "late", ended: "replay ended", "replay-paused": "replay paused", stale: "stale" };
 const LINEAR = ["tikhonov", "noser"];  // one step, which runs contacts together
 
 export const byId = (id) => document.getElementById(id);
@@ -37,6 +37,22 @@ export function showContacts(contacts, unit, value) {
     ];
     texts.forEach((text, column) => setText(row.cells[column], text));
   });
+}
+
+/** A button for each press that is held, by which `lift(press)` takes it away. */
+export function showHeld(presses, lift) {
+  const key = presses.map(({ id }) => id).join();
+  if (byId("held").dataset.presses === key) return;  // a button under a finger must stay
+  byId("held").dataset.presses = key;
+  byId("held").replaceChildren(...presses.map((press) => {
+    const button = element("button", `× ${fixed(press.x, 0)}, ${fixed(press.y, 0)} mm`);
+    button.type = "button";
+    button.ariaLabel = `Lift the press at x ${fixed(press.x, 0)}, y ${fixed(press.y, 0)} mm`;
+    button.onclick = () => lift(press);
+    const item = element("li");
+    item.append(button);
+    return item;
+  }));
 }
 
 function forceText({ force_n: force, force_sigma_n: sigma, pressure_range: range }) {

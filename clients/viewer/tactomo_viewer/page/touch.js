@@ -62,6 +62,14 @@ export class Touch {
     return this.link.ask({ type: "clear" });
   }
 
+  /** Lift one press that is held. */
+  lift(press) {
+    press.lifted = true;
+    this.held = this.held.filter((held) => held !== press);
+    this.link.send({ type: "release", press: press.id });
+    this.onChange();
+  }
+
   /** The indenter changed: so do the presses that are down. */
   refresh() {
     for (const press of this.down.values()) this.#send(Object.assign(press, this.indenter()));

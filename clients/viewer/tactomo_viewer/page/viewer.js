@@ -1,9 +1,11 @@
 // The page's main part: takes what the link brings, and has it drawn once a screen refresh.
 
-import { ageOf, areTouchesSeen, verdict } from "./health.js";
+import { ageOf, areTouchesSeen, staleAfter, verdict } from "./health.js";
 import { Link } from "./link.js";
 import { MapView } from "./map_view.js";
-import { byId, fixed, setText, showContacts, showEvent, showQuality, showState, showStatus } from "./panels.js";
+import { byId, fixed, setText, showContacts, showEvent, showHeld, showQuality, showState, showStatus } from "./panels.js";
+import { Replay } from "./replay.js";
+import { Timeline } from "./timeline.js";
 import { Touch } from "./touch.js";
 
 const PANEL_MS = 100;       // how often the texts beside the map change
@@ -27,15 +29,26 @@ const link = new Link({ onFrame, onMessage, onChange: onLink });
 state.link = link;
 const touch = new Touch({
   view, link, indenter,
-  onChange: () => redraw(),
+  onChange: () => {
+    showHeld(touch.held, (press) => touch.lift(press));
+    redraw();
+  },
   onPress: (press) => {
     if (!contactNear(press)) state.awaited = { ...press, at: performance.now() };
   },
 });
 
+const timeline = new Timeline({
+  canvas: byId("strip"),
+  slider: byId("moment"),
+  onLook: () => { redraw(); refresh(); },
+});
+const replay = new Replay(command);
+
 // For those who drive this page from outside, such as its tests.
 window.tactomo = {
   touch,
+  timeline,
   mmToPixel: (x, y) => view.mmToPixel(x, y),
   pixelToMm: (x, y) => view.pixelToMm(x, y),
   state,
@@ -46,7 +59,13 @@ window.tactomo = {
 function onFrame(frame) {
   if (state.drawn?.session !== frame.session) state.fitted = { kpa: 0, percent: 0 };
   state.frame = frame;
+  timeline.add(frame);
   redraw();
+}
+
+// The frame that the page shows: the newest, or one that is looked back at.
+function shownFrame() {
+  return timeline.shown?.frame ?? state.frame;
 }
 
 function onMessage(message) {
@@ -61,8 +80,12 @@ function onMessage(message) {
       state.status = { fields: message.status, age_ms: message.age_ms, receivedAt: performance.now() };
       describe(message.status.description);
       showStatus(message.status);
+      replay.show(message.status.replay, state.hello);
     },
-    event: () => showEvent(message.event),
+    event: () => {
+      showEvent(message.event);
+      timeline.note(message.event);
+    },
     twin: () => { state.twinAnswers = message.answers; },
   };
   handlers[message.type]?.();
@@ -103,7 +126,7 @@ function redraw() {
 }
 
 function draw() {
-  const { frame } = state;
+  const frame = shownFrame();
   const unit = chosen("unit");
   const image = imageIn(frame, unit);
   view.draw({
@@ -123,7 +146,7 @@ function draw() {
   showReadout();
   if (frame === state.drawn) return;
   state.drawn = frame;
-  notePainted(frame);
+  if (frame === state.frame) notePainted(frame);
 }
 
 function notePainted(frame) {
@@ -201,14 +224,16 @@ function contactNear({ x, y, size }) {
 
 function refresh() {
   const now = performance.now();
-  const found = verdict(state, now);
+  const live = verdict(state, now);
+  const past = timeline.shown;
+  const found = past && live?.level !== "error" ? pausedBanner(past, now) : live;
   showBanner(found);
-  const trusted = !found || found.level === "info" || found.name === "no-reference";
+  const trusted = past !== null || !found || found.level === "info" || found.name === "no-reference";
   byId("map").classList.toggle("stale", !trusted);
   document.body.dataset.health = found?.name ?? (state.status ? "good" : "connecting");
   const linked = link.isOpen && state.status && ageOf(state.status, now) < 3000;
   if (!linked) showState("gone", found ? "disconnected" : "connecting");
-  else if (["stale", "ended"].includes(found?.name)) showState(found.name);
+  else if (["stale", "ended", "replay-paused"].includes(live?.name)) showState(live.name);
   else showState(state.status.fields.state);
   for (const id of ["tare", "record", "method"]) {
     byId(id).disabled = !linked || Boolean(state.hello?.read_only);
@@ -221,6 +246,23 @@ function refresh() {
     ? "Press with the mouse, with fingers, or with the arrow keys and the space bar. Shift holds the press."
     : "");
   showNumbers(now, trusted);
+  const isPaused = timeline.isPaused;
+  byId("pause").setAttribute("aria-pressed", String(isPaused));
+  setText(byId("pause"), isPaused ? "Back to now" : "Pause");
+  const stands = ["ended", "replay-paused"].includes(live?.name) && state.frame;
+  timeline.draw({
+    end: stands ? state.frame.receivedAt : now,
+    unit: chosen("unit") === "kpa" ? "kPa" : "%",
+    value: chosen("unit") === "kpa" ? ({ pressure_kpa: kpa }) => kpa
+      : ({ magnitude }) => (magnitude === null ? null : 100 * magnitude),
+    gapMs: staleAfter(state.status?.fields ?? {}),
+  });
+  replay.tick(now);
+}
+
+function pausedBanner({ frame, at }, now) {
+  const detail = `Shown is the frame of ${fixed((now - at) / 1000, 1)} s ago; the skin goes on.`;
+  return { name: "paused", level: "info", title: "Looking back.", detail, frame };
 }
 
 let bannerShown = "";
@@ -246,7 +288,8 @@ function showBanner(found) {
 }
 
 function showNumbers(now, trusted) {
-  const { frame, painted } = state;
+  const { painted } = state;
+  const frame = shownFrame();
   const recent = painted.filter(({ at }) => now - at < 2000);
   const rate = recent.length > 1 ? (1000 * (recent.length - 1)) / (recent.at(-1).at - recent[0].at) : 0;
   setText(byId("rate"), rate ? `${fixed(rate, 1)} /s` : "–");
@@ -323,6 +366,11 @@ byId("record").onclick = () =>
     : command("record_start", {}, ({ path }) => `Recording to ${path}`);
 byId("method").onchange = ({ target }) =>
   command("set_tier", { tier: target.value }, ({ tier }) => `Method: ${tier}`);
+byId("pause").onclick = () => {
+  if (timeline.isPaused) timeline.goLive();
+  else timeline.pause();
+  refresh();
+};
 byId("clear").onclick = () => touch.clear();
 byId("hold").onchange = ({ target }) => { touch.hold = target.checked; };
 for (const id of ["pressure", "size", "shape"]) byId(id).oninput = showIndenter;
@@ -347,10 +395,11 @@ function showReadout() {
 
 function readout(x, y) {
   const unit = chosen("unit");
-  const image = imageIn(state.frame, unit);
+  const frame = shownFrame();
+  const image = imageIn(frame, unit);
   const place = `x ${fixed(x, 0)}, y ${fixed(y, 0)} mm`;
   if (!image) return place;
-  const { x_mm: [x0, x1], y_mm: [y0, y1] } = state.frame;
+  const { x_mm: [x0, x1], y_mm: [y0, y1] } = frame;
   const ix = Math.round(((x - x0) / (x1 - x0)) * (image.nx - 1));
   const iy = Math.round(((y - y0) / (y1 - y0)) * (image.ny - 1));
   const value = image.values[iy * image.nx + ix];
