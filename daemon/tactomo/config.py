@@ -1,14 +1,15 @@
 """The daemon's configuration: a TOML file, and options that override it.
 
 Every key has a default but `ports`. Errors name the file, the key, its value and what is allowed.
-`tactomo service example` shows every key with its meaning.
+`tactomo service example` shows every key with its meaning, deploy/examples/robot.toml several skins
+in one file.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, NamedTuple, Self, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails
@@ -20,12 +21,20 @@ from tactomo_models.errors import MethodError, explain
 from tactomo_models.methods.registry import find_method
 from tactomo_models.toml_file import read_toml
 
-from tactomo.endpoint import check_endpoint, check_metrics_address, is_local, needs_keys
+from tactomo.endpoint import (
+    check_endpoint,
+    check_metrics_address,
+    is_local,
+    needs_keys,
+    next_address,
+)
 from tactomo.errors import ConfigError
 from tactomo.log import LogFormat, LogLevel
 from tactomo.protocols import NATIVE, find_protocol
 
 MAX_PORTS = 2
+
+_Model = TypeVar("_Model", bound=BaseModel)
 
 
 def _sensor_name(name: str) -> str:
@@ -49,6 +58,12 @@ def _protocol(name: str) -> str:
     except ConfigError as error:
         raise ValueError(f"{error.cause}; {error.next_step}") from error
     return name
+
+
+def _local(endpoint: str) -> str:
+    if not is_local(endpoint):
+        raise ValueError("for other computers run `tactomo proxy` with keys")
+    return endpoint
 
 
 Endpoint = Annotated[str, AfterValidator(check_endpoint)]
@@ -185,6 +200,21 @@ class DaemonConfig(BaseModel):
         return self
 
 
+class Robot(BaseModel):
+    """Several skins of one computer, as their file has them: each in a table ``[skins.NAME]``."""
+
+    skins: Annotated[dict[str, dict[str, Any]], Field(min_length=1)]
+    proxy: Annotated[Endpoint, AfterValidator(_local)] | None = None
+    """Where the streams of all skins are available together."""
+
+
+class Skins(NamedTuple):
+    """The configurations of several skins, and the address of their streams together."""
+
+    each: tuple[DaemonConfig, ...]
+    proxy: str | None
+
+
 def load_config(path: str | Path | None = None, **overrides: Any) -> DaemonConfig:
     """Read a configuration file and apply options to it.
 
@@ -199,10 +229,92 @@ def load_config(path: str | Path | None = None, **overrides: Any) -> DaemonConfi
     """
     given = {key: value for key, value in overrides.items() if value is not None}
     values = {} if path is None else _read_toml(Path(path))
+    return _checked(DaemonConfig, values, given, path)
+
+
+def load_skins(path: Path | None, **overrides: Any) -> Skins | DaemonConfig:
+    """Read a file that may describe several skins, and apply options to each.
+
+    A key outside the tables ``[skins.NAME]`` is every skin's. A skin without addresses gets the
+    default ones, the n-th skin ``20 n`` TCP ports further. Where `name` is overridden, that skin
+    alone is meant.
+
+    Raises:
+        ConfigError: as `load_config` does, or two skins share what each needs for itself.
+    """
+    values = {} if path is None else _read_toml(path)
+    if path is None or "skins" not in values:
+        return load_config(path, **overrides)
+    given = {key: value for key, value in overrides.items() if value is not None}
+    robot = _checked(Robot, values, {}, path)
+    common = {key: value for key, value in values.items() if key not in Robot.model_fields}
+    only = given.pop("name", None)
+    if only not in (None, *robot.skins):
+        known = ", ".join(robot.skins)
+        raise ConfigError(f"{path} has no skin {only!r}", f"use one of: {known}")
+    skins = [
+        _checked(
+            DaemonConfig,
+            {**_default_addresses(number), **_merged(common, table), "name": name},
+            given,
+            f"{path}, [skins.{name}]",
+        )
+        for number, (name, table) in enumerate(robot.skins.items())
+        if only in (None, name)
+    ]
+    if only is not None:
+        return skins[0]
+    _check_apart(path, skins, robot.proxy)
+    return Skins(tuple(skins), robot.proxy)
+
+
+def _default_addresses(number: int) -> dict[str, str]:
+    return {
+        "stream": next_address(DEFAULT_STREAM, number),
+        "control": next_address(DEFAULT_CONTROL, number),
+    }
+
+
+def _merged(common: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keys of all skins with one skin's in their places, tables key by key."""
+    tables = {
+        key: {**common[key], **value}
+        for key, value in own.items()
+        if isinstance(value, dict) and isinstance(common.get(key), dict)
+    }
+    return {**common, **own, **tables}
+
+
+def _check_apart(path: Path, skins: Sequence[DaemonConfig], proxy: str | None) -> None:
+    """Refuse skins that share a port, an address or a file, and streams that no proxy can find."""
+    owners = {} if proxy is None else {proxy: "the proxy"}
+    for skin in skins:
+        if proxy is not None and skin.stream.endswith(":0"):
+            raise ConfigError(
+                f"{path}: the proxy cannot know which port {skin.name}'s stream gets",
+                f"name a port or an ipc:// path below [skins.{skin.name}]",
+            )
+        for own in (*skin.ports, skin.stream, skin.control, skin.metrics, skin.recording.file):
+            if own is None or str(own).endswith(":0"):
+                continue
+            if str(own) in owners:
+                raise ConfigError(
+                    f"{path}: {owners[str(own)]} and {skin.name} both have {str(own)!r}",
+                    f"give each its own, below [skins.{skin.name}]",
+                )
+            owners[str(own)] = skin.name
+
+
+def _checked(
+    model: type[_Model],
+    values: Mapping[str, Any],
+    given: Mapping[str, Any],
+    source: str | Path | None,
+) -> _Model:
     try:
-        return DaemonConfig.model_validate(_override(values, given))
+        return model.model_validate(_override(values, given))
     except ValidationError as error:
-        issues = [f"{_source(item, path, given)}: {explain(item)}" for item in error.errors()]
+        issues = [f"{_source(item, source, given)}: {explain(item)}" for item in error.errors()]
         raise ConfigError("\n".join(issues), _known_keys(error.errors())) from error
 
 

@@ -30,6 +30,8 @@ HANDSHAKE_MS: Final = 3000
 REBIND_S: Final = 2.0
 MAX_OPEN: Final = 8192
 """Files and connections of a process; the systemd units say the same."""
+ADDRESS_STEP: Final = 20
+"""From one skin's default TCP ports to the next one's; the proxy's is between."""
 
 
 def allow_connections() -> None:
@@ -68,6 +70,12 @@ def is_local(endpoint: str) -> bool:
         return endpoint.startswith(IPC) or ipaddress.ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
+
+
+def next_address(address: str, steps: int = 1) -> str:
+    """Return the address of a skin so many skins after the one at ``tcp://HOST:PORT``."""
+    host, _, port = address.rpartition(":")
+    return f"{host}:{int(port) + steps * ADDRESS_STEP}"
 
 
 def check_metrics_address(address: str) -> str:

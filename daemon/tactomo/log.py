@@ -23,7 +23,7 @@ LogFormat = Literal["auto", "text", "json", "journal"]
 _logfmt = structlog.processors.LogfmtRenderer()
 
 
-def configure_logging(level: LogLevel = "info", form: LogFormat = "auto") -> None:
+def configure_logging(level: LogLevel = "info", form: LogFormat = "auto", sensor: str = "") -> None:
     """Set up the process's logs.
 
     Args:
@@ -31,9 +31,16 @@ def configure_logging(level: LogLevel = "info", form: LogFormat = "auto") -> Non
         form: ``text`` for people, ``journal`` for journald, ``json`` for collectors; ``auto`` takes
             ``journal`` where standard error is journald's, ``text`` where it is a terminal, and
             ``json`` elsewhere.
+        sensor: named in each line, where several write to one log; empty for none.
     """
+
+    def name_sensor(
+        _: Any, __: str, event: structlog.typing.EventDict
+    ) -> structlog.typing.EventDict:
+        return {**event, "sensor": sensor} if sensor else event
+
     structlog.configure(
-        processors=[structlog.processors.add_log_level, *_renderers(form)],
+        processors=[structlog.processors.add_log_level, name_sensor, *_renderers(form)],
         wrapper_class=structlog.make_filtering_bound_logger(logging.getLevelName(level.upper())),
         logger_factory=structlog.PrintLoggerFactory(sys.stderr),
         cache_logger_on_first_use=False,

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from tactomo.acquisition import udev
 from tactomo.acquisition.adapters import Adapter
-from tactomo.config import load_config
+from tactomo.config import Skins, load_config, load_skins
 from tactomo.errors import ServiceError
 from tactomo.service import installation
 
@@ -226,7 +226,8 @@ def test_udev_understands_the_rules(tmp_path: Path) -> None:
     "example", sorted((DEPLOY / "examples").glob("*.toml")), ids=lambda p: p.stem
 )
 def test_the_examples_load(example: Path) -> None:
-    assert load_config(example).ports
+    loaded = load_skins(example)
+    assert all(skin.ports for skin in (loaded.each if isinstance(loaded, Skins) else [loaded]))
 
 
 @pytest.mark.slow

@@ -19,12 +19,19 @@ HARD_STOP_S = 3.0
 def watch_parent() -> None:
     """In a child that was started with VARIABLE set: stop when standard input ends."""
     if os.environ.pop(VARIABLE, "") == "stdin":
-        threading.Thread(target=_wait_for_the_end, name="parent watch", daemon=True).start()
+        stop_at_end_of(STDIN)
 
 
-def _wait_for_the_end() -> None:
+def stop_at_end_of(pipe: int) -> None:
+    """Stop this process when the other end of a pipe, a descriptor, is closed."""
+    threading.Thread(
+        target=_wait_for_the_end, args=(pipe,), name="parent watch", daemon=True
+    ).start()
+
+
+def _wait_for_the_end(pipe: int) -> None:
     # The descriptor itself: a thread inside sys.stdin would hold its lock when Python shuts down.
-    while os.read(STDIN, 4096):
+    while os.read(pipe, 4096):
         pass
     os.kill(os.getpid(), signal.SIGTERM)
     # Nobody is left to lose patience with a process that does not stop.

@@ -38,6 +38,7 @@ import structlog
 import zmq
 from tactomo_client.messages import EVENT, SCHEMA, STATUS
 from tactomo_models import (
+    Artifact,
     ArtifactError,
     CalibrationError,
     ModelError,
@@ -94,6 +95,7 @@ class Daemon:
             reference of before.
         machine_speed: what turns a budget of time into one of work; by default what was measured on
             this machine, if that was.
+        artifact: the description's; by default read, and built if need be.
 
     Raises:
         ModelError: the description or the artifact cannot be used.
@@ -111,6 +113,7 @@ class Daemon:
         *,
         reconstructor: Reconstructor | None = None,
         machine_speed: MachineSpeed | None = None,
+        artifact: Artifact | None = None,
     ) -> None:
         self.config = config
         self.session = uuid.uuid4().hex
@@ -142,7 +145,7 @@ class Daemon:
         )
         self._imaging = Imaging(
             description,
-            reconstructor or _make_reconstructor(config, description),
+            reconstructor or _make_reconstructor(config, description, artifact),
             machine_speed or _find_machine_speed(description),
             calibration,
             config.tare_scans,
@@ -439,11 +442,19 @@ def _log_thread_failure(failure: threading.ExceptHookArgs) -> None:
     log.error("thread_failed", thread=thread, exc_info=failure.exc_value)
 
 
-def _make_reconstructor(config: DaemonConfig, description: SensorDescription) -> Reconstructor:
+def load_model(description: SensorDescription) -> Artifact:
+    """Return the artifact of a sensor, built if need be; log and notify that this takes a while."""
     log.info("loading", sensor_model=description.name)
     notify(f"STATUS=loading the model of {description.name}, which is built the first time")
+    return load_or_build_artifact(description)
+
+
+def _make_reconstructor(
+    config: DaemonConfig, description: SensorDescription, artifact: Artifact | None
+) -> Reconstructor:
     budget_s = None if config.budget_ms is None else config.budget_ms * 1e-3
-    artifact = load_or_build_artifact(description)
+    if artifact is None or artifact.sha256 != description.sha256:
+        artifact = load_model(description)
     return Reconstructor(description, artifact, method=config.method, budget_s=budget_s)
 
 

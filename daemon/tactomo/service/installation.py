@@ -23,6 +23,7 @@ from typing import Final, Literal
 
 from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM
 
+from tactomo.endpoint import next_address
 from tactomo.errors import ServiceError
 
 Effect = Literal["write", "replace", "remove", "keep", "unchanged"]
@@ -44,8 +45,6 @@ PROGRAM: Final = "/usr/bin/tactomo"
 """As the units call it; another one is put in its place."""
 HIDDEN: Final = ("/home/", "/root/", "/tmp/", "/var/tmp/", "/run/user/")
 """What the service's sandbox does not see."""
-ADDRESS_STEP: Final = 20
-"""From one skin's ports to the next one's; the proxy's is between."""
 UDEV_RUNS: Final = Path("/run/udev/control")
 
 
@@ -249,6 +248,7 @@ def _config(name: str, ports: Sequence[str], root: Path) -> str:
         f"# The skin {name}, served by {_unit(name)}. Every key and its meaning:\n"
         "# `tactomo service example`. After a change: "
         f"systemctl restart {_unit(name)}\n"
+        f"name = {json.dumps(name)}\n"
         f"ports = {json.dumps(list(ports))}\n"
         "wait_for_ports = true\n"
         f"stream = {json.dumps(stream)}\n"
@@ -264,7 +264,7 @@ def _free_addresses(root: Path, name: str) -> tuple[str, str]:
             taken |= _addresses(path)
     pair = (DEFAULT_STREAM, DEFAULT_CONTROL)
     while taken & set(pair):
-        stream, control = (_next(address) for address in pair)
+        stream, control = (next_address(address) for address in pair)
         pair = (stream, control)
     return pair
 
@@ -275,11 +275,6 @@ def _addresses(path: Path) -> set[str]:
     with contextlib.suppress(tomllib.TOMLDecodeError):
         values = tomllib.loads(_read(path) or "")
     return {values.get("stream", DEFAULT_STREAM), values.get("control", DEFAULT_CONTROL)}
-
-
-def _next(address: str) -> str:
-    host, _, port = address.rpartition(":")
-    return f"{host}:{int(port) + ADDRESS_STEP}"
 
 
 def _unit(name: str) -> str:

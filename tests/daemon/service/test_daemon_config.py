@@ -7,7 +7,14 @@ from pathlib import Path
 
 import pytest
 from pydantic import BaseModel
-from tactomo.config import BaselineConfig, DaemonConfig, RecordingConfig, load_config
+from tactomo.config import (
+    BaselineConfig,
+    DaemonConfig,
+    RecordingConfig,
+    Skins,
+    load_config,
+    load_skins,
+)
 from tactomo.errors import ConfigError
 
 EXAMPLE = Path(__file__).parents[3] / "deploy" / "daemon.example.toml"
@@ -132,3 +139,71 @@ def test_the_example_shows_every_key_and_loads() -> None:
     assert all(f"[{name}]" in text for name in tables)
     assert all(set(table.model_fields) <= shown for table in tables.values())
     assert tomllib.loads(text)
+
+
+TWO_SKINS = """
+tare_scans = 40
+recording = { maps = true, keep_gb = 20 }
+[skins.left]
+ports = ["a"]
+recording = { at_start = true }
+[skins.right]
+ports = ["b"]
+tare_scans = 5
+"""
+
+
+def test_skins_of_one_file_share_its_keys_and_have_addresses_of_their_own(tmp_path: Path) -> None:
+    loaded = load_skins(config_file(tmp_path, TWO_SKINS), method="tikhonov")
+    assert isinstance(loaded, Skins)
+    left, right = loaded.each
+    assert (left.name, left.tare_scans, left.method) == ("left", 40, "tikhonov")
+    assert (left.recording.at_start, left.recording.maps, left.recording.keep_gb) == (
+        True,
+        True,
+        20,
+    )
+    assert (right.name, right.tare_scans, right.recording.at_start) == ("right", 5, False)
+    assert (left.stream, right.stream) == ("tcp://127.0.0.1:5560", "tcp://127.0.0.1:5580")
+    assert (left.control, right.control) == ("tcp://127.0.0.1:5561", "tcp://127.0.0.1:5581")
+
+
+def test_one_skin_of_a_file_is_chosen_by_its_name(tmp_path: Path) -> None:
+    path = config_file(tmp_path, TWO_SKINS)
+    right = load_skins(path, name="right")
+    assert isinstance(right, DaemonConfig)
+    assert (right.ports, right.stream) == (("b",), "tcp://127.0.0.1:5580")
+    with pytest.raises(ConfigError, match="use one of: left, right"):
+        load_skins(path, name="palm")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[skins]", "at least 1"),
+        ("skins = 3", "skins = 3"),
+        ("[skins.left]\nports = ['a']\nprot = 1", "[skins.left]: unknown key prot"),
+        ("[skins.left]\nprot = 1", "ports is missing"),
+        (
+            "[skins.left]\nports = ['a']\n[skins.right]\nports = ['a']",
+            "left and right both have 'a'",
+        ),
+        ("stream = 'ipc:///x'\n[skins.l]\nports = ['a']\n[skins.r]\nports = ['b']", "ipc:///x"),
+        ("proxy = 'x'\n[skins.left]\nports = ['a']", "use tcp://127.0.0.1:PORT"),
+        ("proxy = 'tcp://0.0.0.0:5570'\n[skins.left]\nports = ['a']", "`tactomo proxy` with keys"),
+        ("proxy = 'tcp://127.0.0.1:5560'\n[skins.left]\nports = ['a']", "the proxy and left both"),
+        (
+            "proxy = 'ipc:///x'\n[skins.left]\nports = ['a']\nstream = 'tcp://127.0.0.1:0'",
+            "cannot know which port",
+        ),
+    ],
+)
+def test_a_bad_file_of_skins_is_refused_with_the_reason(
+    tmp_path: Path, text: str, said: str
+) -> None:
+    path = config_file(tmp_path, text)
+    with pytest.raises(ConfigError) as caught:
+        load_skins(path)
+    assert str(path) in caught.value.cause
+    assert said in str(caught.value)
+    assert caught.value.next_step

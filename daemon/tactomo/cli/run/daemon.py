@@ -25,7 +25,7 @@ from tactomo.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from tactomo.config import DaemonConfig
+    from tactomo.config import DaemonConfig, Skins
     from tactomo.recordings.recording import Recording
 
 app = typer_app()
@@ -36,6 +36,7 @@ app = typer_app()
         "tactomo daemon --port /dev/ttyACM0",
         "tactomo daemon --sensor left_forearm --port /dev/ttyACM0 --port /dev/ttyACM1",
         "tactomo daemon /etc/tactomo/left_forearm.toml --method tikhonov",
+        "tactomo daemon robot.toml",
         "tactomo daemon --port /dev/ttyACM0 --set tare_scans=40 --set recording.maps=true",
     ),
 )
@@ -73,15 +74,18 @@ def daemon(
 ) -> None:
     """Read a skin's ports, reconstruct, and publish maps and contacts until stopped.
 
+    A configuration may describe several skins, each in a table [skins.NAME]: each gets a process,
+    and one that ends is started again. --sensor runs that one alone.
+
     At the start the skin must be free for a second: the first scans become the reference that
     changes are measured against. `tactomo tare` takes a new one at any time.
 
     `tactomo service example` shows every key of the configuration. `--set` takes each of them:
     `lossless=true`, `tare_scans=40`, `metrics=127.0.0.1:9460`, `recording.file=grasp.mcap`.
     """
-    from tactomo.config import load_config
+    from tactomo.config import DaemonConfig, load_skins
 
-    settings = load_config(
+    settings = load_skins(
         config,
         **{
             **dict(_setting(each) for each in set_ or ()),
@@ -95,7 +99,9 @@ def daemon(
             "control": control,
         },
     )
-    raise typer.Exit(_run_daemon(settings))
+    if isinstance(settings, DaemonConfig):
+        raise typer.Exit(_run_daemon(settings))
+    raise typer.Exit(_run_skins(settings))
 
 
 def _setting(text: str) -> tuple[str, Any]:
@@ -204,13 +210,26 @@ def warn_of_damage(recording: Recording) -> None:
 
 def _run_daemon(settings: DaemonConfig) -> int:
     """Serve until the daemon is stopped, and return its exit status."""
-    from tactomo.log import configure_logging
+    _prepare(settings)
     from tactomo.service.daemon import Daemon
+
+    return Daemon(settings).run()
+
+
+def _run_skins(skins: Skins) -> int:
+    """Serve several skins until stopped, and return the exit status."""
+    _prepare(skins.each[0])
+    from tactomo.cli.run.skins import SkinProcesses
+
+    return SkinProcesses(skins).run()
+
+
+def _prepare(settings: DaemonConfig) -> None:
+    from tactomo.log import configure_logging
     from tactomo.service.memory import return_freed_memory
 
     return_freed_memory()
     configure_logging(settings.log_level, settings.log_format)
-    return Daemon(settings).run()
 
 
 def _speed(text: str) -> float:

@@ -54,7 +54,8 @@ def install(
 
     An adapter that is plugged in gets a name that lasts, /dev/tactomo/NAME, by a udev rule. The
     configuration, /etc/tactomo/NAME.toml, is yours from then on: installing again leaves it alone.
-    Several skins on one computer are installed one by one, each with addresses of its own.
+    Several skins on one computer are installed one by one, each with addresses of its own, or share
+    a configuration that you write, deploy/examples/robot.toml.
     """
     from tactomo.acquisition import udev
     from tactomo.acquisition.adapters import list_adapters

@@ -1,0 +1,218 @@
+"""Several skins of one robot: a daemon each, forked from a process that has loaded what they share.
+
+Libraries and models are in memory once. A process each, because one process for all would have one
+core (Python's lock) and one fate. To its daemons the parent is what systemd is to one: they notify
+it that they are ready and get on, and one that ends or hangs is started again, with the times of
+the unit `tactomo@.service`. They stop when the parent does, however it ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import select
+import signal
+import socket
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Final
+
+import structlog
+from tactomo_models import load_description
+
+from tactomo.cli.failure import explain
+from tactomo.cli.parent_watch import stop_at_end_of
+from tactomo.config import DaemonConfig, Skins
+from tactomo.log import configure_logging
+from tactomo.service.daemon import Daemon, load_model
+from tactomo.service.supervision import STATUS_PERIOD_S, notify
+from tactomo.stream.proxy import Proxy, serve
+
+TURN_S: Final = 0.2
+RESTART_S: Final = 2.0
+WATCHDOG_S: Final = 10.0
+STOP_S: Final = 8.0
+"""Two seconds less than systemd gives the parent."""
+
+log = structlog.get_logger()
+
+
+class _Process:
+    """One child: a skin's daemon, or the proxy, which says nothing and so is not watched."""
+
+    def __init__(self, name: str, run: Callable[[], int], ear: socket.socket | None) -> None:
+        self.name = name
+        self.run = run
+        self.ear = ear
+        self.pid = 0
+        self.status = "starting"
+        self.is_ready = ear is None
+        self.has_been_ready = False
+        self.is_aborted = False
+        self.is_done = False
+        self.fed_s = 0.0
+        self.ended_s = 0.0
+
+    def hear(self) -> None:
+        """Take note of what the daemon has notified."""
+        assert self.ear is not None
+        for line in self.ear.recv(4096).decode("utf-8", "replace").splitlines():
+            key, _, value = line.partition("=")
+            if key == "READY":
+                self.is_ready = self.has_been_ready = True
+            if key == "STATUS":
+                self.status = value
+            if key in ("READY", "WATCHDOG"):
+                self.fed_s = time.monotonic()
+
+
+class SkinProcesses:
+    """The processes of several skins; `run` them until SIGTERM or SIGINT.
+
+    Args:
+        skins: their configurations, and the proxy's address.
+
+    Raises:
+        ModelError: a description or an artifact cannot be used.
+    """
+
+    def __init__(self, skins: Skins) -> None:
+        self._skins = skins
+        self._is_stopping = False
+        descriptions = dict.fromkeys(skin.description for skin in skins.each)
+        self._artifacts = {each: load_model(load_description(each)) for each in descriptions}
+
+    def run(self) -> int:
+        """Keep every skin's daemon running; return the exit status.
+
+        0 if told to stop or every daemon has come to its end, 1 if none of them ever got ready.
+        """
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._on_signal)
+        with contextlib.ExitStack() as undo:
+            folder = Path(undo.enter_context(tempfile.TemporaryDirectory(prefix="tactomo-")))
+            leash, self._leash_end = os.pipe()
+            self._leash = leash
+            processes = [self._daemon(skin, folder, undo) for skin in self._skins.each]
+            if self._skins.proxy is not None:
+                processes.append(_Process("proxy", self._run_proxy, None))
+            gc.collect()
+            gc.freeze()  # a collection in a child would copy every page that it looks through
+            undo.callback(_stop, processes)
+            for process in processes:
+                self._start(process)
+            return self._watch(processes)
+
+    def _watch(self, processes: list[_Process]) -> int:
+        is_ready, told_s = False, 0.0
+        ears = {process.ear: process for process in processes if process.ear is not None}
+        daemons = list(ears.values())
+        while not self._is_stopping:
+            for ear in select.select(list(ears), [], [], TURN_S)[0]:
+                ears[ear].hear()
+            for process in processes:
+                self._look_after(process)
+            if all(each.is_done for each in daemons):
+                return 0
+            if not any(each.pid or each.has_been_ready for each in daemons):
+                return 1
+            if not is_ready and all(each.is_ready or not each.pid for each in daemons):
+                is_ready = True
+                notify("READY=1")
+                log.info("all_ready", skins=[each.name for each in daemons])
+            if time.monotonic() - told_s > STATUS_PERIOD_S:
+                told_s = time.monotonic()
+                status = "; ".join(f"{each.name} {each.status}" for each in daemons)
+                notify("WATCHDOG=1", f"STATUS={status}")
+        notify("STOPPING=1", "STATUS=stopping")
+        return 0
+
+    def _look_after(self, process: _Process) -> None:
+        """Start a process again that has ended, after a while; end one that hangs."""
+        now_s = time.monotonic()
+        if not process.pid:
+            if not process.is_done and now_s - process.ended_s > RESTART_S:
+                self._start(process)
+            return
+        pid, code = os.waitpid(process.pid, os.WNOHANG)
+        if pid:
+            process.pid, process.ended_s = 0, now_s
+            status = os.waitstatus_to_exitcode(code)
+            process.is_done = status == 0
+            if not process.is_done:
+                process.is_ready = process.ear is None
+                process.status = "ended, is started again"
+                log.error(
+                    "skin_ended",
+                    sensor=process.name,
+                    exit_status=status,
+                    next_step=f"it is started again in {RESTART_S:g} s; the lines before say why",
+                )
+        elif process.ear is not None and process.is_ready and now_s - process.fed_s > WATCHDOG_S:
+            log.error("skin_hangs", sensor=process.name, watchdog_s=WATCHDOG_S)
+            # Its log then has where each thread was; what is stopped obeys SIGKILL alone.
+            os.kill(process.pid, signal.SIGKILL if process.is_aborted else signal.SIGABRT)
+            process.is_aborted, process.fed_s = True, now_s
+
+    def _start(self, process: _Process) -> None:
+        process.is_aborted, process.fed_s = False, time.monotonic()
+        process.pid = os.fork()
+        if process.pid:
+            return
+        status = 1
+        try:
+            for number in (signal.SIGTERM, signal.SIGINT):
+                signal.signal(number, signal.SIG_DFL)
+            os.close(self._leash_end)
+            stop_at_end_of(self._leash)
+            os.environ.pop("NOTIFY_SOCKET", None)
+            os.environ.pop("WATCHDOG_PID", None)
+            if process.ear is not None:
+                os.environ["NOTIFY_SOCKET"] = process.ear.getsockname()
+                os.environ["WATCHDOG_USEC"] = str(round(WATCHDOG_S * 1e6))
+            status = process.run()
+        except Exception as error:
+            words = explain(error)
+            if words is None:
+                log.exception("failed")
+            else:
+                log.error("failed", detail=words)
+        finally:
+            os._exit(status)
+
+    def _daemon(self, skin: DaemonConfig, folder: Path, undo: contextlib.ExitStack) -> _Process:
+        ear = undo.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
+        ear.bind(str(folder / skin.name))
+
+        def run() -> int:
+            configure_logging(skin.log_level, skin.log_format, skin.name)
+            return Daemon(skin, artifact=self._artifacts[skin.description]).run()
+
+        return _Process(skin.name, run, ear)
+
+    def _run_proxy(self) -> int:
+        serve(Proxy([skin.stream for skin in self._skins.each], str(self._skins.proxy)))
+        return 0
+
+    def _on_signal(self, _: int, __: FrameType | None) -> None:
+        self._is_stopping = True
+
+
+def _stop(processes: list[_Process]) -> None:
+    """Have every process stop, and wait for that; kill the one that does not."""
+    running = [process for process in processes if process.pid]
+    for process in running:
+        os.kill(process.pid, signal.SIGTERM)
+    deadline_s = time.monotonic() + STOP_S
+    while running:
+        running = [each for each in running if not os.waitpid(each.pid, os.WNOHANG)[0]]
+        if running and time.monotonic() > deadline_s:
+            for process in running:
+                os.kill(process.pid, signal.SIGKILL)
+                os.waitpid(process.pid, 0)
+            return
+        time.sleep(0.01)

@@ -1,0 +1,160 @@
+"""`tactomo daemon` with several skins in one configuration: a process each, on real ports."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from daemon_process import DaemonProcess
+from processes import children_of, is_running
+from pty_skin import Playing, PtySkin, Volts, still
+from tactomo_client import request, subscribe
+from tactomo_models import SkinSimulator, load_description, load_or_build_artifact
+from tactomo_protocol import Channel
+from waiting import PATIENCE_S, wait_until
+
+NAMES = ("left", "right")
+SHARED_MB = 50.0
+"""Libraries alone are more; a process that shares nothing but its programs' files has 0."""
+
+
+class Robot:
+    """Two skins that rest, and the command that serves both."""
+
+    def __init__(self, folder: Path, rest: Volts, **config: Any) -> None:
+        description = load_description("paper_square")
+        self.skins = {name: PtySkin(folder / f"lines-{name}", description, 1) for name in NAMES}
+        self.playing = [Playing(skin, still(rest), 20.0) for skin in self.skins.values()]
+        self.stream = {name: f"ipc://{folder}/{name}.stream" for name in NAMES}
+        self.process = DaemonProcess(
+            folder,
+            [],
+            ready=False,
+            skins={
+                name: {"ports": skin.paths, "stream": self.stream[name]}
+                for name, skin in self.skins.items()
+            },
+            **config,
+        )
+
+    def wait_ready(self) -> None:
+        wait_until(lambda: self.process.told("all_ready"), "all skins")
+
+    def ready(self, name: str) -> list[dict[str, Any]]:
+        """What the daemon of a skin said each time that it was ready."""
+        return [event for event in self.process.told("ready") if event.get("sensor") == name]
+
+    def status(self, name: str) -> dict[str, Any]:
+        """The status of a skin, from its own control socket."""
+        return request("status", self.ready(name)[-1]["control"], PATIENCE_S)
+
+    def close(self) -> None:
+        self.process.kill()
+        for playing in self.playing:
+            playing.stop()
+        for skin in self.skins.values():
+            skin.close()
+
+
+@pytest.fixture(scope="session")
+def rest() -> Volts:
+    description = load_description("paper_square")
+    load_or_build_artifact(description)
+    volts = SkinSimulator(description, 4e-3).voltages(())
+    return {Channel[name.upper()]: values for name, values in volts.items()}
+
+
+@pytest.fixture
+def start(tmp_path: Path, rest: Volts) -> Iterator[Callable[..., Robot]]:
+    robots: list[Robot] = []
+
+    def begin(**config: Any) -> Robot:
+        robots.append(Robot(tmp_path, rest, **config))
+        return robots[-1]
+
+    yield begin
+    for robot in robots:
+        robot.close()
+
+
+def shared_mb(pid: int) -> float:
+    """Memory that a process has written to, or its parent before the fork, and still shares."""
+    lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    (line,) = (each for each in lines if each.startswith("Shared_Dirty:"))
+    return int(line.split()[1]) / 1024
+
+
+def test_each_skin_is_served_and_found_by_its_name(
+    start: Callable[..., Robot], tmp_path: Path
+) -> None:
+    proxy = f"ipc://{tmp_path}/all.stream"
+    robot = start(proxy=proxy)
+    robot.wait_ready()
+    for name in NAMES:
+        for address in (robot.stream[name], proxy):
+            with subscribe(name, address=address) as frames:
+                assert frames.wait(PATIENCE_S) is not None
+        status = robot.status(name)
+        assert status["sensor"] == name
+        assert status["process"]["pid"] in children_of(robot.process.popen.pid)
+        assert shared_mb(status["process"]["pid"]) > SHARED_MB
+    told = subprocess.run(
+        [sys.executable, "-m", "tactomo.cli", "status", "-s", "right", "--stream", proxy, "--json"],
+        capture_output=True,
+        check=True,
+        timeout=PATIENCE_S,
+    )
+    assert json.loads(told.stdout)["sensor"] == "right"
+
+
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGKILL]
+)
+def test_all_of_them_end_with_the_command(start: Callable[..., Robot], number: int) -> None:
+    robot = start()
+    robot.wait_ready()
+    children = children_of(robot.process.popen.pid)
+    assert len(children) == len(NAMES)
+    robot.process.signal(number)
+    assert robot.process.popen.wait(PATIENCE_S) == (0 if number != signal.SIGKILL else -number)
+    wait_until(lambda: not any(map(is_running, children)), "the children's end")
+
+
+def test_one_that_dies_is_started_again_and_the_other_goes_on(
+    start: Callable[..., Robot],
+) -> None:
+    robot = start()
+    robot.wait_ready()
+    before = {name: robot.status(name) for name in NAMES}
+    subprocess.run(["kill", "-9", str(before["left"]["process"]["pid"])], check=True)
+    wait_until(lambda: len(robot.ready("left")) == 2, "the daemon's second start")
+    assert robot.process.told("skin_ended")[0]["sensor"] == "left"
+    assert robot.status("left")["session"] != before["left"]["session"]
+    assert robot.status("right")["session"] == before["right"]["session"]
+
+
+@pytest.mark.slow
+def test_one_that_hangs_is_killed_and_started_again(start: Callable[..., Robot]) -> None:
+    robot = start()
+    robot.wait_ready()
+    subprocess.run(["kill", "-STOP", str(robot.status("left")["process"]["pid"])], check=True)
+    wait_until(lambda: len(robot.ready("left")) == 2, "the daemon's second start")
+    assert robot.process.told("skin_hangs")[0]["sensor"] == "left"
+
+
+def test_where_none_can_start_the_command_fails_with_the_reasons(
+    tmp_path: Path,
+) -> None:
+    skins = {name: {"ports": [f"/absent/{name}"]} for name in NAMES}
+    process = DaemonProcess(tmp_path, [], ready=False, skins=skins)
+    assert process.popen.wait(PATIENCE_S) == 1
+    failures = process.told("failed")
+    assert {event["sensor"] for event in failures} == set(NAMES)
+    assert all(f"/absent/{event['sensor']}" in event["detail"] for event in failures)
+    assert not any("exception" in event for event in process.log())
