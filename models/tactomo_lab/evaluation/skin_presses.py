@@ -2,8 +2,8 @@
 
 Nobody says how such a skin lies in the robot's frame, nor which way its electrodes run, so an
 affine map from image to robot is fitted to some presses and judged on others (cross-validation in
-ten folds). Beside it stand what needs no physics: a regression from voltages to positions, and
-the mean position.
+ten folds). Beside it stand what needs no physics: what the presses themselves teach, and the mean
+position.
 
 The set's converter turns out to read voltages of one sign only: of a pair that is driven both
 ways, each voltage changes with the press in one of the two scans and is noise in the other. Which
@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from tactomo_models.archive import read_arrays
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
+from tactomo_models.calibration.press_regression import PressRegression
 from tactomo_models.errors import DataError
 from tactomo_models.physics.artifact import Artifact, load_or_build_artifact
 from tactomo_models.physics.forward import ForwardModel
@@ -30,7 +31,6 @@ Estimator = Callable[[IntArray, IntArray], FloatArray]
 FOLDS = 10
 SEED = 0  # of the folds
 WEIGHTS = (0.01, 0.1, 1.0, 10.0, 100.0)  # regularisation over the data's mean power, to choose from
-RIDGE_WEIGHTS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 CUT_HEIGHT = 0.5  # of the image's peak, above which the centroid is taken
 
 
@@ -128,9 +128,9 @@ def localise(presses: Presses, description: SensorDescription) -> list[Localisat
     def mean(train: IntArray, test: IntArray) -> FloatArray:
         return np.repeat(positions[train].mean(axis=0)[None], len(test), axis=0)
 
-    def ridge(train: IntArray, test: IntArray) -> FloatArray:
-        candidates = [_ridge(presses, weight) for weight in RIDGE_WEIGHTS]
-        return _best(candidates, positions, train)(train, test)
+    def taught(train: IntArray, test: IntArray) -> FloatArray:
+        learnt = PressRegression(presses.changes[train], positions[train] * 1e3)
+        return learnt.locate(presses.changes[test]).xy_mm * 1e-3
 
     def image(noser: bool, halves: bool) -> Estimator:
         def estimate(train: IntArray, test: IntArray) -> FloatArray:
@@ -144,7 +144,7 @@ def localise(presses: Presses, description: SensorDescription) -> list[Localisat
         "Tikhonov image": image(noser=False, halves=True),
         "NOSER image, all voltages": image(noser=True, halves=False),
         "NOSER image": image(noser=True, halves=True),
-        "ridge regression (no physics)": ridge,
+        "taught by the other presses (no physics)": taught,
     }
     return [
         Localisation(name, _cross_validated(method, positions)) for name, method in methods.items()
@@ -176,20 +176,6 @@ def _best(candidates: list[Estimator], positions: FloatArray, train: IntArray) -
         return float(np.median(np.linalg.norm(off, axis=1)))
 
     return min(candidates, key=median)
-
-
-def _ridge(presses: Presses, weight: float) -> Estimator:
-    """Linear regression from standardised voltages to positions."""
-
-    def estimate(train: IntArray, test: IntArray) -> FloatArray:
-        fitted, middle = presses.changes[train], presses.positions_m[train].mean(axis=0)
-        mean, spread = fitted.mean(axis=0), fitted.std(axis=0) + 1e-30
-        x = (fitted - mean) / spread
-        penalty = weight * len(x) * np.eye(x.shape[1])
-        slope = np.linalg.solve(x.T @ x + penalty, x.T @ (presses.positions_m[train] - middle))
-        return np.asarray((presses.changes[test] - mean) / spread @ slope + middle)
-
-    return estimate
 
 
 class _Imager:

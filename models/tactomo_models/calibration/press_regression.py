@@ -1,0 +1,285 @@
+"""Where a press is, learnt on one skin from presses at known places.
+
+Voltages depend smoothly on where a skin is pressed. A Gaussian process learns that dependence, of
+two inputs and M outputs, from few presses; a new press is where its voltages are likely, by Bayes'
+rule on a grid of places. This takes far fewer presses than a regression from M voltages to a place
+does. A second Gaussian process learns what is then still wrong, as far as the presses tell: of the
+first process, or of a model of the skin.
+
+Voltages are taken at unit length: how hard a press is scales them, and where it is turns them.
+
+Source of both: Rasmussen & Williams, "Gaussian Processes for Machine Learning" (2006), equations
+2.25, 2.26, 5.8 (hyperparameters by marginal likelihood) and 5.12 (leave-one-out residuals).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple, Self
+
+import numpy as np
+
+from tactomo_models.arrays import BoolArray, FloatArray
+from tactomo_models.errors import DataError
+
+MIN_PRESSES: Final = 20
+"""Below it, five folds leave no four presses each to judge by."""
+FOLDS: Final = 5
+GRID: Final = 32
+"""Places along the longer side: 2.5 mm on a skin of 80 mm. With 40 the median falls by 1 %."""
+REACH: Final = 3.0
+"""Median distances between neighbouring presses, within which a place counts as taught."""
+LENGTHS: Final = (0.075, 0.11, 0.16, 0.23, 0.33)
+"""Length scales of the voltages over the skin, in shares of its longer side, to choose from."""
+NOISES: Final = tuple(np.geomspace(3e-3, 3.0, 10).tolist())
+"""Variances of noise over those of the signal, to choose from."""
+SHRINKAGE: Final = 30.0
+"""Presses over which the noise's covariance outweighs its diagonal. 15 or 60: medians by 1 %."""
+TEMPERING: Final = 0.4
+"""Exponent of the likelihood: residuals are not Gaussian. From 0.3 to 1 medians differ by 2 %."""
+CORRECTION_SCALES: Final = (0.1, 0.3, 1.0, 3.0, 10.0)
+"""Squared length scales of the correction, over the median squared distance of presses."""
+CORRECTION_NOISES: Final = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
+CORRECTION_PLACE: Final = 1 / 3
+"""Share of the skin's longer side that counts as much as the spread of the unit voltages."""
+CORRECTION_RANK: Final = 100
+"""Eigenvectors that tell its variance; the others would lower it by less than 1 %."""
+UNLIKE: Final = 1.5
+"""Times the misfit of the least explained presses (99 %), beyond which none like it was taught."""
+
+
+class Located(NamedTuple):
+    """Where T presses are.
+
+    Attributes:
+        xy_mm: (T, 2).
+        sigma_mm: (T,) standard uncertainty of each coordinate.
+        is_taught: (T,) whether presses like it were taught; where not, the place is a guess.
+    """
+
+    xy_mm: FloatArray
+    sigma_mm: FloatArray
+    is_taught: BoolArray
+
+
+class PressRegression:
+    """Locates presses on the skin whose presses it was made of.
+
+    Args:
+        changes: (N, M) voltage changes under each press, on any one scale.
+        xy_mm: (N, 2) where each was.
+        guess_mm: (N, 2) where a model of the skin has them, to be corrected; if None, the voltages
+            alone tell.
+
+    Raises:
+        DataError: there are too few presses, or they hold what is no number or no press.
+    """
+
+    def __init__(
+        self, changes: FloatArray, xy_mm: FloatArray, guess_mm: FloatArray | None = None
+    ) -> None:
+        if len(changes) < MIN_PRESSES:
+            raise DataError(
+                f"{len(changes)} presses are too few to learn from; give {MIN_PRESSES} or more"
+            )
+        if not np.isfinite(xy_mm).all() or np.ptp(xy_mm, axis=0).max() <= 0:
+            raise DataError("the presses are all at one place, or at none; give where each was")
+        unit, log_size = _unit(changes)
+        self._field, found, misfit = _VoltageField.cross_validated(unit, xy_mm)
+        self.errors_mm = np.linalg.norm((found if guess_mm is None else guess_mm) - xy_mm, axis=1)
+        self._has_guess = guess_mm is not None
+        self._limit = UNLIKE * float(np.quantile(misfit, 0.99))
+        self._scale = np.concatenate(
+            [
+                np.full(unit.shape[1], 1 / np.sqrt(unit.var(axis=0).sum() + 1e-30)),
+                [0.3 / (log_size.std() + 1e-30)],  # how hard tells less than where
+                np.full(2, 1 / (CORRECTION_PLACE * np.ptp(xy_mm, axis=0).max())),
+            ]
+        )
+        guess = found if guess_mm is None else guess_mm
+        self._correction = _Correction.fitted(
+            np.column_stack([unit, log_size, guess]) * self._scale, xy_mm - guess
+        )
+
+    def locate(self, changes: FloatArray, guess_mm: FloatArray | None = None) -> Located:
+        """Locate T presses by their changes (T, M), and where the model has them (T, 2)."""
+        unit, log_size = _unit(changes)
+        found, misfit = self._field.locate(unit)
+        guess = guess_mm if self._has_guess and guess_mm is not None else found
+        seen = np.column_stack([unit, log_size, guess]) * self._scale
+        correction, variance = self._correction.at(seen)
+        return Located(guess + correction, np.sqrt(variance), misfit <= self._limit)
+
+
+def _unit(changes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Changes (T, M) at unit length, and the logarithms (T,) of their lengths."""
+    size = np.linalg.norm(changes, axis=1)
+    if not (np.isfinite(size) & (size > 0)).all():
+        first = int(np.flatnonzero(~(np.isfinite(size) & (size > 0)))[0])
+        raise DataError(
+            f"press {first} changes no voltage, or holds what is no number; leave it out"
+        )
+    return changes / size[:, None], np.log(size)
+
+
+def _squared_distances(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Of each row of one (T, K) from each row of the other (N, K), as (T, N)."""
+    squares = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1)
+    return np.asarray(np.maximum(squares - 2.0 * (a @ b.T), 0.0))
+
+
+@dataclass(frozen=True)
+class _Weights:
+    """What a Gaussian process has learnt of N outputs, as far as one kernel matrix tells.
+
+    Attributes:
+        weights: (N, K) that the kernel's rows are multiplied by.
+        residual: (N, K) leave-one-out residuals.
+        likelihood: logarithm of the marginal likelihood, each output's variance at its best.
+        variance: (K,) of the signal.
+    """
+
+    weights: FloatArray
+    residual: FloatArray
+    likelihood: float
+    variance: FloatArray
+
+    @classmethod
+    def of(cls, values: FloatArray, vectors: FloatArray, y: FloatArray, noise: float) -> Self:
+        """Solve with a kernel matrix given by its eigenvalues and eigenvectors."""
+        turned = vectors.T @ y
+        inverse = 1 / (values + noise)
+        variance = np.asarray(inverse @ turned**2) / len(y) + 1e-30
+        log_likelihood = len(y) * np.log(variance) - np.log(inverse).sum()
+        weights = vectors @ (inverse[:, None] * turned)
+        residual = weights / (vectors**2 @ inverse)[:, None]
+        return cls(weights, residual, -0.5 * float(log_likelihood.sum()), variance)
+
+
+class _VoltageField:
+    """Unit voltages (M,) as a smooth function of the place, with the noise about it.
+
+    Attributes:
+        length_mm: scale over which the voltages change.
+        noise: variance of the noise over the signal's.
+    """
+
+    def __init__(self, unit: FloatArray, xy_mm: FloatArray, length_mm: float, noise: float) -> None:
+        self.length_mm, self.noise = length_mm, noise
+        self._mean = unit.mean(axis=0)
+        values, vectors = _spectrum(_squared_distances(xy_mm, xy_mm) / length_mm**2)
+        solved = _Weights.of(values, vectors, unit - self._mean, noise)
+        self._grid = _taught_places(xy_mm)
+        kernel = np.exp(-0.5 * _squared_distances(self._grid, xy_mm) / length_mm**2)
+        on_grid = kernel @ solved.weights + self._mean
+        self._whitener = _whitener(solved.residual)
+        self._white_grid = on_grid @ self._whitener
+        self._grid_squares = (self._white_grid**2).sum(axis=1)
+
+    def locate(self, unit: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mean places (T, 2), and how far from the nearest place's voltages (T,), rms."""
+        white = unit @ self._whitener
+        squares = self._grid_squares - 2.0 * (white @ self._white_grid.T)
+        least = squares.min(axis=1)
+        weight = np.exp(-0.5 * TEMPERING * (squares - least[:, None]))
+        xy_mm = weight @ self._grid / weight.sum(axis=1)[:, None]
+        misfit = np.sqrt(np.maximum(least + (white**2).sum(axis=1), 0.0) / unit.shape[1])
+        return xy_mm, misfit
+
+    @classmethod
+    def cross_validated(
+        cls, unit: FloatArray, xy_mm: FloatArray
+    ) -> tuple[Self, FloatArray, FloatArray]:
+        """Learn from N presses; also where each is by the others (N, 2), and its misfit (N,).
+
+        The folds are runs of presses in order: what drifts is not in the others.
+        """
+        length_mm, noise = _best_scales(unit, xy_mm)
+        fold = np.arange(len(unit)) * FOLDS // len(unit)
+        parts = [
+            cls(unit[fold != k], xy_mm[fold != k], length_mm, noise).locate(unit[fold == k])
+            for k in range(FOLDS)
+        ]
+        places, misfit = (np.concatenate(each) for each in zip(*parts, strict=True))
+        return cls(unit, xy_mm, length_mm, noise), places, misfit
+
+
+def _whitener(residual: FloatArray) -> FloatArray:
+    """Matrix (M, M) that makes N residuals (N, M) even, their covariance shrunk to its diagonal."""
+    covariance = residual.T @ residual / len(residual)
+    power = np.diag(covariance)
+    shrinkage = min(0.5, SHRINKAGE / len(residual))
+    floor = 1e-6 * power.max() + 1e-30  # a dead channel has no noise at all
+    covariance = (1 - shrinkage) * covariance + np.diag(shrinkage * power + floor)
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)).T)
+
+
+def _spectrum(squared: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Eigenvalues and eigenvectors of the squared-exponential kernel at squared distances."""
+    values, vectors = np.linalg.eigh(np.exp(-0.5 * squared))
+    return np.maximum(values, 0.0), vectors
+
+
+def _best_scales(unit: FloatArray, xy_mm: FloatArray) -> tuple[float, float]:
+    """Length scale in mm and noise of the largest marginal likelihood."""
+    squared, y = _squared_distances(xy_mm, xy_mm), unit - unit.mean(axis=0)
+    tried = []
+    for length_mm in np.multiply(LENGTHS, np.ptp(xy_mm, axis=0).max()).tolist():
+        spectrum = _spectrum(squared / length_mm**2)
+        tried += [
+            (_Weights.of(*spectrum, y, noise).likelihood, length_mm, noise) for noise in NOISES
+        ]
+    _, length_mm, noise = max(tried)
+    return length_mm, noise
+
+
+def _taught_places(xy_mm: FloatArray) -> FloatArray:
+    """A grid of places (P, 2) as far as presses (N, 2) reach."""
+    squared = _squared_distances(xy_mm, xy_mm)
+    apart = np.where(squared > 1e-6 * squared.max(), squared, np.inf)  # one place twice is one
+    reach_mm = REACH * float(np.sqrt(np.median(apart.min(axis=1))))
+    low, high = xy_mm.min(axis=0), xy_mm.max(axis=0)
+    step_mm = float((high - low).max()) / GRID
+    axes = [np.arange(a, b + step_mm, step_mm) for a, b in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    is_near = _squared_distances(grid, xy_mm).min(axis=1) <= max(reach_mm, step_mm) ** 2
+    return np.asarray(grid[is_near])
+
+
+class _Correction(NamedTuple):
+    """What is still wrong, learnt from N presses.
+
+    Attributes:
+        seen: (N, K) inputs.
+        scale: squared length scale.
+        solved: weights of the kernel's rows.
+        noise: variance of the noise over the signal's.
+        factor: (N, R) whose product with the kernel's rows, squared, is what is known.
+    """
+
+    seen: FloatArray
+    scale: float
+    solved: _Weights
+    noise: float
+    factor: FloatArray
+
+    @classmethod
+    def fitted(cls, seen: FloatArray, error_mm: FloatArray) -> Self:
+        """Learn from inputs (N, K) and errors (N, 2); scale and noise by marginal likelihood."""
+        squared = _squared_distances(seen, seen)
+        middle, top = float(np.median(squared)), slice(-CORRECTION_RANK, None)
+        tried = []
+        for share in CORRECTION_SCALES:
+            values, vectors = _spectrum(squared / (share * middle))
+            for noise in CORRECTION_NOISES:
+                solved = _Weights.of(values, vectors, error_mm, noise)
+                factor = vectors[:, top] / np.sqrt(values[top] + noise)
+                tried.append(cls(seen, share * middle, solved, noise, factor))
+        return max(tried, key=lambda each: each.solved.likelihood)
+
+    def at(self, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The corrections (T, 2) in mm, and the variance (T,) of each coordinate in mm²."""
+        kernel = np.exp(-0.5 * _squared_distances(seen, self.seen) / self.scale)
+        known = ((kernel @ self.factor) ** 2).sum(axis=1)
+        variance = self.solved.variance.mean() * (1.0 + self.noise - known)
+        return kernel @ self.solved.weights, variance
