@@ -5,6 +5,7 @@ BIN := $(VENV)/bin
 RUN_READY := $(VENV)/.ready-run
 READY := $(VENV)/.ready
 TRAIN_READY := $(VENV)/.ready-train
+DOCS_READY := $(VENV)/.ready-docs
 SHELL := bash
 .SHELLFLAGS := -eo pipefail -c
 
@@ -15,11 +16,12 @@ SHOW := sed -un 's/^Collecting \([^=; ]*\).*/  \1/p; s/^Installing.*/  unpacking
 BUILD := --quiet --no-build-isolation --no-deps
 LAB := models/tactomo_lab
 DIST := dist
+SITE = $(DIST)/docs/$(shell sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)
 
 LOCKED := pyproject.toml --universal --python-version 3.11 --generate-hashes \
   --no-emit-package tactomo-client --no-emit-package tactomo --no-emit-package tactomo-lab
 
-.PHONY: help setup run test test-all test-long test-train faults soak firmware fuzz lint format bench wheels deb lock clean
+.PHONY: help setup run test test-all test-long test-train faults soak firmware fuzz lint format bench docs wheels deb lock clean
 
 help:            ## list these targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -71,6 +73,10 @@ format: $(READY) ## let ruff rewrite what it can
 bench: $(READY)  ## latency and time per frame on this machine
 	$(BIN)/tactomo bench $(ARGS)
 
+# A warning fails it: a link that leads nowhere, a page that docs/README.md does not name.
+docs: $(DOCS_READY)  ## the documentation as a site: dist/docs/VERSION/index.html
+	$(BIN)/python -m sphinx -W --keep-going -q -E -d $(VENV)/doctrees -c docs . $(SITE)
+
 # The wheels are made of the source archives, so that these are known to be whole.
 wheels: $(RUN_READY)  ## wheels and source archives of every distribution, in dist/
 	rm -f $(DIST)/*.whl $(DIST)/*.tar.gz
@@ -85,6 +91,8 @@ deb: $(READY)    ## the Debian package, for this distribution and processor, in 
 lock:            ## refresh the lock files (needs uv on the PATH)
 	uv pip compile $(LOCKED) --extra dev --group build -o requirements.lock
 	uv pip compile $(LOCKED) --group build -c requirements.lock -o requirements-run.lock
+	uv pip compile --group docs --universal --python-version 3.11 --generate-hashes \
+	  -c requirements.lock -o requirements-docs.lock
 	uv pip compile $(LAB)/$(LOCKED) --extra train -c requirements.lock -c requirements-torch.txt \
 	  --no-emit-package torch -o requirements-train.lock
 
@@ -105,6 +113,11 @@ $(READY): $(RUN_READY) requirements.lock $(LAB)/pyproject.toml
 	@echo "setting up $(VENV): what tests, and the laboratory"
 	@$(INSTALL) --require-hashes -r requirements.lock | $(SHOW)
 	@$(INSTALL) $(BUILD) -e $(LAB)
+	@touch $@
+
+$(DOCS_READY): $(READY) requirements-docs.lock
+	@echo "setting up $(VENV): what builds the documentation's site"
+	@$(INSTALL) --require-hashes -r requirements-docs.lock | $(SHOW)
 	@touch $@
 
 # Torch comes last, when all it needs has come with its hash. Where its own index cannot be reached,

@@ -1,5 +1,7 @@
 """The sensor's physics and the reconstruction methods: from scans to pressure maps and contacts.
 
+::
+
     description = load_description("paper_square")
     reconstructor = Reconstructor(description)
     reconstructor.set_reference(Reference.from_scans(magnitude_scans, structure_scans))

@@ -47,10 +47,9 @@ def test_a_program_is_short_and_says_how_it_is_run(program: Path) -> None:
 def test_five_programs_are_listed_where_a_reader_looks() -> None:
     names = {program.name for program in PROGRAMS}
     assert len(names) == 5
-    assert (
-        set(re.findall(r"examples/(\w+\.py)", (repository() / "docs/python.md").read_text()))
-        == names
-    )
+    for page in ("docs/python.md", "docs/gallery.md"):
+        listed = re.findall(r"examples/(\w+\.py)", (repository() / page).read_text("utf-8"))
+        assert set(listed) == names, page
 
 
 def test_presses_are_simulated_found_and_plotted(run: Run, tmp_path: Path) -> None:

@@ -183,7 +183,7 @@ class BudgetInForce:
     """How long a frame may take from now on."""
 
     budget_ms: float | None
-    """None: the method's own."""
+    """None for the method's own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +191,7 @@ class CalibrationInForce:
     """What changes are turned into pressures by from now on."""
 
     calibration: Calibration | None
-    """None: the table of the sensor's description."""
+    """None for the table of the sensor's description."""
 
 
 @dataclass(slots=True)

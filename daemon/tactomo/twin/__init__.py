@@ -5,6 +5,8 @@ device to work against that can be pressed, disturbed and unplugged. The daemon 
 from hardware, except by the device's name, which starts with "twin", and by the SIMULATED flag of
 every scan.
 
+::
+
     twin = Twin(TwinConfig(load_description("paper_square")))
     twin.start()
     print(twin.ports, twin.control)

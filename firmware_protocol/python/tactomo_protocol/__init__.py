@@ -1,5 +1,7 @@
 """Wire protocol v1 between a tactile skin's firmware and its host: packets, encoder, decoder.
 
+::
+
     decoder = Decoder()                      # one for each port
     for packet in decoder.feed(port.read()):
         match packet:
