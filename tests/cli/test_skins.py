@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -10,28 +11,41 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from daemon_process import DaemonProcess
 from processes import children_of, is_running
-from pty_skin import Playing, PtySkin, Volts, still
+from pty_skin import Playing, PtySkin, Volts, moving, still
 from tactomo_client import request, subscribe
-from tactomo_models import SkinSimulator, load_description, load_or_build_artifact
+from tactomo_models import (
+    Press,
+    SensorDescription,
+    SkinSimulator,
+    load_description,
+    load_or_build_artifact,
+)
 from tactomo_protocol import Channel
 from waiting import PATIENCE_S, wait_until
 
 NAMES = ("left", "right")
+STEPS = 12
+"""Of the path on which a contact jumps: each is far from the one before."""
 SHARED_MB = 50.0
 """Libraries alone are more; a process that shares nothing but its programs' files has 0."""
 
 
 class Robot:
-    """Two skins that rest, and the command that serves both."""
+    """Skins that rest, and the command that serves them."""
 
-    def __init__(self, folder: Path, rest: Volts, **config: Any) -> None:
+    def __init__(
+        self, folder: Path, rest: Volts, names: tuple[str, ...] = NAMES, **config: Any
+    ) -> None:
         description = load_description("paper_square")
-        self.skins = {name: PtySkin(folder / f"lines-{name}", description, 1) for name in NAMES}
-        self.playing = [Playing(skin, still(rest), 20.0) for skin in self.skins.values()]
-        self.stream = {name: f"ipc://{folder}/{name}.stream" for name in NAMES}
+        self.skins = {name: PtySkin(folder / f"lines-{name}", description, 1) for name in names}
+        self.playing: dict[str, Playing] = {}
+        for name in names:
+            self.play(name, still(rest), 20.0)
+        self.stream = {name: f"ipc://{folder}/{name}.stream" for name in names}
         self.process = DaemonProcess(
             folder,
             [],
@@ -42,6 +56,22 @@ class Robot:
             },
             **config,
         )
+
+    def play(self, name: str, volts: Iterator[Volts], rate_hz: float) -> None:
+        """Have a skin say scans from now on."""
+        self.playing[name] = Playing(self.skins[name], volts, rate_hz)
+
+    def stop_and_count(self, name: str) -> int:
+        """Have a skin say nothing more, and return how many scans its daemon has received."""
+        self.playing[name].stop()
+        received = [-1]
+
+        def is_at_rest(status: dict[str, Any]) -> bool:
+            received.append(status["scan_tally"]["received"])
+            return received[-1] == received[-2] and not status["scan_tally"]["waiting"]
+
+        self.wait(name, is_at_rest)
+        return received[-1]
 
     def wait_ready(self) -> None:
         wait_until(lambda: self.process.told("all_ready"), "all skins")
@@ -54,9 +84,13 @@ class Robot:
         """The status of a skin, from its own control socket."""
         return request("status", self.ready(name)[-1]["control"], PATIENCE_S)
 
+    def wait(self, name: str, condition: Callable[[dict[str, Any]], Any]) -> None:
+        """Wait for a status of a skin."""
+        wait_until(lambda: condition(self.status(name)), f"a status of {name}", step_s=0.2)
+
     def close(self) -> None:
         self.process.kill()
-        for playing in self.playing:
+        for playing in self.playing.values():
             playing.stop()
         for skin in self.skins.values():
             skin.close()
@@ -81,6 +115,15 @@ def start(tmp_path: Path, rest: Volts) -> Iterator[Callable[..., Robot]]:
     yield begin
     for robot in robots:
         robot.close()
+
+
+def pressed(description: SensorDescription) -> list[Volts]:
+    """Voltages of two contacts at the steps of a path on which they jump."""
+    skin = SkinSimulator(description, 4e-3)
+    angles = [5 * 2 * np.pi * step / STEPS for step in range(STEPS)]
+    places = [(0.035 * float(np.cos(a)), 0.035 * float(np.sin(a))) for a in angles]
+    scenes = [skin.voltages((Press(x, y, 180.0), Press(-x, -y, 170.0))) for x, y in places]
+    return [{Channel[k.upper()]: v for k, v in scene.items()} for scene in scenes]
 
 
 def shared_mb(pid: int) -> float:
@@ -137,6 +180,42 @@ def test_one_that_dies_is_started_again_and_the_other_goes_on(
     assert robot.process.told("skin_ended")[0]["sensor"] == "left"
     assert robot.status("left")["session"] != before["left"]["session"]
     assert robot.status("right")["session"] == before["right"]["session"]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_busy_skins_degrade_and_starve_no_still_one(
+    start: Callable[..., Robot], rest: Volts
+) -> None:
+    """Three skins on which contacts jump and loops on every core; the fourth skin rests."""
+    busy = ("one", "two", "three")
+    robot = start(names=(*busy, "still"))
+    robot.wait_ready()
+    for name in (*busy, "still"):
+        robot.wait(name, lambda status: status["reference"])
+    received = {name: robot.stop_and_count(name) for name in (*busy, "still")}
+    loops = [
+        subprocess.Popen([sys.executable, "-c", "while True: pass"])
+        for _ in range(os.cpu_count() or 1)
+    ]
+    try:
+        robot.play("still", still(rest), 20.0)
+        for name in busy:
+            robot.play(name, moving(pressed(load_description("paper_square"))), 50.0)
+        before = robot.status("still")
+        for name in busy:
+            robot.wait(name, lambda status: "processor_shared" in status["events"]["counts"])
+        after = robot.status("still")
+    finally:
+        for loop in loops:
+            loop.kill()
+            loop.wait()
+    made = after["frames"] - before["frames"]
+    assert made > 4 * (after["dropped_scans"] - before["dropped_scans"])
+    for name, before_it in received.items():
+        assert robot.stop_and_count(name) - before_it == 2 * len(robot.playing[name].sent)
+        tally = robot.status(name)["scan_tally"]
+        assert tally.pop("received") == sum(tally.values())
 
 
 @pytest.mark.slow

@@ -211,6 +211,8 @@ class Plan:
     tier: str = ""
     modelled_ms: float | None = None
     """Work, in milliseconds of a 2.5 GHz core."""
+    share: float = 1.0
+    """Of the time that was asked for; less than 1 while others take the processor."""
     source: str = ""
     """Where the measure between time and work comes from, in words."""
 

@@ -41,6 +41,7 @@ from tactomo.imaging.frames import (
 )
 from tactomo.imaging.kept_reference import KeptReference, KnownSkin
 from tactomo.imaging.method_in_force import Effort, MethodInForce
+from tactomo.imaging.processor_share import ProcessorShare
 from tactomo.imaging.tare import Taring
 from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording import calibration_text
@@ -123,6 +124,8 @@ class Imaging:
         self._publisher = publisher
         self._on_event = on_event
         self._contacts = 0  # in the last frame
+        self._took_s: tuple[float, float] | None = None  # processor time and time; None if quiet
+        self._processor = ProcessorShare()
         self._failure_limit = RateLimit()
         self._refusal_limit = RateLimit(REFUSAL_PERIOD_S)
 
@@ -230,6 +233,30 @@ class Imaging:
             self._publish_frame(dual, timing, frame)
         self.taring.add(volts, lost, self._contacts)
 
+    def share_processor(self, dropped: int) -> None:
+        """Give frames less time where others take the processor, and more where they do no longer.
+
+        To be called after `process`, with how many dual scans were left out since the start.
+        """
+        if self._took_s is None:
+            return
+        processor, before = self._processor, self._processor.of_time
+        if not processor.note(*self._took_s, dropped, time.monotonic()):
+            return
+        self.method.give_share(processor.of_time)
+        method, share = self.method.effective.method, processor.of_time
+        if share < before:
+            self._on_event(
+                "processor_shared",
+                "warning",
+                f"others take the processor: this skin got {processor.of_core:.0%} of a core while "
+                f"it computed, and frames get {share:.0%} of their time, by {method}",
+                "give the daemon more of the processor, or fewer skins; it takes more by itself "
+                "once it can",
+            )
+        elif share == 1:
+            self._on_event("processor_free", "info", f"frames get all of their time, by {method}")
+
     def _judge_dispute(self, frame: Reconstruction) -> Reconstruction:
         """Flag a frame, unless it settles the dispute: the skin is again as it was known."""
         if frame.tier == "quiet" and TOUCHES_SEEN.issuperset(frame.flags.names()):
@@ -256,7 +283,8 @@ class Imaging:
         self, volts: Volts, saturated: list[Channel], *, is_exact: bool
     ) -> Reconstruction | None:
         """Make a frame; where it is exact, against the reference that the recording had then."""
-        started_s = time.perf_counter()
+        started_s, cpu_s = time.perf_counter(), time.thread_time()
+        self._took_s = None
         scans = (volts.get(Channel.MAGNITUDE), volts.get(Channel.STRUCTURE))
         try:
             if self._tracker is None or is_exact:
@@ -276,7 +304,10 @@ class Imaging:
                     "this is a mistake in tactomo: please report it with a recording",
                 )
             return None
-        self._time("reconstruct", time.perf_counter() - started_s)
+        took_s = time.perf_counter() - started_s
+        if frame.tier != "quiet":
+            self._took_s = time.thread_time() - cpu_s, took_s
+        self._time("reconstruct", took_s)
         for stage, seconds in frame.stage_s.items():
             self._time(stage, seconds)
         if frame.failure and self._failure_limit.allows():

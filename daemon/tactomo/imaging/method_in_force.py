@@ -1,9 +1,9 @@
 """The method and the budget that were requested, and those that frames get.
 
 A budget is milliseconds of this machine; the machine's speed turns it into milliseconds of modelled
-work, and may choose another method than `auto` where there is little time. Recordings hold what was
-effective, so that a replay gives the same on any machine. For use by the pipeline thread; others
-may read.
+work, and may choose another method than `auto` where there is little time, or where others take the
+processor. Recordings hold what was effective, so that a replay gives the same on any machine. For
+use by the pipeline thread; others may read.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from tactomo_models import Reconstructor
 from tactomo_models.machine_speed import MachineSpeed
+from tactomo_models.reconstruct import DEFAULT_BUDGET_S
 
 from tactomo.errors import CommandError
 
@@ -30,10 +31,12 @@ class MethodInForce:
     Attributes:
         requested: what was asked for; the budget in milliseconds of this machine.
         effective: what frames get; the budget in milliseconds of modelled work.
+        share: of the time that was asked for, what frames get.
         source: where the machine's speed is known from, in words.
     """
 
     def __init__(self, reconstructor: Reconstructor, machine_speed: MachineSpeed) -> None:
+        self.share = 1.0
         self.source = machine_speed.source
         self._reconstructor = reconstructor
         self._machine_speed = machine_speed
@@ -62,6 +65,11 @@ class MethodInForce:
         """Have frames take as much time; None for the method's own."""
         self._request(self.requested._replace(budget_ms=budget_ms))
 
+    def give_share(self, share: float) -> None:
+        """Have frames take that share of the time that was asked for, or of the method's own."""
+        self.share = share
+        self._request(self.requested)
+
     def obey(self, recorded: Effort) -> None:
         """Give frames what was effective when they were recorded."""
         if recorded != self.effective:
@@ -69,10 +77,10 @@ class MethodInForce:
             self.requested = recorded
 
     def _request(self, requested: Effort) -> None:
-        budget_ms = requested.budget_ms
-        plan = self._machine_speed.plan(
-            requested.method, None if budget_ms is None else budget_ms * 1e-3
-        )
+        time_s = None if requested.budget_ms is None else requested.budget_ms * 1e-3
+        if self.share < 1:
+            time_s = self.share * (time_s or DEFAULT_BUDGET_S)
+        plan = self._machine_speed.plan(requested.method, time_s)
         modelled_ms = None if plan.budget_s is None else plan.budget_s * 1e3
         self._put_in_force(Effort(plan.method, modelled_ms))
         self.requested = requested

@@ -232,6 +232,8 @@ class Pipeline(Worker):
         timing = recorded or self.skew.timing(dual)
         self.skew.note(timing)
         self._imaging.process(dual, timing, self.sync.lost)
+        if not self._is_lossless:
+            self._imaging.share_processor(self.dropped)
         self._in_hand -= len(dual.scans)
         self._used += len(dual.scans)
 

@@ -148,7 +148,12 @@ class Status:
     def _plan(self) -> dict[str, Any]:
         method = self._imaging.method
         tier, modelled_ms = method.effective
-        return {"source": method.source, "tier": tier, "modelled_ms": modelled_ms}
+        return {
+            "source": method.source,
+            "tier": tier,
+            "modelled_ms": modelled_ms,
+            "share": method.share,
+        }
 
     def _rates(self) -> dict[str, float | None]:
         rates = self._pipeline.scan_rates

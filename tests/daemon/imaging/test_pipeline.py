@@ -35,6 +35,9 @@ class Frames:
         assert self.go.wait(20)
         self.counters.append(dual.counter)
 
+    def share_processor(self, dropped: int) -> None:
+        pass
+
 
 def started(frames: Any, *, lossless: bool = False, replay: Replay | None = None) -> Pipeline:
     ports = 1 if replay is None else 2

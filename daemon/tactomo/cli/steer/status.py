@@ -206,10 +206,13 @@ def _port_line(port: dict[str, Any]) -> str:
 def _budget(budget_ms: float | None, plan: dict[str, Any]) -> str:
     """Say what time a frame may take, and what it is given for that."""
     source = f"machine speed: {plan.get('source', '-')}"
-    if budget_ms is None:
-        return f"the method's own; {source}"
+    share = plan.get("share", 1.0)
+    left = f", {share:.0%} of it while others take the processor" if share < 1 else ""
+    time = "the method's own" if budget_ms is None else f"{budget_ms:g} ms"
+    if budget_ms is None and not left:
+        return f"{time}; {source}"
     given = f"{plan.get('tier')}, {_number(plan.get('modelled_ms'))} modelled ms"
-    return f"{budget_ms:g} ms: {given}; {source}"
+    return f"{time}{left}: {given}; {source}"
 
 
 def _percentiles(times: dict[str, Any]) -> str:

@@ -1,0 +1,71 @@
+"""How much of its time a frame is left where others take the processor.
+
+Where scans are left out because this thread did not get the processor that it asked for, frames
+get half of their time, then a quarter, and so on, and twice as much again when none has been left
+out for a while. Every skin of a busy computer does so; that each gets a fair share of the processor
+is the system's scheduler's work. What one skin asks for with a processor of its own is the budget's
+business.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+TAKEN: Final = 0.75
+"""Share of a core while it computes below which a thread has lost time to others; alone it has more
+than 0.9."""
+WINDOW_S: Final = 0.5
+"""Computing over which the share is averaged: ten frames of 50 ms at half a core take one."""
+LOOK_S: Final = 1.0
+LEAST: Final = 1 / 16
+HOLD_S: Final = 5.0
+"""Until more is tried; twice as long each time that it was too much, up to MAX_HOLD_S: a switch of
+method costs a cold start."""
+MAX_HOLD_S: Final = 80.0
+
+
+class ProcessorShare:
+    """For use by one thread.
+
+    Attributes:
+        of_core: what share of a core the thread got of late while it computed.
+        of_time: what share of its time a frame is left: 1, 1/2, ... LEAST.
+    """
+
+    def __init__(self) -> None:
+        self.of_core = self.of_time = 1.0
+        self._cpu_s = self._wall_s = 0.0
+        self._dropped = 0
+        self._noted_s = self._looked_s = self._changed_s = self._raised_s = float("-inf")
+        self._hold_s = HOLD_S
+
+    def note(self, cpu_s: float, wall_s: float, dropped: int, now_s: float) -> bool:
+        """Take note of a frame in which something presses; return whether `of_time` has changed.
+
+        Args:
+            cpu_s: processor time that the frame took.
+            wall_s: time that passed meanwhile.
+            dropped: dual scans left out since the start.
+            now_s: monotonic seconds.
+        """
+        if now_s - self._noted_s > LOOK_S:  # what was left out while nothing pressed
+            self._dropped, self._looked_s = dropped, now_s
+        self._noted_s = now_s
+        kept = max(0.0, 1 - wall_s / WINDOW_S)
+        self._cpu_s, self._wall_s = kept * self._cpu_s + cpu_s, kept * self._wall_s + wall_s
+        self.of_core = min(1.0, self._cpu_s / self._wall_s) if self._wall_s else 1.0
+        if now_s - self._looked_s < LOOK_S:
+            return False
+        is_late = dropped > self._dropped
+        self._dropped, self._looked_s = dropped, now_s
+        before = self.of_time
+        if is_late and self.of_core < TAKEN:
+            self.of_time = max(LEAST, before / 2)
+            if now_s - self._raised_s < 2 * self._hold_s:
+                self._hold_s, self._raised_s = min(2 * self._hold_s, MAX_HOLD_S), float("-inf")
+        elif before < 1 and not is_late and now_s - self._changed_s > self._hold_s:
+            self.of_time = min(1.0, 2 * before)
+            self._raised_s = now_s
+        if self.of_time != before:
+            self._changed_s = now_s
+        return self.of_time != before
