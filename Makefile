@@ -21,7 +21,7 @@ SITE = $(DIST)/docs/$(shell sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)
 LOCKED := pyproject.toml --universal --python-version 3.11 --generate-hashes \
   --no-emit-package tactomo-client --no-emit-package tactomo --no-emit-package tactomo-lab
 
-.PHONY: help setup run test test-all test-long test-train faults soak firmware fuzz lint format bench docs wheels deb lock clean
+.PHONY: help setup run test test-all test-long test-train faults soak fleet firmware fuzz lint format bench docs wheels deb lock clean
 
 help:            ## list these targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -49,6 +49,9 @@ faults: $(READY) ## every fault and measure (an hour), then docs/reliability.md 
 
 soak: $(READY)   ## a million dual scans as fast as they are taken, and their row of that page
 	$(BIN)/pytest tests/faults -m '' -k soak --reliability docs/reliability.md $(ARGS)
+
+fleet: $(READY)  ## a thousand simulated skins through two Zenoh routers: docs/fleet.md
+	$(BIN)/python tests/support/fleet_measure.py $(ARGS)
 
 firmware:        ## the C firmware library's emulator of a skin: firmware_protocol/c/build
 	$(MAKE) -C firmware_protocol/c

@@ -16,7 +16,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[2]
-EXTRAS = ("foxglove", "metrics")
+EXTRAS = ("foxglove", "metrics", "zenoh")
 
 
 def wanted() -> list[str]:

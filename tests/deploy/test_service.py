@@ -189,7 +189,7 @@ def test_a_port_with_a_lasting_name_or_none_keeps_its_name() -> None:
 
 
 @needs_systemd
-@pytest.mark.parametrize("unit", ["tactomo@.service", "tactomo-proxy.service"])
+@pytest.mark.parametrize("unit", ["tactomo@.service", "tactomo-zenoh.service"])
 def test_the_exposure_of_the_services_is_small(unit: str, tmp_path: Path) -> None:
     command = ["systemd-analyze", "security", "--offline=yes", "--threshold=15"]
     done = subprocess.run(
@@ -200,7 +200,7 @@ def test_the_exposure_of_the_services_is_small(unit: str, tmp_path: Path) -> Non
 
 @needs_systemd
 def test_systemd_understands_the_units(disk: Path, tmp_path: Path) -> None:
-    for unit in ("tactomo@.service", "tactomo-proxy.service"):
+    for unit in ("tactomo@.service", "tactomo-zenoh.service"):
         text = (DEPLOY / "systemd" / unit).read_text()
         place = tmp_path / unit.replace("@", "@palm")
         place.write_text(text.replace(PROGRAM, f"{disk}{PROGRAM}"))

@@ -46,7 +46,7 @@ class Bridge:
 
     Args:
         sensors: their names in the stream.
-        stream: the daemon's stream, or a proxy's.
+        stream: the daemon's stream, or that of `tactomo zenoh --bind`.
         host: the address to listen on.
         port: the port to listen on; 0 takes a free one.
         keys: for a daemon beyond this computer.

@@ -46,7 +46,7 @@ COMMANDS = {
         (RUN, "demo", "Start a simulated skin to press in the browser.", "run.demo"),
         (RUN, "daemon", "Read a skin's ports and publish maps and contacts.", "run.daemon"),
         (RUN, "ports", "List serial adapters and what is amiss with them.", "run.ports"),
-        (RUN, "proxy", "Pass on the streams of several daemons at one address.", "run.proxy"),
+        (RUN, "zenoh", "Carry streams beyond this computer by Zenoh.", "run.zenoh"),
         (RUN, "twin", "Simulate a skin behind simulated firmware.", "run.twin"),
         (RUN, "viewer", "Serve a web page with a daemon's maps and contacts.", "run.viewer"),
         (RUN, "foxglove", "Serve maps, contacts and events to Foxglove.", "run.foxglove"),

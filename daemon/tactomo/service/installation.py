@@ -35,7 +35,7 @@ PACKAGED: Final = (Path("usr/lib/systemd/system"), Path("lib/systemd/system"))
 TEMPLATE: Final = "tactomo@.service"
 SHARED: Final = {
     f"systemd/{TEMPLATE}": UNITS / TEMPLATE,
-    "systemd/tactomo-proxy.service": UNITS / "tactomo-proxy.service",
+    "systemd/tactomo-zenoh.service": UNITS / "tactomo-zenoh.service",
     "udev/71-tactomo.rules": RULES / "71-tactomo.rules",
     "sysusers.conf": Path("etc/sysusers.d/tactomo.conf"),
     "tmpfiles.conf": Path("etc/tmpfiles.d/tactomo.conf"),

@@ -1,4 +1,4 @@
-"""Messages of too many parts, and messages without an end: nobody waits, and memory is bounded."""
+"""Messages of too many parts, messages without an end, floods: nobody waits, memory is bounded."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pty
 import socket
 import struct
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from urllib.parse import urlsplit
 import pytest
 import zmq
 from daemon_process import DaemonProcess
+from ears import Ears
 from tactomo_client import request
 from tactomo_client.messages import decode_reply, encode_request
 from waiting import wait_until
@@ -109,3 +110,55 @@ def test_a_few_parts_more_are_no_reason_to_be_silent(daemon: DaemonProcess) -> N
     assert dealer.poll(30_000)
     assert decode_reply(dealer.recv_multipart()[1])["state"]
     dealer.close()
+
+
+@pytest.mark.slow
+def test_a_flood_of_subscriptions_is_cut_and_the_stream_goes_on(bench: Callable[..., Any]) -> None:
+    b = bench()
+    b.tare()
+    flood: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.XSUB)
+    with flood:
+        flood.setsockopt(zmq.LINGER, 0)
+        flood.connect(b.daemon.stream_address)
+        for number in range(60_000):
+            flood.send(b"\1" + b"%090d" % number)
+
+    def status() -> dict[str, Any]:
+        b.listener.receive()  # ZeroMQ renews subscriptions in the subscriber's own calls alone
+        now: dict[str, Any] = b.ask("status")
+        assert now["subscribers"] < 60_000  # never all of it
+        return now
+
+    # Counted, for who listens may be away when it is told.
+    b.until(lambda: "subscribers_cut" in status()["events"]["counts"])
+    b.until(lambda: status()["subscribers"] == 5)
+    assert b.step(0.1)["map"] is not None
+
+
+@pytest.mark.long
+def test_a_flood_of_connections_leaves_the_daemon_running(tmp_path: Path) -> None:
+    """With no descriptor left for anything else: 300 that say nothing, of 128 that there may be.
+
+    Not over ``ipc://``, where libzmq 4.3.5 itself aborts when there is none left.
+    """
+    device, host = pty.openpty()
+    daemon = DaemonProcess(tmp_path, [os.ttyname(host)], under=("prlimit", "--nofile=128:128"))
+    address = urlsplit(daemon.stream)
+    silent = [socket.socket() for _ in range(300)]
+    try:
+        with Ears(daemon.stream, kinds=("status",)) as ears:
+            ears.wait(lambda _: True, "a status")
+            for each in silent:
+                each.setblocking(False)
+                each.connect_ex((address.hostname, address.port))
+            wait_until(lambda: daemon.descriptors == 128, "no descriptor to be left", step_s=0.001)
+            ears.wait(lambda _: True, "a later status", since=len(ears.heard))
+        assert daemon.is_running
+        for each in silent:
+            each.close()
+        wait_until(daemon.answers, "an answer")
+        daemon.stop()
+    finally:
+        daemon.kill()
+        for descriptor in (device, host):
+            os.close(descriptor)

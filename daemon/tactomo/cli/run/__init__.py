@@ -1,1 +1,1 @@
-"""Commands that keep running: demo, daemon, twin, viewer, replay, proxy, ports, foxglove."""
+"""Commands that keep running: demo, daemon, twin, viewer, replay, ports, foxglove, zenoh."""

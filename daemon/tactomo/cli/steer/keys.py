@@ -51,7 +51,7 @@ Force: TypeAlias = Annotated[bool, typer.Option("--force", help="Replace what is
 def make(
     name: Annotated[str, typer.Argument(help="What to call it, such as the sensor or the user.")],
     server: Annotated[
-        bool, typer.Option("--server", help="For a daemon or proxy: with a list of clients.")
+        bool, typer.Option("--server", help="For a daemon: with a list of clients.")
     ] = False,
     folder: Folder = None,
     force: Force = False,

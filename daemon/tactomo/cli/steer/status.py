@@ -41,7 +41,7 @@ def status(
         typer.Option(
             "--sensor",
             "-s",
-            help="Of this sensor, by its stream; so through a proxy, too. [by the control socket]",
+            help="Of this sensor, by its stream or `tactomo zenoh`'s. [by the control socket]",
         ),
     ] = None,
     stream: StreamAddress = DEFAULT_STREAM,

@@ -1,0 +1,110 @@
+"""`tactomo zenoh`: daemons' streams into Zenoh, and Zenoh's into one stream."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from tactomo.cli.options import KeysFolder, examples, typer_app
+from tactomo.errors import TactomoError
+
+LogLevel = Literal["debug", "info", "warning", "error"]
+LogFormat = Literal["auto", "text", "json", "journal"]
+
+app = typer_app()
+
+
+@app.command(
+    epilog=examples(
+        "tactomo zenoh --from ipc:///run/tactomo/left/stream --from ipc:///run/tactomo/right/stream",
+        "tactomo zenoh --from ... --robot arm --config /etc/tactomo/zenoh.json5",
+        "tactomo zenoh --bind tcp://127.0.0.1:5570 --robot arm --config desk.json5",
+    ),
+)
+def zenoh(
+    sources: Annotated[
+        list[str] | None,
+        typer.Option("--from", help="A daemon's stream to publish; once for each daemon."),
+    ] = None,
+    bind: Annotated[
+        str | None,
+        typer.Option(help="Where to serve what Zenoh has to clients of ZeroMQ on this computer."),
+    ] = None,
+    robot: Annotated[
+        str | None,
+        typer.Option(
+            help="Name in tactomo/ROBOT/SENSOR/KIND. [this host's; without --from: any robot's]"
+        ),
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            help="Zenoh's configuration (JSON5): addresses, TLS, access control. "
+            "[tcp/127.0.0.1:7447, this computer alone]"
+        ),
+    ] = None,
+    keys: KeysFolder = None,
+    log_level: Annotated[LogLevel, typer.Option(help="The least severe that is logged.")] = "info",
+    log_format: Annotated[
+        LogFormat,
+        typer.Option(
+            help="text, json, journal; auto: text on a terminal, journal for journald, else json."
+        ),
+    ] = "auto",
+) -> None:
+    """Carry streams beyond this computer by Eclipse Zenoh, until stopped.
+
+    On a robot, `--from` publishes the streams of its daemons; elsewhere, `--bind` gives them one
+    address, where every client of ZeroMQ finds them. The daemons' control sockets stay where they
+    are. A skin on which nothing changes is sent by a heartbeat of 0.3 s alone.
+
+    Needs eclipse-zenoh: `pip install 'tactomo[zenoh]'`.
+    """
+    if not sources and bind is None:
+        raise typer.BadParameter("give --from, --bind, or both")
+    if bind is not None and bind in (sources or ()):
+        raise typer.BadParameter(
+            f"{bind} is a --from, too; give another address of this computer",
+            param_hint="'--bind'",
+        )
+    _need_zenoh()
+    from tactomo_client.keys import as_keys
+
+    from tactomo.log import configure_logging
+    from tactomo.stream.zenoh_bridge import ZenohBridge, serve
+
+    configure_logging(log_level, log_format)
+    name = "*" if robot is None and not sources else _checked(robot)
+    serve(ZenohBridge(sources or [], name, bind and _endpoint(bind), config, as_keys(keys)))
+
+
+def _checked(robot: str | None) -> str:
+    from tactomo_client.messages import check_sensor_name
+
+    try:
+        return check_sensor_name(socket.gethostname() if robot is None else robot)
+    except ValueError as error:
+        raise typer.BadParameter(
+            f"{error}: give a name of letters, digits, '_', '.' and '-'", param_hint="'--robot'"
+        ) from error
+
+
+def _endpoint(text: str) -> str:
+    from tactomo.endpoint import check_endpoint
+
+    try:
+        return check_endpoint(text)
+    except ValueError as error:
+        raise typer.BadParameter(f"--bind {text}: {error}") from error
+
+
+def _need_zenoh() -> None:
+    try:
+        import zenoh  # noqa: F401
+    except ImportError as error:
+        raise TactomoError(
+            "Zenoh needs eclipse-zenoh, which is not installed", "pip install 'tactomo[zenoh]'"
+        ) from error

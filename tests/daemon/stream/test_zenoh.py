@@ -1,0 +1,483 @@
+"""`tactomo zenoh`: daemons' streams in Zenoh by key, and Zenoh's at one address of ZeroMQ."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgpack  # type: ignore[import-untyped]
+import numpy as np
+import pytest
+import zenoh
+import zmq
+from hostile_page import SUBSCRIBE, post
+from page import Page
+from tactomo.stream.zenoh_publication import ENCODING, HEARTBEAT_S
+from tactomo_client import Contact, subscribe
+from tactomo_client.fake import FakeSensor
+from tactomo_client.messages import decode_message, topic
+from waiting import PATIENCE_S, wait_until
+
+EXAMPLES = Path(__file__).parents[3] / "deploy/examples"
+TOUCH = [Contact(1, 10.0, 0.0, 700.0, 0.1, 0.01, 170.0)]
+
+
+class Running:
+    """`tactomo zenoh` in a process of its own."""
+
+    def __init__(self, *options: object) -> None:
+        command = [sys.executable, "-m", "tactomo.cli", "zenoh", "--log-format", "json"]
+        self.process = subprocess.Popen(
+            [*command, *map(str, options)], stderr=subprocess.PIPE, text=True
+        )
+        self.address: str = self.said("ready")["stream"]
+
+    def said(self, event: str) -> dict[str, Any]:
+        """Return the next such line of its log."""
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            entry: dict[str, Any] = json.loads(line)
+            if entry["event"] == event:
+                return entry
+        raise AssertionError(f"it ended with status {self.process.wait()}")
+
+
+@pytest.fixture
+def configuration(tmp_path: Path) -> Callable[..., Path]:
+    """Write a configuration of Zenoh: ``configuration(mode="client", connect={...})``."""
+
+    def write(**sections: object) -> Path:
+        path = tmp_path / f"zenoh{len(list(tmp_path.iterdir()))}.json5"
+        path.write_text(json.dumps({"scouting": {"multicast": {"enabled": False}}, **sections}))
+        return path
+
+    return write
+
+
+@pytest.fixture
+def desk(tmp_path: Path, configuration: Callable[..., Path]) -> Iterator[zenoh.Session]:
+    """A Zenoh session that is a router, at a file; `client` of it connects there."""
+    listen = {"endpoints": [f"unixsock-stream/{tmp_path / 'router'}"]}
+    session = zenoh.open(zenoh.Config.from_file(str(configuration(mode="router", listen=listen))))
+    yield session
+    session.close()  # type: ignore[no-untyped-call]
+
+
+@pytest.fixture
+def start(
+    tmp_path: Path, configuration: Callable[..., Path], desk: zenoh.Session
+) -> Iterator[Callable[..., Running]]:
+    """Start a bridge that is a client of `desk`: ``start(*sensors, robot="arm", bind=...)``."""
+    started: list[Running] = []
+    connect = {"endpoints": [f"unixsock-stream/{tmp_path / 'router'}"]}
+
+    def go(*sensors: FakeSensor, **options: object) -> Running:
+        config = configuration(mode="client", connect=connect)
+        words = [word for sensor in sensors for word in ("--from", sensor.address)]
+        words += [str(word) for name, value in options.items() for word in (f"--{name}", value)]
+        started.append(Running("--config", config, *words))
+        return started[-1]
+
+    yield go
+    for running in started:
+        running.process.kill()
+        running.process.communicate()
+
+
+@pytest.fixture
+def reader() -> Iterator[Callable[..., zmq.Socket[bytes]]]:
+    """Make a subscriber of ZeroMQ: ``reader(address, prefix)``."""
+    sockets: list[zmq.Socket[bytes]] = []
+
+    def make(address: str, *prefixes: bytes) -> zmq.Socket[bytes]:
+        made: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
+        made.setsockopt(zmq.LINGER, 0)
+        for prefix in prefixes:
+            made.subscribe(prefix)
+        made.connect(address)
+        sockets.append(made)
+        return made
+
+    yield make
+    for each in sockets:
+        each.close()
+
+
+@pytest.fixture
+def left() -> Iterator[FakeSensor]:
+    with FakeSensor("left") as sensor:
+        yield sensor
+
+
+@pytest.fixture
+def right() -> Iterator[FakeSensor]:
+    with FakeSensor("right") as sensor:
+        yield sensor
+
+
+class Samples:
+    """What comes under a key expression: (key, its message, count of those sent)."""
+
+    def __init__(self, session: zenoh.Session, key: str) -> None:
+        self.all: list[tuple[str, dict[str, Any], int]] = []
+        self._subscriber = session.declare_subscriber(key, self._take)
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        assert str(sample.encoding) == "application/msgpack"
+        assert sample.attachment
+        fields = msgpack.unpackb(sample.payload.to_bytes())
+        self.all.append((str(sample.key_expr), fields, int(sample.attachment.to_string())))
+
+    def until(self, condition: Callable[[], object], send: Callable[[], object]) -> None:
+        wait_until(condition, meanwhile=send, step_s=0.02)
+
+
+def next_of(one: zmq.Socket[bytes], send: Callable[[], object] = lambda: None) -> Any:
+    """Return the next message; `send` is called until it comes."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not one.poll(20):
+        assert time.monotonic() < deadline, "no message came"
+        send()
+    return decode_message(one.recv())
+
+
+def test_each_kind_has_its_key_and_its_count(
+    left: FakeSensor, right: FakeSensor, start: Callable[..., Running], desk: zenoh.Session
+) -> None:
+    samples = Samples(desk, "tactomo/**")
+    start(left, right, robot="arm")
+    wanted = {f"tactomo/arm/{s}/{k}" for s in ("left", "right") for k in ("map", "contacts")}
+
+    def send() -> None:
+        left.publish(map=np.ones((3, 3), np.float32))
+        right.publish()
+
+    samples.until(lambda: {key for key, _, _ in samples.all} == wanted, send)
+    for key, fields, _ in samples.all:
+        assert key == f"tactomo/arm/{fields['sensor']}/{fields['kind']}"
+    counts = [n for key, _, n in samples.all if key == "tactomo/arm/left/contacts"]
+    assert counts == list(range(counts[0], counts[0] + len(counts)))
+
+
+def test_a_skin_at_rest_is_sent_by_a_heartbeat_and_a_touch_at_once(
+    left: FakeSensor, start: Callable[..., Running], desk: zenoh.Session
+) -> None:
+    samples = Samples(desk, "tactomo/arm/left/contacts")
+    start(left, robot="arm")
+    samples.until(lambda: samples.all, left.publish)
+    frames, began_s = 0, time.monotonic()
+    while time.monotonic() - began_s < 5 * HEARTBEAT_S:
+        left.publish()
+        frames += 1
+        time.sleep(0.01)
+    took_s = time.monotonic() - began_s
+    assert frames > 3 * len(samples.all)
+    assert took_s / HEARTBEAT_S - 2 <= len(samples.all) <= took_s / HEARTBEAT_S + 2
+    left.publish(TOUCH)
+    left.publish(flags=["misfit_high"])
+    wait_until(lambda: samples.all[-1][1]["flags"])
+    assert [len(fields["contacts"]) for _, fields, _ in samples.all[-2:]] == [1, 0]
+    counts = [count for _, _, count in samples.all]
+    assert counts == list(range(counts[0], counts[0] + len(counts)))  # none is missed
+
+
+def test_a_query_gets_the_newest_contacts_and_status(
+    left: FakeSensor, start: Callable[..., Running], desk: zenoh.Session
+) -> None:
+    samples = Samples(desk, "tactomo/arm/left/status")
+    start(left, robot="arm")
+
+    def send() -> None:
+        left.publish(TOUCH)
+        left.publish_message("status", {"state": "running"})
+
+    samples.until(lambda: samples.all, send)
+    replies = {str(r.ok.key_expr): r.ok for r in desk.get("tactomo/*/left/*") if r.ok}
+    assert replies.keys() == {"tactomo/arm/left/status", "tactomo/arm/left/contacts"}
+    status = replies["tactomo/arm/left/status"]
+    assert msgpack.unpackb(status.payload.to_bytes())["state"] == "running"
+    assert status.attachment
+    assert int(status.attachment.to_string()) in {count for _, _, count in samples.all}
+    contacts = msgpack.unpackb(replies["tactomo/arm/left/contacts"].payload.to_bytes())
+    assert len(contacts["contacts"]) == 1
+
+
+def test_a_token_lives_as_long_as_the_daemon(
+    left: FakeSensor, start: Callable[..., Running], desk: zenoh.Session
+) -> None:
+    heard: list[tuple[str, zenoh.SampleKind]] = []
+    tokens = desk.liveliness().declare_subscriber(
+        "tactomo/*/*", lambda s: heard.append((str(s.key_expr), s.kind)), history=True
+    )
+    start(left, robot="arm")
+    wait_until(lambda: heard, meanwhile=left.publish, step_s=0.05)
+    left.close()
+    wait_until(lambda: len(heard) == 2)
+    token = "tactomo/arm/left"
+    assert heard == [(token, zenoh.SampleKind.PUT), (token, zenoh.SampleKind.DELETE)]
+    assert not [reply for reply in desk.get("tactomo/arm/left/*") if reply.ok]
+    tokens.undeclare()  # type: ignore[no-untyped-call]
+
+
+def test_clients_of_zeromq_find_all_skins_at_one_address(
+    left: FakeSensor, right: FakeSensor, start: Callable[..., Running], reader: Any
+) -> None:
+    start(left, right, robot="arm")
+    address = start(bind="tcp://127.0.0.1:0").address
+    every, one = reader(address, b""), reader(address, topic("right", "contacts"))
+
+    def send() -> None:
+        left.publish(TOUCH, map=np.ones((3, 3), np.float32))
+        right.publish(TOUCH)
+
+    seen: set[tuple[str, str]] = set()
+    while len(seen) < 4:
+        message = next_of(every, send)
+        seen.add((message.sensor, message.kind))
+    assert seen == {(s, k) for s in ("left", "right") for k in ("map", "contacts")}
+    with subscribe("right", address=address, kind="contacts") as skin:
+        wait_until(lambda: (frame := skin.latest()) and frame.contacts, meanwhile=send, step_s=0.02)
+        assert skin.latest() is not None
+    last = 0
+    for _ in range(20):
+        message = next_of(one, send)
+        assert (message.sensor, message.kind) == ("right", "contacts")
+        assert message.fields["sequence"] > last  # once, however many subscriptions overlap
+        last = message.fields["sequence"]
+
+
+def test_late_joiners_get_the_last_status_at_once(
+    left: FakeSensor, start: Callable[..., Running], reader: Any
+) -> None:
+    start(left, robot="arm")
+    address = start(bind="tcp://127.0.0.1:0", robot="arm").address
+    first = reader(address, topic("left", "status"))
+    sequence = next_of(first, lambda: left.publish_message("status", {"state": "running"})).fields[
+        "sequence"
+    ]
+    for prefix in (topic("left", "status"), b"left/", b""):
+        late = next_of(reader(address, prefix))
+        assert late.fields["sequence"] >= sequence
+        assert late.kind == "status"
+
+
+def test_what_is_lost_is_counted_and_told(
+    desk: zenoh.Session, start: Callable[..., Running], reader: Any, left: FakeSensor
+) -> None:
+    running = start(bind="tcp://127.0.0.1:0")
+    socket = reader(running.address, b"")
+    key, body = "tactomo/arm/left/contacts", b"\x80"
+    wait_until(
+        lambda: socket.poll(0), meanwhile=lambda: desk.put(key, body, attachment="1"), step_s=0.02
+    )
+    for count in ("2", "6", "not a number"):
+        desk.put(key, body, attachment=count)
+    assert running.said("messages_lost")["detail"].startswith("3 so far")
+
+
+def test_a_daemon_may_come_and_go(
+    left: FakeSensor, start: Callable[..., Running], desk: zenoh.Session
+) -> None:
+    samples = Samples(desk, "tactomo/arm/left/contacts")
+    start(left, robot="arm")
+    samples.until(lambda: samples.all, left.publish)
+    first = samples.all[-1][1]["session"]
+    left.close()
+    with FakeSensor("left", left.address) as again:
+        samples.until(lambda: samples.all[-1][1]["session"] != first, again.publish)
+
+
+@pytest.mark.slow
+def test_a_source_that_never_answered_is_missed_once(
+    left: FakeSensor, start: Callable[..., Running]
+) -> None:
+    left.close()
+    running = start(left)
+    warning = running.said("source_silent")
+    assert f"nothing from {left.address}" in warning["detail"]
+    assert "start its daemon" in warning["next_step"]
+    with FakeSensor("left", left.address):
+        assert left.address in running.said("source_came")["detail"]
+
+
+def test_two_daemons_of_one_name_are_warned_of(
+    left: FakeSensor, start: Callable[..., Running], desk: zenoh.Session
+) -> None:
+    samples = Samples(desk, "tactomo/**")
+    with FakeSensor("left") as other:
+        running = start(left, other, robot="arm")
+
+        def send() -> None:
+            left.publish()
+            other.publish()
+
+        sessions = {left.session, other.session}
+        samples.until(lambda: {f["session"] for _, f, _ in samples.all} == sessions, send)
+        warning = running.said("same_sensor_twice")
+        assert left.address in warning["detail"]
+        assert other.address in warning["detail"]
+        assert "another name" in warning["next_step"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_it(
+    left: FakeSensor, start: Callable[..., Running], number: signal.Signals
+) -> None:
+    running = start(left, bind="tcp://127.0.0.1:0")
+    running.process.send_signal(number)
+    assert running.process.wait(PATIENCE_S) == 0
+    assert running.process.stderr is not None
+    assert "Traceback" not in running.process.stderr.read()
+
+
+def test_a_web_pages_subscription_gets_nothing(
+    start: Callable[..., Running], reader: Any, left: FakeSensor
+) -> None:
+    running = start(left, bind="tcp://127.0.0.1:0")
+    one = reader(running.address, b"left/")
+    next_of(one, left.publish)
+    assert b"left" not in post(running.address, [SUBSCRIBE + b"left/"])
+
+
+def certificates(folder: Path, *names: str) -> None:
+    """Make an authority and, by it, a certificate of `localhost` for each name."""
+
+    def openssl(*words: object) -> None:
+        subprocess.run(["openssl", *map(str, words)], cwd=folder, check=True, capture_output=True)
+
+    new = ("req", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-keyout")
+    openssl(*new, "authority.key", "-x509", "-out", "authority.pem", "-subj", "/CN=authority")
+    (folder / "names").write_text("subjectAltName=DNS:localhost")
+    authority = ("-CA", "authority.pem", "-CAkey", "authority.key", "-CAcreateserial")
+    for name in names:
+        openssl(*new, f"{name}.key.pem", "-out", f"{name}.csr", "-subj", f"/CN={name}")
+        signed = ("x509", "-req", "-in", f"{name}.csr", *authority, "-out", f"{name}.pem")
+        openssl(*signed, "-extfile", "names")
+
+
+def example(name: str, folder: Path, port: int) -> Path:
+    """Write an example of deploy/ with its files in `folder` and its port on this computer."""
+    text = (EXAMPLES / name).read_text("utf-8")
+    text = text.replace("/etc/tactomo/keys/", "").replace("robot:", "localhost:")
+    text = re.sub(r'"([\w.]+\.pem)"', lambda found: f'"{folder / found[1]}"', text)
+    path = folder / name
+    path.write_text(text.replace("7447", str(port)).replace("0.0.0.0", "127.0.0.1"))
+    return path
+
+
+@pytest.mark.skipif(not shutil.which("openssl"), reason="needs openssl to make certificates")
+def test_the_examples_let_a_listed_certificate_read_and_no_more(
+    left: FakeSensor, tmp_path: Path
+) -> None:
+    certificates(tmp_path, "arm", "desk", "stranger")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port: int = free.getsockname()[1]
+    robot = example("zenoh_robot.json5", tmp_path, port)
+    desk = example("zenoh_desk.json5", tmp_path, port)
+    stranger = tmp_path / "stranger.json5"
+    stranger.write_text(desk.read_text().replace("desk.", "stranger."))
+    bridge = Running("--from", left.address, "--robot", "arm", "--config", robot)
+    try:
+        with zenoh.open(zenoh.Config.from_file(str(desk))) as allowed:
+            samples = Samples(allowed, "tactomo/**")
+            samples.until(lambda: samples.all, left.publish)
+            tokens = [t for t in allowed.liveliness().get("tactomo/*/*") if t.ok]
+            assert [str(t.ok.key_expr) for t in tokens if t.ok] == ["tactomo/arm/left"]
+            assert [r for r in allowed.get("tactomo/arm/left/contacts") if r.ok]
+            with (
+                zenoh.open(zenoh.Config.from_file(str(stranger))) as other,
+                zenoh.open(zenoh.Config.from_file(str(desk))) as witness,
+            ):
+                nothing = Samples(other, "tactomo/arm/left/contacts")
+                seen = Samples(witness, "tactomo/**")
+                heard = len(samples.all)
+                forged = msgpack.packb({"forged": True})
+                for liar in (other, allowed):
+                    liar.put("tactomo/arm/left/map", forged, encoding=ENCODING, attachment="1")
+                samples.until(lambda: len(samples.all) > heard + 3 and seen.all, left.publish)
+                assert not nothing.all
+                assert seen.all
+                assert not [fields for _, fields, _ in seen.all if "forged" in fields]
+                assert not [r for r in other.get("tactomo/**") if r.ok]
+            plain = zenoh.Config.from_file(str(desk))
+            plain.insert_json5("connect/endpoints", f'["tcp/localhost:{port}"]')
+            plain.insert_json5("connect/timeout_ms", "500")
+            with pytest.raises(zenoh.ZError):
+                zenoh.open(plain)
+    finally:
+        bridge.process.kill()
+        bridge.process.communicate()
+
+
+def test_the_pages_program_prints_touches_and_who_is_there(
+    left: FakeSensor, configuration: Callable[..., Path], tmp_path: Path
+) -> None:
+    page = Page("docs/fleet.md")
+    assert "tactomo zenoh --from tcp://127.0.0.1:5560 --robot arm" in page.commands()
+    script = tmp_path / "touched.py"
+    script.write_text(page.file("touched.py"))
+    endpoint = {"endpoints": [f"unixsock-stream/{tmp_path / 'zenoh'}"]}
+    bridge = Running(
+        "--from", left.address, "--robot", "arm", "--config", configuration(listen=endpoint)
+    )
+    client = configuration(mode="client", connect=endpoint)
+    command = [sys.executable, "-I", "-u", str(script), str(client)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        stop = threading.Event()
+
+        def publish() -> None:
+            while not stop.wait(0.05):
+                left.publish(TOUCH)
+
+        publishing = threading.Thread(target=publish)
+        publishing.start()
+        said = {process.stdout.readline().strip(), process.stdout.readline().strip()}
+        stop.set()
+        publishing.join()
+        process.kill()
+    bridge.process.kill()
+    bridge.process.communicate()
+    assert said == {"tactomo/arm/left is there", "tactomo/arm/left/contacts 10, 0 mm"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "said"),
+    [
+        ([], 2, "give --from, --bind, or both"),
+        (["--from", "ipc:///tmp/none", "--bind", "ipc:///tmp/none"], 2, "is a --from, too"),
+        (["--bind", "udp://x"], 2, "use tcp://127.0.0.1:PORT"),
+        (["--from", "ipc:///tmp/none", "--robot", "a/b"], 2, "'a/b' is not a sensor name"),
+        (["--bind", "ipc:///tmp/x", "--config", "/none.json5"], 1, "No such file or directory"),
+        (["--bind", "tcp://0.0.0.0:5570", "--config", "LOCAL"], 1, "reached from other computers"),
+        (["--bind", "ipc:///tmp/x", "--config", "BAD"], 1, "unknown field `mod`"),
+        (["--bind", "ipc:///tmp/x", "--config", "BUSY"], 1, "Zenoh cannot be opened"),
+    ],
+)
+def test_what_cannot_be_done_says_why(
+    arguments: list[str], status: int, said: str, configuration: Callable[..., Path]
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as busy:
+        endpoint = f"tcp/127.0.0.1:{busy.getsockname()[1]}"
+        files = {
+            "LOCAL": configuration(listen={"endpoints": []}),
+            "BAD": configuration(mod=3),
+            "BUSY": configuration(listen={"endpoints": [endpoint]}),
+        }
+        words = [str(files.get(word, word)) for word in arguments]
+        command = [sys.executable, "-m", "tactomo.cli", "zenoh", *words]
+        outcome = subprocess.run(command, capture_output=True, text=True, check=False)
+    told = " ".join(outcome.stderr.replace("│", " ").split())
+    assert said in told
+    assert outcome.returncode == status
+    assert "Traceback" not in told
