@@ -62,7 +62,7 @@ def _protocol(name: str) -> str:
 
 def _local(endpoint: str) -> str:
     if not is_local(endpoint):
-        raise ValueError("for other computers run `tactomo proxy` with keys")
+        raise ValueError("for other computers run `tactomo zenoh`")
     return endpoint
 
 

@@ -1,11 +1,11 @@
-"""One address for the streams of all skins of a computer.
+"""One address of this computer for the streams of several skins.
 
 A daemon serves one skin. This process subscribes to each daemon's stream, most often an ``ipc://``
-file, to just what its own subscribers ask for, and passes it on at one address, beyond the computer
-if there are keys. Sensors are told apart by their topics, as ever. Daemons may come and go.
+file, or to Zenoh's (`zenoh_bridge`), to just what its own subscribers ask for, and passes it on at
+one address. Sensors are told apart by their topics, as ever. Daemons may come and go.
 
 It never waits for a subscriber: what does not fit into a slow one's queue is lost to that one
-alone. One thread, the main one, touches everything but access control's own.
+alone. One thread, the main one, touches everything.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Sequence
-from typing import Final
+from collections.abc import Iterator, Sequence
+from typing import Final, Protocol
 
 import structlog
 import zmq
@@ -25,7 +25,7 @@ from tactomo_client.messages import STATUS
 
 from tactomo.endpoint import allow_connections
 from tactomo.events import RateLimit, Severity
-from tactomo.stream.access_control import STREAM, AccessControl, Context, ServerKeys
+from tactomo.stream.access_control import STREAM, Context
 from tactomo.stream.subscriptions import SUBSCRIBERS_CUT, Subscribers
 
 QUEUED_PER_SUBSCRIBER: Final = 256
@@ -49,30 +49,19 @@ class Proxy:
 
     Args:
         sources: the daemons' stream addresses.
-        endpoint: where to bind.
-        keys: who may come in; None where no other computer can reach `endpoint`.
-        source_keys: this proxy's own, for sources that want some.
+        endpoint: where to bind; no other computer may reach it.
 
     Attributes:
         address: where it is bound, once open.
     """
 
-    def __init__(
-        self,
-        sources: Sequence[str],
-        endpoint: str,
-        keys: ServerKeys | None = None,
-        source_keys: Keys | None = None,
-    ) -> None:
+    def __init__(self, sources: Sequence[str], endpoint: str) -> None:
         self.address = ""
         self.sources = sources
         self._endpoint = endpoint
-        self._keys = keys
-        self._source_keys = source_keys
         self._stopping = threading.Event()
         self._context: Context = zmq.Context()
-        self._access: AccessControl | None = None
-        self._inlets: list[_Inlet] = []
+        self._inlets: Sequence[Inlet] = ()
         self._sensors: dict[bytes, tuple[str, float]] = {}  # who sent it last, and when
         self._statuses: dict[bytes, tuple[bytes, float]] = {}
         self._look_at_s = 0.0
@@ -83,20 +72,17 @@ class Proxy:
         """Bind, and connect to the sources, whether or not they are there.
 
         Raises:
-            AddressError: the address cannot be had, or needs keys.
+            AddressError: the address cannot be had, or can be reached from other computers.
             ControlError: a source's address is not one.
         """
-        secret = None
-        if self._keys is not None:
-            secret = self._keys.secret
-            self._access = AccessControl(self._context, self._keys, _tell, self._cut)
-            self._access.start()
         self._outlet: zmq.Socket[bytes] = self._context.socket(zmq.XPUB)
         self._outlet.setsockopt(zmq.SNDHWM, QUEUED_PER_SUBSCRIBER)
-        self._readers = Subscribers(self._outlet, self._endpoint, STREAM, _tell, secret, "--bind")
+        self._readers = Subscribers(self._outlet, self._endpoint, STREAM, tell, None, "--bind")
         self.address = self._readers.address
-        for source in self.sources:
-            self._inlets.append(_Inlet(self._context, source, self._source_keys))
+        self._inlets = self._connect(self._context)
+
+    def _connect(self, context: Context) -> Sequence[Inlet]:
+        return [StreamInlet(context, source) for source in self.sources]
 
     def run(self) -> None:
         """Pass messages on until `stop`."""
@@ -125,8 +111,6 @@ class Proxy:
         if self.address:
             self._readers.close()
             self._outlet.close(LINGER_MS)
-        if self._access is not None:
-            self._access.stop()
         self._context.term()
 
     def _pass_subscriptions(self) -> None:
@@ -139,7 +123,7 @@ class Proxy:
         # To the first of a prefix the daemon says again how it is, to the others we do.
         self._repeat_statuses(joined & before)
         if self._readers.cuts > cuts and self._flood.allows():
-            _tell("subscribers_cut", "warning", *SUBSCRIBERS_CUT)
+            tell("subscribers_cut", "warning", *SUBSCRIBERS_CUT)
 
     def _repeat_statuses(self, prefixes: set[bytes]) -> None:
         oldest_s = time.monotonic() - REMEMBERED_S
@@ -147,13 +131,8 @@ class Proxy:
             if came_s > oldest_s and any(topic.startswith(prefix) for prefix in prefixes):
                 self._outlet.send(message, zmq.DONTWAIT)
 
-    def _pass_messages(self, inlet: _Inlet) -> None:
-        """Pass on what waits, a bounded number: the others have their turn."""
-        for _ in range(PASSED_AT_ONCE):
-            try:
-                message = inlet.socket.recv(zmq.DONTWAIT)
-            except zmq.Again:
-                return
+    def _pass_messages(self, inlet: Inlet) -> None:
+        for message in waiting(inlet.socket):
             self._note(inlet.address, message)
             self._outlet.send(message, zmq.DONTWAIT)
 
@@ -169,7 +148,7 @@ class Proxy:
         other, seen_s = self._sensors.get(sensor, (source, 0.0))
         if other != source and now_s - seen_s < REMEMBERED_S and sensor not in self._told:
             self._told.add(sensor)
-            _tell(
+            tell(
                 "same_sensor_twice",
                 "warning",
                 f"{other} and {source} both publish a sensor {sensor.decode('ascii', 'replace')!r}",
@@ -183,21 +162,43 @@ class Proxy:
         self._look_at_s = time.monotonic() + LOOK_S
         for inlet in self._inlets:
             inlet.knock_again()
-        if self._access is not None:
-            self._access.check()
-
-    def _cut(self) -> None:
-        self._readers.cut()
 
 
-class _Inlet:
+class Inlet(Protocol):
+    """Where messages come from.
+
+    Attributes:
+        address: of the source, to tell of it.
+        socket: what to wait for and receive from.
+    """
+
+    address: str
+    socket: zmq.Socket[bytes]
+
+    def ask(self, more: set[bytes], less: set[bytes]) -> None:
+        """Subscribe to some prefixes, and no more to others."""
+
+    def knock_again(self) -> None:
+        """Look after the connection, every second."""
+
+    def close(self) -> None:
+        """Close the connection."""
+
+
+class StreamInlet:
     """The connection to one daemon's stream."""
 
-    def __init__(self, context: Context, address: str, keys: Keys | None) -> None:
+    def __init__(
+        self,
+        context: Context,
+        address: str,
+        keys: Keys | None = None,
+        prefixes: Sequence[bytes] = (),
+    ) -> None:
         self.address = address
         self.socket: zmq.Socket[bytes] = context.socket(zmq.SUB)
         self.socket.setsockopt(zmq.RCVHWM, QUEUED_PER_SUBSCRIBER)
-        self._connection = connect_subscriber(self.socket, address, [], keys=keys)
+        self._connection = connect_subscriber(self.socket, address, prefixes, keys=keys)
         self._told: str | None = None
         self._missed_at_s = time.monotonic() + SILENT_S
         self._is_missed = False
@@ -210,10 +211,10 @@ class _Inlet:
             self.socket.unsubscribe(prefix)
 
     def knock_again(self) -> None:
-        """Connect anew where this proxy was not let in, and say so now and then."""
+        """Connect anew where we were not let in, and say so now and then."""
         refusal = self._connection.knock_again()
         if refusal is not None and refusal.name != self._told:
-            _tell(refusal.name, "error", refusal.cause, refusal.next_step)
+            tell(refusal.name, "error", refusal.cause, refusal.next_step)
         self._told = None if refusal is None else refusal.name
         if refusal is None:
             self._tell_missed()
@@ -223,10 +224,10 @@ class _Inlet:
         answers = self._connection.handshakes.have_succeeded
         if self._is_missed and answers:
             self._is_missed, self._missed_at_s = False, math.inf
-            _tell("source_came", "info", f"{self.address} is there now")
+            tell("source_came", "info", f"{self.address} is there now")
         elif not answers and not self._is_missed and time.monotonic() > self._missed_at_s:
             self._is_missed = True
-            _tell(
+            tell(
                 "source_silent",
                 "warning",
                 f"nothing from {self.address}",
@@ -238,22 +239,51 @@ class _Inlet:
         self._connection.close()
 
 
-def serve(proxy: Proxy) -> None:
-    """Open a proxy, serve until SIGTERM or SIGINT, and close it; for the main thread.
+def waiting(socket: zmq.Socket[bytes]) -> Iterator[bytes]:
+    """Yield what waits, a bounded number: the others have their turn."""
+    for _ in range(PASSED_AT_ONCE):
+        try:
+            yield socket.recv(zmq.DONTWAIT)
+        except zmq.Again:
+            return
 
-    Raises what `Proxy.open` raises.
+
+class Server(Protocol):
+    """What `serve` runs."""
+
+    address: str
+    sources: Sequence[str]
+
+    def open(self) -> None:
+        """Open what it serves by."""
+
+    def run(self) -> None:
+        """Serve until `stop`."""
+
+    def stop(self) -> None:
+        """Have `run` return; from any thread or a signal's handler."""
+
+    def close(self) -> None:
+        """Close everything, whatever `open` came to."""
+
+
+def serve(server: Server) -> None:
+    """Open a proxy or bridge, serve until SIGTERM or SIGINT, and close it; for the main thread.
+
+    Raises what its `open` raises.
     """
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: proxy.stop())
+        signal.signal(number, lambda *_: server.stop())
     allow_connections()
     try:
-        proxy.open()
-        log.info("ready", stream=proxy.address, sources=list(proxy.sources))
-        proxy.run()
+        server.open()
+        log.info("ready", stream=server.address or None, sources=list(server.sources))
+        server.run()
     finally:
-        proxy.close()
+        server.close()
     log.info("stopped")
 
 
-def _tell(name: str, severity: Severity, detail: str, next_step: str = "") -> None:
+def tell(name: str, severity: Severity, detail: str, next_step: str = "") -> None:
+    """Log what happened."""
     getattr(log, severity)(name, detail=detail, next_step=next_step)

@@ -190,7 +190,7 @@ def test_one_skin_of_a_file_is_chosen_by_its_name(tmp_path: Path) -> None:
         ),
         ("stream = 'ipc:///x'\n[skins.l]\nports = ['a']\n[skins.r]\nports = ['b']", "ipc:///x"),
         ("proxy = 'x'\n[skins.left]\nports = ['a']", "use tcp://127.0.0.1:PORT"),
-        ("proxy = 'tcp://0.0.0.0:5570'\n[skins.left]\nports = ['a']", "`tactomo proxy` with keys"),
+        ("proxy = 'tcp://0.0.0.0:5570'\n[skins.left]\nports = ['a']", "run `tactomo zenoh`"),
         ("proxy = 'tcp://127.0.0.1:5560'\n[skins.left]\nports = ['a']", "the proxy and left both"),
         (
             "proxy = 'ipc:///x'\n[skins.left]\nports = ['a']\nstream = 'tcp://127.0.0.1:0'",

@@ -36,7 +36,7 @@ def zenoh(
     robot: Annotated[
         str | None,
         typer.Option(
-            help="Name in tactomo/ROBOT/SENSOR/KIND. [this host's; without --from: any robot's]"
+            help="Name in tactomo/ROBOT/SENSOR/KIND. [--from: this host's; --bind: any robot's]"
         ),
     ] = None,
     config: Annotated[
@@ -63,29 +63,28 @@ def zenoh(
 
     Needs eclipse-zenoh: `pip install 'tactomo[zenoh]'`.
     """
-    if not sources and bind is None:
-        raise typer.BadParameter("give --from, --bind, or both")
-    if bind is not None and bind in (sources or ()):
-        raise typer.BadParameter(
-            f"{bind} is a --from, too; give another address of this computer",
-            param_hint="'--bind'",
-        )
+    if bool(sources) == bool(bind):
+        raise typer.BadParameter("give --from or --bind, one of the two")
     _need_zenoh()
     from tactomo_client.keys import as_keys
 
     from tactomo.log import configure_logging
-    from tactomo.stream.zenoh_bridge import ZenohBridge, serve
+    from tactomo.stream.proxy import serve
+    from tactomo.stream.zenoh_bridge import ZenohBridge, ZenohProxy
 
     configure_logging(log_level, log_format)
-    name = "*" if robot is None and not sources else _checked(robot)
-    serve(ZenohBridge(sources or [], name, bind and _endpoint(bind), config, as_keys(keys)))
+    if bind:
+        serve(ZenohProxy(_checked(robot) if robot else "*", _endpoint(bind), config))
+    else:
+        name = _checked(robot or socket.gethostname())
+        serve(ZenohBridge(sources or [], name, config, as_keys(keys)))
 
 
-def _checked(robot: str | None) -> str:
+def _checked(robot: str) -> str:
     from tactomo_client.messages import check_sensor_name
 
     try:
-        return check_sensor_name(socket.gethostname() if robot is None else robot)
+        return check_sensor_name(robot)
     except ValueError as error:
         raise typer.BadParameter(
             f"{error}: give a name of letters, digits, '_', '.' and '-'", param_hint="'--robot'"
