@@ -21,7 +21,7 @@ What is unknown is NaN, or absent; docs/ros2.md says more.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import fields
 from typing import Any, Final, NamedTuple
 
@@ -95,7 +95,10 @@ def ros_messages(
     types = topic_types(frame.sensor)
     cloud, contacts, wrenches, poses, tf, diagnostics = types
     header = _new("std_msgs/msg/Header", stamp=_stamp(time_ns), frame_id=frame.sensor)
-    said: list[tuple[str, Any]] = [(diagnostics, _diagnostics(frame, header, age_s))]
+    level = "STALE" if frame.is_stale else "WARN" if frame.flags else "OK"
+    told = "stale" if frame.is_stale else ", ".join(sorted(frame.flags)) or "ok"
+    trust = _diagnostics(frame.sensor, header, told, _trust(frame, age_s), level)
+    said: list[tuple[str, Any]] = [(diagnostics, trust)]
     if (points := _map_points(frame)) is not None:
         said.append((cloud, _cloud(points, header)))
     said.append((contacts, _cloud(_contact_points(frame), header)))
@@ -255,37 +258,42 @@ def _contact_frame(frame: Frame, contact: Contact) -> str:
     return f"{frame.sensor}/contact_{contact.id}"
 
 
-def _diagnostics(frame: Frame, header: Any, age_s: float | None) -> Any:
-    status: Any = TYPES.types["diagnostic_msgs/msg/DiagnosticStatus"]
-    numbers = {
+def stale_diagnostics(sensor: str, frame: Frame | None, now_ns: int) -> RosMessage:
+    """Return that no frame comes; `frame` is the last that came, None where none ever did."""
+    header = _new("std_msgs/msg/Header", stamp=_stamp(now_ns), frame_id=sensor)
+    known = {} if frame is None else _trust(frame, frame.age_s)
+    told = "no frame yet" if frame is None else f"no frame for {frame.age_s:.1f} s"
+    message = _diagnostics(sensor, header, f"{told}: is the daemon running?", known, "STALE")
+    kind = topic_types(sensor)["/diagnostics"]
+    return RosMessage("/diagnostics", kind, bytes(TYPES.serialize_cdr(message, kind)))
+
+
+def _trust(frame: Frame, age_s: float | None) -> dict[str, Any]:
+    names = (
+        *("tier", "tier_reason", "misfit", "confidence", "session", "sequence", "scan_counter"),
+        *("acquired_realtime_ns", "acquired_monotonic_ns", "device_us", "delay_ns", "skew_ms"),
+    )
+    return {
         "is_known": frame.is_known,
         "age_s": age_s,
         "contacts": len(frame.contacts),
         "flags": " ".join(sorted(frame.flags)),
-        **{
-            name: getattr(frame, name)
-            for name in (
-                *("tier", "tier_reason", "misfit", "confidence", "session", "sequence"),
-                *("scan_counter", "acquired_realtime_ns", "acquired_monotonic_ns", "device_us"),
-                *("delay_ns", "skew_ms"),
-            )
-        },
+        **{name: getattr(frame, name) for name in names},
     }
-    told = "stale" if frame.is_stale else ", ".join(sorted(frame.flags)) or "ok"
-    return _new(
-        "diagnostic_msgs/msg/DiagnosticArray",
-        header=header,
-        status=[
-            status(
-                level=status.STALE if frame.is_stale else int(bool(frame.flags)),  # 1: WARN
-                name=f"tactomo: {frame.sensor}",
-                message=told,
-                hardware_id=frame.sensor,
-                values=[
-                    _new("diagnostic_msgs/msg/KeyValue", key=key, value=str(value))
-                    for key, value in numbers.items()
-                    if value is not None
-                ],
-            )
-        ],
+
+
+def _diagnostics(sensor: str, header: Any, told: str, known: Mapping[str, Any], level: str) -> Any:
+    status: Any = TYPES.types["diagnostic_msgs/msg/DiagnosticStatus"]
+    values = [
+        _new("diagnostic_msgs/msg/KeyValue", key=key, value=str(value))
+        for key, value in known.items()
+        if value is not None
+    ]
+    one = status(
+        level=getattr(status, level),
+        name=f"tactomo: {sensor}",
+        message=told,
+        hardware_id=sensor,
+        values=values,
     )
+    return _new("diagnostic_msgs/msg/DiagnosticArray", header=header, status=[one])

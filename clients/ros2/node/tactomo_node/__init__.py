@@ -1,0 +1,60 @@
+"""A ROS 2 node that publishes a tactomo sensor over whatever RMW the robot has.
+
+It needs `pip install 'tactomo[ros2]'` in ROS's Python (3.12: Jazzy, Kilted). Parameters: `sensor`
+and `stream`, whose they are; `keys`, a folder, for a daemon beyond this computer; `parent` and
+`pose`, where the sensor hangs, as in `tactomo ros2`; `tf`, whether contacts get frames.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from tactomo_client import DEFAULT_STREAM, ClientError, subscribe
+from tactomo_client.placement import Placement
+from tactomo_ros2.live import run
+from tactomo_ros2.messages import RosMessage, topic_types
+
+DEPTH = 10  # messages kept for a slow reader: half a second at 20 frames a second
+
+
+def main() -> None:
+    """Publish until ROS shuts down."""
+    rclpy.init()
+    node = Node("tactomo")
+    try:
+        _publish(node)
+    except (ClientError, ValueError) as error:
+        node.get_logger().fatal(f"{error}")
+        raise SystemExit(1) from None
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        rclpy.try_shutdown()
+
+
+def _publish(node: Node) -> None:
+    def parameter(name: str, default: Any) -> Any:
+        return node.declare_parameter(name, default).value
+
+    sensor, stream = parameter("sensor", "skin"), parameter("stream", DEFAULT_STREAM)
+    keys, parent = parameter("keys", ""), parameter("parent", "")
+    pose, has_tf = parameter("pose", "0,0,0"), parameter("tf", True)
+    publishers = {}
+    for topic, kind in topic_types(sensor).items():
+        package, _, name = kind.split("/")
+        if topic != "/tf" or has_tf:
+            message = getattr(import_module(f"{package}.msg"), name)
+            publishers[topic] = node.create_publisher(message, topic, DEPTH)
+
+    def publish(message: RosMessage) -> None:
+        if message.topic in publishers and rclpy.ok():
+            publishers[message.topic].publish(message.cdr)
+
+    placement = Placement.parse(parent, pose) if parent else None
+    with subscribe(sensor, address=stream, keys=keys or None) as skin:
+        node.get_logger().info(f"publishing {sensor} of {stream}")
+        run(skin, publish, lambda: not rclpy.ok(), placement)

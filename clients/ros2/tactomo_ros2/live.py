@@ -1,0 +1,42 @@
+"""A running sensor's frames as ROS 2 messages, for whatever carries them: Zenoh, or a node."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Final
+
+from tactomo_client import Frame, Subscription
+from tactomo_client.placement import Placement
+
+from tactomo_ros2.messages import RosMessage, ros_messages, stale_diagnostics
+
+WAIT_S: Final = 0.2
+"""How soon a stop is noticed."""
+REMIND_S: Final = 1.0
+"""How often silence is told: as often as diagnostics are published by convention (REP 107)."""
+
+
+def run(
+    skin: Subscription[Frame],
+    publish: Callable[[RosMessage], None],
+    is_over: Callable[[], bool],
+    placement: Placement | None = None,
+) -> None:
+    """Publish every frame, and once a second that none comes, until `is_over`.
+
+    Raises:
+        KeysError: the daemon does not let us in.
+    """
+    last: Frame | None = None
+    due_s = time.monotonic() + REMIND_S
+    while not is_over():
+        frame = skin.wait(WAIT_S)
+        if frame is not None:
+            last = frame
+            for message in ros_messages(frame, frame.acquired_realtime_ns, frame.age_s, placement):
+                publish(message)
+            due_s = time.monotonic() + REMIND_S
+        elif time.monotonic() >= due_s:
+            due_s += REMIND_S
+            publish(stale_diagnostics(skin.sensor, last, time.time_ns()))
