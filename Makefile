@@ -6,6 +6,9 @@ RUN_READY := $(VENV)/.ready-run
 READY := $(VENV)/.ready
 TRAIN_READY := $(VENV)/.ready-train
 DOCS_READY := $(VENV)/.ready-docs
+PEERS_PYTHON ?= python3.12
+PEERS := .venv-peers
+PEERS_READY := $(PEERS)/.ready
 SHELL := bash
 .SHELLFLAGS := -eo pipefail -c
 
@@ -21,7 +24,7 @@ SITE = $(DIST)/docs/$(shell sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)
 LOCKED := pyproject.toml --universal --python-version 3.11 --generate-hashes \
   --no-emit-package tactomo-client --no-emit-package tactomo --no-emit-package tactomo-lab
 
-.PHONY: help setup run test test-all test-long test-train faults soak fleet firmware fuzz lint format bench docs wheels deb lock clean
+.PHONY: help setup run test test-all test-long test-train test-peers faults soak fleet firmware fuzz lint format bench docs wheels deb lock clean
 
 help:            ## list these targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -35,7 +38,7 @@ test: $(READY)   ## the default test suite
 	$(BIN)/pytest -n auto --dist loadfile $(ARGS)
 
 test-all: $(READY)  ## every test but the long ones, training and faults; more examples in each
-	$(BIN)/pytest -n auto --dist loadfile -m 'not long and not train and not faults' \
+	$(BIN)/pytest -n auto --dist loadfile -m 'not long and not train and not peers and not faults' \
 	  --hypothesis-profile many $(ARGS)
 
 test-long: $(READY)  ## statistics, measured sets and days of drift: minutes each
@@ -43,6 +46,10 @@ test-long: $(READY)  ## statistics, measured sets and days of drift: minutes eac
 
 test-train: $(TRAIN_READY)  ## the tests of training; installs PyTorch
 	$(BIN)/pytest -m train $(ARGS)
+
+test-peers: $(PEERS_READY)  ## LeRobot and ROS 2 themselves read ours; installs them (4 GB), needs Python 3.12
+	HF_HOME=$(PEERS)/huggingface HF_HUB_OFFLINE=1 $(PEERS)/bin/python -m pytest -m peers \
+	  tests/learning tests/ros2/test_node.py $(ARGS)
 
 faults: $(READY) ## every fault and measure (an hour), then docs/reliability.md from them
 	$(BIN)/pytest tests/faults -m '' --reliability docs/reliability.md $(ARGS)
@@ -100,7 +107,7 @@ lock:            ## refresh the lock files (needs uv on the PATH)
 	  --no-emit-package torch -o requirements-train.lock
 
 clean:           ## remove the environment and caches
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf $(VENV) $(PEERS) .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
 # Built in place under a temporary marker so that an interrupted install is simply redone. First what
 # runs, then on top of that what tests, then what trains.
@@ -129,4 +136,13 @@ $(TRAIN_READY): $(READY) requirements-train.lock requirements-torch.txt
 	@echo "setting up $(VENV): what trains"
 	@$(INSTALL) --require-hashes -r requirements-train.lock | $(SHOW)
 	@$(INSTALL) -r requirements-torch.txt | $(SHOW)
+	@touch $@
+
+# In an environment of their own: LeRobot wants a newer Python and older packages than ours.
+$(PEERS_READY): requirements-peers.txt pyproject.toml clients/python/pyproject.toml clients/lerobot/pyproject.toml
+	@echo "setting up $(PEERS): LeRobot and ROS 2"
+	@$(PEERS_PYTHON) -m venv $(PEERS)
+	@$(PEERS)/bin/python -m pip install --no-compile -r requirements-peers.txt | $(SHOW)
+	@$(PEERS)/bin/python -m pip install --quiet --no-compile --no-build-isolation \
+	  -e clients/python -e '.[ros2]' -e clients/lerobot
 	@touch $@

@@ -21,6 +21,7 @@ PACKAGES = {
     "tactomo_viewer": ROOT / "clients/viewer/tactomo_viewer",
     "tactomo_foxglove": ROOT / "clients/foxglove/tactomo_foxglove",
     "tactomo_ros2": ROOT / "clients/ros2/tactomo_ros2",
+    "lerobot_camera_tactomo": ROOT / "clients/lerobot/lerobot_camera_tactomo",
     "tactomo": ROOT / "daemon/tactomo",
     "tactomo_lab": ROOT / "models/tactomo_lab",
 }
@@ -32,6 +33,7 @@ ALLOWED: dict[str, set[str]] = {
     "tactomo_viewer": {"tactomo_client"},
     "tactomo_foxglove": {"tactomo_client"},
     "tactomo_ros2": {"tactomo_client"},
+    "lerobot_camera_tactomo": {"tactomo_client"},
     "tactomo": {
         *("tactomo_protocol", "tactomo_client", "tactomo_models"),
         *("tactomo_viewer", "tactomo_foxglove", "tactomo_ros2"),

@@ -15,9 +15,7 @@ topic                  schema                      what
 =====================  ==========================  =================================================
 
 What is unknown is left out of the JSON messages. A contact there has a `trace`, which it keeps for
-as long as it is followed: the least number, from 1, that no other has. Its id would not do for a
-layout, since ids are never used again; nor its place in the list, where others move up when one
-lifts.
+as long as it is followed (`tactomo_client.traces`).
 """
 
 from __future__ import annotations
@@ -37,6 +35,7 @@ from foxglove.channels import (
 )
 from tactomo_client import Contact, Frame
 from tactomo_client.placement import Placement
+from tactomo_client.traces import Traces
 
 from tactomo_foxglove import messages
 from tactomo_foxglove.messages import contact_numbers, known
@@ -119,7 +118,7 @@ class SensorTopics:
         self.description: Mapping[str, Any] = {}
         self._placement = placement
         self._last: Frame | None = None
-        self._traces = _Traces()
+        self._traces = Traces()
         self._transforms = transforms
 
         def topic(name: str) -> str:
@@ -145,7 +144,8 @@ class SensorTopics:
         self._hang(time_ns)
         self._show(frame, time_ns, "")
         numbers = _frame_numbers(frame, self._last, age_s)
-        self._frame.log(numbers | {"contacts": self._traces.of(frame)}, log_time=time_ns)
+        contacts = [{**contact_numbers(c), "trace": n} for c, n in self._traces.of(frame)]
+        self._frame.log(numbers | {"contacts": contacts}, log_time=time_ns)
         self._last = frame
 
     def stale(self, frame: Frame, words: str, time_ns: int) -> None:
@@ -177,28 +177,6 @@ class SensorTopics:
         for channel, draw in drawings:
             if channel.has_sinks() and (drawn := draw(frame, self.description, time_ns, stale)):
                 channel.log(drawn, log_time=time_ns)
-
-
-class _Traces:
-    """Which contact has which trace of the plots."""
-
-    def __init__(self) -> None:
-        self._session = ""
-        self._ids: list[int] = []  # of each trace, that of the contact which has it or had it last
-
-    def of(self, frame: Frame) -> list[dict[str, Any]]:
-        """Return the numbers of the frame's contacts by their ids, the trace of each among them."""
-        if frame.session != self._session:
-            self._session, self._ids = frame.session, []
-        contacts = sorted(frame.contacts, key=lambda contact: contact.id)
-        shown = {contact.id for contact in contacts}
-        for new in sorted(shown - set(self._ids)):
-            free = next((i for i, last in enumerate(self._ids) if last not in shown), None)
-            if free is None:
-                self._ids.append(new)
-            else:
-                self._ids[free] = new
-        return [{**contact_numbers(c), "trace": self._ids.index(c.id) + 1} for c in contacts]
 
 
 def _frame_numbers(frame: Frame, last: Frame | None, age_s: float | None) -> dict[str, Any]:

@@ -29,6 +29,10 @@ TOUCHES_SEEN = frozenset(
 """Flags under which every touch is still seen: see STREAM.md. Of any other nobody knows."""
 
 
+PRESSURE_RANGES = ("unknown", "within", "below", "above")
+"""What a contact's `pressure_range` may be; where it has to be a number, its place in here."""
+
+
 class Answer(Enum):
     """What `exceeds` answers: compare it, as in ``is Answer.NO``.
 

@@ -29,12 +29,11 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 from tactomo_client import Contact, Frame
+from tactomo_client.frame import PRESSURE_RANGES
 from tactomo_client.placement import Placement
 
 TYPES: Final = get_typestore(Stores.ROS2_HUMBLE)
 """Definitions; their hashes are the same up to Kilted and, but for Humble, part of the wire."""
-RANGES: Final = ("unknown", "within", "below", "above")
-"""`pressure_range` of a contact's point is an index into these."""
 CONTACT_POINT: Final = np.dtype(
     [
         *((axis, "<f4") for axis in "xyz"),
@@ -193,7 +192,7 @@ def _contact_points(frame: Frame) -> NDArray[np.void]:
         for field in fields(Contact):
             value = getattr(contact, field.name)
             if field.name == "pressure_range":
-                value = RANGES.index(value) if value in RANGES else 0
+                value = PRESSURE_RANGES.index(value) if value in PRESSURE_RANGES else 0
             point[field.name] = np.nan if value is None else value
         point["x"], point["y"] = contact.x_mm * 1e-3, contact.y_mm * 1e-3
     return points

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from tactomo_client.placement import Placement
 
 KINDS = {".mcap": "frames for Foxglove", ".csv": "contacts", ".npz": "maps and contacts"}
-BAG = "a ROS 2 bag"
+BAG, DATASET = "a ROS 2 bag", "a LeRobot dataset"
 Moments: TypeAlias = Iterator[Moment]
 Writer: TypeAlias = Callable[[RecordedFrames, Moments, Any], int]
 """Writes moments into an open file, or a folder that it makes; returns how many there were."""
@@ -40,6 +40,7 @@ app = typer_app()
     epilog=examples(
         "tactomo export grasp.mcap grasp_foxglove.mcap --layout skin.json",
         "tactomo export grasp.mcap grasp_bag --ros2",
+        "tactomo export grasp.mcap grasp_dataset --lerobot --robot steps.csv --task 'lift the cup'",
         "tactomo export grasp.mcap contacts.csv --from 2 --to 10",
         "tactomo export grasp.mcap maps.npz",
     ),
@@ -55,12 +56,29 @@ def export(
     output: Annotated[
         Path,
         typer.Argument(
-            metavar="OUT", help="The file to write: .mcap, .csv or .npz; with --ros2 a new folder."
+            metavar="OUT",
+            help="The file to write: .mcap, .csv, .npz; a new folder with --ros2, --lerobot.",
         ),
     ],
     ros2: Annotated[
         bool, typer.Option("--ros2", help="Write a ROS 2 bag of standard messages.")
     ] = False,
+    lerobot: Annotated[
+        bool, typer.Option("--lerobot", help="Write a LeRobot dataset, without loss.")
+    ] = False,
+    robot: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.csv",
+            help="For --lerobot: the robot's steps to align with: monotonic_s or realtime_s, "
+            "episode, action.*, and its state.",
+        ),
+    ] = None,
+    fps: Annotated[
+        int | None,
+        typer.Option(min=1, help="For --lerobot: steps a second. [the robot's, or 30]"),
+    ] = None,
+    task: Annotated[str, typer.Option(help="For --lerobot: what is done, in words.")] = "touch",
     start_s: FromOption = 0.0,
     end_s: ToOption = None,
     description: RecordedDescription = None,
@@ -91,6 +109,9 @@ def export(
     WrenchStamped and PoseWithCovarianceStamped, and diagnostics. Needs rosbags, and no ROS:
     `pip install 'tactomo[ros2]'`.
 
+    *--lerobot* writes a folder that LeRobot trains on: maps and contacts as the numbers that they
+    are, with masks for what is not known. Needs lerobot, and Python 3.12.
+
     *.csv* has a row for each contact in each frame, and one with an empty `id` for a frame in which
     nothing is pressed. Units are in the names; what is unknown is empty. Numbers are exact.
 
@@ -102,30 +123,38 @@ def export(
     recording's beginning. The size of a recording does not matter: memory stays small. What a
     recording lacks (lost frames, a clock that was set, restarts) is counted on standard error.
     """
-    kind = BAG if ros2 else _kind(output)
-    if ros2:
+    kind = BAG if ros2 else DATASET if lerobot else _kind(output)
+    is_folder = ros2 or lerobot
+    if robot is not None and not lerobot:
+        raise typer.BadParameter("--robot is for --lerobot")
+    if is_folder:
         _prepare_folder(output)
-    for file in (*([] if ros2 else [output]), *([layout] if layout else [])):
+    for file in (*([] if is_folder else [output]), *([layout] if layout else [])):
         prepare_file(file, force=force, source=recording)
-    write = _writer(kind, parent, pose, output.parent)
     gaps = Gaps()
+    told: list[str] = []
+    if kind == DATASET:
+        write = _dataset_writer(robot, fps, task, gaps, told)
+    else:
+        write = _writer(kind, parent, pose, output.parent)
     with recorded_frames(recording, description, start_s, end_s, output.parent) as frames:
         moments = frames.moments("contacts" if kind == ".csv" else "map")
         watched = gaps.watch(frames.with_progress(moments, "exporting"))
-        into = _write_folder if ros2 else _write_file
+        into = _write_folder if is_folder else _write_file
         count = _written(output, lambda: into(output, lambda out: write(frames, watched, out)))
         if layout is not None:
             write_layout(layout, frames.sensor)
-    for line in gaps.lines():
+    for line in (*gaps.lines(), *told):
         typer.echo(line, err=True)
-    typer.echo(f"wrote {output}: {KINDS.get(kind, kind)}, {count} frames")
+    of = "steps" if kind == DATASET else "frames"
+    typer.echo(f"wrote {output}: {KINDS.get(kind, kind)}, {count} {of}")
 
 
 def _kind(output: Path) -> str:
     kind = output.suffix.lower()
     if kind not in KINDS:
         raise typer.BadParameter(
-            f"{output}: give a file that ends in {', '.join(KINDS)}, or add --ros2"
+            f"{output}: give a file that ends in {', '.join(KINDS)}, or add --ros2 or --lerobot"
         )
     return kind
 
@@ -144,10 +173,27 @@ def _writer(kind: str, parent: str | None, pose: str, scratch: Path) -> Writer:
     return lambda frames, moments, folder: _write_bag(frames, moments, folder, hung)
 
 
+def _dataset_writer(
+    robot: Path | None, fps: int | None, task: str, gaps: Gaps, told: list[str]
+) -> Writer:
+    from tactomo.cli.files.lerobot import need_lerobot, write_dataset
+    from tactomo.cli.files.robot_log import read_robot_log
+
+    log = None if robot is None else read_robot_log(robot)
+    need_lerobot()
+
+    def write(frames: RecordedFrames, moments: Moments, folder: Path) -> int:
+        count, lines = write_dataset(moments, folder, frames.sensor, gaps, log, fps, task)
+        told.extend(lines)
+        return count
+
+    return write
+
+
 def _prepare_folder(output: Path) -> None:
     """Make sure that a folder can be written that is not there yet."""
     if output.suffix.lower() in KINDS:
-        raise typer.BadParameter(f"{output}: a bag is a folder; name {output.with_suffix('')}")
+        raise typer.BadParameter(f"{output}: that is a folder; name {output.with_suffix('')}")
     if output.exists():
         raise TactomoError(f"{output} exists already", "name another folder, or delete this one")
     if not os.access(output.parent, os.W_OK):

@@ -14,13 +14,17 @@ what is less (ntpd up to 0.128 s, and by at most 0.5 ms a second)."""
 
 
 class Gaps:
-    """Counts what is missing or odd among frames that pass by; nothing is filled in."""
+    """Counts what is missing or odd among frames that pass by; nothing is filled in.
+
+    Attributes:
+        first_step_s: by how much the wall clock was set first, s; 0 where it was not.
+    """
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
         self._first_s: dict[str, float] = {}
         self._flags: Counter[str] = Counter()
-        self._first_step_s = 0.0
+        self.first_step_s = 0.0
         self._last: Moment | None = None
 
     def watch(self, moments: Iterator[Moment]) -> Iterator[Moment]:
@@ -36,7 +40,7 @@ class Gaps:
         sentences = {
             "lost": "frames were published that the recording does not hold",
             "left out": "dual scans were taken but not reconstructed",
-            "set": f"steps of the wall clock, the first by {self._first_step_s:+.3f} s; times here "
+            "set": f"steps of the wall clock, the first by {self.first_step_s:+.3f} s; times here "
             "go by the steady clock",
             "back": "frames are not later than the one before",
             "restart": "restarts of the daemon: contact identities begin anew",
@@ -70,7 +74,7 @@ class Gaps:
         if frame.session != last.frame.session:
             self._count("restart", moment)
         elif abs(step_s := _wall_less_steady_s(moment) - _wall_less_steady_s(last)) > CLOCK_STEP_S:
-            self._first_step_s = self._first_step_s or step_s
+            self.first_step_s = self.first_step_s or step_s
             self._count("set", moment)
 
 

@@ -1,0 +1,105 @@
+"""A frame as arrays of fixed shapes, for learning: what a dataset holds and a policy is given.
+
+=================  ==================  =============================================================
+array              shape, dtype        meaning
+=================  ==================  =============================================================
+pressure_kpa       (ny, nx) float32    0 where nothing touches, and where `known` is 0
+known              (ny, nx) uint8      1 where the pressure is known, and the frame would show every
+                                       touch; 0 elsewhere
+magnitude          (ny, nx) float32    |Δσ|/σ₀
+structure          (ny, nx) float32    how surely the node is pressed, 0 to 1
+contacts           (n, fields) float64 a row for each contact, `CONTACT_COLUMNS`; a contact keeps
+                                       its row for as long as it lives
+contacts_known     (n, fields) uint8   1 where the number beside it is one; 0 in empty rows, too
+is_known           (1,) uint8          whether no contacts means nothing pressed
+has_frame          (1,) uint8          0 where there is no frame, and all else is 0
+=================  ==================  =============================================================
+
+What is not known is 0 beside a mask that says so, not NaN: one NaN makes NaN of all statistics that
+learning scales its inputs by. No value of a known number is changed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from tactomo_client.frame import PRESSURE_RANGES, Contact, Frame
+from tactomo_client.traces import Traces
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+CONTACTS: Final = 16
+"""Rows for contacts; a hand of five fingers, thrice."""
+IMAGES: Final = {"pressure_kpa": "pressure_kpa", "magnitude": "map", "structure": "structure"}
+CONTACT_COLUMNS: Final = tuple(field.name for field in fields(Contact))
+"""A contact's fields; `pressure_range` is its place in `frame.PRESSURE_RANGES`."""
+
+
+class Touch:
+    """Turns the frames of one sensor into such arrays, one after the other.
+
+    Args:
+        shape: of the maps, (ny, nx).
+        contacts: how many rows there are for contacts.
+
+    Attributes:
+        crowded: how many contacts found no row so far.
+
+    Example::
+
+        touch = Touch((51, 51))
+        for frame in subscribe("left_forearm", latest_only=True):
+            action = policy(touch.arrays(frame))
+    """
+
+    def __init__(self, shape: tuple[int, int], contacts: int = CONTACTS) -> None:
+        self.crowded = 0
+        self._shape = shape
+        self._rows = contacts
+        self._traces = Traces()
+
+    def arrays(self, frame: Frame | None) -> dict[str, NDArray[Any]]:
+        """Return what a frame shows; None: that there is none.
+
+        Raises:
+            ValueError: its maps are of another shape.
+        """
+        table = np.zeros((self._rows, len(CONTACT_COLUMNS)))
+        is_number = np.zeros(table.shape, np.uint8)
+        for contact, trace in self._traces.of(frame) if frame else ():
+            if trace > self._rows:
+                self.crowded += 1
+                continue
+            row = [_number(getattr(contact, name)) for name in CONTACT_COLUMNS]
+            table[trace - 1] = [0.0 if number is None else number for number in row]
+            is_number[trace - 1] = [number is not None for number in row]
+        images = {
+            name: self._image(None if frame is None else getattr(frame, of_frame))
+            for name, of_frame in IMAGES.items()
+        }
+        is_known = frame is not None and frame.is_known
+        return {
+            **{name: np.nan_to_num(image) for name, image in images.items()},
+            "known": (np.isfinite(images["pressure_kpa"]) & is_known).astype(np.uint8),
+            "contacts": table,
+            "contacts_known": is_number,
+            "is_known": np.array([is_known], np.uint8),
+            "has_frame": np.array([frame is not None], np.uint8),
+        }
+
+    def _image(self, image: NDArray[np.float32] | None) -> NDArray[np.float32]:
+        if image is None:
+            return np.full(self._shape, np.nan, np.float32)
+        if image.shape != self._shape:
+            raise ValueError(f"a map is {image.shape}, not {self._shape}: of another sensor")
+        return image
+
+
+def _number(value: float | str | None) -> float | None:
+    if isinstance(value, str):
+        return float(PRESSURE_RANGES.index(value)) if value in PRESSURE_RANGES else None
+    return value

@@ -1,0 +1,257 @@
+"""A recording's frames as a LeRobot dataset, beside a robot's own steps or at a rate of their own.
+
+Each step has the newest frame that had been *published* by then: what the robot could have known.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
+
+from tactomo.cli.files.gaps import Gaps
+from tactomo.cli.files.recorded_frames import Moment
+from tactomo.cli.files.robot_log import RobotLog
+from tactomo.errors import TactomoError
+
+if TYPE_CHECKING:
+    from tactomo_client.touch import Touch
+
+DEFAULT_FPS: Final = 30
+"""As LeRobot's own programs have it."""
+STALE_S: Final = 0.5
+"""A step without a younger frame has none: from then on `Frame.is_stale`, by default."""
+
+RESOLUTION_S: Final = 1e-6
+"""Of seconds since 1970 in 64 bits: 2.4e-7."""
+
+
+class Step(NamedTuple):
+    """A time, the frame that the dataset has there, and how old that is; 0 where there is none."""
+
+    time_s: float
+    moment: Moment | None
+    age_s: float
+
+
+class Alignment:
+    """Gives each time its frame, and counts what does not fit."""
+
+    def __init__(self, acquired_s: Callable[[Moment], float]) -> None:
+        self._acquired_s = acquired_s
+        self._without = self._repeated = self._passed_over = 0
+
+    def steps(
+        self, moments: Iterator[Moment], times_s: Iterable[float], *, is_endless: bool
+    ) -> Iterator[Step]:
+        """Yield a step for each time; of endless times, for those within the recording."""
+        newest: Moment | None = None
+        shown: Moment | None = None
+        coming = next(moments, None)
+        for time_s in times_s:
+            while coming is not None and self.published_s(coming) <= time_s + RESOLUTION_S:
+                self._passed_over += newest is not shown
+                newest, coming = coming, next(moments, None)
+            if is_endless and coming is None and newest is shown:
+                return
+            age_s = math.inf if newest is None else time_s - self._acquired_s(newest)
+            if newest is None or age_s > STALE_S:
+                self._without += 1
+                yield Step(time_s, None, 0.0)
+                continue
+            self._repeated += newest is shown
+            shown = newest
+            yield Step(time_s, newest, age_s)
+
+    def published_s(self, moment: Moment) -> float:
+        """Return when a frame was there for others; made frames, when it was acquired."""
+        return self._acquired_s(moment) + (moment.age_s or 0.0)
+
+    def lines(self) -> list[str]:
+        """Return what did not fit, a sentence each."""
+        sentences = {
+            f"steps have no frame younger than {STALE_S:g} s: zeros, `has_frame` 0": self._without,
+            "steps show the frame of the step before once more": self._repeated,
+            "frames are in no step: newer ones had come": self._passed_over,
+        }
+        return [f"{count} {sentence}" for sentence, count in sentences.items() if count]
+
+
+def need_lerobot() -> None:
+    """Make sure that LeRobot is there.
+
+    Raises:
+        TactomoError: it is not installed.
+    """
+    logging.getLogger("lerobot").setLevel(logging.ERROR)  # it misses decoders of videos: no matter
+    try:
+        import datasets
+        import lerobot.datasets  # noqa: F401
+    except ImportError as error:
+        raise TactomoError(
+            f"a dataset needs lerobot, and {error.name} is not installed",
+            "pip install 'lerobot[dataset]', in Python 3.12 or newer",
+        ) from error
+    datasets.disable_progress_bars()
+
+
+def write_dataset(
+    moments: Iterator[Moment],
+    folder: Path,
+    sensor: str,
+    gaps: Gaps,
+    log: RobotLog | None = None,
+    fps: int | None = None,
+    task: str = "touch",
+) -> tuple[int, list[str]]:
+    """Write a dataset; return how many steps there are, and what did not fit, a sentence each.
+
+    LeRobot holds an episode in memory: some 40 kB for each step.
+
+    Args:
+        moments: the frames, in the order of their times.
+        folder: the dataset, which must not be there yet.
+        sensor: the sensor's name.
+        gaps: watches `moments`.
+        log: a robot's steps; None for a step every 1 / fps from the first frame to the last.
+        fps: steps a second; None for the log's, or LeRobot's default.
+        task: what is done there, in words.
+
+    Raises:
+        TactomoError: there is no map, the clock that is aligned by was set, or no rate is known.
+    """
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from tactomo_client.touch import Touch
+
+    held = list(_up_to_first_map(moments))
+    if not held:
+        return 0, []
+    touch = Touch(_shape(held[-1]))
+    alignment = Alignment(_clock(log, gaps))
+    rate = fps or _rate(log)
+    start_s = alignment.published_s(held[0])
+    times_s = (start_s + step / rate for step in itertools.count()) if log is None else log.times_s
+    dataset: Any = None
+    count = 0
+    steps = alignment.steps(itertools.chain(held, moments), times_s, is_endless=log is None)
+    for count, step in enumerate(steps, 1):
+        begins = log.first_of_episode[count - 1] if log else count == 1
+        values = _values(sensor, touch, step, log, count - 1)
+        if dataset is None:
+            dataset = LeRobotDataset.create(
+                f"tactomo/{folder.name}",
+                fps=rate,
+                features=_features(values, log),
+                root=folder,
+                use_videos=False,
+            )
+        elif begins:
+            dataset.save_episode()
+        if begins:
+            start_s = step.time_s
+        values["observation.time_s"] = np.array([step.time_s - start_s])
+        dataset.add_frame(values | {"task": task})
+    dataset.save_episode()
+    dataset.finalize()
+    lines = alignment.lines()
+    if log is not None and (lacking := log.missing(rate)):
+        lines.append(
+            f"{lacking} steps are missing in the robot's log at {rate} a second; LeRobot's "
+            "`timestamp` does not know, `observation.time_s` does"
+        )
+    if touch.crowded:
+        lines.append(f"{touch.crowded} contacts found no row: more than the dataset has")
+    return count, lines
+
+
+def _up_to_first_map(moments: Iterator[Moment]) -> Iterator[Moment]:
+    for moment in moments:
+        yield moment
+        if _image(moment) is not None:
+            return
+    raise TactomoError(
+        "no frame has a map, so that a dataset's shape is not known",
+        "look at it with `tactomo info`; record with the skin tared, and with --maps",
+    )
+
+
+def _image(moment: Moment) -> Any:
+    images = (moment.frame.pressure_kpa, moment.frame.map, moment.frame.structure)
+    return next((image for image in images if image is not None), None)
+
+
+def _shape(moment: Moment) -> tuple[int, int]:
+    rows, columns = _image(moment).shape
+    return rows, columns
+
+
+def _rate(log: RobotLog | None) -> int:
+    if log is None:
+        return DEFAULT_FPS
+    if not math.isfinite(log.period_s) or round(1 / log.period_s) < 1:
+        raise TactomoError("the robot's log has less than a step a second", "give --fps")
+    return round(1 / log.period_s)
+
+
+def _clock(log: RobotLog | None, gaps: Gaps) -> Callable[[Moment], float]:
+    """Return how to read from a moment when it was acquired, s, on the clock that rows have."""
+
+    def by_clock(moment: Moment) -> float:
+        assert log is not None
+        if log.clock == "monotonic_s":
+            if moment.age_s is None:
+                raise TactomoError(
+                    "frames that were made of a recording have no monotonic time",
+                    "align by realtime_s, or record with --maps",
+                )
+            return moment.frame.acquired_monotonic_ns * 1e-9
+        if gaps.first_step_s:
+            raise TactomoError(
+                f"the wall clock was set by {gaps.first_step_s:+.3f} s within the recording, so "
+                "that realtime_s is ambiguous",
+                "log monotonic_s, or export before and after with --from and --to",
+            )
+        return moment.frame.acquired_realtime_ns * 1e-9
+
+    return (lambda moment: moment.time_s) if log is None else by_clock
+
+
+def _values(
+    sensor: str, touch: Touch, step: Step, log: RobotLog | None, row: int
+) -> dict[str, Any]:
+    """Return a row of the dataset."""
+    arrays = touch.arrays(step.moment and step.moment.frame)
+    arrays["age_s"] = np.array([step.age_s], np.float32)
+    values = {f"observation.tactile.{sensor}.{name}": array for name, array in arrays.items()}
+    values["observation.time_s"] = np.zeros(1)
+    if log is not None:
+        for name, is_of_it in (("action", True), ("observation.state", False)):
+            chosen = np.array(log.is_action, bool) == is_of_it
+            if chosen.any():
+                values[name] = log.numbers[row, chosen].astype(np.float32)
+    return values
+
+
+def _features(values: Mapping[str, Any], log: RobotLog | None) -> dict[str, Any]:
+    """Return what LeRobot is told of each of these values."""
+    from tactomo_client.touch import CONTACT_COLUMNS
+
+    names: dict[str, Any] = {}
+    for name, is_of_it in (("action", True), ("observation.state", False)):
+        if log is not None:
+            flags = zip(log.columns, log.is_action, strict=True)
+            names[name] = [column for column, is_action in flags if is_action == is_of_it]
+    columns = {"fields": list(CONTACT_COLUMNS)}
+    return {
+        name: {
+            "dtype": str(array.dtype),
+            "shape": array.shape,
+            "names": columns if ".contacts" in name else names.get(name),
+        }
+        for name, array in values.items()
+    }
