@@ -80,7 +80,8 @@ from tactomo.worker import Worker
 if TYPE_CHECKING:
     from tactomo.service.metrics import MetricsServer
 
-WATCH_S: Final = 0.1
+WATCH_S: Final = 0.5
+"""How late, at most, a thread that died or a replay's end is noticed; a stop is at once."""
 
 log = structlog.get_logger()
 

@@ -30,7 +30,8 @@ from tactomo.stream.peers import Peers
 from tactomo.worker import Worker
 
 MAX_REQUEST_BYTES: Final = 64 * 1024
-POLL_MS: Final = 50
+POLL_MS: Final = 250
+"""How late, at most, a stop or a cut is noticed."""
 POLL_WHILE_PENDING_MS: Final = 10
 MAX_PENDING: Final = 64
 QUEUED_PER_CLIENT: Final = 64
@@ -150,9 +151,13 @@ class Control(Worker):
         self._socket.close(LINGER_MS)
 
     def _run(self) -> None:
+        poller = zmq.Poller()
+        poller.register(self._socket, zmq.POLLIN)
+        poller.register(self._peers.monitor, zmq.POLLIN)
         while not self._stopping.is_set():
             self.turns += 1
-            if self._socket.poll(POLL_WHILE_PENDING_MS if self._pending else POLL_MS):
+            longest_ms = POLL_WHILE_PENDING_MS if self._pending else POLL_MS
+            if self._socket in dict(poller.poll(self._peers.wait_ms(longest_ms))):
                 self._receive()
             self._answer_pending()
             if self._cut.is_set():

@@ -26,6 +26,8 @@ MAX_PARTS: Final = 8
 """Of a request: identity, empty part, body; and what a few proxies add."""
 DISCARDED_AT_ONCE: Final = 10_000
 """Parts: some 10 ms."""
+CHECK_MS: Final = 50
+"""How often connections are looked at: what comes of one meanwhile is memory."""
 MAX_UNREAD_BYTES: Final = 2 << 20
 HEARTBEAT_BYTES_S: Final = 100.0
 """What a connection sends that says nothing: heartbeats each second, under CURVE."""
@@ -46,6 +48,7 @@ class Peers:
 
     Attributes:
         address: where the socket is bound.
+        monitor: a socket that is readable when a connection comes or goes.
     """
 
     def __init__(
@@ -60,14 +63,14 @@ class Peers:
         self._socket = socket
         self._purpose = purpose
         self._on_event = on_event
-        self._monitor = socket.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
+        self.monitor = socket.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
         self._connections: dict[int, _Connection] = {}  # by descriptor
         self._is_discarding = False
         self._limit = RateLimit()
         try:
             self.address = bind(socket, endpoint, purpose, secret=secret, option=option)
         except AddressError:
-            self._monitor.close(0)
+            self.monitor.close(0)
             raise
 
     def receive(self) -> list[bytes] | None:
@@ -88,10 +91,14 @@ class Peers:
         self._is_discarding = bool(self._socket.rcvmore)
         return None if self._is_discarding else parts
 
+    def wait_ms(self, longest_ms: int) -> int:
+        """Return how long to wait at most before `check`, unless `monitor` is readable earlier."""
+        return min(CHECK_MS, longest_ms) if self._connections else longest_ms
+
     def check(self) -> None:
         """Cut who sends on and on without a message; to be called several times a second."""
-        while self._monitor.poll(0):
-            event = parse_monitor_message(self._monitor.recv_multipart())
+        while self.monitor.poll(0):
+            event = parse_monitor_message(self.monitor.recv_multipart())
             self._connections.pop(event["value"], None)
             if event["event"] == zmq.EVENT_ACCEPTED:
                 self._connections[event["value"]] = _state(0)
@@ -107,7 +114,7 @@ class Peers:
     def close(self) -> None:
         """Watch no more; before the socket is closed."""
         self._socket.disable_monitor()
-        self._monitor.close(0)
+        self.monitor.close(0)
 
     def _discard(self) -> None:
         for _ in range(DISCARDED_AT_ONCE):

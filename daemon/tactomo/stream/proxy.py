@@ -97,7 +97,7 @@ class Proxy:
             for inlet in self._inlets:
                 if inlet.socket in ready:
                     self._pass_messages(inlet)
-            self._readers.check()
+            self._readers.peers.check()
             self._look_after()
 
     def stop(self) -> None:

@@ -27,8 +27,6 @@ from tactomo.timing import Durations
 from tactomo.worker import Worker
 
 STATUS_PERIOD_S: Final = 1.0
-CHECK_S: Final = 0.05
-"""How often subscribers are looked at: what comes of one meanwhile is memory."""
 LINGER_MS: Final = 200
 """How long messages that were sent may take to leave when the daemon stops."""
 QUEUED_PER_SUBSCRIBER: Final = 64
@@ -183,14 +181,15 @@ class Publisher(Worker):
         poller = zmq.Poller()
         poller.register(self._socket, zmq.POLLIN)
         poller.register(self._wake_reader, zmq.POLLIN)
+        poller.register(self._readers.peers.monitor, zmq.POLLIN)
         status_at_s = time.monotonic()
         while not self._stopping.is_set():
-            wait_s = min(CHECK_S, max(0.0, status_at_s - time.monotonic()))
-            self._readers.check()
-            for ready, _ in poller.poll(math.ceil(wait_s * 1e3)):
+            status_in_ms = math.ceil(max(0.0, status_at_s - time.monotonic()) * 1e3)
+            self._readers.peers.check()
+            for ready, _ in poller.poll(self._readers.peers.wait_ms(status_in_ms)):
                 if ready is self._socket:
                     self._read_subscriptions()
-                else:
+                elif ready == self._wake_reader:
                     os.read(self._wake_reader, 4096)
             self._send_queued()
             if self._cut.is_set():

@@ -39,6 +39,7 @@ class Subscribers:
         address: where the socket is bound.
         prefixes: how many ask for each prefix.
         cuts: how often all of them were cut off because there were too many.
+        peers: the connections.
     """
 
     def __init__(
@@ -56,8 +57,8 @@ class Subscribers:
         # 1, libzmq 4.3.5 makes a peer that is never heard after a CURVE handshake.)
         socket.setsockopt(zmq.RCVHWM, 16)
         socket.setsockopt(zmq.MAXMSGSIZE, MAX_PREFIX_BYTES)
-        self._peers = Peers(socket, endpoint, purpose, on_event, secret, option)
-        self.address = self._peers.address
+        self.peers = Peers(socket, endpoint, purpose, on_event, secret, option)
+        self.address = self.peers.address
         self.prefixes: Counter[bytes] = Counter()
         self.cuts = 0
         self._socket = socket
@@ -83,13 +84,9 @@ class Subscribers:
             self.cuts += 1
             self.cut()
 
-    def check(self) -> None:
-        """Cut who sends without end; to be called several times a second."""
-        self._peers.check()
-
     def close(self) -> None:
         """Watch the connections no more; before the socket is closed."""
-        self._peers.close()
+        self.peers.close()
 
     def cut(self) -> None:
         """End every connection; those who may come back do so by themselves."""
