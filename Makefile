@@ -24,6 +24,10 @@ SITE = $(DIST)/docs/$(shell sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)
 LOCKED := pyproject.toml --universal --python-version 3.11 --generate-hashes \
   --no-emit-package tactomo-client --no-emit-package tactomo --no-emit-package tactomo-lab
 
+# What a robot of 64-bit Arm installs, from wheels alone: `make lock` fails where one has none.
+ON_ARM := --python-version 3.11 --python-platform aarch64-manylinux_2_28 --only-binary :all: \
+  --no-emit-package tactomo-client --no-emit-package tactomo --no-annotate
+
 .PHONY: help setup run test test-all test-long test-train test-peers faults soak fleet firmware fuzz lint format bench docs wheels deb lock clean
 
 help:            ## list these targets
@@ -101,6 +105,8 @@ deb: $(READY)    ## the Debian package, for this distribution and processor, in 
 lock:            ## refresh the lock files (needs uv on the PATH)
 	uv pip compile $(LOCKED) --extra dev --group build -o requirements.lock
 	uv pip compile $(LOCKED) --group build -c requirements.lock -o requirements-run.lock
+	uv pip compile pyproject.toml --extra foxglove --extra metrics --extra plot --extra ros2 --extra zenoh --group build \
+	  $(ON_ARM) -c requirements.lock -o requirements-aarch64.lock
 	uv pip compile --group docs --universal --python-version 3.11 --generate-hashes \
 	  -c requirements.lock -o requirements-docs.lock
 	uv pip compile $(LAB)/$(LOCKED) --extra train -c requirements.lock -c requirements-torch.txt \

@@ -23,6 +23,7 @@ from tactomo_protocol import (
     UnknownPacket,
     encode,
 )
+from tactomo_protocol import cobs as our_cobs
 
 
 def chunked(data: st.DataObject, stream: bytes) -> Iterable[bytes]:
@@ -50,6 +51,31 @@ def test_any_packets_round_trip_in_any_chunks(data: st.DataObject, packets: list
 def test_byte_by_byte_is_the_same(packets: list[Packet]) -> None:
     stream = b"".join(map(encode, packets))
     assert feed_all(Decoder(), (stream[i : i + 1] for i in range(len(stream)))) == packets
+
+
+def runs() -> st.SearchStrategy[bytes]:
+    """Bytes with runs without a zero about as long as a block holds."""
+    run = st.sampled_from([0, 1, 253, 254, 255, 508, 509]).map(lambda size: b"\x07" * size)
+    return st.lists(st.one_of(run, st.binary())).map(b"\0".join)
+
+
+@given(runs())
+def test_our_framing_is_cobs_as_others_write_it(data: bytes) -> None:
+    encoded = our_cobs.encode(data)
+    assert encoded == bytes(cobs.encode(data))
+    assert our_cobs.decode(encoded) == data
+    assert len(encoded) <= our_cobs.max_encoded_length(len(data))
+
+
+@given(st.lists(st.integers(1, 255), min_size=1).map(bytes))
+def test_what_is_no_cobs_is_refused_as_others_refuse_it(encoded: bytes) -> None:
+    try:
+        decoded = bytes(cobs.decode(encoded))
+    except cobs.DecodeError:
+        with pytest.raises(ValueError, match="beyond the end"):
+            our_cobs.decode(encoded)
+    else:
+        assert our_cobs.decode(encoded) == decoded
 
 
 def framed(content: bytes) -> bytes:

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from zlib import crc32
 
 import numpy as np
-from cobs import cobs
 
+from . import cobs
 from .packets import (
     Acknowledge,
     AckStatus,
@@ -52,7 +52,7 @@ _CRC_BYTES = 4
 
 _MAX_PAYLOAD = _SCAN_HEAD.size + 4 * MAX_SAMPLES + _CRC_BYTES
 _MAX_BODY = _MAX_PAYLOAD - _PREFIX.size - _CRC_BYTES
-_MAX_ENCODED: int = cobs.max_encoded_length(_MAX_PAYLOAD)
+_MAX_ENCODED = cobs.max_encoded_length(_MAX_PAYLOAD)
 MAX_FRAME_BYTES = _MAX_ENCODED + 2
 
 _U8, _U16, _U32 = 2**8 - 1, 2**16 - 1, 2**32 - 1
@@ -75,7 +75,7 @@ def encode(packet: Packet) -> bytes:
     """
     payload = _pack(packet)
     payload += crc32(payload).to_bytes(_CRC_BYTES, "little")
-    return b"\0" + bytes(cobs.encode(payload)) + b"\0"
+    return b"\0" + cobs.encode(payload) + b"\0"
 
 
 @dataclass(slots=True)
@@ -160,7 +160,7 @@ class Decoder:
     def _decode(self, encoded: bytes) -> Packet | None:
         try:
             payload = cobs.decode(encoded)
-        except cobs.DecodeError:
+        except ValueError:
             self.counts.cobs_errors += 1
             return None
         content, checksum = payload[:-_CRC_BYTES], payload[-_CRC_BYTES:]
