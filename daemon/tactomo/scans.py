@@ -5,7 +5,7 @@ Plain values without the serial stack, so that whatever is pure may import them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from tactomo_models import Reference
@@ -58,7 +58,9 @@ class Delivery(NamedTuple):
     hello: Hello | None = None
     """What the device says of itself; None before it has."""
     has_ended: bool = False
-    """The replay behind the port is at its end: nothing more will come."""
+    """The replay behind the port is at its end: nothing more will come of this pass."""
+    replay_pass: int = 0
+    """How often the replay had been moved when this was read."""
 
 
 class ScanKey(NamedTuple):
@@ -103,6 +105,8 @@ class Mark:
     """Of pressure, to be put in force just before it: the text of its file, empty for none."""
     calibration_number: int = 0
     """Which of those that were read again meanwhile was in force, from 1; 0 for the origin's."""
+    clock_ns: int = field(default=0, compare=False)
+    """When it was recorded, on the recording's steady clock."""
 
 
 @dataclass(frozen=True, slots=True)

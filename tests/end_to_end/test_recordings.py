@@ -12,6 +12,7 @@ from typing import Any, Self
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from selenium.webdriver import Chrome
 from tactomo_client import Frame, request, subscribe
 from tactomo_client.messages import MAP, decode_message
 from waiting import PATIENCE_S, wait_until
@@ -149,3 +150,34 @@ def test_a_measured_stream_is_imported_replayed_and_located(tmp_path: Path) -> N
     # The hand leads it around the tank, counter-clockwise, by well over half a turn.
     assert angle[-1] - angle[0] > math.pi
     assert np.diff(angle).min() > -0.2
+
+
+@pytest.mark.slow
+@pytest.mark.browser
+def test_a_replay_with_a_page_begins_when_the_page_is_open(
+    demo: Demo, browser: Chrome, tmp_path: Path
+) -> None:
+    path = tmp_path / "short.mcap"
+    with Listener(demo) as listener:
+        request("record_start", demo.control, path=str(path))
+        listener.hear_more(20)
+        request("record_stop", demo.control)
+    control = f"ipc://{tmp_path}/control"
+    command = ["replay", path, "--viewer", "--loop", "--viewer-port", 0, "--control", control]
+    command += ["--stream", f"ipc://{tmp_path}/stream"]
+    replay = subprocess.Popen(
+        [sys.executable, "-m", "tactomo.cli", *map(str, command)],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert replay.stdout is not None
+        words = (word for line in replay.stdout for word in line.split())
+        page = next(word for word in words if word.startswith("http://"))
+        waiting = request("status", control)
+        assert (waiting["state"], waiting["frames"]) == ("paused", 0)
+        browser.get(page)
+        wait_until(lambda: request("status", control)["frames"] > 40, "the second round")
+    finally:
+        replay.terminate()
+        replay.communicate(timeout=PATIENCE_S)

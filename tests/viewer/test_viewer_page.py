@@ -408,10 +408,13 @@ def test_the_end_of_a_replay_is_no_alarm(page: Page) -> None:
     wait_until(lambda: page["quality"].text == "good")
     page.skin.sends_frames = False
     ended = {"url": "replay:///a.mcap?port=0", "connected": False, "state": "ended"}
-    page.skin.status |= {"state": "stale", "source": {"kind": "replay"}, "ports": [ended]}
+    page.skin.status |= {"state": "ended", "source": {"kind": "replay"}, "ports": [ended]}
+    page.skin.status |= {"rates": {"magnitude_hz": 0.0, "structure_hz": None, "frames_hz": 0.0}}
     wait_until(lambda: "at its end" in page["banner"].text)
     assert page["banner"].get_attribute("data-level") == "info"
     wait_until(lambda: page["state"].text == "replay ended")
+    kinds = "return [...document.querySelectorAll('#channels .dot')].map(d => d.dataset.kind)"
+    wait_until(lambda: page.js(kinds) == ["good", "good"])
 
 
 def test_frames_that_come_late_are_not_told_as_no_scans(page: Page) -> None:
@@ -725,6 +728,59 @@ def test_a_ring_is_drawn_with_its_hole(page: Page) -> None:
     wait_until(lambda: is_drawn(radius_mm))
     assert is_drawn(radius_mm / 2)
     assert not is_drawn(0.75 * radius_mm)
+
+
+REPLAY = {
+    "position_s": 2.0,
+    "duration_s": 40.0,
+    "speed": 1.0,
+    "paused": False,
+    "loop": False,
+    "waits_for_page": False,
+}
+
+
+@pytest.mark.usefixtures("quiet_console")
+def test_a_replay_is_steered_by_the_page(page: Page) -> None:
+    page.open()
+    assert not page["replay"].is_displayed()
+    page.skin.status |= {"source": {"kind": "replay"}, "replay": REPLAY}
+    page.daemon.answers["replay"] = REPLAY
+    wait_until(lambda: page["replay"].is_displayed())
+    wait_until(lambda: page["position-text"].text.endswith("/ 40.0 s"))
+    assert page["speed"].get_attribute("value") == "1"
+    page["play"].click()
+    page.skin.status |= {"state": "paused", "replay": REPLAY | {"paused": True}}
+    page.skin.sends_frames = False
+    wait_until(lambda: page.health == "replay-paused")
+    assert page["state"].text == "replay paused"
+    assert page["position-text"].text == "2.0 / 40.0 s"
+    page["step"].click()
+    page["loop"].click()
+    page["speed"].find_element(By.XPATH, "./option[text()='0.25']").click()
+    page["position"].send_keys(Keys.END)
+    page["play"].click()
+    page.skin.status |= {"state": "ended"}
+    wait_until(lambda: page["play"].text == "Play" and page["state"].text == "replay ended")
+    page["play"].click()
+    asked = [
+        {"paused": True},
+        {"step": True},
+        {"loop": True},
+        {"speed": 0.25},
+        {"position_s": 40.0},
+        {"paused": False},
+        {"position_s": 0, "paused": False},
+    ]
+    wait_until(lambda: page.daemon.requests == [("replay", each) for each in asked])
+
+
+def test_a_replay_that_waits_for_the_page_begins_with_it(page: Page) -> None:
+    page.daemon.answers["replay"] = REPLAY
+    waiting = REPLAY | {"paused": True, "waits_for_page": True}
+    page.skin.status |= {"state": "paused", "replay": waiting}
+    page.browser.get(f"http://127.0.0.1:{page.port}/")
+    wait_until(lambda: ("replay", {"paused": False}) in page.daemon.requests)
 
 
 # Buttons

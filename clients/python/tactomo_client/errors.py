@@ -12,6 +12,7 @@ ClientError
 │   ├── NotRecording      none runs that could be stopped
 │   ├── CannotWrite       the recording's file exists, may not be written, or the disk is full
 │   ├── NoNetwork         the sensor has no network for that method
+│   ├── NoReplay          nothing is replayed
 │   └── CalibrationRefused  the pressure calibration is damaged, another sensor's or device's
 ├── StreamTimeout   no frame came within `timeout_s`: the cable is out, the name is misspelt
 ├── KeysError       keys cannot be used (the file is missing, others may read it), or the server
@@ -90,6 +91,10 @@ class CannotWrite(ControlError):  # noqa: N818
 
 class NoNetwork(ControlError):  # noqa: N818
     """``no_network``: the sensor has no network for that method."""
+
+
+class NoReplay(ControlError):  # noqa: N818
+    """``no_replay``: the daemon's ports are live."""
 
 
 class CalibrationRefused(ControlError):  # noqa: N818

@@ -218,6 +218,21 @@ class Plan:
 
 
 @dataclass(frozen=True, slots=True)
+class Replay:
+    """How far a replay is, and how it goes on: the control command ``replay`` changes that."""
+
+    position_s: float
+    """On the recording's own clock, seconds from its beginning."""
+    duration_s: float
+    speed: float
+    """Factor of the recorded speed; 0: as fast as frames are made."""
+    paused: bool = False
+    loop: bool = False
+    waits_for_page: bool = False
+    """Whether it is paused until a viewer's page is open."""
+
+
+@dataclass(frozen=True, slots=True)
 class RecordingProgress:
     """The recording that runs."""
 
@@ -303,6 +318,8 @@ class Status(Received):
     misfit: float | None = None
     description: SensorDescription | None = None
     source: Source = field(default_factory=Source)
+    replay: Replay | None = None
+    """None where the ports are live."""
     ports: tuple[Port, ...] = ()
     rates: Rates = field(default_factory=Rates)
     dropped_scans: int = 0

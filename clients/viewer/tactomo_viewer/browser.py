@@ -30,6 +30,7 @@ DAEMON_COMMANDS: Mapping[str, tuple[frozenset[str], float]] = {
     "set_tier": (frozenset({"tier"}), 5.0),
     "record_start": (frozenset(), 5.0),
     "record_stop": (frozenset(), 5.0),
+    "replay": (frozenset({"paused", "position_s", "speed", "loop", "step"}), 5.0),
 }
 PRESS_ARGUMENTS = ("x_mm", "y_mm", "pressure_kpa", "radius_mm", "shape")
 

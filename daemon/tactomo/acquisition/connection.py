@@ -15,9 +15,10 @@ import serial
 
 from tactomo.acquisition.adapters import LOW_LATENCY_MS, ROOT, device_of
 from tactomo.acquisition.open_serial import DEVICE_GONE, is_path, lower_latency, open_serial
-from tactomo.acquisition.replay_port import ReplayEnded
+from tactomo.acquisition.replay_port import ReplayEnded, ReplayMoved, ReplayPort
 from tactomo.errors import PortAbsentError, TactomoError
 from tactomo.events import OnEvent, RateLimit
+from tactomo.recordings.playback import Playback
 
 MAX_READ_BYTES: Final = 65_536
 """Taken at once at most, so that a flood of noise cannot keep the thread from its other duties."""
@@ -32,7 +33,14 @@ class Connection:
         latency_timer_ms: an FTDI adapter's, as of the last opening; None for others.
     """
 
-    def __init__(self, url: str, baud: int, on_event: OnEvent, root: Path = ROOT) -> None:
+    def __init__(
+        self,
+        url: str,
+        baud: int,
+        on_event: OnEvent,
+        root: Path = ROOT,
+        playback: Playback | None = None,
+    ) -> None:
         self.url = url
         self.is_open = False
         self.problem = ""
@@ -40,6 +48,7 @@ class Connection:
         self._baud = baud
         self._root = root
         self._on_event = on_event
+        self._playback = playback
         self._told = ""  # the problem that was told last
         self._told_limit = RateLimit()
         self._serial: serial.Serial | None = None
@@ -47,6 +56,8 @@ class Connection:
     def open(self) -> None:
         """Open the port; raise PortError or RecordingError where that cannot be done."""
         self._serial = open_serial(self.url, self._baud)
+        if self._playback is not None and isinstance(self._serial, ReplayPort):
+            self._serial.playback = self._playback
         self.latency_timer_ms = lower_latency(self._serial, self._root)
         self.problem, self._told, self.is_open = "", "", True
         self._tell_slow_adapter()
@@ -64,6 +75,7 @@ class Connection:
 
         Raises:
             ReplayEnded: the recording that is replayed is at its end.
+            ReplayMoved: it goes on elsewhere.
         """
         try:
             port = self._port
@@ -71,7 +83,7 @@ class Connection:
             if data:
                 data += port.read(min(port.in_waiting, MAX_READ_BYTES))
             return data
-        except ReplayEnded:
+        except (ReplayEnded, ReplayMoved):
             raise
         except DEVICE_GONE as error:
             self._lose(error)

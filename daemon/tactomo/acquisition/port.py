@@ -33,10 +33,11 @@ from tactomo.acquisition.connection import Connection
 from tactomo.acquisition.device_clock import MAX_RATE, ClockState, DeviceClock
 from tactomo.acquisition.liveness import DeviceState, Liveness
 from tactomo.acquisition.open_serial import other_holders
-from tactomo.acquisition.replay_port import ReplayEnded
+from tactomo.acquisition.replay_port import ReplayEnded, ReplayMoved
 from tactomo.events import OnEvent, RateLimit
 from tactomo.protocols import PortProtocol, Trouble
 from tactomo.recordings.active_recording import ActiveRecording
+from tactomo.recordings.playback import Playback
 from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording import REPLAY_SCHEME
 from tactomo.recordings.recording_writer import port_entry, preamble_entry
@@ -68,6 +69,7 @@ class PortReader(Worker):
         deliver: called by the thread with what each read brought.
         on_event: told what happens.
         root: the folder of `/sys` and `/dev`.
+        playback: the replay's time, where the port replays.
 
     Attributes:
         bytes_read: since the start, over all connections.
@@ -93,6 +95,7 @@ class PortReader(Worker):
         deliver: Callable[[Delivery], None],
         on_event: OnEvent,
         root: Path = ROOT,
+        playback: Playback | None = None,
     ) -> None:
         super().__init__(f"port-{index}")
         self.index = index
@@ -110,10 +113,11 @@ class PortReader(Worker):
         self._recorder = recorder
         self._deliver = deliver
         self._on_event = on_event
-        self._connection = Connection(url, baud, on_event, root)
+        self._connection = Connection(url, baud, on_event, root, playback)
         self._is_replay = url.startswith(f"{REPLAY_SCHEME}://")
         self._liveness = Liveness(protocol.says_hello, protocol.patience_s)
         self._protocol = protocol
+        self._pass = 0  # of the replay
         self._recording = 0  # number of the recording that has the last chunk
         self._preamble_s = 0.0  # when a recording was last given one
         self._is_known = False  # the device that is plugged in has said hello
@@ -185,11 +189,6 @@ class PortReader(Worker):
         else:
             self._connection.open()
 
-    @property
-    def is_alive(self) -> bool:
-        """Whether the thread runs, or has come to the end that a replay has."""
-        return super().is_alive or self.has_ended
-
     def zero_counters(self) -> None:
         """Ask the device to count from 0 again and to scan; for any thread."""
         self._is_zeroing.set()
@@ -200,16 +199,18 @@ class PortReader(Worker):
     def _run(self) -> None:
         if self._connection.is_open:
             self._greet_newcomer()
-        try:
-            while not self._stopping.is_set():
-                self.turns += 1
-                if self._connection.is_open:
-                    self._read_once()
-                else:
-                    self._wait_for_device()
-            self._send(self._protocol.stop())
-        except ReplayEnded as end:
-            self._end(str(end))
+        while not self._stopping.is_set():
+            self.turns += 1
+            if not self._connection.is_open:
+                self._wait_for_device()
+                continue
+            try:
+                self._read_once()
+            except ReplayEnded as end:
+                self._end(str(end))
+            except ReplayMoved as moved:
+                self._begin_pass(*moved.args)
+        self._send(self._protocol.stop())
 
     def _read_once(self) -> None:
         """Wait for bytes, for a bounded time, and pass on what they hold."""
@@ -295,7 +296,9 @@ class PortReader(Worker):
         intact = self.counts.packets + self.counts.faulty - understood
         self._liveness.heard(now_s, intact, found)
         if packets:
-            self._deliver(Delivery(self.index, clock_ns, tuple(scans), self.hello))
+            self._deliver(
+                Delivery(self.index, clock_ns, tuple(scans), self.hello, replay_pass=self._pass)
+            )
         if not self._is_replay:
             self._send(self._protocol.replies())
         self._tell_corrupt()
@@ -493,10 +496,16 @@ class PortReader(Worker):
         return f"; another process has the port open, too ({sharers})" if sharers else ""
 
     def _end(self, reason: str) -> None:
-        self._connection.close()
         self.has_ended = True
-        self._deliver(Delivery(self.index, 0, (), has_ended=True))
+        self._deliver(Delivery(self.index, 0, (), has_ended=True, replay_pass=self._pass))
         self._on_event("replay_ended", "info", f"{self.url}: {reason}")
+
+    def _begin_pass(self, number: int) -> None:
+        """Go on elsewhere in the recording: what had begun to come is not finished."""
+        self._pass, self.has_ended = number, False
+        self._protocol.restart()
+        self.clock = DeviceClock()
+        self._clock_told = (self.clock.state, 0)
 
     def _tell_clock(self) -> None:
         """Tell of a device's clock that jumped or is none; scans are dated by arrival then."""

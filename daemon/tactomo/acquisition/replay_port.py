@@ -10,18 +10,19 @@ Options of the URL:
     1 (as recorded, the default), another factor, or 0 for as fast as it is taken.
 
 Reading returns the bytes of one recorded read after another, each at its time, then raises
-`ReplayEnded`. What is written to the port goes nowhere: a recording does not answer.
+`ReplayEnded`, and `ReplayMoved` where what comes next is from elsewhere. What is written to the
+port goes nowhere: a recording does not answer.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from typing import Any, Final
 
 from serial import PortNotOpenError, SerialBase, SerialException
 
-from tactomo.recordings.recording import Chunk
+from tactomo.recordings.playback import Playback
+from tactomo.recordings.recording import Chunk, Recording
 from tactomo.recordings.replay import parse_replay_url
 
 _WAIT_FOR_EVER_S: Final = 1e9
@@ -31,11 +32,16 @@ class ReplayEnded(SerialException):
     """Every recorded byte has been read."""
 
 
+class ReplayMoved(SerialException):
+    """The next bytes do not go on from those before; in `args`, the number of the pass."""
+
+
 class ReplayPort(SerialBase):
     """The port itself.
 
     Attributes:
         clock_ns: when the bytes of the last read came, on the recording's steady clock.
+        playback: the replay's time; one of its own unless it is given another.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -43,18 +49,19 @@ class ReplayPort(SerialBase):
         self._chunks: Iterator[Chunk] = iter(())
         self._next: Chunk | None = None
         self._rest = b""  # of the chunk whose time has come
-        self._speed = 1.0
-        self._start_ns = 0
-        self._first_read_ns: int | None = None
+        self._recording: Recording
+        self._number = 0
+        self._pass = 0
+        self._has_ended = False
+        self.playback: Playback
         super().__init__(*args, **kwargs)
 
     def open(self) -> None:
         """Open the recording; raise PortError or RecordingError where that cannot be done."""
-        recording, port, self._speed = parse_replay_url(self.port or "")
-        self._chunks = recording.chunks(port)
-        self._next = next(self._chunks, None)
-        self._rest, self._first_read_ns = b"", None
-        self._start_ns = recording.start_ns
+        self._recording, self._number, speed = parse_replay_url(self.port or "")
+        self.playback = Playback(self._recording.start_ns, self._recording.end_ns, speed)
+        self._pass = 0
+        self._read_from(0)
         self.is_open = True
 
     def close(self) -> None:
@@ -71,7 +78,8 @@ class ReplayPort(SerialBase):
         """Return up to `size` bytes of one recorded read; nothing if `timeout` runs out first.
 
         Raises:
-            ReplayEnded: every byte has been read.
+            ReplayEnded: every byte has been read; raised once, then nothing comes.
+            ReplayMoved: the replay was moved.
             PortNotOpenError: the port is closed.
         """
         if not self.is_open:
@@ -91,29 +99,28 @@ class ReplayPort(SerialBase):
     def reset_output_buffer(self) -> None:
         """Do nothing: nothing is ever sent."""
 
+    def _read_from(self, clock_ns: int) -> None:
+        self._chunks = self._recording.chunks(self._number, clock_ns)
+        self._next = next(self._chunks, None)
+        self._rest, self._has_ended = b"", False
+
     def _wait_for_chunk(self) -> bytes:
         """Return the next chunk's bytes once they are due; none if that takes too long."""
-        if self._next is None:
+        playback, chunk = self.playback, self._next
+        if self._pass != playback.passes:
+            self._pass = playback.passes
+            self._read_from(playback.begin_ns)
+            raise ReplayMoved(self._pass)
+        if chunk is None and not self._has_ended:
+            self._has_ended = True
             raise ReplayEnded("the recording has ended")
         timeout_s = _WAIT_FOR_EVER_S if self.timeout is None else self.timeout
-        wait_s = self._due_in_s(self._next)
-        if wait_s > 0:
-            time.sleep(min(wait_s, timeout_s))
-        if wait_s > timeout_s:
+        due_ns = None if chunk is None else chunk.clock_ns
+        if not playback.wait_until_due(due_ns, timeout_s, self._pass) or chunk is None:
             return b""
-        self.clock_ns, data = self._next
+        self.clock_ns, data = chunk
         self._next = next(self._chunks, None)
         return data
-
-    def _due_in_s(self, chunk: Chunk) -> float:
-        if self._speed == 0:
-            return 0.0
-        # Counted from the first read on, not from opening, so that two ports of one recording,
-        # opened one after the other and then read together, keep time with each other.
-        if self._first_read_ns is None:
-            self._first_read_ns = time.monotonic_ns()
-        due_ns = (chunk.clock_ns - self._start_ns) / self._speed
-        return (self._first_read_ns + due_ns - time.monotonic_ns()) * 1e-9
 
     def _reconfigure_port(self) -> None:
         """Nothing to configure; pyserial calls it when a setting changes on an open port."""

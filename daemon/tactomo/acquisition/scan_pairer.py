@@ -71,6 +71,11 @@ class ScanPairer:
         """Return whatever still waits: no scan will come any more."""
         raise NotImplementedError
 
+    def carry_on(self, before: ScanPairer) -> None:
+        """Count on from another one, whose place this one takes."""
+        self.late, self.repeated, self.unmarked = before.late, before.repeated, before.unmarked
+        self.resets, self.zeroed = before.resets, before.zeroed
+
     @property
     def deadline_ns(self) -> int | None:
         """When `advance` will next have something to return; None when nothing waits."""

@@ -204,6 +204,11 @@ class Imaging:
         self.taring.note_reference()
         self._marks.note_reference(reference, self.reference_realtime_ns)
 
+    def forget(self) -> None:
+        """Take the next dual scan for the first one: it does not follow on those before."""
+        self._reconstructor.reset()
+        self._publisher.tell_status()
+
     def use_calibration(self, calibration: PressureCalibration | None) -> dict[str, Any]:
         """Put a calibration in force, None for the description's curve; return what a client gets.
 
@@ -274,7 +279,7 @@ class Imaging:
         if mark.is_cut:
             self._reconstructor.forget_shape()
         self.calibration.obey(mark.calibration)
-        if mark.reference is not None:
+        if mark.reference is not None and mark.reference is not self.reference:
             self.reference_realtime_ns = time.time_ns()
             self._reconstructor.set_reference(mark.reference)
             self._note_reference(mark.reference)

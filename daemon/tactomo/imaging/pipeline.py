@@ -69,7 +69,7 @@ class Pipeline(Worker):
         delivered_ns: when the newest scan was delivered, monotonic; 0 before the first.
         incomplete: dual scans of which one channel did not come that had come before, or is lost.
         scan_rates: how often each channel's scans come.
-        finished: set once every replayed port has ended and what came of it was published.
+        finished: set while every replayed port is at its end, once what came of it was published.
     """
 
     def __init__(
@@ -95,11 +95,8 @@ class Pipeline(Worker):
         self._is_exact = replay is not None and bool(replay.marks)
         is_unpaced = replay is not None and not replay.is_paced
         self._is_lossless = lossless or self._is_exact or is_unpaced
-        self.sync: ScanPairer = (
-            MarkPairer(replay.marks)
-            if replay is not None and replay.marks
-            else CounterPairer(channels, sync_wait_ns)
-        )
+        self._sync_wait_ns = sync_wait_ns
+        self.sync = self._new_sync()
         self.skew = Skew()
         self.wall_clock = WallClock(on_event)
         self._zero_counters = zero_counters
@@ -190,6 +187,10 @@ class Pipeline(Worker):
         """Ask for a time budget; for any thread. The future is done when it is in force."""
         return self._ask(lambda: self._imaging.method.request_budget(budget_ms))
 
+    def move(self, position_s: float) -> Future[None]:
+        """Have the replay go on elsewhere; for any thread. The future is done when that is so."""
+        return self._ask(lambda: self._move(position_s))
+
     def use_calibration(self, calibration: PressureCalibration | None) -> Future[Mapping[str, Any]]:
         """Ask for a pressure calibration, None for the description's curve; for any thread.
 
@@ -217,7 +218,28 @@ class Pipeline(Worker):
             self._obey_commands()
             self._imaging.taring.check()
             if self._replay_clock is not None and self._replay_clock.has_ended:
-                self.finished.set()
+                if self._replay is not None and self._replay.playback.loops:
+                    self._move(0.0)
+                else:
+                    self.finished.set()
+
+    def _new_sync(self) -> ScanPairer:
+        replay = self._replay
+        if replay is not None and replay.marks:
+            return MarkPairer(replay.marks_of_pass())
+        return CounterPairer(self._channels, self._sync_wait_ns)
+
+    def _move(self, position_s: float) -> None:
+        """Go on elsewhere: what waits, and what the ports read before they follow, is left out."""
+        assert self._replay is not None
+        self._replay.playback.move(position_s)
+        self._replay_clock = ReplayClock(self._ports, self._replay.is_paced)
+        self.finished.clear()
+        before, self.sync = self.sync, self._new_sync()
+        self._left_out += before.waiting
+        self.sync.carry_on(before)
+        self.skew = Skew()
+        self._imaging.forget()
 
     def _obey_commands(self) -> None:
         while not self._commands.empty():
@@ -239,6 +261,7 @@ class Pipeline(Worker):
 
     def _begin(self) -> None:
         reference = self._replay.reference if self._replay else None
+        self.sync = self._new_sync()  # the replay may have been moved since
         if self._is_exact:
             return  # the marks bring their references along
         if reference is None:
@@ -281,6 +304,9 @@ class Pipeline(Worker):
 
     def _join(self, delivery: Delivery) -> list[DualScan]:
         ready: list[DualScan] = []
+        if self._replay is not None and delivery.replay_pass != self._replay.playback.passes:
+            self._left_out += len(delivery.scans)
+            return ready
         self._note_device(delivery)
         for scan in delivery.scans:
             self.scan_rates[scan.channel].add(scan.monotonic_ns)
@@ -293,6 +319,8 @@ class Pipeline(Worker):
                 ready += self.sync.finish()
             elif now_ns is not None:
                 ready += self.sync.advance(now_ns)
+        if ready and self._replay is not None:
+            self._replay.playback.note_dual_scan()
         return ready
 
     def _note_device(self, delivery: Delivery) -> None:

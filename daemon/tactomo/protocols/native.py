@@ -58,6 +58,7 @@ class NativeProtocol(PortProtocol):
     def restart(self) -> None:
         """Forget the packet that had begun."""
         self._tail = b""
+        self._decoder.restart()
 
     def preamble(self) -> bytes:
         """Return the hello in force and the packet that has begun."""

@@ -51,6 +51,7 @@ from urllib.parse import quote
 
 import msgpack  # type: ignore[import-untyped]
 import structlog
+from mcap.records import Chunk as McapChunk
 from mcap.records import Footer, McapRecord, Message, Metadata
 from pydantic import BaseModel, Strict, StrictBool, StrictInt, StrictStr
 from tactomo_client import MessageError, recording_file
@@ -71,6 +72,9 @@ REFERENCE_ARRAYS: Final = ("magnitude", "structure", "magnitude_noise", "structu
 DRIFT_ARRAYS: Final = ("magnitude_drift", "structure_drift")
 """Missing in recordings of daemons that did not follow drift."""
 REPLAY_SCHEME: Final = "replay"
+PREAMBLE_REACH_NS: Final = 2_000_000_000
+"""How long a preamble is of use to a replay that begins after it: those of foreign protocols come
+every second, and one of ours is not needed by a port that knows its device."""
 OLD_METHODS: Final = {"hybrid": "auto"}
 """Methods that marks of earlier versions name, and what they are called now."""
 
@@ -181,17 +185,36 @@ class Recording:
         times = (m.log_time for topic, m in _messages(self.path) if topic.startswith("port/"))
         return next(times, 0)
 
-    def chunks(self, port: int) -> Iterator[Chunk]:
-        """Yield what port `port` said; before all else its preamble, if there is one."""
-        for message in self.port_messages(port):
-            yield Chunk(message.log_time, message.data)
+    @property
+    def end_ns(self) -> int:
+        """When the last thing in it was written, on the steady clock."""
+        return self.span.end_ns
 
-    def port_messages(self, port: int) -> Iterator[Message]:
+    def chunks(self, port: int, from_ns: int = 0) -> Iterator[Chunk]:
+        """Yield what port `port` said from a time on; before all else a preamble, if there is one.
+
+        What came between the preamble and that time comes with it, at that time.
+        """
+        for message in self.port_messages(port, from_ns):
+            yield Chunk(max(message.log_time, from_ns), message.data)
+
+    def port_messages(self, port: int, from_ns: int = 0) -> Iterator[Message]:
         """Yield the same as messages, with the time on the wall clock, too."""
         topics = (f"port/{port}", f"port/{port}/hello")
-        for topic, message in _messages(self.path):
-            if topic in topics:
+        before: list[Message] = []  # from the last preamble on
+        for topic, message in _messages(self.path, from_ns - PREAMBLE_REACH_NS):
+            if topic not in topics:
+                continue
+            if message.log_time >= from_ns:
+                yield from before
+                before = []
                 yield message
+            elif topic == topics[1]:
+                before = [message]
+            elif before and message.log_time - before[0].log_time < PREAMBLE_REACH_NS:
+                before.append(message)
+            else:
+                before = []
 
     def marks(self) -> list[Mark]:
         """Return the dual scans that were reconstructed, each with what was new just before it."""
@@ -208,7 +231,10 @@ class Recording:
                 calibration = read_calibration(message.data).text
             elif topic == "frame":
                 mark = read_mark(message.data)
-                marks.append(replace(mark, reference=reference, calibration=calibration))
+                at_ns = message.log_time
+                marks.append(
+                    replace(mark, reference=reference, calibration=calibration, clock_ns=at_ns)
+                )
                 reference = calibration = None
         return marks
 
@@ -301,17 +327,21 @@ def to_origin(metadata: Mapping[str, str]) -> Origin:
     )
 
 
-def _messages(path: Path) -> Iterator[tuple[str, Message]]:
-    for topic, record in _records(path):
+def _messages(path: Path, from_ns: int = 0) -> Iterator[tuple[str, Message]]:
+    """Yield messages; of those before `from_ns` only some."""
+    wants = lambda chunk: chunk.message_end_time >= from_ns  # noqa: E731 - one use, one line
+    for topic, record in _records(path, wants=wants):
         if isinstance(record, Message):
             yield topic, record
 
 
 def _records(
-    path: Path, on_damage: Callable[[int], None] = lambda _: None
+    path: Path,
+    on_damage: Callable[[int], None] = lambda _: None,
+    wants: Callable[[McapChunk], bool] = lambda _: True,
 ) -> Iterator[tuple[str, McapRecord]]:
     with _our_errors():
-        yield from recording_file.records(path, on_damage)
+        yield from recording_file.records(path, on_damage, wants)
 
 
 def open_file(path: Path) -> IO[bytes]:

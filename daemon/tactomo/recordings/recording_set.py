@@ -54,19 +54,28 @@ class RecordingSet(Recording):
         """When the first bytes were read from any port, on the first file's steady clock."""
         return self.parts[0].start_ns
 
-    def chunks(self, port: int) -> Iterator[Chunk]:
-        """Yield what port `port` said; before all else its preamble, if there is one."""
+    @property
+    def end_ns(self) -> int:
+        """When the last thing in it was written, on the first file's steady clock."""
+        return self.parts[-1].span.end_ns + self._shifts_ns[-1]
+
+    def chunks(self, port: int, from_ns: int = 0) -> Iterator[Chunk]:
+        """Yield what port `port` said from a time on; before all else a preamble, if there is one.
+
+        What came between the preamble and that time comes with it, at that time.
+        """
         before: frozenset[int] = frozenset()
         for part, shift_ns in zip(self.parts, self._shifts_ns, strict=True):
-            before = yield from _chunks(part, port, shift_ns, before)
+            if part.span.end_ns + shift_ns >= from_ns or part is self.parts[-1]:
+                before = yield from _chunks(part, port, shift_ns, before, from_ns - shift_ns)
 
     def marks(self) -> list[Mark]:
         """Return the dual scans that were reconstructed, each with what was new just before it."""
         marks: list[Mark] = []
         in_force: Reference | None = None
         calibration = self.origin.calibration
-        for part in self.parts:
-            of_part = part.marks()
+        for part, shift_ns in zip(self.parts, self._shifts_ns, strict=True):
+            of_part = [replace(m, clock_ns=m.clock_ns + shift_ns) for m in part.marks()]
             if of_part and marks:
                 first = of_part[0]
                 again = _is_same(first.reference, in_force)
@@ -133,16 +142,16 @@ def _check_belongs(part: Recording, first: Recording) -> None:
 
 
 def _chunks(
-    part: Recording, port: int, shift_ns: int, before: frozenset[int]
+    part: Recording, port: int, shift_ns: int, before: frozenset[int], from_ns: int
 ) -> Generator[Chunk, None, frozenset[int]]:
     """Yield what a file adds to what was read `before`; return when its last reads were."""
     times: deque[int] = deque(maxlen=REMEMBERED_READS)
-    for message in part.port_messages(port):
+    for message in part.port_messages(port, from_ns):
         times.append(message.publish_time)
         if message.publish_time in before:
             continue
         before = frozenset()
-        yield Chunk(message.log_time + shift_ns, message.data)
+        yield Chunk(max(message.log_time, from_ns) + shift_ns, message.data)
     return frozenset(times)
 
 

@@ -10,7 +10,13 @@ from tactomo_models import Reference, SensorDescription
 from tactomo_models.calibration.calibration_file import PressureCalibration
 
 from tactomo.errors import ConfigError, PortError
-from tactomo.recordings.recording import REPLAY_SCHEME, Recording, recorded_calibration
+from tactomo.recordings.playback import Playback
+from tactomo.recordings.recording import (
+    REPLAY_SCHEME,
+    Recording,
+    calibration_text,
+    recorded_calibration,
+)
 from tactomo.recordings.recording_set import open_replayable
 from tactomo.scans import Delivery, Mark
 
@@ -25,10 +31,36 @@ class Replay:
     """The one in force at its beginning."""
     is_paced: bool
     """Whether bytes come in their own time rather than as fast as they are taken."""
+    playback: Playback
+    """Its time, which the ports share."""
     calibration: PressureCalibration | None = None
     """Of pressure, that the daemon had when it began to record."""
     knows_calibration: bool = False
     """Whether it had that one, or none, and no other is to be looked for."""
+
+    def marks_of_pass(self) -> list[Mark]:
+        """Return the marks from where the playback's pass began on.
+
+        Of a pass that is not the first, the first mark brings what was in force, and starts cold.
+        """
+        if self.playback.passes == 0:
+            return self.marks
+        begin_ns = self.playback.begin_ns
+        index = next((i for i, m in enumerate(self.marks) if m.clock_ns >= begin_ns), None)
+        if index is None:
+            return []
+        known = self.marks[: index + 1]
+        references = [mark.reference for mark in known if mark.reference is not None]
+        texts = [mark.calibration for mark in known if mark.calibration is not None]
+        if any(mark.calibration is not None for mark in self.marks):
+            texts.insert(0, calibration_text(self.calibration))
+        first = replace(
+            self.marks[index],
+            reference=references[-1] if references else None,
+            calibration=texts[-1] if texts else None,
+            is_cold=True,
+        )
+        return [first, *self.marks[index + 1 :]]
 
 
 class ReplayClock:
@@ -99,6 +131,7 @@ def read_replay(urls: Sequence[str], description: SensorDescription) -> Replay |
         marks=marks,
         reference=reference,
         is_paced=speed > 0,
+        playback=Playback(recording.start_ns, recording.end_ns, speed),
         calibration=calibration,
         knows_calibration=calibration is not None or had_none,
     )

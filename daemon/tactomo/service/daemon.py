@@ -73,7 +73,15 @@ from tactomo.recordings.replay import Replay, parse_replay_url, read_replay, wit
 from tactomo.service.status import Status
 from tactomo.service.supervision import Supervision, notify
 from tactomo.stream.access_control import AccessControl, load_server_keys
-from tactomo.stream.control import Control, RecordStart, SetBudget, SetTier, Settling
+from tactomo.stream.control import (
+    Control,
+    Outcome,
+    RecordStart,
+    SetBudget,
+    SetTier,
+    Settling,
+    SteerReplay,
+)
 from tactomo.stream.publisher import Publisher
 from tactomo.worker import Worker
 
@@ -106,6 +114,7 @@ class Daemon:
 
     Attributes:
         session: identity of this run, as in every message.
+        playback: the time of the replay; None where the ports are live.
     """
 
     def __init__(
@@ -135,6 +144,7 @@ class Daemon:
         if replay is not None and config.calibration is not None:
             replay = replace(replay, marks=without_calibrations(replay.marks))
         self._replay = replay
+        self.playback = None if replay is None else replay.playback
         _check_methods(replay, self._methods, description)
         protocol = _protocol(config)
         channels = tuple(c for c in Channel if c in description.channels)
@@ -177,6 +187,7 @@ class Daemon:
                 self._recorder,
                 self._pipeline.deliver,
                 self._on_event,
+                playback=self.playback,
             )
             for index, url in enumerate(config.ports)
         ]
@@ -189,6 +200,7 @@ class Daemon:
                 "set_tier": self._set_tier,
                 "set_budget": self._set_budget,
                 "reload_calibration": lambda _: self._reload_calibration(),
+                "replay": self._steer_replay,
             },
             on_idle=self._check,
             on_event=self._on_event,
@@ -201,8 +213,8 @@ class Daemon:
             self._recorder,
             self._events,
             self._methods,
+            self.playback,
         )
-
         self._access: AccessControl | None = None
         self._metrics = None if config.metrics is None else self._make_metrics()
         self._workers: list[Worker] = [self._publisher, self._control, self._pipeline, *self._ports]
@@ -392,6 +404,22 @@ class Daemon:
     def _set_budget(self, arguments: SetBudget) -> Settling:
         budget_ms = arguments.budget_ms
         return Settling({"budget_ms": budget_ms}, self._pipeline.set_budget(budget_ms))
+
+    def _steer_replay(self, arguments: SteerReplay) -> Outcome:
+        playback = self.playback
+        if playback is None:
+            raise CommandError(
+                "nothing is replayed here", "start a replay: `tactomo replay FILE`", "no_replay"
+            )
+        playback.steer(arguments.paused, arguments.speed, arguments.loop)
+        if arguments.step:
+            playback.step()
+        moved = None if arguments.position_s is None else self._pipeline.move(arguments.position_s)
+        self._publisher.tell_status()
+        fields = playback.fields()
+        if moved is None:
+            return fields
+        return Settling({**fields, "position_s": arguments.position_s}, moved)
 
     def _reload_calibration(self) -> Future[Mapping[str, Any]]:
         """Look for the sensor's calibration as at the start; what cannot be used changes nothing.

@@ -32,7 +32,10 @@ except ImportError as error:
         "metrics need prometheus_client, which is not installed", "pip install 'tactomo[metrics]'"
     ) from error
 
-STATES: Final = ("waiting_for_port", "waiting_for_data", "taring", "running", "late", "stale")
+STATES: Final = (
+    *("waiting_for_port", "waiting_for_data", "taring", "running", "late", "stale"),
+    *("paused", "ended"),
+)
 COUNTERS: Final = {
     "dropped_scans": "Dual scans left out because newer ones had come.",
     "incomplete_scans": "Dual scans of which one channel did not come.",

@@ -17,6 +17,7 @@ from tactomo.events import EventBook
 from tactomo.imaging.frames import description_fields, port_fields, pressure_fields
 from tactomo.imaging.imaging import Imaging
 from tactomo.imaging.pipeline import Pipeline
+from tactomo.recordings.playback import Playback
 from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording import REPLAY_SCHEME
 from tactomo.service.memory import resident_bytes
@@ -40,6 +41,7 @@ class Status:
         recorder: Recorder,
         events: EventBook,
         methods: Sequence[str],
+        playback: Playback | None,
     ) -> None:
         self._sensor = description
         self._description = description_fields(description)
@@ -49,6 +51,7 @@ class Status:
         self._recorder = recorder
         self._events = events
         self._methods = methods
+        self._playback = playback
         self._started_s = time.monotonic()
         self._last_minute = LastMinute()
         self._ports_last_minute = {port.url: LastMinute() for port in ports}
@@ -73,6 +76,7 @@ class Status:
                 **pressure_fields(self._sensor, imaging.calibration.in_force),
             },
             "source": {"kind": source(self._ports)},
+            "replay": None if self._playback is None else self._playback.fields(),
             "ports": [self._port(port) for port in self._ports],
             "rates": self._rates(),
             "scans": pipeline.received,
@@ -111,6 +115,10 @@ class Status:
 
     def state(self) -> str:
         """Return the daemon's state in one word."""
+        if self._pipeline.finished.is_set():
+            return "ended"
+        if self._playback is not None and self._playback.is_paused:
+            return "paused"
         last_ns = self._imaging.acquired_monotonic_ns
         if not last_ns:
             is_waiting = any(port.state == "closed" for port in self._ports)

@@ -39,6 +39,9 @@ LINGER_MS: Final = 100
 SETTLE_S: Final = 1.0
 """How long a change may wait for the frame that is being made: clients wait 2 s for the answer."""
 
+MAX_SPEED: Final = 1000.0
+"""Of a replay; what is faster than frames are made is as fast as they are made."""
+
 Result = Mapping[str, Any]
 
 
@@ -83,6 +86,16 @@ class SetBudget(_Strict):
     budget_ms: BudgetMs | None
 
 
+class SteerReplay(_Strict):
+    """How a replay goes on; what is not given stays so."""
+
+    paused: bool | None = None
+    position_s: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] | None = None
+    speed: Annotated[float, Field(gt=0.0, le=MAX_SPEED, allow_inf_nan=False)] | None = None
+    loop: bool | None = None
+    step: bool = False
+
+
 COMMANDS: Final[Mapping[str, type[Arguments]]] = {
     "status": Nothing,
     "tare": Nothing,
@@ -91,6 +104,7 @@ COMMANDS: Final[Mapping[str, type[Arguments]]] = {
     "set_tier": SetTier,
     "set_budget": SetBudget,
     "reload_calibration": Nothing,
+    "replay": SteerReplay,
 }
 
 

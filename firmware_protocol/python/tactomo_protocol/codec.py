@@ -147,6 +147,11 @@ class Decoder:
         self.counts.packets += len(packets)
         return packets
 
+    def restart(self) -> None:
+        """Forget the frame that had begun: what comes does not go on from it."""
+        self._pending.clear()
+        self._dropping = True
+
     def _collect(self, data: bytes, start: int, end: int) -> None:
         if self._dropping:
             return

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from tactomo.imaging import pipeline as module
 from tactomo.imaging.pipeline import Pipeline
+from tactomo.recordings.playback import Playback
 from tactomo.recordings.replay import Replay
 from tactomo.scans import ChannelScan, Delivery, DualScan
 from tactomo_protocol import Channel, ScanFlag
@@ -109,7 +110,7 @@ def test_lossless_every_one_is_made() -> None:
 def test_an_unpaced_replay_waits_for_the_slower_port() -> None:
     frames = Frames()
     frames.go.set()
-    pipeline = started(frames, replay=Replay([], None, is_paced=False))
+    pipeline = started(frames, replay=Replay([], None, is_paced=False, playback=Playback(0, 0, 0)))
     for port, channel in enumerate(BOTH):  # one is seconds ahead of the other
         for counter in range(5):
             at_ns = counter * 10**9

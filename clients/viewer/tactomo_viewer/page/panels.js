@@ -5,7 +5,7 @@ import { explainFlag } from "./health.js";
 const EVENTS_SHOWN = 50;
 const TROUBLE_SHOWN_S = 3600;
 const SOURCES = { twin: "simulated skin", device: "device", replay: "replay" };
-const STATES = { waiting_for_port: "no port yet", waiting_for_data: "no data yet", taring: "taring", running: "running", late: "late", ended: "replay ended", "replay-paused": "replay paused", stale: "stale" };
+const STATES = { waiting_for_port: "no port yet", waiting_for_data: "no data yet", taring: "taring", running: "running", late: "late", ended: "replay ended", paused: "replay paused", stale: "stale" };
 const LINEAR = ["tikhonov", "noser"];  // one step, which runs contacts together
 
 export const byId = (id) => document.getElementById(id);
@@ -144,12 +144,14 @@ function showStages(stages) {
   });
 }
 
-function showChannels({ ports, rates, events, last_minute: minute }) {
+function showChannels({ state, ports, rates, events, last_minute: minute }) {
   const lines = [];
+  const stands = ["paused", "ended"].includes(state);
   for (const name of ["magnitude", "structure"]) {
     const hz = rates?.[`${name}_hz`];
     if (hz === null || hz === undefined) continue;
-    lines.push([hz > 0 ? "good" : "bad", name, hz > 0 ? `${fixed(hz, 1)} scans/s` : "no scans"]);
+    lines.push([hz > 0 || stands ? "good" : "bad", name,
+      hz > 0 ? `${fixed(hz, 1)} scans/s` : stands ? state : "no scans"]);
   }
   for (const port of ports ?? []) {
     lines.push(portLine(port));
@@ -180,7 +182,8 @@ function showChannels({ ports, rates, events, last_minute: minute }) {
   });
 }
 
-function portLine({ url, connected, refusal, device, bytes: received, received_last_minute: minute }) {
+function portLine({ url, state, connected, refusal, device, bytes: received, received_last_minute: minute }) {
+  if (state === "ended") return ["good", url, "at its end"];
   if (!connected) return ["bad", url, "not connected"];
   if (refusal) return ["bad", url, refusal];
   const corrupt = minute?.corrupt;

@@ -80,7 +80,7 @@ function onMessage(message) {
       state.status = { fields: message.status, age_ms: message.age_ms, receivedAt: performance.now() };
       describe(message.status.description);
       showStatus(message.status);
-      replay.show(message.status.replay, state.hello);
+      replay.show(message.status, state.hello);
     },
     event: () => {
       showEvent(message.event);
@@ -233,7 +233,7 @@ function refresh() {
   document.body.dataset.health = found?.name ?? (state.status ? "good" : "connecting");
   const linked = link.isOpen && state.status && ageOf(state.status, now) < 3000;
   if (!linked) showState("gone", found ? "disconnected" : "connecting");
-  else if (["stale", "ended", "replay-paused"].includes(live?.name)) showState(live.name);
+  else if (["stale", "ended"].includes(live?.name)) showState(live.name);
   else showState(state.status.fields.state);
   for (const id of ["tare", "record", "method"]) {
     byId(id).disabled = !linked || Boolean(state.hello?.read_only);

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,6 +27,7 @@ from tactomo.cli.options import (
 
 if TYPE_CHECKING:
     from tactomo.config import DaemonConfig, Skins
+    from tactomo.recordings.playback import Playback
     from tactomo.recordings.recording import Recording
 
 app = typer_app()
@@ -150,6 +152,12 @@ def replay(
     stay: Annotated[
         bool, typer.Option("--stay", help="Keep running after the recording's end.")
     ] = False,
+    start: Annotated[
+        float, typer.Option(min=0.0, help="Begin so many seconds after its beginning.")
+    ] = 0.0,
+    loop: Annotated[bool, typer.Option("--loop", help="Begin again at the end.")] = False,
+    paused: Annotated[bool, typer.Option("--paused", help="Wait for the page's Play.")] = False,
+    wait_for_page: Annotated[bool, typer.Option("--wait-for-page", hidden=True)] = False,
     record: Annotated[
         Path | None, typer.Option(help="Record the replay to this file, with maps and contacts.")
     ] = None,
@@ -161,6 +169,9 @@ def replay(
 
     A folder of files that a daemon has cut is played as the one recording that it was, from the
     oldest to the newest; pauses between them are shortened to a second.
+
+    With --viewer it waits until the page is open. There, or by the command `replay` of the control
+    socket, it is paused, stepped, moved and paced while it runs.
     """
     from tactomo.recordings.recording_set import RecordingSet, open_replayable
 
@@ -175,6 +186,8 @@ def replay(
         more = ["--method", method]
         more += [] if description is None else ["--description", description]
         more += [] if calibration is None else ["--calibration", str(calibration)]
+        more += ["--start", str(start), *(["--loop"] if loop else [])]
+        more += ["--paused"] if paused else ["--wait-for-page"]
         name = sensor or origin.sensor or DEFAULT_NAME
         show_replay(recording, speed, name, stream, control, viewer_port, more)
         return
@@ -194,7 +207,14 @@ def replay(
     )
     for part in opened.parts if isinstance(opened, RecordingSet) else [opened]:
         warn_of_damage(part)
-    raise typer.Exit(_run_daemon(settings))
+
+    def begin(playback: Playback) -> None:
+        playback.steer(paused or wait_for_page, None, loop)
+        playback.waits_for_page = wait_for_page
+        if start:
+            playback.move(start)
+
+    raise typer.Exit(_run_daemon(settings, begin))
 
 
 def warn_of_damage(recording: Recording) -> None:
@@ -208,12 +228,17 @@ def warn_of_damage(recording: Recording) -> None:
         )
 
 
-def _run_daemon(settings: DaemonConfig) -> int:
+def _run_daemon(
+    settings: DaemonConfig, begin_replay: Callable[[Playback], None] = lambda _: None
+) -> int:
     """Serve until the daemon is stopped, and return its exit status."""
     _prepare(settings)
     from tactomo.service.daemon import Daemon
 
-    return Daemon(settings).run()
+    daemon = Daemon(settings)
+    if daemon.playback is not None:
+        begin_replay(daemon.playback)
+    return daemon.run()
 
 
 def _run_skins(skins: Skins) -> int:

@@ -1,0 +1,139 @@
+"""The time of a replay: when recorded bytes are due, and who may pause, move and pace it.
+
+All ports of one replay share a `Playback`. Its position is on the recording's steady clock. Moving
+it begins another *pass*: ports go on reading elsewhere, and what they read before is left out.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from typing import Any
+
+
+class Playback:
+    """For use by any thread.
+
+    Args:
+        start_ns: when the recording begins.
+        end_ns: when it ends.
+        speed: factor of the recorded speed, or 0 for as fast as it is taken.
+
+    Attributes:
+        passes: how often it was moved.
+        begin_ns: where the pass began.
+        loops: whether the end is followed by the beginning.
+        waits_for_page: whether it is paused until somebody looks.
+    """
+
+    def __init__(self, start_ns: int, end_ns: int, speed: float) -> None:
+        self.passes = 0
+        self.start_ns = self.begin_ns = start_ns
+        self.loops = False
+        self.waits_for_page = False
+        self._end_ns = end_ns
+        self._speed = speed
+        self._is_paused = False
+        self._is_stepping = False
+        self._position_ns = start_ns  # when it was last paused, moved or paced otherwise
+        self._since_ns: int | None = None  # when that was, monotonic; None before anything is read
+        self._changed = threading.Condition(threading.RLock())
+
+    @property
+    def is_paused(self) -> bool:
+        """Whether nothing is due."""
+        return self._is_paused and not self._is_stepping
+
+    @property
+    def position_ns(self) -> int:
+        """How far it is."""
+        with self._changed:
+            played_ns = 0
+            if self._since_ns is not None and not self.is_paused:
+                played_ns = round((time.monotonic_ns() - self._since_ns) * self._pace)
+            return self._position_ns + played_ns
+
+    def fields(self) -> dict[str, Any]:
+        """Return what `status` says of it."""
+        with self._changed:
+            return {
+                "position_s": (min(self.position_ns, self._end_ns) - self.start_ns) * 1e-9,
+                "duration_s": (self._end_ns - self.start_ns) * 1e-9,
+                "speed": self._speed,
+                "paused": self.is_paused,
+                "loop": self.loops,
+                "waits_for_page": self.waits_for_page,
+            }
+
+    def wait_until_due(self, clock_ns: int | None, timeout_s: float, number: int) -> bool:
+        """Wait until bytes are due, and return whether they are.
+
+        Args:
+            clock_ns: when they came, on the recording's clock; None where there are no more.
+            timeout_s: how long to wait at most, seconds.
+            number: the pass that they are of; in another one they are not due.
+        """
+        with self._changed:
+            # Counted from the first read on, not from opening, so that two ports of one recording,
+            # opened one after the other and then read together, keep time with each other.
+            if self._since_ns is None:
+                self._since_ns = time.monotonic_ns()
+            wait_s = self._due_in_s(clock_ns)
+            if wait_s > 0 and number == self.passes:
+                self._changed.wait(min(wait_s, timeout_s))
+            if number != self.passes or self._due_in_s(clock_ns) > 0:
+                return False
+            if not self._pace and clock_ns is not None:
+                self._position_ns = max(self._position_ns, clock_ns)
+            return True
+
+    def steer(self, paused: bool | None, speed: float | None, loop: bool | None) -> None:
+        """Change what is given."""
+        with self._changed:
+            self._settle()
+            if paused is not None:
+                self._is_paused, self._is_stepping, self.waits_for_page = paused, False, False
+            self._speed = self._speed if speed is None else speed
+            self.loops = self.loops if loop is None else loop
+            self._changed.notify_all()
+
+    def step(self) -> None:
+        """Go on, paced, until the next dual scan."""
+        with self._changed:
+            self._settle()
+            self._is_paused = self._is_stepping = True
+            self.waits_for_page = False
+            self._changed.notify_all()
+
+    def note_dual_scan(self) -> None:
+        """End a step: its dual scan is there."""
+        with self._changed:
+            if self._is_stepping:
+                self._settle()
+                self._is_stepping = False
+
+    def move(self, position_s: float) -> None:
+        """Go on `position_s` seconds after the beginning."""
+        with self._changed:
+            position_ns = self.start_ns + round(position_s * 1e9)
+            self.begin_ns = self._position_ns = min(position_ns, self._end_ns)
+            self._since_ns = None
+            self.passes += 1
+            self._changed.notify_all()
+
+    @property
+    def _pace(self) -> float:
+        """Recorded seconds a second; a step goes at the recorded speed at most."""
+        return min(self._speed or 1.0, 1.0) if self._is_stepping else self._speed
+
+    def _settle(self) -> None:
+        """Count from here and now."""
+        self._position_ns = self.position_ns
+        self._since_ns = None if self._since_ns is None else time.monotonic_ns()
+
+    def _due_in_s(self, clock_ns: int | None) -> float:
+        if clock_ns is None or self.is_paused:
+            return math.inf
+        ahead_ns = clock_ns - self.position_ns
+        return 0.0 if not self._pace else ahead_ns * 1e-9 / self._pace
