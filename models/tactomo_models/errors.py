@@ -54,4 +54,6 @@ def explain(item: "ErrorDetails") -> str:
         return message
     if isinstance(item["input"], dict):  # from a section's own check: its text opens with the key
         return f"{key}.{message}"
+    if key.endswith("_m") and item["type"].startswith("less_than"):  # lengths are in metres
+        message += f"; in millimetres? {item['input']:g} mm are {item['input'] * 1e-3:g} m"
     return f"{key} = {item['input']!r}: {message}"

@@ -13,6 +13,7 @@ from tactomo_client import request
 from tactomo_models import SensorDescription, load_description, load_or_build_artifact
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.bare_sheet import scan_voltages
+from tactomo_models.sensor.description_file import shipped_text
 from tactomo_models.sensor.pattern import reciprocal_pairs, scan_pairs
 from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag
 from whole_system import SENSOR, Demo, repository, running_demo
@@ -265,6 +266,17 @@ def test_the_tank_is_not(tactomo: Run, arguments: list[str]) -> None:
 def demo() -> Iterator[Demo]:
     with running_demo() as running:
         yield running
+
+
+def test_the_description_that_a_daemon_holds_is_found(
+    tactomo: Run, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    file = tmp_path_factory.mktemp("elsewhere") / "mine.toml"
+    file.write_text(shipped_text("paper_square").replace('"paper_square"', '"mine"'))
+    with running_demo("--description", str(file)) as demo:
+        outcome = tactomo("doctor", "-s", SENSOR, "--stream", demo.stream, "--seconds", "2")
+    assert outcome.returncode == 0
+    assert "is not here" not in outcome.stdout
 
 
 def test_a_running_daemon(tactomo: Run, demo: Demo) -> None:

@@ -51,6 +51,15 @@ def test_every_command_explains_itself(words: tuple[str, ...]) -> None:
         assert "Examples" in result.output
 
 
+@pytest.mark.parametrize("words", leaves(TOP), ids=" ".join)
+def test_nothing_in_help_is_cut_off_at_80_columns(
+    words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    result = CliRunner().invoke(app, [*words, "--help"], prog_name="tactomo")
+    assert "…" not in result.output
+
+
 def test_every_option_has_one_name_and_one_meaning() -> None:
     meanings: dict[str, set[str]] = {}
     for words in leaves(TOP):

@@ -274,3 +274,13 @@ def test_poke_sends_numbers_as_numbers(tactomo: Run, control: Any) -> None:
     )
     assert json.loads(result.stdout) == {"done": True}
     assert control.requests == [("mute", {"channel": "structure", "seconds": 2.5, "port": 1})]
+
+
+def test_poke_tells_that_there_is_nothing_to_release(tactomo: Run, control: Any) -> None:
+    command = ("poke", "release", "id=thumb", "--twin-control", control.address)
+    control.answers["release"] = {"released": True}
+    assert tactomo(*command).returncode == 0
+    control.answers["release"] = {"released": False}
+    result = tactomo(*command)
+    assert (result.returncode, result.stdout) == (1, "")
+    assert "nothing of this id presses" in result.stderr

@@ -57,6 +57,8 @@ class SensorDescription:
     model: str = ""
     """The description's name, such as ``paper_square``."""
     sha256: str = ""
+    file: str | None = None
+    """On the daemon's computer; None for a shipped one."""
     shape: str = ""
     """``rectangle`` or ``disc``."""
     width_mm: float | None = None

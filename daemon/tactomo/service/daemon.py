@@ -46,6 +46,7 @@ from tactomo_models import (
     SensorDescription,
     load_description,
     load_or_build_artifact,
+    shipped_descriptions,
 )
 from tactomo_models.calibration.calibration_file import (
     PressureCalibration,
@@ -205,8 +206,10 @@ class Daemon:
             on_idle=self._check,
             on_event=self._on_event,
         )
+        is_shipped = config.description in shipped_descriptions()
         self._status = Status(
             description,
+            None if is_shipped else Path(config.description).resolve(),
             self._ports,
             self._pipeline,
             self._imaging,

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Sequence
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any, Final
 
 from tactomo_models import SensorDescription
@@ -35,6 +36,7 @@ class Status:
     def __init__(
         self,
         description: SensorDescription,
+        file: Path | None,
         ports: list[PortReader],
         pipeline: Pipeline,
         imaging: Imaging,
@@ -44,7 +46,7 @@ class Status:
         playback: Playback | None,
     ) -> None:
         self._sensor = description
-        self._description = description_fields(description)
+        self._description = {**description_fields(description), "file": file and str(file)}
         self._ports = ports
         self._pipeline = pipeline
         self._imaging = imaging

@@ -56,6 +56,7 @@ def structure_table(ratios: str) -> str:
             ("width_m = 0.06", "width_m = -1"),
             ["sheet.width_m", "-1", "greater than or equal to 0.00001"],
         ),
+        (("width_m = 0.06", "width_m = 120"), ["in millimetres? 120 mm are 0.12 m"]),
         (("width_m = 0.06", "width_m = nan"), ["sheet.width_m", "nan", "finite"]),
         (("width_m = 0.06", 'width_m = "wide"'), ["sheet.width_m", "wide", "number"]),
         (("width_m = 0.06", "width_m = inf"), ["sheet.width_m", "inf", "finite"]),

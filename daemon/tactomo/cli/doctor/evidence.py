@@ -194,7 +194,7 @@ def _layout_of_status(
 ) -> tuple[Layout, tuple[str, ...]]:
     said = status["description"]
     try:
-        known = load_description(description or said["model"])
+        known = load_description(description or said.get("file") or said["model"])
     except DescriptionError:
         if description is not None:
             raise

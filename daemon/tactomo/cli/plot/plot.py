@@ -40,7 +40,10 @@ def plot(
         Path, typer.Option("--output", "-o", help="The picture: .png, .svg or .pdf.")
     ] = Path("recording.png"),
     what: Annotated[
-        str, typer.Option(metavar="PANELS", help=f"Some of {', '.join(PANELS)}.")
+        str,
+        typer.Option(
+            metavar="PANELS", help=f"Some of {', '.join(PANELS)}. [all]", show_default=False
+        ),
     ] = ",".join(PANELS),
     start_s: FromOption = 0.0,
     end_s: ToOption = None,

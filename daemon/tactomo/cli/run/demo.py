@@ -69,7 +69,9 @@ def demo(
     stream: StreamAddress = DEFAULT_STREAM,
     control: ControlAddress = DEFAULT_CONTROL,
     twin_control: TwinControlAddress = DEFAULT_TWIN_CONTROL,
-    browser: Annotated[bool, typer.Option(help="Open the page, where there is a desktop.")] = True,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="Do not open the page, where there is a desktop.")
+    ] = False,
     verbose: Annotated[
         bool, typer.Option("--verbose", "-v", help="Show what the three programs log.")
     ] = False,
@@ -100,7 +102,7 @@ def demo(
         page = None
         if not any(address.endswith((":0", ":*")) for address in (stream, control, twin_control)):
             # The page waits for the daemon by itself: it need not wait here.
-            page = _open_page(family, asked, viewer_port, browser)
+            page = _open_page(family, asked, viewer_port, not no_browser)
             print(f"starting; the page is {page}", file=sys.stderr)
         simulated = skin.wait_ready()
         builder.wait_done()
@@ -108,7 +110,7 @@ def demo(
         daemon = family.start("daemon", "daemon", *daemon_options, *lines)
         addresses = {**_served(daemon.wait_ready()), "twin": simulated["control"]}
         _wait_tared(addresses["control"])
-        page = page or _open_page(family, addresses, viewer_port, browser)
+        page = page or _open_page(family, addresses, viewer_port, not no_browser)
         _stay(family, {**addresses, "viewer": page}, announce)
 
 

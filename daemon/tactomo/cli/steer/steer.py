@@ -21,6 +21,7 @@ from tactomo.cli.options import (
     method_names,
     typer_app,
 )
+from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
     from tactomo_client import Daemon, RecordedFile
@@ -180,6 +181,8 @@ def poke(
     answer = request(
         command, twin_control, **dict(_named(argument) for argument in arguments or [])
     )
+    if answer.get("released") is False:
+        raise TactomoError("nothing of this id presses", "`tactomo poke scene` lists what does")
     if answer:
         typer.echo(json.dumps(answer, indent=2))
 

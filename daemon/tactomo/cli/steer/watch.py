@@ -19,6 +19,7 @@ from tactomo.cli.options import (
     examples,
     typer_app,
 )
+from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from tactomo_client import Event, Frame, Status
 
 REFRESH_HZ = 12.0
+NOBODY_S = 5.0
+"""How long a name may be silent from the start: a daemon sends its status every second."""
 
 app = typer_app()
 
@@ -43,7 +46,8 @@ def watch(
 ) -> None:
     """Show the pressure map, the contacts and the daemon's health live in the terminal.
 
-    Without a terminal (in a pipe) it prints one line a frame instead. Ctrl-C ends it.
+    Without a terminal (in a pipe) it prints one line a frame instead. Ctrl-C ends it. Where nobody
+    publishes the sensor for 5 s from the start, it ends with exit status 1.
     """
     from rich.console import Console
 
@@ -55,6 +59,7 @@ def watch(
             _show_live(view, console, end_s)
         else:
             _print_lines(view, end_s)
+        view.check_is_published(0.0)
     except KeyboardInterrupt:
         pass
     finally:
@@ -72,6 +77,7 @@ class View:
         self.frame: Frame | None = None
         self.status: Status | None = None
         self.event: Event | None = None
+        self._begin_s = time.monotonic()
         self._news = subscribe(sensor, address=stream, kind=("map", "status", "event"), keys=keys)
 
     def update(self, wait_s: float) -> bool:
@@ -79,12 +85,24 @@ class View:
 
         Raises:
             KeysError: the server does not let us in.
+            TactomoError: nobody publishes the sensor.
         """
         before = self.frame
         while (item := self._news.wait(wait_s)) is not None:
             wait_s = 0.0
             self._take(item)
+        self.check_is_published(NOBODY_S)
         return self.frame is not before
+
+    def check_is_published(self, patience_s: float) -> None:
+        """Raise TactomoError if nothing has come since the start, and that is so long ago."""
+        is_silent = self.frame is None and self.status is None
+        if is_silent and time.monotonic() - self._begin_s >= patience_s:
+            raise TactomoError(
+                f"nobody publishes a sensor {self.sensor!r} at {self.stream}",
+                "`tactomo status` says whether a daemon runs, and its sensor's name: give that "
+                "with --sensor",
+            )
 
     def close(self) -> None:
         """Close the subscription."""
