@@ -46,6 +46,7 @@ ORDER = {
         *("errors", "arrays", "archive", "toml_file", "robust"),
         *("sensor", "physics", "scans", "scene", "methods", "simulation"),
         *("calibration", "health", "drift", "reconstruct", "known_skin", "batch", "machine_speed"),
+        *("mujoco_skin", "gymnasium_skin"),
     ),
     "tactomo": (
         *("errors", "journal", "log", "events", "endpoint", "timing", "scans", "worker"),
@@ -58,6 +59,8 @@ ORDER = {
 FOREIGN = {
     "torch": ("tactomo_lab.training.",),
     "onnx": ("tactomo_lab.training.",),
+    "mujoco": ("tactomo_models.mujoco_skin.",),
+    "gymnasium": ("tactomo_models.gymnasium_skin.",),
     "serial": ("tactomo.",),
     "zmq": ("tactomo.", "tactomo_client.", "tactomo_foxglove."),
 }

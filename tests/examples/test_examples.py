@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
 import runpy
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
+from ctypes.util import find_library
 from pathlib import Path
 
 import pytest
@@ -44,9 +48,9 @@ def test_a_program_is_short_and_says_how_it_is_run(program: Path) -> None:
     assert re.search(rf"^(Run|    tactomo).*{program.stem}", told, re.M)
 
 
-def test_five_programs_are_listed_where_a_reader_looks() -> None:
+def test_six_programs_are_listed_where_a_reader_looks() -> None:
     names = {program.name for program in PROGRAMS}
-    assert len(names) == 5
+    assert len(names) == 6
     for page in ("docs/python.md", "docs/gallery.md"):
         listed = re.findall(r"examples/(\w+\.py)", (repository() / page).read_text("utf-8"))
         assert set(listed) == names, page
@@ -60,6 +64,30 @@ def test_presses_are_simulated_found_and_plotted(run: Run, tmp_path: Path) -> No
         (30, -20): pytest.approx(220, rel=0.05),
     }
     assert (tmp_path / "presses.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_simulated_gripper_feels_the_ball_that_it_rolls(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    if find_library("EGL") is None:
+        pytest.skip("needs EGL to render")
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / "mujoco_grasp.py"],
+        cwd=tmp_path,
+        env={**os.environ, "MUJOCO_GL": "egl"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    said = done.stdout
+    assert done.returncode == 0, done.stderr
+    truth = [float(newtons) for newtons in re.findall(r"([\d.]+) N press", said)]
+    felt = [[float(n) for n in each] for each in re.findall(r"(\d+) N at (.*), (.*) mm", said)]
+    assert len(truth) == len(felt) == 5
+    for pressed_n, (felt_n, _, y_mm) in zip(truth, felt, strict=True):
+        assert felt_n == pytest.approx(pressed_n, rel=0.2)
+        assert y_mm == pytest.approx(10, abs=1)
+    assert [x_mm for _, x_mm, _ in felt] == pytest.approx([-30, -30, -11, 9, 29], abs=2)
+    assert (tmp_path / "grasp.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_sensor_of_ones_own_finds_its_press(run: Run) -> None:

@@ -21,7 +21,7 @@ def touches(description: SensorDescription, electrode: int) -> BoolArray:
 
 def shorted(simulator: SkinSimulator, first: int, second: int) -> SkinSimulator:
     """The same skin with two electrodes connected: a rank-one change of the bare sheet."""
-    forward = simulator._forward
+    forward = simulator.forward
     bare = forward.bare
     between = np.zeros(len(bare.transfer))
     between[first], between[second] = 1, -1
@@ -30,7 +30,7 @@ def shorted(simulator: SkinSimulator, first: int, second: int) -> SkinSimulator:
     resistance = between @ electrodes
     made = copy.copy(simulator)
     made._last = None
-    made._forward = ForwardModel(
+    made.forward = ForwardModel(
         simulator.description,
         replace(
             bare,
@@ -46,14 +46,14 @@ def shorted(simulator: SkinSimulator, first: int, second: int) -> SkinSimulator:
 
 def rewired(simulator: SkinSimulator, order: list[int]) -> SkinSimulator:
     """The same skin, with the device's lead i on electrode order[i]."""
-    forward = simulator._forward
+    forward = simulator.forward
     bare = forward.bare
     move = np.eye(len(order))[order]
     # Potentials are held against the last lead's electrode: a current into lead l, out of the last.
     full = np.hstack([bare.potentials, np.zeros((len(bare.potentials), 1))]) @ move.T
     made = copy.copy(simulator)
     made._last = None
-    made._forward = ForwardModel(
+    made.forward = ForwardModel(
         simulator.description,
         replace(
             bare, transfer=exchanged(bare.transfer, order), potentials=(full - full[:, -1:])[:, :-1]

@@ -28,6 +28,10 @@ class SkinSimulator:
         unevenness: standard deviation of the sheet's smooth conductivity error (0.05 is 5 %).
         impedance_spread: standard deviation of the logarithm of the contact impedances.
         seed: of that unevenness.
+
+    Attributes:
+        forward: its forward model; P of its mesh's nodes can be pressed.
+        spacing_m: distance of the nodes.
     """
 
     def __init__(
@@ -40,8 +44,8 @@ class SkinSimulator:
         seed: int = 0,
     ) -> None:
         self.description = description
-        self._spacing_m = spacing_m or description.width_m / (description.map.nodes_x - 1) * 2 / 3
-        self._sheet = mesh_sheet(description, self._spacing_m)
+        self.spacing_m = spacing_m or description.width_m / (description.map.nodes_x - 1) * 2 / 3
+        self._sheet = mesh_sheet(description, self.spacing_m)
         rng = np.random.default_rng(seed)
         x, y = self._sheet.mesh.p
         self._conductivity = 1 + unevenness * smooth_noise(x, y, description.width_m / 4, rng)
@@ -50,7 +54,7 @@ class SkinSimulator:
         bare = solve_bare_sheet(
             description, self._sheet, self._conductivity, self._impedance, quick=True
         )
-        self._forward = ForwardModel(description, bare)
+        self.forward = ForwardModel(description, bare)
         self._background = self._conductivity[bare.pressable]
         self._x, self._y = bare.points[:, bare.pressable]
         self._last: tuple[tuple[Press, ...], dict[Channel, FloatArray]] | None = None
@@ -73,17 +77,31 @@ class SkinSimulator:
     def _solve(self, channel: Channel, scene: tuple[Press, ...]) -> FloatArray:
         return self.solve(self.ratio(channel, scene))
 
+    def voltages_under(
+        self, pressure_kpa: FloatArray, coverage: FloatArray
+    ) -> dict[Channel, FloatArray]:
+        """Noise-free voltages (M,) of each channel for any pressure at the nodes.
+
+        Args:
+            pressure_kpa: (P,) where the nodes are covered.
+            coverage: (P,) share of each node's neighbourhood that is covered, 0 to 1.
+        """
+        return {
+            name: self.solve(conductivity_ratio(self.description, name, pressure_kpa, coverage))
+            for name in self.channels
+        }
+
     def ratio(self, channel: Channel, presses: Sequence[Press]) -> FloatArray:
         """Conductivity over the bare sheet's at the mesh's P nodes that can be pressed."""
-        pressure, coverage = strongest(presses, self._x, self._y, self._spacing_m)
+        pressure, coverage = strongest(presses, self._x, self._y, self.spacing_m)
         return conductivity_ratio(self.description, channel, pressure, coverage)
 
     def solve(self, ratio: FloatArray) -> FloatArray:
         """Noise-free volts (M,) where those nodes conduct so many times better, (P,)."""
         change = self._background * (ratio - 1)
         # Across the edge of a good conductor resistivities mix; see `ForwardModel.solve`.
-        solved = self._forward.solve(change, mix_resistivities=bool(np.all(ratio >= 1)))
-        return solved.voltages * self._forward.volts_per_unit
+        solved = self.forward.solve(change, mix_resistivities=bool(np.all(ratio >= 1)))
+        return solved.voltages * self.forward.volts_per_unit
 
     def smooth_field(self, rng: np.random.Generator) -> FloatArray:
         """A random field (N,) at all of the mesh's nodes, of unit standard deviation."""

@@ -1,0 +1,176 @@
+"""A skin in MuJoCo: forces are kept, borders cut and told, nothing invented, presses found."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from tactomo_models import DataError
+
+mujoco = pytest.importorskip("mujoco")
+gymnasium = pytest.importorskip("gymnasium")
+
+from tactomo_models.gymnasium_skin import TactileObservation  # noqa: E402
+from tactomo_models.mujoco_skin import MujocoSkin, Touch  # noqa: E402
+
+STEPS = 300
+CELL_M2 = 0.003**2
+
+PLATE = """
+<mujoco>
+  <option timestep="0.002"/>
+  <default><geom solref=".004 1"/></default>
+  <worldbody>
+    <body name="arm" pos="0.3 -0.2 0.5" euler="0 {tilt} 0">
+      <geom name="plate" type="box" size=".09 .09 .01" pos="0 0 -.01"/>
+      <site name="skin"/>
+      {bodies}
+    </body>
+  </worldbody>
+</mujoco>
+"""
+"""Bodies are pressed on the plate by springs, so that it may be turned whichever way."""
+
+
+def body(name: str, geom: str, x_mm: float, y_mm: float, force_n: float, z_mm: float = 0) -> str:
+    """A body that slides along the plate's normal and is pressed on the plate, or from behind."""
+    up = "-1" if z_mm < 0 else "1"
+    return f"""
+      <body name="{name}" pos="{x_mm / 1e3} {y_mm / 1e3} {z_mm / 1e3}">
+        <joint type="slide" axis="0 0 {up}" damping="200" stiffness="1e-3"
+               springref="{-force_n * 1e3}"/>
+        <geom name="{name}" {geom} mass=".1"/>
+      </body>"""
+
+
+BALL = 'type="sphere" size=".04" pos="0 0 .04"'
+
+
+def settled(*bodies: str, tilt: float = 0) -> tuple[Any, Any]:
+    """A model and its data once nothing moves any more; without gravity."""
+    xml = PLATE.format(bodies="".join(bodies), tilt=tilt)
+    model = mujoco.MjModel.from_xml_string(xml)
+    model.opt.gravity[:] = 0
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data, STEPS)
+    return model, data
+
+
+def felt(*bodies: str, tilt: float = 0, **options: Any) -> Touch:
+    """What the skin feels of bodies."""
+    model, data = settled(*bodies, tilt=tilt)
+    return MujocoSkin(model, "skin", **{"method": "network", **options}).feel(data)
+
+
+def truth_n(touch: Touch) -> float:
+    """Force of the true pressure on the map's nodes."""
+    return float(touch.truth_kpa.sum()) * 1e3 * CELL_M2
+
+
+@pytest.mark.parametrize("tilt", [0, 180, 37])
+def test_a_ball_is_found_where_it_presses_and_as_hard(tilt: float) -> None:
+    touch = felt(body("ball", BALL, 20, -15, 90), tilt=tilt, method="auto")
+    assert touch.force_n == pytest.approx(90, rel=0.01)
+    assert touch.lost_n == 0
+    assert touch.outside == ()
+    assert truth_n(touch) == pytest.approx(touch.force_n, rel=0.02)
+    # Hertz: a = (3 F R / 4 E*)^(1/3) = 13.9 mm, p0 = 3 F / 2 pi a^2 = 221 kPa
+    assert touch.truth_kpa.max() == pytest.approx(221, rel=0.04)
+    (contact,) = touch.frame.contacts
+    assert (contact.x_m * 1e3, contact.y_m * 1e3) == pytest.approx((20, -15), abs=1)
+    assert contact.force_n == pytest.approx(90, rel=0.15)
+    assert contact.area_m2 == pytest.approx(np.pi * 0.0139**2, rel=0.15)
+
+
+def test_several_contacts_add_up() -> None:
+    box = 'type="box" size=".02 .02 .01" pos="0 0 .01"'
+    model, data = settled(body("ball", BALL, -30, 0, 80), body("box", box, 35, 10, 120))
+    assert data.ncon == 5
+    touch = MujocoSkin(model, "skin", method="network").feel(data)
+    assert touch.force_n == pytest.approx(data.qfrc_constraint.sum(), rel=0.01)
+    assert truth_n(touch) == pytest.approx(touch.force_n, rel=0.02)
+
+
+def test_what_reaches_over_the_border_is_cut_and_counted() -> None:
+    touch = felt(body("ball", BALL, 69, 0, 90))  # the rim that cannot be pressed begins there
+    assert touch.force_n == pytest.approx(45, abs=1)
+    assert touch.lost_n == pytest.approx(45, abs=1)
+    assert touch.outside == ()
+    assert truth_n(touch) == pytest.approx(touch.force_n, rel=0.1)
+
+
+def test_contacts_outside_the_sheet_are_named_and_press_nothing() -> None:
+    behind = 'type="sphere" size=".02" pos="0 0 -.02"'
+    touch = felt(body("finger", BALL, 86, 0, 30), body("strap", behind, 10, 10, 20, -20))
+    told = {each.body: (each.where, round(each.force_n)) for each in touch.outside}
+    assert told == {"finger": ("off the sheet", 30), "strap": ("behind the sheet", 20)}
+    assert (touch.force_n, touch.lost_n) == (0, 0)
+    assert not touch.truth_kpa.any()
+    assert touch.frame.tier == "quiet"
+    assert touch.frame.contacts == ()
+
+
+def test_nothing_touches_and_nothing_is_felt() -> None:
+    touch = felt(body("ball", BALL, 0, 0, 0, 30))
+    assert (touch.force_n, touch.frame.contacts, touch.outside) == (0, (), ())
+
+
+def test_a_site_that_is_not_there_is_told() -> None:
+    model, _ = settled()
+    with pytest.raises(DataError, match=r"no site 'palm'; add one, or use one of: skin"):
+        MujocoSkin(model, "palm")
+
+
+class Pressing(gymnasium.Env[Any, Any]):  # type: ignore[misc,name-defined]
+    """A ball that is pressed on the plate by so many newtons: the action."""
+
+    def __init__(self) -> None:
+        self.model, self.data = settled(body("ball", BALL, 0, 0, 0))
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,))
+        self.action_space = gymnasium.spaces.Box(0, 100, (1,))
+
+    def _observation(self) -> Any:
+        return self.data.qpos.astype(np.float32)
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        super().reset(**options)
+        mujoco.mj_resetData(self.model, self.data)
+        mujoco.mj_forward(self.model, self.data)
+        return self._observation(), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.data.qfrc_applied[0] = -action[0]
+        mujoco.mj_step(self.model, self.data, STEPS)
+        return self._observation(), 0.0, False, False, {"own": 1}
+
+
+@pytest.fixture(scope="module")
+def env() -> Iterator[Any]:
+    bare = Pressing()
+    palm = MujocoSkin(bare.model, "skin", method="network")
+    with TactileObservation(bare, {"palm": palm}) as made:
+        yield made
+
+
+def test_an_environment_observes_the_skin_and_has_the_truth_beside_it(env: Any) -> None:
+    first, _ = env.reset(seed=1)
+    seen, _, _, _, info = env.step(np.array([90.0]))
+    for observation in (first, seen):
+        assert env.observation_space.contains(observation)
+    assert not first["palm"]["pressure_kpa"].any()
+    assert first["palm"]["is_known"].all()
+    assert seen["palm"]["pressure_kpa"].max() > 140
+    assert seen["palm"]["structure"].max() == pytest.approx(1, abs=0.1)
+    assert info["own"] == 1
+    assert info["palm"].truth_kpa.max() > 140
+    assert seen["robot"].shape == (1,)
+
+
+def test_a_light_touch_is_not_known_rather_than_nothing(env: Any) -> None:
+    env.reset()
+    seen, _, _, _, info = env.step(np.array([15.0]))  # 122 kPa: below what the sheet answers to
+    assert 100 < info["palm"].truth_kpa.max() < 140
+    assert not seen["palm"]["is_known"].all()
+    assert env.observation_space.contains(seen)
