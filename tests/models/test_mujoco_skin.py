@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from page import Page
 from tactomo_models import DataError
 
 mujoco = pytest.importorskip("mujoco")
@@ -174,3 +175,16 @@ def test_a_light_touch_is_not_known_rather_than_nothing(env: Any) -> None:
     assert 100 < info["palm"].truth_kpa.max() < 140
     assert not seen["palm"]["is_known"].all()
     assert env.observation_space.contains(seen)
+
+
+def test_the_pages_code_runs() -> None:
+    page = Page("docs/simulation.md")
+    (wears,) = page.blocks("xml")
+    feel, observe = page.blocks("python")
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{wears}</worldbody></mujoco>")
+    data = mujoco.MjData(model)
+    mujoco.mj_step(model, data)
+    names = {"model": model, "data": data}
+    exec(feel, names)
+    assert names["touch"].force_n == 0
+    exec(observe, names | {"env": Pressing()})
