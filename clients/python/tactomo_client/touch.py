@@ -8,9 +8,9 @@ known              (ny, nx) uint8      1 where the pressure is known, and the fr
                                        touch; 0 elsewhere
 magnitude          (ny, nx) float32    |Δσ|/σ₀
 structure          (ny, nx) float32    how surely the node is pressed, 0 to 1
-contacts           (n, fields) float64 a row for each contact, `CONTACT_COLUMNS`; a contact keeps
+contacts           (n, k) float64      a row for each contact, `CONTACT_COLUMNS`; a contact keeps
                                        its row for as long as it lives
-contacts_known     (n, fields) uint8   1 where the number beside it is one; 0 in empty rows, too
+contacts_known     (n, k) uint8        1 where the number beside it is one; 0 in empty rows, too
 is_known           (1,) uint8          whether no contacts means nothing pressed
 has_frame          (1,) uint8          0 where there is no frame, and all else is 0
 =================  ==================  =============================================================
