@@ -45,8 +45,8 @@ ORDER = {
     "tactomo_models": (
         *("errors", "arrays", "archive", "toml_file", "robust"),
         *("sensor", "physics", "scans", "scene", "methods", "simulation"),
-        *("calibration", "health", "drift", "reconstruct", "known_skin", "batch", "machine_speed"),
-        *("mujoco_skin", "gymnasium_skin"),
+        *("calibration", "health", "drift", "reconstruct", "known_skin", "batch", "teach"),
+        *("machine_speed", "mujoco_skin", "gymnasium_skin"),
     ),
     "tactomo": (
         *("errors", "journal", "log", "events", "endpoint", "timing", "scans", "worker"),

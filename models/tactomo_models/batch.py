@@ -13,7 +13,8 @@ from threadpoolctl import threadpool_limits
 
 from tactomo_models.archive import read_arrays, write_arrays
 from tactomo_models.arrays import FloatArray
-from tactomo_models.errors import DataError
+from tactomo_models.calibration.taught_skin import TaughtSkin
+from tactomo_models.errors import CalibrationError, DataError
 from tactomo_models.reconstruct import Reconstructor
 from tactomo_models.scans.reference import Reference
 from tactomo_models.scene.pressure import PressureCurve
@@ -32,6 +33,7 @@ def reconstruct_file(
     description: SensorDescription,
     method: str = "auto",
     curve: PressureCurve | None = None,
+    taught: TaughtSkin | None = None,
     progress: Progress | None = None,
 ) -> list[Reconstruction]:
     """Reconstruct every frame of `source` into `target`, and return the frames.
@@ -44,11 +46,13 @@ def reconstruct_file(
         description: the sensor.
         method: its name, see `methods.registry`.
         curve: of a pressure calibration; the description's if None.
+        taught: what the skin was taught; None where nothing.
         progress: called with frames done and frames in all.
 
     Raises:
         DataError: the input cannot be read, has the wrong shape, or no channel of the sensor;
             or the output cannot be written.
+        CalibrationError: another skin was taught.
         ModelError: the method is unknown, or lacks what it needs.
     """
     if not target.parent.is_dir():
@@ -57,8 +61,12 @@ def reconstruct_file(
     total = max(len(channel) for channel in scans.values())
     frames: list[Reconstruction] = []
     seconds = np.zeros(total)
+    if taught is not None and (why := taught.changed(reference)):
+        raise CalibrationError(f"what was taught does not fit this skin: {why}; teach it anew")
     with threadpool_limits(1):  # as the daemon runs, so that `seconds` are what a robot would see
-        reconstructor = Reconstructor(description, method=method, budget_s=BUDGET_S, curve=curve)
+        reconstructor = Reconstructor(
+            description, method=method, budget_s=BUDGET_S, curve=curve, taught=taught
+        )
         reconstructor.set_reference(reference)
         for index in range(total):
             magnitude, structure = (_scan(scans, n, index) for n in ("magnitude", "structure"))
@@ -198,6 +206,7 @@ def frame_arrays(
         "contact_peak_sigma_kpa": column([c.peak_sigma_kpa for _, c in contacts]),
         "contact_max_kpa": column([c.max_kpa for _, c in contacts]),
         "contact_edge": column([c.edge for _, c in contacts]),
+        "contact_taught": np.array([c.taught for _, c in contacts], dtype=bool),
         "contact_force_n": column([c.force_n for _, c in contacts]),
         "contact_force_sigma_n": column([c.force_sigma_n for _, c in contacts]),
     }

@@ -19,6 +19,7 @@ import numpy as np
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import BoolArray, FloatArray, Image
+from tactomo_models.calibration.taught_skin import TaughtSkin
 from tactomo_models.errors import DataError, ModelError
 from tactomo_models.methods.magnitudes import BAD_MISFIT
 from tactomo_models.methods.method import Estimate, Method, Skin, UnsolvableError
@@ -50,6 +51,7 @@ class Reconstructor:
         budget_s: compute time a frame may take, on a machine of the 2.5 GHz class.
         regularisation: factor on what a rule chooses for the linear methods.
         curve: turns magnitudes into pressures; the description's own table if None.
+        taught: corrects where single contacts are, see `taught_skin`.
 
     Raises:
         ArtifactError: the artifact or the method's network cannot be used.
@@ -60,6 +62,7 @@ class Reconstructor:
         artifact: what is precomputed for it.
         budget_s: compute time a frame may take; None for `DEFAULT_BUDGET_S`.
         curve: the one in force; it may be set at any time.
+        taught: what presses at known places have taught; likewise. None where nothing.
 
     Not thread-safe: one thread owns it.
     """
@@ -73,9 +76,11 @@ class Reconstructor:
         budget_s: float | None = None,
         regularisation: float = 1.0,
         curve: PressureCurve | None = None,
+        taught: TaughtSkin | None = None,
     ) -> None:
         self.description = description
         self.curve = curve or described_curve(description)
+        self.taught = taught
         self.budget_s = budget_s
         skin = Skin.of(description, artifact)
         self.artifact = skin.artifact
@@ -311,6 +316,12 @@ class Reconstructor:
             }
             kept = self._ranges | seen
             self._ranges = {known: kept[known] for known in self._tracker.ids if known in kept}
+        tier, flags = estimate.made_by or self._name, measurement.flags | estimate.flags
+        if self.taught is not None and len(contacts) == 1:
+            with measurement.timed("taught"):
+                contacts = (self.taught.corrected(contacts[0], measurement, tier),)
+            if not contacts[0].taught:
+                flags |= Flag.UNTAUGHT
         pressure = None
         if estimate.tells_pressure and has_magnitude:
             pressure = pressure_map(areas, contacts, account.pressure_kpa if account else None)
@@ -319,10 +330,10 @@ class Reconstructor:
             pressure_kpa=pressure,
             structure=_image(estimate.structure),
             contacts=contacts,
-            tier=estimate.made_by or self._name,
+            tier=tier,
             reason="; ".join([estimate.reason, *measurement.faults]),
             misfit=estimate.misfit,
-            flags=measurement.flags | estimate.flags,
+            flags=flags,
             stage_s=measurement.stage_s,
             confidence=estimate.confidence,
         )

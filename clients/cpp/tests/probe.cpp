@@ -80,6 +80,7 @@ void print_text(std::string_view text) {
     std::putchar('"');
 }
 
+void print_value(bool value) { print(value ? "true" : "false"); }
 void print_value(double value) { std::printf("%.17g", value); }
 void print_value(std::int64_t value) { std::printf("%" PRId64, value); }
 template <typename Value>
@@ -142,6 +143,7 @@ void print_contact(const tactomo::Contact& contact) {
     print_member("peak_sigma_kpa", contact.peak_sigma_kpa);
     print_member("max_kpa", contact.max_kpa);
     print_member("edge", contact.edge);
+    print_member("taught", contact.taught);
     print_member("exceeds_150", name_of(contact.exceeds(150)));
     print("}");
 }

@@ -24,7 +24,14 @@ Image: TypeAlias = "NDArray[np.float32]"
 
 
 TOUCHES_SEEN = frozenset(
-    ("magnitude_missing", "invalid_voltage", "electrode_fault", "saturated", "channels_skewed")
+    (
+        "magnitude_missing",
+        "invalid_voltage",
+        "electrode_fault",
+        "saturated",
+        "channels_skewed",
+        "untaught",
+    )
 )
 """Flags under which every touch is still seen: see STREAM.md. Of any other nobody knows."""
 
@@ -85,6 +92,9 @@ class Contact:
     """Upper bound of its highest pressure, 95 %, whatever `pressure_range` says; None: no bound."""
     edge: float | None = None
     """Exponent γ of the pressure (1 - ρ²)^γ from the middle to the edge: 0 flat, 0.5 Hertz."""
+    taught: bool = False
+    """Whether presses at known places say where it is, by `tactomo teach`; else the physics alone
+    does."""
 
     def exceeds(self, limit_kpa: float) -> Answer:
         """Return whether it presses with `limit_kpa` or more.
@@ -255,12 +265,16 @@ def _contact(value: object) -> Contact:
     pressure_range = value.get("pressure_range", "unknown")
     if not isinstance(pressure_range, str):
         raise MessageError("field 'pressure_range' is not text")
+    taught = value.get("taught", False)
+    if not isinstance(taught, bool):
+        raise MessageError("field 'taught' is not true or false")
     return Contact(
         id=_integer(value, "id"),
         x_mm=_number(value, "x_mm"),
         y_mm=_number(value, "y_mm"),
         area_mm2=_number(value, "area_mm2"),
         pressure_range=pressure_range,
+        taught=taught,
         **{name: _number_or_none(value, name) for name in _MAY_BE_UNKNOWN},
     )
 

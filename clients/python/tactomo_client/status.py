@@ -51,6 +51,19 @@ class Calibration:
 
 
 @dataclass(frozen=True, slots=True)
+class Taught:
+    """What presses at known places have taught a skin."""
+
+    taken: str = ""
+    """ISO 8601, UTC."""
+    presses: int = 0
+    median_mm: float | None = None
+    """Error of place on presses that were held out."""
+    untaught_median_mm: float | None = None
+    """The same of the physics alone."""
+
+
+@dataclass(frozen=True, slots=True)
 class SensorDescription:
     """The sensor: its sheet, its electrodes and what it answers to."""
 
@@ -76,6 +89,8 @@ class SensorDescription:
     magnitude_response: MagnitudeResponse | None = None
     calibration: Calibration | None = None
     """Of pressure, in force; None where pressures go by the description."""
+    taught: Taught | None = None
+    """In force; None where the physics alone says where contacts are."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -56,6 +56,7 @@ COMMANDS = {
         (STEER, "watch", "Show map, contacts and health in the terminal.", "steer.watch"),
         (STEER, "tare", "Take a new reference of the unloaded skin.", "steer.steer"),
         (STEER, "calibrate", "Find the pressure scale with a load cell.", "calibrate.calibrate"),
+        (STEER, "teach", "Learn places from presses at known ones.", "calibrate.teach"),
         (STEER, "record", "Record what the ports say into a file.", "steer.steer"),
         (STEER, "method", "Choose the reconstruction method.", "steer.steer"),
         (STEER, "poke", "Press, release and break a running twin.", "steer.steer"),

@@ -68,6 +68,10 @@ FLAG_ADVICE: Mapping[str, tuple[str, str]] = {
         "the two channels' scans are not of one instant",
         "check the sync line between the two boards",
     ),
+    "untaught": (
+        "no press like this one was taught: the physics alone says where it is",
+        "teach more of the skin by `tactomo teach live`",
+    ),
 }
 FASTER = "give the daemon more of the processor, or choose a faster method or a budget"
 STATES: Mapping[str, tuple[str, str]] = {

@@ -1,4 +1,4 @@
-"""Which pressure calibration frames go by: the sensor's own, if it is of the devices that speak.
+"""Which pressure calibration and teaching frames go by: the sensor's own, of what is connected.
 
 For use by the pipeline thread; others may read `in_force`.
 """
@@ -8,8 +8,9 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import NamedTuple
 
-from tactomo_models import Reconstructor, SensorDescription
+from tactomo_models import Reconstructor, Reference, SensorDescription
 from tactomo_models.calibration.calibration_file import PressureCalibration
+from tactomo_models.calibration.taught_skin import TaughtSkin
 from tactomo_models.scene.pressure import described_curve
 
 from tactomo.errors import CommandError
@@ -19,11 +20,13 @@ from tactomo.recordings.recording import calibration_text, recorded_calibration
 
 
 class _Foreign(NamedTuple):
-    """That a calibration was made with other devices than those that speak, for people."""
+    """That a calibration or a teaching is of other devices, or of another skin, for people."""
 
     cause: str
     command: str
     """What makes another one."""
+    until: str
+    """What holds until then."""
 
 
 class CalibrationInForce:
@@ -35,9 +38,11 @@ class CalibrationInForce:
         marks: told of each new calibration.
         on_event: told of a calibration that is another device's.
         calibration: the sensor's own; None where there is none.
+        taught: what the sensor was taught; None where nothing was.
 
     Attributes:
         in_force: the calibration that is used; None for the description's curve.
+        taught: the teaching that is used; None where the physics alone locates.
         device_ids: of those that have spoken.
     """
 
@@ -48,15 +53,18 @@ class CalibrationInForce:
         marks: FrameMarks,
         on_event: OnEvent,
         calibration: PressureCalibration | None,
+        taught: TaughtSkin | None,
     ) -> None:
         self.in_force: PressureCalibration | None = None
+        self.taught: TaughtSkin | None = None
         self._description = description
         self._reconstructor = reconstructor
         self._marks = marks
         self._on_event = on_event
-        self._own = calibration
+        self._own, self._own_taught = calibration, taught
+        self._reference: Reference | None = None
         self.device_ids: frozenset[str] = frozenset()
-        self._refused: _Foreign | None = None
+        self._refused: list[_Foreign] = []
         self._judge()
 
     def meet(self, device_ids: Collection[str]) -> None:
@@ -64,20 +72,26 @@ class CalibrationInForce:
         self.device_ids = frozenset(device_ids)
         self._judge()
 
-    def replace(self, calibration: PressureCalibration | None) -> None:
-        """Put another calibration in force, None for the description's curve.
+    def meet_skin(self, reference: Reference) -> None:
+        """Take note of the unpressed skin: what was taught holds for the skin that was taught."""
+        self._reference = reference
+        self._judge()
+
+    def replace(self, calibration: PressureCalibration | None, taught: TaughtSkin | None) -> None:
+        """Put another calibration and teaching in force; None for what the description says.
 
         Raises:
-            CommandError: it is another device's; what was in force stays so.
+            CommandError: one is another device's or skin's; what was in force stays so.
         """
-        foreign = self._foreign(calibration)
-        if foreign is not None:
+        for foreign in self._foreign(calibration, taught):
             step = f"what was in force stays so; run: {foreign.command}"
             self._on_event("calibration_refused", "warning", foreign.cause, step)
             raise CommandError(foreign.cause, step, "calibration_refused")
+        self._own_taught = taught
         self._use(calibration, calibration_text(calibration))
         words = "none is kept: pressures are the description's"
         detail = words if calibration is None else calibration.words
+        detail += "" if taught is None else f"; taught by {taught.words}"
         self._on_event("calibration_reloaded", "info", detail)
 
     def obey(self, text: str | None) -> None:
@@ -97,30 +111,39 @@ class CalibrationInForce:
         self._marks.note_calibration(text)
 
     def _judge(self) -> None:
-        """Put the sensor's own calibration in force, if it was made with the devices that speak."""
-        foreign = self._foreign(self._own)
-        self.in_force = None if foreign else self._own
+        """Put the sensor's own in force, as far as they are of what is connected."""
+        refused = self._foreign(self._own, self._own_taught)
+        of_curve = self._foreign(self._own, None)
+        self.in_force = None if of_curve else self._own
+        self.taught = None if len(refused) > len(of_curve) else self._own_taught
         self._reconstructor.curve = (
             described_curve(self._description) if self.in_force is None else self.in_force.curve
         )
-        if foreign is not None and foreign != self._refused:
-            self._on_event(
-                "calibration_refused",
-                "warning",
-                foreign.cause,
-                f"until you run `{foreign.command}`, pressures are the description's",
-            )
-        self._refused = foreign
+        self._reconstructor.taught = self.taught
+        for foreign in refused:
+            if foreign not in self._refused:
+                step = f"until you run `{foreign.command}`, {foreign.until}"
+                self._on_event("calibration_refused", "warning", foreign.cause, step)
+        self._refused = refused
 
-    def _foreign(self, calibration: PressureCalibration | None) -> _Foreign | None:
-        """Return that a calibration is another device's; None where it is not."""
-        if calibration is None:
-            return None
-        subject = calibration.subject
-        why = subject.foreign(self.device_ids)
-        if not why:
-            return None
-        return _Foreign(
-            f"the pressure calibration of {subject.sensor} {why}",
-            f"tactomo calibrate live --sensor {subject.sensor}",
-        )
+    def _foreign(
+        self, calibration: PressureCalibration | None, taught: TaughtSkin | None
+    ) -> list[_Foreign]:
+        """Return what is of other devices than those that speak, or of another skin."""
+        found = []
+        if calibration is not None and (why := calibration.subject.foreign(self.device_ids)):
+            sensor = calibration.subject.sensor
+            cause = f"the pressure calibration of {sensor} {why}"
+            command = f"tactomo calibrate live --sensor {sensor}"
+            found.append(_Foreign(cause, command, "pressures are the description's"))
+        if taught is not None:
+            sensor, why = taught.subject.sensor, taught.subject.foreign(self.device_ids)
+            if not why and self._reference is not None and (off := taught.changed(self._reference)):
+                why = f"does not fit the skin any more: {off}"
+            if why:
+                cause, command = (
+                    f"the teaching of {sensor} {why}",
+                    f"tactomo teach live -s {sensor}",
+                )
+                found.append(_Foreign(cause, command, "the physics alone locates"))
+        return found

@@ -11,6 +11,7 @@ from tactomo_client.messages import array_to_wire
 from tactomo_models import Contact, Flag, Reconstruction, SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_models.calibration.calibration_file import PressureCalibration
+from tactomo_models.calibration.taught_skin import TaughtSkin
 from tactomo_protocol import Channel, Hello
 
 from tactomo.acquisition.device_clock import DeviceClock
@@ -130,6 +131,16 @@ def calibration_fields(calibration: PressureCalibration) -> dict[str, Any]:
     }
 
 
+def taught_fields(taught: TaughtSkin) -> dict[str, Any]:
+    """Return what `status` says about what the skin was taught."""
+    return {
+        "taken": taught.taken,
+        "presses": len(taught.xy_mm),
+        "median_mm": taught.with_mm,
+        "untaught_median_mm": taught.without_mm,
+    }
+
+
 def port_fields(port: PortReader) -> dict[str, Any]:
     """Return what `status` says about a port."""
     return {
@@ -200,6 +211,7 @@ def _contact(contact: Contact) -> dict[str, Any]:
         "peak_sigma_kpa": _finite(contact.peak_sigma_kpa),
         "max_kpa": _finite(contact.max_kpa),
         "edge": _finite(contact.edge),
+        "taught": contact.taught,
     }
 
 

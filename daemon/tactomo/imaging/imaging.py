@@ -23,6 +23,7 @@ from tactomo_models import (
 )
 from tactomo_models.arrays import FloatArray
 from tactomo_models.calibration.calibration_file import PressureCalibration
+from tactomo_models.calibration.taught_skin import TaughtSkin
 from tactomo_models.known_skin import SkinAtStart, skin_at_start
 from tactomo_models.machine_speed import MachineSpeed
 from tactomo_protocol import Channel, ScanFlag
@@ -38,6 +39,7 @@ from tactomo.imaging.frames import (
     map_fields,
     scan_fields,
     scan_header,
+    taught_fields,
 )
 from tactomo.imaging.kept_reference import KeptReference, KnownSkin
 from tactomo.imaging.method_in_force import Effort, MethodInForce
@@ -64,6 +66,7 @@ class Imaging:
         reconstructor: belongs to this class from now on.
         machine_speed: what turns a budget of time into one of work.
         calibration: of pressure, the sensor's own; None for the description's curve.
+        taught: what the sensor was taught; None where nothing was.
         tare_scans: dual scans for a reference.
         baseline: whether and how fast the reference follows the skin.
         kept: the sensor's last reference; None where it is neither used nor kept.
@@ -88,6 +91,7 @@ class Imaging:
         reconstructor: Reconstructor,
         machine_speed: MachineSpeed,
         calibration: PressureCalibration | None,
+        taught: TaughtSkin | None,
         tare_scans: int,
         baseline: BaselineConfig,
         kept: KeptReference | None,
@@ -108,7 +112,7 @@ class Imaging:
         self._marks = FrameMarks(recorder, calibration_text(calibration))
         self.method = MethodInForce(reconstructor, machine_speed)
         self.calibration = CalibrationInForce(
-            description, reconstructor, self._marks, on_event, calibration
+            description, reconstructor, self._marks, on_event, calibration, taught
         )
         self.taring = Taring(
             tare_scans,
@@ -201,6 +205,7 @@ class Imaging:
     def _note_reference(self, reference: Reference) -> None:
         """Say, and record, that this reference is in force."""
         self.reference = reference
+        self.calibration.meet_skin(reference)
         self.taring.note_reference()
         self._marks.note_reference(reference, self.reference_realtime_ns)
 
@@ -209,15 +214,20 @@ class Imaging:
         self._reconstructor.reset()
         self._publisher.tell_status()
 
-    def use_calibration(self, calibration: PressureCalibration | None) -> dict[str, Any]:
-        """Put a calibration in force, None for the description's curve; return what a client gets.
+    def use_calibration(
+        self, calibration: PressureCalibration | None, taught: TaughtSkin | None
+    ) -> dict[str, Any]:
+        """Put both in force, None for what the description says; return what a client gets.
 
         Raises:
-            CommandError: it is another device's; what was in force stays so.
+            CommandError: one is another device's or skin's; what was in force stays so.
         """
-        self.calibration.replace(calibration)
+        self.calibration.replace(calibration, taught)
         self._publisher.tell_status()
-        return {"calibration": calibration and calibration_fields(calibration)}
+        return {
+            "calibration": calibration and calibration_fields(calibration),
+            "taught": taught and taught_fields(taught),
+        }
 
     def process(self, dual: DualScan, timing: Timing, lost: set[Channel]) -> None:
         """Turn one dual scan into a frame; `lost` are the channels that are not to be expected."""

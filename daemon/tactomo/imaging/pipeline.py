@@ -19,6 +19,7 @@ from concurrent.futures import Future
 from typing import Any, Final, NamedTuple
 
 from tactomo_models.calibration.calibration_file import PressureCalibration
+from tactomo_models.calibration.taught_skin import TaughtSkin
 from tactomo_protocol import Channel, Hello
 
 from tactomo.acquisition.scan_pairer import CounterPairer, MarkPairer, ScanPairer
@@ -191,12 +192,14 @@ class Pipeline(Worker):
         """Have the replay go on elsewhere; for any thread. The future is done when that is so."""
         return self._ask(lambda: self._move(position_s))
 
-    def use_calibration(self, calibration: PressureCalibration | None) -> Future[Mapping[str, Any]]:
-        """Ask for a pressure calibration, None for the description's curve; for any thread.
+    def use_calibration(
+        self, calibration: PressureCalibration | None, taught: TaughtSkin | None
+    ) -> Future[Mapping[str, Any]]:
+        """Ask for a pressure calibration and a teaching, None for neither; for any thread.
 
-        The future gets the `calibration` in force, or CommandError where it is another device's.
+        The future gets what is in force, or CommandError where one is another device's.
         """
-        return self._ask(lambda: self._imaging.use_calibration(calibration))
+        return self._ask(lambda: self._imaging.use_calibration(calibration, taught))
 
     def _run(self) -> None:
         self._begin()

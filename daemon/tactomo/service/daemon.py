@@ -53,6 +53,7 @@ from tactomo_models.calibration.calibration_file import (
     calibration_for,
     load_calibration,
 )
+from tactomo_models.calibration.taught_skin import TaughtSkin, load_taught, taught_path
 from tactomo_models.machine_speed import MachineSpeed, machine_speed_for
 from tactomo_models.methods.registry import available_methods, check_method
 from tactomo_protocol import Channel
@@ -150,6 +151,7 @@ class Daemon:
         protocol = _protocol(config)
         channels = tuple(c for c in Channel if c in description.channels)
         calibration, self._unused = _find_calibration(config, description, replay)
+        taught = _find_taught(config, description, replay, self._unused)
         origin = _origin(config, protocol, description, calibration)
         self._recorder = Recorder(origin, config.recording, self._on_event)
         self._publisher = Publisher(
@@ -160,6 +162,7 @@ class Daemon:
             reconstructor or _make_reconstructor(config, description, artifact),
             machine_speed or _find_machine_speed(description),
             calibration,
+            taught,
             config.tare_scans,
             config.baseline,
             self._make_kept_reference() if replay is None and reconstructor is None else None,
@@ -258,7 +261,7 @@ class Daemon:
         )
         for why in self._unused:
             self._on_event(
-                "calibration_refused", "warning", why, "until then pressures are the description's"
+                "calibration_refused", "warning", why, "until then it is as if there were none"
             )
 
     def stop(self) -> None:
@@ -427,7 +430,7 @@ class Daemon:
     def _reload_calibration(self) -> Future[Mapping[str, Any]]:
         """Look for the sensor's calibration as at the start; what cannot be used changes nothing.
 
-        Reads a small file, on the control thread.
+        Reads small files, on the control thread; what 800 presses teach takes some seconds.
         """
         config, replay = self.config, self._replay
         if replay is not None and replay.marks and config.calibration is None:
@@ -438,13 +441,14 @@ class Daemon:
             )
         try:
             found, unused = _find_calibration(config, self._description, replay)
+            taught = _find_taught(config, self._description, replay, unused)
         except CalibrationError as error:
-            found, unused = None, [str(error)]
+            found, taught, unused = None, None, [str(error)]
         if unused:
             step = "what was in force stays so"
             self._on_event("calibration_refused", "warning", unused[0], step)
             raise CommandError(unused[0], step, "calibration_refused")
-        return self._pipeline.use_calibration(found)
+        return self._pipeline.use_calibration(found, taught)
 
     def _zero_counters(self) -> None:
         for port in self._ports:
@@ -544,6 +548,21 @@ def _find_calibration(
         return replay.calibration, unused
     found = calibration_for(config.name, description, config.description, unused.append)
     return found, unused
+
+
+def _find_taught(
+    config: DaemonConfig, description: SensorDescription, replay: Replay | None, unused: list[str]
+) -> TaughtSkin | None:
+    """Return what the sensor was taught; why not is added to `unused`. A replay goes without."""
+    if replay is not None:
+        return None
+    try:
+        return load_taught(taught_path(config.name), config.name, description)
+    except FileNotFoundError:
+        return None
+    except CalibrationError as error:
+        unused.append(str(error))
+        return None
 
 
 def _origin(

@@ -15,7 +15,12 @@ from tactomo_protocol import Channel
 
 from tactomo.acquisition.port import PortReader
 from tactomo.events import EventBook
-from tactomo.imaging.frames import description_fields, port_fields, pressure_fields
+from tactomo.imaging.frames import (
+    description_fields,
+    port_fields,
+    pressure_fields,
+    taught_fields,
+)
 from tactomo.imaging.imaging import Imaging
 from tactomo.imaging.pipeline import Pipeline
 from tactomo.recordings.playback import Playback
@@ -62,7 +67,7 @@ class Status:
         """Return the fields of a `status` message; the publisher's part is handed in."""
         pipeline, imaging = self._pipeline, self._imaging
         active = self._recorder.active
-        reference = imaging.reference
+        reference, taught = imaging.reference, imaging.calibration.taught
         stages = {stage: times.percentiles_ms() for stage, times in imaging.stages.items()}
         losses = {
             "frames": imaging.frame_rate.count,
@@ -76,6 +81,7 @@ class Status:
             "description": {
                 **self._description,
                 **pressure_fields(self._sensor, imaging.calibration.in_force),
+                "taught": taught and taught_fields(taught),
             },
             "source": {"kind": source(self._ports)},
             "replay": None if self._playback is None else self._playback.fields(),

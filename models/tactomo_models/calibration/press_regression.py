@@ -14,7 +14,6 @@ Source of both: Rasmussen & Williams, "Gaussian Processes for Machine Learning" 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final, NamedTuple, Self
 
 import numpy as np
@@ -22,8 +21,8 @@ import numpy as np
 from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.errors import DataError
 
-MIN_PRESSES: Final = 20
-"""Below it, five folds leave no four presses each to judge by."""
+MIN_PRESSES: Final = 12
+"""Below it, five folds leave hardly two presses each to choose by."""
 FOLDS: Final = 5
 GRID: Final = 32
 """Places along the longer side: 2.5 mm on a skin of 80 mm. With 40 the median falls by 1 %."""
@@ -71,6 +70,9 @@ class PressRegression:
         guess_mm: (N, 2) where a model of the skin has them, to be corrected; if None, the voltages
             alone tell.
 
+    Attributes:
+        found_mm: (N, 2) where the voltages of each have it, by presses of other folds alone.
+
     Raises:
         DataError: there are too few presses, or they hold what is no number or no press.
     """
@@ -86,7 +88,8 @@ class PressRegression:
             raise DataError("the presses are all at one place, or at none; give where each was")
         unit, log_size = _unit(changes)
         self._field, found, misfit = _VoltageField.cross_validated(unit, xy_mm)
-        self.errors_mm = np.linalg.norm((found if guess_mm is None else guess_mm) - xy_mm, axis=1)
+        self.found_mm, self._xy_mm = found, xy_mm
+        self._reach_mm = _reach_mm(xy_mm)
         self._has_guess = guess_mm is not None
         self._limit = UNLIKE * float(np.quantile(misfit, 0.99))
         self._scale = np.concatenate(
@@ -97,7 +100,7 @@ class PressRegression:
             ]
         )
         guess = found if guess_mm is None else guess_mm
-        self._correction = _Correction.fitted(
+        self._correction = _Correction(
             np.column_stack([unit, log_size, guess]) * self._scale, xy_mm - guess
         )
 
@@ -105,10 +108,15 @@ class PressRegression:
         """Locate T presses by their changes (T, M), and where the model has them (T, 2)."""
         unit, log_size = _unit(changes)
         found, misfit = self._field.locate(unit)
-        guess = guess_mm if self._has_guess and guess_mm is not None else found
+        is_taught = misfit <= self._limit
+        guess = found
+        if self._has_guess and guess_mm is not None:
+            guess = guess_mm
+            nearest = _squared_distances(guess, self._xy_mm).min(axis=1)
+            is_taught &= nearest <= self._reach_mm**2
         seen = np.column_stack([unit, log_size, guess]) * self._scale
         correction, variance = self._correction.at(seen)
-        return Located(guess + correction, np.sqrt(variance), misfit <= self._limit)
+        return Located(guess + correction, np.sqrt(variance), is_taught)
 
 
 def _unit(changes: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -128,32 +136,37 @@ def _squared_distances(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(np.maximum(squares - 2.0 * (a @ b.T), 0.0))
 
 
-@dataclass(frozen=True)
-class _Weights:
-    """What a Gaussian process has learnt of N outputs, as far as one kernel matrix tells.
+class _Spectrum:
+    """What N presses teach of K outputs (N, K), by a squared-exponential kernel, at any noise.
 
-    Attributes:
-        weights: (N, K) that the kernel's rows are multiplied by.
-        residual: (N, K) leave-one-out residuals.
-        likelihood: logarithm of the marginal likelihood, each output's variance at its best.
-        variance: (K,) of the signal.
+    Args:
+        squared: (N, N) squared distances of the presses over the squared length scale.
+        y: the outputs, of zero mean.
     """
 
-    weights: FloatArray
-    residual: FloatArray
-    likelihood: float
-    variance: FloatArray
+    def __init__(self, squared: FloatArray, y: FloatArray) -> None:
+        values, self.vectors = np.linalg.eigh(np.exp(-0.5 * squared))
+        self.values = np.maximum(values, 0.0)
+        self._turned = self.vectors.T @ y
 
-    @classmethod
-    def of(cls, values: FloatArray, vectors: FloatArray, y: FloatArray, noise: float) -> Self:
-        """Solve with a kernel matrix given by its eigenvalues and eigenvectors."""
-        turned = vectors.T @ y
-        inverse = 1 / (values + noise)
-        variance = np.asarray(inverse @ turned**2) / len(y) + 1e-30
-        log_likelihood = len(y) * np.log(variance) - np.log(inverse).sum()
-        weights = vectors @ (inverse[:, None] * turned)
-        residual = weights / (vectors**2 @ inverse)[:, None]
-        return cls(weights, residual, -0.5 * float(log_likelihood.sum()), variance)
+    def variance(self, noise: float) -> FloatArray:
+        """Variance (K,) of each output's signal, at its most likely."""
+        inverse = 1 / (self.values + noise)
+        return np.asarray(inverse @ self._turned**2) / len(self.values) + 1e-30
+
+    def log_likelihood(self, noise: float) -> float:
+        """Marginal, of all outputs together, but for a constant."""
+        logs = np.log(self.variance(noise)) + np.log(self.values + noise).mean()
+        return -0.5 * len(self.values) * float(logs.sum())
+
+    def weights(self, noise: float) -> FloatArray:
+        """Weights (N, K) of the kernel's rows."""
+        return np.asarray(self.vectors @ (self._turned / (self.values + noise)[:, None]))
+
+    def residual(self, noise: float) -> FloatArray:
+        """Leave-one-out residuals (N, K)."""
+        precision = self.vectors**2 @ (1 / (self.values + noise))
+        return np.asarray(self.weights(noise) / precision[:, None])
 
 
 class _VoltageField:
@@ -167,12 +180,12 @@ class _VoltageField:
     def __init__(self, unit: FloatArray, xy_mm: FloatArray, length_mm: float, noise: float) -> None:
         self.length_mm, self.noise = length_mm, noise
         self._mean = unit.mean(axis=0)
-        values, vectors = _spectrum(_squared_distances(xy_mm, xy_mm) / length_mm**2)
-        solved = _Weights.of(values, vectors, unit - self._mean, noise)
+        squared = _squared_distances(xy_mm, xy_mm) / length_mm**2
+        spectrum = _Spectrum(squared, unit - self._mean)
         self._grid = _taught_places(xy_mm)
         kernel = np.exp(-0.5 * _squared_distances(self._grid, xy_mm) / length_mm**2)
-        on_grid = kernel @ solved.weights + self._mean
-        self._whitener = _whitener(solved.residual)
+        on_grid = kernel @ spectrum.weights(noise) + self._mean
+        self._whitener = _whitener(spectrum.residual(noise))
         self._white_grid = on_grid @ self._whitener
         self._grid_squares = (self._white_grid**2).sum(axis=1)
 
@@ -214,72 +227,53 @@ def _whitener(residual: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)).T)
 
 
-def _spectrum(squared: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Eigenvalues and eigenvectors of the squared-exponential kernel at squared distances."""
-    values, vectors = np.linalg.eigh(np.exp(-0.5 * squared))
-    return np.maximum(values, 0.0), vectors
-
-
 def _best_scales(unit: FloatArray, xy_mm: FloatArray) -> tuple[float, float]:
     """Length scale in mm and noise of the largest marginal likelihood."""
     squared, y = _squared_distances(xy_mm, xy_mm), unit - unit.mean(axis=0)
     tried = []
     for length_mm in np.multiply(LENGTHS, np.ptp(xy_mm, axis=0).max()).tolist():
-        spectrum = _spectrum(squared / length_mm**2)
-        tried += [
-            (_Weights.of(*spectrum, y, noise).likelihood, length_mm, noise) for noise in NOISES
-        ]
+        spectrum = _Spectrum(squared / length_mm**2, y)
+        tried += [(spectrum.log_likelihood(noise), length_mm, noise) for noise in NOISES]
     _, length_mm, noise = max(tried)
     return length_mm, noise
 
 
-def _taught_places(xy_mm: FloatArray) -> FloatArray:
-    """A grid of places (P, 2) as far as presses (N, 2) reach."""
+def _reach_mm(xy_mm: FloatArray) -> float:
+    """How far from a press a place still counts as taught."""
     squared = _squared_distances(xy_mm, xy_mm)
     apart = np.where(squared > 1e-6 * squared.max(), squared, np.inf)  # one place twice is one
-    reach_mm = REACH * float(np.sqrt(np.median(apart.min(axis=1))))
+    return REACH * float(np.sqrt(np.median(apart.min(axis=1))))
+
+
+def _taught_places(xy_mm: FloatArray) -> FloatArray:
+    """A grid of places (P, 2) as far as presses (N, 2) reach."""
     low, high = xy_mm.min(axis=0), xy_mm.max(axis=0)
     step_mm = float((high - low).max()) / GRID
     axes = [np.arange(a, b + step_mm, step_mm) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
-    is_near = _squared_distances(grid, xy_mm).min(axis=1) <= max(reach_mm, step_mm) ** 2
-    return np.asarray(grid[is_near])
+    reach_mm = max(_reach_mm(xy_mm), step_mm)
+    return np.asarray(grid[_squared_distances(grid, xy_mm).min(axis=1) <= reach_mm**2])
 
 
-class _Correction(NamedTuple):
-    """What is still wrong, learnt from N presses.
+class _Correction:
+    """What is still wrong, learnt from inputs (N, K) and errors (N, 2) in mm."""
 
-    Attributes:
-        seen: (N, K) inputs.
-        scale: squared length scale.
-        solved: weights of the kernel's rows.
-        noise: variance of the noise over the signal's.
-        factor: (N, R) whose product with the kernel's rows, squared, is what is known.
-    """
-
-    seen: FloatArray
-    scale: float
-    solved: _Weights
-    noise: float
-    factor: FloatArray
-
-    @classmethod
-    def fitted(cls, seen: FloatArray, error_mm: FloatArray) -> Self:
-        """Learn from inputs (N, K) and errors (N, 2); scale and noise by marginal likelihood."""
+    def __init__(self, seen: FloatArray, error_mm: FloatArray) -> None:
         squared = _squared_distances(seen, seen)
-        middle, top = float(np.median(squared)), slice(-CORRECTION_RANK, None)
-        tried = []
-        for share in CORRECTION_SCALES:
-            values, vectors = _spectrum(squared / (share * middle))
-            for noise in CORRECTION_NOISES:
-                solved = _Weights.of(values, vectors, error_mm, noise)
-                factor = vectors[:, top] / np.sqrt(values[top] + noise)
-                tried.append(cls(seen, share * middle, solved, noise, factor))
-        return max(tried, key=lambda each: each.solved.likelihood)
+        scales = np.median(squared) * np.array(CORRECTION_SCALES)
+        spectra = [_Spectrum(squared / scale, error_mm) for scale in scales]
+        which, noise = max(
+            ((k, noise) for k in range(len(scales)) for noise in CORRECTION_NOISES),
+            key=lambda tried: spectra[tried[0]].log_likelihood(tried[1]),
+        )
+        best, top = spectra[which], slice(-CORRECTION_RANK, None)
+        self._seen, self._scale, self._noise = seen, scales[which], noise
+        self._weights, self._variance = best.weights(noise), float(best.variance(noise).mean())
+        # The product of the kernel's rows with it, squared, is what is known.
+        self._factor = best.vectors[:, top] / np.sqrt(best.values[top] + noise)
 
     def at(self, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The corrections (T, 2) in mm, and the variance (T,) of each coordinate in mm²."""
-        kernel = np.exp(-0.5 * _squared_distances(seen, self.seen) / self.scale)
-        known = ((kernel @ self.factor) ** 2).sum(axis=1)
-        variance = self.solved.variance.mean() * (1.0 + self.noise - known)
-        return kernel @ self.solved.weights, variance
+        kernel = np.exp(-0.5 * _squared_distances(seen, self._seen) / self._scale)
+        known = ((kernel @ self._factor) ** 2).sum(axis=1)
+        return kernel @ self._weights, self._variance * (1.0 + self._noise - known)

@@ -57,6 +57,7 @@ class Flag(IntFlag):
     CHANNELS_SKEWED = 4096  # the two scans are not of one instant; set by who pairs them
     NO_USABLE_SCAN = 8192  # nothing was measured: that no contact is shown says nothing
     REFERENCE_DISPUTED = 16384  # the skin at the start was not as last known; set by who tares
+    UNTAUGHT = 32768  # the skin was taught, and no press like this one: the physics alone locates
 
     def names(self) -> list[str]:
         """Names of the flags that are set, in lower case, as the stream carries them."""

@@ -36,6 +36,7 @@ class Contact:
             curve ends below it, NaN where nothing bounds it: no magnitude, or no uncertainty.
         edge: exponent γ of the pressure (1 - ρ²)^γ from the middle to the edge: 0 flat,
             0.5 Hertz; NaN if unknown.
+        taught: whether presses at known places say where it is; else the physics alone does.
     """
 
     id: int
@@ -56,6 +57,7 @@ class Contact:
     peak_sigma_kpa: float = float("nan")
     max_kpa: float = float("nan")
     edge: float = float("nan")
+    taught: bool = False
 
 
 def contacts_of(

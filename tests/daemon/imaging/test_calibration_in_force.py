@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from daemon_bench import BOTH, MEASUREMENTS, REST
 from tactomo.config import load_config
 from tactomo.recordings import recorder
 from tactomo.recordings.recording import open_recording
@@ -25,6 +26,7 @@ from tactomo_models.calibration.calibration_file import (
     save_calibration,
 )
 from tactomo_models.calibration.curve import Reading
+from tactomo_models.calibration.taught_skin import TaughtSkin, save_taught, taught_path
 
 SENSOR = load_description("paper_square")
 SUBJECT = Subject(sensor="left", description=SENSOR.name, sha256=SENSOR.sha256)
@@ -171,7 +173,7 @@ def test_where_it_was_deleted_pressures_are_the_descriptions_again(
     kept()
     daemon = bench()
     calibration_path("left").unlink()
-    assert daemon.ask("reload_calibration") == {"calibration": None}
+    assert daemon.ask("reload_calibration") == {"calibration": None, "taught": None}
     description = daemon.ask("status")["description"]
     assert (description["calibration"], description["pressure_max_kpa"]) == (None, 300)
     assert "pressures are the description's" in daemon.listener.event(RELOADED)["detail"]
@@ -371,3 +373,85 @@ def test_an_exact_replay_does_not_look_for_another(
         assert description["calibration"]["range_kpa"] == list(made.curve.range_kpa)
     finally:
         replaying.stop()
+
+
+def taught(**changes: Any) -> TaughtSkin:
+    """Keep what the skin of the bench was taught, or another one."""
+    rng = np.random.default_rng(0)
+    xy_mm = rng.uniform(-50, 50, (40, 2))
+    fields: dict[str, Any] = {
+        "subject": SUBJECT,
+        "taken": "2026-01-31T12:00:00+00:00",
+        "channels": BOTH,
+        "usable": np.ones(2 * MEASUREMENTS, bool),
+        "changes": xy_mm @ rng.standard_normal((2, 2 * MEASUREMENTS)),
+        "xy_mm": xy_mm,
+        "guess_mm": xy_mm + 1.0,
+        "tiers": frozenset(["fit"]),
+        "without_mm": 1.4,
+        "with_mm": 0.2,
+        "reference": np.stack([REST, REST]),
+    }
+    made = TaughtSkin(**{**fields, **changes})
+    save_taught(made, taught_path("left"))
+    return made
+
+
+def test_what_was_taught_is_found_by_the_sensors_name_and_told(bench: Callable[..., Any]) -> None:
+    made = taught()
+    daemon = bench()
+    daemon.tare()
+    told = daemon.ask("status")["description"]["taught"]
+    assert told == {
+        **{"taken": made.taken, "presses": 40},
+        **{"median_mm": 0.2, "untaught_median_mm": 1.4},
+    }
+    taught_path("left").unlink()
+    assert daemon.ask("reload_calibration")["taught"] is None
+    assert daemon.ask("status")["description"]["taught"] is None
+    again = taught(taken="2026-02-01T12:00:00+00:00")
+    assert daemon.ask("reload_calibration")["taught"]["taken"] == again.taken
+    assert (
+        "taught by 40 presses"
+        in daemon.listener.wait(
+            "event", lambda e: e["name"] == RELOADED and "taught" in e["detail"]
+        )["detail"]
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"subject": SUBJECT.model_copy(update={"sensor": "right"})}, "is of the sensor right"),
+        (
+            {"subject": SUBJECT.model_copy(update={"device_ids": ("skin-elsewhere",)})},
+            "was made with skin-elsewhere, and bench-1 is",
+        ),
+        (
+            {"reference": np.stack([REST, REST[::-1]])},
+            "does not fit the skin any more: its structure voltages at rest are",
+        ),
+        (None, "is damaged"),
+    ],
+)
+def test_what_was_taught_on_another_skin_is_not_used(
+    bench: Callable[..., Any], changes: dict[str, Any] | None, said: str
+) -> None:
+    taught(**(changes or {}))
+    if changes is None:
+        taught_path("left").write_bytes(b"PK")
+    daemon = bench()
+    daemon.tare()
+    status = daemon.ask("status")
+    (trouble,) = status["events"]["troubles"]
+    assert said in trouble["detail"]
+    assert status["description"]["taught"] is None
+    with pytest.raises(CalibrationRefused, match="what was in force stays so"):
+        daemon.ask("reload_calibration")
+
+
+def test_a_sheet_that_drifts_evenly_is_the_one_that_was_taught(bench: Callable[..., Any]) -> None:
+    taught(reference=0.8 * np.stack([REST, REST]))
+    daemon = bench()
+    daemon.tare()
+    assert daemon.ask("status")["description"]["taught"] is not None

@@ -65,8 +65,8 @@ def test_what_a_model_gets_wrong_is_learnt() -> None:
 
 def test_presses_that_teach_nothing_are_refused() -> None:
     changes, xy_mm = presses_on(1, 30)
-    with pytest.raises(DataError, match="19 presses are too few"):
-        PressRegression(changes[:19], xy_mm[:19])
+    with pytest.raises(DataError, match="11 presses are too few"):
+        PressRegression(changes[:11], xy_mm[:11])
     changes[7] = 0.0
     with pytest.raises(DataError, match="press 7 changes no voltage"):
         PressRegression(changes, xy_mm)

@@ -74,6 +74,7 @@ struct Contact {
     std::optional<double> peak_sigma_kpa;
     std::optional<double> max_kpa;  ///< upper bound of the highest, 95 %, in every pressure_range
     std::optional<double> edge;     ///< γ of its pressure (1 - ρ²)^γ: 0 flat, 0.5 Hertz
+    bool taught = false;  ///< presses at known places say where it is; else the physics alone does
 
     /// Whether it presses with limit_kpa or more: yes by the best estimate of its highest pressure,
     /// no by the upper bound of 95 %. So noise moves the answer near the limit to and fro: stop at
@@ -119,8 +120,9 @@ private:
 };
 
 /// Flags under which every touch is still seen: see STREAM.md. Of any other nobody knows.
-inline constexpr std::array<std::string_view, 5> touches_seen{
-    "magnitude_missing", "invalid_voltage", "electrode_fault", "saturated", "channels_skewed"};
+inline constexpr std::array<std::string_view, 6> touches_seen{
+    "magnitude_missing", "invalid_voltage", "electrode_fault",
+    "saturated",         "channels_skewed", "untaught"};
 
 /// What the skin felt at one instant, and how far to trust it. clients/STREAM.md has the fields.
 struct Frame {

@@ -117,7 +117,11 @@ public:
         expects_key_ = false;
     }
     bool visit_nil() { return put({}); }
-    bool visit_boolean(bool) { return put(token(Token::boolean)); }
+    bool visit_boolean(bool value) {
+        Token made = token(Token::boolean);
+        made.unsigned_value = value ? 1 : 0;
+        return put(made);
+    }
     bool visit_positive_integer(std::uint64_t value) {
         Token made = token(Token::positive);
         made.unsigned_value = value;
@@ -251,6 +255,13 @@ public:
         const std::optional<double> read = as_number(*token);
         if (!read) fail(name);
         return read;
+    }
+    /// False where it is absent.
+    bool boolean(std::string_view name) noexcept {
+        const Token* const token = value(name, Allow::absence);
+        if (token == nullptr) return false;
+        if (token->type != Token::boolean) fail(name);
+        return token->type == Token::boolean && token->unsigned_value != 0;
     }
     std::string_view text(std::string_view name, Allow allow = Allow::nothing) noexcept {
         const Token* const token = value(name, allow);
@@ -396,6 +407,7 @@ inline Contact contact(Fields& fields) noexcept {
     read.peak_sigma_kpa = fields.number("peak_sigma_kpa", Allow::both);
     read.max_kpa = fields.number("max_kpa", Allow::both);
     read.edge = fields.number("edge", Allow::both);
+    read.taught = fields.boolean("taught");
     return read;
 }
 

@@ -20,10 +20,11 @@ const FLAGS = {
   low_confidence: ["Low confidence", "The network expects this map to be wrong. Do not act on it; tare, and check the leads if it stays."],
   channels_swapped: ["Channels swapped?", "The magnitude channel answers more than the structure channel: exchange their plugs, then tare. Or is the structure channel dead?"],
   channels_skewed: ["Channels of two instants", "The two channels' scans of one counter were taken at different times: do not act on this map. Check the sync line between the boards."],
+  untaught: ["Not taught", "No press like this one was taught: the physics alone says where it is. Teach more of the skin by `tactomo teach live`."],
 };
 
 // Flags under which every touch is still seen (clients/STREAM.md); of any other nobody knows.
-const TOUCHES_SEEN = ["magnitude_missing", "invalid_voltage", "electrode_fault", "saturated", "channels_skewed"];
+const TOUCHES_SEEN = ["magnitude_missing", "invalid_voltage", "electrode_fault", "saturated", "channels_skewed", "untaught"];
 
 /** Whether no contacts in a fresh frame means that nothing presses. */
 export function areTouchesSeen(frame) {

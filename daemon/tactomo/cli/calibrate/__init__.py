@@ -1,1 +1,1 @@
-"""`tactomo calibrate`: from magnitude to pressure with a load cell."""
+"""`tactomo calibrate`: from magnitude to pressure with a load cell; `tactomo teach`: places."""

@@ -233,6 +233,7 @@ def _keep(made: PressureCalibration, path: Path, control: str, keys: Path | None
 
     save_calibration(made, path)
     typer.echo(f"kept in {path}")
+
     typer.echo(taken_up(made, path, control, keys))
 
 

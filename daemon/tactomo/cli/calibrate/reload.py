@@ -1,6 +1,6 @@
-"""`tactomo calibrate` and the daemon that runs already: a kept calibration is put in force.
+"""`tactomo calibrate`, `tactomo teach` and the daemon that runs already: what is kept is used.
 
-The daemon is asked to look for its sensor's calibration again, where it looks at its start; what it
+The daemon is asked to look for what its sensor keeps again, where it looks at its start; what it
 finds may be another file than the one just kept, so what it says that it goes by is compared.
 """
 
@@ -9,11 +9,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from tactomo_client.status import Calibration, Taught
+
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
-    from tactomo_client.status import Calibration
+    from tactomo_client import CalibrationInForce
     from tactomo_models.calibration.calibration_file import PressureCalibration
+    from tactomo_models.calibration.taught_skin import TaughtSkin
 
 
 CONNECT_S: Final = 1.0
@@ -33,7 +36,7 @@ def reload_kept(sensor: str, control: str, keys: Path | None) -> str:
         ClientError: it does not answer, refuses the calibration, or does not let us command.
         OtherSensorError: it is another sensor's daemon.
     """
-    found = _reloaded(sensor, control, keys)
+    found = _reloaded(sensor, control, keys).calibration
     if found is None:
         return f"the daemon of {sensor} found none: pressures are the description's"
     low, high = found.range_kpa
@@ -43,17 +46,20 @@ def reload_kept(sensor: str, control: str, keys: Path | None) -> str:
     )
 
 
-def taken_up(made: PressureCalibration, path: Path, control: str, keys: Path | None) -> str:
-    """Have the daemon of its sensor, if it runs, go by a calibration that was kept in `path`.
+def taken_up(
+    made: PressureCalibration | TaughtSkin, path: Path, control: str, keys: Path | None
+) -> str:
+    """Have the daemon of its sensor, if it runs, go by what was kept in `path`.
 
     Returns in words what became of it, and what is to be done.
     """
     from tactomo_client import CalibrationRefused, ClientError, KeysError, NoAnswer
-    from tactomo_models.calibration.calibration_file import calibration_path
+    from tactomo_models.calibration.calibration_file import PressureCalibration, calibration_path
+    from tactomo_models.calibration.taught_skin import taught_path
 
     sensor = made.subject.sensor
+    own = (calibration_path if isinstance(made, PressureCalibration) else taught_path)(sensor)
     again = f"tactomo calibrate reload --sensor {sensor}"
-    own = calibration_path(sensor)
     it = "It" if path.absolute() == own.absolute() else f"Copied to {own}, it"
     later = f"{it} is in force when the daemon of {sensor} starts next, or by: {again}"
     try:
@@ -69,17 +75,21 @@ def taken_up(made: PressureCalibration, path: Path, control: str, keys: Path | N
         )
     except ClientError as error:
         return f"not in force yet: {error.cause}. {later}"
-    if found is not None and _is_same(found, made):
+    its = found.calibration if isinstance(made, PressureCalibration) else found.taught
+    if its is not None and _is_same(its, made):
         return f"in force now: the daemon of {sensor} goes by it"
-    other = "the description's table" if found is None else f"the one taken {found.taken}"
+    nothing = (
+        "the description's table" if isinstance(made, PressureCalibration) else "physics alone"
+    )
+    other = nothing if its is None else f"the one taken {its.taken}"
     return (
         f"not in force: the daemon of {sensor} goes by {other}. It looks on its own computer, in "
         f"its own data folder, or where its configuration says: copy {path} there, then {again}"
     )
 
 
-def _reloaded(sensor: str, control: str, keys: Path | None) -> Calibration | None:
-    """Ask a sensor's daemon to read its calibration again; returns the one in force, if any."""
+def _reloaded(sensor: str, control: str, keys: Path | None) -> CalibrationInForce:
+    """Ask a sensor's daemon to read what is kept again; returns what is in force."""
     from tactomo_client import Daemon
 
     with Daemon(control, keys=keys, connect_timeout_s=CONNECT_S) as daemon:
@@ -89,9 +99,13 @@ def _reloaded(sensor: str, control: str, keys: Path | None) -> Calibration | Non
                 f"the daemon at {control} is that of {there}, not of {sensor}",
                 f"give the address of that of {sensor} by --control",
             )
-        return daemon.reload_calibration().calibration
+        return daemon.reload_calibration()
 
 
-def _is_same(found: Calibration, made: PressureCalibration) -> bool:
-    its = (found.taken, found.readings, found.range_kpa)
-    return its == (made.taken, len(made.readings), made.curve.range_kpa)
+def _is_same(its: Calibration | Taught, made: PressureCalibration | TaughtSkin) -> bool:
+    from tactomo_models.calibration.calibration_file import PressureCalibration
+
+    if isinstance(its, Calibration) and isinstance(made, PressureCalibration):
+        kept = (made.taken, len(made.readings), made.curve.range_kpa)
+        return (its.taken, its.readings, its.range_kpa) == kept
+    return its.taken == made.taken

@@ -35,6 +35,9 @@ def reconstruct(
         Path | None,
         typer.Option(help="Of pressure, by `tactomo calibrate`. [the description's response]"),
     ] = None,
+    taught: Annotated[
+        Path | None, typer.Option(help="By `tactomo teach`: corrects where single contacts are.")
+    ] = None,
     force: Force = False,
 ) -> None:
     """Reconstruct a file of scans, without a daemon.
@@ -53,8 +56,9 @@ def reconstruct(
     and `contact_pressure_range` (*within*, *below*, *above* or *unknown*); the highest pressure
     under each, `contact_peak_kpa`, `contact_peak_sigma_kpa`, what it cannot exceed,
     `contact_max_kpa` (95 %), and how the pressure falls to the edge, `contact_edge` (0 flat, 0.5
-    Hertz). Where the sensor's objects conduct `either_way`, such as metal and plastic in a tank,
-    `structure` is -1 in those that conduct worse.
+    Hertz), and `contact_taught`, whether --taught
+    says where it is. Where the sensor's objects conduct `either_way`, such as metal and plastic in
+    a tank, `structure` is -1 in those that conduct worse.
 
     Frames follow one another, as in a stream: each one starts from what the last one found. Give
     scenes that have nothing to do with each other in files of their own.
@@ -66,7 +70,7 @@ def reconstruct(
     missing, 4 invalid voltage, 8 no reference, 16 misfit high, 32 not converged, 64 reference
     mismatch, 128 electrode fault, 256 noise high, 512 channels swapped, 1024 saturated,
     2048 low confidence, 4096 channels skewed and 16384 reference disputed (live only), 8192 no
-    usable scan.
+    usable scan, 32768 untaught.
 
     Methods: *tikhonov* and *noser* are one linear step, regularised so that the image is as noisy,
     relative to its signal, as the scans are (noise figure 1); *fit* models a few outlines,
@@ -81,10 +85,12 @@ def reconstruct(
     from tactomo_models import load_description
     from tactomo_models.batch import reconstruct_file
     from tactomo_models.calibration.calibration_file import calibration_of
+    from tactomo_models.calibration.taught_skin import taught_of
 
     prepare_file(maps, force=force or _is_of_reconstruct(maps), source=scans)
     sensor = load_description(description)
     curve = None if calibration is None else calibration_of(sensor, calibration).curve
+    lesson = None if taught is None else taught_of(sensor, taught)
     with Progress(transient=True) as progress:
         task = progress.add_task("reconstructing", total=None)
 
@@ -92,7 +98,13 @@ def reconstruct(
             progress.update(task, completed=done, total=total)
 
         frames = reconstruct_file(
-            scans, maps, description=sensor, method=method, progress=show, curve=curve
+            scans,
+            maps,
+            description=sensor,
+            method=method,
+            progress=show,
+            curve=curve,
+            taught=lesson,
         )
     failures = [frame.failure for frame in frames if frame.failure]
     if failures:

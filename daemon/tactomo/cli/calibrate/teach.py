@@ -1,0 +1,204 @@
+"""`tactomo teach`: where a skin is pressed, learnt from presses at known places."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tactomo.cli.options import (
+    DEFAULT_CONTROL,
+    DEFAULT_DESCRIPTION,
+    DEFAULT_NAME,
+    DEFAULT_STREAM,
+    ControlAddress,
+    Description,
+    GivenDescription,
+    KeysFolder,
+    SensorName,
+    StreamAddress,
+    examples,
+    typer_app,
+)
+
+if TYPE_CHECKING:
+    from tactomo_models import SensorDescription
+    from tactomo_models.calibration.calibration_file import Subject
+    from tactomo_models.calibration.taught_skin import TaughtSkin
+
+app = typer_app(
+    name="teach",
+    help=(
+        "Learn from presses at known places what the physics gets wrong on this very skin.\n\n"
+        "With a robot, a plotter or a template, press 20 to 800 known places, spread over the "
+        "skin, one at a time. What is learnt from the first three quarters is judged on the rest, "
+        "and kept only where it locates them better than the physics alone. From then on each "
+        "single contact says whether what was taught places it; a press unlike all that were "
+        "taught is flagged `untaught`.\n\n"
+        "It is kept by the sensor's name and devices, and used at once by the sensor's daemon if "
+        "that runs (at --control), else from its next start. A service keeps its own, see "
+        "`tactomo calibrate --help`."
+    ),
+    no_args_is_help=True,
+    epilog=examples(
+        "tactomo teach live --sensor left_forearm",
+        "tactomo teach fit presses.npz --sensor left_forearm",
+        "tactomo teach show --sensor left_forearm",
+    ),
+)
+
+Output = Annotated[
+    Path | None,
+    typer.Option("--output", "-o", help="Keep it in this file. [where the daemon looks]"),
+]
+KeepOdd = Annotated[
+    bool, typer.Option("--keep-odd", help="Learn also from presses that the others contradict.")
+]
+
+
+@app.command(
+    epilog=examples(
+        "tactomo teach live",
+        "tactomo teach live --sensor left_forearm --presses palm.npz",
+    ),
+)
+def live(
+    sensor: SensorName = DEFAULT_NAME,
+    presses: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.npz", help="Presses are kept here. [beside what is taught]"),
+    ] = None,
+    description: GivenDescription = None,
+    output: Output = None,
+    keep_odd: KeepOdd = False,
+    stream: StreamAddress = DEFAULT_STREAM,
+    control: ControlAddress = DEFAULT_CONTROL,
+    keys: KeysFolder = None,
+) -> None:
+    """Be guided, press by press, with the running daemon.
+
+    Says where to press, takes the scans of a second while it is held, and learns at the end. Each
+    press is kept at once; the same command goes on from there.
+    """
+    from tactomo.cli.calibrate.teach_live import guided
+
+    path = _path(sensor, output)
+    file = presses or path.with_name(f"{sensor}.presses.npz")
+    sensor_description, subject = guided(sensor, stream, keys, description, file)
+    _teach(file, sensor_description, subject, path, control, keys, keep_odd=keep_odd)
+
+
+@app.command(
+    epilog=examples(
+        "tactomo teach fit presses.npz --sensor left_forearm",
+        "tactomo teach fit presses.npz --dry-run -d my_skin.toml",
+    ),
+)
+def fit(
+    presses: Annotated[Path, typer.Argument(metavar="FILE.npz", help="Presses, see above.")],
+    sensor: SensorName = DEFAULT_NAME,
+    description: Description = DEFAULT_DESCRIPTION,
+    device_id: Annotated[
+        list[str] | None, typer.Option(help="The device that it was made with; repeat.")
+    ] = None,
+    output: Output = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Keep nothing.")] = False,
+    keep_odd: KeepOdd = False,
+    control: ControlAddress = DEFAULT_CONTROL,
+    keys: KeysFolder = None,
+) -> None:
+    """Learn from a file of presses.
+
+    FILE holds what `tactomo reconstruct` reads, a row for each press in order of time: `magnitude`
+    and `structure` (P, M) volts, and `magnitude_reference`, `structure_reference` (M,) of the
+    unpressed skin; and `xy_mm` (P, 2), where each press was: x to the right and y up from the
+    middle of the skin, seen from the pressed side. Presses that the others contradict are named,
+    and nothing is kept until they are mended (or --keep-odd is given).
+    """
+    from tactomo_models import load_description
+    from tactomo_models.calibration.calibration_file import Subject
+
+    known = load_description(description)
+    subject = Subject(
+        sensor=sensor,
+        description=known.name,
+        sha256=known.sha256,
+        device_ids=tuple(device_id or ()),
+    )
+    path = None if dry_run else _path(sensor, output)
+    _teach(presses, known, subject, path, control, keys, keep_odd=keep_odd)
+
+
+@app.command(epilog=examples("tactomo teach show --sensor left_forearm"))
+def show(
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="[FILE]", help="[the one that the sensor's daemon uses]"),
+    ] = None,
+    sensor: SensorName = DEFAULT_NAME,
+) -> None:
+    """Show what is kept: what it rests on, and what it brings."""
+    from tactomo_models import CalibrationError
+    from tactomo_models.calibration.taught_skin import read_taught
+
+    path = _path(sensor, file)
+    try:
+        _print(read_taught(path))
+    except FileNotFoundError as error:
+        raise CalibrationError(
+            f"nothing was taught in {path}; run: tactomo teach live --sensor {sensor}"
+        ) from error
+
+
+def _path(sensor: str, given: Path | None) -> Path:
+    from tactomo_client.messages import check_sensor_name
+    from tactomo_models.calibration.taught_skin import taught_path
+
+    check_sensor_name(sensor)
+    return given or taught_path(sensor)
+
+
+def _teach(
+    presses: Path,
+    description: SensorDescription,
+    subject: Subject,
+    path: Path | None,
+    control: str,
+    keys: Path | None,
+    *,
+    keep_odd: bool,
+) -> None:
+    """Learn from a file, keep what is learnt in `path`, if any, and have the daemon use it."""
+    from rich.console import Console
+    from rich.progress import Progress
+    from tactomo_models.calibration.taught_skin import save_taught
+    from tactomo_models.teach import read_presses, teach
+
+    from tactomo.cli.calibrate.reload import taken_up
+
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("reconstructing presses", total=None)
+
+        def show(done: int, total: int) -> None:
+            progress.update(task, completed=done, total=total)
+
+        known = read_presses(presses, description)
+        taught, notes = teach(known, description, subject, keep_odd=keep_odd, progress=show)
+    for note in notes:
+        typer.echo(note, err=True)
+    _print(taught)
+    if path is None:
+        return
+    save_taught(taught, path)
+    typer.echo(f"kept in {path}")
+
+    typer.echo(taken_up(taught, path, control, keys))
+
+
+def _print(taught: TaughtSkin) -> None:
+    subject = taught.subject
+    typer.echo(f"{subject.sensor}: {taught.words}")
+    how = "from the voltages alone" if taught.guess_mm is None else "as a correction of the physics"
+    devices = ", ".join(subject.device_ids) or "any device"
+    typer.echo(f"learnt {how}; of {devices}, as {subject.description}")

@@ -1,0 +1,190 @@
+"""The guided session of `tactomo teach live`: press by press, at the terminal.
+
+The file of presses is written whole after each one, which is also how a session that was
+interrupted goes on.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from tactomo_client import Keys
+from tactomo_models.archive import read_arrays, write_arrays
+from tactomo_models.arrays import FloatArray
+from tactomo_models.calibration.calibration_file import Subject
+from tactomo_models.scans.plausibility import DISTRUST
+from tactomo_models.sensor.description import SensorDescription
+
+from tactomo.cli.doctor.evidence import Evidence, of_daemon
+from tactomo.errors import TactomoError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+REST_S: Final = 2.0
+HOLD_S: Final = 1.0
+"""For how long scans are averaged: of 20 a second, noise falls to a quarter."""
+STILL_SHARE: Final = 0.05
+"""Of the press's change, by which it may differ from the first half to the second."""
+INSIDE: Final = 0.85
+"""Share of the sensing area's width that places are suggested in: an indenter has a width, too."""
+GOLDEN: Final = 1.32471795724475
+"""Root of x³ = x + 1: its powers spread points evenly over a square, however many there are
+(Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018)."""
+
+
+def guided(
+    sensor: str, stream: str, keys: Path | None, description: str | None, file: Path
+) -> tuple[SensorDescription, Subject]:
+    """Take presses together with the user into a file; of which sensor they are.
+
+    Raises:
+        TactomoError: no daemon answers, or the file is of other presses.
+    """
+    from rich.console import Console
+
+    return _Session(sensor, stream, keys, description, file, Console(highlight=False)).run()
+
+
+class _Session:
+    """Asks, averages, and keeps."""
+
+    def __init__(
+        self,
+        sensor: str,
+        stream: str,
+        keys: Path | None,
+        description: str | None,
+        file: Path,
+        console: Console,
+    ) -> None:
+        self._sensor, self._stream, self._given = sensor, stream, description
+        self._keys = None if keys is None else Keys.load(keys)
+        self._file, self._console = file, console
+        self._arrays: dict[str, Any] = {}
+        if file.exists():
+            self._arrays = read_arrays(file)
+
+    def run(self) -> tuple[SensorDescription, Subject]:
+        """Take presses until the user has enough; Ctrl-C ends it, too."""
+        say = self._console.print
+        say(f"Teaching [bold]{self._sensor}[/] where it is pressed.")
+        rest, description = self._rest()
+        if self._count:
+            say(f"Going on with {self._count} presses in {self._file}.")
+        else:
+            self._arrays = {f"{name}_reference": volts for name, volts in rest.items()}
+        say(
+            "Press one known place at a time and hold still: Enter takes it. Or type another "
+            "place, such as [bold]12.5 -30[/]\n(mm from the middle, x to the right, y up). "
+            "[bold]undo[/] drops the last one, [bold]done[/] or Ctrl-C ends."
+        )
+        try:
+            while self._take_one(description):
+                say(f"{self._count} presses are kept in {self._file}")
+        except (KeyboardInterrupt, EOFError):
+            say("\nstopped")
+        return description, self._subject
+
+    @property
+    def _count(self) -> int:
+        return len(self._arrays.get("xy_mm", ()))
+
+    def _rest(self) -> tuple[dict[str, FloatArray], SensorDescription]:
+        """The unpressed skin's voltages, and what the sensor is."""
+        while True:
+            self._console.input("Take everything off the skin, and press Enter: ")
+            heard = self._heard(REST_S)
+            if not heard.pressed:
+                break
+            self._console.print("something presses; `tactomo tare` if nothing does")
+        if not isinstance(heard.layout, SensorDescription):
+            raise TactomoError(
+                "the daemon's sensor description is not on this computer", "give --description"
+            )
+        assert heard.after is not None
+        devices = [port["device"]["device_id"] for port in heard.after["ports"] if port["device"]]
+        self._subject = Subject(
+            sensor=self._sensor,
+            description=heard.layout.name,
+            sha256=heard.layout.sha256,
+            device_ids=tuple(sorted(set(devices))),
+        )
+        return {name: scans.mean(axis=0) for name, scans in heard.scans.items()}, heard.layout
+
+    def _take_one(self, description: SensorDescription) -> bool:
+        """Take one press, or undo one; returns whether to go on."""
+        x_mm, y_mm = suggested_mm(description, self._count)
+        word = self._console.input(f"\nPress ({x_mm:g}, {y_mm:g}) mm, hold, and Enter: ").strip()
+        if word in ("done", "q", "quit"):
+            return False
+        if word == "undo":
+            self._keep(slice(0, max(self._count - 1, 0)))
+            return True
+        if word:
+            try:
+                x_mm, y_mm = (float(part) for part in word.replace(",", " ").split())
+            except ValueError:
+                self._console.print("two numbers, such as 12.5 -30, please")
+                return True
+        heard = self._heard(HOLD_S)
+        if why := self._why_not(heard):
+            self._console.print(f"not taken: {why}")
+            return True
+        means = {name: scans.mean(axis=0) for name, scans in heard.scans.items()}
+        self._keep(slice(None), {**means, "xy_mm": np.array([x_mm, y_mm])})
+        return True
+
+    def _heard(self, seconds: float) -> Evidence:
+        with self._console.status("listening"):
+            return of_daemon(
+                self._sensor, self._stream, seconds, self._given, self._keys, lambda _: None
+            )
+
+    def _why_not(self, heard: Evidence) -> str:
+        """Why what was heard is no press; empty where it is one."""
+        flags = sorted(heard.flags.keys() & set(DISTRUST.names()))
+        if flags:
+            return f"not to be trusted: {', '.join(flags)}; `tactomo tare` unpressed"
+        if heard.pressed < heard.frames or not heard.frames:
+            return "no contact was seen all the while: press, then Enter, and hold for a second"
+        for name, scans in heard.scans.items():
+            if f"{name}_reference" not in self._arrays:
+                return f"the {name} channel was missing when the skin was taken at rest; begin anew"
+            half = len(scans) // 2
+            change = np.linalg.norm(scans.mean(axis=0) - self._arrays[f"{name}_reference"])
+            moved = np.linalg.norm(scans[half:].mean(axis=0) - scans[:half].mean(axis=0))
+            if moved > STILL_SHARE * change:
+                return "it moved: hold it still for a second"
+        return ""
+
+    def _keep(self, which: slice, press: dict[str, FloatArray] | None = None) -> None:
+        """Keep these of the presses so far, and one more."""
+        for name in ("magnitude", "structure", "xy_mm"):
+            rows = self._arrays.get(name)
+            rows = None if rows is None else rows[which]
+            if press is not None and name in press:
+                row = press[name][None]
+                rows = row if rows is None else np.concatenate([rows, row])
+            if rows is not None:
+                self._arrays[name] = rows
+        try:
+            write_arrays(self._file, self._arrays)
+        except OSError as error:
+            raise TactomoError(
+                f"cannot write {self._file}: {error.strerror}", "give --presses a file to write"
+            ) from error
+
+
+def suggested_mm(description: SensorDescription, number: int) -> tuple[float, float]:
+    """Where to press next: any first so many of these places are spread over the skin."""
+    at = np.array([(0.5 + (number + 1) / GOLDEN) % 1, (0.5 + (number + 1) / GOLDEN**2) % 1]) - 0.5
+    frame_m = 2 * description.sheet.frame_width_m
+    size_m = np.array([description.width_m, description.height_m]) - frame_m
+    if description.sheet.shape == "disc":  # the square onto the disc, evenly
+        radius, angle = np.sqrt(at[0] + 0.5) / 2, 2 * np.pi * at[1]
+        at = radius * np.array([np.cos(angle), np.sin(angle)])
+    x_mm, y_mm = np.round(1e3 * INSIDE * size_m * at).tolist()
+    return x_mm, y_mm

@@ -1,0 +1,239 @@
+"""What a sensor was taught by presses at known places, as it is kept: one file for each sensor.
+
+It holds the presses themselves; what is learnt from them is worked out again when it is read. What
+it was taught on stands in it, and it is refused elsewhere, as a pressure calibration is.
+"""
+
+from __future__ import annotations
+
+import stat
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from pydantic import ValidationError
+from tactomo_protocol import Channel
+
+from tactomo_models.archive import read_arrays, write_arrays
+from tactomo_models.arrays import BoolArray, FloatArray
+from tactomo_models.calibration.calibration_file import Subject, data_folder
+from tactomo_models.calibration.press_regression import PressRegression
+from tactomo_models.errors import CalibrationError, DataError
+from tactomo_models.scans.measurement import Measurement
+from tactomo_models.scans.reference import Reference
+from tactomo_models.scene.contacts import Contact
+from tactomo_models.sensor.description import SensorDescription
+
+SUFFIX: Final = ".taught.npz"
+FORMAT: Final = 1
+OTHER_SKIN: Final = 0.06
+"""Rms of the logarithms of a reference's voltages over those of teaching, a common factor aside,
+from which the skin is another one, or damaged. Simulated: 0.02 where 10 K change a sheet unevenly,
+by 2 %; two skins of one make are 0.04 to 0.05 apart, made by hand 0.08 to 0.19."""
+
+
+@dataclass(frozen=True)
+class TaughtSkin:
+    """What one sensor was taught.
+
+    Attributes:
+        subject: what it is of.
+        taken: when, ISO 8601, UTC.
+        channels: whose changes are learnt from, in order.
+        usable: (V,) of their changes, one channel after the other, those that all presses have.
+        changes: (N, V) of each press.
+        xy_mm: (N, 2) where each was.
+        guess_mm: (N, 2) where the physics had it; None where the voltages alone tell.
+        tiers: what made the contacts that places were corrected of.
+        without_mm, with_mm: median errors on presses held out, by the physics and as taught.
+        reference: (channels, M) volts of the unpressed skin then.
+    """
+
+    subject: Subject
+    taken: str
+    channels: tuple[Channel, ...]
+    usable: BoolArray
+    changes: FloatArray
+    xy_mm: FloatArray
+    guess_mm: FloatArray | None
+    tiers: frozenset[str]
+    without_mm: float
+    with_mm: float
+    reference: FloatArray
+
+    @cached_property
+    def regression(self) -> PressRegression:
+        """What is learnt: 0.2 s for 200 presses, 4 s for 800."""
+        return PressRegression(self.changes, self.xy_mm, self.guess_mm)
+
+    def corrected(self, contact: Contact, measurement: Measurement, tier: str) -> Contact:
+        """A frame's one contact at the place that was taught; as it is where none like it was.
+
+        So it is, too, where voltages are missing, or another method made the contact.
+        """
+        changes, valid = press_changes(measurement, self.channels)
+        if not valid[self.usable].all() or (self.guess_mm is not None and tier not in self.tiers):
+            return contact
+        guess_mm = 1e3 * np.array([[contact.x_m, contact.y_m]])
+        found = self.regression.locate(changes[None, self.usable], guess_mm)
+        if not found.is_taught[0]:
+            return contact
+        x_m, y_m = (1e-3 * found.xy_mm[0]).tolist()
+        sigma_m = 1e-3 * float(found.sigma_mm[0])
+        return replace(contact, x_m=x_m, y_m=y_m, x_sigma_m=sigma_m, y_sigma_m=sigma_m, taught=True)
+
+    def changed(self, reference: Reference) -> str:
+        """In words, how the unpressed skin is another one than was taught; empty where it is not.
+
+        A factor that all voltages share is none: temperature and gain do that.
+        """
+        for name, taught in zip(self.channels, self.reference, strict=True):
+            now = getattr(reference, name)
+            if now is None or not np.any((now != 0) & (taught != 0)):
+                continue
+            there = (now != 0) & (taught != 0)
+            ratio = np.log(np.abs(now[there] / taught[there]))
+            off = float(np.sqrt(np.mean((ratio - np.median(ratio)) ** 2)))
+            if off > OTHER_SKIN:
+                return f"its {name} voltages at rest are {off:.0%} off what they were at teaching"
+        return ""
+
+    @property
+    def words(self) -> str:
+        """In words, what it rests on and what it brings."""
+        return (
+            f"{len(self.xy_mm)} presses of {self.taken[:10]}; on presses held out "
+            f"{self.with_mm:.2f} mm (median), by the physics alone {self.without_mm:.2f} mm"
+        )
+
+
+def press_changes(
+    measurement: Measurement, channels: Sequence[Channel]
+) -> tuple[FloatArray, BoolArray]:
+    """Changes (V,) of channels one after the other, and which of them are valid (V,)."""
+    count = len(next(iter(measurement.changes.values())).change)
+    none = np.zeros(count)
+    seen = [measurement.changes.get(name) for name in channels]
+    changes = np.concatenate([none if each is None else each.change for each in seen])
+    weight = np.concatenate([none if each is None else each.weight for each in seen])
+    return changes, weight > 0
+
+
+def taught_path(sensor: str) -> Path:
+    """Where what a sensor was taught is kept by default."""
+    return data_folder() / "calibrations" / f"{sensor}{SUFFIX}"
+
+
+def save_taught(taught: TaughtSkin, path: Path) -> None:
+    """Write what was taught; a half-written file is never left under that name.
+
+    Raises:
+        CalibrationError: the file cannot be written.
+    """
+    guess = np.zeros((0, 2)) if taught.guess_mm is None else taught.guess_mm
+    arrays = {
+        "format": np.array(FORMAT),
+        "tactomo": np.array(version("tactomo")),
+        "subject": np.array(taught.subject.model_dump_json()),
+        "taken": np.array(taught.taken),
+        "channels": np.array(taught.channels),
+        "usable": taught.usable,
+        "changes": taught.changes.astype(np.float32),
+        "xy_mm": taught.xy_mm,
+        "guess_mm": guess,
+        "tiers": np.array(sorted(taught.tiers)),
+        "held_out_mm": np.array([taught.without_mm, taught.with_mm]),
+        "reference": taught.reference,
+    }
+    try:
+        write_arrays(path, arrays)
+    except OSError as error:
+        raise CalibrationError(
+            f"cannot write {path}: {error.strerror}; name a file that you may write"
+        ) from error
+
+
+def read_taught(path: Path) -> TaughtSkin:
+    """Read what was taught, whatever it is of.
+
+    Raises:
+        CalibrationError: it is damaged, of another format, or cannot be read.
+        FileNotFoundError: there is none.
+    """
+    again = "teach it again, or delete it"
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):  # reading a pipe may never end
+            raise CalibrationError(f"cannot read {path}: it is no regular file; {again}")
+        arrays = read_arrays(path)
+        if int(arrays["format"]) != FORMAT:
+            raise CalibrationError(
+                f"{path} is of format {int(arrays['format'])}, and this tactomo reads format "
+                f"{FORMAT}; {again}"
+            )
+        taught = _of_arrays(arrays)
+        _ = taught.regression  # now, not in the first frame
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise CalibrationError(f"cannot read {path}: {error.strerror}; {again}") from error
+    except (DataError, KeyError, ValueError, ValidationError) as error:
+        raise CalibrationError(f"{path} is damaged, or nothing that was taught; {again}") from error
+    return taught
+
+
+def _of_arrays(arrays: Mapping[str, Any]) -> TaughtSkin:
+    guess = arrays["guess_mm"].astype(np.float64)
+    without_mm, with_mm = arrays["held_out_mm"].tolist()
+    return TaughtSkin(
+        Subject.model_validate_json(str(arrays["subject"])),
+        str(arrays["taken"]),
+        tuple(Channel(name) for name in arrays["channels"].tolist()),
+        arrays["usable"].astype(bool),
+        arrays["changes"].astype(np.float64),
+        arrays["xy_mm"].astype(np.float64),
+        guess if len(guess) else None,
+        frozenset(arrays["tiers"].tolist()),
+        float(without_mm),
+        float(with_mm),
+        arrays["reference"].astype(np.float64),
+    )
+
+
+def load_taught(path: Path, sensor: str, description: SensorDescription) -> TaughtSkin:
+    """Read what was taught and make sure that it is of this sensor.
+
+    Raises:
+        CalibrationError: it is not, or see `read_taught`.
+        FileNotFoundError: there is none.
+    """
+    found = read_taught(path)
+    mismatch = found.subject.mismatch(sensor, description)
+    if mismatch:
+        raise CalibrationError(f"{path} {mismatch}; run: tactomo teach live --sensor {sensor}")
+    return found
+
+
+def taught_of(description: SensorDescription, path: Path) -> TaughtSkin:
+    """Read what a sensor of such a description was taught, whatever its name.
+
+    Raises:
+        CalibrationError: there is none, or it is of another description; see `read_taught`.
+    """
+    try:
+        found = read_taught(path)
+    except FileNotFoundError as error:
+        raise CalibrationError(f"nothing was taught in {path}; give another path") from error
+    mismatch = found.subject.mismatch(found.subject.sensor, description)
+    if mismatch:
+        raise CalibrationError(f"{path} {mismatch}; give the one of this sensor")
+    return found
+
+
+def now_utc() -> str:
+    """The moment, ISO 8601, UTC."""
+    return datetime.now(UTC).isoformat(timespec="seconds")

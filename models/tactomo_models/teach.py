@@ -1,0 +1,297 @@
+"""Teach a skin: learn from presses at known places what the physics gets wrong on this very skin.
+
+Presses are reconstructed, each from a cold start. What is learnt from the first three quarters is
+judged on the last one, in order of time; what locates that no better than the physics alone is not
+kept. Presses that the others contradict, and coordinates in another unit or frame, are named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+from tactomo_protocol import Channel
+from threadpoolctl import threadpool_limits
+
+from tactomo_models.archive import read_arrays
+from tactomo_models.arrays import BoolArray, FloatArray, IntArray
+from tactomo_models.batch import read_scans
+from tactomo_models.calibration.calibration_file import Subject
+from tactomo_models.calibration.press_regression import PressRegression
+from tactomo_models.calibration.taught_skin import TaughtSkin, now_utc, press_changes
+from tactomo_models.errors import CalibrationError, DataError
+from tactomo_models.reconstruct import Reconstructor
+from tactomo_models.scans.reference import Reference
+from tactomo_models.sensor.description import SensorDescription
+
+MIN_PRESSES: Final = 20
+"""Of which five are judged on; fewer would tell no improvement from chance."""
+HELD_OUT: Final = 4
+"""One in so many presses, the last, is judged on."""
+ODD: Final = 10.0
+"""Median errors from which the other presses contradict a press. Of five measured skins the worst
+of 800 good presses is 8.9 medians off, and of those with x and y swapped four in five are above."""
+OTHER_FRAME: Final = 0.5
+"""Of the distance as given: coordinates in another frame or unit are nearer to the contacts."""
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class KnownPresses:
+    """Presses at known places, in order of time.
+
+    Attributes:
+        scans: (P, M) volts of each channel.
+        reference: of the unpressed skin.
+        xy_mm: (P, 2) where each was, in the description's frame.
+    """
+
+    scans: dict[str, FloatArray]
+    reference: Reference
+    xy_mm: FloatArray
+
+
+def read_presses(path: Path, description: SensorDescription) -> KnownPresses:
+    """Read what `tactomo reconstruct` reads, and `xy_mm` (P, 2).
+
+    Raises:
+        DataError: the file cannot be read or does not fit the sensor.
+    """
+    scans, reference = read_scans(path, description)
+    count = len(next(iter(scans.values())))
+    xy_mm = read_arrays(path).get("xy_mm", np.zeros(0))
+    if xy_mm.dtype.kind not in "fiu" or xy_mm.shape != (count, 2):
+        raise DataError(
+            f"{path}: xy_mm is {xy_mm.dtype} of shape {xy_mm.shape}; where each of the {count} "
+            f"presses was is needed, as real numbers of shape {count} x 2, in mm from the middle"
+        )
+    return KnownPresses(scans, reference, xy_mm.astype(np.float64))
+
+
+def teach(
+    presses: KnownPresses,
+    description: SensorDescription,
+    subject: Subject,
+    *,
+    keep_odd: bool = False,
+    progress: Progress | None = None,
+) -> tuple[TaughtSkin, list[str]]:
+    """Learn from presses; also, in words, what was left out.
+
+    Args:
+        presses: at known places.
+        description: the sensor.
+        subject: what they are of.
+        keep_odd: learn also from presses that the others contradict.
+        progress: called with presses done and presses in all.
+
+    Raises:
+        CalibrationError: they are too few, contradict each other or the sensor, or teach nothing.
+    """
+    _check_numbers(presses, description)
+    with threadpool_limits(1):
+        seen = _reconstructed(presses, description, progress)
+        one = np.flatnonzero(np.isfinite(seen.places_mm).all(axis=1))
+        notes = _left_out(np.setdiff1d(np.arange(len(presses.xy_mm)), one))
+        if len(one) < MIN_PRESSES:
+            raise CalibrationError(
+                f"{len(one)} of {len(presses.xy_mm)} presses show one contact, and {MIN_PRESSES} "
+                "are needed; press harder, one place at a time, and take the reference unpressed"
+            )
+        xy_mm, guess_mm = presses.xy_mm[one], seen.places_mm[one]
+        _check_frame(xy_mm, guess_mm, description)
+        usable = np.asarray(seen.valid[one].all(axis=0))
+        changes = seen.changes[one][:, usable]
+        odd = _odd(changes, xy_mm, guess_mm, one)
+        if odd and not keep_odd:
+            raise CalibrationError(
+                f"nothing is kept, as all others contradict {'; '.join(odd)} (counted from "
+                "0). Correct them, or leave them out, and run this again; or give --keep-odd"
+            )
+        best, without_mm, with_mm = _best(changes, xy_mm, guess_mm)
+    channels = tuple(name for name in description.channels if name in presses.scans)
+    taught = TaughtSkin(
+        subject,
+        now_utc(),
+        channels,
+        usable,
+        changes,
+        xy_mm,
+        guess_mm if best == "corrected" else None,
+        seen.tiers,
+        without_mm,
+        with_mm,
+        np.array([getattr(presses.reference, name) for name in channels]),
+    )
+    return taught, [*notes, *(f"{each} is kept against the others" for each in odd)]
+
+
+def _check_numbers(presses: KnownPresses, description: SensorDescription) -> None:
+    """Refuse what no robot reports of a skin, before anything is computed."""
+    xy_mm = presses.xy_mm
+    if len(xy_mm) < MIN_PRESSES:
+        raise CalibrationError(f"{len(xy_mm)} presses are too few; give {MIN_PRESSES} or more")
+    if not np.isfinite(xy_mm).all():
+        first = int(np.flatnonzero(~np.isfinite(xy_mm).all(axis=1))[0])
+        raise CalibrationError(f"press {first} has no place; give xy_mm, or leave the press out")
+    width_mm = 1e3 * max(description.width_m, description.height_m)
+    if np.abs(xy_mm).max() < 0.01 * width_mm:  # a hundredth of the skin teaches nothing, either
+        raise CalibrationError(
+            f"all places are within {np.abs(xy_mm).max():.2g} mm of the middle: they seem to be "
+            "metres; give millimetres"
+        )
+    scans = np.hstack(list(presses.scans.values()))
+    for k in range(1, len(scans)):
+        if np.array_equal(scans[k], scans[k - 1]):
+            raise CalibrationError(
+                f"presses {k - 1} and {k} hold the very same voltages: one was stored twice, and "
+                "the places after it may be shifted; take them again"
+            )
+
+
+class _Seen(NamedTuple):
+    """What P presses look like.
+
+    Attributes:
+        changes: (P, V) of all channels, one after the other.
+        valid: (P, V) which of them are.
+        places_mm: (P, 2) of each one's contact; NaN where there is none, or several.
+        tiers: what made the contacts.
+    """
+
+    changes: FloatArray
+    valid: BoolArray
+    places_mm: FloatArray
+    tiers: frozenset[str]
+
+
+def _reconstructed(
+    presses: KnownPresses, description: SensorDescription, progress: Progress | None
+) -> _Seen:
+    """Reconstruct each press from a cold start, as the daemon does by default."""
+    reconstructor = Reconstructor(description)
+    reconstructor.set_reference(presses.reference)
+    channels = [name for name in description.channels if name in presses.scans]
+    width = len(channels) * description.measurements
+    count, tiers = len(presses.xy_mm), set()
+    changes, valid = np.zeros((count, width)), np.zeros((count, width), bool)
+    places_mm = np.full((count, 2), np.nan)
+    for index in range(count):
+        scan = {name: volts[index] for name, volts in presses.scans.items()}
+        measurement = reconstructor.compare(
+            scan.get(Channel.MAGNITUDE), scan.get(Channel.STRUCTURE)
+        )
+        if measurement.changes:
+            changes[index], valid[index] = press_changes(measurement, channels)
+            reconstructor.reset()
+            frame = reconstructor.solve(measurement)
+            if len(frame.contacts) == 1:
+                places_mm[index] = 1e3 * frame.contacts[0].x_m, 1e3 * frame.contacts[0].y_m
+                tiers.add(frame.tier)
+        if progress:
+            progress(index + 1, count)
+    return _Seen(changes, valid, places_mm, frozenset(tiers))
+
+
+def _left_out(others: IntArray) -> list[str]:
+    if not len(others):
+        return []
+    shown = ", ".join(map(str, others[:10])) + (", ..." if len(others) > 10 else "")
+    return [f"{len(others)} presses that show no contact, or several, are left out: {shown}"]
+
+
+def _check_frame(xy_mm: FloatArray, guess_mm: FloatArray, description: SensorDescription) -> None:
+    """Refuse coordinates that fit the contacts far better in another frame or unit."""
+
+    def distance_mm(places_mm: FloatArray) -> float:
+        return float(np.median(np.linalg.norm(places_mm - guess_mm, axis=1)))
+
+    x, y = xy_mm.T
+    others = {
+        "x and y seem swapped": (y, x),
+        "x seems to run the other way": (-x, y),
+        "y seems to run the other way": (x, -y),
+        "the frame seems turned by half a turn": (-x, -y),
+        "the frame seems turned by a quarter": (y, -x),
+        "the frame seems turned by a quarter, clockwise": (-y, x),
+        "they seem doubled": (x / 2, y / 2),
+        "they seem halved": (2 * x, 2 * y),
+        "they seem to be centimetres": (10 * x, 10 * y),
+        "they seem to be inches": (25.4 * x, 25.4 * y),
+        "they seem to be counted from a corner": (
+            x - 500 * description.width_m,
+            y - 500 * description.height_m,
+        ),
+    }
+    as_given = distance_mm(xy_mm)
+    why, there = min(
+        ((why, distance_mm(np.stack(places, axis=1))) for why, places in others.items()),
+        key=lambda each: each[1],
+    )
+    if there < OTHER_FRAME * as_given:
+        raise CalibrationError(
+            f"places and contacts are {as_given:.0f} mm apart (median), and {there:.0f} mm if "
+            f"{why.removeprefix('they ')}: {why}; give x to the right and y up from the middle, "
+            "seen from the pressed side, in mm"
+        )
+    limits_mm = 500 * np.array([description.width_m, description.height_m])
+    outside = np.flatnonzero((np.abs(xy_mm) > limits_mm).any(axis=1))
+    if len(outside):
+        place = ", ".join(f"{each:.1f}" for each in xy_mm[outside[0]])
+        raise CalibrationError(
+            f"{len(outside)} presses are off the skin, the first at ({place}) mm; give places in "
+            "mm from its middle"
+        )
+
+
+def _odd(
+    changes: FloatArray, xy_mm: FloatArray, guess_mm: FloatArray, numbers: IntArray
+) -> list[str]:
+    """Name the presses that the physics or the others contradict, whichever locates better."""
+
+    def errors_mm(found_mm: FloatArray) -> FloatArray:
+        return np.asarray(np.linalg.norm(found_mm - xy_mm, axis=1))
+
+    found_mm = min(
+        (guess_mm, PressRegression(changes, xy_mm).found_mm),
+        key=lambda found: float(np.median(errors_mm(found))),
+    )
+    off_mm = errors_mm(found_mm)
+    odd = []
+    for k in np.flatnonzero(off_mm > ODD * np.median(off_mm)):
+        x, y = xy_mm[k]
+        words = f"press {numbers[k]} at ({x:.1f}, {y:.1f}) mm"
+        if np.linalg.norm(found_mm[k] - (y, x)) < 0.5 * off_mm[k]:
+            words += ", which x and y swapped explains"
+        odd.append(words)
+    return odd
+
+
+def _best(changes: FloatArray, xy_mm: FloatArray, guess_mm: FloatArray) -> tuple[str, float, float]:
+    """What locates held-out presses best, and the median errors without and with it, mm."""
+    train = len(xy_mm) - len(xy_mm) // HELD_OUT
+    places = {
+        "voltages": PressRegression(changes[:train], xy_mm[:train]).locate(changes[train:]),
+        "corrected": PressRegression(changes[:train], xy_mm[:train], guess_mm[:train]).locate(
+            changes[train:], guess_mm[train:]
+        ),
+    }
+
+    def errors_mm(found_mm: FloatArray) -> FloatArray:
+        return np.asarray(np.linalg.norm(found_mm - xy_mm[train:], axis=1))
+
+    errors = {name: errors_mm(found.xy_mm) for name, found in places.items()}
+    physics = errors_mm(guess_mm[train:])
+    best = min(errors, key=lambda name: float(np.median(errors[name])))
+    without_mm, with_mm = float(np.median(physics)), float(np.median(errors[best]))
+    if with_mm >= without_mm or errors[best].mean() >= physics.mean():
+        raise CalibrationError(
+            f"nothing is kept: on the last {len(physics)} presses what was learnt is "
+            f"{with_mm:.2f} mm off (median), and the physics alone {without_mm:.2f} mm; give more "
+            "presses, spread over the skin"
+        )
+    return best, without_mm, with_mm

@@ -1,0 +1,45 @@
+"""A skin made by hand, simulated: electrodes a millimetre off, uneven contacts, an uneven sheet."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tactomo_models import Press, SensorDescription, SkinSimulator, load_description
+from variants import variant
+
+COARSE = {"nodes_x": 25, "nodes_y": 25}
+SNR = 100.0  # of a voltage's change: 40 dB
+
+
+def described() -> SensorDescription:
+    """What the skin was to be; coarse, so that a press takes a tenth of a second."""
+    return variant(load_description("paper_square"), map=COARSE)
+
+
+def write_description(path: Path) -> Path:
+    """The same as a file."""
+    shipped = Path(__file__).parents[2] / "models/tactomo_models/sensor/shipped/paper_square.toml"
+    path.write_text(shipped.read_text("utf-8") + "\n[map]\nnodes_x = 25\nnodes_y = 25\n")
+    return path
+
+
+def presses(count: int, *, seed: int, skin: int = 0) -> dict[str, Any]:
+    """The arrays of a file of presses on one of several such skins."""
+    made = variant(described(), electrodes={"pitch_m": 0.037})
+    simulator = SkinSimulator(made, unevenness=0.10, impedance_spread=0.30, seed=skin)
+    rng = np.random.default_rng(seed)
+    rest = simulator.voltages([])
+    xy_mm = rng.uniform(-50, 50, (count, 2))
+    pressed = [
+        simulator.voltages([Press(1e-3 * x, 1e-3 * y, rng.uniform(160, 220), 0.010)])
+        for x, y in xy_mm
+    ]
+    arrays: dict[str, Any] = {"xy_mm": xy_mm}
+    for name, volts in rest.items():
+        scans = np.array([each[name] for each in pressed])
+        noise = np.sqrt(np.mean((scans - volts) ** 2)) / SNR
+        arrays[f"{name}_reference"] = volts + 0.2 * noise * rng.standard_normal(volts.shape)
+        arrays[str(name)] = scans + noise * rng.standard_normal(scans.shape)
+    return arrays
