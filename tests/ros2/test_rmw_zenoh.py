@@ -59,13 +59,17 @@ def sensor() -> Iterator[FakeSensor]:
         yield fake
 
 
-@pytest.fixture
-def node(tmp_path: Path, sensor: FakeSensor) -> Iterator[subprocess.Popen[str]]:
+def start(sensor: FakeSensor, config: Path) -> subprocess.Popen[str]:
     command = (
         *(sys.executable, "-m", "tactomo.cli", "ros2", "left", "--stream", sensor.address),
-        *("--domain", str(DOMAIN), "--config", str(tmp_path / "node.json5"), "--announce"),
+        *("--domain", str(DOMAIN), "--config", str(config)),
     )
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.fixture
+def node(tmp_path: Path, sensor: FakeSensor) -> Iterator[subprocess.Popen[str]]:
+    with start(sensor, tmp_path / "node.json5") as process:
         assert process.stdout is not None
         assert "/left/map" in process.stdout.readline()
         yield process
@@ -157,6 +161,16 @@ def test_silence_is_told(
     wait_until(lambda: 3 in levels())  # STALE
     last = decoded(DIAGNOSTICS, said[-1].payload.to_bytes())
     assert "is the daemon running?" in last.status[0].message
+
+
+def test_that_there_is_no_router_is_told(sensor: FakeSensor, tmp_path: Path) -> None:
+    listen = {"endpoints": [f"unixsock-stream/{tmp_path / 'alone'}"]}
+    alone = {"mode": "peer", "listen": listen, "scouting": {"multicast": {"enabled": False}}}
+    (tmp_path / "alone.json5").write_text(json.dumps(alone))
+    with start(sensor, tmp_path / "alone.json5") as process:
+        assert process.stderr is not None
+        assert "rmw_zenohd" in process.stderr.readline()
+        process.kill()
 
 
 def test_a_configuration_that_is_none_is_named(tactomo: Callable[..., Any], tmp_path: Path) -> None:

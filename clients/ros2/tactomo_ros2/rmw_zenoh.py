@@ -78,6 +78,11 @@ class ZenohNode:
             )
             self._publishers[topic] = publisher, identity
 
+    @property
+    def is_alone(self) -> bool:
+        """Whether it meets nobody: no router runs where it looks for one."""
+        return not self._session.info.routers_zid() and not self._session.info.peers_zid()
+
     def publish(self, message: RosMessage) -> None:
         """Publish on one of the topics; what a reader is too slow for is dropped."""
         publisher, identity = self._publishers[message.topic]

@@ -12,7 +12,6 @@ import typer
 from tactomo.cli.options import (
     DEFAULT_NAME,
     DEFAULT_STREAM,
-    Announce,
     KeysFolder,
     StreamAddress,
     examples,
@@ -53,7 +52,6 @@ def ros2(
         ),
     ] = "0,0,0",
     keys: KeysFolder = None,
-    announce: Announce = False,
 ) -> None:
     """Publish maps, contacts and diagnostics to ROS 2 until stopped, where the nodes use Zenoh.
 
@@ -73,8 +71,6 @@ def ros2(
         ) from error
     from tactomo_client import subscribe
 
-    from tactomo.cli.children import print_ready
-
     hung = None if parent is None else placement_of(parent, pose)
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -85,6 +81,6 @@ def ros2(
         ZenohNode(name, topics, domain, config) as node,
     ):
         typer.echo(f"{name}: {', '.join(topics)}")
-        if announce:
-            print_ready({"node": name})
+        if node.is_alone:
+            typer.echo("no router yet: run `ros2 run rmw_zenoh_cpp rmw_zenohd`", err=True)
         run(skin, node.publish, stop.is_set, hung)
