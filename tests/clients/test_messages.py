@@ -219,3 +219,27 @@ def test_replies_round_trip() -> None:
         decode_reply(encode_error("tare_refused", "a contact is there", "lift it and tare again"))
     assert caught.value.name == "tare_refused"
     assert str(caught.value) == "a contact is there; lift it and tare again"
+
+
+@pytest.mark.parametrize(
+    "pairs",
+    [
+        [("command", "status"), ("command", "tare")],
+        [("command", "press"), ("arguments", [("x_mm", 1.0), ("x_mm", 2.0)])],
+    ],
+)
+def test_a_request_in_which_a_key_comes_twice_is_none(pairs: list[tuple[str, Any]]) -> None:
+    packer = msgpack.Packer(autoreset=False)
+
+    def pack(value: object) -> None:
+        if isinstance(value, list):
+            packer.pack_map_header(len(value))
+            for key, inside in value:
+                packer.pack(key)
+                pack(inside)
+        else:
+            packer.pack(value)
+
+    pack([("schema", 1), *pairs])
+    with pytest.raises(MessageError, match="a key comes twice"):
+        decode_request(packer.bytes())

@@ -15,7 +15,7 @@ from __future__ import annotations
 import functools
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeGuard
 
@@ -193,7 +193,7 @@ def encode_request(command: str, arguments: Mapping[str, Any]) -> bytes:
 
 def decode_request(data: bytes) -> tuple[str, dict[str, Any]]:
     """Return the command and arguments of a control request; raise MessageError if it is none."""
-    fields = _unpack_map(data)
+    fields = _unpack_map(data, object_pairs_hook=_without_repeats)
     command, arguments = fields.get("command"), fields.get("arguments", {})
     if not isinstance(command, str) or not isinstance(arguments, dict):
         raise MessageError("a request is {schema, command: string, arguments: map}")
@@ -251,11 +251,21 @@ def _numpy_to_wire(value: object) -> object:
     raise TypeError(f"{type(value).__name__} cannot be sent")
 
 
-def _unpack_map(data: bytes) -> dict[str, Any]:
+def _without_repeats(pairs: Iterable[tuple[Any, Any]]) -> dict[Any, Any]:
+    """Return a map; a key that comes twice would mean one thing here and another elsewhere."""
+    listed = list(pairs)
+    fields = dict(listed)
+    if len(fields) < len(listed):
+        raise ValueError("a key comes twice")
+    return fields
+
+
+def _unpack_map(data: bytes, **options: Any) -> dict[str, Any]:
     if len(data) > MAX_MESSAGE_BYTES:
         raise MessageError(f"a message of {len(data)} bytes is over {MAX_MESSAGE_BYTES}")
     try:
-        fields = msgpack.unpackb(data, max_array_len=MAX_ENTRIES, max_map_len=MAX_ENTRIES)
+        limits = {"max_array_len": MAX_ENTRIES, "max_map_len": MAX_ENTRIES}
+        fields = msgpack.unpackb(data, **limits, **options)
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         raise MessageError(f"the body is not MessagePack: {error}") from error
     except MemoryError as error:

@@ -145,6 +145,9 @@ class Port:
     bytes: int = 0
     packets: int = 0
     corrupt: int = 0
+    """Packets that were damaged on their way."""
+    faulty: int = 0
+    """Intact packets that break the protocol."""
     """Packets that failed a check."""
     received_last_minute: Mapping[str, int] = field(default_factory=dict)
     """By how much `packets` and `corrupt` have risen within it."""

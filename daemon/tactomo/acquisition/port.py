@@ -168,7 +168,10 @@ class PortReader(Worker):
             return "ended"
         if not self.is_open:
             return "closed"
-        return "refused" if self.refusal else str(self._liveness.state)
+        if self.refusal:
+            return "refused"
+        is_faulty = self._liveness.state is DeviceState.IDLE and self._has_fault
+        return "faulty" if is_faulty else str(self._liveness.state)
 
     @property
     def problem(self) -> str:

@@ -46,6 +46,7 @@ class ScanPairer:
         lost: channels that nobody waits for at present.
         late: scans dropped because their dual scan, or their channel, had gone on without them.
         repeated: scans dropped because they had come before.
+        disordered: how many of the late ones came after their own channel's next.
         unmarked: scans dropped because the recorded run did not use them.
         resets: how often a counter went back with its clock: the device was reset.
         zeroed: how often a counter alone went back.
@@ -53,7 +54,7 @@ class ScanPairer:
 
     def __init__(self) -> None:
         self.lost: set[Channel] = set()
-        self.late = 0
+        self.late = self.disordered = 0
         self.repeated = 0
         self.unmarked = 0
         self.resets = 0
@@ -74,6 +75,7 @@ class ScanPairer:
     def carry_on(self, before: ScanPairer) -> None:
         """Count on from another one, whose place this one takes."""
         self.late, self.repeated, self.unmarked = before.late, before.repeated, before.unmarked
+        self.disordered = before.disordered
         self.resets, self.zeroed = before.resets, before.zeroed
 
     @property
@@ -121,6 +123,7 @@ class CounterPairer(ScanPairer):
         if not self._is_new(scan):
             self.repeated += is_repeated
             self.late += not is_repeated
+            self.disordered += not is_repeated
             return []
         keys.append(scan.key)
         if len(self._expected) == 1:

@@ -80,6 +80,10 @@ STATES: Mapping[str, tuple[str, str]] = {
     "stale": ("scans have stopped coming", "check the ports below"),
     "late": ("scans come, and frames come late", FASTER),
 }
+FIRMWARE_STEP = (
+    "the line is good: correct the firmware, by firmware_protocol/PROTOCOL.md; the event "
+    "firmware_fault names the rule"
+)
 TARING = ("a reference is being taken", "leave the skin alone until it runs")
 
 
@@ -116,6 +120,7 @@ PORT_STATES: Mapping[str, str] = {
     "garbage": "check the baud rate, and that the firmware speaks the protocol",
     "silent": "check that the device has power and that this is its port",
     "idle": "is the device waiting for a trigger, or was it reset?",
+    "faulty": FIRMWARE_STEP,
 }
 
 
@@ -126,11 +131,14 @@ def _of_port(port: Mapping[str, Any]) -> Iterator[HealthIssue]:
         because = f": {port['problem']}" if port.get("problem") else ""
         yield HealthIssue("error", f"{url} is {port['state']}{because}", step)
     recent = port.get("received_last_minute") or {}
-    packets, corrupt = recent.get("packets") or 0, recent.get("corrupt") or 0
-    if corrupt > CORRUPT_NOTED * (packets + corrupt):
-        share = f"{corrupt} of {packets + corrupt} packets came damaged within the last minute"
-        step = "check the cable, its shield and the baud rate"
-        yield HealthIssue("warning", f"{url}: {share}", step)
+    counts = [recent.get(name) or 0 for name in ("packets", "corrupt", "faulty")]
+    for count, happened, step in (
+        (counts[1], "came damaged", "check the cable, its shield and the baud rate"),
+        (counts[2], "broke the protocol", FIRMWARE_STEP),
+    ):
+        if count > CORRUPT_NOTED * sum(counts):
+            share = f"{count} of {sum(counts)} packets {happened} within the last minute"
+            yield HealthIssue("warning", f"{url}: {share}", step)
     timer_ms = port.get("latency_timer_ms") or 0
     if timer_ms > LATENCY_TIMER_MS:
         step = "set it to 1 ms, as the udev rule of tactomo does"

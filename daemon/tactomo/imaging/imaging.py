@@ -124,6 +124,7 @@ class Imaging:
         )
         self._kept = kept
         self._is_disputed = False  # the skin at the start was not as the reference in force has it
+        self._is_unchecked = False  # what lay on it when the reference in force was taken
         self._recorder = recorder
         self._publisher = publisher
         self._on_event = on_event
@@ -177,8 +178,10 @@ class Imaging:
                     "if something lies on it, take it off; then `tactomo tare`",
                 )
         self._is_disputed = False
+        is_first = not is_asked and self.reference is None
+        self._is_unchecked = is_first and self._kept is not None and self._kept.is_unreadable
         self.use_reference(reference, time.time_ns())
-        if self._kept is not None:
+        if self._kept is not None and not self._is_unchecked:
             self._kept.keep(reference, self.calibration.device_ids)
         return True
 
@@ -242,6 +245,8 @@ class Imaging:
         frame = self._reconstruct(volts, _saturated(dual), is_exact=mark is not None)
         if frame is not None and self._is_disputed:
             frame = self._judge_dispute(frame)
+        elif frame is not None and self._is_unchecked:
+            frame = replace(frame, flags=frame.flags | Flag.REFERENCE_DISPUTED)
         self._marks.mark(dual, timing, *self.method.effective)  # first: what was seen is recorded
         if frame is not None:
             self._contacts = len(frame.contacts)
@@ -334,7 +339,7 @@ class Imaging:
         """Take over the reference that the tracker has put in force, and tell where it refuses."""
         if tracker.reference is not None and tracker.reference is not self.reference:
             self._note_reference(tracker.reference)
-            if self._kept is not None:
+            if self._kept is not None and not self._is_unchecked:
                 self._kept.follow(tracker.reference, self.calibration.device_ids)
         if tracker.refusal and self._refusal_limit.allows():
             self._on_event(

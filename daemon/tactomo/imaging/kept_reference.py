@@ -60,11 +60,15 @@ class KeptReference:
         description: what it is made of; a reference of another one is not used.
         recorder: its thread writes, so that a stuck disk holds up nobody.
         on_event: told when it cannot be kept.
+
+    Attributes:
+        is_unreadable: whether there is one that could not be read.
     """
 
     def __init__(
         self, sensor: str, description: SensorDescription, recorder: Recorder, on_event: OnEvent
     ) -> None:
+        self.is_unreadable = False
         self._path = reference_path(sensor)
         self._description = description
         self._recorder = recorder
@@ -83,11 +87,12 @@ class KeptReference:
         except FileNotFoundError:
             return None
         except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:
-            self._tell(f"cannot read {self._path}: {getattr(error, 'strerror', None) or error}")
-            return None
+            why = f"cannot read {self._path}: {getattr(error, 'strerror', None) or error}"
         except DataError as error:
-            self._tell(str(error))
-            return None
+            why = str(error)
+        self.is_unreadable = True
+        self._tell(why)
+        return None
 
     def keep(self, reference: Reference, device_ids: Collection[str]) -> None:
         """Keep a reference that holds now."""

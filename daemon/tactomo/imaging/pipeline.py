@@ -47,6 +47,7 @@ class _SyncState(NamedTuple):
     lost: frozenset[Channel]
     resets: int
     zeroed: int
+    disordered: int
     is_skewed: bool
 
 
@@ -103,6 +104,7 @@ class Pipeline(Worker):
         self._zero_counters = zero_counters
         self._zero_limit = RateLimit(ZERO_PERIOD_S)
         self._reset_limit, self._zeroed_limit = RateLimit(), RateLimit()
+        self._disorder_limit = RateLimit()
         self._on_event = on_event
         # Scans: each port's thread counts its own; the port threads share a lock for what is
         # discarded because this thread did not come round to it for seconds.
@@ -357,7 +359,9 @@ class Pipeline(Worker):
 
     def _sync_state(self) -> _SyncState:
         sync = self.sync
-        return _SyncState(frozenset(sync.lost), sync.resets, sync.zeroed, self.skew.is_skewed)
+        return _SyncState(
+            frozenset(sync.lost), sync.resets, sync.zeroed, sync.disordered, self.skew.is_skewed
+        )
 
     def _tell_changes(self, before: _SyncState) -> None:
         now = self._sync_state()
@@ -375,6 +379,14 @@ class Pipeline(Worker):
                 "counters_zeroed",
                 "info",
                 f"the scan counter went back, the clock on; {now.zeroed} times since the start",
+            )
+        if now.disordered > before.disordered and self._disorder_limit.allows():
+            self._on_event(
+                "scans_disordered",
+                "warning",
+                f"{now.disordered} scans since the start came after their channel's next ones, and "
+                "were left out",
+                "have the firmware send each channel's scans in the order of their counter",
             )
         if now.is_skewed:
             self._bring_in_step(is_news=not before.is_skewed)

@@ -78,7 +78,7 @@ class LineProtocol(ForeignProtocol):
         if len(line) <= LONGEST_WORDS and line.isascii() and line.decode().isprintable():
             self.counts.packets += 1
         else:
-            self.counts.malformed += 1
+            self.counts.unreadable += 1
 
     def misfit(self, cause: str, next_step: str) -> None:
         """Take note of a reading that is whole, but not of the sensor described."""

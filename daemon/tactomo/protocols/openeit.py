@@ -81,7 +81,7 @@ class OpenEit(LineProtocol):
     def _frame(self, line: bytes) -> Reading | None:
         values = numbers(line)
         if values is None:
-            self.counts.malformed += 1
+            self.counts.unreadable += 1
         elif b";" in line:
             self.misfit("one frequency a line: the board is in mode b, a spectrum", ANOTHER_MODE)
         elif len(values) != self.description.measurements:

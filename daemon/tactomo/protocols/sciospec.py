@@ -235,7 +235,7 @@ class Sciospec(ForeignProtocol):
 
     def _skip(self) -> None:
         if not self._is_skipping:
-            self.counts.malformed += 1
+            self.counts.unreadable += 1
         self._is_skipping = True
 
     def _take(self, found: bytes) -> Reading | None:
@@ -250,7 +250,7 @@ class Sciospec(ForeignProtocol):
             return None
         last = next(reversed(self._parts), (-1, 0))
         if key <= last:  # the order begins again
-            self.counts.malformed += 1
+            self.counts.unreadable += 1
             if key == last and found[_TIME] == self._parts[key][_TIME]:
                 return None  # the same once more
             self._forget_frame()
@@ -265,7 +265,7 @@ class Sciospec(ForeignProtocol):
         """Return the reading of a whole frame, (drives, groups); None if it is not to be used."""
         times = parts["time"][:, 0]
         if not self._is_of_one(times) or not np.isfinite(parts["volts"]).all():
-            self.counts.malformed += 1
+            self.counts.unreadable += 1
             return None
         self._decide_clock(int(times[0]))
         differences = self._differences(parts)

@@ -140,7 +140,9 @@ class Summary:
     hellos: list[Hello] = field(default_factory=list)
     """The distinct ones, in the order in which they were heard."""
     corrupt: int = 0
-    """Frames on the ports that yielded no packet."""
+    """Frames on the ports that were damaged."""
+    faulty: int = 0
+    """Intact ones that break the protocol."""
     frames: int = 0
     """Dual scans that the daemon reconstructed while it recorded."""
     references: int = 0
@@ -287,7 +289,8 @@ def _summarise(path: Path, origin: Origin) -> Summary:
                 if not extra:
                     _count_bytes(summary, int(number), record)
                 _count_packets(summary, decoders[int(number)], record.data)
-    summary.corrupt = sum(decoder.counts.corrupt for decoder in decoders.values())
+    summary.corrupt = sum(decoder.counts.damaged for decoder in decoders.values())
+    summary.faulty = sum(decoder.counts.faulty for decoder in decoders.values())
     summary.references = len(references)
     summary.has_more = bool(stops) and _has_chunks(path, stops[0])
     return summary

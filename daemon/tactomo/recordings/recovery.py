@@ -24,6 +24,7 @@ from mcap.records import Header, Message, Metadata
 from mcap.stream_reader import StreamReader
 from tactomo_client.intact_chunks import intact_chunks
 from tactomo_client.recording_file import CHANNELS, PROFILE
+from tactomo_models.archive import part_of
 from tactomo_protocol import SCAN_COUNTERS, Channel, Scan
 
 from tactomo.errors import RecordingError
@@ -96,7 +97,7 @@ def recover(
         RecordingError: there is nothing of a recording in `damaged`, it cannot be read, or
             `output` exists or cannot be written.
     """
-    part = output.with_name(f".{output.name}.{os.getpid()}.part")
+    part = part_of(output)
     with open_file(damaged) as file:
         _refuse_existing(output)
         origin = _read_origin(damaged, file)

@@ -17,6 +17,7 @@ from typing import Any, Final
 from urllib.parse import urlsplit
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 
+from tactomo_client.web_access import names_this_computer
 from tactomo_models import Flag
 
 from tactomo.errors import AddressError, ConfigError
@@ -45,7 +46,8 @@ COUNTERS: Final = {
 PORT_COUNTERS: Final = {
     "bytes": "Bytes received.",
     "packets": "Packets received.",
-    "corrupt": "Packets that failed a check.",
+    "corrupt": "Packets that were damaged on their way.",
+    "faulty": "Intact packets that break the protocol.",
     "unused_scans": "Scans that were not used.",
 }
 SCRAPER_TIMEOUT_S: Final = 5.0
@@ -83,7 +85,7 @@ class MetricsServer(Worker):
                 f"cannot offer metrics at {endpoint}: {error.strerror or error}",
                 "stop what uses this port, or give another one as metrics",
             ) from error
-        server.set_app(self._app)
+        server.set_app(_only_for(host, self._app))
         self.address = f"http://{host}:{server.server_port}/metrics"
 
     def _close(self) -> None:
@@ -96,6 +98,18 @@ class MetricsServer(Worker):
         self._server.timeout = POLL_S
         while not self._stopping.is_set():
             self._server.handle_request()
+
+
+def _only_for(host: str, app: Any) -> Any:
+    """Return the application for those alone who name this computer: no page from elsewhere."""
+
+    def answer(environ: dict[str, Any], start: Any) -> Any:
+        if names_this_computer(environ.get("HTTP_HOST", ""), host):
+            return app(environ, start)
+        start("403 Forbidden", [("Content-Type", "text/plain")])
+        return [f"ask for {host} or localhost\n".encode()]
+
+    return answer
 
 
 class _Server(WSGIServer):

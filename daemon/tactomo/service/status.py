@@ -148,7 +148,7 @@ class Status:
 
     def _port(self, port: PortReader) -> dict[str, Any]:
         fields = port_fields(port)
-        counts = {name: fields[name] for name in ("packets", "corrupt")}
+        counts = {name: fields[name] for name in ("packets", "corrupt", "faulty")}
         return {**fields, "received_last_minute": self._ports_last_minute[port.url].rise(counts)}
 
     def _recorder_fields(self) -> dict[str, Any]:

@@ -254,6 +254,8 @@ class ScanCheck:
         same_clipped = 4  # voltages of exactly the same, largest size: beside noise, no chance
         alike = 1.01  # ratio within which they may come out the same by symmetry without noise
         top = size >= size.max() * (1 - rounding)
+        if not saturated and not size.any():  # nothing usable: alike, and at no limit
+            return None
         if not saturated and np.count_nonzero(top) < same_clipped:
             return None
         expected = self._size[top]

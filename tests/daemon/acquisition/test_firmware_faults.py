@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from daemon_bench import HELLO, VOLTS_PER_COUNT, scan
 from hostile_board import content_of, framed
+from tactomo.cli.health_issues import health_issues
 from tactomo_protocol import Acknowledge, AckStatus, Channel, SampleFormat, Scan, ScanFlag
 
 Start = Callable[..., Any]
@@ -42,10 +43,45 @@ def test_a_hello_with_a_rate_that_cannot_be_is_told_and_the_port_does_not_run(be
     def is_idle() -> bool:
         b.skin.lines[0].say(bad, scan(MAGNITUDE, 1))
         (port,) = b.ask("status")["ports"]
-        return port["state"] == "idle" and "scan_rate_hz" in port["problem"]
+        return port["state"] == "faulty" and "scan_rate_hz" in port["problem"]
 
     b.until(is_idle)
-    assert "device_idle" not in b.ask("status")["events"]["counts"]
+    status = b.ask("status")
+    assert "device_idle" not in status["events"]["counts"]
+    (port,) = status["ports"]
+    assert port["corrupt"] == 0 < port["faulty"]
+    issues = [issue for issue in health_issues(status) if port["url"] in issue.what]
+    assert len(issues) == 2  # the port's state, and the share of its packets
+    for issue in issues:
+        assert "correct the firmware" in issue.next_step
+        assert "cable" not in issue.next_step
+
+
+def test_scans_of_another_length_are_no_waiting_for_a_trigger(bench: Start) -> None:
+    b = bench()
+    b.skin.introduce()
+    short = replace(scan(MAGNITUDE, 1), samples=np.zeros(104, np.int32))
+
+    def is_faulty() -> bool:
+        b.skin.lines[0].say(short)
+        return bool(b.ask("status")["ports"][0]["state"] == "faulty")
+
+    b.until(is_faulty)
+    (issue, *_) = (i for i in health_issues(b.ask("status")) if "faulty" in i.what)
+    assert "its hello says 208" in issue.what
+    assert "trigger" not in issue.next_step
+    assert "correct the firmware" in issue.next_step
+
+
+def test_scans_in_swapped_order_are_told(bench: Start) -> None:
+    b = bench(ports=2)
+    b.tare()
+    first = b.skin.counter
+    for number in (2, 1, 4, 3):
+        for channel in Channel:
+            b.skin.line_of(channel).say(scan(channel, first + number))
+    event = b.listener.event("scans_disordered")
+    assert "in the order of their counter" in event["next_step"]
 
 
 @pytest.mark.parametrize(

@@ -220,6 +220,7 @@ def test_an_old_scan_is_no_restart_but_a_repetition_or_late(old: int, repeated: 
     told = [scan(BOTH[0], n, n, n * 50_000) for n in (7, 8, old, 9)]
     feed(sync, *told)
     assert (sync.repeated, sync.late, sync.resets, sync.zeroed) == (repeated, 1 - repeated, 0, 0)
+    assert sync.disordered == sync.late
 
 
 @pytest.mark.parametrize("jitter_ns", [0, 7_000_000])

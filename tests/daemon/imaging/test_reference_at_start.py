@@ -117,6 +117,27 @@ def test_a_damaged_file_is_told_and_does_no_harm(begin: Any) -> None:
     b.listener.event("tared")
 
 
+def test_where_nobody_can_tell_what_lay_on_the_skin_every_frame_says_so_until_a_tare(
+    begin: Any,
+) -> None:
+    once(begin)
+    for _ in range(2):  # what was taken under a load is not kept for the next start
+        reference_path("left").write_bytes(b"no archive")
+        b = begin(volts(True))
+        b.listener.event("tared")
+        frame = b.step(volts=volts(True))
+        assert "reference_disputed" in frame["flags"]
+        assert not is_known(frame)
+        b.daemon.stop()
+    assert reference_path("left").read_bytes() == b"no archive"
+    b = begin(volts(False))
+    with ThreadPoolExecutor(1) as pool:
+        answer = pool.submit(b.ask, "tare")
+        while not answer.done():
+            b.step(volts=volts(False))
+    assert b.step(volts=volts(False))["flags"] == []
+
+
 def test_a_folder_that_cannot_be_written_is_told(begin: Any) -> None:
     reference_path("left").parent.parent.mkdir(parents=True, exist_ok=True)
     reference_path("left").parent.write_text("a file where the folder should be")

@@ -10,7 +10,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-from urllib.request import urlopen
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
 
 import pytest
 from tactomo.config import load_config
@@ -40,6 +41,17 @@ def scrape(daemon: Any) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
 
 def key(name: str, **labels: str) -> tuple[str, frozenset[tuple[str, str]]]:
     return f"tactomo_{name}", frozenset(labels.items())
+
+
+def test_only_who_names_this_computer_is_answered(bench: Bench) -> None:
+    address = bench(ports=1, metrics=ANYWHERE).daemon.metrics_address
+    with urlopen(Request(address, headers={"Host": "localhost:1"}), timeout=30) as answer:
+        assert b"tactomo_" in answer.read()
+    foreign = Request(address, headers={"Host": "evil.example:80"})  # made to point here
+    with pytest.raises(HTTPError) as refused:
+        urlopen(foreign, timeout=30)
+    assert refused.value.code == 403
+    assert b"tactomo_" not in refused.value.read()
 
 
 def test_a_scrape_says_what_the_status_says(bench: Bench, tmp_path: Path) -> None:

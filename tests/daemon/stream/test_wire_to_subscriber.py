@@ -84,7 +84,7 @@ def test_the_largest_clock_goes_through_to_the_subscriber(bench: Start, late_us:
         b.skin.lines[0].say(framed(content[:8] + struct.pack("<Q", late_us) + content[16:]))
     if late_us < 2**53:
         assert b.listener.frame(b.skin.counter)["device_us"] == late_us
-    b.until(lambda: b.ask("status")["ports"][0]["corrupt"] == (0 if late_us < 2**53 else 2))
+    b.until(lambda: b.ask("status")["ports"][0]["faulty"] == (0 if late_us < 2**53 else 2))
     assert b.step()
 
 

@@ -240,6 +240,17 @@ def test_clipped_voltages_are_left_out(
     assert_found(frame, PRESS)
 
 
+def test_a_scan_without_a_number_is_not_called_clipped(
+    paper: SensorDescription, artifact: Artifact, skin: Skin
+) -> None:
+    frame = frame_of(
+        paper, artifact, skin, later=lambda scans: {n: v * math.nan for n, v in scans.items()}
+    )
+    assert Flag.SATURATED not in frame.flags
+    assert Flag.INVALID_VOLTAGE in frame.flags
+    assert Flag.NO_USABLE_SCAN in frame.flags
+
+
 @pytest.mark.parametrize("value", [0.0, 1e-3, -0.1, 1e300, 1e-310])
 def test_a_scan_of_one_value_gives_no_map(
     paper: SensorDescription, artifact: Artifact, skin: Skin, value: float

@@ -186,9 +186,9 @@ function portLine({ url, state, connected, refusal, device, bytes: received, rec
   if (state === "ended") return ["good", url, "at its end"];
   if (!connected) return ["bad", url, "not connected"];
   if (refusal) return ["bad", url, refusal];
-  const corrupt = minute?.corrupt;
-  const parts = [device?.device_id, bytes(received), corrupt ? `${corrupt} corrupt in the last minute` : ""];
-  return [corrupt ? "warn" : "good", url, parts.filter(Boolean).join(", ")];
+  const wrong = ["corrupt", "faulty"].filter((kind) => minute?.[kind])
+    .map((kind) => `${minute[kind]} ${kind} in the last minute`);
+  return [wrong.length ? "warn" : "good", url, [device?.device_id, bytes(received), ...wrong].filter(Boolean).join(", ")];
 }
 
 export function showEvent(event) {

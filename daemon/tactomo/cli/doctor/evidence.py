@@ -47,7 +47,8 @@ class Heard(NamedTuple):
 
     Attributes:
         packets: packets that came.
-        corrupt: packets that failed their check.
+        corrupt: packets that were damaged on their way.
+        faulty: intact ones that break the protocol.
         lost: dual scans that the device took and nobody received, by gaps in the counter.
         delay_ms: (n,) how much later than the promptest each scan came, by the device's clock.
         period_ms: from scan to scan on the device's clock; None where fewer than two came.
@@ -55,6 +56,7 @@ class Heard(NamedTuple):
 
     packets: int
     corrupt: int
+    faulty: int
     lost: int
     delay_ms: FloatArray
     period_ms: float | None
@@ -252,6 +254,7 @@ def _heard_of_messages(
     return Heard(
         rise("packets"),
         rise("corrupt"),
+        rise("faulty"),
         max(0, _gaps(counters) - dropped),
         delays_ms,
         _period(device_ms, counters),
@@ -353,7 +356,8 @@ def _heard_on_ports(ports: list[_PortScans]) -> Heard:
     known = [period for period in periods if period is not None]
     return Heard(
         sum(port.counts.packets for port in ports),
-        sum(port.counts.corrupt for port in ports),
+        sum(port.counts.damaged for port in ports),
+        sum(port.counts.faulty for port in ports),
         lost,
         np.concatenate(delays) if delays else np.zeros(0),
         min(known) if known else None,

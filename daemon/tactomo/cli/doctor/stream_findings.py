@@ -9,7 +9,7 @@ import numpy as np
 from tactomo_models.health.findings import Finding, Level
 
 from tactomo.cli.doctor.evidence import Evidence, Heard
-from tactomo.cli.health_issues import CORRUPT_NOTED, FLAG_ADVICE, health_issues
+from tactomo.cli.health_issues import CORRUPT_NOTED, FIRMWARE_STEP, FLAG_ADVICE, health_issues
 
 FLAG_FAULTS = frozenset(
     {"electrode_fault", "noise_high", "saturated", "channels_swapped", "reference_mismatch"}
@@ -32,8 +32,17 @@ def stream_findings(evidence: Evidence) -> list[Finding]:
 
 
 def _packets_found(heard: Heard) -> Finding:
-    total = heard.packets + heard.corrupt
-    figures = {"packets": float(heard.packets), "corrupt": float(heard.corrupt)}
+    total = heard.packets + heard.corrupt + heard.faulty
+    counts = {"packets": heard.packets, "corrupt": heard.corrupt, "faulty": heard.faulty}
+    figures = {name: float(count) for name, count in counts.items()}
+    if heard.faulty > heard.corrupt:
+        return Finding(
+            "packets",
+            Level.FAULT,
+            f"{heard.faulty} of {total} are intact and break the protocol",
+            FIRMWARE_STEP,
+            {**figures},
+        )
     if not heard.corrupt:
         return Finding("packets", Level.OK, f"{heard.packets}, none damaged", "", {**figures})
     share = heard.corrupt / total

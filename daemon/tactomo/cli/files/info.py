@@ -128,6 +128,7 @@ def _recording_facts(recording: Recording) -> dict[str, Any]:
         "scans": dict(summary.scans.items()),
         "devices": [f"{hello.device_id}, {hello.firmware}" for hello in summary.hellos],
         "corrupt packets": summary.corrupt,
+        "faulty packets": summary.faulty,
         "reconstructed frames": summary.frames,
         "references": summary.references,
         "recorded by": f"tactomo {summary.origin.version}",
