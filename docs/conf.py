@@ -20,6 +20,7 @@ include_patterns = ["*.md", "docs/**", "deploy/*.md", "clients/**.md", "firmware
 include_patterns += ["models/**.md"]
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 myst_heading_anchors = 3
+napoleon_use_ivar = True  # a list of attributes, not a heading for each
 autodoc_default_options = {"members": True, "member-order": "bysource"}
 python_maximum_signature_line_length = 88
 default_role = "code"  # `name` in docstrings
