@@ -12,9 +12,9 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import zenoh
 import zmq
@@ -27,32 +27,30 @@ from tactomo.stream.access_control import Context
 from tactomo.stream.proxy import LOOK_S, POLL_MS, Inlet, Proxy, StreamInlet, tell, waiting
 from tactomo.stream.zenoh_publication import MAX_SENSORS, Publication
 
-LOCAL: Final[Mapping[str, object]] = {
-    "mode": "peer",
-    "listen/endpoints": ["tcp/127.0.0.1:7447"],
-    "scouting/multicast/enabled": False,
-}
-"""Without a configuration of its own: Zenoh's port, for this computer alone."""
+LOCAL: Final = "tcp/127.0.0.1:7447"
+"""Without a configuration of its own: Zenoh's port, on this computer alone."""
 QUEUED: Final = 256
 """Messages on their way from Zenoh's threads."""
 MAX_KEYS: Final = 256
 """Beyond as many, all that there is is subscribed to."""
 
 
-def open_session(configuration: Path | None) -> zenoh.Session:
-    """Open a Zenoh session as a configuration file has it; without one, on this computer alone.
+def open_session(
+    configuration: Path | None, without: Literal["listen", "connect"]
+) -> zenoh.Session:
+    """Open a Zenoh session as a configuration file has it; without one, at or to `LOCAL`.
 
     Raises:
         ConfigError: the file cannot be read, or is no configuration of Zenoh.
         AddressError: an address of it cannot be listened on or connected to.
     """
     zenoh.init_log_from_env_or("error")
-    where = configuration or LOCAL["listen/endpoints"]
     try:
         if configuration is None:
             config = zenoh.Config()
-            for key, value in LOCAL.items():
-                config.insert_json5(key, json.dumps(value))
+            config.insert_json5("scouting/multicast/enabled", "false")
+            config.insert_json5("listen/endpoints", "[]")
+            config.insert_json5(f"{without}/endpoints", json.dumps([LOCAL]))
         else:
             config = zenoh.Config.from_file(str(configuration))
     except zenoh.ZError as error:
@@ -64,7 +62,7 @@ def open_session(configuration: Path | None) -> zenoh.Session:
         return zenoh.open(config)
     except zenoh.ZError as error:
         raise AddressError(
-            f"Zenoh cannot be opened as {where} asks: {_words(error)}",
+            f"Zenoh cannot be opened as {configuration or LOCAL} asks: {_words(error)}",
             "where another program listens there, give --config with a file that connects to it",
         ) from error
 
@@ -104,7 +102,7 @@ class ZenohBridge:
             AddressError, ConfigError: as `open_session` does.
             ControlError: a source's address is not one.
         """
-        self._session = open_session(self._configuration)
+        self._session = open_session(self._configuration, "listen")
         self._publication = Publication(self._session, self._robot)
         for source in self.sources:
             self._inlets.append(StreamInlet(self._context, source, self._keys, [b""]))
@@ -154,7 +152,7 @@ class ZenohProxy(Proxy):
         self._configuration = configuration
 
     def _connect(self, context: Context) -> Sequence[Inlet]:
-        return [_ZenohInlet(context, open_session(self._configuration), self._robot)]
+        return [_ZenohInlet(context, open_session(self._configuration, "connect"), self._robot)]
 
 
 class _ZenohInlet:

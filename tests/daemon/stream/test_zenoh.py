@@ -21,6 +21,7 @@ import pytest
 import zenoh
 import zmq
 from page import Page
+from tactomo.stream import zenoh_bridge
 from tactomo.stream.zenoh_publication import ENCODING, HEARTBEAT_S
 from tactomo_client import Contact, subscribe
 from tactomo_client.fake import FakeSensor
@@ -325,6 +326,23 @@ def test_a_signal_ends_it(
         assert running.process.wait(PATIENCE_S) == 0
         assert running.process.stderr is not None
         assert "Traceback" not in running.process.stderr.read()
+
+
+def test_without_a_configuration_the_two_meet_on_this_computer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        local = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    monkeypatch.setattr(zenoh_bridge, "LOCAL", local)
+    with (
+        zenoh_bridge.open_session(None, "connect") as desk,  # whichever comes first
+        zenoh_bridge.open_session(None, "listen") as robot,
+    ):
+        heard: list[bytes] = []
+        desk.declare_subscriber(
+            "tactomo/**", lambda sample: heard.append(sample.payload.to_bytes())
+        )
+        wait_until(lambda: heard, meanwhile=lambda: robot.put("tactomo/a/b", b"1"), step_s=0.05)
 
 
 def certificates(folder: Path, *names: str) -> None:

@@ -43,7 +43,7 @@ def zenoh(
         Path | None,
         typer.Option(
             help="Zenoh's configuration (JSON5): addresses, TLS, access control. "
-            "[tcp/127.0.0.1:7447, this computer alone]"
+            "[tcp/127.0.0.1:7447: --from listens there, --bind connects to it]"
         ),
     ] = None,
     keys: KeysFolder = None,
