@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tomllib
 import zipfile
 from importlib.metadata import Distribution, distribution
 from pathlib import Path
@@ -93,6 +94,15 @@ def test_each_wheel_carries_its_licence(wheels: dict[str, Path]) -> None:
     assert wheels.keys() >= {"tactomo", "tactomo_client", "tactomo_lab"}
     for path in wheels.values():
         assert [name for name in zipfile.ZipFile(path).namelist() if name.endswith("/LICENSE")]
+
+
+def test_each_package_is_in_the_wheel(wheels: dict[str, Path]) -> None:
+    project = tomllib.loads((repository() / "pyproject.toml").read_text("utf-8"))
+    packages = project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]
+    names = zipfile.ZipFile(wheels["tactomo"]).namelist()
+    assert {path.rpartition("/")[2] for path in packages} == {
+        name.partition("/")[0] for name in names if ".dist-info/" not in name
+    }
 
 
 def test_the_demo_is_read_by_an_environment_of_the_client_alone(
