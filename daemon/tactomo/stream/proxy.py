@@ -15,7 +15,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from typing import Final, Protocol
+from typing import Final
 
 import structlog
 import zmq
@@ -44,24 +44,51 @@ MAX_TOPIC_BYTES: Final = 128
 log = structlog.get_logger()
 
 
-class Proxy:
-    """Passes on the streams of several daemons; `open` it, `run` it until `stop`, `close` it.
+class Relay:
+    """Passes messages on from sources; `open` it, `run` it until `stop`, `close` it.
+
+    Attributes:
+        address: where it is bound, once open; empty where nowhere.
+        sources: where messages come from.
+    """
+
+    def __init__(self, sources: Sequence[str]) -> None:
+        self.address = ""
+        self.sources = sources
+        self._stopping = threading.Event()
+        self._context: Context = zmq.Context()
+        self._inlets: list[Inlet] = []
+
+    def open(self) -> None:
+        """Open what it passes messages by."""
+        raise NotImplementedError
+
+    def run(self) -> None:
+        """Pass messages on until `stop`."""
+        raise NotImplementedError
+
+    def stop(self) -> None:
+        """Have `run` return; from any thread or a signal's handler."""
+        self._stopping.set()
+
+    def close(self) -> None:
+        """Close everything, whatever `open` came to."""
+        for inlet in self._inlets:
+            inlet.close()
+        self._context.term()
+
+
+class Proxy(Relay):
+    """Passes on the streams of several daemons.
 
     Args:
         sources: the daemons' stream addresses.
         endpoint: where to bind; no other computer may reach it.
-
-    Attributes:
-        address: where it is bound, once open.
     """
 
     def __init__(self, sources: Sequence[str], endpoint: str) -> None:
-        self.address = ""
-        self.sources = sources
+        super().__init__(sources)
         self._endpoint = endpoint
-        self._stopping = threading.Event()
-        self._context: Context = zmq.Context()
-        self._inlets: Sequence[Inlet] = ()
         self._sensors: dict[bytes, tuple[str, float]] = {}  # who sent it last, and when
         self._statuses: dict[bytes, tuple[bytes, float]] = {}
         self._look_at_s = 0.0
@@ -79,10 +106,11 @@ class Proxy:
         self._outlet.setsockopt(zmq.SNDHWM, QUEUED_PER_SUBSCRIBER)
         self._readers = Subscribers(self._outlet, self._endpoint, STREAM, tell, None, "--bind")
         self.address = self._readers.address
-        self._inlets = self._connect(self._context)
+        for source in self.sources:
+            self._inlets.append(self._connect(source))
 
-    def _connect(self, context: Context) -> Sequence[Inlet]:
-        return [StreamInlet(context, source) for source in self.sources]
+    def _connect(self, source: str) -> Inlet:
+        return StreamInlet(self._context, source)
 
     def run(self) -> None:
         """Pass messages on until `stop`."""
@@ -100,18 +128,12 @@ class Proxy:
             self._readers.peers.check()
             self._look_after()
 
-    def stop(self) -> None:
-        """Have `run` return; from any thread or a signal's handler."""
-        self._stopping.set()
-
     def close(self) -> None:
         """Close everything, whatever `open` came to."""
-        for inlet in self._inlets:
-            inlet.close()
         if self.address:
             self._readers.close()
             self._outlet.close(LINGER_MS)
-        self._context.term()
+        super().close()
 
     def _pass_subscriptions(self) -> None:
         """Ask the sources for what the first one asks for here, and no more for what none does."""
@@ -164,7 +186,7 @@ class Proxy:
             inlet.knock_again()
 
 
-class Inlet(Protocol):
+class Inlet:
     """Where messages come from.
 
     Attributes:
@@ -177,15 +199,17 @@ class Inlet(Protocol):
 
     def ask(self, more: set[bytes], less: set[bytes]) -> None:
         """Subscribe to some prefixes, and no more to others."""
+        raise NotImplementedError
 
     def knock_again(self) -> None:
         """Look after the connection, every second."""
 
     def close(self) -> None:
         """Close the connection."""
+        raise NotImplementedError
 
 
-class StreamInlet:
+class StreamInlet(Inlet):
     """The connection to one daemon's stream."""
 
     def __init__(
@@ -248,39 +272,20 @@ def waiting(socket: zmq.Socket[bytes]) -> Iterator[bytes]:
             return
 
 
-class Server(Protocol):
-    """What `serve` runs."""
-
-    address: str
-    sources: Sequence[str]
-
-    def open(self) -> None:
-        """Open what it serves by."""
-
-    def run(self) -> None:
-        """Serve until `stop`."""
-
-    def stop(self) -> None:
-        """Have `run` return; from any thread or a signal's handler."""
-
-    def close(self) -> None:
-        """Close everything, whatever `open` came to."""
-
-
-def serve(server: Server) -> None:
-    """Open a proxy or bridge, serve until SIGTERM or SIGINT, and close it; for the main thread.
+def serve(relay: Relay) -> None:
+    """Open a relay, serve until SIGTERM or SIGINT, and close it; for the main thread.
 
     Raises what its `open` raises.
     """
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: server.stop())
+        signal.signal(number, lambda *_: relay.stop())
     allow_connections()
     try:
-        server.open()
-        log.info("ready", stream=server.address or None, sources=list(server.sources))
-        server.run()
+        relay.open()
+        log.info("ready", stream=relay.address or None, sources=list(relay.sources))
+        relay.run()
     finally:
-        server.close()
+        relay.close()
     log.info("stopped")
 
 

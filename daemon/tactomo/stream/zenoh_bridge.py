@@ -24,7 +24,7 @@ from tactomo_client.messages import KINDS, STATUS, check_sensor_name
 from tactomo.errors import AddressError, ConfigError
 from tactomo.events import RateLimit
 from tactomo.stream.access_control import Context
-from tactomo.stream.proxy import LOOK_S, POLL_MS, Inlet, Proxy, StreamInlet, tell, waiting
+from tactomo.stream.proxy import LOOK_S, POLL_MS, Inlet, Proxy, Relay, StreamInlet, tell, waiting
 from tactomo.stream.zenoh_publication import MAX_SENSORS, Publication
 
 LOCAL: Final = "tcp/127.0.0.1:7447"
@@ -67,8 +67,8 @@ def open_session(
         ) from error
 
 
-class ZenohBridge:
-    """Publishes daemons' streams in Zenoh; `open` it, `run` it until `stop`, `close` it.
+class ZenohBridge(Relay):
+    """Publishes daemons' streams in Zenoh.
 
     Args:
         sources: addresses of the streams.
@@ -77,8 +77,6 @@ class ZenohBridge:
         keys: this bridge's own, for sources that want some.
     """
 
-    address = ""
-
     def __init__(
         self,
         sources: Sequence[str],
@@ -86,14 +84,11 @@ class ZenohBridge:
         configuration: Path | None = None,
         keys: Keys | None = None,
     ) -> None:
-        self.sources = sources
+        super().__init__(sources)
         self._robot = robot
         self._configuration = configuration
         self._keys = keys
-        self._stopping = threading.Event()
-        self._context: Context = zmq.Context()
         self._session: zenoh.Session | None = None
-        self._inlets: list[StreamInlet] = []
 
     def open(self) -> None:
         """Open Zenoh, and connect to the sources, whether or not they are there.
@@ -124,17 +119,11 @@ class ZenohBridge:
                 for inlet in self._inlets:
                     inlet.knock_again()
 
-    def stop(self) -> None:
-        """Have `run` return; from any thread or a signal's handler."""
-        self._stopping.set()
-
     def close(self) -> None:
         """Close everything, whatever `open` came to."""
-        for inlet in self._inlets:
-            inlet.close()
+        super().close()
         if self._session is not None:
             self._session.close()  # type: ignore[no-untyped-call]
-        self._context.term()
 
 
 class ZenohProxy(Proxy):
@@ -148,18 +137,17 @@ class ZenohProxy(Proxy):
 
     def __init__(self, robot: str, endpoint: str, configuration: Path | None = None) -> None:
         super().__init__([f"tactomo/{robot}"], endpoint)
-        self._robot = robot
         self._configuration = configuration
 
-    def _connect(self, context: Context) -> Sequence[Inlet]:
-        return [_ZenohInlet(context, open_session(self._configuration, "connect"), self._robot)]
+    def _connect(self, source: str) -> Inlet:
+        return _ZenohInlet(self._context, open_session(self._configuration, "connect"), source)
 
 
-class _ZenohInlet:
+class _ZenohInlet(Inlet):
     """Zenoh as a proxy's source, owned by the proxy's thread but where said otherwise."""
 
-    def __init__(self, context: Context, session: zenoh.Session, robot: str) -> None:
-        self.address = f"tactomo/{robot}"
+    def __init__(self, context: Context, session: zenoh.Session, address: str) -> None:
+        self.address = address
         self.socket: zmq.Socket[bytes] = context.socket(zmq.PULL)
         self._arriving: zmq.Socket[bytes] = context.socket(zmq.PUSH)
         for socket in (self.socket, self._arriving):
@@ -171,10 +159,11 @@ class _ZenohInlet:
         self._subscribers: dict[str, Any] = {}
         self._lock = threading.Lock()  # of what follows, and of `_arriving`
         self._counts: dict[str, int] = {}
+        self._robots: dict[str, str] = {}  # whose skin each is here
         self._lost = 0
-        self._loss_limit = RateLimit()
+        self._loss_limit, self._name_limit = RateLimit(), RateLimit()
         self._tokens = session.liveliness().declare_subscriber(
-            f"{self.address}/*", _tell_presence, history=True
+            f"{self.address}/*", self._tell_presence, history=True
         )
 
     def ask(self, more: set[bytes], less: set[bytes]) -> None:
@@ -213,19 +202,31 @@ class _ZenohInlet:
                 tell("messages_lost", "warning", f"{self._lost} so far, of {key} the last")
         self._arrive(sample)
 
+    def _tell_presence(self, sample: zenoh.Sample) -> None:
+        """Tell that a skin came or went, and whose name is free again; in Zenoh's thread."""
+        came = sample.kind == zenoh.SampleKind.PUT
+        tell("skin_came" if came else "skin_gone", "info", str(sample.key_expr))
+        _, robot, sensor = str(sample.key_expr).split("/")
+        with self._lock:
+            if not came and self._robots.get(sensor) == robot:
+                del self._robots[sensor]
+
     def _arrive(self, sample: zenoh.Sample) -> None:
-        _, _, sensor, kind = str(sample.key_expr).split("/")
+        _, robot, sensor, kind = str(sample.key_expr).split("/")
         data = f"{sensor}/{kind}".encode() + b"\0" + sample.payload.to_bytes()
         with self._lock:
             if self._arriving.closed:
+                return
+            if (other := self._robots.setdefault(sensor, robot)) != robot:
+                if self._name_limit.allows():
+                    detail = f"{robot} and {other} both have a skin {sensor!r}"
+                    next_step = f"--robot {robot} serves the one that is left out"
+                    tell("same_sensor_twice", "warning", detail, next_step)
                 return
             try:
                 self._arriving.send(data, zmq.DONTWAIT)
             except zmq.Again:
                 self._lost += 1
-
-    def knock_again(self) -> None:
-        """Do nothing: Zenoh connects anew by itself."""
 
     def close(self) -> None:
         """Close the session, then the sockets."""
@@ -254,11 +255,6 @@ def _count(sample: zenoh.Sample) -> int:
         return int(sample.attachment.to_string()) if sample.attachment else 0
     except ValueError:
         return 0
-
-
-def _tell_presence(sample: zenoh.Sample) -> None:
-    came = sample.kind == zenoh.SampleKind.PUT
-    tell("skin_came" if came else "skin_gone", "info", str(sample.key_expr))
 
 
 def _words(error: zenoh.ZError) -> str:

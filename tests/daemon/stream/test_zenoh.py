@@ -286,6 +286,26 @@ def test_what_is_lost_is_counted_and_told(
     assert running.said("messages_lost")["detail"].startswith("3 so far")
 
 
+def test_two_robots_skins_of_one_name_are_not_mixed(
+    desk: zenoh.Session, start: Callable[..., Running], reader: Any, left: FakeSensor
+) -> None:
+    running = start(bind="tcp://127.0.0.1:0")
+    one = reader(running.address, topic("left", "contacts"))
+    start(left, robot="arm")
+    first = next_of(one, lambda: left.publish(TOUCH)).fields["session"]
+    with FakeSensor("left") as other:
+        start(other, robot="leg")
+        samples = Samples(desk, "tactomo/leg/left/contacts")
+        samples.until(lambda: len(samples.all) > 5, lambda: other.publish(TOUCH))
+        warning = running.said("same_sensor_twice")
+        assert warning["detail"] == "leg and arm both have a skin 'left'"
+        assert "--robot leg" in warning["next_step"]
+        while one.poll(0):
+            assert decode_message(one.recv()).fields["session"] == first
+        left.close()
+        wait_until(lambda: next_of(one, lambda: other.publish(TOUCH)).fields["session"] != first)
+
+
 def test_a_daemon_may_come_and_go(
     left: FakeSensor, start: Callable[..., Running], desk: zenoh.Session
 ) -> None:
@@ -455,6 +475,11 @@ def test_the_pages_program_prints_touches_and_who_is_there(
         (["--bind", "udp://x"], 2, "use tcp://127.0.0.1:PORT"),
         (["--from", "ipc:///tmp/none", "--robot", "a/b"], 2, "'a/b' is not a sensor name"),
         (["--bind", "ipc:///tmp/x", "--config", "/none.json5"], 1, "No such file or directory"),
+        (
+            ["--config", "LOCAL", "--from", "ipc:///tmp/a", "--from", "x"],
+            1,
+            "cannot connect to 'x'",
+        ),
         (["--bind", "tcp://0.0.0.0:5570", "--config", "LOCAL"], 1, "reached from other computers"),
         (["--bind", "ipc:///tmp/x", "--config", "BAD"], 1, "unknown field `mod`"),
         (["--bind", "ipc:///tmp/x", "--config", "BUSY"], 1, "Zenoh cannot be opened"),
