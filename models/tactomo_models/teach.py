@@ -1,8 +1,8 @@
 """Teach a skin: learn from presses at known places what the physics gets wrong on this very skin.
 
-Presses are reconstructed, each from a cold start. What is learnt from the first three quarters is
-judged on the last one, in order of time; what locates that no better than the physics alone is not
-kept. Presses that the others contradict, and coordinates in another unit or frame, are named.
+Presses are reconstructed, each from a cold start. Each quarter of them, in order of time, is judged
+by what the others teach; what locates no better than the physics alone is not kept. Presses that
+the others contradict, and coordinates in another unit or frame, are named.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from tactomo_models.scans.reference import Reference
 from tactomo_models.sensor.description import SensorDescription
 
 MIN_PRESSES: Final = 20
-"""Of which five are judged on; fewer would tell no improvement from chance."""
+"""Fifteen to learn from where five are judged; fewer tell no improvement from chance."""
 HELD_OUT: Final = 4
-"""One in so many presses, the last, is judged on."""
+"""Parts, in order of time, each judged by what the others teach."""
 ODD: Final = 10.0
 """Median errors from which the other presses contradict a press. Of five measured skins the worst
 of 800 good presses is 8.9 medians off, and of those with x and y swapped four in five are above."""
@@ -273,25 +273,26 @@ def _odd(
 
 def _best(changes: FloatArray, xy_mm: FloatArray, guess_mm: FloatArray) -> tuple[str, float, float]:
     """What locates held-out presses best, and the median errors without and with it, mm."""
-    train = len(xy_mm) - len(xy_mm) // HELD_OUT
-    places = {
-        "voltages": PressRegression(changes[:train], xy_mm[:train]).locate(changes[train:]),
-        "corrected": PressRegression(changes[:train], xy_mm[:train], guess_mm[:train]).locate(
-            changes[train:], guess_mm[train:]
-        ),
-    }
+    places = {"voltages": np.empty_like(xy_mm), "corrected": np.empty_like(xy_mm)}
+    part = np.arange(len(xy_mm)) * HELD_OUT // len(xy_mm)
+    for k in range(HELD_OUT):
+        out, rest = part == k, part != k
+        alone = PressRegression(changes[rest], xy_mm[rest])
+        places["voltages"][out] = alone.locate(changes[out]).xy_mm
+        corrected = PressRegression(changes[rest], xy_mm[rest], guess_mm[rest])
+        places["corrected"][out] = corrected.locate(changes[out], guess_mm[out]).xy_mm
 
     def errors_mm(found_mm: FloatArray) -> FloatArray:
-        return np.asarray(np.linalg.norm(found_mm - xy_mm[train:], axis=1))
+        return np.asarray(np.linalg.norm(found_mm - xy_mm, axis=1))
 
-    errors = {name: errors_mm(found.xy_mm) for name, found in places.items()}
-    physics = errors_mm(guess_mm[train:])
+    errors = {name: errors_mm(found_mm) for name, found_mm in places.items()}
+    physics = errors_mm(guess_mm)
     best = min(errors, key=lambda name: float(np.median(errors[name])))
     without_mm, with_mm = float(np.median(physics)), float(np.median(errors[best]))
     if with_mm >= without_mm or errors[best].mean() >= physics.mean():
         raise CalibrationError(
-            f"nothing is kept: on the last {len(physics)} presses what was learnt is "
-            f"{with_mm:.2f} mm off (median), and the physics alone {without_mm:.2f} mm; give more "
-            "presses, spread over the skin"
+            f"nothing is kept: of {len(physics)} presses, each quarter judged by what the others "
+            f"teach, places are {with_mm:.2f} mm off (median), and the physics alone is "
+            f"{without_mm:.2f} mm off; give more presses, spread over the skin"
         )
     return best, without_mm, with_mm

@@ -32,8 +32,8 @@ app = typer_app(
     help=(
         "Learn from presses at known places what the physics gets wrong on this very skin.\n\n"
         "With a robot, a plotter or a template, press 20 to 800 known places, spread over the "
-        "skin, one at a time. What is learnt from the first three quarters is judged on the rest, "
-        "and kept only where it locates them better than the physics alone. From then on each "
+        "skin, one at a time. Each quarter is judged by what the others teach, and that is kept "
+        "only where it locates better than the physics alone. From then on each "
         "single contact says whether what was taught places it; a press unlike all that were "
         "taught is flagged `untaught`.\n\n"
         "It is kept by the sensor's name and devices, and used at once by the sensor's daemon if "
@@ -78,7 +78,7 @@ def live(
 ) -> None:
     """Be guided, press by press, with the running daemon.
 
-    Says where to press, takes the scans of a second while it is held, and learns at the end. Each
+    Says where to press, listens for a second while it is held, and learns at the end. Each
     press is kept at once; the same command goes on from there.
     """
     from tactomo.cli.calibrate.teach_live import guided

@@ -14,7 +14,7 @@ from tactomo_client import Keys
 from tactomo_models.archive import read_arrays, write_arrays
 from tactomo_models.arrays import FloatArray
 from tactomo_models.calibration.calibration_file import Subject
-from tactomo_models.scans.plausibility import DISTRUST
+from tactomo_models.scans.plausibility import Flag
 from tactomo_models.sensor.description import SensorDescription
 
 from tactomo.cli.doctor.evidence import Evidence, of_daemon
@@ -25,9 +25,11 @@ if TYPE_CHECKING:
 
 REST_S: Final = 2.0
 HOLD_S: Final = 1.0
-"""For how long scans are averaged: of 20 a second, noise falls to a quarter."""
+"""For how long a press is to be held still."""
 STILL_SHARE: Final = 0.05
 """Of the press's change, by which it may differ from the first half to the second."""
+DISTURBED: Final = Flag.NOISE_HIGH | Flag.CHANNELS_SWAPPED | Flag.CHANNELS_SKEWED
+"""What makes scans worthless; what the physics explains badly is what is to be taught."""
 INSIDE: Final = 0.85
 """Share of the sensing area's width that places are suggested in: an indenter has a width, too."""
 GOLDEN: Final = 1.32471795724475
@@ -45,11 +47,13 @@ def guided(
     """
     from rich.console import Console
 
-    return _Session(sensor, stream, keys, description, file, Console(highlight=False)).run()
+    return _Session(
+        sensor, stream, keys, description, file, Console(highlight=False, soft_wrap=True)
+    ).run()
 
 
 class _Session:
-    """Asks, averages, and keeps."""
+    """Asks, listens, and keeps."""
 
     def __init__(
         self,
@@ -83,7 +87,7 @@ class _Session:
         )
         try:
             while self._take_one(description):
-                say(f"{self._count} presses are kept in {self._file}")
+                say(f"presses kept in {self._file}: {self._count}")
         except (KeyboardInterrupt, EOFError):
             say("\nstopped")
         return description, self._subject
@@ -133,8 +137,9 @@ class _Session:
         if why := self._why_not(heard):
             self._console.print(f"not taken: {why}")
             return True
-        means = {name: scans.mean(axis=0) for name, scans in heard.scans.items()}
-        self._keep(slice(None), {**means, "xy_mm": np.array([x_mm, y_mm])})
+        # One scan, not their mean: what is learnt is to hold for scans as noisy as they come.
+        last = {name: scans[-1] for name, scans in heard.scans.items()}
+        self._keep(slice(None), {**last, "xy_mm": np.array([x_mm, y_mm])})
         return True
 
     def _heard(self, seconds: float) -> Evidence:
@@ -145,7 +150,7 @@ class _Session:
 
     def _why_not(self, heard: Evidence) -> str:
         """Why what was heard is no press; empty where it is one."""
-        flags = sorted(heard.flags.keys() & set(DISTRUST.names()))
+        flags = sorted(heard.flags.keys() & set(DISTURBED.names()))
         if flags:
             return f"not to be trusted: {', '.join(flags)}; `tactomo tare` unpressed"
         if heard.pressed < heard.frames or not heard.frames:
@@ -153,10 +158,11 @@ class _Session:
         for name, scans in heard.scans.items():
             if f"{name}_reference" not in self._arrays:
                 return f"the {name} channel was missing when the skin was taken at rest; begin anew"
-            half = len(scans) // 2
+            before, after = np.array_split(scans, 2)
             change = np.linalg.norm(scans.mean(axis=0) - self._arrays[f"{name}_reference"])
-            moved = np.linalg.norm(scans[half:].mean(axis=0) - scans[:half].mean(axis=0))
-            if moved > STILL_SHARE * change:
+            moved = np.linalg.norm(after.mean(axis=0) - before.mean(axis=0))
+            noise = np.sqrt(2 * before.var(axis=0).sum() / max(len(before) - 1, 1))
+            if moved > STILL_SHARE * change + 2 * noise:
                 return "it moved: hold it still for a second"
         return ""
 
