@@ -24,7 +24,6 @@ from tactomo_models import (
     load_description,
     load_or_build_artifact,
 )
-from tactomo_protocol import Channel
 from waiting import PATIENCE_S, wait_until
 
 NAMES = ("left", "right")
@@ -100,8 +99,7 @@ class Robot:
 def rest() -> Volts:
     description = load_description("paper_square")
     load_or_build_artifact(description)
-    volts = SkinSimulator(description, 4e-3).voltages(())
-    return {Channel[name.upper()]: values for name, values in volts.items()}
+    return SkinSimulator(description, 4e-3).voltages(())
 
 
 @pytest.fixture
@@ -122,8 +120,7 @@ def pressed(description: SensorDescription) -> list[Volts]:
     skin = SkinSimulator(description, 4e-3)
     angles = [5 * 2 * np.pi * step / STEPS for step in range(STEPS)]
     places = [(0.035 * float(np.cos(a)), 0.035 * float(np.sin(a))) for a in angles]
-    scenes = [skin.voltages((Press(x, y, 180.0), Press(-x, -y, 170.0))) for x, y in places]
-    return [{Channel[k.upper()]: v for k, v in scene.items()} for scene in scenes]
+    return [skin.voltages((Press(x, y, 180.0), Press(-x, -y, 170.0))) for x, y in places]
 
 
 def shared_mb(pid: int) -> float:

@@ -28,6 +28,11 @@ class Heard:
         return float((self.arrived_ns - self.fields["acquired_monotonic_ns"]) * 1e-6)
 
     @property
+    def read_age_ms(self) -> float:
+        """How long before publication their last byte was read."""
+        return float((self.fields["age_ns"] - (self.fields["delay_ns"] or 0)) * 1e-6)
+
+    @property
     def published_age_ms(self) -> float:
         """How old they were when they were published."""
         return float(self.fields["age_ns"] * 1e-6)

@@ -25,6 +25,8 @@ VOLTS_PER_COUNT = 2e-8
 NOISE_COUNTS = 60.0
 """What a good converter has: 60 dB below the largest voltages' rms, about."""
 PATH_STEPS = 60
+SLIDE_M, SLIDE_M_S = 0.09, 0.1
+"""A finger that strokes: 10 cm/s."""
 PATIENCE_S = 60.0
 
 Volts = Mapping[Channel, FloatArray]
@@ -40,16 +42,23 @@ class Scenes:
     """
 
     def __init__(self, description: SensorDescription) -> None:
-        skin = SkinSimulator(description, 4e-3, unevenness=0.03, impedance_spread=0.1)
+        skin = self._skin = SkinSimulator(description, 4e-3, unevenness=0.03, impedance_spread=0.1)
 
         def volts(*presses: Press) -> Volts:
-            return {Channel[k.upper()]: v for k, v in skin.voltages(presses).items()}
+            return skin.voltages(presses)
 
         angles = np.linspace(0, 2 * np.pi, PATH_STEPS, endpoint=False)
         circle = [(0.035 * float(np.cos(a)), 0.035 * float(np.sin(a))) for a in angles]
         self.rest = volts()
         self.one = [volts(Press(x, y, 180.0)) for x, y in circle]
         self.two = [volts(Press(x, y, 180.0), Press(-x, -y, 170.0)) for x, y in circle]
+
+    def sliding(self, rate_hz: float) -> list[Volts]:
+        """One contact that slides to and fro at SLIDE_M_S, at so many scans a second."""
+        steps = round(SLIDE_M / SLIDE_M_S * rate_hz)
+        to = [Press(x, 0.01, 180.0) for x in np.linspace(-SLIDE_M / 2, SLIDE_M / 2, steps)]
+        path = [self._skin.voltages((press,)) for press in to]
+        return [*path, *path[-2:0:-1]]
 
 
 class PtySkin:

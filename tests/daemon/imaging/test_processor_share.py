@@ -27,7 +27,7 @@ class Computer:
 
 
 def test_time_is_halved_while_others_take_the_processor_and_scans_are_left_out() -> None:
-    assert Computer().run(0.4, 10.0, drops=True) == [1 / 2, 1 / 4, 1 / 8, LEAST]
+    assert Computer().run(0.4, 10.0, drops=True) == [1 / 2, 1 / 4, LEAST]
 
 
 def test_a_busy_processor_alone_takes_no_time_nor_do_lost_scans_alone() -> None:
