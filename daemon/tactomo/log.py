@@ -42,7 +42,8 @@ def configure_logging(level: LogLevel = "info", form: LogFormat = "auto", sensor
     structlog.configure(
         processors=[structlog.processors.add_log_level, name_sensor, *_renderers(form)],
         wrapper_class=structlog.make_filtering_bound_logger(logging.getLevelName(level.upper())),
-        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+        # A line is one write: several processes may share the log.
+        logger_factory=structlog.WriteLoggerFactory(sys.stderr),
         cache_logger_on_first_use=False,
     )
 

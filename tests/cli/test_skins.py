@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 from daemon_process import DaemonProcess
 from processes import children_of, is_running
-from pty_skin import Playing, PtySkin, Volts, moving, still
-from tactomo_client import request, subscribe
+from pty_skin import Volts, moving, still
+from robot import Robot
+from tactomo_client import subscribe
 from tactomo_models import (
     Press,
     SensorDescription,
@@ -33,68 +34,6 @@ SHARED_MB = 50.0
 """Libraries alone are more; a process that shares nothing but its programs' files has 0."""
 
 
-class Robot:
-    """Skins that rest, and the command that serves them."""
-
-    def __init__(
-        self, folder: Path, rest: Volts, names: tuple[str, ...] = NAMES, **config: Any
-    ) -> None:
-        description = load_description("paper_square")
-        self.skins = {name: PtySkin(folder / f"lines-{name}", description, 1) for name in names}
-        self.playing: dict[str, Playing] = {}
-        for name in names:
-            self.play(name, still(rest), 20.0)
-        self.stream = {name: f"ipc://{folder}/{name}.stream" for name in names}
-        self.process = DaemonProcess(
-            folder,
-            [],
-            ready=False,
-            skins={
-                name: {"ports": skin.paths, "stream": self.stream[name]}
-                for name, skin in self.skins.items()
-            },
-            **config,
-        )
-
-    def play(self, name: str, volts: Iterator[Volts], rate_hz: float) -> None:
-        """Have a skin say scans from now on."""
-        self.playing[name] = Playing(self.skins[name], volts, rate_hz)
-
-    def stop_and_count(self, name: str) -> int:
-        """Have a skin say nothing more, and return how many scans its daemon has received."""
-        self.playing[name].stop()
-        received = [-1]
-
-        def is_at_rest(status: dict[str, Any]) -> bool:
-            received.append(status["scan_tally"]["received"])
-            return received[-1] == received[-2] and not status["scan_tally"]["waiting"]
-
-        self.wait(name, is_at_rest)
-        return received[-1]
-
-    def wait_ready(self) -> None:
-        wait_until(lambda: self.process.told("all_ready"), "all skins")
-
-    def ready(self, name: str) -> list[dict[str, Any]]:
-        """What the daemon of a skin said each time that it was ready."""
-        return [event for event in self.process.told("ready") if event.get("sensor") == name]
-
-    def status(self, name: str) -> dict[str, Any]:
-        """The status of a skin, from its own control socket."""
-        return request("status", self.ready(name)[-1]["control"], PATIENCE_S)
-
-    def wait(self, name: str, condition: Callable[[dict[str, Any]], Any]) -> None:
-        """Wait for a status of a skin."""
-        wait_until(lambda: condition(self.status(name)), f"a status of {name}", step_s=0.2)
-
-    def close(self) -> None:
-        self.process.kill()
-        for playing in self.playing.values():
-            playing.stop()
-        for skin in self.skins.values():
-            skin.close()
-
-
 @pytest.fixture(scope="session")
 def rest() -> Volts:
     description = load_description("paper_square")
@@ -107,7 +46,7 @@ def start(tmp_path: Path, rest: Volts) -> Iterator[Callable[..., Robot]]:
     robots: list[Robot] = []
 
     def begin(**config: Any) -> Robot:
-        robots.append(Robot(tmp_path, rest, **config))
+        robots.append(Robot(tmp_path, rest, config.pop("names", NAMES), **config))
         return robots[-1]
 
     yield begin

@@ -1,10 +1,10 @@
 """How much of its time a frame is left where others take the processor.
 
-Where scans are left out because this thread did not get the processor that it asked for, frames
-get half of their time, then a quarter, and so on, and twice as much again when none has been left
-out for a while. Every skin of a busy computer does so; that each gets a fair share of the processor
-is the system's scheduler's work. What one skin asks for with a processor of its own is the budget's
-business.
+Where many scans are left out because this thread did not get the processor that it asked for,
+frames get half of their time, then a quarter, and so on, and twice as much again when few have been
+left out for a while. Every skin of a busy computer does so; that each gets a fair share of the
+processor is the system's scheduler's work. What one skin asks for with a processor of its own is
+the budget's business.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ than 0.9."""
 WINDOW_S: Final = 0.5
 """Computing over which the share is averaged: ten frames of 50 ms at half a core take one."""
 LOOK_S: Final = 1.0
+MANY: Final = 1 / 3
+"""Scans left out for each frame: a contact that lands costs three of twenty by itself."""
 LEAST: Final = 1 / 8
 """Of the usual 50 ms: the network (correlation 0.97) fits in; a linear map (0.67) saves little."""
 HOLD_S: Final = 5.0
@@ -36,7 +38,7 @@ class ProcessorShare:
     def __init__(self) -> None:
         self.of_core = self.of_time = 1.0
         self._cpu_s = self._wall_s = 0.0
-        self._dropped = 0
+        self._dropped = self._frames = 0
         self._noted_s = self._looked_s = self._changed_s = self._raised_s = float("-inf")
         self._hold_s = HOLD_S
 
@@ -50,15 +52,16 @@ class ProcessorShare:
             now_s: monotonic seconds.
         """
         if now_s - self._noted_s > LOOK_S:  # what was left out while nothing pressed
-            self._dropped, self._looked_s = dropped, now_s
+            self._dropped, self._frames, self._looked_s = dropped, 0, now_s
         self._noted_s = now_s
+        self._frames += 1
         kept = max(0.0, 1 - wall_s / WINDOW_S)
         self._cpu_s, self._wall_s = kept * self._cpu_s + cpu_s, kept * self._wall_s + wall_s
         self.of_core = min(1.0, self._cpu_s / self._wall_s) if self._wall_s else 1.0
         if now_s - self._looked_s < LOOK_S:
             return False
-        is_late = dropped > self._dropped
-        self._dropped, self._looked_s = dropped, now_s
+        is_late = dropped - self._dropped > MANY * self._frames
+        self._dropped, self._frames, self._looked_s = dropped, 0, now_s
         before = self.of_time
         if is_late and self.of_core < TAKEN:
             self.of_time = max(LEAST, before / 2)

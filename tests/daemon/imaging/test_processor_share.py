@@ -35,6 +35,13 @@ def test_a_busy_processor_alone_takes_no_time_nor_do_lost_scans_alone() -> None:
     assert Computer().run(0.95, 10.0, drops=True) == []
 
 
+def test_what_a_landing_contact_costs_by_itself_takes_no_time() -> None:
+    computer = Computer()
+    for _ in range(10):
+        assert computer.run(0.4, 0.15, drops=True) == []
+        assert computer.run(0.4, 0.85, drops=False) == []
+
+
 def test_time_comes_back_when_nothing_has_been_left_out_for_a_while() -> None:
     computer = Computer()
     computer.run(0.4, 2.2, drops=True)

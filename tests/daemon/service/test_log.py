@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
@@ -56,6 +58,20 @@ def test_each_line_of_a_traceback_has_the_priority(written: io.StringIO) -> None
 
 
 ADDRESSES = ("--stream", "tcp://127.0.0.1:0", "--control", "tcp://127.0.0.1:0")
+
+
+def test_a_line_is_one_write_since_processes_share_the_log() -> None:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)  # keeps writes apart
+    say = "import structlog, tactomo.log as log; log.configure_logging(form='json', sensor='left');"
+    with ours, theirs:
+        subprocess.run(
+            [sys.executable, "-u", "-c", f"{say} structlog.get_logger().info('ready')"],
+            stderr=theirs,
+            check=True,
+        )
+        written = ours.recv(10_000)
+    assert written.endswith(b"\n")
+    assert json.loads(written)["sensor"] == "left"
 
 
 def daemon(*arguments: str, **environment: str) -> subprocess.Popen[str]:
