@@ -66,7 +66,7 @@ def test_a_line_is_one_write_since_processes_share_the_log() -> None:
     with ours, theirs:
         subprocess.run(
             [sys.executable, "-u", "-c", f"{say} structlog.get_logger().info('ready')"],
-            stderr=theirs,
+            stderr=theirs.fileno(),
             check=True,
         )
         written = ours.recv(10_000)
