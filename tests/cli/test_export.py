@@ -300,10 +300,10 @@ def test_half_a_reconstruction_is_no_export(tactomo: Run, tmp_path: Path) -> Non
 def test_memory_does_not_grow_with_the_recording(tmp_path: Path) -> None:
     """Ten minutes of maps are 0.4 GB as arrays."""
 
-    def most_mb(source: Path, output: str) -> float:
+    def most_mb(source: Path, output: str, *more: str) -> float:
         program = (
             "import resource, sys; from tactomo.cli import main\n"
-            f"sys.argv = ['tactomo', 'export', {str(source)!r}, {str(tmp_path / output)!r}]\n"
+            f"sys.argv = {['tactomo', 'export', *map(str, (source, tmp_path / output)), *more]!r}\n"
             "try: main()\n"
             "finally: print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3)"
         )
@@ -314,4 +314,5 @@ def test_memory_does_not_grow_with_the_recording(tmp_path: Path) -> None:
     short = write_grasp(tmp_path / "short.mcap", [n % FRAMES for n in range(1200)])
     long = write_grasp(tmp_path / "long.mcap", [n % FRAMES for n in range(12_000)])
     for output in ("out.csv", "out.npz", "out.mcap"):
-        assert most_mb(long, output) < most_mb(short, output) + 60, output
+        assert most_mb(long, output) < most_mb(short, f"short_{output}") + 60, output
+    assert most_mb(long, "long", "--ros2") < most_mb(short, "short", "--ros2") + 60

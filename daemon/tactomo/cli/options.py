@@ -152,6 +152,10 @@ Announce: TypeAlias = Annotated[
         "--announce", help="Print one line of JSON with the addresses when ready, for programs."
     ),
 ]
+Pose: TypeAlias = Annotated[
+    str,
+    typer.Option(metavar="X,Y,Z[,ROLL,PITCH,YAW]", help="Pose in that frame, metres and degrees."),
+]
 Force: TypeAlias = Annotated[
     bool, typer.Option("--force", "-f", help="Write over a file that is there, without asking.")
 ]

@@ -18,7 +18,7 @@ from tactomo.cli.files.recorded_frames import (
     ToOption,
     recorded_frames,
 )
-from tactomo.cli.options import Force, RecordedDescription, examples, typer_app
+from tactomo.cli.options import Force, Pose, RecordedDescription, examples, typer_app
 from tactomo.cli.plot.plot import prepare_file
 from tactomo.cli.run.foxglove import need_foxglove, placement_of, write_layout
 from tactomo.errors import TactomoError
@@ -92,12 +92,7 @@ def export(
             help="For .mcap and --ros2: frame that the sensor hangs on. [world; a bag: not told]"
         ),
     ] = None,
-    pose: Annotated[
-        str,
-        typer.Option(
-            metavar="X,Y,Z[,ROLL,PITCH,YAW]", help="Pose in that frame, metres and degrees."
-        ),
-    ] = "0,0,0",
+    pose: Pose = "0,0,0",
     force: Force = False,
 ) -> None:
     """Write the frames of a recording for other programs; the extension of OUT says for which.

@@ -7,6 +7,7 @@ grow in files, and go from there into the archive.
 from __future__ import annotations
 
 import contextlib
+import shutil
 import tempfile
 import zipfile
 from collections.abc import Iterable, Mapping
@@ -76,11 +77,13 @@ def write_maps(moments: Iterable[Moment], output: IO[bytes], scratch: Path) -> i
             count += 1
         arrays: dict[str, Any] = {
             **_columns(files["frames"], FRAME_TYPES),
-            **{name: growing.array(count, axes) for name, growing in images.items()},
             **_columns(files["contacts"], CONTACT_TYPES),
             **axes,
         }
         with zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+            for name, growing in images.items():
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                    growing.write(entry, count, axes)
             for name, array in arrays.items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
                     npy.write_array(entry, array)
@@ -100,14 +103,18 @@ class _Images:
             self._file.write(image.astype("<f4").tobytes())
             self._rows += 1
 
-    def array(self, rows: int, axes: Mapping[str, FloatArray]) -> Any:
-        """Return all images, from the file; none where no frame had any."""
-        if not axes:
-            return np.zeros(0, "<f4")
-        shape = (len(axes["y_mm"]), len(axes["x_mm"]))
-        self._fill(rows, shape)
-        self._file.flush()
-        return np.memmap(self._file, "<f4", "r", shape=(rows, *shape))
+    def write(self, entry: IO[bytes], rows: int, axes: Mapping[str, FloatArray]) -> None:
+        """Write all images into an .npy file; none where no frame had any.
+
+        They pass by: a memory map would count all that is read as this program's memory.
+        """
+        shape: tuple[int, ...] = (0,)
+        if axes:
+            shape = (rows, len(axes["y_mm"]), len(axes["x_mm"]))
+            self._fill(rows, shape[1:])
+        npy.write_array_header_1_0(entry, {"descr": "<f4", "fortran_order": False, "shape": shape})
+        self._file.seek(0)
+        shutil.copyfileobj(self._file, entry)
 
     def _fill(self, rows: int, shape: tuple[int, ...]) -> None:
         for _ in range(self._rows, rows):

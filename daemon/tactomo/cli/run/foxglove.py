@@ -14,6 +14,7 @@ from tactomo.cli.options import (
     DEFAULT_STREAM,
     Announce,
     KeysFolder,
+    Pose,
     StreamAddress,
     examples,
     typer_app,
@@ -54,12 +55,7 @@ def foxglove(
         typer.Option(help="Write the layout of the (first) sensor here, to import in Foxglove."),
     ] = None,
     parent: Annotated[str, typer.Option(help="Frame that the sensor hangs on.")] = "world",
-    pose: Annotated[
-        str,
-        typer.Option(
-            metavar="X,Y,Z[,ROLL,PITCH,YAW]", help="Pose in that frame, metres and degrees."
-        ),
-    ] = "0,0,0",
+    pose: Pose = "0,0,0",
     allow_origin: Annotated[
         list[str] | None,
         typer.Option(

@@ -13,6 +13,7 @@ from tactomo.cli.options import (
     DEFAULT_NAME,
     DEFAULT_STREAM,
     KeysFolder,
+    Pose,
     StreamAddress,
     examples,
     typer_app,
@@ -45,12 +46,7 @@ def ros2(
     parent: Annotated[
         str | None, typer.Option(help="Frame that the sensor hangs on. [not told]")
     ] = None,
-    pose: Annotated[
-        str,
-        typer.Option(
-            metavar="X,Y,Z[,ROLL,PITCH,YAW]", help="Pose in that frame, metres and degrees."
-        ),
-    ] = "0,0,0",
+    pose: Pose = "0,0,0",
     keys: KeysFolder = None,
 ) -> None:
     """Publish maps, contacts and diagnostics to ROS 2 until stopped, where the nodes use Zenoh.
