@@ -81,10 +81,20 @@ def test_it_says_when_data_are_stale() -> None:
     assert "STALE: the newest frame is" in shown
 
 
-def old_frame(fake: FakeSensor) -> None:
+def test_the_end_of_a_replay_is_not_called_stale() -> None:
+    with FakeSensor("skin") as fake:
+        thread = threading.Thread(target=old_frame, args=[fake, {**STATUS, "state": "ended"}])
+        thread.start()
+        shown, _ = in_a_terminal("--stream", fake.address, until="19.7 frames/s")
+        thread.join()
+    assert "STALE" not in shown
+    assert "ended" in shown
+
+
+def old_frame(fake: FakeSensor, status: dict[str, Any] = STATUS) -> None:
     for _ in ("map", "status", "event"):
         fake.wait_for_subscriber(60)
-    fake.publish_message("status", STATUS)
+    fake.publish_message("status", status)
     fake.publish([], **images(), acquired_monotonic_ns=time.monotonic_ns() - 2_000_000_000)
 
 

@@ -13,7 +13,7 @@ import contextlib
 import queue
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from typing import Any, Final, NamedTuple
@@ -111,6 +111,7 @@ class Pipeline(Worker):
         self._received: list[Counter[Channel]] = [Counter() for _ in range(ports)]
         self._discarded: Counter[Channel] = Counter()
         self._used = self._left_out = self._in_hand = 0
+        self._ready: deque[DualScan] = deque()  # to be made into frames now
         self._skipped = 0  # dual scans left out because newer ones had come
         self._drop_limit = RateLimit()
         self._dropped_told = 0
@@ -211,12 +212,11 @@ class Pipeline(Worker):
             before = self._sync_state()
             ready = self._gather()
             self._tell_changes(before)
-            for dual in ready if self._is_lossless else self._newest(ready):
-                if self._stopping.is_set():
-                    break
+            self._ready.extend(ready if self._is_lossless else self._newest(ready))
+            while self._ready and not self._stopping.is_set():
                 self.turns += 1
                 taken_ns = self._imaging.reference_realtime_ns
-                self._process(dual)
+                self._process(self._ready.popleft())
                 if self._imaging.reference_realtime_ns != taken_ns:
                     self._is_excused = True
                 self._obey_commands()
@@ -241,7 +241,10 @@ class Pipeline(Worker):
         self._replay_clock = ReplayClock(self._ports, self._replay.is_paced)
         self.finished.clear()
         before, self.sync = self.sync, self._new_sync()
-        self._left_out += before.waiting
+        left_out = sum(len(dual.scans) for dual in self._ready)
+        self._ready.clear()
+        self._in_hand -= left_out
+        self._left_out += before.waiting + left_out
         self.sync.carry_on(before)
         self.skew = Skew()
         self._imaging.forget()

@@ -41,7 +41,7 @@ class Replay:
     def marks_of_pass(self) -> list[Mark]:
         """Return the marks from where the playback's pass began on.
 
-        Of a pass that is not the first, the first mark brings what was in force, and starts cold.
+        Of a pass that is not the first, the first mark brings what was in force.
         """
         if self.playback.passes == 0:
             return self.marks
@@ -58,7 +58,6 @@ class Replay:
             self.marks[index],
             reference=references[-1] if references else None,
             calibration=texts[-1] if texts else None,
-            is_cold=True,
         )
         return [first, *self.marks[index + 1 :]]
 

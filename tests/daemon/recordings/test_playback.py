@@ -8,12 +8,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from daemon_bench import Bench, Listener, Memory
+from daemon_bench import HELLO, Bench, Listener, Memory, scan
 from tactomo.config import load_config
+from tactomo.protocols import protocol_named
+from tactomo.recordings.recording import Origin
 from tactomo.recordings.recording_set import open_replayable
+from tactomo.recordings.recording_writer import RecordingWriter
 from tactomo.service.daemon import Daemon
 from tactomo_client import ControlError
 from tactomo_client.messages import array_from_wire
+from tactomo_models import load_description
+from tactomo_protocol import Channel, Scan, encode
 
 Start = Callable[..., Any]
 
@@ -23,7 +28,7 @@ def play(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
     """Start a replay that is paused at its beginning: ``play(path, start_s=0, speed=1)``."""
     undo: list[Callable[[], None]] = []
 
-    def start(path: Path, start_s: float = 0.0, speed: float = 1.0) -> Bench:
+    def start(path: Path, start_s: float = 0.0, speed: float = 1.0, seconds: float = 0.0) -> Bench:
         settings = {
             "name": "left",
             "ports": open_replayable(path).replay_urls(speed),
@@ -32,7 +37,7 @@ def play(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
             "tare_scans": 3,
             "baseline": {"track": False},
         }
-        memory: Any = Memory()
+        memory: Any = Memory(seconds)
         daemon = Daemon(load_config(None, **settings), reconstructor=memory)
         assert daemon.playback is not None
         daemon.playback.steer(paused=True, speed=None, loop=None)
@@ -154,6 +159,48 @@ def test_a_moved_replay_goes_on_there_against_the_reference_of_then(
     assert tally["received"] == sum(n for name, n in tally.items() if name != "received")
 
 
+def test_what_the_ports_had_read_before_a_move_is_left_out(play: Any, life: Life) -> None:
+    b = play(life.path, speed=0, seconds=0.05)  # the ports are far ahead of the frames
+    b.ask("replay", paused=False)
+    b.until(lambda: len(counters(b)) >= 3)
+    b.ask("replay", position_s=0.0)
+    play_to_the_end(b, life)
+    assert counters(b)[-len(life.values) :] == list(life.values)
+    assert len(counters(b)) < 2 * len(life.values) - 3
+    tally = b.ask("status")["scan_tally"]
+    assert tally["received"] == sum(n for name, n in tally.items() if name != "received")
+
+
+@pytest.fixture
+def torn(tmp_path: Path) -> Path:
+    """A recording without marks, whose reads end anywhere in a packet."""
+    path = tmp_path / "torn.mcap"
+    dual_scans = [encode(scan(c, n)) for n in range(1, 81) for c in Channel]
+    stream = encode(HELLO) + b"".join(dual_scans)
+    writer = RecordingWriter(path, Origin("left", "paper_square", "", ("/dev/x",), "0"))
+    for index in range(0, len(stream), 300):
+        at_ns = 10**18 + index * 4 * 10**9 // len(stream)
+        writer.write("port/0", stream[index : index + 300], at_ns, at_ns)
+    writer.flush()
+    writer.close()
+    return path
+
+
+def test_a_move_into_the_middle_of_a_packet_is_no_damage(play: Any, torn: Path) -> None:
+    b = play(torn)
+    b.ask("replay", paused=False)
+    for position_s in (1.003, 2.101, 0.507):
+        seen = len(counters(b))
+        b.until(lambda seen=seen: len(counters(b)) > seen + 2)
+        b.ask("replay", position_s=position_s)
+    b.ask("replay", speed=5.0)
+    b.until(lambda: b.ask("status")["state"] == "ended")
+    b.until(lambda: counters(b)[-1:] == [80])
+    events = b.ask("status")["events"]["counts"]
+    assert not {"corrupt_packets", "device_clock_jumped", "device_restarted"} & events.keys()
+    assert b.ask("status")["ports"][0]["corrupt"] == 0
+
+
 def test_a_replay_that_loops_begins_again(play: Any, life: Life) -> None:
     path, values = life.path, life.values
     b = play(path, speed=5)
@@ -191,3 +238,39 @@ def test_only_a_replay_is_steered_and_only_where_that_makes_sense(
         assert refused.value.name == "bad_argument"
     b.ask("replay", position_s=1e9, paused=False)  # beyond the end is the end
     b.until(lambda: b.ask("status")["state"] == "ended")
+
+
+def test_a_foreign_port_goes_on_in_the_middle_with_whole_scans_and_their_counters(
+    tmp_path: Path,
+) -> None:
+    """Their lines say neither counter nor clock: what does comes every second."""
+    description = load_description("openeit_disc")
+    protocol = protocol_named("openeit", description)
+    origin = Origin("left", "openeit_disc", description.sha256, ("/dev/x",), "0", "openeit")
+    writer = RecordingWriter(tmp_path / "board.mcap", origin)
+    numbers = ",".join(["1.5"] * description.measurements)
+    stream = b"".join(b"magnitudes: %s,\r\n" % numbers.encode() for _ in range(60))
+    begin_ns, whole = 10**18, []
+    for index in range(0, len(stream), 300):  # a line is in several reads
+        at_ns = begin_ns + index * 10**10 // len(stream)
+        if index * 10 // len(stream) != (index - 300) * 10 // len(stream):
+            writer.write("port/0/hello", protocol.preamble(), at_ns, at_ns)
+        data = stream[index : index + 300]
+        writer.write("port/0", data, at_ns, at_ns)
+        whole += [(at_ns, each.counter) for each in protocol.feed(data) if isinstance(each, Scan)]
+    writer.flush()
+    writer.close()
+    recording = open_replayable(tmp_path / "board.mcap")
+    for after_s in (0.0, 3.4, 7.9):
+        from_ns = begin_ns + round(after_s * 1e9)
+        again = recording.origin.new_protocol()
+        found = [
+            packet.counter
+            for chunk in recording.chunks(0, from_ns)
+            for packet in again.feed(chunk.data)
+            if isinstance(packet, Scan)
+        ]
+        expected = [counter for at_ns, counter in whole if at_ns >= from_ns]
+        assert found[-len(expected) :] == expected
+        assert len(found) - len(expected) <= 60 / 10 + 1  # those since the preamble, a second back
+        assert again.counts.corrupt == 0

@@ -378,8 +378,8 @@ def _live_table(results: Results) -> Table:
         title="live: last byte read to contacts in another process",
         min_width=80,
     )
-    for name in ("scene", "frames/s", "p50 ms", "p99 ms", "daemon MB", "frames by tier"):
-        table.add_column(name, justify="left" if name in ("scene", "frames by tier") else "right")
+    for name in ("scene", "frames/s", "p50 ms", "p99 ms", "daemon MB", "frames by method"):
+        table.add_column(name, justify="left" if name in ("scene", "frames by method") else "right")
     for phase in results.live:
         table.add_row(
             phase.scene,

@@ -113,6 +113,12 @@ class View:
         """Whether no status has come for so long that the daemon cannot be there."""
         return self.status is None or self.status.is_stale
 
+    @property
+    def is_stale(self) -> bool:
+        """Whether the newest frame is old, and not of a replay that stands still."""
+        stands = self.status is not None and self.status.state in ("paused", "ended")
+        return self.frame is not None and self.frame.is_stale and not stands
+
     def _take(self, item: Frame | Status | Event) -> None:
         from tactomo_client import Frame, Status
 
@@ -176,7 +182,7 @@ def _screen(view: View, columns: int, rows: int) -> RenderableType:
         body,
         title=f"tactomo watch {view.sensor}",
         subtitle="Ctrl-C ends",
-        border_style="red" if view.is_gone or frame.is_stale else "none",
+        border_style="red" if view.is_gone or view.is_stale else "none",
     )
     return Group(_state_line(view), panel)
 
@@ -190,7 +196,7 @@ def _state_line(view: View) -> Text:
             "bold red",
         )
     state = view.status.state
-    if view.frame is not None and view.frame.is_stale:
+    if view.frame is not None and view.is_stale:
         age = f"STALE: the newest frame is {view.frame.age_s:.1f} s old"
         return Text(f"{age} (the daemon says: {state}) {_event_words(view.event)}", "bold red")
     return Text(f"{state} {_event_words(view.event)}", "green" if state == "running" else "yellow")
@@ -253,7 +259,7 @@ def _health(view: View, frame: Frame) -> RenderableType:
         "rate": f"{status.rates.frames_hz:.1f} frames/s" if status else "-",
         "latency": f"{latency.p50:.1f} ms (p99 {latency.p99:.1f})" if latency else "-",
         "age": f"{frame.age_s * 1e3:.0f} ms",
-        "tier": frame.tier or "-",
+        "method": frame.tier or "-",
         "because": frame.tier_reason or "-",
         "misfit": "-" if frame.misfit is None else f"{frame.misfit:.2f}",
         "flags": ", ".join(sorted(frame.flags)) or "none",
