@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
+from mcap_ros2.decoder import DecoderFactory as Ros2DecoderFactory
 from recorded_grasp import (
     FIRST_PRESSED,
     FRAMES,
@@ -278,6 +279,17 @@ def test_what_holds_no_frames_is_reconstructed_first(tactomo: Run, tmp_path: Pat
     times = [float(row["time_s"]) for row in touched]
     assert (min(times), max(times)) == pytest.approx((1.25, 1.7), abs=0.02)
     assert float(touched[5]["x_mm"]) == pytest.approx(10.0, abs=2.0)
+    assert tactomo("export", "bare.mcap", "made", "--ros2", "--from", 1).returncode == 0
+    with (tmp_path / "made/made.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[Ros2DecoderFactory()])
+        told = list(reader.iter_decoded_messages(topics=["/diagnostics"]))
+    assert told
+    for each in told:
+        keys = {value.key for value in each.decoded_message.status[0].values}
+        assert "sequence" in keys
+        assert "age_s" not in keys  # nobody knows it here, either
+        stamp = each.decoded_message.header.stamp
+        assert each.message.log_time == stamp.sec * 1_000_000_000 + stamp.nanosec
     result = tactomo("plot", "bare.mcap", "-o", "made.png", "--what", "path")
     assert result.returncode == 0, result.stderr
     assert not list(tmp_path.glob(".tactomo*"))
