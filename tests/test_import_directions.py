@@ -53,7 +53,7 @@ ORDER = {
         *("protocols", "config", "recordings", "acquisition", "stream", "imaging"),
         *("service", "twin", "cli", "__main__"),
     ),
-    "tactomo_lab": ("scenes", "baselines", "training", "evaluation", "commands"),
+    "tactomo_lab": ("scenes", "baselines", "tanks", "training", "evaluation", "commands"),
 }
 # What a package must do without, but for the modules whose names begin so.
 FOREIGN = {

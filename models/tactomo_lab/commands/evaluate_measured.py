@@ -50,12 +50,14 @@ def tanks(
     -1 in what conducts worse, row 0 at the top, the disc filling the picture; and `name` (n,).
 
     The figure is the Pearson correlation of the structure map with the truth over the disc. The
-    scale is the largest at which the level set explains all tanks as well as at any; the truth
-    has no part in it.
+    scale is a parameter of each tank's fit, averaged over the tanks; the truth has no part in it.
+    *levelset* refines a network's objects as `tactomo evaluate ktc` does; other methods are the
+    daemon's.
     """
     from tactomo_models import load_description
 
     from tactomo_lab.evaluation.tanks import (
+        TankFitter,
         TankImager,
         estimate_scale,
         evaluate_tanks,
@@ -73,13 +75,15 @@ def tanks(
     methods = [method] if method else ["tikhonov", "noser", "levelset"]
     with _status("reading"):
         measured = read_tanks(scans, description)
-        imager = TankImager(description)
+        imager, fitter = TankImager(description), TankFitter(description)
+    sigma = 0.0
     if scale is None:
         with _status("finding the scale"):
-            scale = estimate_scale(imager, measured.changes)
+            scale, sigma = estimate_scale(fitter, measured.changes)
     total = len(methods) * len(measured.names)
-    outcomes = list(shown(evaluate_tanks(imager, measured, methods, scale), total, "tanks"))
-    facts = {"simulated": False, "sensor": description.name, "scale": scale}
+    found = evaluate_tanks(imager, fitter, measured, methods, scale, sigma)
+    outcomes = list(shown(found, total, "tanks"))
+    facts = {"simulated": False, "sensor": description.name, "scale": scale, "scale_sigma": sigma}
     if as_json:
         print_json({**facts, **_tanks_as_json(methods, outcomes)})
     else:
@@ -128,7 +132,8 @@ def _print_tanks(
     longest = (max(o.seconds for o in outcomes if o.method == method) for method in methods)
     table.add_row("seconds, longest", *(f"{seconds:.2f}" for seconds in longest))
     console = Console()
-    console.print(f"measured tanks, {facts['sensor']}, scale {facts['scale']:.3g}")
+    scale = f"scale {facts['scale']:.3g} (± {facts['scale_sigma']:.0%})"
+    console.print(f"measured tanks, {facts['sensor']}, {scale}")
     console.print(table)
 
 

@@ -82,7 +82,7 @@ def solve_bare_sheet(
     pressable = np.flatnonzero(inside)
     touched = np.isin(mesh.t, pressable).any(axis=0)
     support = np.unique(mesh.t[:, touched])
-    fields = _fields(description, system)
+    fields = electrode_fields(description, system)
     with threadpool_limits(1):
         green = GreensFunction(system, support, mesh.p[:, support])
         kept = green if quick else green.packed()
@@ -118,7 +118,7 @@ def transfer_resistances(
         see `scan_voltages`.
     """
     system = assemble_sheet(description, sheet, conductivity, impedance)
-    return _transfer(description, _fields(description, system))
+    return _transfer(description, electrode_fields(description, system))
 
 
 def transfer_slopes(
@@ -135,7 +135,7 @@ def transfer_slopes(
         (L, L) as `transfer_resistances`, and (K, L, L): dR = -u^T dA u, with the fields u.
     """
     even = assemble_sheet(description, sheet, np.ones(changes.shape[1]))
-    fields = _fields(description, even)
+    fields = electrode_fields(description, even)
     slopes = np.zeros((len(changes), *[description.electrode_count] * 2))
     for slope, change in zip(slopes, changes, strict=True):
         moved = assemble_sheet(description, sheet, 1 + change) - even  # it is linear in that
@@ -168,7 +168,7 @@ def volts_per_unit(description: SensorDescription) -> float:
     return description.pattern.current_a / description.sheet_conductance_s
 
 
-def _fields(description: SensorDescription, system: sp.csc_matrix) -> FloatArray:
+def electrode_fields(description: SensorDescription, system: sp.csc_matrix) -> FloatArray:
     """Solutions (unknowns, L - 1) of a sheet's system for a current into each electrode.
 
     The last electrode is what the currents leave by: its potential is 0 and no unknown.

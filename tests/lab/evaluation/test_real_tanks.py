@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from tactomo_lab.evaluation.skin_presses import localise, read_presses
 from tactomo_lab.evaluation.tanks import (
+    TankFitter,
     TankImager,
     Tanks,
     estimate_scale,
@@ -35,12 +36,14 @@ def tanks() -> Tanks:
 
 @pytest.mark.long
 def test_measured_tanks(tanks: Tanks) -> None:
-    imager = TankImager(load_description("tank_uef2017"))
-    scale = estimate_scale(imager, tanks.changes)
-    outcomes = list(evaluate_tanks(imager, tanks, ["tikhonov", "noser", "levelset"], scale))
+    methods = ("tikhonov", "noser", "levelset")
+    tank = load_description("tank_uef2017")
+    imager, fitter = TankImager(tank), TankFitter(tank)
+    scale, _ = estimate_scale(fitter, tanks.changes)
+    outcomes = list(evaluate_tanks(imager, fitter, tanks, methods, scale))
     mean = {
         method: np.mean([o.correlation for o in outcomes if o.method == method])
-        for method in ("tikhonov", "noser", "levelset")
+        for method in methods
     }
     assert mean["levelset"] > 0.84
     assert mean["noser"] > 0.7
@@ -75,11 +78,12 @@ def test_objects_stand_at_the_electrodes_that_their_names_tell() -> None:
 @pytest.mark.long
 def test_turned_tanks_are_not_recognised(tanks: Tanks) -> None:
     """Electrode 0 at the bottom, counter-clockwise: any other way correlates with nothing."""
-    imager = TankImager(load_description("tank_uef2017"))
+    tank = load_description("tank_uef2017")
+    imager, fitter = TankImager(tank), TankFitter(tank)
     means = []
     for truth in (tanks.truth, np.rot90(tanks.truth, 1, (1, 2)), tanks.truth[:, :, ::-1]):
         turned = Tanks(tanks.names, tanks.changes, truth)
-        outcomes = evaluate_tanks(imager, turned, ["noser"], 1.0)
+        outcomes = evaluate_tanks(imager, fitter, turned, ["noser"], 1.0)
         means.append(np.mean([outcome.correlation for outcome in outcomes]))
     assert means[0] > max(means[1:]) + 0.2
 

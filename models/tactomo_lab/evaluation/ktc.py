@@ -1,0 +1,158 @@
+"""Tanks as the Kuopio Tomography Challenge reads and judges them.
+
+A reading that is not a number belongs to an electrode that is lost. The conductivity of the water
+follows from the empty tank; what stood in the full one has no part in anything but the score.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from tactomo_models.archive import read_arrays
+from tactomo_models.arrays import BoolArray, FloatArray, Image, IntArray
+from tactomo_models.errors import DataError
+from tactomo_models.sensor.description import SensorDescription
+
+from tactomo_lab.tanks.challenge import every_reading, kept_readings, score
+from tactomo_lab.tanks.fit import TankFit
+from tactomo_lab.tanks.model import Readings, TankModel
+
+WATER_SIGMA = 0.05  # of the scale's logarithm; four measured empty tanks leave the model 0.04 off
+
+
+@dataclass(frozen=True)
+class Challenge:
+    """A file of the challenge's tanks.
+
+    Attributes:
+        currents: (T, L, D) of each drive, amperes.
+        weights: (L, m) of the electrodes' potentials in each reading of a drive.
+        reference: (T, D m) readings of the empty tank, volts, drive by drive.
+        voltages: (T, D m) of the full one; not a number where an electrode is lost.
+        truth: (T, rows, columns) 0 water, 1 conducts worse, 2 better.
+        level: (T,) of difficulty, as the file has it.
+    """
+
+    currents: FloatArray
+    weights: FloatArray
+    reference: FloatArray
+    voltages: FloatArray
+    truth: Image
+    level: IntArray
+
+    def at_level(self, level: int) -> Challenge:
+        """The same tanks without the electrodes that a level of difficulty loses."""
+        voltages = self.voltages.copy()
+        for currents, volts in zip(self.currents, voltages, strict=True):
+            of_drive, of_reading = every_reading(currents, self.weights)
+            volts[~kept_readings(of_drive, of_reading, range(2 * level - 2))] = np.nan
+        return replace(self, voltages=voltages, level=np.full_like(self.level, level))
+
+
+@dataclass(frozen=True)
+class ChallengeOutcome:
+    """One tank's; `image` (rows, columns) has the truth's kinds."""
+
+    level: int
+    readings: int
+    score: float
+    misfit: float
+    seconds: float
+    image: Image
+
+
+def read_challenge(path: Path, description: SensorDescription) -> Challenge:
+    """Read a file of the challenge's tanks.
+
+    Raises:
+        DataError: the file cannot be read or holds something else.
+    """
+    keys = ("injection", "measurement", "reference", "voltages", "truth")
+    try:
+        arrays = read_arrays(path)
+        currents, weights, reference, voltages, truth = (arrays[key].astype(float) for key in keys)
+        level = arrays.get("level", np.zeros(len(truth))).astype(int)
+    except OSError as error:
+        raise DataError(f"cannot read {path}: {error.strerror}; give the set's .npz") from error
+    except (KeyError, ValueError) as error:
+        raise DataError(
+            f"{path} is no set of the challenge's tanks ({error}): {', '.join(keys)} are needed, "
+            "all numbers"
+        ) from error
+    tanks, electrodes = len(truth), description.electrode_count
+    readings = currents.shape[-1] * weights.shape[-1]
+    shapes = {
+        "injection": (currents, (tanks, electrodes, currents.shape[-1])),
+        "measurement": (weights, (electrodes, weights.shape[-1])),
+        "reference": (reference, (tanks, readings)),
+        "voltages": (voltages, (tanks, readings)),
+        "truth": (truth, (tanks, *truth.shape[-2:])),
+        "level": (level, (tanks,)),
+    }
+    for key, (array, wanted) in shapes.items():
+        if array.shape != wanted:
+            raise DataError(f"{path}: {key} is {array.shape}; {wanted} is needed, drive by drive")
+    if not np.isin(truth, (0, 1, 2)).all():
+        raise DataError(f"{path}: truth holds other values than 0 water, 1 worse, 2 better")
+    usable = np.isfinite(reference) & np.isfinite(voltages)
+    if not usable.any(axis=1).all():
+        tank = int(np.flatnonzero(~usable.any(axis=1))[0])
+        raise DataError(f"{path}: tank {tank} has no reading that is a number; leave it out")
+    return Challenge(currents, weights, reference, voltages, truth.astype(np.uint8), level)
+
+
+class ChallengeImager:
+    """Finds what stands in the challenge's tanks.
+
+    Args:
+        description: of the tank.
+    """
+
+    def __init__(self, description: SensorDescription) -> None:
+        self._model = TankModel(description)
+        self._known: tuple[bytes, TankFit] | None = None  # tanks in a row are read one way
+
+    def find(
+        self, currents: FloatArray, weights: FloatArray, reference: FloatArray, volts: FloatArray
+    ) -> tuple[TankFit, FloatArray]:
+        """What fits one tank of a `Challenge`, and its changes (n,) in the model's unit."""
+        of_drive, of_reading = every_reading(currents, weights)
+        kept = np.isfinite(reference) & np.isfinite(volts)
+        empty = self._model.readings_of_empty(of_drive[kept], of_reading[kept])
+        # The largest readings tell most, and are nearest to the model's.
+        scale = float(empty @ empty / (empty @ reference[kept]))
+        key = of_drive.tobytes() + of_reading.tobytes() + kept.tobytes()
+        if self._known is None or self._known[0] != key:
+            readings = Readings(self._model, of_drive[kept], of_reading[kept], empty)
+            self._known = key, TankFit(self._model, readings)
+        return self._known[1], scale * (volts - reference)[kept]
+
+
+def evaluate_challenge(
+    given: Challenge, description: SensorDescription
+) -> Iterator[ChallengeOutcome]:
+    """Find what stands in every tank, and score it."""
+    imager = ChallengeImager(description)
+    for currents, reference, volts, truth, level in zip(
+        given.currents, given.reference, given.voltages, given.truth, given.level, strict=True
+    ):
+        begin = time.process_time()
+        fit, changes = imager.find(currents, given.weights, reference, volts)
+        tank = fit.find(changes, WATER_SIGMA)
+        image = classes(fit.image(tank, *truth.shape))
+        seconds = time.process_time() - begin
+        found = score(truth, image)
+        yield ChallengeOutcome(int(level), len(changes), found, tank.misfit, seconds, image)
+
+
+def classes(f: FloatArray) -> Image:
+    """Kinds (rows, columns) as the challenge has them, of a level-set function."""
+    rows, columns = f.shape
+    y = 1 - (np.arange(rows) + 0.5) / rows * 2
+    x = (np.arange(columns) + 0.5) / columns * 2 - 1
+    inside: BoolArray = np.hypot(*np.meshgrid(x, y)) < 1
+    return np.asarray(np.where(f > 0.5, 2, np.where(f < -0.5, 1, 0)) * inside, np.uint8)

@@ -1,0 +1,166 @@
+"""What stands in a tank: the network's objects, refined until they explain the readings.
+
+    f(x) = sum_i mu_i p_i(x)                  Gaussians p_i on a grid
+    h = H(f - 1/2) - H(-f - 1/2)              1 in what conducts better, -1 in what conducts worse
+    minimise |e^s V(h(mu)) - v|^2 / k^2 + |mu - mu_0|^2 q + (s / s_0)^2       (Levenberg-Marquardt)
+
+The network's image is where the fit starts, mu_0, and its prior: where readings say little the
+network has the word, and no speck comes but that readings pay for it. With the scale s of the
+readings free, its uncertainty is part of the fit's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import RegularGridInterpolator
+from tactomo_models.arrays import FloatArray
+from tactomo_models.scene.pressure_field import heaviside, heaviside_slope
+
+from tactomo_lab.tanks.images import PIXELS, LinearImages, pixel_grid, probabilities
+from tactomo_lab.tanks.model import Readings, TankModel
+
+WIDTH = 0.096  # of a Gaussian over the radius
+SPACING = 1.1  # of the grid, over that
+HALF_WIDTH = 0.25  # of the edge, in f
+PRECISION = 10.0  # q
+# k = |(1, MODEL_ERROR rms(v))|: unit noise, and what the model gets wrong of the change itself.
+MODEL_ERROR = 0.2
+STEPS = 10
+STEP_LIMIT = 0.6  # of a coefficient in one step
+SETTLED = 3e-3  # share of the cost below which a gain is not worth another step
+
+
+@dataclass(frozen=True)
+class Tank:
+    """What was found in a tank.
+
+    Attributes:
+        likely: (3, PIXELS, PIXELS) probabilities of nothing, worse, better, as the network has
+            them.
+        coefficients: (K,) mu.
+        log_scale: s.
+        log_scale_sigma: its standard uncertainty.
+        misfit: root mean square of what is left of the readings, over the noise assumed.
+    """
+
+    likely: FloatArray
+    coefficients: FloatArray
+    log_scale: float
+    log_scale_sigma: float
+    misfit: float
+
+
+class TankFit:
+    """Finds what stands in tanks that are read one way.
+
+    Args:
+        model: the tank.
+        readings: that there are.
+    """
+
+    def __init__(self, model: TankModel, readings: Readings) -> None:
+        self._model, self._readings = model, readings
+        self._images = LinearImages(model, readings)
+        structure = model.description.structure
+        assert structure is not None
+        self._log_contrast = np.log(structure.saturated_ratio)
+        step = SPACING * WIDTH
+        grid = np.arange(-np.ceil(1 / step), np.ceil(1 / step) + 1) * step
+        centres = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
+        self._centres = centres[np.hypot(*centres.T) < 1]
+        self._kernels = self._gaussians(model.points)
+        count = self._kernels.shape[1]
+        ridge = 0.03 * np.eye(count)  # against coefficients of either sign that cancel
+        self._onto = np.linalg.solve(self._kernels.T @ self._kernels + ridge, self._kernels.T)
+        self._empty = readings.by_pair @ model.empty
+
+    def _gaussians(self, points: FloatArray) -> FloatArray:
+        off = points[:, None] - self._centres
+        return np.asarray(np.exp(-(off**2).sum(axis=2) / (2 * WIDTH**2)))
+
+    def find(self, changes: FloatArray, scale_sigma: float) -> Tank:
+        """Find what explains readings' changes (n,), known but for a factor.
+
+        Args:
+            changes: full minus empty, in the model's unit.
+            scale_sigma: s_0, standard deviation of that factor's logarithm.
+        """
+        v = self._readings.reduced(changes)
+        likely = probabilities(self._images.inputs(v[None]))[0]
+        axis = pixel_grid(PIXELS)[0][0]
+        signed = RegularGridInterpolator(
+            (axis, axis), (likely[2] - likely[1])[::-1], bounds_error=False, fill_value=None
+        )
+        start = self._onto @ np.clip(signed(self._model.points[:, ::-1]), -1, 1)
+        return self._refined(v, likely, np.append(start, 0.0), scale_sigma)
+
+    def _refined(
+        self, v: FloatArray, likely: FloatArray, start: FloatArray, scale_sigma: float
+    ) -> Tank:
+        noise = np.hypot(1, MODEL_ERROR * np.sqrt(np.mean(v**2)))
+        precision = np.append(np.full(len(start) - 1, PRECISION), scale_sigma**-2)
+
+        def judged(x: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+            conductivity = np.exp(self._model.nodes @ (self._log_contrast * self._share(x)))
+            transfer, fields = self._model.solve(conductivity)
+            shown = np.exp(x[-1]) * (self._readings.by_pair @ transfer - self._empty)
+            left = np.append((shown - v) / noise, np.sqrt(precision) * (x - start))
+            return float(left @ left), left, fields, conductivity
+
+        x, (cost, left, fields, conductivity) = start, judged(start)
+        damping = 1.0
+        for _ in range(STEPS):
+            slope = self._slopes(x, left[: len(v)], v, fields, conductivity, noise)
+            jacobian = np.vstack([slope, np.diag(np.sqrt(precision))])
+            normal, gradient = jacobian.T @ jacobian, jacobian.T @ left
+            before = cost
+            while damping < 1e5 and cost == before:
+                step = -np.linalg.solve(normal + damping * np.eye(len(x)), gradient)
+                step *= min(1.0, STEP_LIMIT / np.abs(step).max())
+                trial = judged(x + step)
+                if trial[0] < cost:
+                    x, (cost, left, fields, conductivity) = x + step, trial
+                    damping = max(damping / 5, 1e-2)
+                else:
+                    damping *= 6
+            if before - cost < SETTLED * before:
+                break
+        misfit = float(np.sqrt(np.mean(left[: len(v)] ** 2)))
+        sigma = np.sqrt(np.linalg.inv(normal)[-1, -1]) * max(1.0, misfit)
+        return Tank(likely, x[:-1], float(x[-1]), float(sigma), misfit)
+
+    def _slopes(
+        self,
+        x: FloatArray,
+        left: FloatArray,
+        v: FloatArray,
+        fields: FloatArray,
+        conductivity: FloatArray,
+        noise: float,
+    ) -> FloatArray:
+        """Derivative (r, K + 1) of what is left of the readings by coefficients and scale."""
+        scale = np.exp(x[-1]) / noise
+        by_triangle = self._model.derivative(self._readings.by_pair, fields) * conductivity
+        f = self._kernels @ x[:-1]
+        slope = sum(heaviside_slope((sign * f - 0.5) / HALF_WIDTH) for sign in (1, -1))
+        by_node = (by_triangle @ self._model.nodes) * (self._log_contrast / HALF_WIDTH * slope)
+        return np.column_stack([scale * (by_node @ self._kernels), left + v / noise])
+
+    def _share(self, x: FloatArray) -> FloatArray:
+        f = self._kernels @ x[:-1]
+        return np.asarray(heaviside((f - 0.5) / HALF_WIDTH) - heaviside((-f - 0.5) / HALF_WIDTH))
+
+    def image(self, tank: Tank, rows: int, columns: int) -> FloatArray:
+        """Level-set function f on a picture's pixels (rows, columns), row 0 at the top.
+
+        0.5 or more in objects that conduct better, -0.5 or less in those that conduct worse.
+        """
+        axis = np.linspace(-1, 1, 2 * PIXELS + 1)
+        grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+        f = (self._gaussians(grid) @ tank.coefficients).reshape(len(axis), -1)
+        y = 1 - (np.arange(rows) + 0.5) / rows * 2
+        x = (np.arange(columns) + 0.5) / columns * 2 - 1
+        at = np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1)
+        return np.asarray(RegularGridInterpolator((axis, axis), f)(at))

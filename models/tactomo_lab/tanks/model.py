@@ -1,0 +1,136 @@
+"""A tank's forward model, and its readings made independent and of unit noise.
+
+Any node's conductivity may change, so that a solve is one of the whole mesh, unlike a skin's
+(`tactomo_models.physics.forward`). A reading is linear in the transfer resistances Z between the
+electrodes, whatever currents are driven and whichever electrodes are lost:
+
+    v = m^T Z c        c the currents into the electrodes, m the weights of their potentials
+
+Readings are therefore reduced to as many numbers as are independent, weighted by their noise, and
+what no object does is projected out: the water's conductivity and the electrodes' contacts change
+between the empty tank and the full one.
+
+Source: Kolehmainen, Vauhkonen, Karjalainen & Kaipio, "Assessment of errors in static electrical
+impedance tomography with adjacent and trigonometric current patterns", Physiol. Meas. 18 (1997),
+for what unmodelled contacts do.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
+from tactomo_models.arrays import FloatArray
+from tactomo_models.physics.bare_sheet import assemble_sheet, electrode_fields
+from tactomo_models.physics.mesh import mesh_sheet
+from tactomo_models.sensor.description import SensorDescription
+
+# Noise of a reading's change: of the root mean square of all reference readings, and of its own.
+# In four measured tanks of the Kuopio challenge truth leaves 0.3 to 0.6 % and 0.5 to 1 %; half or
+# twice as much moves the score on simulated ones by less than 0.005.
+NOISE_OF_ALL, NOISE_OF_OWN = 0.006, 0.007
+WATER = 0.08  # deviation of the water's conductivity; those tanks: up to 8 %
+CONTACT = 0.022  # of an electrode's contact resistance, relative to the sheet's; up to 0.01
+INDEPENDENT = 1e-9  # of the largest eigenvalue, below which readings repeat each other
+
+
+class TankModel:
+    """The complete electrode model of a tank, and its derivative by each triangle's conductivity.
+
+    Args:
+        description: the tank; its conductivity is 1 here.
+        rings: of nodes between centre and rim.
+
+    Attributes:
+        points: (N, 2) nodes, over the tank's radius.
+        triangles: (T, 3) nodes of each triangle.
+        pairs: (2, P) electrodes i <= j, whose transfer resistances are all there are.
+        nodes: (T, N) mean of the corners.
+        empty: (P,) transfer resistances of the empty tank.
+    """
+
+    def __init__(self, description: SensorDescription, rings: int = 22) -> None:
+        sheet = mesh_sheet(description, description.width_m / 2 / rings, refinements=1)
+        mesh = sheet.mesh
+        self.description = description
+        self.points = mesh.p.T / (description.width_m / 2)
+        self.triangles = mesh.t.T
+        self.pairs = np.array(np.triu_indices(description.electrode_count))
+        p = mesh.p[:, mesh.t]  # (2, 3, T)
+        edge = np.roll(p, -2, axis=1) - np.roll(p, -1, axis=1)  # opposite each corner
+        twice = edge[0, 1] * edge[1, 2] - edge[1, 1] * edge[0, 2]
+        self._area = np.abs(twice) / 2
+        slopes = np.stack([-edge[1], edge[0]]) / twice  # (2, 3, T) of each corner's hat function
+        count, nodes = len(self.triangles), len(self.points)
+        at = np.repeat(np.arange(count), 3), self.triangles.ravel()
+        shape = count, nodes
+        self._slope = [sp.csr_matrix((slope.T.ravel(), at), shape) for slope in slopes]
+        self.nodes = sp.csr_matrix((np.full(3 * count, 1 / 3), at), shape)
+        self._system = assemble_sheet(description, sheet, np.ones(count))
+        self.empty, self._fields = self.solve(np.ones(count))
+
+    def solve(self, conductivity: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Transfer resistances (P,) and nodes' potentials (N, L) for conductivities (T,)."""
+        added = sp.diags(self._area * (conductivity - 1))
+        law = sum(slope.T @ added @ slope for slope in self._slope)
+        law.resize(self._system.shape)
+        fields = electrode_fields(self.description, (self._system + law).tocsc())
+        nodes, electrodes = len(self.points), self.description.electrode_count
+        padded = np.zeros((nodes + electrodes, electrodes))  # the last electrode's potential is 0
+        padded[:-1, :-1] = fields
+        return padded[nodes:][tuple(self.pairs)], padded[:nodes]
+
+    def readings_of_empty(self, currents: FloatArray, weights: FloatArray) -> FloatArray:
+        """Readings (n,) of the empty tank by currents and weights (n, L), see `Readings`."""
+        transfer = np.zeros((currents.shape[1],) * 2)
+        transfer[tuple(self.pairs)] = transfer[tuple(self.pairs[::-1])] = self.empty
+        return np.asarray(((currents @ transfer) * weights).sum(axis=1))
+
+    def derivative(self, by_pair: FloatArray, fields: FloatArray | None = None) -> FloatArray:
+        """Derivative (r, T) by the triangles' conductivities; of the empty tank if no fields.
+
+        Args:
+            by_pair: (r, P) how numbers follow from the transfer resistances.
+            fields: (N, L) of the tank that is differentiated.
+        """
+        fields = self._fields if fields is None else fields
+        one, other = self.pairs
+        gradients = [np.ascontiguousarray((slope @ fields).T) for slope in self._slope]
+        products = sum(gradient[one] * gradient[other] for gradient in gradients)
+        return np.asarray(-(by_pair @ products) * self._area)
+
+
+class Readings:
+    """Readings of one tank, as independent numbers of unit noise.
+
+    Args:
+        model: the tank.
+        currents: (n, L) into the electrodes at each reading; a row's sum is 0.
+        weights: (n, L) of the electrodes' potentials; a row's sum is 0.
+        reference: (n,) readings of the empty tank, in the model's unit.
+
+    Attributes:
+        by_pair: (r, P) the numbers by the transfer resistances.
+    """
+
+    def __init__(
+        self, model: TankModel, currents: FloatArray, weights: FloatArray, reference: FloatArray
+    ) -> None:
+        one, other = model.pairs
+        to_readings = currents[:, one] * weights[:, other] + currents[:, other] * weights[:, one]
+        to_readings[:, one == other] /= 2
+        noise = np.hypot(NOISE_OF_ALL * np.sqrt(np.mean(reference**2)), NOISE_OF_OWN * reference)
+        weighted = to_readings / noise[:, None]
+        size, axes = np.linalg.eigh(weighted.T @ weighted)
+        kept = size > INDEPENDENT * size[-1]
+        length, axes = np.sqrt(size[kept]), axes[:, kept]
+        away = np.diag(CONTACT * (one == other))[:, one == other]
+        away = length[:, None] * (axes.T @ np.column_stack([away, WATER * model.empty]))
+        root = np.linalg.cholesky(np.eye(len(length)) + away @ away.T)
+        self.by_pair = scipy.linalg.solve_triangular(root, length[:, None] * axes.T, lower=True)
+        reduce = (weighted @ axes / length / noise[:, None]).T
+        self._reduce = scipy.linalg.solve_triangular(root, reduce, lower=True)
+
+    def reduced(self, changes: FloatArray) -> FloatArray:
+        """Numbers (..., r) of readings' changes (..., n), full minus empty, in the model's unit."""
+        return np.asarray(changes @ self._reduce.T)

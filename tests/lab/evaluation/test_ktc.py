@@ -1,0 +1,134 @@
+"""Tanks of the Kuopio Tomography Challenge: simulated ones, the four measured ones, bad files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tactomo_lab.evaluation.ktc import evaluate_challenge, read_challenge
+from tactomo_lab.tanks.challenge import challenge_pattern, every_reading, kept_readings
+from tactomo_lab.tanks.model import TankModel
+from tactomo_lab.training.tank_scenes import FINE_RINGS, draw, simulate
+from tactomo_models import DataError, load_description
+from tactomo_models.arrays import FloatArray
+
+Run = Callable[..., Any]
+Arrays = dict[str, Any]
+
+MEASURED = Path(__file__).parents[3].parent / "shared" / "data" / "ktc2023_training.npz"
+SEED = 10**6  # no seed of the training's
+LEVELS = (1, 4, 7)
+
+
+@pytest.fixture(scope="module")
+def tank_model() -> TankModel:
+    return TankModel(load_description("tank_ktc2023"), FINE_RINGS)
+
+
+@pytest.fixture(scope="module")
+def simulated(tank_model: TankModel) -> Arrays:
+    """Six tanks in volts and amperes, with noise; of each level two."""
+    currents, weights = challenge_pattern()
+    drive, measure = 1.5 * currents[::31].T, weights[:31].T
+    currents, weights = every_reading(drive, measure)
+    one, other = tank_model.pairs
+    rng = np.random.default_rng(SEED)
+    empty = tank_model.readings_of_empty(currents, weights) / 0.74
+    voltages, truth = [], []
+    for count, (kind, solved) in enumerate(islice(simulate([tank_model], SEED), 6)):
+        transfer = np.zeros((32, 32))
+        transfer[one, other] = transfer[other, one] = solved[0]
+        change = ((currents @ transfer) * weights).sum(axis=1) / 0.74
+        change += 0.03 * np.sqrt(np.mean(change**2)) * rng.standard_normal(len(change))
+        lost = ~kept_readings(currents, weights, range(2 * LEVELS[count // 2] - 2))
+        voltages.append(np.where(lost, np.nan, empty + change))
+        truth.append(np.kron(np.where(kind > 0.5, 2, kind < -0.5), np.ones((4, 4))))
+    return {
+        "injection": np.array([drive] * 6),
+        "measurement": measure,
+        "reference": np.array([empty] * 6),
+        "voltages": np.array(voltages),
+        "truth": np.array(truth, np.uint8),
+        "level": np.repeat(LEVELS, 2),
+    }
+
+
+def test_simulated_tanks_are_scored(tactomo: Run, simulated: Arrays, tmp_path: Path) -> None:
+    np.savez(tmp_path / "six.npz", **simulated)
+    asked = ("evaluate", "ktc", tmp_path / "six.npz")
+    result = tactomo(*asked, "--json", "--picture", tmp_path / "ktc.png")
+    assert result.returncode == 0, result.stderr
+    told = json.loads(result.stdout)
+    scores = [tank["score"] for tank in told["tanks"]]
+    assert told["score"] == pytest.approx(sum(scores))
+    assert np.mean(scores) > 0.7
+    assert [tank["level"] for tank in told["tanks"]] == list(simulated["level"])
+    assert [tank["readings"] for tank in told["tanks"]][::2] == [2356, 50 * 25, 27 * 19]
+    assert max(tank["seconds"] for tank in told["tanks"]) < 10
+    assert (tmp_path / "ktc.png").read_bytes().startswith(b"\x89PNG")
+    assert "sum" in tactomo(*asked).stdout
+
+
+def test_the_unit_of_the_voltages_does_not_matter(simulated: Arrays, tmp_path: Path) -> None:
+    """Nor whose currents are driven by: what counts is what they do to the empty tank."""
+    tank = load_description("tank_ktc2023")
+
+    def images(**changed: FloatArray) -> FloatArray:
+        np.savez(
+            tmp_path / "some.npz", **{k: v[2:4] if len(v) == 6 else v for k, v in changed.items()}
+        )
+        given = read_challenge(tmp_path / "some.npz", tank)
+        return np.array([outcome.image for outcome in evaluate_challenge(given, tank)])
+
+    as_it_is = images(**simulated)
+    in_mv = {key: 1e3 * simulated[key] for key in ("reference", "voltages")}
+    assert (images(**{**simulated, **in_mv}) == as_it_is).mean() > 0.999
+
+
+@pytest.mark.parametrize(
+    ("key", "change", "said"),
+    [
+        ("voltages", lambda a: a[:, :-1], "voltages is"),
+        ("voltages", lambda a: a * np.nan, "no reading that is a number"),
+        ("injection", lambda a: a[:, :16], "injection is"),
+        ("truth", lambda a: a + 1, "other values"),
+        ("level", lambda a: a[:2], "level is"),
+    ],
+)
+def test_what_is_no_challenge(
+    simulated: Arrays, tmp_path: Path, key: str, change: Callable[[Any], Any], said: str
+) -> None:
+    np.savez(tmp_path / "bad.npz", **{**simulated, key: change(simulated[key])})
+    with pytest.raises(DataError, match=said):
+        read_challenge(tmp_path / "bad.npz", load_description("tank_ktc2023"))
+
+
+def test_drawn_objects_keep_apart() -> None:
+    rng = np.random.default_rng(SEED)
+    kinds = np.array([draw(rng) for _ in range(8)])
+    assert set(np.unique(kinds)) == {-1, 0, 1}
+    assert not kinds[:, [0, -1]].any()
+    beside = np.abs(np.diff(kinds, axis=1)).max(), np.abs(np.diff(kinds, axis=2)).max()
+    assert max(beside) == 1  # no two of opposite kinds touch
+
+
+@pytest.mark.parametrize(("level", "least"), [(1, 0.88), (4, 0.8), (7, 0.7)])
+def test_measured_tanks(level: int, least: float) -> None:
+    if not MEASURED.exists():
+        pytest.skip(f"{MEASURED.name} is not beside the project")
+    tank = load_description("tank_ktc2023")
+    given = read_challenge(MEASURED, tank).at_level(level)
+    np.testing.assert_array_equal(
+        np.sign(every_reading(given.currents[0], given.weights)), challenge_pattern()
+    )
+    outcomes = list(evaluate_challenge(given, tank))
+    assert np.mean([outcome.score for outcome in outcomes]) > least
+    assert all(
+        outcome.readings == np.isfinite(v).sum()
+        for outcome, v in zip(outcomes, given.voltages, strict=True)
+    )
