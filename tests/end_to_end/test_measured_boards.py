@@ -21,7 +21,7 @@ from tactomo.twin import Twin, TwinConfig
 from tactomo_client import Frame, subscribe
 from tactomo_lab.evaluation.skin_presses import read_presses
 from tactomo_lab.evaluation.tanks import (
-    TankFitter,
+    TankImager,
     correlation,
     on_pixels,
     read_tanks,
@@ -154,7 +154,7 @@ def test_tanks_come_as_well_through_a_board_that_prints_tables(tmp_path: Path) -
     tanks = read_tanks(measured("tank_uef2017.npz"), sensor)
     artifact = build_artifact(sensor)
     size = np.abs(ForwardModel(sensor, artifact.bare).bare_voltages)
-    changes = tanks.changes * SCALE * TankFitter(sensor).largest_scale(tanks.changes)
+    changes = tanks.changes * SCALE * TankImager(sensor, artifact).largest_scale(tanks.changes)
     noise = noise_of_reciprocity(sensor, changes)
     assert noise is not None
     rng = np.random.default_rng(0)

@@ -24,19 +24,19 @@ app = typer_app()
 @app.command(
     epilog=examples(
         "tactomo evaluate tanks tank_uef2017.npz --picture tanks.png",
-        "tactomo evaluate tanks tank_uef2017.npz --method levelset --scale 0.9",
+        "tactomo evaluate tanks tank_uef2017.npz --method levelset --scale 0.78",
     ),
 )
 def tanks(
     scans: Annotated[Path, typer.Argument(metavar="IN.npz", help="Measured tanks, see above.")],
     method: Annotated[
-        str | None, method_option(" [tikhonov, noser and levelset, side by side]")
+        str | None, method_option(" [tikhonov, noser and network, side by side]")
     ] = None,
     scale: Annotated[
         float | None,
         typer.Option(
             min=1e-30,
-            help="Volts per ampere in a sheet of 1 S, per unit of dv. [found from dv]",
+            help="Volts per ampere in a sheet of 1 S, per unit of dv. [not known]",
         ),
     ] = None,
     sensor: Description = "tank_uef2017",
@@ -49,17 +49,15 @@ def tanks(
     scale common to all; `truth` (n, rows, columns), 1 in what conducts better than the saline and
     -1 in what conducts worse, row 0 at the top, the disc filling the picture; and `name` (n,).
 
-    The figure is the Pearson correlation of the structure map with the truth over the disc. The
-    scale is a parameter of each tank's fit, averaged over the tanks; the truth has no part in it.
-    *levelset* refines a network's objects as `tactomo evaluate ktc` does; other methods are the
-    daemon's.
+    The figure is the Pearson correlation of the structure map with the truth over the disc.
+    *network* makes objects of linear images, as in `tactomo evaluate ktc`, and where the scale is
+    not known averages over all that are likely; its confidence is the correlation to expect. Other
+    methods are the daemon's, which take the middle one of these scales.
     """
     from tactomo_models import load_description
 
     from tactomo_lab.evaluation.tanks import (
-        TankFitter,
         TankImager,
-        estimate_scale,
         evaluate_tanks,
         read_tanks,
     )
@@ -72,18 +70,13 @@ def tanks(
             f"{description.name!r} is no tank: it has a magnitude channel",
             "give a description of one channel, such as tank_uef2017",
         )
-    methods = [method] if method else ["tikhonov", "noser", "levelset"]
+    methods = [method] if method else ["tikhonov", "noser", "network"]
     with _status("reading"):
         measured = read_tanks(scans, description)
-        imager, fitter = TankImager(description), TankFitter(description)
-    sigma = 0.0
-    if scale is None:
-        with _status("finding the scale"):
-            scale, sigma = estimate_scale(fitter, measured.changes)
+        imager = TankImager(description)
     total = len(methods) * len(measured.names)
-    found = evaluate_tanks(imager, fitter, measured, methods, scale, sigma)
-    outcomes = list(shown(found, total, "tanks"))
-    facts = {"simulated": False, "sensor": description.name, "scale": scale, "scale_sigma": sigma}
+    outcomes = list(shown(evaluate_tanks(imager, measured, methods, scale), total, "tanks"))
+    facts = {"simulated": False, "sensor": description.name, "scale": scale}
     if as_json:
         print_json({**facts, **_tanks_as_json(methods, outcomes)})
     else:
@@ -105,7 +98,7 @@ def _mean(outcomes: Sequence[TankOutcome], method: str) -> float:
 
 
 def _tanks_as_json(methods: Sequence[str], outcomes: Sequence[TankOutcome]) -> dict[str, Any]:
-    told = ("name", "method", "correlation", "misfit", "seconds")
+    told = ("name", "method", "correlation", "misfit", "confidence", "seconds")
     return {
         "mean_correlation": {method: _mean(outcomes, method) for method in methods},
         "tanks": [{name: getattr(outcome, name) for name in told} for outcome in outcomes],
@@ -123,17 +116,20 @@ def _print_tanks(
     table.add_column("correlation with the truth")
     for method in methods:
         table.add_column(method, justify="right")
+    table.add_column("confidence", justify="right")
     by_tank = [outcomes[i : i + len(methods)] for i in range(0, len(outcomes), len(methods))]
     for of_tank in by_tank:
-        table.add_row(of_tank[0].name, *(f"{outcome.correlation:.3f}" for outcome in of_tank))
+        figures = (f"{outcome.correlation:.3f}" for outcome in of_tank)
+        sure = [f"{o.confidence:.2f}" for o in of_tank if o.method == "network"]
+        table.add_row(of_tank[0].name, *figures, *sure)
     table.add_section()
     means = (f"{_mean(outcomes, method):.3f}" for method in methods)
     table.add_row("[bold]mean[/]", *(f"[bold]{mean}[/]" for mean in means))
     longest = (max(o.seconds for o in outcomes if o.method == method) for method in methods)
     table.add_row("seconds, longest", *(f"{seconds:.2f}" for seconds in longest))
     console = Console()
-    scale = f"scale {facts['scale']:.3g} (± {facts['scale_sigma']:.0%})"
-    console.print(f"measured tanks, {facts['sensor']}, {scale}")
+    scale = "not known" if facts["scale"] is None else f"{facts['scale']:.3g}"
+    console.print(f"measured tanks, {facts['sensor']}, scale {scale}")
     console.print(table)
 
 

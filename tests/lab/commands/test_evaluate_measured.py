@@ -56,7 +56,7 @@ def test_tanks_in_words(tactomo: Run, tank: Path, tmp_path: Path) -> None:
     result = tactomo(*asked)
     assert result.returncode == 0
     assert "measured tanks, tank_uef2017, scale 0.01" in result.stdout
-    for heading in ("half", "tikhonov", "noser", "levelset", "mean"):
+    for heading in ("half", "tikhonov", "noser", "network", "mean"):
         assert heading in result.stdout
 
 
@@ -82,7 +82,7 @@ def test_presses_in_numbers_and_words(tactomo: Run, tmp_path: Path) -> None:
     assert "taught by" in result.stdout
 
 
-@pytest.mark.parametrize("command", ["tanks", "skin"])
+@pytest.mark.parametrize("command", ["tanks", "skin", "ktc"])
 def test_a_file_that_is_none(tactomo: Run, tmp_path: Path, command: str) -> None:
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     result = tactomo("evaluate", command, tmp_path / "other.npz")

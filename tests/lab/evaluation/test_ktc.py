@@ -75,19 +75,18 @@ def test_simulated_tanks_are_scored(tactomo: Run, simulated: Arrays, tmp_path: P
 
 
 def test_the_unit_of_the_voltages_does_not_matter(simulated: Arrays, tmp_path: Path) -> None:
-    """Nor whose currents are driven by: what counts is what they do to the empty tank."""
+    """What counts is what the empty tank shows."""
     tank = load_description("tank_ktc2023")
 
-    def images(**changed: FloatArray) -> FloatArray:
-        np.savez(
-            tmp_path / "some.npz", **{k: v[2:4] if len(v) == 6 else v for k, v in changed.items()}
-        )
+    def images(changed: Arrays) -> FloatArray:
+        two: Arrays = {k: v[2:4] if len(v) == 6 else v for k, v in changed.items()}
+        np.savez(tmp_path / "some.npz", **two)
         given = read_challenge(tmp_path / "some.npz", tank)
         return np.array([outcome.image for outcome in evaluate_challenge(given, tank)])
 
-    as_it_is = images(**simulated)
+    as_it_is = images(simulated)
     in_mv = {key: 1e3 * simulated[key] for key in ("reference", "voltages")}
-    assert (images(**{**simulated, **in_mv}) == as_it_is).mean() > 0.999
+    assert (images({**simulated, **in_mv}) == as_it_is).mean() > 0.999
 
 
 @pytest.mark.parametrize(
