@@ -187,7 +187,7 @@ def train(
 def train_tanks(
     folder: Annotated[Path, typer.Argument(help="Where the scenes go; made if missing.")],
     scenes: Annotated[int, typer.Option(min=TANKS_IN_SHARD, help="How many tanks.")] = 2500,
-    steps: Annotated[int, typer.Option(min=20, help="Batches of twenty.")] = 4000,
+    steps: Annotated[int, typer.Option(min=20, help="Batches of twenty.")] = 3600,
     seed: Annotated[int, typer.Option(min=0, help="Of weights, noise and turns.")] = 0,
     jobs: Annotated[
         int | None, typer.Option(min=1, help="Processes. [one for each core]", show_default=False)
