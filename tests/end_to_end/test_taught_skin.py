@@ -63,7 +63,12 @@ class Bench:
 
     def press(self, x_mm: float, y_mm: float) -> Frame:
         """Press one place alone; returns a frame of a scan that was taken since."""
-        where = {"x_mm": x_mm, "y_mm": y_mm, "radius_mm": RADIUS_MM, "pressure_kpa": KPA}
+        where: dict[str, Any] = {
+            "x_mm": x_mm,
+            "y_mm": y_mm,
+            "radius_mm": RADIUS_MM,
+            "pressure_kpa": KPA,
+        }
         ask("clear", self._control)
         ask("press", self._control, **where)
         before = ask("status", self._control)["counter"]
