@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from tactomo.cli.options import Description, JsonOutput, examples, typer_app
 from tactomo.cli.plot.plot import prepare_picture, save_figure
+from tactomo.errors import TactomoError
 
 from tactomo_lab.commands.evaluate import Picture, print_json, shown
 
@@ -51,6 +52,10 @@ def ktc(
     if picture is not None:
         prepare_picture(picture)
     description = load_description(sensor)
+    if description.sheet.shape != "disc" or description.structure is None:
+        raise TactomoError(
+            f"{description.name!r} is no round tank", "give a description such as tank_ktc2023"
+        )
     given = read_challenge(file, description)
     if level is not None:
         given = given.at_level(level)

@@ -119,12 +119,22 @@ class ChallengeImager:
     def find(
         self, currents: FloatArray, weights: FloatArray, reference: FloatArray, volts: FloatArray
     ) -> tuple[TankFit, FloatArray]:
-        """What fits one tank of a `Challenge`, and its changes (n,) in the model's unit."""
+        """What fits one tank of a `Challenge`, and its changes (n,) in the model's unit.
+
+        Raises:
+            DataError: the reference is none of this tank.
+        """
         of_drive, of_reading = every_reading(currents, weights)
         kept = np.isfinite(reference) & np.isfinite(volts)
         empty = self._model.readings_of_empty(of_drive[kept], of_reading[kept])
         # The largest readings tell most, and are nearest to the model's.
-        scale = float(empty @ empty / (empty @ reference[kept]))
+        shown = float(empty @ reference[kept])
+        if not shown > 0:
+            raise DataError(
+                "the reference is no scan of this tank: give injection in amperes into the "
+                "electrodes, measurement as the weights of their potentials, drive by drive"
+            )
+        scale = float(empty @ empty) / shown
         key = of_drive.tobytes() + of_reading.tobytes() + kept.tobytes()
         if self._known is None or self._known[0] != key:
             readings = Readings(self._model, of_drive[kept], of_reading[kept], empty)

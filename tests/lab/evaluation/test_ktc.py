@@ -107,6 +107,16 @@ def test_what_is_no_challenge(
         read_challenge(tmp_path / "bad.npz", load_description("tank_ktc2023"))
 
 
+def test_what_the_command_refuses(tactomo: Run, simulated: Arrays, tmp_path: Path) -> None:
+    np.savez(tmp_path / "turned.npz", **{**simulated, "reference": -simulated["reference"]})
+    result = tactomo("evaluate", "ktc", tmp_path / "turned.npz")
+    assert result.returncode == 1
+    assert "the reference is no scan of this tank" in result.stderr
+    result = tactomo("evaluate", "ktc", tmp_path / "turned.npz", "--description", "paper_square")
+    assert result.returncode == 1
+    assert "no round tank" in result.stderr
+
+
 def test_drawn_objects_keep_apart() -> None:
     rng = np.random.default_rng(SEED)
     kinds = np.array([draw(rng) for _ in range(8)])
