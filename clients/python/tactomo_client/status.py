@@ -148,9 +148,8 @@ class Port:
     """Packets that were damaged on their way."""
     faulty: int = 0
     """Intact packets that break the protocol."""
-    """Packets that failed a check."""
     received_last_minute: Mapping[str, int] = field(default_factory=dict)
-    """By how much `packets` and `corrupt` have risen within it."""
+    """By how much `packets`, `corrupt` and `faulty` have risen within it."""
     refusal: str | None = None
     """Why the device's scans are not used, if they are not."""
     unused_scans: int = 0

@@ -120,6 +120,18 @@ _POSITION: Final = struct.Struct("<IQB")
 _POSITION_TYPE: Final = 0x70  # PROTOCOL.md leaves it to experiments; no device of ours sends it
 
 
+@dataclass
+class ForeignCounts(DecoderCounts):
+    """See `DecoderCounts`; what has no checksum is damaged where it cannot be read."""
+
+    unreadable: int = 0  # no message of the protocol, or not all of one
+
+    @property
+    def damaged(self) -> int:
+        """Messages that the line spoilt."""
+        return super().damaged + self.unreadable
+
+
 @dataclass(frozen=True, slots=True)
 class _Position:
     """Where in its scans a foreign port is: what its bytes do not say."""
@@ -150,6 +162,7 @@ class ForeignProtocol(PortProtocol):
     """
 
     device_id: ClassVar[str]
+    counts: ForeignCounts
 
     def __init__(self, description: SensorDescription | None, rate_hz: float = 0.0) -> None:
         if description is None:
@@ -170,7 +183,7 @@ class ForeignProtocol(PortProtocol):
                 "list fewer drive or measuring pairs in its [pattern]",
             )
         self.description = description
-        self.counts = DecoderCounts()
+        self.counts = ForeignCounts()
         self._failure: Trouble | None = None  # a mistake of the subclass, the last one
         self.device_us = 0
         self.clock_format = 0

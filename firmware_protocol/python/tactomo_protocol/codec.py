@@ -93,13 +93,12 @@ class DecoderCounts:
     malformed: int = 0  # intact, but its body breaks the specification: a sender's mistake
     oversize: int = 0  # longer than any frame may be; dropped up to the next delimiter
     wrong_version: int = 0  # intact, of a protocol version that is not spoken here
-    unreadable: int = 0  # of a protocol without a checksum: no message of it, or not all of one
     unknown_type: int = 0  # returned as `UnknownPacket`; not an error
 
     @property
     def damaged(self) -> int:
         """Frames that the line spoilt."""
-        return self.crc_errors + self.cobs_errors + self.oversize + self.unreadable
+        return self.crc_errors + self.cobs_errors + self.oversize
 
     @property
     def faulty(self) -> int:

@@ -203,7 +203,7 @@ def test_a_damaged_line_costs_itself(line: bytes) -> None:
     whole = openeit_line(VALUES[:192])
     protocol = begun(OpenEit(OPENEIT))
     assert len(scans(protocol.feed(whole + line + whole))) == 2
-    assert protocol.counts.corrupt == 1
+    assert (protocol.counts.damaged, protocol.counts.faulty) == (1, 0)
     assert protocol.trouble is None
 
 
