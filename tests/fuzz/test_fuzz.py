@@ -47,7 +47,9 @@ def mutations(draw: st.DrawFn, examples: list[bytes]) -> bytes:
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_what_is_valid_is_taken(name: str) -> None:
-    for example in TARGETS[name].examples():
+    examples = TARGETS[name].examples()
+    assert examples
+    for example in examples:
         assert TARGETS[name].parse(example)
 
 

@@ -37,7 +37,7 @@ from tactomo.recordings.recording_writer import (
 from tactomo.scans import Mark, ScanKey
 from tactomo.stream.control import COMMANDS
 from tactomo.twin import control as twin_control
-from tactomo.twin.scene import load_scene
+from tactomo.twin.scene import SHIPPED, load_scene
 from tactomo_client import ClientError, ControlError, MessageError
 from tactomo_client.event import Event
 from tactomo_client.frame import frame_from_message
@@ -428,7 +428,7 @@ def _parse_config(data: bytes) -> bool:
 
 
 def _scene_examples() -> list[bytes]:
-    return [path.read_bytes() for path in sorted((DEPLOY / "scenes").glob("*.toml"))]
+    return [path.read_bytes() for path in SHIPPED.values()]
 
 
 def _parse_scene(data: bytes) -> bool:
