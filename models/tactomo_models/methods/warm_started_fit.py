@@ -313,8 +313,9 @@ class _Course:
             if suspect:
                 self._tried_misfit = 0.0
             scratch, how = self._from_scratch(frame)
-            left_out = self._each_left_out(shape, frame)
-            best = min([shape, *left_out, scratch], key=lambda s: s.cost)
+            joined = self._joined(shape, frame)
+            left_out = self._each_left_out(joined, frame)
+            best = min([shape, joined, *left_out, scratch], key=lambda s: s.cost)
             # What was only moved explains most at once; what was found elsewhere may mislead.
             nothing_cost = self._nothing(frame).cost
             self._from_nothing = best is scratch or best.cost < max_left * nothing_cost
@@ -446,6 +447,14 @@ class _Course:
         as_needed = self.shape_model == ShapeModel.AS_NEEDED and not self.searches_both
         free = [self._escalate] if as_needed else []
         return [self._birth, *form, *free, *self._deaths(shape)]
+
+    def _joined(self, shape: FittedField, frame: _Frame) -> FittedField:
+        """The same contacts and others that landed away from them, before any is let move."""
+        while (born := self._birth(shape, frame)) is not None and born.shape.cost < shape.cost / 2:
+            shape = born.shape
+            if frame.budget.over:
+                break
+        return shape
 
     def _early_birth(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
         """A further contact where that much is left that it need not wait for the others."""
