@@ -356,7 +356,7 @@ class _Course:
             proposed = self._evaluate(each, proposed_order, self.tools.fit.likely, frame)
             if proposed is not None and proposed.cost < nothing.cost:
                 return proposed, "proposed"
-        return nothing, "cold start"
+        return self._joined(nothing, frame), "cold start"
 
     def _improve(self, shape: FittedField, frame: _Frame) -> FittedField:
         """Refine, and try one candidate after another, until none is left or the budget ends."""
@@ -450,10 +450,11 @@ class _Course:
 
     def _joined(self, shape: FittedField, frame: _Frame) -> FittedField:
         """The same contacts and others that landed away from them, before any is let move."""
-        while (born := self._birth(shape, frame)) is not None and born.shape.cost < shape.cost / 2:
-            shape = born.shape
-            if frame.budget.over:
+        while not frame.budget.over:
+            born = self._birth(shape, frame)
+            if born is None or born.shape.cost > shape.cost - born.gain:
                 break
+            shape = born.shape
         return shape
 
     def _early_birth(self, shape: FittedField, frame: _Frame) -> _Candidate | None:
