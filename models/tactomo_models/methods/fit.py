@@ -19,6 +19,7 @@ from tactomo_models.methods.magnitudes import BAD_MISFIT
 from tactomo_models.methods.method import Estimate, Skin, UnsolvableError
 from tactomo_models.methods.objects import ObjectFit
 from tactomo_models.methods.warm_started_fit import Propose, ShapeModel, WarmStartedFit
+from tactomo_models.physics.actual_sheet import SheetEstimator
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scene.field_account import FieldAccount, FieldAccountant
@@ -42,6 +43,7 @@ class OutlineFit:
         self._last: tuple[FittedField, FieldAccount] | None = None
         self._odds: list[float] = []  # of what the last account was made with
         if before is not None and before.forward is skin.forward:
+            self._look_at_sheets()
             return
         self._field_fit = FieldFit(skin.forward, skin.description)
         self._accountant = FieldAccountant(self._field_fit, skin.areas)
@@ -52,11 +54,28 @@ class OutlineFit:
         else:
             self._fit = WarmStartedFit(self._field_fit, self.shape_model, self.questions)
             self._typical_peak = self._fit.typical_peak
+            self._estimator = SheetEstimator(skin.description, skin.artifact.bare)
+        self._look_at_sheets()
+
+    def _look_at_sheets(self) -> None:
+        """Find how each sheet was made, by its reference."""
+        self._error_ratios: dict[Channel, float] = {}
+        if isinstance(self._fit, ObjectFit):
+            return
+        sheets = {}
+        for name, channel in self._skin.channels.items():
+            noise = channel.relative_noise
+            sheet = self._estimator.estimate(channel.reference, channel.usable, noise)
+            if sheet is not None:
+                sheets[name] = sheet
+                self._error_ratios[name] = channel.error_ratio(sheet.bare_voltages)
+        self._field_fit.sheets = sheets
 
     def solve(
         self, measurement: Measurement, previous: Estimate | None, budget_s: float
     ) -> Estimate:
         """Fit a field, from where the frame before ended."""
+        measurement = self._as_sheets_are(measurement)
         if previous is None:
             self._forget()
         if Channel.STRUCTURE in self._skin.description.channels:
@@ -69,6 +88,14 @@ class OutlineFit:
             account = self._account(fitted, measurement.changes)
         self._made_by = self._name_of(fitted)
         return self._conclude(measurement, fitted, account, how)
+
+    def _as_sheets_are(self, measurement: Measurement) -> Measurement:
+        """The same, with changes as sure as the sheets that they are judged by are known."""
+        changes = {
+            name: each.judged_by(self._error_ratios[name]) if name in self._error_ratios else each
+            for name, each in measurement.changes.items()
+        }
+        return replace(measurement, changes=changes)
 
     def _forget(self) -> None:
         self._fit.forget()

@@ -63,6 +63,7 @@ def solve_bare_sheet(
     impedance: FloatArray | None = None,
     *,
     quick: bool = False,
+    drawn_on: BareSheet | None = None,
 ) -> BareSheet:
     """Assemble and solve the complete electrode model of an unpressed sheet.
 
@@ -73,13 +74,19 @@ def solve_bare_sheet(
         impedance: (L,) contact impedances, relative to the description's; 1 if None.
         quick: leave the Green's function in pieces: a tenth of the time and memory, but a newly
             pressed area then costs a millisecond more.
+        drawn_on: a sheet of the same mesh, before its electrodes were moved: what can be pressed,
+            and where that is on the map, is as on that one. Found anew if None.
     """
     mesh = sheet.mesh
     # The integral of a linear conductivity over a triangle is that of its corners' mean.
     nodal = np.ones(mesh.p.shape[1]) if conductivity is None else conductivity
     system = assemble_sheet(description, sheet, nodal[mesh.t].mean(axis=0), impedance)
-    inside = description.on_sheet(mesh.p[0], mesh.p[1], description.sheet.frame_width_m)
-    pressable = np.flatnonzero(inside)
+    if drawn_on is None:
+        inside = description.on_sheet(mesh.p[0], mesh.p[1], description.sheet.frame_width_m)
+        pressable = np.flatnonzero(inside)
+        map_weights = _map_weights(description, mesh)[:, pressable].tocsr()
+    else:
+        pressable, map_weights = drawn_on.pressable, drawn_on.map_weights
     touched = np.isin(mesh.t, pressable).any(axis=0)
     support = np.unique(mesh.t[:, touched])
     fields = electrode_fields(description, system)
@@ -93,8 +100,8 @@ def solve_bare_sheet(
         support=support,
         green=kept,
         potentials=fields[support],
-        transfer=_transfer(description, fields),
-        map_weights=_map_weights(description, mesh)[:, pressable].tocsr(),
+        transfer=transfer_of(description, fields),
+        map_weights=map_weights,
         conductivity=conductivity,
     )
 
@@ -118,7 +125,7 @@ def transfer_resistances(
         see `scan_voltages`.
     """
     system = assemble_sheet(description, sheet, conductivity, impedance)
-    return _transfer(description, electrode_fields(description, system))
+    return transfer_of(description, electrode_fields(description, system))
 
 
 def transfer_slopes(
@@ -140,7 +147,7 @@ def transfer_slopes(
     for slope, change in zip(slopes, changes, strict=True):
         moved = assemble_sheet(description, sheet, 1 + change) - even  # it is linear in that
         slope[:-1, :-1] = -fields.T @ (moved @ fields)
-    return _transfer(description, fields), slopes
+    return transfer_of(description, fields), slopes
 
 
 def scan_voltages(description: SensorDescription, transfer: FloatArray) -> FloatArray:
@@ -181,7 +188,8 @@ def electrode_fields(description: SensorDescription, system: sp.csc_matrix) -> F
         return np.asarray(factor.solve(injected))
 
 
-def _transfer(description: SensorDescription, fields: FloatArray) -> FloatArray:
+def transfer_of(description: SensorDescription, fields: FloatArray) -> FloatArray:
+    """Transfer resistances (L, L) that a sheet's fields (unknowns, L - 1) end in."""
     electrodes = description.electrode_count
     transfer = np.zeros((electrodes, electrodes))
     transfer[:-1, :-1] = fields[1 - electrodes :]

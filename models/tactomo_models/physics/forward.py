@@ -93,7 +93,16 @@ class _PressedAreas:
 
 
 class ForwardModel:
-    """Voltages and their derivatives for relative conductivities on the pressable nodes."""
+    """Voltages and their derivatives for relative conductivities on the pressable nodes.
+
+    Args:
+        description: the sensor.
+        bare: its sheet, solved.
+
+    Attributes:
+        bare_voltages: (M,) of the unpressed sheet, in scan order; see `volts_per_unit`.
+        at_rest: (P,) conductivity of the unpressed sheet at the pressable nodes.
+    """
 
     def __init__(self, description: SensorDescription, bare: BareSheet) -> None:
         self.description = description
@@ -137,6 +146,7 @@ class ForwardModel:
             "tdi,tdj->tij", self._gradient, self._gradient
         )
         uneven = np.ones(nodes) if bare.conductivity is None else bare.conductivity
+        self.at_rest = uneven[bare.pressable]
         # Conductivity of a triangle is the mean of its corners'.
         self._bare_conductivity = uneven[corners].mean(axis=0)
 

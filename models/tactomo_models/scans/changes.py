@@ -7,7 +7,7 @@ variances: of noise, as seen at the tare, and of the model's error, which grows 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import NamedTuple
 
@@ -72,6 +72,19 @@ class Changes:
     tolerance: FloatArray
     modes: FloatArray
 
+    def judged_by(self, error_ratio: float) -> Changes:
+        """The same for a model whose errors have so many times the variance."""
+        there = self.weight > 0
+        variance = np.divide(1, self.weight**2, out=np.ones_like(self.weight), where=there)
+        error = error_ratio * np.maximum(variance - self.noise_variance, 0.0)
+        variance = self.noise_variance + error
+        return replace(
+            self,
+            weight=there / np.sqrt(variance),
+            variance_inflation=1 + (CORRELATED - 1) * error / variance,
+            tolerance=error_ratio * self.tolerance,
+        )
+
     @property
     def misfit(self) -> float:
         """Misfit of a model in which nothing is pressed."""
@@ -105,6 +118,7 @@ class MeasuredChannel:
         scans: how many `volts` is the mean of.
 
     Attributes:
+        reference: (M,) volts of the unpressed sheet, as it was at the tare.
         usable: (M,) voltages that the tare has found nothing wrong with.
         relative_noise: (M,) standard deviation of a relative change by noise, at the tare.
 
@@ -123,8 +137,6 @@ class MeasuredChannel:
         noise: FloatArray | None,
         scans: int,
     ) -> None:
-        change_error = 0.01  # least model error, as a share of a change and of a typical one
-        mismatch_share = 1 / 3  # of the reference's mismatch that is left in the changes
         trace = 1e-9  # relative noise of data that have none
         max_invalid = 0.5  # share of voltages that may be invalid before the channel is given up
         self._description, self._name = description, name
@@ -144,7 +156,7 @@ class MeasuredChannel:
         self.usable = valid = verdict.usable
         reference = np.where(valid, volts, 0.0)
         noise = np.where(valid, noise, 0.0)
-        self._tare = self._reference = reference
+        self.reference = self._reference = reference
         self._tare_per_volt = self._per_volt = np.divide(
             1, np.abs(reference), out=np.zeros_like(reference), where=valid
         )
@@ -153,15 +165,25 @@ class MeasuredChannel:
         self._noise = np.maximum(self.relative_noise**2 - MODEL_ERROR**2, trace**2)
         self._modes = _leading_modes(artifact.jacobian, np.where(valid, self._noise, np.inf))
         self._variance = self.relative_noise**2  # of a change where nothing presses, drift included
-        # A model that is wrong about the reference is wrong about the changes, too, if less: most
-        # of its error divides out.
-        mismatch = _mismatch(reference[valid], predicted[valid])
-        self._error_share = max(change_error, mismatch_share * mismatch)
+        self._error_share = self._error_share_of(predicted)
         asymmetry = asymmetry_of(wiring, reference)
         self._check = ScanCheck(wiring, reference, noise, valid, contrast, asymmetry)
         # Weights of the changes whose sum is the whole sheet's, in the direction of pressing.
         direction = 0.0 if description.either_way(name) else description.sign(name)
         self._total = direction * artifact.tikhonov.sum(axis=0)
+
+    def _error_share_of(self, predicted: FloatArray) -> float:
+        """Model error as a share of a change, of a model that predicts this reference (M,)."""
+        least = 0.01
+        # A model that is wrong about the reference is wrong about the changes, too, if less: most
+        # of its error divides out.
+        mismatch_share = 1 / 3
+        valid = self.usable
+        return max(least, mismatch_share * _mismatch(self.reference[valid], predicted[valid]))
+
+    def error_ratio(self, predicted: FloatArray) -> float:
+        """Variance of the errors of a model that predicts this reference (M,), over those told."""
+        return (self._error_share_of(predicted) / self._error_share) ** 2
 
     def follow(self, drift: FloatArray | None) -> None:
         """Measure changes against the tare as it has drifted since: (M,) logarithms of factors.
@@ -169,7 +191,7 @@ class MeasuredChannel:
         What is known of noise, wiring and faults stays that of the tare.
         """
         factor = 1.0 if drift is None else np.exp(drift)
-        self._reference = self._tare * factor
+        self._reference = self.reference * factor
         self._per_volt = self._tare_per_volt / factor
 
     def compare(self, scan: FloatArray, *, saturated: bool = False) -> ChannelResult:

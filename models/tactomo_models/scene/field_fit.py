@@ -136,7 +136,8 @@ class FieldFit:
         description: the sensor; that of `forward` if None.
 
     Attributes:
-        forward: the model of the sheets.
+        forward: the model of an even sheet.
+        sheets: each sheet as it is, where the tare has told; the even one elsewhere.
         responses: of each sheet.
         likely: logarithm of the structure sheet's ratio, as likely as any.
     """
@@ -145,7 +146,7 @@ class FieldFit:
         description = description or forward.description
         self.forward = forward
         self.responses: dict[Channel, SheetResponse] = responses_of(description)
-        self._volts = np.abs(forward.bare_voltages)
+        self.sheets: Mapping[Channel, ForwardModel] = {}
         saturated = np.log(10.0)
         if description.structure is not None:
             saturated = float(np.log(description.structure.saturated_ratio))
@@ -155,6 +156,9 @@ class FieldFit:
             self.likely = saturated / 2
         self._ratio_sigma = np.log(10) / np.sqrt(12)
         self._least_ratio, self._most_ratio = sorted((0.1 * saturated, 1.5 * saturated))
+
+    def _sheet(self, name: Channel) -> ForwardModel:
+        return self.sheets.get(name, self.forward)
 
     def compare(self, fitted: FittedField, measured: Measured) -> FittedField:
         """Hold an estimate against other data, without a solve.
@@ -192,13 +196,12 @@ class FieldFit:
             return None
         solutions = {}
         for name in measured:
-            response = self.responses[name]
+            response, forward = self.responses[name], self._sheet(name)
             share = _seen(name, drawing)
-            change = np.zeros(len(self.forward.bare.pressable))
-            change[drawing.nodes] = (
-                response.conductivity(share, drawing.pressure_kpa, log_ratio)[0] - 1
-            )
-            solutions[name] = self.forward.solve(
+            ratio = response.conductivity(share, drawing.pressure_kpa, log_ratio)[0]
+            change = np.zeros(len(forward.bare.pressable))
+            change[drawing.nodes] = forward.at_rest[drawing.nodes] * (ratio - 1)
+            solutions[name] = forward.solve(
                 change, mix_resistivities=response.rises(log_ratio), within=drawing.nodes
             )
         return self._judged(family, parameters, log_ratio, drawing, solutions, measured)
@@ -212,12 +215,11 @@ class FieldFit:
         solutions: Mapping[Channel, Solution],
         measured: Measured,
     ) -> FittedField:
-        bare = self.forward.bare_voltages
-        residuals = {
-            name: changes.weight
-            * ((solutions[name].voltages - bare) / self._volts - changes.change)
-            for name, changes in measured.items()
-        }
+        residuals = {}
+        for name, changes in measured.items():
+            bare = self._sheet(name).bare_voltages
+            change = (solutions[name].voltages - bare) / np.abs(bare)
+            residuals[name] = changes.weight * (change - changes.change)
         off = (log_ratio - self.likely) / (family.ratio_freedom * self._ratio_sigma)
         away = family.prior_precision @ (parameters - family.prior_mean) ** 2
         cost = float(sum(each @ each for each in residuals.values()) + away + off**2)
@@ -255,8 +257,11 @@ class FieldFit:
             onto = np.empty((len(drawing.nodes), share.shape[1] + 1))
             onto[:, :-1] = by_share[:, None] * seen + by_pressure[:, None] * pressure
             onto[:, -1] = by_log_ratio
-            by_parameter = self.forward.jacobian(fitted.solutions[name], drawing.nodes, onto)
-            sheets.append(by_parameter * (changes.weight / self._volts)[:, None])
+            forward = self._sheet(name)
+            onto *= forward.at_rest[drawing.nodes, None]
+            by_parameter = forward.jacobian(fitted.solutions[name], drawing.nodes, onto)
+            volts = np.abs(forward.bare_voltages)
+            sheets.append(by_parameter * (changes.weight / volts)[:, None])
         return np.concatenate(sheets)
 
     def refine(
