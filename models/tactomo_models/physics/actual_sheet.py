@@ -7,10 +7,10 @@ are fitted to the reference (Gauss-Newton, each with a prior of what such skins 
 are then solved on that sheet instead of an even one. Where no such sheet explains the reference,
 nothing is known of it and the even one stays.
 
-Sources: Vilhunen et al., "Simultaneous reconstruction of electrode contact impedances and internal
-electrical properties", Meas. Sci. Technol. 13 (2002), for the impedances; Darde et al., "Fine-tuning
-electrode information in electrical impedance tomography", Inverse Probl. Imaging 6 (2012), for the
-electrodes' places.
+Sources: for the impedances, Vilhunen et al., "Simultaneous reconstruction of electrode contact
+impedances and internal electrical properties", Meas. Sci. Technol. 13 (2002); for the electrodes'
+places, Darde et al., "Fine-tuning electrode information in electrical impedance tomography",
+Inverse Probl. Imaging 6 (2012).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 import skfem
 
-from tactomo_models.arrays import BoolArray, FloatArray
+from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 from tactomo_models.physics.artifact import INVERSE_REFINEMENTS, MODEL_ERROR
 from tactomo_models.physics.bare_sheet import (
     BareSheet,
@@ -174,7 +174,7 @@ class SheetEstimator:
         transfer[first, second] = transfer[second, first] = slopes
         return scan_voltages(self._description, transfer)
 
-    def _by_modes(self, shape: _Shape, first: FloatArray, second: FloatArray) -> FloatArray:
+    def _by_modes(self, shape: _Shape, first: IntArray, second: IntArray) -> FloatArray:
         """Derivatives (pairs, modes) of transfer resistances by the modes of conductivity."""
         corners = shape.mesh.mesh.t
         p = shape.mesh.mesh.p[:, corners]
