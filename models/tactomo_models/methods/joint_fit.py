@@ -115,6 +115,8 @@ class JointFit:
             self._settled_on, self._was_asked = measured, asks
             if asks and start.converged:  # else its form may answer for an edge
                 fitted = self._questioned(fitted, measured, budget, doubt)
+                if budget.over and not self._evidence:  # what never was answered is asked again
+                    self._was_asked, self._frames_moved = False, 0
         self._fitted = fitted
         return fitted
 
