@@ -7,8 +7,9 @@ which is refined beside the shape in force and takes its place once it explains 
 more than its further parameters would by chance. Contacts that the data do not need are taken away
 again.
 
-After a change that the known contacts do not account for, a cold start runs beside the warm one.
-Work is spent by the frame's budget; what one frame does not finish, the next one goes on with.
+After a change that the known contacts do not account for, they compete with what a cold start
+finds, and with themselves and what is missing. Work is spent by the frame's budget; what one frame
+does not finish, the next one goes on with.
 """
 
 from __future__ import annotations
@@ -207,20 +208,18 @@ class WarmStartedFit:
 
 
 class _Course:
-    """One course of fits from frame to frame; a cold start that runs beside it is another."""
+    """One course of fits from frame to frame."""
 
     def __init__(self, tools: _Tools, shape_model: ShapeModel) -> None:
         self.tools, self.shape_model = tools, shape_model
         self._shape: FittedField | None = None
         self._settled_on: Measured = {}  # the frame that the shape is of
         self._tried_misfit = 0.0  # at which all moves were tried on contacts like these
-        self._from_nothing = True  # or from the shape of frames before
         self.doubts: dict[int, Doubt] = {}  # of contacts like these, by what is in doubt
         self._adopted: Drawing | None = None
         self._earlier = np.zeros((0, COLUMNS))  # contacts of the frame before the last
         self._lacking: tuple[FittedField, list[MissingContact]] | None = None
         self._halved: tuple[FittedField, list[tuple[FittedField, int]]] | None = None
-        self._cold_start: _Course | None = None
         self._start_over()
 
     def _start_over(self) -> None:
@@ -236,12 +235,6 @@ class _Course:
             shape = self._improve(shape, frame)
             self._settled_on = frame.measured
         self._shape = shape
-        while self._doubtful(shape):
-            shape, how = self._against_cold_start(shape, how, frame)
-            if frame.budget.over:
-                break
-        if not self._doubtful(shape):
-            self._cold_start = None
         return shape, f"{how}, {_in_words(shape)}"
 
     @property
@@ -267,33 +260,8 @@ class _Course:
             self._adopted = joint.drawing
         return self._shape.drawing
 
-    def _doubtful(self, shape: FittedField) -> bool:
-        """Tell whether a cold start might do better: where the warm one had little to go on."""
-        return shape.converged and not self._from_nothing
-
-    def _against_cold_start(
-        self, shape: FittedField, how: str, frame: _Frame
-    ) -> tuple[FittedField, str]:
-        """Let a cold start run beside a doubtful shape; the better or the simpler goes on."""
-        if self._cold_start is None:
-            self._cold_start = _Course(self.tools, self.shape_model)
-        other, _ = self._cold_start.follow(frame)
-        if not other.converged:
-            return shape, how
-        self._from_nothing, self._cold_start = True, None
-        simpler = len(other.parameters) < len(shape.parameters)
-        as_good = other.misfit <= SLACK * max(shape.misfit, GOOD_MISFIT)
-        is_better = other.cost <= shape.cost - SURE_GAIN * _scale(shape, frame)
-        if not (is_better or (simpler and as_good)):
-            return shape, how
-        self._start_over()
-        self._shape, self._settled_on = other, frame.measured
-        self._tried_misfit = other.misfit
-        return other, "restarted"
-
     def _start(self, frame: _Frame) -> tuple[FittedField, str]:
         """The last frame's shape where it still holds; else the best of what may be left of it."""
-        max_left = 0.25  # of the cost of nothing, that contacts which moved leave to a new frame
         before = self._shape
         if before is not None and len(before.solutions) > len(frame.measured):  # a scan was lost
             known = isinstance(before.family, PressureField)
@@ -316,9 +284,6 @@ class _Course:
             joined = self._joined(shape, frame)
             left_out = self._each_left_out(joined, frame)
             best = min([shape, joined, *left_out, scratch], key=lambda s: s.cost)
-            # What was only moved explains most at once; what was found elsewhere may mislead.
-            nothing_cost = self._nothing(frame).cost
-            self._from_nothing = best is scratch or best.cost < max_left * nothing_cost
             if best is not shape:  # else they moved: once they have been followed, all is as it was
                 self._tried_misfit = 0.0
             return best, how if best is scratch else "warm start"
