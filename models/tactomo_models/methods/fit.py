@@ -60,16 +60,15 @@ class OutlineFit:
     def _look_at_sheets(self) -> None:
         """Find how each sheet was made, by its reference."""
         self._error_ratios: dict[Channel, float] = {}
+        self._field_fit.sheets = sheets = {}  # the last tare's take tens of megabytes
         if isinstance(self._fit, ObjectFit):
             return
-        sheets = {}
         for name, channel in self._skin.channels.items():
             noise = channel.relative_noise
             sheet = self._estimator.estimate(channel.reference, channel.usable, noise)
             if sheet is not None:
                 sheets[name] = sheet
                 self._error_ratios[name] = channel.error_ratio(sheet.bare_voltages)
-        self._field_fit.sheets = sheets
 
     def solve(
         self, measurement: Measurement, previous: Estimate | None, budget_s: float
