@@ -10,6 +10,7 @@ from tactomo_models.physics.actual_sheet import SheetEstimator
 from tactomo_models.physics.artifact import Artifact
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.reconstruct import Reconstructor
+from tactomo_protocol import Channel
 from variants import variant
 
 EVERY = np.ones(208, bool)
@@ -37,7 +38,7 @@ def off(voltages: FloatArray, forward: ForwardModel) -> float:
 def test_a_hand_made_sheet_is_found_by_its_reference(
     paper: SensorDescription, artifact: Artifact, estimator: SheetEstimator, seed: int
 ) -> None:
-    voltages = hand_made(paper, seed).voltages([])["magnitude"]
+    voltages = hand_made(paper, seed).voltages([])[Channel.MAGNITUDE]
     found = estimator.estimate(voltages, EVERY, NOISE)
     assert found is not None
     assert off(voltages, ForwardModel(paper, artifact.bare)) > 0.05
@@ -47,7 +48,7 @@ def test_a_hand_made_sheet_is_found_by_its_reference(
 def test_the_scale_of_the_voltages_is_of_no_matter(
     paper: SensorDescription, estimator: SheetEstimator
 ) -> None:
-    voltages = hand_made(paper).voltages([])["magnitude"]
+    voltages = hand_made(paper).voltages([])[Channel.MAGNITUDE]
     one = estimator.estimate(voltages, EVERY, NOISE)
     two = estimator.estimate(1e4 * voltages, EVERY, NOISE)
     assert one is not None
@@ -60,8 +61,8 @@ def test_a_press_changes_the_voltages_as_the_found_sheet_foretells(
 ) -> None:
     """The structure sheet, on which a press is a jump of conductivity, whatever its pressure."""
     skin = hand_made(paper)
-    rest = skin.voltages([])["structure"]
-    pressed = skin.voltages([Press(0.03, -0.02, 200.0, 0.012)])["structure"]
+    rest = skin.voltages([])[Channel.STRUCTURE]
+    pressed = skin.voltages([Press(0.03, -0.02, 200.0, 0.012)])[Channel.STRUCTURE]
     found = estimator.estimate(rest, EVERY, NOISE)
     assert found is not None
 
@@ -91,7 +92,7 @@ def test_voltages_that_no_such_sheet_has_are_left_to_the_even_one(
 def test_what_is_not_usable_does_not_count(
     paper: SensorDescription, estimator: SheetEstimator
 ) -> None:
-    voltages = hand_made(paper).voltages([])["magnitude"]
+    voltages = hand_made(paper).voltages([])[Channel.MAGNITUDE]
     whole = estimator.estimate(voltages, EVERY, NOISE)
     usable = EVERY.copy()
     usable[40:53] = False
@@ -125,8 +126,9 @@ def test_a_hand_made_skin_is_reconstructed_as_if_it_were_even(
     skin = hand_made(paper)
     rest = skin.voltages([])
     reconstructor = Reconstructor(paper, artifact, method="fit", budget_s=1.0)
-    reconstructor.set_reference(Reference(rest["magnitude"], rest["structure"]))
+    reconstructor.set_reference(Reference(rest[Channel.MAGNITUDE], rest[Channel.STRUCTURE]))
     press = Press(0.02, 0.03, 190.0, 0.012)
-    (contact,) = reconstructor.reconstruct(**skin.voltages([press])).contacts
+    by_name = {str(name): volts for name, volts in skin.voltages([press]).items()}
+    (contact,) = reconstructor.reconstruct(**by_name).contacts
     assert np.hypot(contact.x_m - press.x_m, contact.y_m - press.y_m) < 5e-4
     assert contact.pressure_kpa == pytest.approx(190, abs=10)
