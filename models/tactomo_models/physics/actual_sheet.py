@@ -34,6 +34,7 @@ from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import SheetMesh, mesh_sheet
 from tactomo_models.sensor.description import SensorDescription
 
+MAX_NODES = 6000  # that can be pressed: 150 MB of Green's function a sheet; the paper's has 2,500
 MAX_LEFT = 0.02  # relative error of a reference that the sheet explains: a tenth of hand-made ones'
 MODES = 6  # cosines along each side: with 8 nothing gets better
 UNEVENNESS = 0.15  # prior standard deviation of the logarithm of conductivity
@@ -93,13 +94,17 @@ class SheetEstimator:
     def estimate(
         self, voltages: FloatArray, usable: BoolArray, noise: FloatArray
     ) -> ForwardModel | None:
-        """The model of the sheet that these voltages are of; None where none explains them.
+        """The model of the sheet that these voltages are of.
+
+        None where none explains them, or where the sheet is too large for a model of its own.
 
         Args:
             voltages: (M,) of the unpressed sheet, volts on any scale.
             usable: (M,) which of them count.
             noise: (M,) their relative standard deviations.
         """
+        if len(self._even.support) > MAX_NODES:
+            return None
         parameters = np.zeros(len(self._sigma))
         prior = np.append(self._sigma**-2.0, 0.0)  # any scale is as likely
         for _ in range(STEPS):

@@ -146,7 +146,7 @@ class FieldFit:
         description = description or forward.description
         self.forward = forward
         self.responses: dict[Channel, SheetResponse] = responses_of(description)
-        self.sheets: Mapping[Channel, ForwardModel] = {}
+        self.sheets: dict[Channel, ForwardModel] = {}
         saturated = np.log(10.0)
         if description.structure is not None:
             saturated = float(np.log(description.structure.saturated_ratio))
