@@ -50,6 +50,8 @@ class Reconstructor:
             has.
         budget_s: compute time a frame may take, on a machine of the 2.5 GHz class.
         regularisation: factor on what a rule chooses for the linear methods.
+        finds_sheets: whether a reference tells how uneven the sheets are, and where electrodes
+            sit: at each tare a second of work.
         curve: turns magnitudes into pressures; the description's own table if None.
         taught: corrects where single contacts are, see `taught_skin`.
 
@@ -75,6 +77,7 @@ class Reconstructor:
         method: str | Method = "auto",
         budget_s: float | None = None,
         regularisation: float = 1.0,
+        finds_sheets: bool = True,
         curve: PressureCurve | None = None,
         taught: TaughtSkin | None = None,
     ) -> None:
@@ -85,7 +88,7 @@ class Reconstructor:
         skin = Skin.of(description, artifact)
         self.artifact = skin.artifact
         factor = regularisation * description.instrument.regularisation
-        self._skin = replace(skin, regularisation=factor)
+        self._skin = replace(skin, regularisation=factor, finds_sheets=finds_sheets)
         self._comparator = Comparator(description, skin.artifact, skin.forward)
         self._methods: dict[str, Method] = {}  # by their names, once they were asked for
         self._failures: dict[str, str] = {}  # of methods prepared since the tare; empty if good

@@ -173,7 +173,8 @@ def _reconstructed(
     presses: KnownPresses, description: SensorDescription, progress: Progress | None
 ) -> _Seen:
     """Reconstruct each press from a cold start, as the daemon does by default."""
-    reconstructor = Reconstructor(description)
+    # As the daemon does, whose places are corrected: it takes sheets as even.
+    reconstructor = Reconstructor(description, finds_sheets=False)
     reconstructor.set_reference(presses.reference)
     channels = [name for name in description.channels if name in presses.scans]
     width = len(channels) * description.measurements

@@ -491,7 +491,10 @@ def _make_reconstructor(
     budget_s = None if config.budget_ms is None else config.budget_ms * 1e-3
     if artifact is None or artifact.sha256 != description.sha256:
         artifact = load_model(description)
-    return Reconstructor(description, artifact, method=config.method, budget_s=budget_s)
+    # A second of work at the tare would hold up the frames: sheets are taken as even.
+    return Reconstructor(
+        description, artifact, method=config.method, budget_s=budget_s, finds_sheets=False
+    )
 
 
 def _check_methods(

@@ -62,7 +62,7 @@ class OutlineFit:
 
     def _look_at_sheets(self, before: Mapping[Channel, MeasuredChannel]) -> None:
         """Find how each sheet was made by its reference, unless that is as it was before."""
-        if isinstance(self._fit, ObjectFit):
+        if isinstance(self._fit, ObjectFit) or not self._skin.finds_sheets:
             return
         sheets, self._field_fit.sheets = self._field_fit.sheets, {}
         for name, channel in self._skin.channels.items():

@@ -48,6 +48,7 @@ class Skin:
         networks: trained for this sensor.
         channels: those that have a reference, with their noise.
         regularisation: factor on the linear methods' regularisation parameter.
+        finds_sheets: whether references tell how the sheets are; else they are taken as even.
     """
 
     description: SensorDescription
@@ -57,6 +58,7 @@ class Skin:
     networks: SensorNetworks
     channels: Mapping[Channel, MeasuredChannel] = field(default_factory=dict)
     regularisation: float = 1.0
+    finds_sheets: bool = True
 
     @property
     def magnitude_sign(self) -> float:
