@@ -65,7 +65,12 @@ def reconstruct_file(
         raise CalibrationError(f"what was taught does not fit this skin: {why}; teach it anew")
     with threadpool_limits(1):  # as the daemon runs, so that `seconds` are what a robot would see
         reconstructor = Reconstructor(
-            description, method=method, budget_s=BUDGET_S, curve=curve, taught=taught
+            description,
+            method=method,
+            budget_s=BUDGET_S,
+            curve=curve,
+            taught=taught,
+            finds_sheets=taught is None,  # what was taught corrects places on even ones
         )
         reconstructor.set_reference(reference)
         for index in range(total):
