@@ -70,7 +70,7 @@ def reconstruct_file(
             budget_s=BUDGET_S,
             curve=curve,
             taught=taught,
-            finds_sheets=taught is None,  # what was taught corrects places on even ones
+            finds_sheets=False,  # as the daemon does
         )
         reconstructor.set_reference(reference)
         for index in range(total):
