@@ -346,8 +346,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
         ) from error
     except ValueError as error:
         raise ConfigError(
-            f"{path} is not valid TOML: {error}",
-            "compare it with `tactomo service example`",
+            f"{path} is not valid TOML: {error}", "compare it with `tactomo service example`"
         ) from error
 
 

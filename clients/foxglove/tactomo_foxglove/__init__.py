@@ -10,11 +10,4 @@ from tactomo_foxglove.bridge import Bridge, BridgeError
 from tactomo_foxglove.layout import layout_for, shipped_layout
 from tactomo_foxglove.recorded import write_mcap
 
-__all__ = [
-    "Bridge",
-    "BridgeError",
-    "Placement",
-    "layout_for",
-    "shipped_layout",
-    "write_mcap",
-]
+__all__ = ["Bridge", "BridgeError", "Placement", "layout_for", "shipped_layout", "write_mcap"]

@@ -245,12 +245,7 @@ def _pose(x_mm: float, y_mm: float, z_m: float) -> Pose:
 
 def _text(text: str, pose: Pose, colour: Color, pixels: float) -> TextPrimitive:
     return TextPrimitive(
-        pose=pose,
-        billboard=True,
-        font_size=pixels,
-        scale_invariant=True,
-        color=colour,
-        text=text,
+        pose=pose, billboard=True, font_size=pixels, scale_invariant=True, color=colour, text=text
     )
 
 

@@ -80,10 +80,7 @@ def subscribe(
 
 
 def subscribe(
-    sensor: str,
-    *,
-    kind: Kind | tuple[Kind, ...] = "map",
-    **options: Unpack[Options],
+    sensor: str, *, kind: Kind | tuple[Kind, ...] = "map", **options: Unpack[Options]
 ) -> Subscription[Any]:
     """Subscribe to one sensor's frames, as `tactomo_client.subscribe` does, within an event loop.
 

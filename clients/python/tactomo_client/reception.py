@@ -9,13 +9,7 @@ from pathlib import Path
 from typing import Final, Generic, Literal, TypedDict, TypeVar, cast
 
 from tactomo_client.arguments import checked_seconds
-from tactomo_client.connection import (
-    KNOCK_PERIOD_S,
-    Owner,
-    Waiting,
-    connect_subscriber,
-    whole_ms,
-)
+from tactomo_client.connection import KNOCK_PERIOD_S, Owner, Waiting, connect_subscriber, whole_ms
 from tactomo_client.errors import MessageError, StreamTimeout
 from tactomo_client.event import Event
 from tactomo_client.frame import Frame, frame_from_message

@@ -34,10 +34,7 @@ def subscribe(
 
 
 def subscribe(
-    sensor: str,
-    *,
-    kind: Kind | tuple[Kind, ...] = "map",
-    **options: Unpack[Options],
+    sensor: str, *, kind: Kind | tuple[Kind, ...] = "map", **options: Unpack[Options]
 ) -> Subscription[Any]:
     """Subscribe to one sensor's frames, or to what its daemon says of itself.
 

@@ -18,15 +18,7 @@ from typing import Final
 
 from tactomo_models import SensorDescription
 from tactomo_models.arrays import FloatArray
-from tactomo_protocol import (
-    Acknowledge,
-    AckStatus,
-    CommandCode,
-    DecoderCounts,
-    Hello,
-    Packet,
-    Scan,
-)
+from tactomo_protocol import Acknowledge, AckStatus, CommandCode, DecoderCounts, Hello, Packet, Scan
 
 from tactomo.acquisition.adapters import ROOT
 from tactomo.acquisition.connection import Connection

@@ -115,12 +115,7 @@ class Imaging:
             description, reconstructor, self._marks, on_event, calibration, taught
         )
         self.taring = Taring(
-            tare_scans,
-            description.channels,
-            self.frame_rate,
-            self._take,
-            self._fall_back,
-            on_event,
+            tare_scans, description.channels, self.frame_rate, self._take, self._fall_back, on_event
         )
         self._kept = kept
         self._is_disputed = False  # the skin at the start was not as the reference in force has it

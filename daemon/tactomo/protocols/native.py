@@ -5,15 +5,7 @@ from __future__ import annotations
 import math
 
 from tactomo_models import SensorDescription
-from tactomo_protocol import (
-    MAX_FRAME_BYTES,
-    Command,
-    CommandCode,
-    Decoder,
-    Hello,
-    Packet,
-    encode,
-)
+from tactomo_protocol import MAX_FRAME_BYTES, Command, CommandCode, Decoder, Hello, Packet, encode
 
 from tactomo.protocols.interface import PortProtocol
 

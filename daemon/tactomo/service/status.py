@@ -15,12 +15,7 @@ from tactomo_protocol import Channel
 
 from tactomo.acquisition.port import PortReader
 from tactomo.events import EventBook
-from tactomo.imaging.frames import (
-    description_fields,
-    port_fields,
-    pressure_fields,
-    taught_fields,
-)
+from tactomo.imaging.frames import description_fields, port_fields, pressure_fields, taught_fields
 from tactomo.imaging.imaging import Imaging
 from tactomo.imaging.pipeline import Pipeline
 from tactomo.recordings.playback import Playback
@@ -98,10 +93,7 @@ class Status:
                 "last_jump_s": pipeline.wall_clock.last_jump_s,
             },
             "reference": reference
-            and {
-                "scans": reference.scans,
-                "taken_realtime_ns": imaging.reference_realtime_ns,
-            },
+            and {"scans": reference.scans, "taken_realtime_ns": imaging.reference_realtime_ns},
             "baseline": imaging.baseline,
             "stage_ms": {stage: times for stage, times in stages.items() if times},
             "latency_ms": latency.percentiles_ms(),

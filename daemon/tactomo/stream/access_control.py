@@ -168,11 +168,7 @@ class AccessControl:
     """
 
     def __init__(
-        self,
-        context: Context,
-        keys: ServerKeys,
-        on_event: OnEvent,
-        on_revoked: Callable[[], None],
+        self, context: Context, keys: ServerKeys, on_event: OnEvent, on_revoked: Callable[[], None]
     ) -> None:
         self._allowed = AllowList(keys.clients, on_event)
         self._clients = keys.clients

@@ -143,10 +143,7 @@ class Control(Worker):
         self._cut = threading.Event()
 
     def open(
-        self,
-        context: zmq.Context[zmq.Socket[bytes]],
-        endpoint: str,
-        secret: bytes | None = None,
+        self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, secret: bytes | None = None
     ) -> None:
         """Bind the control socket; raise AddressError where the address cannot be had."""
         self._socket = context.socket(zmq.ROUTER)

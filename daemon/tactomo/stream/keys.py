@@ -159,10 +159,7 @@ def revoke(folder: Path, name: str, server: str) -> None:
 def list_clients(folder: Path, server: str) -> list[Client]:
     """Return a server's list, by name; a file without a key is left out."""
     listed = clients_folder(folder, server)
-    return [
-        *_clients(listed, may_command=False),
-        *_clients(listed / MAY_COMMAND, may_command=True),
-    ]
+    return [*_clients(listed, may_command=False), *_clients(listed / MAY_COMMAND, may_command=True)]
 
 
 def list_pairs(folder: Path) -> list[str]:

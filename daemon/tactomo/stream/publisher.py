@@ -108,10 +108,7 @@ class Publisher(Worker):
         self._wake_reader = self._wake_writer = -1
 
     def open(
-        self,
-        context: zmq.Context[zmq.Socket[bytes]],
-        endpoint: str,
-        secret: bytes | None = None,
+        self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, secret: bytes | None = None
     ) -> None:
         """Bind the stream's socket; raise AddressError where the address cannot be had."""
         self._socket = context.socket(zmq.XPUB)

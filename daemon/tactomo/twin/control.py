@@ -14,12 +14,7 @@ from typing import Annotated, Any, Literal
 import zmq
 from pydantic import BaseModel, Field
 from tactomo_client.errors import MessageError
-from tactomo_client.messages import (
-    MAX_MESSAGE_BYTES,
-    decode_request,
-    encode_error,
-    encode_reply,
-)
+from tactomo_client.messages import MAX_MESSAGE_BYTES, decode_request, encode_error, encode_reply
 
 from tactomo.endpoint import bind
 from tactomo.errors import AddressError, CommandError

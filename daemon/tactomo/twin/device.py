@@ -46,14 +46,7 @@ from tactomo.twin.control import (
     ReleaseArguments,
 )
 from tactomo.twin.converter import Converter
-from tactomo.twin.firmware import (
-    RATE_HZ_MAX,
-    RATE_HZ_MIN,
-    Firmware,
-    Identity,
-    Port,
-    Voltages,
-)
+from tactomo.twin.firmware import RATE_HZ_MAX, RATE_HZ_MIN, Firmware, Identity, Port, Voltages
 from tactomo.twin.foreign import Emulator, ForeignFirmware
 from tactomo.twin.line import SerialLine
 from tactomo.twin.playing import Player

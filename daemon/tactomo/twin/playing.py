@@ -35,9 +35,7 @@ class PlayedFrame(Mapping[Channel, FloatArray]):
     """
 
     def __init__(
-        self,
-        volts: Mapping[Channel, FloatArray],
-        potentials: NDArray[np.complexfloating] | None,
+        self, volts: Mapping[Channel, FloatArray], potentials: NDArray[np.complexfloating] | None
     ) -> None:
         self.potentials = potentials
         self._volts = volts

@@ -50,8 +50,7 @@ SnrOf = Annotated[
     ),
 ]
 Picture = Annotated[
-    Path | None,
-    typer.Option(help="Draw truth and outcome: .png, .svg or .pdf. Needs matplotlib."),
+    Path | None, typer.Option(help="Draw truth and outcome: .png, .svg or .pdf. Needs matplotlib.")
 ]
 
 
@@ -61,7 +60,7 @@ Picture = Annotated[
         "tactomo evaluate scenes --count 50 --contacts 1-4 --snr 60,40,20,10",
         "tactomo evaluate scenes --method tikhonov --picture tikhonov.png",
         "tactomo evaluate scenes --seeds reporting --snr-of voltage --json > report.json",
-    ),
+    )
 )
 def scenes(
     seeds: Seeds = "tuning",
@@ -116,7 +115,7 @@ def scenes(
         "tactomo evaluate moving",
         "tactomo evaluate moving --count 10 --snr 20 --budget-ms 100",
         "tactomo evaluate moving --seeds reporting --json > moving.json",
-    ),
+    )
 )
 def moving(
     seeds: Seeds = "tuning",
@@ -242,13 +241,7 @@ def _as_json(outcomes: Sequence[Outcome]) -> dict[str, Any]:
 
 def settings_of(sensor: str, seeds: str, snr_of: str, method: str) -> dict[str, Any]:
     """Return what was evaluated, for JSON and `print_settings`."""
-    return {
-        "simulated": True,
-        "sensor": sensor,
-        "seeds": seeds,
-        "snr_of": snr_of,
-        "method": method,
-    }
+    return {"simulated": True, "sensor": sensor, "seeds": seeds, "snr_of": snr_of, "method": method}
 
 
 def print_settings(console: Console, settings: dict[str, Any]) -> None:
@@ -313,10 +306,7 @@ FIGURES: dict[str, Callable[[Any], str]] = {
     "ids": lambda s: str(s.switches),
 }
 MAPS = ("frames", "ICC", "worst", "shape", "RIE", "flagged", "wrong", "ms", "p99")
-CONTACTS = (
-    *("count", "missed", "false", "mm", "p95", "area"),
-    *("Δσ", "spread", "kPa", "in σ"),
-)
+CONTACTS = (*("count", "missed", "false", "mm", "p95", "area"), *("Δσ", "spread", "kPa", "in σ"))
 PHASES = (
     *("frames", "ICC", "worst", "shape", "count", "lost", "most", "ids"),
     *("flagged", "wrong", "ms", "p99"),

@@ -33,7 +33,7 @@ app = typer_app()
         "tactomo evaluate drift",
         "tactomo evaluate drift --hours 3 --json",
         "tactomo evaluate drift --seeds reporting --count 2 --picture drift.png",
-    ),
+    )
 )
 def drift(
     seeds: Seeds = "tuning",

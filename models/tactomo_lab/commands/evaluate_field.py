@@ -41,7 +41,7 @@ app = typer_app()
         "tactomo evaluate field --rows soft,graded --method fit --count 30",
         "tactomo evaluate field --seeds reporting --count 50 --json > field.json",
         "tactomo evaluate field --rows soft --picture soft_press.png",
-    ),
+    )
 )
 def field(
     seeds: Seeds = "tuning",

@@ -22,7 +22,7 @@ app = typer_app()
     epilog=examples(
         "tactomo evaluate ktc ktc2023_training.npz --picture ktc.png",
         "tactomo evaluate ktc ktc2023_training.npz --level 7 --json",
-    ),
+    )
 )
 def ktc(
     file: Annotated[Path, typer.Argument(metavar="FILE.npz", help="Tanks, see above.")],

@@ -25,7 +25,7 @@ app = typer_app()
     epilog=examples(
         "tactomo evaluate tanks tank_uef2017.npz --picture tanks.png",
         "tactomo evaluate tanks tank_uef2017.npz --method levelset --scale 0.78",
-    ),
+    )
 )
 def tanks(
     scans: Annotated[Path, typer.Argument(metavar="IN.npz", help="Measured tanks, see above.")],
@@ -35,8 +35,7 @@ def tanks(
     scale: Annotated[
         float | None,
         typer.Option(
-            min=1e-30,
-            help="Volts per ampere in a sheet of 1 S, per unit of dv. [not known]",
+            min=1e-30, help="Volts per ampere in a sheet of 1 S, per unit of dv. [not known]"
         ),
     ] = None,
     sensor: Description = "tank_uef2017",
@@ -56,11 +55,7 @@ def tanks(
     """
     from tactomo_models import load_description
 
-    from tactomo_lab.evaluation.tanks import (
-        TankImager,
-        evaluate_tanks,
-        read_tanks,
-    )
+    from tactomo_lab.evaluation.tanks import TankImager, evaluate_tanks, read_tanks
 
     if picture is not None:
         prepare_picture(picture)
@@ -159,7 +154,7 @@ def _draw_tanks(
     epilog=examples(
         "tactomo evaluate skin skin_round_presses.npz",
         "tactomo evaluate skin presses.npz -d my_round_skin.toml --json",
-    ),
+    )
 )
 def skin(
     presses: Annotated[Path, typer.Argument(metavar="IN.npz", help="Robot presses, see above.")],

@@ -64,7 +64,7 @@ app = typer_app()
         "tactomo evaluate paper --figure 9,10 --method tikhonov --method auto --picture figures",
         "tactomo evaluate paper --figure 5 --count 10",
         "tactomo evaluate paper --seeds reporting --json > paper.json",
-    ),
+    )
 )
 def paper(
     figure: Annotated[
@@ -78,8 +78,7 @@ def paper(
         float, typer.Option(help="Figs. 7 to 12: SNR of the voltages at rest, in dB.")
     ] = 60.0,
     method: Annotated[
-        list[str] | None,
-        methods_option(" [tikhonov, cnn-single, cnn-multimodal; network, auto]"),
+        list[str] | None, methods_option(" [tikhonov, cnn-single, cnn-multimodal; network, auto]")
     ] = None,
     seeds: Seeds = "tuning",
     sensor: Description = DEFAULT_DESCRIPTION,

@@ -18,7 +18,7 @@ app = typer_app()
     epilog=examples(
         "tactomo evaluate presses skins_anisotropy.npz --train 100",
         "tactomo evaluate presses skins_anisotropy.npz --train 800 --json",
-    ),
+    )
 )
 def presses(
     skins: Annotated[Path, typer.Argument(metavar="FILE.npz", help="Presses, see above.")],

@@ -37,7 +37,7 @@ app = typer_app()
         "tactomo evaluate stability --count 2",
         "tactomo evaluate stability --regime jump,drift --method auto --picture flags.png",
         "tactomo evaluate stability --seeds reporting --jobs 2 --json > stability.json",
-    ),
+    )
 )
 def stability(
     seeds: Seeds = "tuning",
@@ -49,8 +49,7 @@ def stability(
     jobs: Annotated[int, typer.Option(min=1, help="Processes that share the work.")] = 1,
     sensor: Description = DEFAULT_DESCRIPTION,
     picture: Annotated[
-        Path | None,
-        typer.Option(help="Draw an overview: .png, .svg or .pdf. Needs matplotlib."),
+        Path | None, typer.Option(help="Draw an overview: .png, .svg or .pdf. Needs matplotlib.")
     ] = None,
     as_json: JsonOutput = False,
 ) -> None:

@@ -94,11 +94,7 @@ def draw_response(points: Sequence[Response], output: Path) -> None:
 
 
 def draw_images(
-    frames: Sequence[Frame],
-    description: SensorDescription,
-    output: Path,
-    *,
-    traces: bool = False,
+    frames: Sequence[Frame], description: SensorDescription, output: Path, *, traces: bool = False
 ) -> None:
     """Figs. 8, 11 and 12: the truth above each method's images, a column for each press.
 

@@ -38,7 +38,7 @@ app = typer_app()
         "tactomo models simulate scenes/robust",
         "tactomo models simulate scenes/paper --preset paper",
         "tactomo models simulate scenes/mine -d my_skin.toml --scenes 8000 --jobs 4",
-    ),
+    )
 )
 def simulate(
     folder: Annotated[Path, typer.Argument(help="Where the scenes go; made if missing.")],
@@ -96,7 +96,7 @@ def simulate(
         "tactomo models train scenes/robust --epochs 5 --output trial.onnx",
         "tactomo models train scenes/robust --start scenes/robust/ours.pt --checkpoint more.pt",
         "tactomo models train scenes/paper --configuration paper-multimodal --device cuda",
-    ),
+    )
 )
 def train(
     folder: Annotated[Path, typer.Argument(help="Scenes, from `tactomo models simulate`.")],

@@ -269,10 +269,7 @@ class Day:
 
 
 def simulate_day(
-    description: SensorDescription,
-    seed_set: SeedSet,
-    number: int,
-    hours: float = 24.0,
+    description: SensorDescription, seed_set: SeedSet, number: int, hours: float = 24.0
 ) -> Day:
     """Draw a day and solve it; what was solved is kept."""
     require_both_channels(description)

@@ -42,11 +42,7 @@ SCENES_A_SEQUENCE = 10  # a moving scene has 146 frames and takes a minute to si
 
 
 def scores_of_row(
-    description: SensorDescription,
-    row: str,
-    method: str,
-    seed_set: SeedSet,
-    count: int,
+    description: SensorDescription, row: str, method: str, seed_set: SeedSet, count: int
 ) -> dict[str, Iterator[FrameScore]]:
     """Frames of one of `ROWS` as a method reconstructs them, by the name of their line.
 
@@ -79,10 +75,7 @@ def _moving(
 
 
 def scenes_of_row(
-    description: SensorDescription,
-    row: str,
-    seed_set: SeedSet,
-    count: int,
+    description: SensorDescription, row: str, seed_set: SeedSet, count: int
 ) -> dict[str, Iterator[EvaluationScene]]:
     """Scenes of one of `STILL_ROWS`, by the line's name; the same ones every time.
 
@@ -104,10 +97,7 @@ def scenes_of_row(
 
 
 def middle_press(
-    description: SensorDescription,
-    methods: Sequence[str],
-    seed_set: SeedSet,
-    count: int,
+    description: SensorDescription, methods: Sequence[str], seed_set: SeedSet, count: int
 ) -> list[Outcome]:
     """One soft contact as each method has it: the scene whose ICC by the last one is the middle."""
     soft = scenes_of_row(description, "soft", seed_set, count)["soft"]

@@ -23,12 +23,7 @@ from tactomo_models.sensor.description_file import load_description
 from tactomo_protocol import Channel
 
 from tactomo_lab.scenes.presets import placed_apart, scale_of
-from tactomo_lab.scenes.simulation import (
-    AS_MADE,
-    IMPEDANCE_DEVIATION,
-    UNEVENNESS,
-    SheetState,
-)
+from tactomo_lab.scenes.simulation import AS_MADE, IMPEDANCE_DEVIATION, UNEVENNESS, SheetState
 from tactomo_lab.scenes.still_scenes import (
     BOTH_CHANNELS,
     CONTRAST,

@@ -77,12 +77,7 @@ class Case:
     truth: Truth
 
 
-def make_case(
-    description: SensorDescription,
-    regime: str,
-    seed_set: SeedSet,
-    number: int,
-) -> Case:
+def make_case(description: SensorDescription, regime: str, seed_set: SeedSet, number: int) -> Case:
     """Draw, simulate and measure a case; the same one every time.
 
     Raises:
@@ -148,10 +143,7 @@ def _warped(mesh: SheetMesh, plan: Plan, sensor: SensorDescription) -> SheetMesh
 
 
 def _measure(
-    plan: Plan,
-    volts: SimulatedVolts,
-    description: SensorDescription,
-    rng: np.random.Generator,
+    plan: Plan, volts: SimulatedVolts, description: SensorDescription, rng: np.random.Generator
 ) -> tuple[Reference, tuple[dict[Channel, FloatArray], ...]]:
     """What the device makes of voltages: noise, a lead that opens, scans late or lost."""
     rest: dict[Channel, FloatArray] = {}

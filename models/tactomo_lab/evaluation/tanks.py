@@ -169,10 +169,7 @@ class TankImager:
 
 
 def evaluate_tanks(
-    imager: TankImager,
-    tanks: Tanks,
-    methods: Iterable[str],
-    scale: float | None = None,
+    imager: TankImager, tanks: Tanks, methods: Iterable[str], scale: float | None = None
 ) -> Iterator[TankOutcome]:
     """Reconstruct every tank by every method and compare with the truth.
 

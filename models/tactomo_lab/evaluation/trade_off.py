@@ -102,12 +102,7 @@ def left_out(description: SensorDescription, methods: Iterable[str]) -> dict[str
     return reasons
 
 
-def _point(
-    scene: SceneKind,
-    snr_db: float,
-    variant: Variant,
-    summary: Summary,
-) -> Point:
+def _point(scene: SceneKind, snr_db: float, variant: Variant, summary: Summary) -> Point:
     return Point(
         scene=scene,
         snr_db=snr_db,

@@ -225,8 +225,7 @@ def assemble_sheet(
     stiffness = _conduction.assemble(basis, conductivity=conductivity[:, None])
     # Contact impedance, made relative to the sheet: an extra length of conductor, in metres.
     contact_m = np.full(
-        electrodes,
-        description.electrodes.contact_impedance_ohm_m * description.sheet_conductance_s,
+        electrodes, description.electrodes.contact_impedance_ohm_m * description.sheet_conductance_s
     )
     if impedance is not None:
         contact_m *= impedance

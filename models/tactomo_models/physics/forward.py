@@ -171,11 +171,7 @@ class ForwardModel:
         self._closed = left < 1e-9 * (abs(law) @ np.abs(self.bare.potentials)).max(axis=1)
 
     def solve(
-        self,
-        change: FloatArray,
-        *,
-        mix_resistivities: bool = False,
-        within: IntArray | None = None,
+        self, change: FloatArray, *, mix_resistivities: bool = False, within: IntArray | None = None
     ) -> Solution:
         """Solve for a pressed sheet.
 

@@ -17,11 +17,7 @@ from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
 from tactomo_models.errors import DataError
-from tactomo_models.physics.artifact import (
-    MODEL_ERROR,
-    Artifact,
-    nominal_noise_v,
-)
+from tactomo_models.physics.artifact import MODEL_ERROR, Artifact, nominal_noise_v
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.robust import median, robust_sigma
 from tactomo_models.scans.plausibility import (

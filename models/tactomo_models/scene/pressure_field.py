@@ -269,12 +269,7 @@ class _Contacts:
     """K contacts at n points: what is pressed, with what pressure, and the derivatives."""
 
     def __init__(
-        self,
-        of: PressureField,
-        each: FloatArray,
-        outlines: _Outlines,
-        *,
-        is_sharp: bool = False,
+        self, of: PressureField, each: FloatArray, outlines: _Outlines, *, is_sharp: bool = False
     ) -> None:
         self._of, self._each, self.outline = of, each, outlines
         step = _linear_step if is_sharp else heaviside

@@ -134,10 +134,7 @@ class SkinSimulator:
 
 
 def conductivity_ratio(
-    description: SensorDescription,
-    channel: Channel,
-    pressure_kpa: FloatArray,
-    coverage: FloatArray,
+    description: SensorDescription, channel: Channel, pressure_kpa: FloatArray, coverage: FloatArray
 ) -> FloatArray:
     """Conductivity over the bare sheet's at each point, same shape.
 

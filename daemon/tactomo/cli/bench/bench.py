@@ -89,7 +89,7 @@ app = typer_app()
         "tactomo bench --chart mine.png --method my_module:MyMethod --method auto",
         "tactomo bench --machine-speed",
         "tactomo bench --machine-speed --show",
-    ),
+    )
 )
 def bench(
     description: Description = DEFAULT_DESCRIPTION,
@@ -374,10 +374,7 @@ def _console(results: Results) -> Console:
 def _live_table(results: Results) -> Table:
     from rich.table import Table
 
-    table = Table(
-        title="live: last byte read to contacts in another process",
-        min_width=80,
-    )
+    table = Table(title="live: last byte read to contacts in another process", min_width=80)
     for name in ("scene", "frames/s", "p50 ms", "p99 ms", "daemon MB", "frames by method"):
         table.add_column(name, justify="left" if name in ("scene", "frames by method") else "right")
     for phase in results.live:

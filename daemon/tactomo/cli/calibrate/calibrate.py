@@ -51,8 +51,7 @@ app = typer_app(
 )
 
 DiameterMm = Annotated[
-    float | None,
-    typer.Option("--diameter-mm", min=1.0, max=1e3, help="Of a round, flat indenter."),
+    float | None, typer.Option("--diameter-mm", min=1.0, max=1e3, help="Of a round, flat indenter.")
 ]
 AreaMm2 = Annotated[
     float | None, typer.Option("--area-mm2", min=1.0, max=1e6, help="Of one of another shape.")
@@ -66,9 +65,8 @@ Picture = Annotated[Path | None, typer.Option(help="Draw readings and curve: .pn
 
 @app.command(
     epilog=examples(
-        "tactomo calibrate live",
-        "tactomo calibrate live --sensor left_forearm --diameter-mm 30",
-    ),
+        "tactomo calibrate live", "tactomo calibrate live --sensor left_forearm --diameter-mm 30"
+    )
 )
 def live(
     sensor: SensorName = DEFAULT_NAME,
@@ -99,7 +97,7 @@ def live(
     epilog=examples(
         "tactomo calibrate fit load_cell.csv --sensor left_forearm --recording presses.mcap",
         "tactomo calibrate fit magnitudes.csv --dry-run --picture curve.png",
-    ),
+    )
 )
 def fit(
     readings: Annotated[
@@ -107,8 +105,7 @@ def fit(
     ],
     sensor: SensorName = DEFAULT_NAME,
     recording: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.mcap", help="What the sensor said meanwhile."),
+        Path | None, typer.Option(metavar="FILE.mcap", help="What the sensor said meanwhile.")
     ] = None,
     diameter_mm: DiameterMm = None,
     area_mm2: AreaMm2 = None,
@@ -168,7 +165,7 @@ def fit(
     epilog=examples(
         "tactomo calibrate show --sensor left_forearm",
         "tactomo calibrate show curve.json --picture curve.png",
-    ),
+    )
 )
 def show(
     file: Annotated[

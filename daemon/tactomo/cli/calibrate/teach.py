@@ -59,9 +59,8 @@ KeepOdd = Annotated[
 
 @app.command(
     epilog=examples(
-        "tactomo teach live",
-        "tactomo teach live --sensor left_forearm --presses palm.npz",
-    ),
+        "tactomo teach live", "tactomo teach live --sensor left_forearm --presses palm.npz"
+    )
 )
 def live(
     sensor: SensorName = DEFAULT_NAME,
@@ -93,7 +92,7 @@ def live(
     epilog=examples(
         "tactomo teach fit presses.npz --sensor left_forearm",
         "tactomo teach fit presses.npz --dry-run -d my_skin.toml",
-    ),
+    )
 )
 def fit(
     presses: Annotated[Path, typer.Argument(metavar="FILE.npz", help="Presses, see above.")],

@@ -46,7 +46,7 @@ app = typer_app()
         "tactomo doctor grasp.mcap --frames 0:100",
         "tactomo doctor tank.npz -d tank_disc",
         "tactomo doctor new_device.npz --array baseline --json",
-    ),
+    )
 )
 def doctor(
     what: Annotated[

@@ -43,14 +43,13 @@ app = typer_app()
         "tactomo export grasp.mcap grasp_dataset --lerobot --robot steps.csv --task 'lift the cup'",
         "tactomo export grasp.mcap contacts.csv --from 2 --to 10",
         "tactomo export grasp.mcap maps.npz",
-    ),
+    )
 )
 def export(
     recording: Annotated[
         Path,
         typer.Argument(
-            metavar="RECORDING",
-            help="A recording (.mcap), or the folder of one in several files.",
+            metavar="RECORDING", help="A recording (.mcap), or the folder of one in several files."
         ),
     ],
     output: Annotated[
@@ -75,16 +74,14 @@ def export(
         ),
     ] = None,
     fps: Annotated[
-        int | None,
-        typer.Option(min=1, help="For --lerobot: steps a second. [the robot's, or 30]"),
+        int | None, typer.Option(min=1, help="For --lerobot: steps a second. [the robot's, or 30]")
     ] = None,
     task: Annotated[str, typer.Option(help="For --lerobot: what is done, in words.")] = "touch",
     start_s: FromOption = 0.0,
     end_s: ToOption = None,
     description: RecordedDescription = None,
     layout: Annotated[
-        Path | None,
-        typer.Option(help="For .mcap: write the layout, too, to import in Foxglove."),
+        Path | None, typer.Option(help="For .mcap: write the layout, too, to import in Foxglove.")
     ] = None,
     parent: Annotated[
         str | None,

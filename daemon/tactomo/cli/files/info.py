@@ -25,7 +25,7 @@ app = typer_app()
         "tactomo info ~/.local/share/tactomo/recordings",
         "tactomo info paper_square",
         "tactomo info my.toml",
-    ),
+    )
 )
 def info(
     what: Annotated[

@@ -17,7 +17,7 @@ app = typer_app()
 
 
 @app.command(
-    epilog=examples("tactomo recover grasp.mcap", "tactomo recover grasp.mcap -o whole.mcap"),
+    epilog=examples("tactomo recover grasp.mcap", "tactomo recover grasp.mcap -o whole.mcap")
 )
 def recover(
     recording: RecordingFile,

@@ -33,7 +33,7 @@ app = typer_app()
         "tactomo models draw my_sheet.toml -o my_sheet.png",
         "tactomo models draw my_sheet.toml -o my_sheet.pdf      (prints true to scale)",
         "tactomo models draw paper_square",
-    ),
+    )
 )
 def draw(
     sensor: Annotated[str, typer.Argument(help="A shipped description's name, or a TOML file.")],

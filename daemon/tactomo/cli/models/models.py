@@ -12,10 +12,7 @@ from tactomo.cli.models.drawing import app as drawing_app
 from tactomo.cli.options import DEFAULT_DESCRIPTION, Description, examples, typer_app
 
 app = typer_app(
-    help="Build and list the models of sensors.",
-    name="models",
-    cls=Group,
-    no_args_is_help=True,
+    help="Build and list the models of sensors.", name="models", cls=Group, no_args_is_help=True
 )
 
 app.add_typer(drawing_app)
@@ -26,7 +23,7 @@ app.add_typer(drawing_app)
         "tactomo models build",
         "tactomo models build --description my_skin.toml",
         "tactomo models build --description my_skin.toml --output my_skin.npz",
-    ),
+    )
 )
 def build(
     description: Description = DEFAULT_DESCRIPTION,

@@ -21,13 +21,7 @@ if TYPE_CHECKING:
 
 WIDTH_IN: Final = 12.0
 STRIP_IN: Final = 2.75
-HEIGHTS_IN: Final = {
-    "pressure": 2.0,
-    "force": 1.5,
-    "misfit": 1.2,
-    "flags": 1.1,
-    "timing": 1.3,
-}
+HEIGHTS_IN: Final = {"pressure": 2.0, "force": 1.5, "misfit": 1.2, "flags": 1.1, "timing": 1.3}
 SIGMAS: Final = 2.0
 GAP_S: Final = 0.5
 """Without a frame for so long, a line is broken."""
@@ -153,10 +147,7 @@ def _short_words(contact: Contact) -> str:
 
 
 def _draw_path(
-    figure: Any,
-    course: Course,
-    description: SensorDescription | None,
-    colours: dict[str, Any],
+    figure: Any, course: Course, description: SensorDescription | None, colours: dict[str, Any]
 ) -> None:
     axes = figure.subplots()
     if description is not None:
@@ -272,11 +263,7 @@ def _draw_force(axes: Any, course: Course, colours: dict[str, Any]) -> None:
 
 
 def _draw_quantity(
-    axes: Any,
-    course: Course,
-    colours: dict[str, Any],
-    name: str,
-    sigma_name: str,
+    axes: Any, course: Course, colours: dict[str, Any], name: str, sigma_name: str
 ) -> None:
     """Draw one number of each contact over time, with its uncertainty as a band."""
     for identity, track in course.tracks.items():

@@ -9,11 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tactomo.cli.files.recorded_frames import (
-    FromOption,
-    ToOption,
-    recorded_frames,
-)
+from tactomo.cli.files.recorded_frames import FromOption, ToOption, recorded_frames
 from tactomo.cli.options import Force, RecordedDescription, examples, typer_app
 from tactomo.errors import TactomoError
 
@@ -30,7 +26,7 @@ app = typer_app()
     epilog=examples(
         "tactomo plot grasp.mcap -o grasp.png",
         "tactomo plot grasp.mcap -o push.pdf --from 2 --to 8 --what maps,pressure,force",
-    ),
+    )
 )
 def plot(
     recording: Annotated[

@@ -40,7 +40,7 @@ app = typer_app()
         "tactomo daemon /etc/tactomo/left_forearm.toml --method tikhonov",
         "tactomo daemon robot.toml",
         "tactomo daemon --port /dev/ttyACM0 --set tare_scans=40 --set recording.maps=true",
-    ),
+    )
 )
 def daemon(
     config: Annotated[
@@ -125,7 +125,7 @@ def _setting(text: str) -> tuple[str, Any]:
         "tactomo replay grasp.mcap --speed 0.25",
         "tactomo replay grasp.mcap --speed max --record frames.mcap",
         "tactomo replay ~/.local/share/tactomo/recordings --speed 10",
-    ),
+    )
 )
 def replay(
     recording: Annotated[
@@ -142,8 +142,7 @@ def replay(
     ] = None,
     description: RecordedDescription = None,
     calibration: Annotated[
-        Path | None,
-        typer.Option(help="Of pressure, by `tactomo calibrate`. [the recorded one]"),
+        Path | None, typer.Option(help="Of pressure, by `tactomo calibrate`. [the recorded one]")
     ] = None,
     method: Method = "auto",
     stream: StreamAddress = DEFAULT_STREAM,

@@ -47,7 +47,7 @@ app = typer_app()
         "tactomo demo --scene two_fingers_merge",
         "tactomo demo --ports 1 --noise-uv 50",
         "tactomo demo --description graded_square",
-    ),
+    )
 )
 def demo(
     sensor: SensorName = DEFAULT_NAME,

@@ -36,7 +36,7 @@ app = typer_app()
         "tactomo foxglove left_forearm --layout left_forearm.json",
         "tactomo foxglove left_forearm --parent forearm_link --pose 0,0.04,0.12,0,90,0",
         "ssh -L 8765:127.0.0.1:8765 robot tactomo foxglove",
-    ),
+    )
 )
 def foxglove(
     sensors: Annotated[
@@ -146,6 +146,5 @@ def need_foxglove() -> None:
         import foxglove  # noqa: F401
     except ImportError as error:
         raise TactomoError(
-            "Foxglove needs foxglove-sdk, which is not installed",
-            "pip install 'tactomo[foxglove]'",
+            "Foxglove needs foxglove-sdk, which is not installed", "pip install 'tactomo[foxglove]'"
         ) from error

@@ -32,7 +32,7 @@ app = typer_app()
         "tactomo ports",
         "tactomo ports --ask",
         "tactomo ports /dev/ttyACM0 --ask --json | jq .ports[0].device.device_id",
-    ),
+    )
 )
 def ports(
     paths: Annotated[

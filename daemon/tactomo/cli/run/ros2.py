@@ -28,7 +28,7 @@ app = typer_app()
     epilog=examples(
         "tactomo ros2 left_forearm",
         "tactomo ros2 left_forearm --parent forearm_link --pose 0,0.04,0.12,0,90,0",
-    ),
+    )
 )
 def ros2(
     sensor: Annotated[str, typer.Argument(help="Its name in the stream.")] = DEFAULT_NAME,

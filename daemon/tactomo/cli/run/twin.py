@@ -27,7 +27,7 @@ app = typer_app()
         "tactomo twin --ports 1 --scene sliding_finger",
         "tactomo poke press x_mm=10 y_mm=-20",
         "tactomo twin --description tank_disc --play tank.npz",
-    ),
+    )
 )
 def twin(
     description: Description = DEFAULT_DESCRIPTION,

@@ -28,7 +28,7 @@ app = typer_app()
         "tactomo viewer --sensor left_forearm",
         "tactomo viewer --twin-control tcp://127.0.0.1:5562",
         "ssh -L 8750:127.0.0.1:8750 robot tactomo viewer",
-    ),
+    )
 )
 def viewer(
     sensor: SensorName = DEFAULT_NAME,

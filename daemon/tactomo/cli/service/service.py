@@ -39,7 +39,7 @@ DryRun = Annotated[bool, typer.Option("--dry-run", help="Show what would be done
         "sudo tactomo service install left_forearm --port /dev/ttyUSB0 --port /dev/ttyUSB1",
         "sudo tactomo service install palm --port /dev/ttyACM0 --root /mnt/robot "
         "--program /usr/bin/tactomo",
-    ),
+    )
 )
 def install(
     name: Name,
@@ -72,9 +72,8 @@ def install(
 
 @app.command(
     epilog=examples(
-        "sudo tactomo service uninstall left_forearm",
-        "tactomo service uninstall --dry-run",
-    ),
+        "sudo tactomo service uninstall left_forearm", "tactomo service uninstall --dry-run"
+    )
 )
 def uninstall(
     name: Annotated[

@@ -45,9 +45,7 @@ ForServer: TypeAlias = Annotated[
 Force: TypeAlias = Annotated[bool, typer.Option("--force", help="Replace what is there.")]
 
 
-@app.command(
-    epilog=examples("tactomo keys make left_forearm --server", "tactomo keys make desk"),
-)
+@app.command(epilog=examples("tactomo keys make left_forearm --server", "tactomo keys make desk"))
 def make(
     name: Annotated[str, typer.Argument(help="What to call it, such as the sensor or the user.")],
     server: Annotated[
@@ -96,7 +94,7 @@ def make(
     epilog=examples(
         "tactomo keys allow ros.key --for left_forearm",
         "tactomo keys allow desk.key --for left_forearm --may-command",
-    ),
+    )
 )
 def allow(
     public: Annotated[Path, typer.Argument(help="The client's public key, NAME.key.")],

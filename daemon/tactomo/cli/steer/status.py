@@ -33,7 +33,7 @@ app = typer_app()
         "tactomo status -s left_forearm",
         "tactomo status -s left_forearm --stream tcp://127.0.0.1:5570",
         "tactomo status --json | jq .latency_ms",
-    ),
+    )
 )
 def status(
     sensor: Annotated[

@@ -33,9 +33,7 @@ USUAL_TARE_SCANS = 20
 app = typer_app()
 
 
-@app.command(
-    epilog=examples("tactomo tare"),
-)
+@app.command(epilog=examples("tactomo tare"))
 def tare(control: ControlAddress = DEFAULT_CONTROL, keys: KeysFolder = None) -> None:
     """Take a new reference: the next scans of the *unloaded* skin count as "nothing pressed".
 
@@ -73,7 +71,7 @@ def _tare_s(status: Mapping[str, Any]) -> float:
         "tactomo record start grasp.mcap",
         "tactomo record start        (into the daemon's folder)",
         "tactomo record stop",
-    ),
+    )
 )
 def record(
     what: Annotated[
@@ -85,8 +83,7 @@ def record(
     ],
     path: Annotated[Path | None, typer.Argument(help="For `start`: the file.")] = None,
     seconds: Annotated[
-        float | None,
-        typer.Option(min=0.1, help="For FILE: how long; until Ctrl-C when left out."),
+        float | None, typer.Option(min=0.1, help="For FILE: how long; until Ctrl-C when left out.")
     ] = None,
     maps: Annotated[
         bool, typer.Option("--maps", help="With maps and contacts. [as the daemon is configured]")
@@ -119,9 +116,7 @@ def record(
     typer.echo(f"recording to {daemon.record_start(path, maps=maps or None).path}")
 
 
-@app.command(
-    epilog=examples("tactomo method levelset", "tactomo method auto --budget-ms 20"),
-)
+@app.command(epilog=examples("tactomo method levelset", "tactomo method auto --budget-ms 20"))
 def method(
     name: Annotated[
         str,
@@ -160,7 +155,7 @@ def method(
         "tactomo poke unplug",
         "tactomo poke replug",
         "tactomo poke status",
-    ),
+    )
 )
 def poke(
     command: Annotated[str, typer.Argument(help="A command of the twin, see below.")],

@@ -34,7 +34,7 @@ app = typer_app()
 
 
 @app.command(
-    epilog=examples("tactomo watch", "tactomo watch -s left_forearm", "tactomo watch | tee log"),
+    epilog=examples("tactomo watch", "tactomo watch -s left_forearm", "tactomo watch | tee log")
 )
 def watch(
     sensor: SensorName = DEFAULT_NAME,
