@@ -11,15 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
+from tactomo.cli import options
 from tactomo.cli.commands import Group
-from tactomo.cli.options import (
-    DEFAULT_DESCRIPTION,
-    Description,
-    JsonOutput,
-    Method,
-    examples,
-    typer_app,
-)
 from tactomo.cli.plot.plot import prepare_picture
 
 if TYPE_CHECKING:
@@ -31,7 +24,7 @@ if TYPE_CHECKING:
 
 Item = TypeVar("Item")
 
-app = typer_app(
+app = options.typer_app(
     name="evaluate",
     cls=Group,
     help="Measure how right the reconstruction is, where the truth is known.",
@@ -55,7 +48,7 @@ Picture = Annotated[
 
 
 @app.command(
-    epilog=examples(
+    epilog=options.examples(
         "tactomo evaluate scenes",
         "tactomo evaluate scenes --count 50 --contacts 1-4 --snr 60,40,20,10",
         "tactomo evaluate scenes --method tikhonov --picture tikhonov.png",
@@ -68,10 +61,10 @@ def scenes(
     contacts: Annotated[str, typer.Option(help="How many contacts: 3, or 1-4.")] = "1-6",
     snr: Annotated[str, typer.Option(help="Signal-to-noise ratios in dB, with commas.")] = "40",
     snr_of: SnrOf = "change",
-    method: Method = "auto",
-    sensor: Description = DEFAULT_DESCRIPTION,
+    method: options.Method = "auto",
+    sensor: options.Description = options.DEFAULT_DESCRIPTION,
     picture: Picture = None,
-    as_json: JsonOutput = False,
+    as_json: options.JsonOutput = False,
 ) -> None:
     """Reconstruct simulated still scenes, each from a cold start, and compare with the truth.
 
@@ -111,7 +104,7 @@ def scenes(
 
 
 @app.command(
-    epilog=examples(
+    epilog=options.examples(
         "tactomo evaluate moving",
         "tactomo evaluate moving --count 10 --snr 20 --budget-ms 100",
         "tactomo evaluate moving --seeds reporting --json > moving.json",
@@ -122,12 +115,12 @@ def moving(
     count: Annotated[int, typer.Option(min=1, help="Sequences.")] = 3,
     snr: Annotated[float, typer.Option(help="Signal-to-noise ratio in dB.")] = 40.0,
     snr_of: SnrOf = "change",
-    method: Method = "auto",
+    method: options.Method = "auto",
     budget_ms: Annotated[
         float | None, typer.Option(min=1.0, help="Compute time a frame may take. [the daemon's]")
     ] = None,
-    sensor: Description = DEFAULT_DESCRIPTION,
-    as_json: JsonOutput = False,
+    sensor: options.Description = options.DEFAULT_DESCRIPTION,
+    as_json: options.JsonOutput = False,
 ) -> None:
     """Follow simulated contacts that slide, land, lift, jump, merge and split, frame by frame.
 

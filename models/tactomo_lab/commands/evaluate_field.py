@@ -7,14 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from tactomo.cli.options import (
-    DEFAULT_DESCRIPTION,
-    Description,
-    JsonOutput,
-    Method,
-    examples,
-    typer_app,
-)
+from tactomo.cli import options
 from tactomo.cli.plot.plot import prepare_picture
 
 from tactomo_lab.commands.evaluate import (
@@ -32,11 +25,11 @@ if TYPE_CHECKING:
 
 EVEN_FIT = "tactomo_lab.baselines.even_fit:EvenFit"
 
-app = typer_app()
+app = options.typer_app()
 
 
 @app.command(
-    epilog=examples(
+    epilog=options.examples(
         "tactomo evaluate field",
         "tactomo evaluate field --rows soft,graded --method fit --count 30",
         "tactomo evaluate field --seeds reporting --count 50 --json > field.json",
@@ -47,8 +40,8 @@ def field(
     seeds: Seeds = "tuning",
     count: Annotated[int, typer.Option(min=1, help="Scenes of each line.")] = 10,
     rows: Annotated[str | None, typer.Option(help="Which rows, with commas. [all of them]")] = None,
-    method: Method = "auto",
-    sensor: Description = DEFAULT_DESCRIPTION,
+    method: options.Method = "auto",
+    sensor: options.Description = options.DEFAULT_DESCRIPTION,
     picture: Annotated[
         Path | None,
         typer.Option(
@@ -56,7 +49,7 @@ def field(
             "fitted, the method: .png, .svg or .pdf. Needs matplotlib."
         ),
     ] = None,
-    as_json: JsonOutput = False,
+    as_json: options.JsonOutput = False,
 ) -> None:
     """Reconstruct what one pressure field has to explain: soft presses, one graded sheet, crowds.
 

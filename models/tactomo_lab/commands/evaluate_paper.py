@@ -11,14 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from tactomo.cli.options import (
-    DEFAULT_DESCRIPTION,
-    Description,
-    JsonOutput,
-    examples,
-    methods_option,
-    typer_app,
-)
+from tactomo.cli import options
 from tactomo.cli.plot.plot import prepare_folder
 from tactomo.errors import TactomoError
 
@@ -55,11 +48,11 @@ class _Study:
     methods: Sequence[str]
 
 
-app = typer_app()
+app = options.typer_app()
 
 
 @app.command(
-    epilog=examples(
+    epilog=options.examples(
         "tactomo evaluate paper",
         "tactomo evaluate paper --figure 9,10 --method tikhonov --method auto --picture figures",
         "tactomo evaluate paper --figure 5 --count 10",
@@ -78,15 +71,16 @@ def paper(
         float, typer.Option(help="Figs. 7 to 12: SNR of the voltages at rest, in dB.")
     ] = 60.0,
     method: Annotated[
-        list[str] | None, methods_option(" [tikhonov, cnn-single, cnn-multimodal; network, auto]")
+        list[str] | None,
+        options.methods_option(" [tikhonov, cnn-single, cnn-multimodal; network, auto]"),
     ] = None,
     seeds: Seeds = "tuning",
-    sensor: Description = DEFAULT_DESCRIPTION,
+    sensor: options.Description = options.DEFAULT_DESCRIPTION,
     picture: Annotated[
         Path | None,
         typer.Option(metavar="FOLDER", help="Draw each figure into it. Needs matplotlib."),
     ] = None,
-    as_json: JsonOutput = False,
+    as_json: options.JsonOutput = False,
 ) -> None:
     """Repeat the paper's evaluation on simulated skins, and set its printed numbers beside ours.
 

@@ -9,14 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from tactomo.cli.options import (
-    DEFAULT_DESCRIPTION,
-    Description,
-    JsonOutput,
-    examples,
-    methods_option,
-    typer_app,
-)
+from tactomo.cli import options
 from tactomo.cli.plot.plot import prepare_picture
 
 from tactomo_lab.commands.evaluate import Seeds, chosen_names, print_json, shown
@@ -29,11 +22,11 @@ if TYPE_CHECKING:
 NAME_WIDTH, CELL_WIDTH = 17, 16  # characters of the first and of the other columns
 IN_WORDS = "auto"  # the method whose doings are told in words, where it is among those asked for
 
-app = typer_app()
+app = options.typer_app()
 
 
 @app.command(
-    epilog=examples(
+    epilog=options.examples(
         "tactomo evaluate stability --count 2",
         "tactomo evaluate stability --regime jump,drift --method auto --picture flags.png",
         "tactomo evaluate stability --seeds reporting --jobs 2 --json > stability.json",
@@ -45,13 +38,13 @@ def stability(
     regime: Annotated[
         str | None, typer.Option(help="Which regimes, with commas. [all of them]")
     ] = None,
-    method: Annotated[list[str] | None, methods_option(" [all that are available]")] = None,
+    method: Annotated[list[str] | None, options.methods_option(" [all that are available]")] = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes that share the work.")] = 1,
-    sensor: Description = DEFAULT_DESCRIPTION,
+    sensor: options.Description = options.DEFAULT_DESCRIPTION,
     picture: Annotated[
         Path | None, typer.Option(help="Draw an overview: .png, .svg or .pdf. Needs matplotlib.")
     ] = None,
-    as_json: JsonOutput = False,
+    as_json: options.JsonOutput = False,
 ) -> None:
     """Break what reconstruction relies on, one regime at a time, and see whether it is flagged.
 

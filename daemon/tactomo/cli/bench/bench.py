@@ -20,16 +20,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from tactomo.cli import options
 from tactomo.cli.bench.comparison import compared, read_results, table_of
 from tactomo.cli.laboratory import installed_measurement, measurement, not_installed
-from tactomo.cli.options import (
-    DEFAULT_DESCRIPTION,
-    Description,
-    JsonOutput,
-    examples,
-    methods_option,
-    typer_app,
-)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -75,11 +68,11 @@ class Results:
     chart: list[dict[str, Any]] = field(default_factory=list)
 
 
-app = typer_app()
+app = options.typer_app()
 
 
 @app.command(
-    epilog=examples(
+    epilog=options.examples(
         "tactomo bench",
         "tactomo bench --seconds 20 --ports 1",
         "tactomo bench --json > times.json",
@@ -92,7 +85,7 @@ app = typer_app()
     )
 )
 def bench(
-    description: Description = DEFAULT_DESCRIPTION,
+    description: options.Description = options.DEFAULT_DESCRIPTION,
     seconds: Annotated[
         float,
         typer.Option(min=1.0, rich_help_panel=LIVE, help="Time of each of the four live scenes."),
@@ -108,7 +101,7 @@ def bench(
         bool, typer.Option(rich_help_panel=LIVE, help="Measure latency from port to subscriber.")
     ] = True,
     method: Annotated[
-        list[str] | None, methods_option(" [every installed one]", rich_help_panel=METHODS)
+        list[str] | None, options.methods_option(" [every installed one]", rich_help_panel=METHODS)
     ] = None,
     compare: Annotated[
         Path | None,
@@ -143,7 +136,7 @@ def bench(
             help="With --machine-speed: only show what such a daemon would go by.",
         ),
     ] = False,
-    as_json: JsonOutput = False,
+    as_json: options.JsonOutput = False,
 ) -> None:
     """Measure latency, rate and time per frame on this machine.
 
@@ -241,16 +234,16 @@ def _measure_twin(
     with _sockets() as at, _family() as family:
         size = load_description(results.description)
         spots = [_spot(size, place) for place in PLACES]
-        options = ("--description", results.description)
-        family.start("models build", "models", "build", *options).wait_done()
+        described = ("--description", results.description)
+        family.start("models build", "models", "build", *described).wait_done()
         skin = family.start(
-            *("twin", "twin", *options, "--rate", str(rate)),
+            *("twin", "twin", *described, "--rate", str(rate)),
             *("--twin-control", at("twin"), "--announce"),
             *([] if ports is None else ["--ports", str(ports)]),
         ).wait_ready()
         lines = [word for path in skin["ports"] for word in ("--port", path)]
         family.start(
-            *("daemon", "daemon", "--sensor", SENSOR, *options, *lines),
+            *("daemon", "daemon", "--sensor", SENSOR, *described, *lines),
             *("--stream", at("stream"), "--control", at("control")),
         ).wait_ready()
 

@@ -8,18 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tactomo.cli.options import (
-    DEFAULT_CONTROL,
-    DEFAULT_NAME,
-    DEFAULT_STREAM,
-    ControlAddress,
-    GivenDescription,
-    KeysFolder,
-    SensorName,
-    StreamAddress,
-    examples,
-    typer_app,
-)
+from tactomo.cli import options
 from tactomo.cli.plot.plot import prepare_picture
 
 if TYPE_CHECKING:
@@ -28,7 +17,7 @@ if TYPE_CHECKING:
 
 ROWS = 9  # of the table
 
-app = typer_app(
+app = options.typer_app(
     name="calibrate",
     help=(
         "Find out what pressure the magnitude channel's change means on this very sensor.\n\n"
@@ -43,7 +32,7 @@ app = typer_app(
         '`calibration = "FILE"` in its configuration.'
     ),
     no_args_is_help=True,
-    epilog=examples(
+    epilog=options.examples(
         "tactomo calibrate live --sensor left_forearm --diameter-mm 30",
         "tactomo calibrate fit load_cell.csv --sensor left_forearm --recording presses.mcap",
         "tactomo calibrate show --sensor left_forearm --picture curve.png",
@@ -64,21 +53,21 @@ Picture = Annotated[Path | None, typer.Option(help="Draw readings and curve: .pn
 
 
 @app.command(
-    epilog=examples(
+    epilog=options.examples(
         "tactomo calibrate live", "tactomo calibrate live --sensor left_forearm --diameter-mm 30"
     )
 )
 def live(
-    sensor: SensorName = DEFAULT_NAME,
+    sensor: options.SensorName = options.DEFAULT_NAME,
     diameter_mm: DiameterMm = None,
     area_mm2: AreaMm2 = None,
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Begin anew, not with what was taken.")
     ] = False,
     output: Output = None,
-    stream: StreamAddress = DEFAULT_STREAM,
-    control: ControlAddress = DEFAULT_CONTROL,
-    keys: KeysFolder = None,
+    stream: options.StreamAddress = options.DEFAULT_STREAM,
+    control: options.ControlAddress = options.DEFAULT_CONTROL,
+    keys: options.KeysFolder = None,
 ) -> None:
     """Be guided, press by press, with the running daemon.
 
@@ -94,7 +83,7 @@ def live(
 
 
 @app.command(
-    epilog=examples(
+    epilog=options.examples(
         "tactomo calibrate fit load_cell.csv --sensor left_forearm --recording presses.mcap",
         "tactomo calibrate fit magnitudes.csv --dry-run --picture curve.png",
     )
@@ -103,7 +92,7 @@ def fit(
     readings: Annotated[
         Path, typer.Argument(metavar="FILE.csv", help="What the load cell said, see above.")
     ],
-    sensor: SensorName = DEFAULT_NAME,
+    sensor: options.SensorName = options.DEFAULT_NAME,
     recording: Annotated[
         Path | None, typer.Option(metavar="FILE.mcap", help="What the sensor said meanwhile.")
     ] = None,
@@ -112,7 +101,7 @@ def fit(
     time_offset: Annotated[
         float, typer.Option(metavar="SECONDS", help="Added to the load cell's times.")
     ] = 0.0,
-    description: GivenDescription = None,
+    description: options.GivenDescription = None,
     device_id: Annotated[
         list[str] | None,
         typer.Option(help="The device that it was made with, where no recording says; repeat."),
@@ -123,8 +112,8 @@ def fit(
     keep_odd: Annotated[
         bool, typer.Option("--keep-odd", help="Keep it with lines that the others contradict.")
     ] = False,
-    control: ControlAddress = DEFAULT_CONTROL,
-    keys: KeysFolder = None,
+    control: options.ControlAddress = options.DEFAULT_CONTROL,
+    keys: options.KeysFolder = None,
 ) -> None:
     """Fit a table of readings.
 
@@ -162,7 +151,7 @@ def fit(
 
 
 @app.command(
-    epilog=examples(
+    epilog=options.examples(
         "tactomo calibrate show --sensor left_forearm",
         "tactomo calibrate show curve.json --picture curve.png",
     )
@@ -172,7 +161,7 @@ def show(
         Path | None,
         typer.Argument(metavar="[FILE]", help="[the one that the sensor's daemon uses]"),
     ] = None,
-    sensor: SensorName = DEFAULT_NAME,
+    sensor: options.SensorName = options.DEFAULT_NAME,
     picture: Picture = None,
 ) -> None:
     """Show the calibration that is kept: its curve, its uncertainty, and what it rests on."""
@@ -192,11 +181,11 @@ def show(
     _draw(made, picture)
 
 
-@app.command(epilog=examples("tactomo calibrate reload --sensor left_forearm"))
+@app.command(epilog=options.examples("tactomo calibrate reload --sensor left_forearm"))
 def reload(
-    sensor: SensorName = DEFAULT_NAME,
-    control: ControlAddress = DEFAULT_CONTROL,
-    keys: KeysFolder = None,
+    sensor: options.SensorName = options.DEFAULT_NAME,
+    control: options.ControlAddress = options.DEFAULT_CONTROL,
+    keys: options.KeysFolder = None,
 ) -> None:
     """Have the running daemon read again the calibration that it finds."""
     from tactomo_client.messages import check_sensor_name

@@ -7,27 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tactomo.cli.options import (
-    DEFAULT_CONTROL,
-    DEFAULT_DESCRIPTION,
-    DEFAULT_NAME,
-    DEFAULT_STREAM,
-    ControlAddress,
-    Description,
-    GivenDescription,
-    KeysFolder,
-    SensorName,
-    StreamAddress,
-    examples,
-    typer_app,
-)
+from tactomo.cli import options
 
 if TYPE_CHECKING:
     from tactomo_models import SensorDescription
     from tactomo_models.calibration.calibration_file import Subject
     from tactomo_models.calibration.taught_skin import TaughtSkin
 
-app = typer_app(
+app = options.typer_app(
     name="teach",
     help=(
         "Learn from presses at known places what the physics gets wrong on this very skin.\n\n"
@@ -41,7 +28,7 @@ app = typer_app(
         "`tactomo calibrate --help`."
     ),
     no_args_is_help=True,
-    epilog=examples(
+    epilog=options.examples(
         "tactomo teach live --sensor left_forearm",
         "tactomo teach fit presses.npz --sensor left_forearm",
         "tactomo teach show --sensor left_forearm",
@@ -58,22 +45,22 @@ KeepOdd = Annotated[
 
 
 @app.command(
-    epilog=examples(
+    epilog=options.examples(
         "tactomo teach live", "tactomo teach live --sensor left_forearm --presses palm.npz"
     )
 )
 def live(
-    sensor: SensorName = DEFAULT_NAME,
+    sensor: options.SensorName = options.DEFAULT_NAME,
     presses: Annotated[
         Path | None,
         typer.Option(metavar="FILE.npz", help="Presses are kept here. [beside what is taught]"),
     ] = None,
-    description: GivenDescription = None,
+    description: options.GivenDescription = None,
     output: Output = None,
     keep_odd: KeepOdd = False,
-    stream: StreamAddress = DEFAULT_STREAM,
-    control: ControlAddress = DEFAULT_CONTROL,
-    keys: KeysFolder = None,
+    stream: options.StreamAddress = options.DEFAULT_STREAM,
+    control: options.ControlAddress = options.DEFAULT_CONTROL,
+    keys: options.KeysFolder = None,
 ) -> None:
     """Be guided, press by press, with the running daemon.
 
@@ -89,23 +76,23 @@ def live(
 
 
 @app.command(
-    epilog=examples(
+    epilog=options.examples(
         "tactomo teach fit presses.npz --sensor left_forearm",
         "tactomo teach fit presses.npz --dry-run -d my_skin.toml",
     )
 )
 def fit(
     presses: Annotated[Path, typer.Argument(metavar="FILE.npz", help="Presses, see above.")],
-    sensor: SensorName = DEFAULT_NAME,
-    description: Description = DEFAULT_DESCRIPTION,
+    sensor: options.SensorName = options.DEFAULT_NAME,
+    description: options.Description = options.DEFAULT_DESCRIPTION,
     device_id: Annotated[
         list[str] | None, typer.Option(help="The device that it was made with; repeat.")
     ] = None,
     output: Output = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Keep nothing.")] = False,
     keep_odd: KeepOdd = False,
-    control: ControlAddress = DEFAULT_CONTROL,
-    keys: KeysFolder = None,
+    control: options.ControlAddress = options.DEFAULT_CONTROL,
+    keys: options.KeysFolder = None,
 ) -> None:
     """Learn from a file of presses.
 
@@ -129,13 +116,13 @@ def fit(
     _teach(presses, known, subject, path, control, keys, keep_odd=keep_odd)
 
 
-@app.command(epilog=examples("tactomo teach show --sensor left_forearm"))
+@app.command(epilog=options.examples("tactomo teach show --sensor left_forearm"))
 def show(
     file: Annotated[
         Path | None,
         typer.Argument(metavar="[FILE]", help="[the one that the sensor's daemon uses]"),
     ] = None,
-    sensor: SensorName = DEFAULT_NAME,
+    sensor: options.SensorName = options.DEFAULT_NAME,
 ) -> None:
     """Show what is kept: what it rests on, and what it brings."""
     from tactomo_models import CalibrationError

@@ -8,16 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tactomo.cli.options import (
-    DEFAULT_NAME,
-    DEFAULT_STREAM,
-    JsonOutput,
-    KeysFolder,
-    SensorName,
-    StreamAddress,
-    examples,
-    typer_app,
-)
+from tactomo.cli import options
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -36,11 +27,11 @@ VERDICTS = {
     "unknown": "unknown",
 }
 
-app = typer_app()
+app = options.typer_app()
 
 
 @app.command(
-    epilog=examples(
+    epilog=options.examples(
         "tactomo doctor",
         "tactomo doctor -s left_forearm --seconds 30",
         "tactomo doctor grasp.mcap --frames 0:100",
@@ -56,8 +47,8 @@ def doctor(
             help="A recording (.mcap) or measured scans (.npz); without, a daemon that runs.",
         ),
     ] = None,
-    sensor: SensorName = DEFAULT_NAME,
-    stream: StreamAddress = DEFAULT_STREAM,
+    sensor: options.SensorName = options.DEFAULT_NAME,
+    stream: options.StreamAddress = options.DEFAULT_STREAM,
     seconds: Annotated[
         float, typer.Option(min=1.0, help="How long to listen to the daemon.")
     ] = 10.0,
@@ -80,8 +71,8 @@ def doctor(
     lookup: Annotated[
         str, typer.Option(help="Of an .npz file: the array that says how voltages are ordered.")
     ] = "lookup",
-    as_json: JsonOutput = False,
-    keys: KeysFolder = None,
+    as_json: options.JsonOutput = False,
+    keys: options.KeysFolder = None,
 ) -> None:
     """Examine a skin at rest: noise, reciprocity, electrodes, clipping, drift, line and latency.
 

@@ -7,22 +7,14 @@ from typing import Annotated, Literal
 
 import typer
 
-from tactomo.cli.options import (
-    DEFAULT_DESCRIPTION,
-    DEFAULT_NAME,
-    Description,
-    SensorName,
-    examples,
-    frame_slice,
-    typer_app,
-)
+from tactomo.cli import options
 
-app = typer_app()
+app = options.typer_app()
 
 
 @app.command(
     "import",
-    epilog=examples(
+    epilog=options.examples(
         "tactomo import tank.npz tank.mcap -d tank_disc --reference-frames 0:20",
         "tactomo import presses.npz presses.mcap --rate 20",
         "tactomo import setup_00001/ tank.mcap -d sciospec_disc --reference-frames 0:20",
@@ -34,7 +26,7 @@ def import_scans(
         typer.Argument(metavar="IN", help="An .npz file; .eit files, or a folder of them."),
     ],
     recording: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="The recording to write.")],
-    description: Description = DEFAULT_DESCRIPTION,
+    description: options.Description = options.DEFAULT_DESCRIPTION,
     channel: Annotated[
         Literal["magnitude", "structure"] | None,
         typer.Option(help="Which channel single-ended volts are. [the sensor's only one]"),
@@ -46,7 +38,7 @@ def import_scans(
     rate: Annotated[
         float | None, typer.Option(min=0.01, help="Scans a second. [the file's own times, t]")
     ] = None,
-    sensor: SensorName = DEFAULT_NAME,
+    sensor: options.SensorName = options.DEFAULT_NAME,
 ) -> None:
     """Turn measured scans (.npz, .eit) into a recording that replays through the daemon.
 
@@ -63,7 +55,7 @@ def import_scans(
     from tactomo.recordings.imported_scans import read_scans
     from tactomo.recordings.recording_writer import write_recording
 
-    reference = frame_slice(reference_frames)
+    reference = options.frame_slice(reference_frames)
     measured = load_description(description)
     known = None if channel is None else Channel(channel)
     read = read_scans(scans, measured, known)

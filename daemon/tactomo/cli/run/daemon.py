@@ -8,33 +8,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tactomo.cli.options import (
-    DEFAULT_CONTROL,
-    DEFAULT_NAME,
-    DEFAULT_STREAM,
-    DEFAULT_VIEWER_PORT,
-    ControlAddress,
-    GivenDescription,
-    GivenMethod,
-    GivenProtocol,
-    Method,
-    RecordedDescription,
-    StreamAddress,
-    ViewerPort,
-    examples,
-    typer_app,
-)
+from tactomo.cli import options
 
 if TYPE_CHECKING:
     from tactomo.config import DaemonConfig, Skins
     from tactomo.recordings.playback import Playback
     from tactomo.recordings.recording import Recording
 
-app = typer_app()
+app = options.typer_app()
 
 
 @app.command(
-    epilog=examples(
+    epilog=options.examples(
         "tactomo daemon --port /dev/ttyACM0",
         "tactomo daemon --sensor left_forearm --port /dev/ttyACM0 --port /dev/ttyACM1",
         "tactomo daemon /etc/tactomo/left_forearm.toml --method tikhonov",
@@ -49,21 +34,21 @@ def daemon(
     sensor: Annotated[
         str | None, typer.Option("--sensor", "-s", help="The sensor's name in the stream. [skin]")
     ] = None,
-    description: GivenDescription = None,
+    description: options.GivenDescription = None,
     port: Annotated[
         list[str] | None,
         typer.Option("--port", "-p", help="Serial device or pyserial URL; twice for two boards."),
     ] = None,
-    protocol: GivenProtocol = None,
-    method: GivenMethod = None,
+    protocol: options.GivenProtocol = None,
+    method: options.GivenMethod = None,
     budget_ms: Annotated[
         float | None, typer.Option(help="Time that one reconstruction may take. [the method's own]")
     ] = None,
     stream: Annotated[
-        str | None, typer.Option(help=f"Where to publish. [{DEFAULT_STREAM}]")
+        str | None, typer.Option(help=f"Where to publish. [{options.DEFAULT_STREAM}]")
     ] = None,
     control: Annotated[
-        str | None, typer.Option(help=f"Where to take commands. [{DEFAULT_CONTROL}]")
+        str | None, typer.Option(help=f"Where to take commands. [{options.DEFAULT_CONTROL}]")
     ] = None,
     set_: Annotated[
         list[str] | None,
@@ -120,7 +105,7 @@ def _setting(text: str) -> tuple[str, Any]:
 
 
 @app.command(
-    epilog=examples(
+    epilog=options.examples(
         "tactomo replay grasp.mcap --viewer",
         "tactomo replay grasp.mcap --speed 0.25",
         "tactomo replay grasp.mcap --speed max --record frames.mcap",
@@ -140,14 +125,14 @@ def replay(
     sensor: Annotated[
         str | None, typer.Option("--sensor", "-s", help="Name in the stream. [the recorded one]")
     ] = None,
-    description: RecordedDescription = None,
+    description: options.RecordedDescription = None,
     calibration: Annotated[
         Path | None, typer.Option(help="Of pressure, by `tactomo calibrate`. [the recorded one]")
     ] = None,
-    method: Method = "auto",
-    stream: StreamAddress = DEFAULT_STREAM,
-    control: ControlAddress = DEFAULT_CONTROL,
-    viewer_port: ViewerPort = DEFAULT_VIEWER_PORT,
+    method: options.Method = "auto",
+    stream: options.StreamAddress = options.DEFAULT_STREAM,
+    control: options.ControlAddress = options.DEFAULT_CONTROL,
+    viewer_port: options.ViewerPort = options.DEFAULT_VIEWER_PORT,
     stay: Annotated[
         bool, typer.Option("--stay", help="Keep running after the recording's end.")
     ] = False,
@@ -187,7 +172,7 @@ def replay(
         more += [] if calibration is None else ["--calibration", str(calibration)]
         more += ["--start", str(start), *(["--loop"] if loop else [])]
         more += ["--paused"] if paused else ["--wait-for-page"]
-        name = sensor or origin.sensor or DEFAULT_NAME
+        name = sensor or origin.sensor or options.DEFAULT_NAME
         show_replay(recording, speed, name, stream, control, viewer_port, more)
         return
     from tactomo.config import load_config

@@ -14,35 +14,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tactomo.cli.options import (
-    DEFAULT_CONTROL,
-    DEFAULT_DESCRIPTION,
-    DEFAULT_NAME,
-    DEFAULT_STREAM,
-    DEFAULT_TWIN_CONTROL,
-    DEFAULT_VIEWER_PORT,
-    Announce,
-    ControlAddress,
-    Description,
-    GivenMethod,
-    SensorName,
-    StreamAddress,
-    TwinControlAddress,
-    ViewerPort,
-    examples,
-    typer_app,
-)
+from tactomo.cli import options
 
 if TYPE_CHECKING:
     from tactomo.cli.children import Family
 
 TARE_PATIENCE_S = 10.0
 
-app = typer_app()
+app = options.typer_app()
 
 
 @app.command(
-    epilog=examples(
+    epilog=options.examples(
         "tactomo demo",
         "tactomo demo --scene two_fingers_merge",
         "tactomo demo --ports 1 --noise-uv 50",
@@ -50,9 +33,9 @@ app = typer_app()
     )
 )
 def demo(
-    sensor: SensorName = DEFAULT_NAME,
-    description: Description = DEFAULT_DESCRIPTION,
-    method: GivenMethod = None,
+    sensor: options.SensorName = options.DEFAULT_NAME,
+    description: options.Description = options.DEFAULT_DESCRIPTION,
+    method: options.GivenMethod = None,
     ports: Annotated[
         int | None,
         typer.Option(min=1, max=2, help="One line for both channels, or a line for each. [each]"),
@@ -65,17 +48,17 @@ def demo(
         float | None, typer.Option(min=0.0, help="Converter noise, µV rms.")
     ] = None,
     record: Annotated[Path | None, typer.Option(help="Record what the ports say.")] = None,
-    viewer_port: ViewerPort = DEFAULT_VIEWER_PORT,
-    stream: StreamAddress = DEFAULT_STREAM,
-    control: ControlAddress = DEFAULT_CONTROL,
-    twin_control: TwinControlAddress = DEFAULT_TWIN_CONTROL,
+    viewer_port: options.ViewerPort = options.DEFAULT_VIEWER_PORT,
+    stream: options.StreamAddress = options.DEFAULT_STREAM,
+    control: options.ControlAddress = options.DEFAULT_CONTROL,
+    twin_control: options.TwinControlAddress = options.DEFAULT_TWIN_CONTROL,
     no_browser: Annotated[
         bool, typer.Option("--no-browser", help="Do not open the page, where there is a desktop.")
     ] = False,
     verbose: Annotated[
         bool, typer.Option("--verbose", "-v", help="Show what the three programs log.")
     ] = False,
-    announce: Announce = False,
+    announce: options.Announce = False,
 ) -> None:
     """Start a skin to press in the browser: simulated sensor, daemon and viewer in one command.
 
@@ -180,14 +163,14 @@ def _print_box(addresses: Mapping[str, Any]) -> None:
     from rich.panel import Panel
 
     name = addresses["sensor"]
-    at_control = _flag("--control", addresses["control"], DEFAULT_CONTROL)
-    at_stream = _flag("--stream", addresses["stream"], DEFAULT_STREAM)
-    named = _flag("--sensor", name, DEFAULT_NAME)
+    at_control = _flag("--control", addresses["control"], options.DEFAULT_CONTROL)
+    at_stream = _flag("--stream", addresses["stream"], options.DEFAULT_STREAM)
+    named = _flag("--sensor", name, options.DEFAULT_NAME)
     at = addresses["stream"]
-    called = f'"{name}"' if at == DEFAULT_STREAM else f'"{name}", address="{at}"'
+    called = f'"{name}"' if at == options.DEFAULT_STREAM else f'"{name}", address="{at}"'
     lines = [f"open      [bold link={addresses['viewer']}]{addresses['viewer']}[/]"]
     if "twin" in addresses:
-        at_twin = _flag("--twin-control", addresses["twin"], DEFAULT_TWIN_CONTROL)
+        at_twin = _flag("--twin-control", addresses["twin"], options.DEFAULT_TWIN_CONTROL)
         lines += [
             "          and press the skin there with the mouse",
             f"press     tactomo poke press x_mm=10 y_mm=-20{at_twin}",

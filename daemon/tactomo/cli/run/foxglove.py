@@ -9,16 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tactomo.cli.options import (
-    DEFAULT_NAME,
-    DEFAULT_STREAM,
-    Announce,
-    KeysFolder,
-    Pose,
-    StreamAddress,
-    examples,
-    typer_app,
-)
+from tactomo.cli import options
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
@@ -27,11 +18,11 @@ if TYPE_CHECKING:
 
 DEFAULT_PORT = 8765
 
-app = typer_app()
+app = options.typer_app()
 
 
 @app.command(
-    epilog=examples(
+    epilog=options.examples(
         "tactomo foxglove",
         "tactomo foxglove left_forearm --layout left_forearm.json",
         "tactomo foxglove left_forearm --parent forearm_link --pose 0,0.04,0.12,0,90,0",
@@ -41,9 +32,11 @@ app = typer_app()
 def foxglove(
     sensors: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[SENSOR]...", help=f"Names in the stream. [{DEFAULT_NAME}]"),
+        typer.Argument(
+            metavar="[SENSOR]...", help=f"Names in the stream. [{options.DEFAULT_NAME}]"
+        ),
     ] = None,
-    stream: StreamAddress = DEFAULT_STREAM,
+    stream: options.StreamAddress = options.DEFAULT_STREAM,
     host: Annotated[
         str, typer.Option(help="Address to listen on; any but a loopback one lets others look.")
     ] = "127.0.0.1",
@@ -55,7 +48,7 @@ def foxglove(
         typer.Option(help="Write the layout of the (first) sensor here, to import in Foxglove."),
     ] = None,
     parent: Annotated[str, typer.Option(help="Frame that the sensor hangs on.")] = "world",
-    pose: Pose = "0,0,0",
+    pose: options.Pose = "0,0,0",
     allow_origin: Annotated[
         list[str] | None,
         typer.Option(
@@ -63,8 +56,8 @@ def foxglove(
             help="A web page's origin that may look, too, such as http://localhost:8080; several.",
         ),
     ] = None,
-    keys: KeysFolder = None,
-    announce: Announce = False,
+    keys: options.KeysFolder = None,
+    announce: options.Announce = False,
 ) -> None:
     """Serve maps, contacts, numbers and events to Foxglove until stopped.
 
@@ -80,7 +73,7 @@ def foxglove(
     from tactomo_client.keys import as_keys
     from tactomo_foxglove import Bridge
 
-    names = sensors or [DEFAULT_NAME]
+    names = sensors or [options.DEFAULT_NAME]
     if layout is not None:
         write_layout(layout, names[0])
     stop = threading.Event()

@@ -9,30 +9,22 @@ from typing import Annotated
 
 import typer
 
-from tactomo.cli.options import (
-    DEFAULT_NAME,
-    DEFAULT_STREAM,
-    KeysFolder,
-    Pose,
-    StreamAddress,
-    examples,
-    typer_app,
-)
+from tactomo.cli import options
 from tactomo.cli.run.foxglove import placement_of
 from tactomo.errors import TactomoError
 
-app = typer_app()
+app = options.typer_app()
 
 
 @app.command(
-    epilog=examples(
+    epilog=options.examples(
         "tactomo ros2 left_forearm",
         "tactomo ros2 left_forearm --parent forearm_link --pose 0,0.04,0.12,0,90,0",
     )
 )
 def ros2(
-    sensor: Annotated[str, typer.Argument(help="Its name in the stream.")] = DEFAULT_NAME,
-    stream: StreamAddress = DEFAULT_STREAM,
+    sensor: Annotated[str, typer.Argument(help="Its name in the stream.")] = options.DEFAULT_NAME,
+    stream: options.StreamAddress = options.DEFAULT_STREAM,
     domain: Annotated[
         int, typer.Option(min=0, max=232, envvar="ROS_DOMAIN_ID", help="As the nodes have it.")
     ] = 0,
@@ -46,8 +38,8 @@ def ros2(
     parent: Annotated[
         str | None, typer.Option(help="Frame that the sensor hangs on. [not told]")
     ] = None,
-    pose: Pose = "0,0,0",
-    keys: KeysFolder = None,
+    pose: options.Pose = "0,0,0",
+    keys: options.KeysFolder = None,
 ) -> None:
     """Publish maps, contacts and diagnostics to ROS 2 until stopped, where the nodes use Zenoh.
 

@@ -7,22 +7,13 @@ from typing import Annotated
 
 import typer
 
-from tactomo.cli.options import (
-    DEFAULT_DESCRIPTION,
-    DEFAULT_TWIN_CONTROL,
-    Announce,
-    Description,
-    Protocol,
-    TwinControlAddress,
-    examples,
-    typer_app,
-)
+from tactomo.cli import options
 
-app = typer_app()
+app = options.typer_app()
 
 
 @app.command(
-    epilog=examples(
+    epilog=options.examples(
         "tactomo twin --link /tmp/skin",
         "tactomo twin --ports 1 --scene sliding_finger",
         "tactomo poke press x_mm=10 y_mm=-20",
@@ -30,7 +21,7 @@ app = typer_app()
     )
 )
 def twin(
-    description: Description = DEFAULT_DESCRIPTION,
+    description: options.Description = options.DEFAULT_DESCRIPTION,
     ports: Annotated[
         int | None,
         typer.Option(min=1, max=2, help="One line for both channels, or a line for each. [each]"),
@@ -38,7 +29,7 @@ def twin(
     rate: Annotated[
         float | None, typer.Option(help="Dual scans a second. [20, or as in the file that plays]")
     ] = None,
-    protocol: Protocol = "tactomo",
+    protocol: options.Protocol = "tactomo",
     play: Annotated[
         Path | None,
         typer.Option(
@@ -64,8 +55,8 @@ def twin(
         float, typer.Option(min=0.0, max=0.5, help="Of the sheet's conductivity; 0.05 is 5 %.")
     ] = 0.03,
     seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal noise and drift.")] = 0,
-    twin_control: TwinControlAddress = DEFAULT_TWIN_CONTROL,
-    announce: Announce = False,
+    twin_control: options.TwinControlAddress = options.DEFAULT_TWIN_CONTROL,
+    announce: options.Announce = False,
 ) -> None:
     """Simulate a skin behind simulated firmware, on real pseudo-terminals, until stopped.
 

@@ -8,27 +8,18 @@ from typing import Annotated, Any
 
 import typer
 
+from tactomo.cli import options
 from tactomo.cli.health_issues import health_issues
-from tactomo.cli.options import (
-    DEFAULT_CONTROL,
-    DEFAULT_STREAM,
-    ControlAddress,
-    JsonOutput,
-    KeysFolder,
-    StreamAddress,
-    examples,
-    typer_app,
-)
 from tactomo.errors import TactomoError
 
 HEARD_WITHIN_S = 3.0
 """A status comes every second."""
 
-app = typer_app()
+app = options.typer_app()
 
 
 @app.command(
-    epilog=examples(
+    epilog=options.examples(
         "tactomo status",
         "tactomo status -s left_forearm",
         "tactomo status -s left_forearm --stream tcp://127.0.0.1:5570",
@@ -44,10 +35,10 @@ def status(
             help="Of this sensor, by its stream or `tactomo zenoh`'s. [by the control socket]",
         ),
     ] = None,
-    stream: StreamAddress = DEFAULT_STREAM,
-    control: ControlAddress = DEFAULT_CONTROL,
-    keys: KeysFolder = None,
-    as_json: JsonOutput = False,
+    stream: options.StreamAddress = options.DEFAULT_STREAM,
+    control: options.ControlAddress = options.DEFAULT_CONTROL,
+    keys: options.KeysFolder = None,
+    as_json: options.JsonOutput = False,
 ) -> None:
     """Show how the daemon is: first what is wrong and what to do about it, then all there is.
 

@@ -11,16 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tactomo.cli.options import (
-    DEFAULT_CONTROL,
-    DEFAULT_TWIN_CONTROL,
-    ControlAddress,
-    KeysFolder,
-    TwinControlAddress,
-    examples,
-    method_names,
-    typer_app,
-)
+from tactomo.cli import options
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
@@ -30,11 +21,13 @@ SOON_S = 3.0
 USUAL_TARE_SCANS = 20
 """Where no reference says yet how many the daemon takes."""
 
-app = typer_app()
+app = options.typer_app()
 
 
-@app.command(epilog=examples("tactomo tare"))
-def tare(control: ControlAddress = DEFAULT_CONTROL, keys: KeysFolder = None) -> None:
+@app.command(epilog=options.examples("tactomo tare"))
+def tare(
+    control: options.ControlAddress = options.DEFAULT_CONTROL, keys: options.KeysFolder = None
+) -> None:
     """Take a new reference: the next scans of the *unloaded* skin count as "nothing pressed".
 
     Leave the skin alone for a second, then run this. Needed after mounting the skin, after a
@@ -65,7 +58,7 @@ def _tare_s(status: Mapping[str, Any]) -> float:
 
 
 @app.command(
-    epilog=examples(
+    epilog=options.examples(
         "tactomo record grasp.mcap --seconds 10",
         "tactomo record grasp.mcap --maps",
         "tactomo record start grasp.mcap",
@@ -88,8 +81,8 @@ def record(
     maps: Annotated[
         bool, typer.Option("--maps", help="With maps and contacts. [as the daemon is configured]")
     ] = False,
-    control: ControlAddress = DEFAULT_CONTROL,
-    keys: KeysFolder = None,
+    control: options.ControlAddress = options.DEFAULT_CONTROL,
+    keys: options.KeysFolder = None,
 ) -> None:
     """Record what the ports say (every byte, with its time) into an MCAP file.
 
@@ -116,21 +109,23 @@ def record(
     typer.echo(f"recording to {daemon.record_start(path, maps=maps or None).path}")
 
 
-@app.command(epilog=examples("tactomo method levelset", "tactomo method auto --budget-ms 20"))
+@app.command(
+    epilog=options.examples("tactomo method levelset", "tactomo method auto --budget-ms 20")
+)
 def method(
     name: Annotated[
         str,
         typer.Argument(
             help="The method; auto chooses for each frame. `tactomo status` lists those that the "
             "daemon has.",
-            autocompletion=method_names,
+            autocompletion=options.method_names,
         ),
     ],
     budget_ms: Annotated[
         float | None, typer.Option(min=0.1, help="Time that one reconstruction may take.")
     ] = None,
-    control: ControlAddress = DEFAULT_CONTROL,
-    keys: KeysFolder = None,
+    control: options.ControlAddress = options.DEFAULT_CONTROL,
+    keys: options.KeysFolder = None,
 ) -> None:
     """Choose the reconstruction method while the daemon runs.
 
@@ -147,7 +142,7 @@ def method(
 
 
 @app.command(
-    epilog=examples(
+    epilog=options.examples(
         "tactomo poke press x_mm=10 y_mm=-20 pressure_kpa=180",
         "tactomo poke release",
         "tactomo poke mute channel=structure seconds=3",
@@ -162,7 +157,7 @@ def poke(
     arguments: Annotated[
         list[str] | None, typer.Argument(metavar="[NAME=VALUE]...", help="Its arguments.")
     ] = None,
-    twin_control: TwinControlAddress = DEFAULT_TWIN_CONTROL,
+    twin_control: options.TwinControlAddress = options.DEFAULT_TWIN_CONTROL,
 ) -> None:
     """Press, move, release and break a running twin, as a test of your own robot would.
 

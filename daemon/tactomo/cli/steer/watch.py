@@ -10,15 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from tactomo.cli.options import (
-    DEFAULT_NAME,
-    DEFAULT_STREAM,
-    KeysFolder,
-    SensorName,
-    StreamAddress,
-    examples,
-    typer_app,
-)
+from tactomo.cli import options
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
@@ -30,19 +22,21 @@ REFRESH_HZ = 12.0
 NOBODY_S = 5.0
 """How long a name may be silent from the start: a daemon sends its status every second."""
 
-app = typer_app()
+app = options.typer_app()
 
 
 @app.command(
-    epilog=examples("tactomo watch", "tactomo watch -s left_forearm", "tactomo watch | tee log")
+    epilog=options.examples(
+        "tactomo watch", "tactomo watch -s left_forearm", "tactomo watch | tee log"
+    )
 )
 def watch(
-    sensor: SensorName = DEFAULT_NAME,
-    stream: StreamAddress = DEFAULT_STREAM,
+    sensor: options.SensorName = options.DEFAULT_NAME,
+    stream: options.StreamAddress = options.DEFAULT_STREAM,
     seconds: Annotated[
         float | None, typer.Option(min=0.0, help="Stop after this long; until Ctrl-C without it.")
     ] = None,
-    keys: KeysFolder = None,
+    keys: options.KeysFolder = None,
 ) -> None:
     """Show the pressure map, the contacts and the daemon's health live in the terminal.
 
