@@ -25,11 +25,9 @@ import zmq
 from tactomo.errors import AddressError
 
 IPC: Final = "ipc://"
-HANDSHAKE_MS: Final = 3000
-"""Who has not finished the handshake by then is cut off."""
+HANDSHAKE_MS: Final = 3000  # who has not finished the handshake by then is cut off
 REBIND_S: Final = 2.0
-MAX_OPEN: Final = 8192
-"""Files and connections of a process; the systemd units say the same."""
+MAX_OPEN: Final = 8192  # files and connections of a process; the systemd units say the same
 ADDRESS_STEP: Final = 20
 """From one skin's default TCP ports to the next one's; the proxy's is between."""
 

@@ -27,14 +27,11 @@ class ChannelScan:
     flags: ScanFlag
     volts: FloatArray
     realtime_ns: int
-    monotonic_ns: int
-    """When the read that brought the scan's last byte had returned."""
+    monotonic_ns: int  # when the read that brought the scan's last byte had returned
     clock_ns: int
     """The same on the clock that synchronisation goes by: in a replay, the recording's."""
-    recording: int
-    """Number of the recording that has the scan's bytes; 0 for none."""
-    port: int = 0
-    """Index of the port that the scan came by."""
+    recording: int  # number of the recording that has the scan's bytes; 0 for none
+    port: int = 0  # index of the port that the scan came by
     delay_ns: int | None = None
     """How long the scan was held up on its way; None while the device's clock cannot tell."""
 
@@ -55,12 +52,10 @@ class Delivery(NamedTuple):
     port: int
     clock_ns: int
     scans: tuple[ChannelScan, ...]
-    hello: Hello | None = None
-    """What the device says of itself; None before it has."""
+    hello: Hello | None = None  # what the device says of itself; None before it has
     has_ended: bool = False
     """The replay behind the port is at its end: nothing more will come of this pass."""
-    replay_pass: int = 0
-    """How often the replay had been moved when this was read."""
+    replay_pass: int = 0  # how often the replay had been moved when this was read
 
 
 class ScanKey(NamedTuple):
@@ -74,14 +69,12 @@ class ScanKey(NamedTuple):
 class Timing(NamedTuple):
     """When a dual scan was acquired, and how far its two channels are apart."""
 
-    delay_ns: int
-    """From then to the arrival of its last byte."""
+    delay_ns: int  # from then to the arrival of its last byte
     is_dated: bool
     """Whether by the device's clock; otherwise it was acquired when its first scan arrived."""
     skew_ns: int | None
     """The magnitude scan's time less the structure scan's; None where that is not known."""
-    is_skewed: bool
-    """Whether that is so much that the two are not of one instant."""
+    is_skewed: bool  # whether that is so much that the two are not of one instant
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,14 +84,12 @@ class Mark:
     scans: tuple[ScanKey, ...]
     tier: str
     budget_ms: float | None
-    reference: Reference | None = None
-    """A reference to be put in force just before it."""
+    reference: Reference | None = None  # a reference to be put in force just before it
     reference_number: int | None = None
     """Which of the recording's references was in force, from 1; None for none."""
     is_cold: bool = False
     """Whether what came before is unknown, so that the reconstruction starts anew with it."""
-    timing: Timing | None = None
-    """None where an older version recorded."""
+    timing: Timing | None = None  # None where an older version recorded
     is_cut: bool = False
     """Whether it began another file, so that the reconstruction forgot what shapes there were."""
     calibration: str | None = None
@@ -116,8 +107,7 @@ class DualScan:
     counter: int
     magnitude: ChannelScan | None
     structure: ChannelScan | None
-    mark: Mark | None = None
-    """What a recording says about it, in an exact replay."""
+    mark: Mark | None = None  # what a recording says about it, in an exact replay
 
     @property
     def scans(self) -> tuple[ChannelScan, ...]:

@@ -17,12 +17,9 @@ import numpy as np
 
 RING: Final = 256
 """Of each measure: at 20 Hz 13 s, long enough for a 99th percentile to hold two values."""
-RATE_WINDOW_NS: Final = 3_000_000_000
-"""Three hellos of a device; a rate that falls shows within it."""
-WAITS: Final = 5
-"""A median of five bears two waits that were long by chance."""
-FEW: Final = 3.0
-"""As many of its own periods late, and something has stopped."""
+RATE_WINDOW_NS: Final = 3_000_000_000  # three hellos of a device; a rate that falls shows within it
+WAITS: Final = 5  # A median of five bears two waits that were long by chance
+FEW: Final = 3.0  # as many of its own periods late, and something has stopped
 LONGEST_PERIOD_S: Final = 60.0
 MINUTE_S: Final = 60.0
 LOOK_S: Final = 1.0

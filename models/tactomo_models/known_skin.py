@@ -27,11 +27,9 @@ LEAST_DEVIATION: Final = 0.02  # that of a sheet uneven by 4 %: a better one may
 class SkinAtStart(Enum):
     """What the first scans of a start are, beside a reference of before."""
 
-    KNOWN = "known"
-    """The same, drifted; or nothing can be compared."""
+    KNOWN = "known"  # the same, drifted; or nothing can be compared
     LOADED = "loaded"
-    OTHER = "other"
-    """No contacts explain it, and it is as near to its model as the known one was."""
+    OTHER = "other"  # no contacts explain it, and it is as near to its model as the known one was
 
 
 def skin_at_start(

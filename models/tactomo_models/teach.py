@@ -29,8 +29,7 @@ from tactomo_models.sensor.description import SensorDescription
 
 MIN_PRESSES: Final = 20
 """Fifteen to learn from where five are judged; fewer tell no improvement from chance."""
-HELD_OUT: Final = 4
-"""Parts, in order of time, each judged by what the others teach."""
+HELD_OUT: Final = 4  # parts, in order of time, each judged by what the others teach
 ODD: Final = 10.0
 """Median errors from which the other presses contradict a press. Of five measured skins the worst
 of 800 good presses is 8.9 medians off, and of those with x and y swapped four in five are above."""

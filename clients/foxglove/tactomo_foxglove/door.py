@@ -20,8 +20,7 @@ from typing import Any, Final
 from tactomo_client.web_access import names_this_computer
 
 FOXGLOVE_ORIGIN: Final = "https://app.foxglove.dev"
-HEAD_S: Final = 3.0
-"""Who has not sent a request's head by then is cut off, as on the stream."""
+HEAD_S: Final = 3.0  # who has not sent a request's head by then is cut off, as on the stream
 GOODBYE_S: Final = 0.5
 MAX_HEAD_BYTES: Final = 16 * 1024
 PASSED_BYTES: Final = 64 * 1024

@@ -59,8 +59,7 @@ Pixels = NDArray[np.uint8]
 
 TALLEST: Final = 0.25
 """Height of the disc at the top of the pressure range, as a share of the sheet's width."""
-FLAT_M: Final = 0.001
-"""Height of a disc whose pressure is not known."""
+FLAT_M: Final = 0.001  # height of a disc whose pressure is not known
 STALE_ALPHA: Final = 0.45
 WHITE: Final = Color(r=1.0, g=1.0, b=1.0, a=1.0)
 GREY: Final = Color(r=0.55, g=0.55, b=0.55, a=1.0)

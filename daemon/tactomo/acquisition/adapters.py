@@ -21,8 +21,7 @@ ROOT: Final = Path("/")
 LINK_FOLDERS: Final = ("tactomo", "serial/by-id", "serial/by-path")
 """Where udev puts lasting names below ``/dev``, the most telling one first."""
 PTY_MAJORS: Final = range(136, 144)
-LOW_LATENCY_MS: Final = 2
-"""A latency timer of up to so much costs a scan nothing worth telling of."""
+LOW_LATENCY_MS: Final = 2  # a latency timer of up to so much costs a scan nothing worth telling of
 
 _COMMAND_LENGTH: Final = 100
 _PTY_MASTERS: Final = {"/dev/ptmx", "/dev/pts/ptmx"}
@@ -37,8 +36,7 @@ class Holder:
 
     pid: int
     command: str
-    is_far_end: bool
-    """Whether it plays the device: it has the other end of a pseudo-terminal, too."""
+    is_far_end: bool  # whether it plays the device: it has the other end of a pseudo-terminal, too
 
     def __str__(self) -> str:
         return f"pid {self.pid}: {self.command}"
@@ -49,19 +47,15 @@ class Adapter:
     """One serial port of this computer. What is not known is empty or None."""
 
     path: str
-    names: tuple[str, ...]
-    """Links that udev made to it, in the order of LINK_FOLDERS."""
+    names: tuple[str, ...]  # links that udev made to it, in the order of LINK_FOLDERS
     driver: str
-    vendor_id: int | None
-    """Of USB, as `product_id`; None for a port that is built in."""
+    vendor_id: int | None  # of USB, as `product_id`; None for a port that is built in
     product_id: int | None
     maker: str
     product: str
     serial_number: str
-    interface: int | None
-    """Number of the USB interface: chips with several ports have one for each."""
-    latency_timer_ms: int | None
-    """How long an FTDI chip waits for more bytes before it sends some."""
+    interface: int | None  # number of the USB interface: chips with several ports have one for each
+    latency_timer_ms: int | None  # how long an FTDI chip waits for more bytes before it sends some
     is_kept_from_modem_manager: bool
 
     @property

@@ -29,8 +29,7 @@ from tactomo_protocol import Channel
 
 from tactomo.timing import Durations
 
-MAX_RATE: Final = 500e-6
-"""How fast the clocks may drift apart; the protocol asks for 200 ppm."""
+MAX_RATE: Final = 500e-6  # how fast the clocks may drift apart; the protocol asks for 200 ppm
 BUCKET_NS: Final = 2_000_000_000
 BUCKETS: Final = 64
 SETTLE_NS: Final = 10_000_000_000
@@ -42,8 +41,7 @@ ROUGH_NS: Final = 50_000_000
 """How far from the line the usual point may be; those of a clock that stands still are seconds."""
 WANDER: Final = 50e-6
 """How fast a line that has proved itself may become later than it was headed for."""
-RATE_STEP: Final = 1e-6
-"""What its rate may change by at a time while it does."""
+RATE_STEP: Final = 1e-6  # what its rate may change by at a time while it does
 EARLY_NS: Final = 5_000_000
 LATE_NS: Final = 1_000_000_000
 """Scans earlier than the one, or later than the other, may mean that the clock has jumped."""
@@ -60,11 +58,9 @@ dual scan come in either order, but soon after one another."""
 class ClockState(StrEnum):
     """Whether scans are dated by the device's clock."""
 
-    SETTLING = "settling"
-    """Not yet: too little was seen of it."""
+    SETTLING = "settling"  # not yet: too little was seen of it
     SETTLED = "settled"
-    UNUSABLE = "unusable"
-    """No: it stands still, or its rate cannot be."""
+    UNUSABLE = "unusable"  # no: it stands still, or its rate cannot be
 
 
 class Point(NamedTuple):

@@ -29,16 +29,11 @@ REOPEN_MOST_S: Final = 60.0
 class DeviceState(StrEnum):
     """How the device at an open port does."""
 
-    STARTING = "starting"
-    """Opened a moment ago."""
-    RUNNING = "running"
-    """Scans come."""
-    IDLE = "idle"
-    """It speaks, but sends no scans."""
-    GARBAGE = "garbage"
-    """Bytes come, but no packet."""
-    SILENT = "silent"
-    """Nothing comes."""
+    STARTING = "starting"  # opened a moment ago
+    RUNNING = "running"  # scans come
+    IDLE = "idle"  # it speaks, but sends no scans
+    GARBAGE = "garbage"  # bytes come, but no packet
+    SILENT = "silent"  # nothing comes
 
 
 class Liveness:

@@ -23,8 +23,7 @@ ALIKE: Final = 0.05
 """Share by which they may differ: the period is an estimate, and counters may be far apart."""
 MIN_LIMIT_NS: Final = 5_000_000
 """The least delays of two ports are unknown and may differ by some milliseconds."""
-UNDATED_NS: Final = 1_000_000_000
-"""What arrivals alone may be apart by, beyond a period."""
+UNDATED_NS: Final = 1_000_000_000  # what arrivals alone may be apart by, beyond a period
 MAX_GAP_NS: Final = 2_000_000_000
 """Scans of two counters farther apart than this are not compared: one channel is silent."""
 _SMOOTHING: Final = 0.125

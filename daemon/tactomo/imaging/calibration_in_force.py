@@ -23,10 +23,8 @@ class _Foreign(NamedTuple):
     """That a calibration or a teaching is of other devices, or of another skin, for people."""
 
     cause: str
-    command: str
-    """What makes another one."""
-    until: str
-    """What holds until then."""
+    command: str  # what makes another one
+    until: str  # what holds until then
 
 
 class CalibrationInForce:

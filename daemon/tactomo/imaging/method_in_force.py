@@ -21,8 +21,7 @@ class Effort(NamedTuple):
     """How much model a frame gets."""
 
     method: str
-    budget_ms: float | None
-    """None for the method's own."""
+    budget_ms: float | None  # None for the method's own
 
 
 class MethodInForce:

@@ -18,8 +18,7 @@ from tactomo_models.arrays import FloatArray
 from tactomo.protocols.interface import ForeignProtocol, Reading, Trouble
 
 MAX_LINE_BYTES: Final = 65_536
-LONGEST_WORDS: Final = 200
-"""Bytes of a banner's or a menu's line; what is longer was to be numbers."""
+LONGEST_WORDS: Final = 200  # bytes of a banner's or a menu's line; what is longer was to be numbers
 SURE_LINES: Final = 3
 """In a row that do not fit in the same way: no damage, but another board than is described."""
 _SEPARATORS: Final = re.compile(rb"[,;\s]+")

@@ -32,8 +32,7 @@ from tactomo.protocols.openeit import OpenEit
 
 BEGINNINGS: Final = (b"", b"A")
 ANOTHER_BOARD: Final = "give the description of the board that is connected"
-FEWEST_IN_ROW: Final = 8
-"""Numbers in a line of a table, or of a row of it, at least."""
+FEWEST_IN_ROW: Final = 8  # numbers in a line of a table, or of a row of it, at least
 
 
 class Matrix(LineProtocol):

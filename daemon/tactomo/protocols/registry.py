@@ -26,8 +26,7 @@ from tactomo.errors import ConfigError
 from tactomo.protocols.interface import PortProtocol
 
 GROUP: Final = "tactomo.protocols"
-NATIVE: Final = "tactomo"
-"""The protocol of `firmware_protocol/PROTOCOL.md`."""
+NATIVE: Final = "tactomo"  # the protocol of `firmware_protocol/PROTOCOL.md`
 WHERE: Final = "run in its folder, or set PYTHONPATH"
 _MEMBERS: Final = ("name", "baud", "recognises", "feed", "introduction", "preamble")
 

@@ -55,8 +55,7 @@ from tactomo.protocols.interface import ForeignProtocol, Reading, Trouble
 from tactomo.scans import MAX_QUADRATURE
 
 AMPLITUDE_A: Final = (100e-9, 10e-3)
-CHANNELS: Final = 16
-"""In a group, and in a message."""
+CHANNELS: Final = 16  # in a group, and in a message
 DATA_TAG: Final = 0xB4
 ACK_TAG: Final = 0x18
 DATA: Final = np.dtype(
@@ -85,8 +84,7 @@ _FLOAT_FROM: Final = 0x3A80_0000  # floats above a thousandth; 11 days, read as 
 _GAP: Final = 8.0
 """Times the usual one between messages, above which they are of two frames; it is a frame's 16."""
 _CLOCK_TRIES: Final = 5
-_EDGE: Final = 0.8
-"""Of what is too much out of phase, what is little enough again."""
+_EDGE: Final = 0.8  # of what is too much out of phase, what is little enough again
 
 
 class Ack(IntEnum):
@@ -114,8 +112,7 @@ class Clock(IntEnum):
 class Request(NamedTuple):
     """One thing that is asked of the instrument."""
 
-    what: str
-    """In words, for when it is refused."""
+    what: str  # in words, for when it is refused
     message: bytes
 
 

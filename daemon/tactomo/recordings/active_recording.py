@@ -11,8 +11,7 @@ from tactomo.recordings.recording_writer import Entry, RecordingWriter
 
 MAX_QUEUED_BYTES: Final = 64 << 20
 """What may wait for a stuck disk: half an hour of raw bytes, two minutes with maps."""
-ENTRY_BYTES: Final = 300
-"""What an entry takes beside its data."""
+ENTRY_BYTES: Final = 300  # what an entry takes beside its data
 
 
 class ActiveRecording:

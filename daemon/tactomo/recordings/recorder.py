@@ -33,13 +33,11 @@ from tactomo.worker import Worker
 FLUSH_S: Final = 0.2
 LOOK_S: Final = 1.0
 RETRY_S: Final = 10.0
-OVERLAP_S: Final = 10.0
-"""How long, at most, a file goes on when the next one has begun."""
+OVERLAP_S: Final = 10.0  # how long, at most, a file goes on when the next one has begun
 STALL_S: Final = 5.0
 START_S: Final = 10.0
 STOP_S: Final = 3.0
-MAX_RESERVED: Final = 0.1
-"""Of a disk; what is left of a small one is for recordings."""
+MAX_RESERVED: Final = 0.1  # of a disk; what is left of a small one is for recordings
 RESUME_RESERVES: Final = 2
 MIN_ROOM: Final = 1 << 20
 

@@ -93,13 +93,11 @@ class Origin:
     """What a recording is of."""
 
     sensor: str
-    description: str
-    """The shipped description's name, or its path on the computer that recorded."""
+    description: str  # the shipped description's name, or its path on the computer that recorded
     description_sha256: str
     ports: tuple[str, ...]
     version: str
-    protocol: str = NATIVE
-    """What the ports speak."""
+    protocol: str = NATIVE  # what the ports speak
     calibration: str = ""
     """The pressure calibration that the daemon began it with, as the text of its file; empty for
     none."""
@@ -132,19 +130,15 @@ class Summary:
     """Whether intact data lie beyond the damage that ends it here: `tactomo recover` gets them."""
     recovered_gaps: int | None = None
     """How many gaps `tactomo recover` had to leave in it; None for a recording as it was made."""
-    start_ns: int = 0
-    """When the first byte was read, nanoseconds since 1970, on the steady clock."""
+    start_ns: int = 0  # when the first byte was read, nanoseconds since 1970, on the steady clock
     end_ns: int = 0
     port_bytes: dict[int, int] = field(default_factory=dict)
     scans: dict[Channel, int] = field(default_factory=dict)
     hellos: list[Hello] = field(default_factory=list)
     """The distinct ones, in the order in which they were heard."""
-    corrupt: int = 0
-    """Frames on the ports that were damaged."""
-    faulty: int = 0
-    """Intact ones that break the protocol."""
-    frames: int = 0
-    """Dual scans that the daemon reconstructed while it recorded."""
+    corrupt: int = 0  # frames on the ports that were damaged
+    faulty: int = 0  # intact ones that break the protocol
+    frames: int = 0  # dual scans that the daemon reconstructed while it recorded
     references: int = 0
 
     @property
@@ -383,10 +377,8 @@ def read_reference_number(data: bytes) -> int | None:
 class KeptCalibration(NamedTuple):
     """A pressure calibration that was put in force during a recording."""
 
-    number: int
-    """Which of its recording's, from 1."""
-    text: str
-    """Of its file; empty for none."""
+    number: int  # which of its recording's, from 1
+    text: str  # of its file; empty for none
 
 
 def read_calibration(data: bytes) -> KeptCalibration:

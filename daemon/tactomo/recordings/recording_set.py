@@ -28,8 +28,7 @@ from tactomo.scans import Mark
 LONGEST_PAUSE_NS: Final = 1_000_000_000
 LONGEST_OVERLAP_NS: Final = 30_000_000_000
 """Beyond these two the clock was set between two files, or nothing ran."""
-REMEMBERED_READS: Final = 50_000
-"""Of the end of a file; more than an overlap has."""
+REMEMBERED_READS: Final = 50_000  # of the end of a file; more than an overlap has
 
 
 class RecordingSet(Recording):

@@ -63,17 +63,13 @@ class Gap:
 class Recovery:
     """What was kept of a damaged recording, and what was lost."""
 
-    path: Path
-    """The new file."""
+    path: Path  # the new file
     origin: Origin
-    knows_origin: bool = True
-    """Whether the damaged file still said what it is of."""
-    lost_bytes: int = 0
-    """Of the damaged file, counted without what any recording has for its index."""
+    knows_origin: bool = True  # whether the damaged file still said what it is of
+    lost_bytes: int = 0  # of the damaged file, counted without what any recording has for its index
     gaps: list[Gap] = field(default_factory=list)
     """Where something is missing between the first and the last that was kept."""
-    is_cut: bool = False
-    """Whether the end is missing; nobody can tell how much of it."""
+    is_cut: bool = False  # whether the end is missing; nobody can tell how much of it
     frames_lost: int = 0
     """Reconstructed dual scans after a gap whose reference, calibration or scans are lost."""
 

@@ -25,14 +25,10 @@ from tactomo.scans import Delivery, Mark
 class Replay:
     """What a recording tells the pipeline beyond the bytes on the ports."""
 
-    marks: list[Mark]
-    """The dual scans to reconstruct; empty where the recording does not say."""
-    reference: Reference | None
-    """The one in force at its beginning."""
-    is_paced: bool
-    """Whether bytes come in their own time rather than as fast as they are taken."""
-    playback: Playback
-    """Its time, which the ports share."""
+    marks: list[Mark]  # the dual scans to reconstruct; empty where the recording does not say
+    reference: Reference | None  # the one in force at its beginning
+    is_paced: bool  # whether bytes come in their own time rather than as fast as they are taken
+    playback: Playback  # its time, which the ports share
     calibration: PressureCalibration | None = None
     """Of pressure, that the daemon had when it began to record."""
     knows_calibration: bool = False

@@ -30,10 +30,8 @@ class KeptRecording(NamedTuple):
     number: int
     path: Path
     size: int
-    begin_s: float
-    """When it began, seconds since 1970 by the wall clock of that time."""
-    end_s: float
-    """When it was last written to, likewise."""
+    begin_s: float  # when it began, seconds since 1970 by the wall clock of that time
+    end_s: float  # when it was last written to, likewise
 
 
 class Deletion(NamedTuple):

@@ -41,8 +41,7 @@ SHARED: Final = {
     "tmpfiles.conf": Path("etc/tmpfiles.d/tactomo.conf"),
 }
 """Where each file of `deploy/` goes."""
-PROGRAM: Final = "/usr/bin/tactomo"
-"""As the units call it; another one is put in its place."""
+PROGRAM: Final = "/usr/bin/tactomo"  # as the units call it; another one is put in its place
 HIDDEN: Final = ("/home/", "/root/", "/tmp/", "/var/tmp/", "/run/user/")
 """What the service's sandbox does not see."""
 UDEV_RUNS: Final = Path("/run/udev/control")

@@ -19,8 +19,7 @@ from typing import Final
 import structlog
 
 STATUS_PERIOD_S: Final = 2.0
-FEED_AT: Final = 0.5
-"""Share of the watchdog's time after which it is fed; systemd advises half."""
+FEED_AT: Final = 0.5  # share of the watchdog's time after which it is fed; systemd advises half
 TELL_AT: Final = 0.8
 """Share after which the log says which part hangs, while there is still time to say it."""
 

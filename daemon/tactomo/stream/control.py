@@ -30,8 +30,7 @@ from tactomo.stream.peers import Peers
 from tactomo.worker import Worker
 
 MAX_REQUEST_BYTES: Final = 64 * 1024
-POLL_MS: Final = 250
-"""How late, at most, a stop or a cut is noticed."""
+POLL_MS: Final = 250  # how late, at most, a stop or a cut is noticed
 POLL_WHILE_PENDING_MS: Final = 10
 MAX_PENDING: Final = 64
 QUEUED_PER_CLIENT: Final = 64

@@ -22,18 +22,14 @@ from tactomo.endpoint import bind
 from tactomo.errors import AddressError
 from tactomo.events import OnEvent, RateLimit
 
-MAX_PARTS: Final = 8
-"""Of a request: identity, empty part, body; and what a few proxies add."""
-DISCARDED_AT_ONCE: Final = 10_000
-"""Parts: some 10 ms."""
-CHECK_MS: Final = 50
-"""How often connections are looked at: what comes of one meanwhile is memory."""
+MAX_PARTS: Final = 8  # of a request: identity, empty part, body; and what a few proxies add
+DISCARDED_AT_ONCE: Final = 10_000  # parts: some 10 ms
+CHECK_MS: Final = 50  # how often connections are looked at: what comes of one meanwhile is memory
 MAX_UNREAD_BYTES: Final = 2 << 20
 HEARTBEAT_BYTES_S: Final = 100.0
 """What a connection sends that says nothing: heartbeats each second, under CURVE."""
 TCP_INFO_BYTES: Final = 136
-RECEIVED_AT: Final = 128
-"""Of `tcpi_bytes_received` in Linux's `struct tcp_info`."""
+RECEIVED_AT: Final = 128  # of `tcpi_bytes_received` in Linux's `struct tcp_info`
 
 
 class _Connection(NamedTuple):

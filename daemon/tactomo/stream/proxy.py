@@ -28,15 +28,12 @@ from tactomo.events import RateLimit, Severity
 from tactomo.stream.access_control import STREAM, Context
 from tactomo.stream.subscriptions import SUBSCRIBERS_CUT, Subscribers
 
-QUEUED_PER_SUBSCRIBER: Final = 256
-"""Of all sensors together; a daemon keeps 64 of its one."""
+QUEUED_PER_SUBSCRIBER: Final = 256  # of all sensors together; a daemon keeps 64 of its one
 PASSED_AT_ONCE: Final = 64
 POLL_MS: Final = 200
 LOOK_S: Final = 1.0
-REMEMBERED_S: Final = 3.0
-"""A status that is older is not news to a newcomer: its daemon is gone."""
-SILENT_S: Final = 5.0
-"""A source that has not answered so long after the start is missed."""
+REMEMBERED_S: Final = 3.0  # a status that is older is not news to a newcomer: its daemon is gone
+SILENT_S: Final = 5.0  # a source that has not answered so long after the start is missed
 LINGER_MS: Final = 200
 MAX_SENSORS: Final = 64
 MAX_TOPIC_BYTES: Final = 128

@@ -27,8 +27,7 @@ from tactomo.timing import Durations
 from tactomo.worker import Worker
 
 STATUS_PERIOD_S: Final = 1.0
-LINGER_MS: Final = 200
-"""How long messages that were sent may take to leave when the daemon stops."""
+LINGER_MS: Final = 200  # how long messages that were sent may take to leave when the daemon stops
 QUEUED_PER_SUBSCRIBER: Final = 64
 MAX_QUEUED: Final = 1024
 

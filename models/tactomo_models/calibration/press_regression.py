@@ -21,8 +21,7 @@ import numpy as np
 from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.errors import DataError
 
-MIN_PRESSES: Final = 12
-"""Below it, five folds leave hardly two presses each to choose by."""
+MIN_PRESSES: Final = 12  # below it, five folds leave hardly two presses each to choose by
 FOLDS: Final = 5
 GRID: Final = 32
 """Places along the longer side: 2.5 mm on a skin of 80 mm. With 40 the median falls by 1 %."""

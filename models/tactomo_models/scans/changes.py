@@ -91,13 +91,10 @@ class Changes:
 class ChannelResult(NamedTuple):
     """What is to be had of a scan."""
 
-    changes: Changes | None
-    """None where there is too little to go by; a flag says so."""
+    changes: Changes | None  # None where there is too little to go by; a flag says so
     flags: Flag
-    electrodes: list[int]
-    """Those left out, ascending."""
-    own_flags: Flag
-    """Those of `flags` that this scan raises, and not its reference."""
+    electrodes: list[int]  # those left out, ascending
+    own_flags: Flag  # those of `flags` that this scan raises, and not its reference
 
 
 class MeasuredChannel:

@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from tactomo_models.calibration.curve import Fit, Reading
 
 STATUS_WAIT_S: Final = 3.0
-STILL_S: Final = 1.0
-"""For how long a press is to be held still, and is averaged."""
+STILL_S: Final = 1.0  # for how long a press is to be held still, and is averaged
 MIN_FRAMES: Final = 5
 STILL_MM: Final = 1.0
 STILL_SHARE: Final = 0.03

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from tactomo_models.calibration.taught_skin import TaughtSkin
 
 
-CONNECT_S: Final = 1.0
-"""How long to wait where nobody listens: there need not be a daemon."""
+CONNECT_S: Final = 1.0  # how long to wait where nobody listens: there need not be a daemon
 
 
 class OtherSensorError(TactomoError):

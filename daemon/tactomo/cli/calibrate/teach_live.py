@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 REST_S: Final = 2.0
-HOLD_S: Final = 1.0
-"""For how long a press is to be held still."""
+HOLD_S: Final = 1.0  # for how long a press is to be held still
 STILL_SHARE: Final = 0.05
 """Of the press's change, by which it may differ from the first half to the second."""
 DISTURBED: Final = Flag.NOISE_HIGH | Flag.CHANNELS_SWAPPED | Flag.CHANNELS_SKEWED

@@ -22,13 +22,11 @@ from tactomo.errors import TactomoError
 if TYPE_CHECKING:
     from tactomo_client.touch import Touch
 
-DEFAULT_FPS: Final = 30
-"""As LeRobot's own programs have it."""
+DEFAULT_FPS: Final = 30  # as LeRobot's own programs have it
 STALE_S: Final = 0.5
 """A step without a younger frame has none: from then on `Frame.is_stale`, by default."""
 
-RESOLUTION_S: Final = 1e-6
-"""Of seconds since 1970 in 64 bits: 2.4e-7."""
+RESOLUTION_S: Final = 1e-6  # of seconds since 1970 in 64 bits: 2.4e-7
 
 
 class Step(NamedTuple):

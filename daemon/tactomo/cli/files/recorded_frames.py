@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from tactomo_client.recording import Recording
     from tactomo_models import SensorDescription
 
-MARGIN_S = 30.0
-"""How much earlier or later than it was acquired a frame may have been published."""
+MARGIN_S = 30.0  # how much earlier or later than it was acquired a frame may have been published
 
 
 FromOption = Annotated[
@@ -37,8 +36,7 @@ ToOption = Annotated[
 class Moment(NamedTuple):
     """A frame and its time in the recording."""
 
-    time_s: float
-    """When it was acquired, seconds from the recording's beginning."""
+    time_s: float  # when it was acquired, seconds from the recording's beginning
     frame: Frame
     age_s: float | None
     """How old it was when it was published; None where it was made of the recording just now."""
@@ -64,8 +62,7 @@ class RecordedFrames:
     start_s: float
     end_s: float
     _given: Recording
-    _remade: Sequence[Recording]
-    """Of each file, if it had to be made; otherwise none."""
+    _remade: Sequence[Recording]  # of each file, if it had to be made; otherwise none
 
     def moments(self, kind: Literal["map", "contacts"] = "map") -> Iterator[Moment]:
         """Yield the frames in the order of their times, one at a time."""

@@ -12,8 +12,7 @@ if TYPE_CHECKING:
     from tactomo_client import Contact
 
 MAPS_SHOWN: Final = 6
-SHORTEST_S: Final = 0.15
-"""Stretches shorter than this are not shown, unless there is no other."""
+SHORTEST_S: Final = 0.15  # stretches shorter than this are not shown, unless there is no other
 
 
 @dataclass(slots=True)
@@ -29,12 +28,10 @@ class Course:
     """The frames of a recording without their images, one list entry for each."""
 
     sensor: str
-    start_ns: int
-    """When the recording began, nanoseconds since 1970."""
+    start_ns: int  # when the recording began, nanoseconds since 1970
     times_s: list[float] = field(default_factory=list)
     """When each frame was acquired, seconds from there."""
-    pressed: list[frozenset[str]] = field(default_factory=list)
-    """Which contacts were there."""
+    pressed: list[frozenset[str]] = field(default_factory=list)  # which contacts were there
     tiers: list[str] = field(default_factory=list)
     flags: list[frozenset[str]] = field(default_factory=list)
     misfits: list[float | None] = field(default_factory=list)

@@ -23,8 +23,7 @@ WIDTH_IN: Final = 12.0
 STRIP_IN: Final = 2.75
 HEIGHTS_IN: Final = {"pressure": 2.0, "force": 1.5, "misfit": 1.2, "flags": 1.1, "timing": 1.3}
 SIGMAS: Final = 2.0
-GAP_S: Final = 0.5
-"""Without a frame for so long, a line is broken."""
+GAP_S: Final = 0.5  # without a frame for so long, a line is broken
 INK: Final = "0.25"
 LETTERS: Final = "abcdefghijkl"
 

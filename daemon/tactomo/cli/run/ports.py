@@ -81,10 +81,8 @@ class Row:
     """One port as it is listed."""
 
     path: str
-    adapter: Adapter | None
-    """None for a port that is no adapter, such as a pseudo-terminal."""
-    use: str
-    """The name to configure; empty where none lasts."""
+    adapter: Adapter | None  # None for a port that is no adapter, such as a pseudo-terminal
+    use: str  # the name to configure; empty where none lasts
     held_by: list[Holder]
     remarks: list[str]
 

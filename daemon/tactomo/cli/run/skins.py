@@ -35,8 +35,7 @@ from tactomo.stream.proxy import Proxy, serve
 TURN_S: Final = 0.2
 RESTART_S: Final = 2.0
 WATCHDOG_S: Final = 10.0
-STOP_S: Final = 8.0
-"""Two seconds less than systemd gives the parent."""
+STOP_S: Final = 8.0  # two seconds less than systemd gives the parent
 
 log = structlog.get_logger()
 

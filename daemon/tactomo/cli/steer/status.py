@@ -12,8 +12,7 @@ from tactomo.cli import options
 from tactomo.cli.health_issues import health_issues
 from tactomo.errors import TactomoError
 
-HEARD_WITHIN_S = 3.0
-"""A status comes every second."""
+HEARD_WITHIN_S = 3.0  # a status comes every second
 
 app = options.typer_app()
 

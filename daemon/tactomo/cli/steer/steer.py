@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from tactomo_client import Daemon, RecordedFile
 
 SOON_S = 3.0
-USUAL_TARE_SCANS = 20
-"""Where no reference says yet how many the daemon takes."""
+USUAL_TARE_SCANS = 20  # where no reference says yet how many the daemon takes
 
 app = options.typer_app()
 
