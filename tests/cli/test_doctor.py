@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from shared_data import measured
 from tactomo.recordings.recording_writer import write_recording
 from tactomo_client import request
 from tactomo_models import SensorDescription, load_description, load_or_build_artifact
@@ -16,12 +17,10 @@ from tactomo_models.physics.bare_sheet import scan_voltages
 from tactomo_models.sensor.description_file import shipped_text
 from tactomo_models.sensor.pattern import reciprocal_pairs, scan_pairs
 from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag
-from whole_system import SENSOR, Demo, repository, running_demo
+from whole_system import SENSOR, Demo, running_demo
 
 Run = Callable[..., Any]
 
-SHARED = repository().parent / "shared/data"
-measured = pytest.mark.skipif(not SHARED.is_dir(), reason="measured data are not here")
 NOISE = 1e-3
 
 
@@ -246,18 +245,16 @@ def test_nobody_there(tactomo: Run) -> None:
     assert "no daemon answers at ipc:///nowhere/at/all" in outcome.stderr
 
 
-@measured
 def test_the_broken_device_is_called_broken(tactomo: Run) -> None:
-    outcome = tactomo("doctor", SHARED / "skin_bad_device_32el.npz")
+    outcome = tactomo("doctor", measured("skin_bad_device_32el.npz"))
     assert outcome.returncode == 1
     assert "broken" in outcome.stdout
     assert "67.8%" in outcome.stdout
 
 
-@measured
 @pytest.mark.parametrize("arguments", [[], ["-d", "tank_disc"], ["--frames", "0:20"]])
 def test_the_tank_is_not(tactomo: Run, arguments: list[str]) -> None:
-    outcome = tactomo("doctor", SHARED / "tank_sciospec_20fps.npz", *arguments, "--json")
+    outcome = tactomo("doctor", measured("tank_sciospec_20fps.npz"), *arguments, "--json")
     assert outcome.returncode == 0
     assert report(outcome)["verdict"] == "healthy"
 

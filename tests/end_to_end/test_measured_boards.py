@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from daemon_process import SENSOR, DaemonProcess
+from shared_data import measured
 from tactomo.twin import Twin, TwinConfig
 from tactomo_client import Frame, subscribe
 from tactomo_lab.evaluation.skin_presses import read_presses
@@ -32,20 +33,12 @@ from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scans.reference import noise_of_reciprocity
 from tactomo_models.sensor.shipped import __path__ as sensors_path
 
-DATA = Path(__file__).parents[2].parent / "shared" / "data"
 REST = 100
 """Scans at rest that come first: a daemon tares by twenty, and a controller subscribes."""
 SCALE = 0.62
 """Of the tanks' changes, as a share of the largest possible: what `evaluate tanks` finds."""
 ONE_SIDED = '[instrument]\nvoltages = "positive"\nregularisation = 30.0\n'
 UNSIGNED = '[instrument]\nvoltages = "unsigned"\n'
-
-
-def measured(name: str) -> Path:
-    path = DATA / name
-    if not path.exists():
-        pytest.skip(f"{name} is not beside the project")
-    return path
 
 
 def described(tmp_path: Path, name: str, more: str = "") -> Path:

@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from selenium.webdriver import Chrome
+from shared_data import measured
 from tactomo_client import Frame, request, subscribe
 from tactomo_client.messages import MAP, decode_message
 from waiting import PATIENCE_S, wait_until
-from whole_system import ANYWHERE, SENSOR, Demo, repository
-
-TANK = repository().parent / "shared" / "data" / "tank_sciospec_20fps.npz"
+from whole_system import ANYWHERE, SENSOR, Demo
 
 
 def tactomo(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -120,11 +119,11 @@ def array(wire: Any) -> Any:
     return np.frombuffer(wire["data"], wire["dtype"]).reshape(wire["shape"])
 
 
-@pytest.mark.skipif(not TANK.exists(), reason="the measured stream is not part of the project")
 def test_a_measured_stream_is_imported_replayed_and_located(tmp_path: Path) -> None:
     recording, again = tmp_path / "tank.mcap", tmp_path / "again.mcap"
+    tank = measured("tank_sciospec_20fps.npz")
     imported = tactomo(
-        *("import", TANK, recording, "--description", "tank_disc", "--reference-frames", "0:20")
+        *("import", tank, recording, "--description", "tank_disc", "--reference-frames", "0:20")
     )
     assert imported.returncode == 0, imported.stderr
     replayed = tactomo(

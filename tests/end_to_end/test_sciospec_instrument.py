@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from daemon_process import SENSOR, DaemonProcess
+from shared_data import measured
 from tactomo.recordings.recording import open_recording
 from tactomo.twin import Twin, TwinConfig
 from tactomo_client import Frame, request, subscribe
@@ -23,10 +24,7 @@ from tactomo_models import load_description
 from tactomo_models.sensor.shipped import __path__ as sensors_path
 from tactomo_protocol import Scan
 from waiting import wait_until
-from whole_system import repository
 
-DATA = repository().parent / "shared" / "data"
-measured = pytest.mark.skipif(not DATA.exists(), reason="measured data are no part of the project")
 COARSE = ("[structure]", "[map]\nnodes_x = 25\nnodes_y = 25\n\n[structure]")
 
 Start = Callable[..., tuple[Twin, DaemonProcess]]
@@ -169,12 +167,12 @@ def test_ports_tells_what_speaks_sciospec(tmp_path: Path) -> None:
         twin.stop()
 
 
-@measured
 @pytest.mark.long
 @pytest.mark.timeout(600)
 def test_a_played_stream_gives_what_its_import_gives(start: Start, tmp_path: Path) -> None:
     """The measured cup, said by the emulator and read from its file: equal scans and contacts."""
-    path, live, imported = DATA / "tank_sciospec_20fps.npz", tmp_path / "live.mcap", "import.mcap"
+    path = measured("tank_sciospec_20fps.npz")
+    live, imported = tmp_path / "live.mcap", "import.mcap"
     tank = sensor(tmp_path, COARSE)
     settings = {"lossless": True, "recording": {"file": str(live), "maps": True}}
     twin, daemon = start(tank, settings, play=path, play_once=True)
@@ -208,7 +206,6 @@ def test_a_played_stream_gives_what_its_import_gives(start: Start, tmp_path: Pat
     assert angle[-1] - angle[0] > math.pi  # around the tank, counter-clockwise
 
 
-@measured
 @pytest.mark.long
 def test_each_labelled_object_lies_beside_its_electrode(start: Start, tmp_path: Path) -> None:
     """Metal and plastic that stood beside electrodes 1, 5, 9 and 13 of a tank."""
@@ -217,7 +214,7 @@ def test_each_labelled_object_lies_beside_its_electrode(start: Start, tmp_path: 
         COARSE,
         ("conductivity_ratio = 0.01", "conductivity_ratio = 30\neither_way = true"),
     )
-    with np.load(DATA / "tank_labelled.npz") as sets:
+    with np.load(measured("tank_labelled.npz")) as sets:
         names, rest, there = sets["name"], sets["reference"], sets["target"]
     number = next(n for n, name in enumerate(names) if "electrode13" in name and "60uA" in name)
     turn = np.exp(-0.5j * np.angle(np.sum(rest[number] ** 2)))

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 from drawn_skin import presses_on
-from whole_system import repository
+from shared_data import measured
 
 Run = Callable[..., Any]
-MEASURED = repository().parent / "shared" / "data" / "skins_anisotropy.npz"
 
 
 def test_the_last_are_judged_by_the_first(tactomo: Run, tmp_path: Path) -> None:
@@ -53,11 +52,12 @@ def test_files_that_are_none(
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not MEASURED.exists(), reason="the measured set is not here")
 @pytest.mark.parametrize(("train", "asked_mm"), [(100, 4.5), (200, 3.6), (800, 2.3)])
 def test_measured_skins(tactomo: Run, train: int, asked_mm: float) -> None:
     """Plain kernel ridge regression comes to 7.1, 5.2 and 3.0 mm."""
-    result = tactomo("evaluate", "presses", MEASURED, "--train", train, "--json")
+    result = tactomo(
+        "evaluate", "presses", measured("skins_anisotropy.npz"), "--train", train, "--json"
+    )
     skins = json.loads(result.stdout)["skins"]
     assert np.mean([one["median_mm"] for one in skins]) < asked_mm
     assert 0.6 < np.median([one["within_sigma"] for one in skins]) < 0.8

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from shared_data import measured
 from tactomo_lab.evaluation.ktc import evaluate_challenge, read_challenge
 from tactomo_lab.tanks.challenge import challenge_pattern, every_reading, kept_readings
 from tactomo_lab.tanks.model import TankModel
@@ -20,7 +21,6 @@ from tactomo_models.arrays import FloatArray
 Run = Callable[..., Any]
 Arrays = dict[str, Any]
 
-MEASURED = Path(__file__).parents[3].parent / "shared" / "data" / "ktc2023_training.npz"
 SEED = 10**6  # no seed of the training's
 LEVELS = (1, 4, 7)
 
@@ -128,10 +128,8 @@ def test_drawn_objects_keep_apart() -> None:
 
 @pytest.mark.parametrize(("level", "least"), [(1, 0.88), (4, 0.8), (7, 0.7)])
 def test_measured_tanks(level: int, least: float) -> None:
-    if not MEASURED.exists():
-        pytest.skip(f"{MEASURED.name} is not beside the project")
     tank = load_description("tank_ktc2023")
-    given = read_challenge(MEASURED, tank).at_level(level)
+    given = read_challenge(measured("ktc2023_training.npz"), tank).at_level(level)
     np.testing.assert_array_equal(
         np.sign(every_reading(given.currents[0], given.weights)), challenge_pattern()
     )

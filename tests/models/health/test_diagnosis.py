@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+import shared_data
 from faulty_skin import rewired, shorted, touches
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,7 +20,6 @@ from tactomo_models.health.examination import noise_about_line
 from tactomo_models.health.findings import Finding, Level
 from tactomo_models.sensor.pattern import PatternLayout, pattern_of_zeros, scan_pairs, without_zeros
 from tactomo_protocol import Channel
-from whole_system import repository
 
 Change = Callable[[FloatArray], FloatArray]
 
@@ -244,12 +244,8 @@ def test_noise_is_not_drift() -> None:
     assert not noise_about_line(noise[:2]).any()
 
 
-SHARED = repository().parent / "shared/data"
-
-
-@pytest.mark.skipif(not SHARED.is_dir(), reason="measured data are not here")
 def test_the_broken_device_is_broken() -> None:
-    with np.load(SHARED / "skin_bad_device_32el.npz") as file:
+    with np.load(shared_data.measured("skin_bad_device_32el.npz")) as file:
         scans = file["baseline"].astype(float)
     layout = pattern_of_zeros(scans)
     assert layout.electrode_count == 32
@@ -258,9 +254,8 @@ def test_the_broken_device_is_broken() -> None:
     assert about(found, "reciprocity").figures["pairs_percent"] == pytest.approx(68, abs=0.5)
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="measured data are not here")
 def test_the_tank_is_healthy() -> None:
-    with np.load(SHARED / "tank_sciospec_20fps.npz") as file:
+    with np.load(shared_data.measured("tank_sciospec_20fps.npz")) as file:
         volts = file["volts"][:20].real
     pairs = scan_pairs(16)
     scans = volts[:, pairs.drive[:, 0], pairs.measure[:, 0]]

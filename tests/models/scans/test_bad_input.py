@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +17,7 @@ from faulty_skin import rewired, shorted, touches
 from hypothesis import given
 from hypothesis import strategies as st
 from noisy_skin import Skin, rms
+from shared_data import measured
 from tactomo_lab.evaluation.faults import with_lead
 from tactomo_models import (
     Artifact,
@@ -43,7 +43,6 @@ Change = Callable[[Scans], Scans]
 PRESS = Press(0.03, -0.02, 180.0)
 OTHER = Press(-0.03, 0.03, 170.0)
 LEAD = 9
-BAD_DEVICE = Path(__file__).parents[4] / "shared" / "data" / "skin_bad_device_32el.npz"
 
 
 def frame_of(
@@ -340,11 +339,10 @@ def test_interference_is_flagged_and_widens_the_uncertainty(
     assert at_rest.tier == "quiet", "interference is not pressing"
 
 
-@pytest.mark.skipif(not BAD_DEVICE.exists(), reason="measured data are not here")
 def test_a_broken_device_is_flagged(paper: SensorDescription) -> None:
     """Its reciprocity error is 68 %: nothing can be located from it."""
     sensor = variant(paper, electrodes={"per_side": 8, "pitch_m": 0.018}, magnitude=None)
-    with np.load(BAD_DEVICE) as stored:
+    with np.load(measured("skin_bad_device_32el.npz")) as stored:
         baseline, dv = (stored[name].astype(float) for name in ("baseline", "dv"))
     apart = (np.arange(32)[:, None] - np.arange(32)) % 32
     kept = ((apart > 1) & (apart < 31)).ravel()  # drive-major; a row holds driven pairs as 0

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
 from noisy_skin import Skin
+from shared_data import measured
 from tactomo_models import (
     Artifact,
     Channel,
@@ -24,7 +24,6 @@ from tactomo_models.arrays import FloatArray
 from tactomo_models.scans.changes import Changes
 from tactomo_models.scans.stillness import is_still
 
-TANK = Path(__file__).parents[4] / "shared" / "data" / "tank_sciospec_20fps.npz"
 HELD = Press(0.02, -0.01, 170.0, 0.012)
 
 Seen = Callable[..., Changes]
@@ -101,12 +100,11 @@ def test_the_same_scan_without_noise_is_still(
     assert not is_still(settled, other)
 
 
-@pytest.mark.skipif(not TANK.exists(), reason="measured data are not here")
 @pytest.mark.parametrize("scans", [1, 20])
 def test_a_cup_that_moves_through_a_tank_is_never_still(scans: int) -> None:
     """Its reciprocity error is 75 times its noise; from frame 90 on the cup is on its way."""
     tank = load_description("sciospec_disc")
-    with np.load(TANK) as file:
+    with np.load(measured("tank_sciospec_20fps.npz")) as file:
         single = file["volts"].real
     drive, measure = tank.pairs.drive[:, 0], tank.pairs.measure
     volts = single[:, drive, measure[:, 0]] - single[:, drive, measure[:, 1]]
