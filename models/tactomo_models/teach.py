@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -21,7 +22,7 @@ from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 from tactomo_models.batch import read_scans
 from tactomo_models.calibration.calibration_file import Subject
 from tactomo_models.calibration.press_regression import PressRegression
-from tactomo_models.calibration.taught_skin import TaughtSkin, now_utc, press_changes
+from tactomo_models.calibration.taught_skin import TaughtSkin, press_changes
 from tactomo_models.errors import CalibrationError, DataError
 from tactomo_models.reconstruct import Reconstructor
 from tactomo_models.scans.reference import Reference
@@ -115,7 +116,7 @@ def teach(
     channels = tuple(name for name in description.channels if name in presses.scans)
     taught = TaughtSkin(
         subject,
-        now_utc(),
+        datetime.now(UTC).isoformat(timespec="seconds"),
         channels,
         usable,
         changes,

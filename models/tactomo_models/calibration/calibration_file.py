@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Final, Literal, Self
+from typing import IO, Annotated, Final, Literal, Self
 
 import numpy as np
 from platformdirs import user_data_path
@@ -49,6 +50,25 @@ class Subject(BaseModel):
     sha256: str
     device_ids: tuple[str, ...] = ()
 
+    @classmethod
+    def of(
+        cls, sensor: str, description: SensorDescription, device_ids: Iterable[str] = ()
+    ) -> Subject:
+        """A sensor of this name, made as described."""
+        return cls(
+            sensor=sensor,
+            description=description.name,
+            sha256=description.sha256,
+            device_ids=tuple(sorted(set(device_ids))),
+        )
+
+    def check(
+        self, path: Path, description: SensorDescription, next_step: str, sensor: str = ""
+    ) -> None:
+        """Raise CalibrationError where what `path` holds is of another sensor, or name if given."""
+        if mismatch := self.mismatch(sensor or self.sensor, description):
+            raise CalibrationError(f"{path} {mismatch}; {next_step}")
+
     def mismatch(self, sensor: str, description: SensorDescription) -> str:
         """In words, why this is not of a sensor; empty where it is."""
         if self.sensor != sensor:
@@ -69,7 +89,7 @@ class Subject(BaseModel):
 
 
 def subject_of(
-    sensor: str, description: SensorDescription, device_ids: Sequence[str] = ()
+    sensor: str, description: SensorDescription, device_ids: Iterable[str] = ()
 ) -> Subject:
     """What a calibration of such a sensor is of.
 
@@ -81,12 +101,7 @@ def subject_of(
             f"{description.name} has no magnitude channel; its structure channel says where it is "
             "touched, and never how hard"
         )
-    return Subject(
-        sensor=sensor,
-        description=description.name,
-        sha256=description.sha256,
-        device_ids=tuple(device_ids),
-    )
+    return Subject.of(sensor, description, device_ids)
 
 
 class PressureCalibration(BaseModel):
@@ -187,12 +202,7 @@ def save_calibration(calibration: PressureCalibration, path: Path) -> None:
         CalibrationError: the file cannot be written.
     """
     content = (calibration.model_dump_json(indent=1) + "\n").encode()
-    try:
-        write_whole(path, lambda file: file.write(content))
-    except OSError as error:
-        raise CalibrationError(
-            f"cannot write {path}: {error.strerror}; name a file that you may write"
-        ) from error
+    write_kept(path, lambda file: file.write(content))
 
 
 def read_calibration(path: Path) -> PressureCalibration:
@@ -202,14 +212,31 @@ def read_calibration(path: Path) -> PressureCalibration:
         CalibrationError: it is damaged, of another format, or cannot be read.
         FileNotFoundError: there is none.
     """
+    with reading(path, READABLE):
+        return parse_calibration(path.read_bytes(), str(path))
+
+
+def write_kept(path: Path, write: Callable[[IO[bytes]], object]) -> None:
+    """Write what a sensor keeps, as a whole; raise CalibrationError where that cannot be done."""
+    try:
+        write_whole(path, write)
+    except OSError as error:
+        raise CalibrationError(
+            f"cannot write {path}: {error.strerror}; name a file that you may write"
+        ) from error
+
+
+@contextmanager
+def reading(path: Path, next_step: str) -> Iterator[None]:
+    """Raise CalibrationError for a file that cannot be read, FileNotFoundError for none."""
     try:
         if not stat.S_ISREG(path.stat().st_mode):  # reading a pipe may never end
-            raise CalibrationError(f"cannot read {path}: it is no regular file; {READABLE}")
-        return parse_calibration(path.read_bytes(), str(path))
+            raise CalibrationError(f"cannot read {path}: it is no regular file; {next_step}")
+        yield
     except FileNotFoundError:
         raise
     except OSError as error:
-        raise CalibrationError(f"cannot read {path}: {error.strerror}; {READABLE}") from error
+        raise CalibrationError(f"cannot read {path}: {error.strerror}; {next_step}") from error
 
 
 def parse_calibration(content: bytes | str, source: str) -> PressureCalibration:
@@ -243,9 +270,7 @@ def load_calibration(
         FileNotFoundError: there is none.
     """
     found = read_calibration(path)
-    mismatch = found.subject.mismatch(sensor, description)
-    if mismatch:
-        raise CalibrationError(f"{path} {mismatch}; run: tactomo calibrate live --sensor {sensor}")
+    found.subject.check(path, description, f"run: tactomo calibrate live --sensor {sensor}", sensor)
     return found
 
 
@@ -259,9 +284,7 @@ def calibration_of(description: SensorDescription, path: Path) -> PressureCalibr
         found = read_calibration(path)
     except FileNotFoundError as error:
         raise CalibrationError(f"there is no calibration {path}; give another path") from error
-    mismatch = found.subject.mismatch(found.subject.sensor, description)
-    if mismatch:
-        raise CalibrationError(f"{path} {mismatch}; give the one of this sensor")
+    found.subject.check(path, description, "give the one of this sensor")
     return found
 
 

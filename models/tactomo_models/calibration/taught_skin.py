@@ -6,10 +6,8 @@ it was taught on stands in it, and it is refused elsewhere, as a pressure calibr
 
 from __future__ import annotations
 
-import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
@@ -19,9 +17,14 @@ import numpy as np
 from pydantic import ValidationError
 from tactomo_protocol import Channel
 
-from tactomo_models.archive import read_arrays, write_arrays
+from tactomo_models.archive import read_arrays
 from tactomo_models.arrays import BoolArray, FloatArray
-from tactomo_models.calibration.calibration_file import Subject, data_folder
+from tactomo_models.calibration.calibration_file import (
+    Subject,
+    data_folder,
+    reading,
+    write_kept,
+)
 from tactomo_models.calibration.press_regression import PressRegression
 from tactomo_models.errors import CalibrationError, DataError
 from tactomo_models.scans.measurement import Measurement
@@ -150,12 +153,7 @@ def save_taught(taught: TaughtSkin, path: Path) -> None:
         "held_out_mm": np.array([taught.without_mm, taught.with_mm]),
         "reference": taught.reference,
     }
-    try:
-        write_arrays(path, arrays)
-    except OSError as error:
-        raise CalibrationError(
-            f"cannot write {path}: {error.strerror}; name a file that you may write"
-        ) from error
+    write_kept(path, lambda file: np.savez_compressed(file, **arrays))
 
 
 def read_taught(path: Path) -> TaughtSkin:
@@ -167,9 +165,8 @@ def read_taught(path: Path) -> TaughtSkin:
     """
     again = "teach it again, or delete it"
     try:
-        if not stat.S_ISREG(path.stat().st_mode):  # reading a pipe may never end
-            raise CalibrationError(f"cannot read {path}: it is no regular file; {again}")
-        arrays = read_arrays(path)
+        with reading(path, again):
+            arrays = read_arrays(path)
         if int(arrays["format"]) != FORMAT:
             raise CalibrationError(
                 f"{path} is of format {int(arrays['format'])}, and this tactomo reads format "
@@ -177,10 +174,6 @@ def read_taught(path: Path) -> TaughtSkin:
             )
         taught = _of_arrays(arrays)
         _ = taught.regression  # now, not in the first frame
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise CalibrationError(f"cannot read {path}: {error.strerror}; {again}") from error
     except (DataError, KeyError, ValueError, ValidationError) as error:
         raise CalibrationError(f"{path} is damaged, or nothing that was taught; {again}") from error
     return taught
@@ -212,9 +205,7 @@ def load_taught(path: Path, sensor: str, description: SensorDescription) -> Taug
         FileNotFoundError: there is none.
     """
     found = read_taught(path)
-    mismatch = found.subject.mismatch(sensor, description)
-    if mismatch:
-        raise CalibrationError(f"{path} {mismatch}; run: tactomo teach live --sensor {sensor}")
+    found.subject.check(path, description, f"run: tactomo teach live --sensor {sensor}", sensor)
     return found
 
 
@@ -228,12 +219,5 @@ def taught_of(description: SensorDescription, path: Path) -> TaughtSkin:
         found = read_taught(path)
     except FileNotFoundError as error:
         raise CalibrationError(f"nothing was taught in {path}; give another path") from error
-    mismatch = found.subject.mismatch(found.subject.sensor, description)
-    if mismatch:
-        raise CalibrationError(f"{path} {mismatch}; give the one of this sensor")
+    found.subject.check(path, description, "give the one of this sensor")
     return found
-
-
-def now_utc() -> str:
-    """The moment, ISO 8601, UTC."""
-    return datetime.now(UTC).isoformat(timespec="seconds")

@@ -106,12 +106,7 @@ def fit(
     from tactomo_models.calibration.calibration_file import Subject
 
     known = load_description(description)
-    subject = Subject(
-        sensor=sensor,
-        description=known.name,
-        sha256=known.sha256,
-        device_ids=tuple(device_id or ()),
-    )
+    subject = Subject.of(sensor, known, device_id or ())
     path = None if dry_run else _path(sensor, output)
     _teach(presses, known, subject, path, control, keys, keep_odd=keep_odd)
 

@@ -109,12 +109,7 @@ class _Session:
             )
         assert heard.after is not None
         devices = [port["device"]["device_id"] for port in heard.after["ports"] if port["device"]]
-        self._subject = Subject(
-            sensor=self._sensor,
-            description=heard.layout.name,
-            sha256=heard.layout.sha256,
-            device_ids=tuple(sorted(set(devices))),
-        )
+        self._subject = Subject.of(self._sensor, heard.layout, devices)
         return {name: scans.mean(axis=0) for name, scans in heard.scans.items()}, heard.layout
 
     def _take_one(self, description: SensorDescription) -> bool:
