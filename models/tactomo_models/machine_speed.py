@@ -65,31 +65,20 @@ class Plan(NamedTuple):
 
 
 class MachineSpeed(_Table):
-    """What was measured for one sensor on one machine.
+    """What was measured for one sensor on one machine."""
 
-    Attributes:
-        format: of the file.
-        tactomo: the version that measured.
-        machine: its processor.
-        taken: the day, as YYYY-MM-DD.
-        sensor: name of the description.
-        sha256: that description's hash.
-        overhead_s: time of a frame, at its 99th percentile, that goes by no budget.
-        speed: seconds that a frame takes for each second of modelled work, there.
-        rows: the methods that `auto` may choose from.
-        shipped: whether it came with tactomo.
-    """
-
-    format: Literal[1] = 1
-    tactomo: str
-    machine: str
-    taken: str
-    sensor: str
-    sha256: str
+    format: Literal[1] = 1  # of the file
+    tactomo: str  # the version that measured
+    machine: str  # its processor
+    taken: str  # the day, as YYYY-MM-DD
+    sensor: str  # name of the description
+    sha256: str  # that description's hash
+    # time of a frame, at its 99th percentile, that goes by no budget
     overhead_s: Annotated[float, Field(ge=0)]
+    # seconds that a frame takes for each second of modelled work, there
     speed: Annotated[float, Field(gt=0)]
-    rows: tuple[Row, ...]
-    shipped: Annotated[bool, Field(exclude=True)] = False
+    rows: tuple[Row, ...]  # the methods that `auto` may choose from
+    shipped: Annotated[bool, Field(exclude=True)] = False  # whether it came with tactomo
 
     @classmethod
     def of_rows(

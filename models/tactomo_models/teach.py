@@ -42,17 +42,11 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class KnownPresses:
-    """Presses at known places, in order of time.
+    """Presses at known places, in order of time."""
 
-    Attributes:
-        scans: (P, M) volts of each channel.
-        reference: of the unpressed skin.
-        xy_mm: (P, 2) where each was, in the description's frame.
-    """
-
-    scans: dict[str, FloatArray]
-    reference: Reference
-    xy_mm: FloatArray
+    scans: dict[str, FloatArray]  # (P, M) volts of each channel
+    reference: Reference  # of the unpressed skin
+    xy_mm: FloatArray  # (P, 2) where each was, in the description's frame
 
 
 def read_presses(path: Path, description: SensorDescription) -> KnownPresses:
@@ -154,19 +148,12 @@ def _check_numbers(presses: KnownPresses, description: SensorDescription) -> Non
 
 
 class _Seen(NamedTuple):
-    """What P presses look like.
+    """What P presses look like."""
 
-    Attributes:
-        changes: (P, V) of all channels, one after the other.
-        valid: (P, V) which of them are.
-        places_mm: (P, 2) of each one's contact; NaN where there is none, or several.
-        tiers: what made the contacts.
-    """
-
-    changes: FloatArray
-    valid: BoolArray
-    places_mm: FloatArray
-    tiers: frozenset[str]
+    changes: FloatArray  # (P, V) of all channels, one after the other
+    valid: BoolArray  # (P, V) which of them are
+    places_mm: FloatArray  # (P, 2) of each one's contact; NaN where there is none, or several
+    tiers: frozenset[str]  # what made the contacts
 
 
 def _reconstructed(

@@ -49,17 +49,11 @@ UDEV_RUNS: Final = Path("/run/udev/control")
 
 @dataclass(frozen=True, slots=True)
 class File:
-    """A file to be there; without a text, not to be there.
+    """A file to be there; without a text, not to be there."""
 
-    Attributes:
-        path: below the root.
-        text: what is to stand in it; None removes it.
-        is_owners: whether what stands there already is left as it is.
-    """
-
-    path: Path
-    text: str | None
-    is_owners: bool = False
+    path: Path  # below the root
+    text: str | None  # what is to stand in it; None removes it
+    is_owners: bool = False  # whether what stands there already is left as it is
 
     def effect(self, root: Path) -> Effect:
         """Return what carrying it out would do."""

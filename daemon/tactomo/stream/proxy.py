@@ -184,15 +184,10 @@ class Proxy(Relay):
 
 
 class Inlet:
-    """Where messages come from.
+    """Where messages come from."""
 
-    Attributes:
-        address: of the source, to tell of it.
-        socket: what to wait for and receive from.
-    """
-
-    address: str
-    socket: zmq.Socket[bytes]
+    address: str  # of the source, to tell of it
+    socket: zmq.Socket[bytes]  # what to wait for and receive from
 
     def ask(self, more: set[bytes], less: set[bytes]) -> None:
         """Subscribe to some prefixes, and no more to others."""

@@ -316,29 +316,17 @@ def _plan(
 
 @dataclass(frozen=True)
 class Seen:
-    """One frame of a day.
+    """One frame of a day."""
 
-    Attributes:
-        time_s: when.
-        pressed: what presses; None where nothing does.
-        shown: whether it is shown.
-        ghosts: contacts where nothing presses.
-        magnitude: of the contact shown; NaN if unknown.
-        truth: what it should be; NaN where nothing presses.
-        distrusted: whether a flag says so.
-        gain: relative change of the structure channel's baseline since the tare.
-        state: the tracker's; "off" without one.
-    """
-
-    time_s: float
-    pressed: TimedPress | None
-    shown: bool
-    ghosts: int
-    magnitude: float
-    truth: float
-    distrusted: bool
-    gain: float
-    state: str
+    time_s: float  # when
+    pressed: TimedPress | None  # what presses; None where nothing does
+    shown: bool  # whether it is shown
+    ghosts: int  # contacts where nothing presses
+    magnitude: float  # of the contact shown; NaN if unknown
+    truth: float  # what it should be; NaN where nothing presses
+    distrusted: bool  # whether a flag says so
+    gain: float  # relative change of the structure channel's baseline since the tare
+    state: str  # the tracker's; "off" without one
 
 
 def live(
@@ -398,31 +386,18 @@ def _seen(
 
 @dataclass(frozen=True)
 class DaySummary:
-    """What became of a day.
+    """What became of a day."""
 
-    Attributes:
-        frames: how many.
-        ghost_share: of frames, that show a contact where nothing presses.
-        ghosts_per_hour: times that such a contact begins, an hour.
-        presses: how many.
-        missed: presses that were never shown.
-        erased: presses that were shown, and vanished while they lasted.
-        erased_share: of frames under a press, that do not show it.
-        distrusted: share of frames that say that they are not to be trusted.
-        refused: share of frames at which the tracker refused.
-        magnitude_error: mean relative error of firm presses' magnitudes.
-    """
-
-    frames: int
-    ghost_share: float
-    ghosts_per_hour: float
-    presses: int
-    missed: int
-    erased: int
-    erased_share: float
-    distrusted: float
-    refused: float
-    magnitude_error: float
+    frames: int  # how many
+    ghost_share: float  # of frames, that show a contact where nothing presses
+    ghosts_per_hour: float  # times that such a contact begins, an hour
+    presses: int  # how many
+    missed: int  # presses that were never shown
+    erased: int  # presses that were shown, and vanished while they lasted
+    erased_share: float  # of frames under a press, that do not show it
+    distrusted: float  # share of frames that say that they are not to be trusted
+    refused: float  # share of frames at which the tracker refused
+    magnitude_error: float  # mean relative error of firm presses' magnitudes
 
 
 def summarise_day(seen: Sequence[Seen], hours: float) -> DaySummary:

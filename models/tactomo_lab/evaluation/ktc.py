@@ -26,23 +26,14 @@ WATER_SIGMA = 0.05  # of the scale's logarithm; four measured empty tanks leave 
 
 @dataclass(frozen=True)
 class Challenge:
-    """A file of the challenge's tanks.
+    """A file of the challenge's tanks."""
 
-    Attributes:
-        currents: (T, L, D) of each drive, amperes.
-        weights: (L, m) of the electrodes' potentials in each reading of a drive.
-        reference: (T, D m) readings of the empty tank, volts, drive by drive.
-        voltages: (T, D m) of the full one; not a number where an electrode is lost.
-        truth: (T, rows, columns) 0 water, 1 conducts worse, 2 better.
-        level: (T,) of difficulty, as the file has it.
-    """
-
-    currents: FloatArray
-    weights: FloatArray
-    reference: FloatArray
-    voltages: FloatArray
-    truth: Image
-    level: IntArray
+    currents: FloatArray  # (T, L, D) of each drive, amperes
+    weights: FloatArray  # (L, m) of the electrodes' potentials in each reading of a drive
+    reference: FloatArray  # (T, D m) readings of the empty tank, volts, drive by drive
+    voltages: FloatArray  # (T, D m) of the full one; not a number where an electrode is lost
+    truth: Image  # (T, rows, columns) 0 water, 1 conducts worse, 2 better
+    level: IntArray  # (T,) of difficulty, as the file has it
 
     def at_level(self, level: int) -> Challenge:
         """The same tanks without the electrodes that a level of difficulty loses."""

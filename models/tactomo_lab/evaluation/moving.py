@@ -68,19 +68,12 @@ LOST = DISTRUST | Flag.STRUCTURE_MISSING | Flag.MAGNITUDE_MISSING  # flags that 
 
 @dataclass(frozen=True)
 class Step:
-    """One frame of the choreography.
+    """One frame of the choreography."""
 
-    Attributes:
-        phase: its name.
-        presses: what presses, by the name of each contact.
-        lost: channels whose scan is lost.
-        tare: whether the reference is taken anew before it.
-    """
-
-    phase: str
-    presses: Presses
-    lost: tuple[Channel, ...] = ()
-    tare: bool = False
+    phase: str  # its name
+    presses: Presses  # what presses, by the name of each contact
+    lost: tuple[Channel, ...] = ()  # channels whose scan is lost
+    tare: bool = False  # whether the reference is taken anew before it
 
 
 def choreography(indenters: Presses, millimetre_m: float) -> list[Step]:
@@ -154,27 +147,17 @@ INDENTERS = "ABCDEFGH"
 
 @dataclass(frozen=True)
 class Sequence:
-    """A moving scene as it is measured.
+    """A moving scene as it is measured."""
 
-    Attributes:
-        name: seed set and number.
-        description: the sensor as the reconstructor is told; see `scenes.EvaluationScene`.
-        true_description: the sensor as it is, with its true contrast.
-        steps: the frames.
-        volts: noise-free voltages, pressed (T, M).
-        snr_db: signal-to-noise ratio, over all frames in which something presses.
-        noise: standard deviation of the noise of each channel, volts.
-        seed: of the noise.
-    """
-
-    name: str
+    name: str  # seed set and number
+    # the sensor as the reconstructor is told; see `scenes.EvaluationScene`
     description: SensorDescription
-    true_description: SensorDescription
-    steps: tuple[Step, ...]
-    volts: SimulatedVolts
-    snr_db: float
-    noise: dict[Channel, float]
-    seed: np.random.SeedSequence
+    true_description: SensorDescription  # the sensor as it is, with its true contrast
+    steps: tuple[Step, ...]  # the frames
+    volts: SimulatedVolts  # noise-free voltages, pressed (T, M)
+    snr_db: float  # signal-to-noise ratio, over all frames in which something presses
+    noise: dict[Channel, float]  # standard deviation of the noise of each channel, volts
+    seed: np.random.SeedSequence  # of the noise
 
 
 def draw_sequence(
@@ -266,19 +249,14 @@ class StepScore(FrameScore):
 
     Its measures of the map are NaN where nothing presses hard enough to show, or no map was made;
     that of the shape where nothing presses, or no shape was made.
-
-    Attributes:
-        phase: of the choreography.
-        groups: how many contacts press, those that touch counted as one.
-        countable: False where contacts are so near each other that either number would do, and
-            where a scan is lost.
-        switches: contacts that another identity was given to than they had.
     """
 
-    phase: str
-    groups: int
+    phase: str  # of the choreography
+    groups: int  # how many contacts press, those that touch counted as one
+    # False where contacts are so near each other that either number would do, and where a scan is
+    # lost
     countable: bool
-    switches: int
+    switches: int  # contacts that another identity was given to than they had
 
     @property
     def count_right(self) -> bool | None:
@@ -397,18 +375,12 @@ class _Identities:
 
 @dataclass(frozen=True)
 class PhaseSummary(Summary):
-    """One phase over many sequences.
+    """One phase over many sequences."""
 
-    Attributes:
-        recovery: longest run of frames in which the shape's ICC is below `WRONG_ICC`; median over
-            the sequences.
-        recovery_most: of the slowest sequence.
-        switches: identities lost, in all.
-    """
-
+    # longest run of frames in which the shape's ICC is below `WRONG_ICC`; median over the sequences
     recovery: float
-    recovery_most: float
-    switches: int
+    recovery_most: float  # of the slowest sequence
+    switches: int  # identities lost, in all
 
 
 def summarise_phases(sequences: Iterable[Iterable[StepScore]]) -> dict[str, PhaseSummary]:

@@ -145,18 +145,12 @@ class Area:
 
 @dataclass(frozen=True)
 class Case:
-    """One arrangement of indenters, pressed in one or more ways.
+    """One arrangement of indenters, pressed in one or more ways."""
 
-    Attributes:
-        number: the paper's.
-        areas: A1, A2, ...
-        pressures_kpa: of each area, for each way.
-        ours: whether the arrangement is ours: the paper shows its own in a picture alone.
-    """
-
-    number: int
-    areas: tuple[Area, ...]
-    pressures_kpa: tuple[tuple[float, ...], ...]
+    number: int  # the paper's
+    areas: tuple[Area, ...]  # A1, A2, ...
+    pressures_kpa: tuple[tuple[float, ...], ...]  # of each area, for each way
+    # whether the arrangement is ours: the paper shows its own in a picture alone
     ours: bool = False
 
 
@@ -356,28 +350,20 @@ def magnitude_estimate(values: FloatArray, method: str) -> float:
 
 @dataclass(frozen=True)
 class MagnitudeError:
-    """Figs. 8 and 9 in one number, of one method on one sensor.
+    """Figs. 8 and 9 in one number, of one method on one sensor."""
 
-    Attributes:
-        method: of reconstruction.
-        sheet: number of the sensor.
-        error: largest minus smallest estimate over the cases at one pressure, at the pressure
-            where that is largest, estimates divided by the largest of them all (0-1
-            normalisation); the paper's definition.
-        pressure_kpa: that pressure.
-        of_range: the same in shares of the sensor's range, the change at 200 kPa.
-        of_contacts: likewise of the magnitudes that the contacts are reported with instead of
-            the image's; NaN where a case has none.
-        rises: share of the cases in which the estimate rises with every step of pressure.
-    """
-
-    method: str
-    sheet: int
+    method: str  # of reconstruction
+    sheet: int  # number of the sensor
+    # largest minus smallest estimate over the cases at one pressure, at the pressure where that is
+    # largest, estimates divided by the largest of them all (0-1 normalisation); the paper's
+    # definition
     error: float
-    pressure_kpa: float
-    of_range: float
+    pressure_kpa: float  # that pressure
+    of_range: float  # the same in shares of the sensor's range, the change at 200 kPa
+    # likewise of the magnitudes that the contacts are reported with instead of the image's; NaN
+    # where a case has none
     of_contacts: float
-    rises: float
+    rises: float  # share of the cases in which the estimate rises with every step of pressure
 
 
 def magnitude_errors(
@@ -501,28 +487,18 @@ def locate(frame: Frame, description: SensorDescription) -> Localisation:
 
 @dataclass(frozen=True)
 class SeveralAreas:
-    """How one frame of two to four areas came out, in numbers for Figs. 11 and 12.
+    """How one frame of two to four areas came out, in numbers for Figs. 11 and 12."""
 
-    Attributes:
-        case: the paper's number.
-        pressures_kpa: of its areas.
-        method: of reconstruction.
-        sheet: number of the sensor.
-        icc: of the map.
-        estimates: of each area, see `magnitude_estimate`, from the image within its outline.
-        told_apart: whether, on the way between any two areas, the image falls below half of the
-            paler one.
-        counted: whether as many contacts were reported as press.
-    """
-
-    case: int
-    pressures_kpa: tuple[float, ...]
-    method: str
-    sheet: int
-    icc: float
+    case: int  # the paper's number
+    pressures_kpa: tuple[float, ...]  # of its areas
+    method: str  # of reconstruction
+    sheet: int  # number of the sensor
+    icc: float  # of the map
+    # of each area, see `magnitude_estimate`, from the image within its outline
     estimates: tuple[float, ...]
+    # whether, on the way between any two areas, the image falls below half of the paler one
     told_apart: bool
-    counted: bool
+    counted: bool  # whether as many contacts were reported as press
 
     @property
     def ordered(self) -> tuple[bool, ...]:

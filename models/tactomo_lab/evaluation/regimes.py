@@ -46,59 +46,37 @@ SOFT_KPA = (180.0, 300.0)  # peak under a ball: well above where the magnitude c
 
 @dataclass(frozen=True)
 class BadLead:
-    """A lead that opens before the last frame.
+    """A lead that opens before the last frame."""
 
-    Attributes:
-        electrode: whose it is.
-        level: what its input floats to, times the root mean square of the channel's voltages.
-        current: share of the current that still passes.
-    """
-
-    electrode: int
-    level: float
-    current: float = 1e-3
+    electrode: int  # whose it is
+    level: float  # what its input floats to, times the root mean square of the channel's voltages
+    current: float = 1e-3  # share of the current that still passes
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A case before it is simulated: what is not a default is what makes it hard.
+    """A case before it is simulated: what is not a default is what makes it hard."""
 
-    Attributes:
-        frames: what presses in each; the last one is judged.
-        contrast: true one of the structure channel.
-        opposite: whether the magnitude channel changes against the description's sign.
-        sign_told: whether the reconstructor knows that.
-        snr_db: signal-to-noise ratio, and `snr_of` what; see `scenes.noise_std`.
-        at_fault: the sheets that `tared`, `later` and `lead` are about.
-        tared: their state at the tare.
-        later: their state in the last frame.
-        lead: a lead of theirs that opens before the last frame.
-        unevenness: standard deviation of each sheet's smooth conductivity error.
-        impedance_deviation: standard deviation of the logarithm of the contact impedances.
-        displaced_m: (L,) by how much electrodes sit off along the rim; in place where empty.
-        stretch: relative elongation along x, electrodes and all.
-        behind: by how many scans the structure channel is late in the last frame.
-        lost: how many structure scans are missing at the end.
-        regularisation: factor on what the linear methods' rule chooses.
-    """
-
-    frames: tuple[tuple[Press, ...], ...]
-    contrast: float
-    opposite: bool
-    sign_told: bool = True
-    snr_db: float = 40.0
+    frames: tuple[tuple[Press, ...], ...]  # what presses in each; the last one is judged
+    contrast: float  # true one of the structure channel
+    opposite: bool  # whether the magnitude channel changes against the description's sign
+    sign_told: bool = True  # whether the reconstructor knows that
+    snr_db: float = 40.0  # signal-to-noise ratio, and `snr_of` what; see `scenes.noise_std`
     snr_of: SnrOf = "change"
+    # the sheets that `tared`, `later` and `lead` are about
     at_fault: tuple[Channel, ...] = BOTH_CHANNELS
-    tared: SheetState = AS_MADE
-    later: SheetState = AS_MADE
-    lead: BadLead | None = None
-    unevenness: float = UNEVENNESS
+    tared: SheetState = AS_MADE  # their state at the tare
+    later: SheetState = AS_MADE  # their state in the last frame
+    lead: BadLead | None = None  # a lead of theirs that opens before the last frame
+    unevenness: float = UNEVENNESS  # standard deviation of each sheet's smooth conductivity error
+    # standard deviation of the logarithm of the contact impedances
     impedance_deviation: float = IMPEDANCE_DEVIATION
+    # (L,) by how much electrodes sit off along the rim; in place where empty
     displaced_m: tuple[float, ...] = ()
-    stretch: float = 0.0
-    behind: int = 0
-    lost: int = 0
-    regularisation: float = 1.0
+    stretch: float = 0.0  # relative elongation along x, electrodes and all
+    behind: int = 0  # by how many scans the structure channel is late in the last frame
+    lost: int = 0  # how many structure scans are missing at the end
+    regularisation: float = 1.0  # factor on what the linear methods' rule chooses
 
 
 class Draw:

@@ -36,15 +36,11 @@ CUT_HEIGHT = 0.5  # of the image's peak, above which the centroid is taken
 
 @dataclass(frozen=True)
 class Presses:
-    """Robot presses on a skin.
+    """Robot presses on a skin."""
 
-    Attributes:
-        changes: (n, M) voltage changes in the description's order and sign, on one unknown scale.
-        positions_m: (n, 2) where the robot pressed, about the middle of their range.
-    """
-
+    # (n, M) voltage changes in the description's order and sign, on one unknown scale
     changes: FloatArray
-    positions_m: FloatArray
+    positions_m: FloatArray  # (n, 2) where the robot pressed, about the middle of their range
 
 
 @dataclass(frozen=True)

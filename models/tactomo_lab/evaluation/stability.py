@@ -56,25 +56,16 @@ from tactomo_lab.scenes.still_scenes import (
 
 @dataclass(frozen=True)
 class Case:
-    """A case of a regime as it is measured.
+    """A case of a regime as it is measured."""
 
-    Attributes:
-        regime: its name.
-        name: seed set and number.
-        plan: what was simulated.
-        description: the sensor as the reconstructor is told.
-        reference: the mean of noisy unpressed scans.
-        frames: scans of each frame, volts (M,); without the channels that are lost.
-        truth: of the last frame.
-    """
-
-    regime: str
-    name: str
-    plan: Plan
-    description: SensorDescription
-    reference: Reference
+    regime: str  # its name
+    name: str  # seed set and number
+    plan: Plan  # what was simulated
+    description: SensorDescription  # the sensor as the reconstructor is told
+    reference: Reference  # the mean of noisy unpressed scans
+    # scans of each frame, volts (M,); without the channels that are lost
     frames: tuple[dict[Channel, FloatArray], ...]
-    truth: Truth
+    truth: Truth  # of the last frame
 
 
 def make_case(description: SensorDescription, regime: str, seed_set: SeedSet, number: int) -> Case:
@@ -317,25 +308,15 @@ def _evaluate_case(
 
 @dataclass(frozen=True)
 class Trust:
-    """Whether flags told bad maps from good ones.
+    """Whether flags told bad maps from good ones."""
 
-    Attributes:
-        maps: how many.
-        icc: mean.
-        bad: how many have an ICC below `BAD_ICC`.
-        bad_unwarned: of those, how many had no flag of `DISTRUST`.
-        bad_unflagged: of those, how many had no flag at all.
-        good_warned: good maps that were flagged as not to be trusted.
-        good_flagged: good maps with any flag.
-    """
-
-    maps: int
-    icc: float
-    bad: int
-    bad_unwarned: int
-    bad_unflagged: int
-    good_warned: int
-    good_flagged: int
+    maps: int  # how many
+    icc: float  # mean
+    bad: int  # how many have an ICC below `BAD_ICC`
+    bad_unwarned: int  # of those, how many had no flag of `DISTRUST`
+    bad_unflagged: int  # of those, how many had no flag at all
+    good_warned: int  # good maps that were flagged as not to be trusted
+    good_flagged: int  # good maps with any flag
 
 
 def trust(scores: Iterable[CaseScore]) -> Trust:

@@ -20,15 +20,10 @@ from tactomo_lab.scenes.still_scenes import EvaluationScene
 
 @dataclass(frozen=True)
 class Variant:
-    """A method and the compute time that it may take for a frame.
+    """A method and the compute time that it may take for a frame."""
 
-    Attributes:
-        method: its name.
-        budget_s: by a model of the work (`field_fit.Budget`); None leaves it to what plays the
-            frames.
-    """
-
-    method: str
+    method: str  # its name
+    # by a model of the work (`field_fit.Budget`); None leaves it to what plays the frames
     budget_s: float | None = None
 
     def __str__(self) -> str:

@@ -44,17 +44,12 @@ MIDDLE_SHARE = 0.7  # for methods that need one
 
 @dataclass(frozen=True)
 class Tanks:
-    """Scans of tanks with objects, and what stood in them.
+    """Scans of tanks with objects, and what stood in them."""
 
-    Attributes:
-        names: of the n tanks.
-        changes: (n, M) by how much each voltage's size grew, on one common scale.
-        truth: (n, rows, columns) 1 in what conducts better, -1 worse; row 0 is the top, and the
-            disc fills the picture.
-    """
-
-    names: tuple[str, ...]
-    changes: FloatArray
+    names: tuple[str, ...]  # of the n tanks
+    changes: FloatArray  # (n, M) by how much each voltage's size grew, on one common scale
+    # (n, rows, columns) 1 in what conducts better, -1 worse; row 0 is the top, and the disc fills
+    # the picture
     truth: FloatArray
 
 

@@ -60,23 +60,15 @@ BOTH_CHANNELS: tuple[Channel, ...] = (Channel.MAGNITUDE, Channel.STRUCTURE)
 
 @dataclass(frozen=True)
 class Layout:
-    """What a seed stands for.
+    """What a seed stands for."""
 
-    Attributes:
-        seed_set: which of the two sets of seeds.
-        number: of the scene, among those of its set with as many contacts.
-        presses: what presses.
-        shape: of all indenters, or "mixed".
-        contrast: true ratio of the structure channel's conductivities.
-        opposite: whether the magnitude channel's conductivity goes against the description's
-            sign under pressure; the reconstructor is told.
-    """
-
-    seed_set: SeedSet
-    number: int
-    presses: tuple[Press, ...]
-    shape: SceneShape
-    contrast: float
+    seed_set: SeedSet  # which of the two sets of seeds
+    number: int  # of the scene, among those of its set with as many contacts
+    presses: tuple[Press, ...]  # what presses
+    shape: SceneShape  # of all indenters, or "mixed"
+    contrast: float  # true ratio of the structure channel's conductivities
+    # whether the magnitude channel's conductivity goes against the description's sign under
+    # pressure; the reconstructor is told
     opposite: bool
 
     def seed(self, purpose: str) -> np.random.SeedSequence:
@@ -89,25 +81,17 @@ class Layout:
 
 @dataclass(frozen=True)
 class EvaluationScene:
-    """One dual scan with its reference and the truth behind it.
+    """One dual scan with its reference and the truth behind it."""
 
-    Attributes:
-        layout: what the seed stands for.
-        description: the sensor as the reconstructor is told: the true sign of the magnitude
-            channel, but the nominal contrast of the structure channel.
-        snr_db: signal-to-noise ratio, and `snr_of` what; see `noise_std`.
-        reference: the mean of noisy unpressed scans, as at a tare.
-        magnitude: (M,) volts.
-        structure: (M,) volts; None of a sensor without that channel.
-    """
-
-    layout: Layout
+    layout: Layout  # what the seed stands for
+    # the sensor as the reconstructor is told: the true sign of the magnitude channel, but the
+    # nominal contrast of the structure channel
     description: SensorDescription
-    snr_db: float
+    snr_db: float  # signal-to-noise ratio, and `snr_of` what; see `noise_std`
     snr_of: SnrOf
-    reference: Reference
-    magnitude: FloatArray
-    structure: FloatArray | None
+    reference: Reference  # the mean of noisy unpressed scans, as at a tare
+    magnitude: FloatArray  # (M,) volts
+    structure: FloatArray | None  # (M,) volts; None of a sensor without that channel
 
     @cached_property
     def truth(self) -> Truth:

@@ -34,18 +34,12 @@ SETTLED = 3e-3  # share of the cost below which a gain is not worth another step
 
 @dataclass(frozen=True)
 class Tank:
-    """What was found in a tank.
+    """What was found in a tank."""
 
-    Attributes:
-        likely: (3, PIXELS, PIXELS) probabilities of nothing, worse, better, as the network has
-            them.
-        coefficients: (K,) mu.
-        misfit: root mean square of what is left of the readings, over the noise assumed.
-    """
-
+    # (3, PIXELS, PIXELS) probabilities of nothing, worse, better, as the network has them
     likely: FloatArray
-    coefficients: FloatArray
-    misfit: float
+    coefficients: FloatArray  # (K,) mu
+    misfit: float  # root mean square of what is left of the readings, over the noise assumed
 
 
 class TankFit:

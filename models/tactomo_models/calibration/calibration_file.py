@@ -34,21 +34,14 @@ Points = Annotated[tuple[float, ...], Field(min_length=2, max_length=256)]
 
 
 class Subject(BaseModel):
-    """What a calibration is of.
-
-    Attributes:
-        sensor: its name in the stream.
-        description: name of its description.
-        sha256: that description's hash.
-        device_ids: the devices that it was read by; empty where nobody knows.
-    """
+    """What a calibration is of."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    sensor: str
-    description: str
-    sha256: str
-    device_ids: tuple[str, ...] = ()
+    sensor: str  # its name in the stream
+    description: str  # name of its description
+    sha256: str  # that description's hash
+    device_ids: tuple[str, ...] = ()  # the devices that it was read by; empty where nobody knows
 
     @classmethod
     def of(

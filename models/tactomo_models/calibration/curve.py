@@ -43,38 +43,27 @@ Direction = Literal["up", "down", "unknown"]
 
 
 class Reading(BaseModel):
-    """A press held still.
-
-    Attributes:
-        pressure_kpa: what the load cell says, over the indenter's area.
-        magnitude: |relative conductivity change| inside the contact.
-        magnitude_sigma: its standard uncertainty; 0 where nobody has said.
-        direction: of the load before it was held.
-    """
+    """A press held still."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    pressure_kpa: Annotated[float, Field(ge=0)]
-    magnitude: Annotated[float, Field(ge=0)]
+    pressure_kpa: Annotated[float, Field(ge=0)]  # what the load cell says, over the indenter's area
+    magnitude: Annotated[float, Field(ge=0)]  # |relative conductivity change| inside the contact
+    # its standard uncertainty; 0 where nobody has said
     magnitude_sigma: Annotated[float, Field(ge=0)] = 0.0
-    direction: Direction = "unknown"
+    direction: Direction = "unknown"  # of the load before it was held
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A sensor's curve, and what it came from.
+    """A sensor's curve, and what it came from."""
 
-    Attributes:
-        curve: with the uncertainty of the readings and of the fit.
-        onset_kpa: from where the channel answers; NaN where the lightest reading did already.
-        hysteresis_kpa: by how much a falling load reads higher than a rising one, mean; NaN where
-            only one of the two was taken.
-        repeatability_kpa: scatter of readings about the curve, half way up, hysteresis included.
-    """
-
-    curve: PressureCurve
-    onset_kpa: float
+    curve: PressureCurve  # with the uncertainty of the readings and of the fit
+    onset_kpa: float  # from where the channel answers; NaN where the lightest reading did already
+    # by how much a falling load reads higher than a rising one, mean; NaN where only one of the two
+    # was taken
     hysteresis_kpa: float
+    # scatter of readings about the curve, half way up, hysteresis included
     repeatability_kpa: float
 
 

@@ -47,16 +47,11 @@ UNLIKE: Final = 1.5
 
 
 class Located(NamedTuple):
-    """Where T presses are.
+    """Where T presses are."""
 
-    Attributes:
-        xy_mm: (T, 2).
-        sigma_mm: (T,) standard uncertainty of each coordinate.
-        is_taught: (T,) whether presses like it were taught; where not, the place is a guess.
-    """
-
-    xy_mm: FloatArray
-    sigma_mm: FloatArray
+    xy_mm: FloatArray  # (T, 2)
+    sigma_mm: FloatArray  # (T,) standard uncertainty of each coordinate
+    # (T,) whether presses like it were taught; where not, the place is a guess
     is_taught: BoolArray
 
 

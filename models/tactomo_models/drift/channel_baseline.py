@@ -27,15 +27,10 @@ MAX_RESIDUAL: Final = 1.0  # rms of what no drift explains, in standard deviatio
 
 @dataclass(frozen=True)
 class Drift:
-    """How far a channel's baseline has moved since the tare.
+    """How far a channel's baseline has moved since the tare."""
 
-    Attributes:
-        gain: common relative change of its voltages.
-        uneven: root mean square of their relative changes beyond that.
-    """
-
-    gain: float
-    uneven: float
+    gain: float  # common relative change of its voltages
+    uneven: float  # root mean square of their relative changes beyond that
 
 
 class ChannelBaseline:

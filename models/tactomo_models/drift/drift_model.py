@@ -30,19 +30,12 @@ OUT_OF_BOUNDS: Final = 2.5  # standard deviations that no drift reaches
 
 @dataclass(frozen=True)
 class Explained:
-    """The most likely drift behind a change.
+    """The most likely drift behind a change."""
 
-    Attributes:
-        amounts: (K,) of every mode.
-        left: (M,) what they do not explain.
-        misfit: sum of squares of that, over the limit of what noise may come to; good below 1.
-        excess: the largest amount over its bound; good below 1.
-    """
-
-    amounts: FloatArray
-    left: FloatArray
-    misfit: float
-    excess: float
+    amounts: FloatArray  # (K,) of every mode
+    left: FloatArray  # (M,) what they do not explain
+    misfit: float  # sum of squares of that, over the limit of what noise may come to; good below 1
+    excess: float  # the largest amount over its bound; good below 1
 
 
 class DriftSubspace:

@@ -31,25 +31,15 @@ from tactomo_models.sensor.pattern import Pairs
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found out about one channel.
+    """What was found out about one channel."""
 
-    Attributes:
-        findings: one for each thing that was looked at.
-        electrodes: (L,) state of each: good, dead, loose, misread or swapped.
-        noise: (L,) how many times noisier than the others the voltages of each are.
-        volts: (M,) mean of the scans that were looked at.
-        snr_db: (M,) of each voltage; NaN where unknown.
-        reciprocal: (n, 2) positions of reciprocal voltages.
-        pairs: electrodes of each voltage.
-    """
-
-    findings: tuple[Finding, ...]
-    electrodes: tuple[str, ...]
-    noise: FloatArray
-    volts: FloatArray
-    snr_db: FloatArray
-    reciprocal: IntArray
-    pairs: Pairs
+    findings: tuple[Finding, ...]  # one for each thing that was looked at
+    electrodes: tuple[str, ...]  # (L,) state of each: good, dead, loose, misread or swapped
+    noise: FloatArray  # (L,) how many times noisier than the others the voltages of each are
+    volts: FloatArray  # (M,) mean of the scans that were looked at
+    snr_db: FloatArray  # (M,) of each voltage; NaN where unknown
+    reciprocal: IntArray  # (n, 2) positions of reciprocal voltages
+    pairs: Pairs  # electrodes of each voltage
 
     @property
     def level(self) -> Level:

@@ -61,20 +61,13 @@ def worst(levels: Iterator[Level]) -> Level:
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at.
+    """One thing that was looked at."""
 
-    Attributes:
-        about: what, in a word that programs may rely on.
-        level: how bad it is.
-        detail: what was found, for people.
-        next_step: what to do about it; empty where nothing need be done.
-        figures: the numbers, each with its unit in its name.
-    """
-
-    about: str
-    level: Level
-    detail: str
-    next_step: str = ""
+    about: str  # what, in a word that programs may rely on
+    level: Level  # how bad it is
+    detail: str  # what was found, for people
+    next_step: str = ""  # what to do about it; empty where nothing need be done
+    # the numbers, each with its unit in its name
     figures: Mapping[str, float | list[float] | list[int] | None] = field(default_factory=dict)
 
 

@@ -19,17 +19,11 @@ Trial = Callable[[Sequence[int]], tuple[float, FloatArray]]
 
 @dataclass(frozen=True)
 class Order:
-    """Which leads are not where they belong, and what is expected with them so.
+    """Which leads are not where they belong, and what is expected with them so."""
 
-    Attributes:
-        exchanged: pairs of electrodes whose leads changed places.
-        turned: places by which all leads are on; 0 where they are not.
-        expected: (M,) the model's voltages in that order, relative.
-    """
-
-    exchanged: tuple[tuple[int, int], ...]
-    turned: int
-    expected: FloatArray
+    exchanged: tuple[tuple[int, int], ...]  # pairs of electrodes whose leads changed places
+    turned: int  # places by which all leads are on; 0 where they are not
+    expected: FloatArray  # (M,) the model's voltages in that order, relative
 
 
 def find_order(

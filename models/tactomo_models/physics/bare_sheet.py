@@ -29,30 +29,23 @@ from tactomo_models.sensor.description import SensorDescription
 
 @dataclass(frozen=True)
 class BareSheet:
-    """What is computed once for a mesh: everything a pressed sheet's voltages follow from.
+    """What is computed once for a mesh: everything a pressed sheet's voltages follow from."""
 
-    Attributes:
-        points: (2, N) mesh nodes, metres.
-        triangles: (3, T) nodes of each triangle.
-        pressable: (P,) mesh nodes whose conductivity may change.
-        support: (S,) nodes of all triangles that touch a pressable node.
-        green: (S, S) potential at a support node for a unit current into another; as a
-            `GreensFunction` where few presses are solved and a quick start is worth more.
-        potentials: (S, L - 1) potential at the support nodes for a unit current into electrode
-            l and out of the last one.
-        transfer: (L, L) electrode potentials for the same currents; the last row and column are 0.
-        map_weights: (nodes_y * nodes_x, P) interpolation of pressable nodes onto the map.
-        conductivity: (N,) of an uneven sheet, relative to the description's; 1 if None.
-    """
-
-    points: FloatArray
-    triangles: IntArray
-    pressable: IntArray
-    support: IntArray
+    points: FloatArray  # (2, N) mesh nodes, metres
+    triangles: IntArray  # (3, T) nodes of each triangle
+    pressable: IntArray  # (P,) mesh nodes whose conductivity may change
+    support: IntArray  # (S,) nodes of all triangles that touch a pressable node
+    # (S, S) potential at a support node for a unit current into another; as a `GreensFunction`
+    # where few presses are solved and a quick start is worth more
     green: PackedGreensFunction | GreensFunction
+    # (S, L - 1) potential at the support nodes for a unit current into electrode l and out of the
+    # last one
     potentials: FloatArray
+    # (L, L) electrode potentials for the same currents; the last row and column are 0
     transfer: FloatArray
+    # (nodes_y * nodes_x, P) interpolation of pressable nodes onto the map
     map_weights: sp.csr_matrix
+    # (N,) of an uneven sheet, relative to the description's; 1 if None
     conductivity: FloatArray | None = None
 
 

@@ -24,15 +24,11 @@ from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 
 @dataclass(frozen=True)
 class Condensed:
-    """Pressed areas as seen from their rims.
+    """Pressed areas as seen from their rims."""
 
-    Attributes:
-        rims: per area the (r, r) stiffness that is left on its rim.
-        inner: per area and layer that was eliminated, from the rim inwards: its Cholesky factor L
-            and L^-1 E, where E couples it with the next layer outwards.
-    """
-
-    rims: list[FloatArray]
+    rims: list[FloatArray]  # per area the (r, r) stiffness that is left on its rim
+    # per area and layer that was eliminated, from the rim inwards: its Cholesky factor L and L^-1
+    # E, where E couples it with the next layer outwards
     inner: list[list[tuple[FloatArray, FloatArray]]]
 
     def times(self, potentials: FloatArray) -> FloatArray:

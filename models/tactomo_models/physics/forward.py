@@ -30,37 +30,26 @@ _STRIP = 256  # triangles, or spots, at once: what that takes stays in the cache
 
 @dataclass(frozen=True)
 class Probes:
-    """Where the field is looked at: C spots, each an average over its neighbourhood.
+    """Where the field is looked at: C spots, each an average over its neighbourhood."""
 
-    Attributes:
-        bare: (2 C, L - 1) field of the bare sheet there, x components first.
-        gradient: (2 C, S) of potentials at the support nodes, averaged.
-    """
-
-    bare: FloatArray
-    gradient: sp.csr_matrix
+    bare: FloatArray  # (2 C, L - 1) field of the bare sheet there, x components first
+    gradient: sp.csr_matrix  # (2 C, S) of potentials at the support nodes, averaged
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Voltages of one pressed sheet, with what its potentials and derivatives follow from.
+    """Voltages of one pressed sheet, with what its potentials and derivatives follow from."""
 
-    Attributes:
-        voltages: (M,) in scan order, relative (multiply by `ForwardModel.volts_per_unit`).
-        nodes: (n,) positions in `BareSheet.support` of the corners of all triangles that changed.
-        potentials: (n, L - 1) potentials there.
-        rim: (r,) positions in `BareSheet.support` of those that other triangles touch, too.
-        injected: (r, L - 1) currents that, injected there into the bare sheet, make the pressed
-            sheet's potentials on the rims and everywhere outside.
-        mixed: (P,) changes at the pressable nodes whose resistivities were mixed; None where
-            conductivities were.
-    """
-
-    voltages: FloatArray
+    voltages: FloatArray  # (M,) in scan order, relative (multiply by `ForwardModel.volts_per_unit`)
+    # (n,) positions in `BareSheet.support` of the corners of all triangles that changed
     nodes: IntArray
-    potentials: FloatArray
-    rim: IntArray
+    potentials: FloatArray  # (n, L - 1) potentials there
+    rim: IntArray  # (r,) positions in `BareSheet.support` of those that other triangles touch, too
+    # (r, L - 1) currents that, injected there into the bare sheet, make the pressed sheet's
+    # potentials on the rims and everywhere outside
     injected: FloatArray
+    # (P,) changes at the pressable nodes whose resistivities were mixed; None where conductivities
+    # were
     mixed: FloatArray | None = None
 
 
@@ -70,26 +59,17 @@ class _PressedAreas:
 
     With S and S0 the areas' stiffness on their rims, pressed and bare, the potentials there are
     u = u0 + G i, and the currents injected there i = -(S - S0) u.
-
-    Attributes:
-        triangles: (t,) indexed triangles that change.
-        condensation: of their corners onto the rims.
-        nodes: (n,) positions of the corners in `BareSheet.support`, in the condensation's order.
-        rim: (r,) positions of those on rims.
-        potentials: (r, L - 1) u0.
-        green: (r, r) G.
-        both: (r, r + L - 1) G and u0 side by side.
-        bare_both: (r, r + L - 1) S0 G and S0 u0.
     """
 
-    triangles: IntArray
-    condensation: Condensation
+    triangles: IntArray  # (t,) indexed triangles that change
+    condensation: Condensation  # of their corners onto the rims
+    # (n,) positions of the corners in `BareSheet.support`, in the condensation's order
     nodes: IntArray
-    rim: IntArray
-    potentials: FloatArray
-    green: FloatArray
-    both: FloatArray
-    bare_both: FloatArray
+    rim: IntArray  # (r,) positions of those on rims
+    potentials: FloatArray  # (r, L - 1) u0
+    green: FloatArray  # (r, r) G
+    both: FloatArray  # (r, r + L - 1) G and u0 side by side
+    bare_both: FloatArray  # (r, r + L - 1) S0 G and S0 u0
 
 
 class ForwardModel:

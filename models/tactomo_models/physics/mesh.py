@@ -18,15 +18,10 @@ from tactomo_models.sensor.description import SensorDescription
 
 @dataclass(frozen=True)
 class SheetMesh:
-    """A meshed sheet.
+    """A meshed sheet."""
 
-    Attributes:
-        mesh: scikit-fem triangles, coordinates in metres.
-        electrode_facets: per electrode, the boundary facets it covers.
-    """
-
-    mesh: skfem.MeshTri
-    electrode_facets: tuple[IntArray, ...]
+    mesh: skfem.MeshTri  # scikit-fem triangles, coordinates in metres
+    electrode_facets: tuple[IntArray, ...]  # per electrode, the boundary facets it covers
 
 
 def mesh_sheet(

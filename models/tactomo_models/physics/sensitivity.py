@@ -21,16 +21,12 @@ CHANGE = 0.1  # of conductivity, a ratio: of a press that is felt, but only just
 
 @dataclass(frozen=True)
 class Visibility:
-    """How well a press is seen, by where it is. NaN where it does not fit on what can be pressed.
+    """How well a press is seen, by where it is; NaN where none fits on what can be pressed."""
 
-    Attributes:
-        diameter_m: of the press.
-        signal: (nodes_y, nodes_x) how large its signal is, in standard deviations of the noise.
-        place_m: (nodes_y, nodes_x) standard uncertainty of its centre, its strength unknown.
-    """
-
-    diameter_m: float
+    diameter_m: float  # of the press
+    # (nodes_y, nodes_x) how large its signal is, in standard deviations of the noise
     signal: FloatArray
+    # (nodes_y, nodes_x) standard uncertainty of its centre, its strength unknown
     place_m: FloatArray
 
 

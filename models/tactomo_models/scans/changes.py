@@ -40,32 +40,26 @@ WRONG_WAY = 5.0  # standard uncertainties by which a conductivity may change aga
 
 @dataclass(frozen=True)
 class Changes:
-    """Relative voltage changes of one channel's scan.
+    """Relative voltage changes of one channel's scan."""
 
-    Attributes:
-        change: (M,) 0 where it is invalid.
-        weight: (M,) inverse standard deviations, of noise and of model error; 0 where invalid.
-        variance_inflation: (M,) factor by which the variance of an estimate exceeds what
-            independent errors of that size would give it: model errors go together.
-        noise_variance: (M,) that of the changes by noise, as the tare knows it: where it was of a
-            single scan, no more than an upper bound.
-        tolerance: (M,) square of a change too far below the model's error to be worth a solve.
-        modes: (M, K) orthonormal directions in which the sheet's conductivity can move changes
-            over their noise.
-        quiet: whether nothing presses.
-        signal: root mean square of the changes over their noise and what no noise accounts for;
-            what is quiet is below the root of `noise_limit` over the count (1.24 of 208).
-        precision: (M,) inverse variances of the changes by noise; 0 where invalid.
-    """
-
-    change: FloatArray
+    change: FloatArray  # (M,) 0 where it is invalid
+    # (M,) inverse standard deviations, of noise and of model error; 0 where invalid
     weight: FloatArray
+    # (M,) factor by which the variance of an estimate exceeds what independent errors of that size
+    # would give it: model errors go together
     variance_inflation: FloatArray
-    quiet: bool
+    quiet: bool  # whether nothing presses
+    # root mean square of the changes over their noise and what no noise accounts for; what is quiet
+    # is below the root of `noise_limit` over the count (1.24 of 208)
     signal: float
-    precision: FloatArray
+    precision: FloatArray  # (M,) inverse variances of the changes by noise; 0 where invalid
+    # (M,) that of the changes by noise, as the tare knows it: where it was of a single scan, no
+    # more than an upper bound
     noise_variance: FloatArray
+    # (M,) square of a change too far below the model's error to be worth a solve
     tolerance: FloatArray
+    # (M, K) orthonormal directions in which the sheet's conductivity can move changes over their
+    # noise
     modes: FloatArray
 
     def judged_by(self, error_ratio: float) -> Changes:

@@ -79,19 +79,12 @@ DISTRUST = (
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is wrong with a scan.
+    """What is wrong with a scan."""
 
-    Attributes:
-        usable: (M,) voltages that may be believed.
-        flags: what is wrong.
-        electrodes: those whose voltages were left out.
-        noise: how many times noisier than expected; 1 where that may be chance.
-    """
-
-    usable: BoolArray
-    flags: Flag
-    electrodes: tuple[int, ...] = ()
-    noise: float = 1.0
+    usable: BoolArray  # (M,) voltages that may be believed
+    flags: Flag  # what is wrong
+    electrodes: tuple[int, ...] = ()  # those whose voltages were left out
+    noise: float = 1.0  # how many times noisier than expected; 1 where that may be chance
 
 
 class Layout(Protocol):

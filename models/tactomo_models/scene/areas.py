@@ -13,21 +13,13 @@ from tactomo_models.physics.forward import ForwardModel
 
 @dataclass(frozen=True)
 class Areas:
-    """Separate pressed areas.
+    """Separate pressed areas."""
 
-    Attributes:
-        on_map: (K, nodes_y, nodes_x) share of each map node that each area covers.
-        on_nodes: (K, P) the same at the pressable nodes.
-        centres_m: (K, 2) centroids.
-        areas_m2: (K,).
-        sigmas: (K, 3) standard uncertainties of x, y and area; NaN where unknown.
-    """
-
-    on_map: FloatArray
-    on_nodes: FloatArray
-    centres_m: FloatArray
-    areas_m2: FloatArray
-    sigmas: FloatArray
+    on_map: FloatArray  # (K, nodes_y, nodes_x) share of each map node that each area covers
+    on_nodes: FloatArray  # (K, P) the same at the pressable nodes
+    centres_m: FloatArray  # (K, 2) centroids
+    areas_m2: FloatArray  # (K,)
+    sigmas: FloatArray  # (K, 3) standard uncertainties of x, y and area; NaN where unknown
 
     def __len__(self) -> int:
         return len(self.areas_m2)

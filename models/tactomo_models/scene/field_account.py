@@ -40,42 +40,27 @@ SAMPLES = 3  # per side of a map cell: what an outline covers of it is right to 
 
 @dataclass(frozen=True)
 class FieldAccount:
-    """What a fitted field says.
+    """What a fitted field says."""
 
-    Attributes:
-        areas: K pressed areas.
-        map: (nodes_y, nodes_x) |relative conductivity change| of the magnitude sheet.
-        structure: (nodes_y, nodes_x) share of the structure sheet's full change.
-        pressure_kpa: (nodes_y, nodes_x) by the description's table.
-        magnitudes: (K,) |relative conductivity change|, mean over each area.
-        magnitude_sigmas: (K,) their standard uncertainties.
-        contacts: what it says of each area's pressure.
-        goes_wrong_way: whether a conductivity goes where no pressure takes it.
-        uncertainty: of areas and magnitudes together, as a share of them, by noise alone and not by
-            other accounts; NaN where they are not known.
-    """
-
-    areas: Areas
-    map: FloatArray
-    structure: FloatArray
-    pressure_kpa: FloatArray
-    magnitudes: FloatArray
-    magnitude_sigmas: FloatArray
-    contacts: FieldContacts | None
-    goes_wrong_way: bool
+    areas: Areas  # K pressed areas
+    map: FloatArray  # (nodes_y, nodes_x) |relative conductivity change| of the magnitude sheet
+    structure: FloatArray  # (nodes_y, nodes_x) share of the structure sheet's full change
+    pressure_kpa: FloatArray  # (nodes_y, nodes_x) by the description's table
+    magnitudes: FloatArray  # (K,) |relative conductivity change|, mean over each area
+    magnitude_sigmas: FloatArray  # (K,) their standard uncertainties
+    contacts: FieldContacts | None  # what it says of each area's pressure
+    goes_wrong_way: bool  # whether a conductivity goes where no pressure takes it
+    # of areas and magnitudes together, as a share of them, by noise alone and not by other
+    # accounts; NaN where they are not known
     uncertainty: float = float("nan")
 
 
 @dataclass(frozen=True)
 class Doubt:
-    """Another account of the same contacts that the data leave possible.
+    """Another account of the same contacts that the data leave possible."""
 
-    Attributes:
-        odds: how likely it is, over the likelier account, 0 to 1.
-        difference: (K, COLUMNS) of its contacts' parameters from those of the likelier account.
-    """
-
-    odds: float
+    odds: float  # how likely it is, over the likelier account, 0 to 1
+    # (K, COLUMNS) of its contacts' parameters from those of the likelier account
     difference: FloatArray
 
 

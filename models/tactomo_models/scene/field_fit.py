@@ -62,31 +62,20 @@ class Family(Protocol):
 
 @dataclass(frozen=True)
 class FittedField:
-    """An estimate of what presses.
+    """An estimate of what presses."""
 
-    Attributes:
-        family: what its parameters mean.
-        parameters: (N,) of the family.
-        log_ratio: logarithm of the structure sheet's pressed over its bare conductivity.
-        drawing: the field on the nodes.
-        solutions: each sheet's forward solution.
-        residuals: each sheet's (M,) noise-weighted misfit of the data.
-        cost: what is minimised, the prior included.
-        damping: Levenberg-Marquardt damping that its last step got through with.
-        jacobian: (sum M, N + 1) that its last step was made with; None before any.
-        converged: whether the last step changed next to nothing.
-    """
-
-    family: Family
-    parameters: FloatArray
-    log_ratio: float
-    drawing: Drawing
-    solutions: Mapping[Channel, Solution] = field(repr=False)
+    family: Family  # what its parameters mean
+    parameters: FloatArray  # (N,) of the family
+    log_ratio: float  # logarithm of the structure sheet's pressed over its bare conductivity
+    drawing: Drawing  # the field on the nodes
+    solutions: Mapping[Channel, Solution] = field(repr=False)  # each sheet's forward solution
+    # each sheet's (M,) noise-weighted misfit of the data
     residuals: Mapping[Channel, FloatArray] = field(repr=False)
-    cost: float
-    damping: float = 1.0
+    cost: float  # what is minimised, the prior included
+    damping: float = 1.0  # Levenberg-Marquardt damping that its last step got through with
+    # (sum M, N + 1) that its last step was made with; None before any
     jacobian: FloatArray | None = field(default=None, repr=False)
-    converged: bool = False
+    converged: bool = False  # whether the last step changed next to nothing
 
     @property
     def residual(self) -> FloatArray:

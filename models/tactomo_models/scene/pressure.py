@@ -36,57 +36,35 @@ class PressureRange(StrEnum):
 
 @dataclass(frozen=True)
 class Pressures:
-    """Pressures of K contacts; NaN where unknown.
+    """Pressures of K contacts; NaN where unknown."""
 
-    Attributes:
-        kpa: (K,) the range's top where it is `above`.
-        sigma_kpa: (K,) standard uncertainties; known `within` alone.
-        force_n: (K,) pressure times area.
-        force_sigma_n: (K,) standard uncertainties; NaN where the area's is.
-        ranges: K of them.
-        peak_kpa: (K,) highest pressures; the range's top where one is `above`.
-        peak_sigma_kpa: (K,) standard uncertainties; known `within` alone.
-        max_kpa: (K,) upper bounds, 95 %, in every range; +inf where the curve ends below.
-    """
-
-    kpa: FloatArray
-    sigma_kpa: FloatArray
-    force_n: FloatArray
-    force_sigma_n: FloatArray
-    ranges: tuple[PressureRange, ...]
-    peak_kpa: FloatArray
-    peak_sigma_kpa: FloatArray
-    max_kpa: FloatArray
+    kpa: FloatArray  # (K,) the range's top where it is `above`
+    sigma_kpa: FloatArray  # (K,) standard uncertainties; known `within` alone
+    force_n: FloatArray  # (K,) pressure times area
+    force_sigma_n: FloatArray  # (K,) standard uncertainties; NaN where the area's is
+    ranges: tuple[PressureRange, ...]  # K of them
+    peak_kpa: FloatArray  # (K,) highest pressures; the range's top where one is `above`
+    peak_sigma_kpa: FloatArray  # (K,) standard uncertainties; known `within` alone
+    max_kpa: FloatArray  # (K,) upper bounds, 95 %, in every range; +inf where the curve ends below
 
 
 @dataclass(frozen=True)
 class FieldContacts:
-    """What a fitted pressure field says of K contacts, by the sensor description's table.
+    """What a fitted pressure field says of K contacts, by the sensor description's table."""
 
-    Attributes:
-        peak_magnitude: (K,) |relative conductivity change| under the highest pressure.
-        peak_magnitude_sigma: (K,) standard uncertainties.
-        felt: (K,) the same by the likely account in which the pressure falls least towards the
-            edge: it tells best whether anything is felt at all.
-        felt_sigma: (K,) its standard uncertainty by noise.
-        peak_kpa: (K,) highest pressures.
-        mean_kpa: (K,) mean pressures.
-        mean_sigma_kpa: (K,) their standard uncertainties: how a pressure falls matters less there.
-        force_n: (K,) forces.
-        force_sigma_n: (K,) standard uncertainties.
-        edge: (K,) gamma; 0 flat, 1/2 Hertz.
-    """
-
-    peak_magnitude: FloatArray
-    peak_magnitude_sigma: FloatArray
+    peak_magnitude: FloatArray  # (K,) |relative conductivity change| under the highest pressure
+    peak_magnitude_sigma: FloatArray  # (K,) standard uncertainties
+    # (K,) the same by the likely account in which the pressure falls least towards the edge: it
+    # tells best whether anything is felt at all
     felt: FloatArray
-    felt_sigma: FloatArray
-    peak_kpa: FloatArray
-    mean_kpa: FloatArray
+    felt_sigma: FloatArray  # (K,) its standard uncertainty by noise
+    peak_kpa: FloatArray  # (K,) highest pressures
+    mean_kpa: FloatArray  # (K,) mean pressures
+    # (K,) their standard uncertainties: how a pressure falls matters less there
     mean_sigma_kpa: FloatArray
-    force_n: FloatArray
-    force_sigma_n: FloatArray
-    edge: FloatArray
+    force_n: FloatArray  # (K,) forces
+    force_sigma_n: FloatArray  # (K,) standard uncertainties
+    edge: FloatArray  # (K,) gamma; 0 flat, 1/2 Hertz
 
 
 @dataclass(frozen=True)

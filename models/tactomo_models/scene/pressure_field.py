@@ -51,48 +51,32 @@ RIM = 0.1  # of the nodes' distance: how far inside its edge a falling pressure 
 
 @dataclass(frozen=True)
 class Drawing:
-    """A field on the nodes that it presses.
+    """A field on the nodes that it presses."""
 
-    Attributes:
-        nodes: (n,) pressable nodes where something presses.
-        enclosed: (n,) share of each within outlines, 0 to 1 (-1 to 1 of `objects`): what a
-            saturated sheet shows, since a good conductor hides the hole of a ring.
-        share: (n,) share of each that is pressed: holes are left out.
-        pressure_kpa: (n,) pressure on that share.
-        slopes: makes the derivatives (n, N) of the three by the parameters.
-    """
-
-    nodes: IntArray
+    nodes: IntArray  # (n,) pressable nodes where something presses
+    # (n,) share of each within outlines, 0 to 1 (-1 to 1 of `objects`): what a saturated sheet
+    # shows, since a good conductor hides the hole of a ring
     enclosed: FloatArray
-    share: FloatArray
-    pressure_kpa: FloatArray
+    share: FloatArray  # (n,) share of each that is pressed: holes are left out
+    pressure_kpa: FloatArray  # (n,) pressure on that share
+    # makes the derivatives (n, N) of the three by the parameters
     slopes: Callable[[], tuple[FloatArray, FloatArray, FloatArray]]
 
 
 @dataclass(frozen=True)
 class PressureField:
-    """Contacts on a sheet, and which of their parameters are fitted.
+    """Contacts on a sheet, and which of their parameters are fitted."""
 
-    Attributes:
-        x_m: (P,) nodes.
-        y_m: (P,) nodes.
-        half_width_m: half the width over which the share falls from 1 to 0.
-        offset_m: how far outwards of its parameters an outline is drawn for a saturated sheet.
-        unit_kpa: pressure that peaks are counted in: the end of the table.
-        peak_limits: least and largest peak, in that unit.
-        order: 0, 1 or 2.
-        fixed: (K, COLUMNS) parameters of each contact, as far as they are not fitted.
-        free: (K, COLUMNS) which are fitted.
-    """
-
-    x_m: FloatArray = field(repr=False)
-    y_m: FloatArray = field(repr=False)
-    half_width_m: float
-    offset_m: float
-    unit_kpa: float
-    peak_limits: tuple[float, float]
-    order: int = 0
+    x_m: FloatArray = field(repr=False)  # (P,) nodes
+    y_m: FloatArray = field(repr=False)  # (P,) nodes
+    half_width_m: float  # half the width over which the share falls from 1 to 0
+    offset_m: float  # how far outwards of its parameters an outline is drawn for a saturated sheet
+    unit_kpa: float  # pressure that peaks are counted in: the end of the table
+    peak_limits: tuple[float, float]  # least and largest peak, in that unit
+    order: int = 0  # 0, 1 or 2
+    # (K, COLUMNS) parameters of each contact, as far as they are not fitted
     fixed: FloatArray = field(default_factory=lambda: np.zeros((0, COLUMNS)))
+    # (K, COLUMNS) which are fitted
     free: BoolArray = field(default_factory=lambda: np.zeros((0, COLUMNS), bool))
 
     @classmethod

@@ -46,15 +46,10 @@ class SheetResponse(Protocol):
 
 @dataclass(frozen=True)
 class GradedResponse:
-    """A magnitude sheet: the relative change of conductivity grows with the pressure.
+    """A magnitude sheet: the relative change of conductivity grows with the pressure."""
 
-    Attributes:
-        pressure_kpa: (n,) of the description's table.
-        change: (n,) relative conductivity changes, signed.
-    """
-
-    pressure_kpa: FloatArray
-    change: FloatArray
+    pressure_kpa: FloatArray  # (n,) of the description's table
+    change: FloatArray  # (n,) relative conductivity changes, signed
 
     @classmethod
     def of(cls, response: MagnitudeResponse) -> GradedResponse:
@@ -107,14 +102,10 @@ class SaturatingResponse:
     """A structure sheet: a share of its full change, in logarithm, by a table.
 
     The table gives the shares alone: how far the sheet changes where it is saturated is fitted.
-
-    Attributes:
-        pressure_kpa: (n,) of the description's table; empty where any pressure saturates.
-        share: (n,) of the logarithm of the saturated ratio, from 0 to 1.
     """
 
-    pressure_kpa: FloatArray
-    share: FloatArray
+    pressure_kpa: FloatArray  # (n,) of the description's table; empty where any pressure saturates
+    share: FloatArray  # (n,) of the logarithm of the saturated ratio, from 0 to 1
 
     @classmethod
     def of(cls, channel: StructureChannel) -> SaturatingResponse:

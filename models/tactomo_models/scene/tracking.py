@@ -27,21 +27,14 @@ class _Seen(NamedTuple):
 
 @dataclass
 class _Track:
-    """One identity.
+    """One identity."""
 
-    Attributes:
-        id: counted up from 1.
-        last: its last sight.
-        before: the last `LANDING` sights of it; while it is grown, those before it grew.
-        grown: frames for which it has been larger than it was in `before`.
-        missed: frames since it was last seen.
-    """
-
-    id: int
-    last: _Seen
+    id: int  # counted up from 1
+    last: _Seen  # its last sight
+    # the last `LANDING` sights of it; while it is grown, those before it grew
     before: deque[_Seen] = field(default_factory=lambda: deque(maxlen=LANDING))
-    grown: int = 0
-    missed: int = 0
+    grown: int = 0  # frames for which it has been larger than it was in `before`
+    missed: int = 0  # frames since it was last seen
 
     def see(self, seen: _Seen) -> None:
         """Follow it to where it is now."""

@@ -11,15 +11,10 @@ from tactomo_models.errors import DataError
 
 @dataclass(frozen=True)
 class Pairs:
-    """Electrodes of every voltage of a scan, in order.
+    """Electrodes of every voltage of a scan, in order."""
 
-    Attributes:
-        drive: (M, 2) electrodes that the current enters and leaves by.
-        measure: (M, 2) electrodes whose potential difference, first minus second, is read.
-    """
-
-    drive: IntArray
-    measure: IntArray
+    drive: IntArray  # (M, 2) electrodes that the current enters and leaves by
+    measure: IntArray  # (M, 2) electrodes whose potential difference, first minus second, is read
 
 
 def scan_pairs(electrodes: int, drive_offset: int = 1, measure_offset: int = 1) -> Pairs:

@@ -20,19 +20,12 @@ _TURNS = tuple(
 
 @dataclass(frozen=True)
 class Symmetry:
-    """One turn or mirror image, as what it does to data and maps of a scene.
+    """One turn or mirror image, as what it does to data and maps of a scene."""
 
-    Attributes:
-        matrix: (2, 2) what it does to a place.
-        scan: (M,) which voltage of the scene as it was each voltage of the turned scene is.
-        sign: (M,) by what that is multiplied: pairs may change direction.
-        nodes: (nodes_y * nodes_x,) the same for the nodes of a map.
-    """
-
-    matrix: FloatArray
-    scan: IntArray
-    sign: FloatArray
-    nodes: IntArray
+    matrix: FloatArray  # (2, 2) what it does to a place
+    scan: IntArray  # (M,) which voltage of the scene as it was each voltage of the turned scene is
+    sign: FloatArray  # (M,) by what that is multiplied: pairs may change direction
+    nodes: IntArray  # (nodes_y * nodes_x,) the same for the nodes of a map
 
 
 def symmetries(description: SensorDescription) -> list[Symmetry]:

@@ -26,26 +26,18 @@ WANDER_S: Final = (3600.0, 28_800.0)  # periods of contact impedances: an hour t
 
 @dataclass(frozen=True, slots=True)
 class SkinDrift:
-    """What a skin's sheets do by themselves.
+    """What a skin's sheets do by themselves."""
 
-    Attributes:
-        swing_k: temperature of a day, from its coldest to its warmest, in kelvin.
-        period_s: length of that day.
-        step_k: temperature that has been added at once, in kelvin.
-        per_kelvin: relative change of conductivity per kelvin.
-        uneven: share of that change that differs from place to place (standard deviation).
-        impedance: amplitude by which contact impedances wander, of their logarithm.
-        creep: what a decade of time adds under pressure, as a share of the pressed change, and
-            leaves behind, as a share of the bare conductivity or of the pressed change if less.
-    """
-
-    swing_k: float = 0.0
-    period_s: float = 86_400.0
-    step_k: float = 0.0
-    per_kelvin: float = 0.02
+    swing_k: float = 0.0  # temperature of a day, from its coldest to its warmest, in kelvin
+    period_s: float = 86_400.0  # length of that day
+    step_k: float = 0.0  # temperature that has been added at once, in kelvin
+    per_kelvin: float = 0.02  # relative change of conductivity per kelvin
+    # share of that change that differs from place to place (standard deviation)
     uneven: float = 0.1
+    # what a decade of time adds under pressure, as a share of the pressed change, and leaves
+    # behind, as a share of the bare conductivity or of the pressed change if less
     creep: float = 0.0
-    impedance: float = 0.0
+    impedance: float = 0.0  # amplitude by which contact impedances wander, of their logarithm
 
     def warming(self, time_s: float) -> float:
         """Logarithm of the factor on the sheets' conductivity; the skin starts at a middle one."""

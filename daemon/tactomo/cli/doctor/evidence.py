@@ -43,22 +43,15 @@ class DoctorError(TactomoError):
 
 
 class Heard(NamedTuple):
-    """How scans came in over the ports while they were examined.
+    """How scans came in over the ports while they were examined."""
 
-    Attributes:
-        packets: packets that came.
-        corrupt: packets that were damaged on their way.
-        faulty: intact ones that break the protocol.
-        lost: dual scans that the device took and nobody received, by gaps in the counter.
-        delay_ms: (n,) how much later than the promptest each scan came, by the device's clock.
-        period_ms: from scan to scan on the device's clock; None where fewer than two came.
-    """
-
-    packets: int
-    corrupt: int
-    faulty: int
-    lost: int
+    packets: int  # packets that came
+    corrupt: int  # packets that were damaged on their way
+    faulty: int  # intact ones that break the protocol
+    lost: int  # dual scans that the device took and nobody received, by gaps in the counter
+    # (n,) how much later than the promptest each scan came, by the device's clock
     delay_ms: FloatArray
+    # from scan to scan on the device's clock; None where fewer than two came
     period_ms: float | None
 
 

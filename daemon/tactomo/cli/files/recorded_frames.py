@@ -44,23 +44,15 @@ class Moment(NamedTuple):
 
 @dataclass(frozen=True)
 class RecordedFrames:
-    """The frames of a recording between two times.
+    """The frames of a recording between two times."""
 
-    Attributes:
-        path: the recording that was given.
-        sensor: the sensor's name.
-        description: what the sensor is made of; None where that is not known on this computer.
-        start_ns: when the recording begins, nanoseconds since 1970.
-        start_s: the first frames that are wanted, seconds from there.
-        end_s: where the frames end that are wanted.
-    """
-
-    path: Path
-    sensor: str
+    path: Path  # the recording that was given
+    sensor: str  # the sensor's name
+    # what the sensor is made of; None where that is not known on this computer
     description: SensorDescription | None
-    start_ns: int
-    start_s: float
-    end_s: float
+    start_ns: int  # when the recording begins, nanoseconds since 1970
+    start_s: float  # the first frames that are wanted, seconds from there
+    end_s: float  # where the frames end that are wanted
     _given: Recording
     _remade: Sequence[Recording]  # of each file, if it had to be made; otherwise none
 

@@ -25,21 +25,13 @@ EPISODE: Final = "episode"
 
 @dataclass(frozen=True)
 class RobotLog:
-    """A robot's steps.
+    """A robot's steps."""
 
-    Attributes:
-        clock: which of the clocks `times_s` is read from.
-        times_s: (R,) rising within an episode.
-        episodes: (R,) which episode each step is of; equal ones are together.
-        columns: names of the numbers, the clock and the episode left out.
-        numbers: (R, len(columns)).
-    """
-
-    clock: str
-    times_s: FloatArray
-    episodes: FloatArray
-    columns: tuple[str, ...]
-    numbers: FloatArray
+    clock: str  # which of the clocks `times_s` is read from
+    times_s: FloatArray  # (R,) rising within an episode
+    episodes: FloatArray  # (R,) which episode each step is of; equal ones are together
+    columns: tuple[str, ...]  # names of the numbers, the clock and the episode left out
+    numbers: FloatArray  # (R, len(columns))
 
     @property
     def is_action(self) -> list[bool]:
