@@ -139,7 +139,7 @@ def save_taught(taught: TaughtSkin, path: Path) -> None:
         CalibrationError: the file cannot be written.
     """
     guess = np.zeros((0, 2)) if taught.guess_mm is None else taught.guess_mm
-    arrays = {
+    arrays: dict[str, Any] = {
         "format": np.array(FORMAT),
         "tactomo": np.array(version("tactomo")),
         "subject": np.array(taught.subject.model_dump_json()),
