@@ -21,21 +21,16 @@ from __future__ import annotations
 
 
 class TactomoError(Exception):
-    """Base of everything that tactomo raises on purpose.
-
-    Attributes:
-        name: a short stable identifier such as ``port_busy``, for programs.
-        cause: what went wrong, for people.
-        next_step: what to do about it, for people; may be empty.
-    """
+    """Base of everything that tactomo raises on purpose."""
 
     name = "tactomo_error"
 
     def __init__(self, cause: str, next_step: str = "", name: str | None = None) -> None:
         super().__init__(f"{cause}; {next_step}" if next_step else cause)
+        # a short stable identifier such as ``port_busy``, for programs
         self.name = name or type(self).name
-        self.cause = cause
-        self.next_step = next_step
+        self.cause = cause  # what went wrong, for people
+        self.next_step = next_step  # what to do about it, for people; may be empty
 
 
 class ConfigError(TactomoError):

@@ -26,16 +26,11 @@ LOOK_S: Final = 1.0
 
 
 class Durations:
-    """The last 256 durations of one thing.
-
-    Attributes:
-        count: how many there were in all.
-        total_s: and how long they took together.
-    """
+    """The last 256 durations of one thing."""
 
     def __init__(self) -> None:
-        self.count = 0
-        self.total_s = 0.0
+        self.count = 0  # how many there were in all
+        self.total_s = 0.0  # and how long they took together
         self._seconds = np.full(RING, np.nan)
 
     def add(self, seconds: float) -> None:
@@ -57,12 +52,10 @@ class Pace:
     """How long the next of something takes to come: the median of the last few waits.
 
     So what is slow by nature is given its time, and one long pause is nobody's pace.
-
-    Attributes:
-        few_s: seconds after which it is late: a few of its periods. 0 before the first one.
     """
 
     def __init__(self) -> None:
+        # seconds after which it is late: a few of its periods. 0 before the first one
         self.few_s = 0.0
         self._waits_s: deque[float] = deque(maxlen=WAITS)
 
@@ -78,16 +71,11 @@ class Pace:
 
 
 class Rate:
-    """How often something comes, over the last seconds, or a few periods of what is slower.
-
-    Attributes:
-        count: how often it came in all.
-        pace: how long the next one usually takes.
-    """
+    """How often something comes, over the last seconds, or a few periods of what is slower."""
 
     def __init__(self) -> None:
-        self.count = 0
-        self.pace = Pace()
+        self.count = 0  # how often it came in all
+        self.pace = Pace()  # how long the next one usually takes
         self._times_ns = np.zeros(RING, dtype=np.int64)
 
     def add(self, monotonic_ns: int) -> None:

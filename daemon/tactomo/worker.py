@@ -19,15 +19,11 @@ class Worker:
         name: the thread's.
         join_s: how long `stop` waits for the thread at most, in seconds, where it may hang in the
             operating system; None to wait until it ends.
-
-    Attributes:
-        name: the thread's.
-        turns: how often the thread went round its loop; the watchdog goes by them.
     """
 
     def __init__(self, name: str, join_s: float | None = None) -> None:
-        self.name = name
-        self.turns = 0
+        self.name = name  # the thread's
+        self.turns = 0  # how often the thread went round its loop; the watchdog goes by them
         self._join_s = join_s
         self._stopping = threading.Event()
         # A thread that may hang for ever must not keep the process from ending.

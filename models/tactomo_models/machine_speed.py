@@ -40,20 +40,16 @@ class _Table(BaseModel):
 
 
 class Row(_Table):
-    """How fast and how right a method is on moving scenes, frame after frame.
+    """How fast and how right a method is on moving scenes, frame after frame."""
 
-    Attributes:
-        method: its name.
-        budget_s: modelled work that a frame might take; None where a method takes what it takes.
-        p50_s, p99_s: time of a frame.
-        icc: of the magnitude map, mean, on the laboratory's moving scenes of the shipped sensor: no
-            matter of the machine, and the order of methods on other sensors, too.
-    """
-
-    method: str
+    method: str  # its name
+    # modelled work that a frame might take; None where a method takes what it takes
     budget_s: Annotated[float, Field(gt=0)] | None
+    # p50_s, p99_s: time of a frame
     p50_s: Annotated[float, Field(gt=0)]
     p99_s: Annotated[float, Field(gt=0)]
+    # of the magnitude map, mean, on the laboratory's moving scenes of the shipped sensor: no matter
+    # of the machine, and the order of methods on other sensors, too
     icc: Annotated[float, Field(ge=-1, le=1)]
 
 

@@ -36,15 +36,12 @@ class Door:
 
     Raises:
         OSError: the address cannot be listened on.
-
-    Attributes:
-        port: where it listens.
     """
 
     def __init__(self, host: str, port: int, origins: Collection[str]) -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         self._listener = socket.create_server((host, port), family=family)
-        self.port: int = self._listener.getsockname()[1]
+        self.port: int = self._listener.getsockname()[1]  # where it listens
         self._host = host
         self._origins = frozenset(origins)
         self._behind = ("", 0)

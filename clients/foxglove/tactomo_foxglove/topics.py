@@ -102,9 +102,6 @@ class SensorTopics:
     """One sensor's topics in a context, that is towards a server or into a file.
 
     Times are nanoseconds since 1970: `log_time_ns` when it is said, None for now.
-
-    Attributes:
-        description: the sensor, as `status` has it; empty until `sheet` has said it.
     """
 
     def __init__(
@@ -115,6 +112,7 @@ class SensorTopics:
         placement: Placement,
     ) -> None:
         self.sensor = sensor
+        # the sensor, as `status` has it; empty until `sheet` has said it
         self.description: Mapping[str, Any] = {}
         self._placement = placement
         self._last: Frame | None = None

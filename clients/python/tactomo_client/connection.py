@@ -51,20 +51,16 @@ class Connection:
     """One socket connected to one address, watched for whether the server lets this client in.
 
     Close it, or let it go out of use.
-
-    Attributes:
-        socket: what to send and receive by, without waiting.
-        owner: what to wait for.
-        handshakes: what became of them when `refusal` last looked.
     """
 
     def __init__(self, owner: Owner, address: str, keys: Keys | None) -> None:
-        self.owner = owner
+        self.owner = owner  # what to wait for
         self.address = address
+        # what to send and receive by, without waiting
         self.socket: zmq.Socket[bytes] = zmq.Socket.shadow(owner.underlying)
         self._keys = keys
         self._knock_at_s = 0.0
-        self.handshakes = Handshakes(owner)
+        self.handshakes = Handshakes(owner)  # what became of them when `refusal` last looked
         self._closed = weakref.finalize(self, _close, self.handshakes, owner)
         try:
             secure(self.socket, address, keys)

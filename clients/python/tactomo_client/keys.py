@@ -145,18 +145,14 @@ class Handshakes:
 
     Belongs to the socket's thread, and is to be closed before the socket. The attributes are as of
     the last call of `refusal`.
-
-    Attributes:
-        have_succeeded: whether a server has ever taken this client in.
-        is_connected: whether something listens at the other end, busy or not.
     """
 
     def __init__(self, socket: zmq.Socket[bytes]) -> None:
         self._socket = socket
         self._monitor = socket.get_monitor_socket(_WATCHED)
         self._failures: list[int] = []  # since the last success
-        self.have_succeeded = False
-        self.is_connected = False
+        self.have_succeeded = False  # whether a server has ever taken this client in
+        self.is_connected = False  # whether something listens at the other end, busy or not
 
     def refusal(self, address: str, keys: Keys | None) -> KeysError | None:
         """Return why the server lets nobody in by these keys; None as long as it may do so."""

@@ -13,11 +13,6 @@ EVENTS_KEPT = 100
 class Feed:
     """Reads one sensor's stream. `on_change` is called after each message that was taken in.
 
-    Attributes:
-        frame: the newest frame, or None before the first.
-        status: the newest status, or None before the first.
-        events: the recent events, oldest first, each with its number as it came, from 1.
-
     Raises:
         MessageError: `sensor` cannot be a sensor's name.
         ControlError: `address` is not an address.
@@ -26,8 +21,9 @@ class Feed:
     def __init__(
         self, sensor: str, address: str, keys: Keys | None, on_change: Callable[[], None]
     ) -> None:
-        self.frame: Frame | None = None
-        self.status: Status | None = None
+        self.frame: Frame | None = None  # the newest frame, or None before the first
+        self.status: Status | None = None  # the newest status, or None before the first
+        # the recent events, oldest first, each with its number as it came, from 1
         self.events: deque[tuple[int, Event]] = deque(maxlen=EVENTS_KEPT)
         self._events_seen = 0
         self._on_change = on_change

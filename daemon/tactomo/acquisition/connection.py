@@ -25,13 +25,7 @@ MAX_READ_BYTES: Final = 65_536
 
 
 class Connection:
-    """One port, open or waited for.
-
-    Attributes:
-        is_open: whether the device is there at present.
-        problem: why it is not open, for people; empty while it is.
-        latency_timer_ms: an FTDI adapter's, as of the last opening; None for others.
-    """
+    """One port, open or waited for."""
 
     def __init__(
         self,
@@ -42,8 +36,9 @@ class Connection:
         playback: Playback | None = None,
     ) -> None:
         self.url = url
-        self.is_open = False
-        self.problem = ""
+        self.is_open = False  # whether the device is there at present
+        self.problem = ""  # why it is not open, for people; empty while it is
+        # an FTDI adapter's, as of the last opening; None for others
         self.latency_timer_ms: int | None = None
         self._baud = baud
         self._root = root

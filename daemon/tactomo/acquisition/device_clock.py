@@ -90,17 +90,12 @@ class Line(NamedTuple):
 
 
 class DeviceClock:
-    """Dates one device's scans by its own clock. One thread calls it, others may read.
-
-    Attributes:
-        jumps: how often the clock jumped, or went back.
-        restarts: how often it went back, as it does where the device was reset.
-        delays: by how much scans came later than need be, while the clock is used.
-    """
+    """Dates one device's scans by its own clock. One thread calls it, others may read."""
 
     def __init__(self) -> None:
-        self.jumps = 0
-        self.restarts = 0
+        self.jumps = 0  # how often the clock jumped, or went back
+        self.restarts = 0  # how often it went back, as it does where the device was reset
+        # by how much scans came later than need be, while the clock is used
         self.delays = Durations()
         self._fit = _Fit()
         self._newest_us: dict[Channel, int] = {}

@@ -42,13 +42,10 @@ class Liveness:
     Args:
         says_hello: every second, scans or not, so that silence tells.
         first_s: how long it may take until its pace is known.
-
-    Attributes:
-        state: as of the last call.
     """
 
     def __init__(self, says_hello: bool = True, first_s: float = 0.0) -> None:
-        self.state = DeviceState.STARTING
+        self.state = DeviceState.STARTING  # as of the last call
         self._says_hello = says_hello
         self._first_s = first_s
         self._stated_s = 0.0  # a few periods, by the rate that the device says

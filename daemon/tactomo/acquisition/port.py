@@ -62,17 +62,6 @@ class PortReader(Worker):
         on_event: told what happens.
         root: the folder of `/sys` and `/dev`.
         playback: the replay's time, where the port replays.
-
-    Attributes:
-        bytes_read: since the start, over all connections.
-        counts: the decoder's counts, likewise.
-        unused: scans that cannot be used: before the first hello, of a device that does not fit
-            the sensor, of another length or of a channel that the sensor does not have.
-        hello: the newest one; None before the first.
-        refusal: why this device's scans are not used; empty when they are.
-        reopened: how often the port was opened again because the device did not speak.
-        clock: the device's, by which its scans are dated.
-        has_ended: whether the replay behind the port is at its end.
     """
 
     def __init__(
@@ -92,13 +81,15 @@ class PortReader(Worker):
         super().__init__(f"port-{index}")
         self.index = index
         self.url = url
-        self.bytes_read = 0
+        self.bytes_read = 0  # since the start, over all connections
+        # scans that cannot be used: before the first hello, of a device that does not fit the
+        # sensor, of another length or of a channel that the sensor does not have
         self.unused = 0
-        self.hello: Hello | None = None
-        self.refusal = ""
-        self.reopened = 0
-        self.clock = DeviceClock()
-        self.has_ended = False
+        self.hello: Hello | None = None  # the newest one; None before the first
+        self.refusal = ""  # why this device's scans are not used; empty when they are
+        self.reopened = 0  # how often the port was opened again because the device did not speak
+        self.clock = DeviceClock()  # the device's, by which its scans are dated
+        self.has_ended = False  # whether the replay behind the port is at its end
         self._baud = baud
         self._description = description
         self._device_ids = device_ids

@@ -37,15 +37,10 @@ class ReplayMoved(SerialException):
 
 
 class ReplayPort(SerialBase):
-    """The port itself.
-
-    Attributes:
-        clock_ns: when the bytes of the last read came, on the recording's steady clock.
-        playback: the replay's time; one of its own unless it is given another.
-    """
+    """The port itself."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self.clock_ns = 0
+        self.clock_ns = 0  # when the bytes of the last read came, on the recording's steady clock
         self._chunks: Iterator[Chunk] = iter(())
         self._next: Chunk | None = None
         self._rest = b""  # of the chunk whose time has come
@@ -53,7 +48,7 @@ class ReplayPort(SerialBase):
         self._number = 0
         self._pass = 0
         self._has_ended = False
-        self.playback: Playback
+        self.playback: Playback  # the replay's time; one of its own unless it is given another
         super().__init__(*args, **kwargs)
 
     def open(self) -> None:

@@ -43,22 +43,17 @@ class ScanPairer:
     Every scan that is pushed waits, is part of one dual scan, or is counted in one of these.
 
     Attributes:
-        lost: channels that nobody waits for at present.
         late: scans dropped because their dual scan, or their channel, had gone on without them.
-        repeated: scans dropped because they had come before.
         disordered: how many of the late ones came after their own channel's next.
-        unmarked: scans dropped because the recorded run did not use them.
-        resets: how often a counter went back with its clock: the device was reset.
-        zeroed: how often a counter alone went back.
     """
 
     def __init__(self) -> None:
-        self.lost: set[Channel] = set()
+        self.lost: set[Channel] = set()  # channels that nobody waits for at present
         self.late = self.disordered = 0
-        self.repeated = 0
-        self.unmarked = 0
-        self.resets = 0
-        self.zeroed = 0
+        self.repeated = 0  # scans dropped because they had come before
+        self.unmarked = 0  # scans dropped because the recorded run did not use them
+        self.resets = 0  # how often a counter went back with its clock: the device was reset
+        self.zeroed = 0  # how often a counter alone went back
 
     def push(self, scan: ChannelScan) -> list[DualScan]:
         """Take one scan and return the dual scans that are complete now, in order."""

@@ -30,19 +30,13 @@ _SMOOTHING: Final = 0.125
 
 
 class Skew:
-    """Measures; for use by one thread, others may read.
-
-    Attributes:
-        is_skewed: whether the counters are out of step, for several scans in a row.
-        out_of_step_ns: by how much, when last measured; positive if the magnitude channel's
-            counter is behind.
-        sizes: of the skew of each dual scan, without its sign.
-    """
+    """Measures; for use by one thread, others may read."""
 
     def __init__(self) -> None:
-        self.is_skewed = False
+        self.is_skewed = False  # whether the counters are out of step, for several scans in a row
+        # by how much, when last measured; positive if the magnitude channel's counter is behind
         self.out_of_step_ns = 0
-        self.sizes = Durations()
+        self.sizes = Durations()  # of the skew of each dual scan, without its sign
         self._newest: dict[Channel, ChannelScan] = {}
         self._compared: ChannelScan | None = None  # the newest one that found its counterpart
         self._periods_ns: dict[Channel, float] = {}

@@ -18,14 +18,11 @@ class WallClock:
     """Compares the wall clock with the monotonic one whenever `check` is called.
 
     For use by one thread; others may read.
-
-    Attributes:
-        jumps: how often it was set.
-        last_jump_s: by how much the last time, positive if forwards; None if never.
     """
 
     def __init__(self, on_event: OnEvent) -> None:
-        self.jumps = 0
+        self.jumps = 0  # how often it was set
+        # by how much the last time, positive if forwards; None if never
         self.last_jump_s: float | None = None
         self._on_event = on_event
         self._ahead_ns = time.time_ns() - time.monotonic_ns()

@@ -37,11 +37,6 @@ class CalibrationInForce:
         on_event: told of a calibration that is another device's.
         calibration: the sensor's own; None where there is none.
         taught: what the sensor was taught; None where nothing was.
-
-    Attributes:
-        in_force: the calibration that is used; None for the description's curve.
-        taught: the teaching that is used; None where the physics alone locates.
-        device_ids: of those that have spoken.
     """
 
     def __init__(
@@ -53,7 +48,9 @@ class CalibrationInForce:
         calibration: PressureCalibration | None,
         taught: TaughtSkin | None,
     ) -> None:
+        # the calibration that is used; None for the description's curve
         self.in_force: PressureCalibration | None = None
+        # the teaching that is used; None where the physics alone locates
         self.taught: TaughtSkin | None = None
         self._description = description
         self._reconstructor = reconstructor
@@ -61,7 +58,7 @@ class CalibrationInForce:
         self._on_event = on_event
         self._own, self._own_taught = calibration, taught
         self._reference: Reference | None = None
-        self.device_ids: frozenset[str] = frozenset()
+        self.device_ids: frozenset[str] = frozenset()  # of those that have spoken
         self._refused: list[_Foreign] = []
         self._judge()
 

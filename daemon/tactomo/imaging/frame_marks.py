@@ -22,14 +22,10 @@ REPEAT_S: Final = 60.0
 
 
 class FrameMarks:
-    """Marks frames in the recording that runs.
-
-    Attributes:
-        calibration: likewise, as of now.
-    """
+    """Marks frames in the recording that runs."""
 
     def __init__(self, recorder: Recorder, calibration: str) -> None:
-        self.calibration = calibration
+        self.calibration = calibration  # the text of the pressure calibration in force
         self._recorder = recorder
         self._recording: ActiveRecording | None = None  # the one that gets marks
         self._reference: tuple[Reference, int] | None = None  # and when it was taken

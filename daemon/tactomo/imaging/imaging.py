@@ -73,16 +73,6 @@ class Imaging:
         recorder: is told of which scans frames were made.
         publisher: gets the frames.
         on_event: told what people should know.
-
-    Attributes:
-        method: requested and effective.
-        calibration: of pressure, the one in force.
-        taring: takes references.
-        reference: what changes are measured against; None before the first tare.
-        reference_realtime_ns: when it was taken.
-        stages: how long each stage takes.
-        frame_rate: how often a frame is published.
-        acquired_monotonic_ns: when the newest dual scan was acquired; 0 before the first.
     """
 
     def __init__(
@@ -99,21 +89,24 @@ class Imaging:
         publisher: Publisher,
         on_event: OnEvent,
     ) -> None:
+        # what changes are measured against; None before the first tare
         self.reference: Reference | None = None
-        self.reference_realtime_ns = 0
-        self.stages: dict[str, Durations] = {}
-        self.frame_rate = Rate()
-        self.acquired_monotonic_ns = 0
+        self.reference_realtime_ns = 0  # when it was taken
+        self.stages: dict[str, Durations] = {}  # how long each stage takes
+        self.frame_rate = Rate()  # how often a frame is published
+        self.acquired_monotonic_ns = 0  # when the newest dual scan was acquired; 0 before the first
         self._description = description
         self._reconstructor = reconstructor
         self._tracker = (
             BaselineTracker(reconstructor, baseline.time_constant_s) if baseline.track else None
         )
         self._marks = FrameMarks(recorder, calibration_text(calibration))
-        self.method = MethodInForce(reconstructor, machine_speed)
+        self.method = MethodInForce(reconstructor, machine_speed)  # requested and effective
+        # of pressure, the one in force
         self.calibration = CalibrationInForce(
             description, reconstructor, self._marks, on_event, calibration, taught
         )
+        # takes references
         self.taring = Taring(
             tare_scans, description.channels, self.frame_rate, self._take, self._fall_back, on_event
         )

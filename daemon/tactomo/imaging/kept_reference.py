@@ -60,15 +60,12 @@ class KeptReference:
         description: what it is made of; a reference of another one is not used.
         recorder: its thread writes, so that a stuck disk holds up nobody.
         on_event: told when it cannot be kept.
-
-    Attributes:
-        is_unreadable: whether there is one that could not be read.
     """
 
     def __init__(
         self, sensor: str, description: SensorDescription, recorder: Recorder, on_event: OnEvent
     ) -> None:
-        self.is_unreadable = False
+        self.is_unreadable = False  # whether there is one that could not be read
         self._path = reference_path(sensor)
         self._description = description
         self._recorder = recorder

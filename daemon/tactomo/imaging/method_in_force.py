@@ -30,13 +30,11 @@ class MethodInForce:
     Attributes:
         requested: what was asked for; the budget in milliseconds of this machine.
         effective: what frames get; the budget in milliseconds of modelled work.
-        share: of the time that was asked for, what frames get.
-        source: where the machine's speed is known from, in words.
     """
 
     def __init__(self, reconstructor: Reconstructor, machine_speed: MachineSpeed) -> None:
-        self.share = 1.0
-        self.source = machine_speed.source
+        self.share = 1.0  # of the time that was asked for, what frames get
+        self.source = machine_speed.source  # where the machine's speed is known from, in words
         self._reconstructor = reconstructor
         self._machine_speed = machine_speed
         budget_s = reconstructor.budget_s

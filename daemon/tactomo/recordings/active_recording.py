@@ -15,19 +15,7 @@ ENTRY_BYTES: Final = 300  # what an entry takes beside its data
 
 
 class ActiveRecording:
-    """A recording in progress: a queue that any thread may fill and the recorder's thread empties.
-
-    Attributes:
-        number: tells it from the daemon's other recordings; rises from 1.
-        previous: the file before it, as long as that gets the ports' bytes, too. The pipeline's
-            thread ends that, or the recorder's when it has waited long enough.
-        calibration: the pressure calibration that the file's metadata tell, as text.
-        references: how many references were added; the pipeline's thread counts.
-        calibrations: how many pressure calibrations were added, likewise.
-        bytes_written: length of the file at the last flush; written by the recorder's thread.
-        is_overflowed: the queue was full once, and nothing is taken any more.
-        is_empty: nothing was written yet; written by the recorder's thread.
-    """
+    """A recording in progress: any thread may fill its queue, the recorder's thread empties it."""
 
     def __init__(
         self,
@@ -38,16 +26,20 @@ class ActiveRecording:
         calibration: str,
         previous: ActiveRecording | None = None,
     ) -> None:
-        self.number = number
+        self.number = number  # tells it from the daemon's other recordings; rises from 1
         self.path = path
         self.with_maps = with_maps
+        # the pressure calibration that the file's metadata tell, as text
         self.calibration = calibration
+        # the file before it, as long as that gets the ports' bytes, too. The pipeline's thread ends
+        # that, or the recorder's when it has waited long enough
         self.previous = previous
-        self.references = 0
-        self.calibrations = 0
+        self.references = 0  # how many references were added; the pipeline's thread counts
+        self.calibrations = 0  # how many pressure calibrations were added, likewise
+        # length of the file at the last flush; written by the recorder's thread
         self.bytes_written = 0
-        self.is_overflowed = False
-        self.is_empty = True
+        self.is_overflowed = False  # the queue was full once, and nothing is taken any more
+        self.is_empty = True  # nothing was written yet; written by the recorder's thread
         self._begin_s = time.monotonic()
         self._writer = writer
         self._lock = threading.Lock()

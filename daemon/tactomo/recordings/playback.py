@@ -21,17 +21,14 @@ class Playback:
         speed: factor of the recorded speed, or 0 for as fast as it is taken.
 
     Attributes:
-        passes: how often it was moved.
         begin_ns: where the pass began.
-        loops: whether the end is followed by the beginning.
-        waits_for_page: whether it is paused until somebody looks.
     """
 
     def __init__(self, start_ns: int, end_ns: int, speed: float) -> None:
-        self.passes = 0
+        self.passes = 0  # how often it was moved
         self.start_ns = self.begin_ns = start_ns
-        self.loops = False
-        self.waits_for_page = False
+        self.loops = False  # whether the end is followed by the beginning
+        self.waits_for_page = False  # whether it is paused until somebody looks
         self._end_ns = end_ns
         self._speed = speed
         self._is_paused = False

@@ -49,24 +49,17 @@ class Recorder(Worker):
 
     Its thread does everything that touches a file; `begin` and `end` ask it to. Every thread reads
     `active` once and uses what it got, which stays harmless after the recording has ended.
-
-    Attributes:
-        active: the recording that runs; None while there is none.
-        files: how many files were begun since the start.
-        deleted: how many were deleted to keep to the rules.
-        failures: how often a recording could not go on.
-        failure: why the last recording did not go on; empty once there is another.
-        waits_for: why a recording that is wanted does not run; empty while none does.
     """
 
     def __init__(self, origin: Origin, rules: RecordingConfig, on_event: OnEvent) -> None:
         super().__init__("recorder", STOP_S)
+        # the recording that runs; None while there is none
         self.active: ActiveRecording | None = None
-        self.files = 0
-        self.deleted = 0
-        self.failures = 0
-        self.failure = ""
-        self.waits_for = ""
+        self.files = 0  # how many files were begun since the start
+        self.deleted = 0  # how many were deleted to keep to the rules
+        self.failures = 0  # how often a recording could not go on
+        self.failure = ""  # why the last recording did not go on; empty once there is another
+        self.waits_for = ""  # why a recording that is wanted does not run; empty while none does
         self._origin = origin  # replaced by the pipeline's thread, see `set_calibration`
         self._rules = rules
         self._on_event = on_event

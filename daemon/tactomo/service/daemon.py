@@ -113,10 +113,6 @@ class Daemon:
         ConfigError: the ports are not all live, or not all of one recording.
         KeysError: the secret key cannot be used.
         RecordingError, PortError: a replay URL leads to no recording.
-
-    Attributes:
-        session: identity of this run, as in every message.
-        playback: the time of the replay; None where the ports are live.
     """
 
     def __init__(
@@ -128,7 +124,7 @@ class Daemon:
         artifact: Artifact | None = None,
     ) -> None:
         self.config = config
-        self.session = uuid.uuid4().hex
+        self.session = uuid.uuid4().hex  # identity of this run, as in every message
         self._undo = contextlib.ExitStack()
         self._stop_asked = threading.Event()
         self._why_stopped = "asked to"
@@ -146,6 +142,7 @@ class Daemon:
         if replay is not None and config.calibration is not None:
             replay = replace(replay, marks=without_calibrations(replay.marks))
         self._replay = replay
+        # the time of the replay; None where the ports are live
         self.playback = None if replay is None else replay.playback
         _check_methods(replay, self._methods, description)
         protocol = _protocol(config)

@@ -59,15 +59,11 @@ Times = Callable[[], Mapping[str, Durations]]
 
 
 class MetricsServer(Worker):
-    """`open` it, `start` its thread, `stop` it.
-
-    Attributes:
-        address: where it can be scraped, once open.
-    """
+    """`open` it, `start` its thread, `stop` it."""
 
     def __init__(self, status: Status, latency: Durations, stages: Times) -> None:
         super().__init__("metrics")
-        self.address = ""
+        self.address = ""  # where it can be scraped, once open
         registry = CollectorRegistry()
         registry.register(_StatusCollector(status, latency, stages))
         ProcessCollector(registry=registry)

@@ -81,14 +81,10 @@ def check_closed(clients: Path) -> None:
 
 
 class AllowList:
-    """The public keys in a folder, by what their holders may do. For any thread.
-
-    Attributes:
-        revocations: how often a key was taken away from either socket.
-    """
+    """The public keys in a folder, by what their holders may do. For any thread."""
 
     def __init__(self, folder: Path, on_event: OnEvent) -> None:
-        self.revocations = 0
+        self.revocations = 0  # how often a key was taken away from either socket
         self._folder = folder
         self._on_event = on_event
         self._lock = threading.Lock()  # held for the reading of some small files

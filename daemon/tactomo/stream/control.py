@@ -123,16 +123,13 @@ class Control(Worker):
         handlers: one for each of COMMANDS; called by the thread with the checked arguments.
         on_idle: called by the thread several times a second.
         on_event: told of connections that were cut.
-
-    Attributes:
-        address: where it is bound, once open.
     """
 
     def __init__(
         self, handlers: Mapping[str, Handler], on_idle: Callable[[], None], on_event: OnEvent
     ) -> None:
         super().__init__("control")
-        self.address = ""
+        self.address = ""  # where it is bound, once open
         self._on_event = on_event
         self._handlers = handlers
         self._on_idle = on_idle

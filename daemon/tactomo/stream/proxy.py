@@ -42,16 +42,11 @@ log = structlog.get_logger()
 
 
 class Relay:
-    """Passes messages on from sources; `open` it, `run` it until `stop`, `close` it.
-
-    Attributes:
-        address: where it is bound, once open; empty where nowhere.
-        sources: where messages come from.
-    """
+    """Passes messages on from sources; `open` it, `run` it until `stop`, `close` it."""
 
     def __init__(self, sources: Sequence[str]) -> None:
-        self.address = ""
-        self.sources = sources
+        self.address = ""  # where it is bound, once open; empty where nowhere
+        self.sources = sources  # where messages come from
         self._stopping = threading.Event()
         self._context: Context = zmq.Context()
         self._inlets: list[Inlet] = []

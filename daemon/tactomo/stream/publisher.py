@@ -66,13 +66,6 @@ class Publisher(Worker):
         on_frame: called by the thread with kind and bytes of each frame's message, before it is
             sent: whatever was seen is in the recording.
         on_event: told of a flood of subscriptions, and of messages that cannot be sent.
-
-    Attributes:
-        address: where it is bound, once open.
-        subscribers: subscriptions in force.
-        header: the newest frame's; written by the pipeline thread, sent with status and events. One
-            that cannot be sent gives way to none.
-        latency: from the last byte of a dual scan to the sending of its contacts.
     """
 
     def __init__(
@@ -84,9 +77,12 @@ class Publisher(Worker):
         on_event: OnEvent,
     ) -> None:
         super().__init__("publisher")
-        self.address = ""
-        self.subscribers = 0
+        self.address = ""  # where it is bound, once open
+        self.subscribers = 0  # subscriptions in force
+        # the newest frame's; written by the pipeline thread, sent with status and events. One that
+        # cannot be sent gives way to none
         self.header: Mapping[str, Any] = NO_FRAME_YET
+        # from the last byte of a dual scan to the sending of its contacts
         self.latency = Durations()
         self._sensor = sensor
         self._session = session

@@ -32,14 +32,7 @@ SUBSCRIBERS_CUT: Final = (
 
 
 class Subscribers:
-    """A bound XPUB socket's subscribers. Belongs to the socket's thread.
-
-    Attributes:
-        address: where the socket is bound.
-        prefixes: how many ask for each prefix.
-        cuts: how often all of them were cut off because there were too many.
-        peers: the connections.
-    """
+    """A bound XPUB socket's subscribers. Belongs to the socket's thread."""
 
     def __init__(
         self,
@@ -56,10 +49,10 @@ class Subscribers:
         # 1, libzmq 4.3.5 makes a peer that is never heard after a CURVE handshake.)
         socket.setsockopt(zmq.RCVHWM, 16)
         socket.setsockopt(zmq.MAXMSGSIZE, MAX_PREFIX_BYTES)
-        self.peers = Peers(socket, endpoint, purpose, on_event, secret, option)
-        self.address = self.peers.address
-        self.prefixes: Counter[bytes] = Counter()
-        self.cuts = 0
+        self.peers = Peers(socket, endpoint, purpose, on_event, secret, option)  # the connections
+        self.address = self.peers.address  # where the socket is bound
+        self.prefixes: Counter[bytes] = Counter()  # how many ask for each prefix
+        self.cuts = 0  # how often all of them were cut off because there were too many
         self._socket = socket
         self._bytes = 0
         self._passes = 0  # that found no end, one after the other

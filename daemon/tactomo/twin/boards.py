@@ -15,18 +15,13 @@ from tactomo.twin.foreign import Frame, Grounded
 
 
 class _Printer:
-    """What both have in common.
-
-    Attributes:
-        rate_hz: frames a second.
-        is_streaming: whether it sends frames.
-    """
+    """What both have in common."""
 
     largest: float
 
     def __init__(self, description: SensorDescription, rate_hz: float) -> None:
-        self.rate_hz = rate_hz
-        self.is_streaming = False
+        self.rate_hz = rate_hz  # frames a second
+        self.is_streaming = False  # whether it sends frames
         self._description = description
         self._gain = 0.0
         self._heard = b""

@@ -44,14 +44,10 @@ class Emulator(Protocol):
     """One instrument's side of its language, made of the sensor and the frames a second at first.
 
     A protocol's class names it as its `emulator`. For use by one thread.
-
-    Attributes:
-        rate_hz: frames a second; the host may have changed it.
-        is_streaming: whether it sends frames at present.
     """
 
-    rate_hz: float
-    is_streaming: bool
+    rate_hz: float  # frames a second; the host may have changed it
+    is_streaming: bool  # whether it sends frames at present
 
     def greeting(self) -> list[bytes]:
         """Return what it says when it is switched on, or plugged in."""

@@ -27,16 +27,13 @@ REST_FRAMES = 40
 
 
 class PlayedFrame(Mapping[Channel, FloatArray]):
-    """One frame: volts of each channel in the description's order.
-
-    Attributes:
-        potentials: (injections, electrodes) volts against ground, where the file has them; the
-            injections in the description's order.
-    """
+    """One frame: volts of each channel in the description's order."""
 
     def __init__(
         self, volts: Mapping[Channel, FloatArray], potentials: NDArray[np.complexfloating] | None
     ) -> None:
+        # (injections, electrodes) volts against ground, where the file has them; the injections in
+        # the description's order
         self.potentials = potentials
         self._volts = volts
 
@@ -57,10 +54,6 @@ class Player:
 
     Raises:
         ImportFileError: the file cannot be read, or does not fit the sensor.
-
-    Attributes:
-        rate_hz: mean rate of the frames; None where the file does not say.
-        is_over: whether the last frame has been said and none follows.
     """
 
     def __init__(self, path: Path, description: SensorDescription, once: bool = False) -> None:
@@ -76,8 +69,9 @@ class Player:
                 self._volts[channel] = np.vstack([self._volts[channel], volts])
             self._order = [scans.count] * REST_FRAMES + self._order
         seconds = 0.0 if scans.time_s is None else float(scans.time_s[-1])
+        # mean rate of the frames; None where the file does not say
         self.rate_hz = (scans.count - 1) / seconds if seconds else None
-        self.is_over = False
+        self.is_over = False  # whether the last frame has been said and none follows
         self._once = once
         self._next = 0
 

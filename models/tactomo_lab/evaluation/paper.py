@@ -437,24 +437,17 @@ def image_mass(image: FloatArray, description: SensorDescription) -> tuple[float
 
 @dataclass(frozen=True)
 class Localisation:
-    """One arrow of Fig. 10.
+    """One arrow of Fig. 10."""
 
-    Attributes:
-        method: of reconstruction.
-        sheet: number of the sensor.
-        x_m, y_m: where the indenter was.
-        mass_m: (x, y) of the image's mass.
-        contact_m: (x, y) of the largest contact reported; NaN where there was none.
-        contacts: how many were reported.
-    """
-
-    method: str
-    sheet: int
+    method: str  # of reconstruction
+    sheet: int  # number of the sensor
+    # x_m, y_m: where the indenter was
     x_m: float
     y_m: float
-    mass_m: tuple[float, float]
+    mass_m: tuple[float, float]  # (x, y) of the image's mass
+    # (x, y) of the largest contact reported; NaN where there was none
     contact_m: tuple[float, float]
-    contacts: int
+    contacts: int  # how many were reported
 
     @property
     def mass_error_mm(self) -> float:

@@ -166,26 +166,21 @@ def _measure(
 
 @dataclass(frozen=True)
 class CaseScore:
-    """How one case came out.
+    """How one case came out."""
 
-    Attributes:
-        regime, case, method: which.
-        contacts, found: how many press, and were reported.
-        icc: of the magnitude map; of the pressed shape where nothing presses hard enough to show
-            in it; where nothing presses at all, 1 if nothing was reported and else 0.
-        warned: whether a flag of `DISTRUST`, or the lack of a map, told not to trust it.
-        flags: names of all that were raised.
-        tier, reason, misfit, confidence: as reported.
-    """
-
+    # regime, case, method: which
     regime: str
     case: str
     method: str
+    # contacts, found: how many press, and were reported
     contacts: int
     found: int
+    # of the magnitude map; of the pressed shape where nothing presses hard enough to show in it;
+    # where nothing presses at all, 1 if nothing was reported and else 0
     icc: float
-    warned: bool
-    flags: tuple[str, ...]
+    warned: bool  # whether a flag of `DISTRUST`, or the lack of a map, told not to trust it
+    flags: tuple[str, ...]  # names of all that were raised
+    # tier, reason, misfit, confidence: as reported
     tier: str
     reason: str
     misfit: float

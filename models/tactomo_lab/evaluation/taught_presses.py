@@ -32,26 +32,18 @@ class SkinPresses:
 
 @dataclass(frozen=True)
 class Judgement:
-    """How far presses were located from where they were.
+    """How far presses were located from where they were."""
 
-    Attributes:
-        name: of the skin.
-        train: presses learnt from.
-        judged: presses judged.
-        median_mm, p95_mm: distances that half and 95 % of them are within.
-        within_sigma: share of coordinates within one standard uncertainty; 0.68 where that holds.
-        is_taught: share of presses of which the like was taught.
-        median_mm_since: medians of the quarters of all later presses, in order.
-    """
-
-    name: str
-    train: int
-    judged: int
+    name: str  # of the skin
+    train: int  # presses learnt from
+    judged: int  # presses judged
+    # median_mm, p95_mm: distances that half and 95 % of them are within
     median_mm: float
     p95_mm: float
+    # share of coordinates within one standard uncertainty; 0.68 where that holds
     within_sigma: float
-    is_taught: float
-    median_mm_since: tuple[float, ...]
+    is_taught: float  # share of presses of which the like was taught
+    median_mm_since: tuple[float, ...]  # medians of the quarters of all later presses, in order
 
 
 def read_skins(path: Path) -> list[SkinPresses]:

@@ -42,10 +42,6 @@ class TankModel:
         rings: of nodes between centre and rim.
 
     Attributes:
-        points: (N, 2) nodes, over the tank's radius.
-        triangles: (T, 3) nodes of each triangle.
-        pairs: (2, P) electrodes i <= j, whose transfer resistances are all there are.
-        nodes: (T, N) mean of the corners.
         empty: (P,) transfer resistances of the empty tank.
     """
 
@@ -53,8 +49,9 @@ class TankModel:
         sheet = mesh_sheet(description, description.width_m / 2 / rings, refinements=1)
         mesh = sheet.mesh
         self.description = description
-        self.points = mesh.p.T / (description.width_m / 2)
-        self.triangles = mesh.t.T
+        self.points = mesh.p.T / (description.width_m / 2)  # (N, 2) nodes, over the tank's radius
+        self.triangles = mesh.t.T  # (T, 3) nodes of each triangle
+        # (2, P) electrodes i <= j, whose transfer resistances are all there are
         self.pairs = np.array(np.triu_indices(description.electrode_count))
         p = mesh.p[:, mesh.t]  # (2, 3, T)
         edge = np.roll(p, -2, axis=1) - np.roll(p, -1, axis=1)  # opposite each corner
@@ -65,6 +62,7 @@ class TankModel:
         at = np.repeat(np.arange(count), 3), self.triangles.ravel()
         shape = count, nodes
         self._slope = [sp.csr_matrix((slope.T.ravel(), at), shape) for slope in slopes]
+        # (T, N) mean of the corners
         self.nodes = sp.csr_matrix((np.full(3 * count, 1 / 3), at), shape)
         self._system = assemble_sheet(description, sheet, np.ones(count))
         self.empty, self._fields = self.solve(np.ones(count))
@@ -108,9 +106,6 @@ class Readings:
         currents: (n, L) into the electrodes at each reading; a row's sum is 0.
         weights: (n, L) of the electrodes' potentials; a row's sum is 0.
         reference: (n,) readings of the empty tank, in the model's unit.
-
-    Attributes:
-        by_pair: (r, P) the numbers by the transfer resistances.
     """
 
     def __init__(
@@ -127,6 +122,7 @@ class Readings:
         away = np.diag(CONTACT * (one == other))[:, one == other]
         away = length[:, None] * (axes.T @ np.column_stack([away, WATER * model.empty]))
         root = np.linalg.cholesky(np.eye(len(length)) + away @ away.T)
+        # (r, P) the numbers by the transfer resistances
         self.by_pair = scipy.linalg.solve_triangular(root, length[:, None] * axes.T, lower=True)
         reduce = (weighted @ axes / length / noise[:, None]).T
         self._reduce = scipy.linalg.solve_triangular(root, reduce, lower=True)

@@ -98,28 +98,20 @@ def subject_of(
 
 
 class PressureCalibration(BaseModel):
-    """What was found for one sensor, and from what.
-
-    Attributes:
-        format: of the file.
-        tactomo: the version that made it.
-        subject: what it is of.
-        taken: when, ISO 8601, UTC.
-        readings: what it was fitted to.
-        magnitude, pressure_kpa, sigma_kpa: its curve, see `PressureCurve`.
-        onset_kpa, hysteresis_kpa, repeatability_kpa: see `Fit`; None where unknown.
-    """
+    """What was found for one sensor, and from what."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    format: Literal[1] = 1
-    tactomo: str
-    subject: Subject
-    taken: str
-    readings: tuple[Reading, ...]
+    format: Literal[1] = 1  # of the file
+    tactomo: str  # the version that made it
+    subject: Subject  # what it is of
+    taken: str  # when, ISO 8601, UTC
+    readings: tuple[Reading, ...]  # what it was fitted to
+    # magnitude, pressure_kpa, sigma_kpa: its curve, see `PressureCurve`
     magnitude: Points
     pressure_kpa: Points
     sigma_kpa: Points
+    # onset_kpa, hysteresis_kpa, repeatability_kpa: see `Fit`; None where unknown
     onset_kpa: float | None
     hysteresis_kpa: float | None
     repeatability_kpa: float

@@ -42,28 +42,18 @@ CLOCKS: Final = ("time_s", "realtime_s")
 
 @dataclass(frozen=True)
 class LoadCell:
-    """What a load cell said, line by line.
+    """What a load cell said, line by line."""
 
-    Attributes:
-        lines: (n,) numbers of the lines in the file.
-        pressure_kpa: (n,).
-        clock: "time_s", "realtime_s", or "" without times.
-        times_s: (n,) by that clock; NaN without.
-        magnitude, magnitude_sigma: (n,) what the sensor showed; NaN without.
-        contact_mm2: (n,) area that it showed; NaN without.
-        indenter_mm2: (n,) area of the indenter; NaN without.
-        directions: n of them, or none.
-    """
-
-    lines: NDArray[np.int64]
-    pressure_kpa: FloatArray
-    clock: str
-    times_s: FloatArray
+    lines: NDArray[np.int64]  # (n,) numbers of the lines in the file
+    pressure_kpa: FloatArray  # (n,)
+    clock: str  # "time_s", "realtime_s", or "" without times
+    times_s: FloatArray  # (n,) by that clock; NaN without
+    # magnitude, magnitude_sigma: (n,) what the sensor showed; NaN without
     magnitude: FloatArray
     magnitude_sigma: FloatArray
-    contact_mm2: FloatArray
-    indenter_mm2: FloatArray
-    directions: tuple[Direction, ...]
+    contact_mm2: FloatArray  # (n,) area that it showed; NaN without
+    indenter_mm2: FloatArray  # (n,) area of the indenter; NaN without
+    directions: tuple[Direction, ...]  # n of them, or none
 
     def direction(self, index: int) -> Direction:
         """Of the load at a line: by its column, or by the lines before."""
@@ -72,20 +62,14 @@ class LoadCell:
 
 @dataclass(frozen=True)
 class Seen:
-    """What a sensor showed, frame by frame.
+    """What a sensor showed, frame by frame."""
 
-    Attributes:
-        times_s: (n,) rising, by the load cell's clock.
-        magnitude, magnitude_sigma: (n,) of the only contact; NaN where there is none or several.
-        contact_mm2: (n,) its area, likewise.
-        contacts: (n,) how many there were.
-    """
-
-    times_s: FloatArray
+    times_s: FloatArray  # (n,) rising, by the load cell's clock
+    # magnitude, magnitude_sigma: (n,) of the only contact; NaN where there is none or several
     magnitude: FloatArray
     magnitude_sigma: FloatArray
-    contact_mm2: FloatArray
-    contacts: NDArray[np.int64]
+    contact_mm2: FloatArray  # (n,) its area, likewise
+    contacts: NDArray[np.int64]  # (n,) how many there were
 
 
 @dataclass(frozen=True)
@@ -231,20 +215,14 @@ def _of_one_area(
 
 
 class _Table:
-    """The file's cells by line and column.
-
-    Attributes:
-        columns: their names.
-        lines: the number of each row's line.
-        unknown: NaN for each row.
-    """
+    """The file's cells by line and column."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         lines = _lines(path)
         delimiter = max(",;\t", key=lines[0][1].count)
-        self.lines = [number for number, _ in lines[1:]]
-        self.columns: list[str] = []
+        self.lines = [number for number, _ in lines[1:]]  # the number of each row's line
+        self.columns: list[str] = []  # their names
         self._rows: list[dict[str, str]] = []
         for number, line in lines:
             try:
@@ -261,7 +239,7 @@ class _Table:
                 self._rows.append(dict(zip(self.columns, cells, strict=False)))
             else:
                 self.columns = [cell.lower() for cell in cells]
-        self.unknown = np.full(len(self._rows), np.nan)
+        self.unknown = np.full(len(self._rows), np.nan)  # NaN for each row
 
     def numbers(self, column: str, least: float = -MAX_NUMBER) -> FloatArray:
         values = np.empty(len(self._rows))

@@ -42,32 +42,22 @@ by 2 %; two skins of one make are 0.04 to 0.05 apart, made by hand 0.08 to 0.19.
 
 @dataclass(frozen=True)
 class TaughtSkin:
-    """What one sensor was taught.
+    """What one sensor was taught."""
 
-    Attributes:
-        subject: what it is of.
-        taken: when, ISO 8601, UTC.
-        channels: whose changes are learnt from, in order.
-        usable: (V,) of their changes, one channel after the other, those that all presses have.
-        changes: (N, V) of each press.
-        xy_mm: (N, 2) where each was.
-        guess_mm: (N, 2) where the physics had it; None where the voltages alone tell.
-        tiers: what made the contacts that places were corrected of.
-        without_mm, with_mm: median errors on presses held out, by the physics and as taught.
-        reference: (channels, M) volts of the unpressed skin then.
-    """
-
-    subject: Subject
-    taken: str
-    channels: tuple[Channel, ...]
+    subject: Subject  # what it is of
+    taken: str  # when, ISO 8601, UTC
+    channels: tuple[Channel, ...]  # whose changes are learnt from, in order
+    # (V,) of their changes, one channel after the other, those that all presses have
     usable: BoolArray
-    changes: FloatArray
-    xy_mm: FloatArray
+    changes: FloatArray  # (N, V) of each press
+    xy_mm: FloatArray  # (N, 2) where each was
+    # (N, 2) where the physics had it; None where the voltages alone tell
     guess_mm: FloatArray | None
-    tiers: frozenset[str]
+    tiers: frozenset[str]  # what made the contacts that places were corrected of
+    # without_mm, with_mm: median errors on presses held out, by the physics and as taught
     without_mm: float
     with_mm: float
-    reference: FloatArray
+    reference: FloatArray  # (channels, M) volts of the unpressed skin then
 
     @cached_property
     def regression(self) -> PressRegression:

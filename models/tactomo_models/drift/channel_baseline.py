@@ -40,9 +40,6 @@ class ChannelBaseline:
         subspace: the modes of the sensor's drift.
         tare: (M,) volts.
         usable: (M,) voltages that it is right about; nothing is learned from the others.
-
-    Attributes:
-        has_moved: whether what is in force is behind what is known by more than is worth a change.
     """
 
     def __init__(self, subspace: DriftSubspace, tare: FloatArray, usable: BoolArray) -> None:
@@ -51,6 +48,7 @@ class ChannelBaseline:
         self._per_tare = np.divide(1.0, tare, out=np.zeros_like(tare), where=usable)
         self._now = np.zeros(len(tare))  # as it is known; what is in force follows in steps
         self._in_force = self._now
+        # whether what is in force is behind what is known by more than is worth a change
         self.has_moved = False
         self._amounts = np.zeros(subspace.modes.shape[1])
         self._residual = np.zeros(len(tare))

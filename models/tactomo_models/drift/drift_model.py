@@ -42,14 +42,6 @@ class DriftSubspace:
     """The modes of one sensor's drift: the gain, the smooth ones, and one for each cell's creep.
 
     Making it takes a tenth of a second.
-
-    Attributes:
-        modes: (M, K) change of the logarithm of each voltage by a unit of each mode: a factor e
-            for the gain, a field of unit standard deviation for each smooth one together with the
-            others, a relative change of 1 for a cell.
-        smooth: places of the smooth modes among the K.
-        cells: places of the cells among the K.
-        cell_of_map: (nodes_y, nodes_x) the cell of each map node, from 0.
     """
 
     def __init__(self, description: SensorDescription, artifact: Artifact) -> None:
@@ -60,9 +52,14 @@ class DriftSubspace:
         predicted = scan_voltages(description, artifact.bare.transfer)
         cells = (own @ artifact.jacobian.T).T * np.sign(predicted)[:, None]
         smooth = self._smooth_modes(description)
+        # (M, K) change of the logarithm of each voltage by a unit of each mode: a factor e for the
+        # gain, a field of unit standard deviation for each smooth one together with the others, a
+        # relative change of 1 for a cell
         self.modes = np.hstack([np.ones((len(cells), 1)), smooth, cells])
-        self.smooth = slice(1, 1 + smooth.shape[1])
+        self.smooth = slice(1, 1 + smooth.shape[1])  # places of the smooth modes among the K
+        # places of the cells among the K
         self.cells = slice(1 + smooth.shape[1], self.modes.shape[1])
+        # (nodes_y, nodes_x) the cell of each map node, from 0
         self.cell_of_map = self._cell_of(*np.meshgrid(description.map_x_m, description.map_y_m))
 
     def _cell_of(self, x_m: FloatArray, y_m: FloatArray) -> IntArray:

@@ -43,22 +43,6 @@ class Examination:
         still: those in which nothing moves; loose leads are looked for in all.
         transfer: (L, L) transfer resistances of the sheet's model, if there is one.
         contrast: factor by which pressing changes conductivity at most.
-
-    Attributes:
-        count: scans at rest.
-        mean: (M,) of the scans at rest, volts.
-        noise: (M,) standard deviation of a scan; 0 where unknown.
-        is_moving: whether something moves even in the stillest scans.
-        has_noise: whether the noise is known.
-        is_frozen: whether scan after scan is the same to the last bit.
-        snr_db: (M,) of each voltage; NaN where unknown.
-        electrode_noise: (L,) how many times noisier than the others the voltages of each are.
-        sought: (M,) voltages that the instrument reads at all.
-        order: which leads are not where they belong.
-        verdict: what is wrong with the mean scan.
-        later: flags and bad electrodes of every single scan.
-        states: of each electrode: good, dead, loose, misread or swapped.
-        good: (M,) voltages that no bad electrode has part in; all where most are bad.
     """
 
     def __init__(
@@ -73,26 +57,35 @@ class Examination:
         self.wiring = wiring
         self.pairs = layout.pairs
         at_rest = scans[still]
-        self.count = len(at_rest)
-        self.mean = at_rest.mean(axis=0)
-        self.noise = noise_about_line(at_rest)
+        self.count = len(at_rest)  # scans at rest
+        self.mean = at_rest.mean(axis=0)  # (M,) of the scans at rest, volts
+        self.noise = noise_about_line(at_rest)  # (M,) standard deviation of a scan; 0 where unknown
+        # whether something moves even in the stillest scans
         self.is_moving = moves(wiring, at_rest)
+        # whether the noise is known
         self.has_noise = self.count >= MIN_SCANS_FOR_NOISE and not self.is_moving
+        # whether scan after scan is the same to the last bit
         self.is_frozen = self.count >= 3 and not self.noise.any()
+        # (M,) of each voltage; NaN where unknown
         self.snr_db = _decibels(np.abs(self.mean), self.noise)
         excess = _excess_noise(self.mean, self.noise)
+        # (L,) how many times noisier than the others the voltages of each are
         self.electrode_noise = np.array([np.median(excess[t]) for t in self.wiring.electrodes])
         of_mean = self.noise / np.sqrt(self.count)
+        # (M,) voltages that the instrument reads at all
         self.sought = _sought(wiring, layout, transfer)
-        self.order = self._order(layout, transfer, of_mean)
+        self.order = self._order(layout, transfer, of_mean)  # which leads are not where they belong
         expected = self.order.expected
         if (scans >= 0).all():  # a device that reports sizes alone
             expected = np.abs(expected)
+        # what is wrong with the mean scan
         self.verdict = examine_reference(
             self.wiring, self.mean, expected, of_mean, contrast, self.sought
         )
-        self.later = self._each(scans, contrast)
+        self.later = self._each(scans, contrast)  # flags and bad electrodes of every single scan
+        # of each electrode: good, dead, loose, misread or swapped
         self.states = self._states(layout.electrode_count, excess, expected)
+        # (M,) voltages that no bad electrode has part in; all where most are bad
         self.good = self._good()
 
     def _order(self, layout: Layout, transfer: FloatArray | None, noise: FloatArray) -> Order:

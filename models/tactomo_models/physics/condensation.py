@@ -61,19 +61,16 @@ class Condensation:
         neighbours: (n, most) of each node, filled up with -1.
         rim: (n,) nodes that are not to be eliminated, one at least in each area.
         corners: (t, 3) nodes of each triangle.
-
-    Attributes:
-        order: (n,) nodes area by area and, in each, by layers from the rim inwards.
-        depth: (n,) of the nodes in that order: 0 on a rim, 1 for its neighbours, and so on.
-        corners: (t, 3) of the triangles, by their places in that order.
     """
 
     def __init__(self, neighbours: IntArray, rim: BoolArray, corners: IntArray) -> None:
         area, depth = _areas(neighbours), _depths(neighbours, rim)
+        # (n,) nodes area by area and, in each, by layers from the rim inwards
         self.order = np.lexsort((depth, area))
         place = np.empty_like(self.order)
         place[self.order] = np.arange(len(place))
-        self.corners = place[corners]
+        self.corners = place[corners]  # (t, 3) of the triangles, by their places in that order
+        # (n,) of the nodes in that order: 0 on a rim, 1 for its neighbours, and so on
         self.depth = depth[self.order]
         first = np.append(True, (np.diff(self.depth) != 0) | (np.diff(area[self.order]) != 0))
         self._is_rim = self.depth[first] == 0

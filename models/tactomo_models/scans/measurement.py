@@ -61,15 +61,13 @@ class Comparator:
         description: the sensor.
         artifact: what is precomputed for it.
         forward: the model of its sheet.
-
-    Attributes:
-        channels: those that the reference has; others after a tare.
     """
 
     def __init__(
         self, description: SensorDescription, artifact: Artifact, forward: ForwardModel
     ) -> None:
         much_more = 5.0  # ratio of the channels' contrasts (logarithms) for that
+        # those that the reference has; others after a tare
         self.channels: dict[Channel, MeasuredChannel] = {}
         self._description, self._artifact, self._forward = description, artifact, forward
         self._wiring = Wiring(description)

@@ -23,10 +23,6 @@ class Polarity:
         description: the sensor; says whether its instrument tells signs.
         wiring: of the same sensor.
         predicted: (M,) voltages of the bare sheet by the model, on any scale.
-
-    Attributes:
-        certain: (M,) readings whose sign is known; all of them where the device tells it, and the
-            half that it reads where it reads but one sign.
     """
 
     def __init__(
@@ -37,6 +33,8 @@ class Polarity:
         kind = description.instrument.voltages
         self._are_told = kind == "signed"
         self._model = np.sign(predicted)
+        # (M,) readings whose sign is known; all of them where the device tells it, and the half
+        # that it reads where it reads but one sign
         self.certain = wiring.ordered | (np.abs(predicted) > least) | self._are_told
         if kind in ("positive", "negative"):
             self.certain &= self._model == (1.0 if kind == "positive" else -1.0)

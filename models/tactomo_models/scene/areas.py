@@ -26,18 +26,14 @@ class Areas:
 
 
 class AreaFinder:
-    """Splits an image of what is pressed into separate areas.
-
-    Attributes:
-        places: (2, P) x and y of the pressable nodes, metres.
-        node_areas_m2: (P,) share of the sheet's area that belongs to each.
-        nearest: row and column (P,) of the map node next to each.
-    """
+    """Splits an image of what is pressed into separate areas."""
 
     def __init__(self, forward: ForwardModel) -> None:
         description = forward.description
+        # (2, P) x and y of the pressable nodes, metres
         self.places = forward.bare.points[:, forward.bare.pressable]
         self._map_weights = forward.bare.map_weights
+        # (P,) share of the sheet's area that belongs to each
         self.node_areas_m2 = forward.node_areas_m2
         self._x, self._y = np.meshgrid(description.map_x_m, description.map_y_m)
         self._cell_m2 = (description.map_x_m[1] - description.map_x_m[0]) * (
@@ -46,6 +42,7 @@ class AreaFinder:
         x, y = self.places
         column = np.abs(x[:, None] - description.map_x_m).argmin(axis=1)
         row = np.abs(y[:, None] - description.map_y_m).argmin(axis=1)
+        # row and column (P,) of the map node next to each
         self.nearest: tuple[IntArray, IntArray] = (row, column)
 
     @property

@@ -97,13 +97,10 @@ class Budget:
 
     A model and not a clock: the steps taken, and so the maps, must not depend on how busy the
     machine was.
-
-    Attributes:
-        left_s: seconds left.
     """
 
     def __init__(self, seconds: float) -> None:
-        self.left_s = seconds
+        self.left_s = seconds  # seconds left
 
     @property
     def over(self) -> bool:
@@ -125,16 +122,14 @@ class FieldFit:
         description: the sensor; that of `forward` if None.
 
     Attributes:
-        forward: the model of an even sheet.
-        sheets: each sheet as it is, where the tare has told; the even one elsewhere.
-        responses: of each sheet.
         likely: logarithm of the structure sheet's ratio, as likely as any.
     """
 
     def __init__(self, forward: ForwardModel, description: SensorDescription | None = None) -> None:
         description = description or forward.description
-        self.forward = forward
-        self.responses: dict[Channel, SheetResponse] = responses_of(description)
+        self.forward = forward  # the model of an even sheet
+        self.responses: dict[Channel, SheetResponse] = responses_of(description)  # of each sheet
+        # each sheet as it is, where the tare has told; the even one elsewhere
         self.sheets: dict[Channel, ForwardModel] = {}
         saturated = np.log(10.0)
         if description.structure is not None:

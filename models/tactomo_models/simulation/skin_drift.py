@@ -65,14 +65,12 @@ class DriftingSkin:
     Args:
         simulator: the skin as it was made.
         seed: of how unevenly it drifts.
-
-    Attributes:
-        drift: may be replaced between two calls, by another thread, too.
     """
 
     def __init__(
         self, simulator: SkinSimulator, drift: SkinDrift | None = None, seed: int = 0
     ) -> None:
+        # may be replaced between two calls, by another thread, too
         self.drift = drift or SkinDrift()
         self._simulator = simulator
         self._seed = seed

@@ -41,22 +41,17 @@ COLUMNS: Final = (
 
 @dataclass(frozen=True)
 class Held:
-    """A press that was still for a while.
+    """A press that was still for a while."""
 
-    Attributes:
-        magnitude, magnitude_sigma, contact_mm2: means.
-        x_mm, y_mm: its place.
-        frames: how many were averaged.
-        realtime_s: of the last one.
-    """
-
+    # magnitude, magnitude_sigma, contact_mm2: means
     magnitude: float
     magnitude_sigma: float
     contact_mm2: float
+    # x_mm, y_mm: its place
     x_mm: float
     y_mm: float
-    frames: int
-    realtime_s: float
+    frames: int  # how many were averaged
+    realtime_s: float  # of the last one
 
 
 def guided(

@@ -57,36 +57,25 @@ class Heard(NamedTuple):
 
 @dataclass
 class Evidence:
-    """What was gathered.
+    """What was gathered."""
 
-    Attributes:
-        title: of what.
-        layout: the sensor's description, or a pattern alone.
-        scans: (T, M) volts of each channel.
-        times_s: (T,) when they were taken, on the device's clock; None where unknown.
-        saturated: scans of each channel of which the device said that it clipped.
-        heard: how they came; None for a file of arrays.
-        before, after: the daemon's status then; empty but for a daemon.
-        ages_ms: (n,) of the frames when they were published.
-        flags: frames by the flags that they had.
-        pressed: frames with a contact.
-        frames: frames that came.
-        notes: how it was read, for people.
-    """
-
-    title: str
-    layout: Layout
-    scans: dict[str, FloatArray]
+    title: str  # of what
+    layout: Layout  # the sensor's description, or a pattern alone
+    scans: dict[str, FloatArray]  # (T, M) volts of each channel
+    # (T,) when they were taken, on the device's clock; None where unknown
     times_s: dict[str, FloatArray | None]
+    # scans of each channel of which the device said that it clipped
     saturated: dict[str, int] = field(default_factory=dict)
-    heard: Heard | None = None
+    heard: Heard | None = None  # how they came; None for a file of arrays
+    # before, after: the daemon's status then; empty but for a daemon
     before: Mapping[str, Any] = field(default_factory=dict)
     after: Mapping[str, Any] = field(default_factory=dict)
+    # (n,) of the frames when they were published
     ages_ms: FloatArray = field(default_factory=lambda: np.zeros(0))
-    flags: dict[str, int] = field(default_factory=dict)
-    pressed: int = 0
-    frames: int = 0
-    notes: tuple[str, ...] = ()
+    flags: dict[str, int] = field(default_factory=dict)  # frames by the flags that they had
+    pressed: int = 0  # frames with a contact
+    frames: int = 0  # frames that came
+    notes: tuple[str, ...] = ()  # how it was read, for people
 
 
 def of_daemon(

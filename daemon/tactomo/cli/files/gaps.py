@@ -14,17 +14,13 @@ what is less (ntpd up to 0.128 s, and by at most 0.5 ms a second)."""
 
 
 class Gaps:
-    """Counts what is missing or odd among frames that pass by; nothing is filled in.
-
-    Attributes:
-        first_step_s: by how much the wall clock was set first, s; 0 where it was not.
-    """
+    """Counts what is missing or odd among frames that pass by; nothing is filled in."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
         self._first_s: dict[str, float] = {}
         self._flags: Counter[str] = Counter()
-        self.first_step_s = 0.0
+        self.first_step_s = 0.0  # by how much the wall clock was set first, s; 0 where it was not
         self._last: Moment | None = None
 
     def watch(self, moments: Iterator[Moment]) -> Iterator[Moment]:
