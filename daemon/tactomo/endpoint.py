@@ -92,23 +92,17 @@ def check_metrics_address(address: str) -> str:
 
 
 def bind(
-    socket: zmq.Socket[bytes],
-    endpoint: str,
-    purpose: str,
+    socket: zmq.Socket[bytes],  # a socket that has not been bound
+    endpoint: str,  # where to
+    purpose: str,  # what it is for, also the domain under which a `AccessControl` knows it
     *,
-    secret: bytes | None = None,
+    secret: bytes | None = None,  # the server's secret CURVE key; None where the address needs none
+    # the command line's option for another address; by default named as the purpose
     option: str = "",
 ) -> str:
     """Bind `socket` and return its address, with the port that was chosen where any would do.
 
     The socket is closed when that fails.
-
-    Args:
-        socket: a socket that has not been bound.
-        endpoint: where to.
-        purpose: what it is for, also the domain under which a `AccessControl` knows it.
-        secret: the server's secret CURVE key; None where the address needs none.
-        option: the command line's option for another address; by default named as the purpose.
 
     Raises:
         AddressError: the address is in use, cannot be had, or can be reached from other computers

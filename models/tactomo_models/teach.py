@@ -67,21 +67,14 @@ def read_presses(path: Path, description: SensorDescription) -> KnownPresses:
 
 
 def teach(
-    presses: KnownPresses,
-    description: SensorDescription,
-    subject: Subject,
+    presses: KnownPresses,  # at known places
+    description: SensorDescription,  # the sensor
+    subject: Subject,  # what they are of
     *,
-    keep_odd: bool = False,
-    progress: Progress | None = None,
+    keep_odd: bool = False,  # learn also from presses that the others contradict
+    progress: Progress | None = None,  # called with presses done and presses in all
 ) -> tuple[TaughtSkin, list[str]]:
     """Learn from presses; also, in words, what was left out.
-
-    Args:
-        presses: at known places.
-        description: the sensor.
-        subject: what they are of.
-        keep_odd: learn also from presses that the others contradict.
-        progress: called with presses done and presses in all.
 
     Raises:
         CalibrationError: they are too few, contradict each other or the sensor, or teach nothing.

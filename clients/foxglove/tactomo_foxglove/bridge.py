@@ -44,15 +44,6 @@ class BridgeError(ClientError):
 class Bridge:
     """Serves one or several sensors of one stream. Use it in a `with` block.
 
-    Args:
-        sensors: their names in the stream.
-        stream: the daemon's stream, or that of `tactomo zenoh --bind`.
-        host: the address to listen on.
-        port: the port to listen on; 0 takes a free one.
-        keys: for a daemon beyond this computer.
-        placement: where the sensor hangs; of several, all hang there.
-        origins: of further web pages that may look, such as ``http://localhost:8080``.
-
     Raises:
         BridgeError: the address cannot be listened on.
         ClientError: a name is no sensor's, or `stream` no address.
@@ -60,12 +51,13 @@ class Bridge:
 
     def __init__(
         self,
-        sensors: Sequence[str],
-        stream: str,
-        host: str = DEFAULT_HOST,
-        port: int = DEFAULT_PORT,
-        keys: Keys | None = None,
-        placement: Placement | None = None,
+        sensors: Sequence[str],  # their names in the stream
+        stream: str,  # the daemon's stream, or that of `tactomo zenoh --bind`
+        host: str = DEFAULT_HOST,  # the address to listen on
+        port: int = DEFAULT_PORT,  # the port to listen on; 0 takes a free one
+        keys: Keys | None = None,  # for a daemon beyond this computer
+        placement: Placement | None = None,  # where the sensor hangs; of several, all hang there
+        # of further web pages that may look, such as ``http://localhost:8080``
         origins: Sequence[str] = (),
     ) -> None:
         topics = [topic(sensor, kind) for sensor in sensors for kind in (MAP, STATUS, EVENT)]

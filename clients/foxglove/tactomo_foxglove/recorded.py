@@ -17,22 +17,15 @@ PROFILE = "tactomo-foxglove"
 
 
 def write_mcap(
+    # in the order of their times: when each was acquired, nanoseconds since 1970; the frame; and
+    # how old it was when it was published, seconds, if that is known
     frames: Iterable[tuple[int, Frame, float | None]],
-    file: IO[bytes],
-    sensor: str,
-    description: Mapping[str, Any],
-    placement: Placement | None = None,
+    file: IO[bytes],  # a file opened for writing, which stays open
+    sensor: str,  # the sensor's name
+    description: Mapping[str, Any],  # the sensor, as `status` has it; empty where it is not known
+    placement: Placement | None = None,  # where the sensor hangs
 ) -> int:
-    """Write frames as an MCAP file, and return how many there were; one at a time is in memory.
-
-    Args:
-        frames: in the order of their times: when each was acquired, nanoseconds since 1970; the
-            frame; and how old it was when it was published, seconds, if that is known.
-        file: a file opened for writing, which stays open.
-        sensor: the sensor's name.
-        description: the sensor, as `status` has it; empty where it is not known.
-        placement: where the sensor hangs.
-    """
+    """Write frames as an MCAP file, and return how many there were; one at a time is in memory."""
     context = foxglove.Context()
     transforms = FrameTransformsChannel("/tf", context=context)
     topics = SensorTopics(sensor, context, transforms, placement or Placement())

@@ -45,25 +45,17 @@ class ViewerError(ClientError):
 
 
 class Viewer:
-    """One sensor's web page: what all open pages share, one feed, one link to daemon and twin.
-
-    Args:
-        sensor: the sensor's name in the daemon's configuration.
-        stream: the daemon's stream.
-        control: the daemon's control socket.
-        twin: the twin's control socket, where there is a twin.
-        host: the address to listen on; on any but a loopback one the viewer only shows.
-        keys: for a daemon beyond this computer.
-    """
+    """One sensor's web page: what all open pages share, one feed, one link to daemon and twin."""
 
     def __init__(
         self,
-        sensor: str,
-        stream: str = DEFAULT_STREAM,
-        control: str = DEFAULT_CONTROL,
-        twin: str | None = None,
+        sensor: str,  # the sensor's name in the daemon's configuration
+        stream: str = DEFAULT_STREAM,  # the daemon's stream
+        control: str = DEFAULT_CONTROL,  # the daemon's control socket
+        twin: str | None = None,  # the twin's control socket, where there is a twin
+        # the address to listen on; on any but a loopback one the viewer only shows
         host: str = DEFAULT_HOST,
-        keys: Keys | None = None,
+        keys: Keys | None = None,  # for a daemon beyond this computer
     ) -> None:
         may_command = is_loopback(host)
         self._about = {"sensor": sensor, "stream": stream, "read_only": not may_command}

@@ -48,35 +48,21 @@ UNANSWERED_S: Final = 3.0
 
 
 class PortReader(Worker):
-    """One port. `open` it, `start` its thread, `stop` it.
-
-    Args:
-        index: its number among the sensor's ports.
-        url: a device's path or a pyserial URL.
-        baud: of a real UART.
-        protocol: what its device speaks; it belongs to the thread from `start` on.
-        description: the sensor that the device must fit.
-        device_ids: those that may speak here; any where it is empty.
-        recorder: gets every byte while it records.
-        deliver: called by the thread with what each read brought.
-        on_event: told what happens.
-        root: the folder of `/sys` and `/dev`.
-        playback: the replay's time, where the port replays.
-    """
+    """One port. `open` it, `start` its thread, `stop` it."""
 
     def __init__(
         self,
-        index: int,
-        url: str,
-        baud: int,
-        protocol: PortProtocol,
-        description: SensorDescription,
-        device_ids: Collection[str],
-        recorder: Recorder,
-        deliver: Callable[[Delivery], None],
-        on_event: OnEvent,
-        root: Path = ROOT,
-        playback: Playback | None = None,
+        index: int,  # its number among the sensor's ports
+        url: str,  # a device's path or a pyserial URL
+        baud: int,  # of a real UART
+        protocol: PortProtocol,  # what its device speaks; it belongs to the thread from `start` on
+        description: SensorDescription,  # the sensor that the device must fit
+        device_ids: Collection[str],  # those that may speak here; any where it is empty
+        recorder: Recorder,  # gets every byte while it records
+        deliver: Callable[[Delivery], None],  # called by the thread with what each read brought
+        on_event: OnEvent,  # told what happens
+        root: Path = ROOT,  # the folder of `/sys` and `/dev`
+        playback: Playback | None = None,  # the replay's time, where the port replays
     ) -> None:
         super().__init__(f"port-{index}")
         self.index = index

@@ -28,25 +28,17 @@ class _Foreign(NamedTuple):
 
 
 class CalibrationInForce:
-    """The pressure calibration in force; the reconstructor's curve and the recording follow it.
-
-    Args:
-        description: the sensor, whose own curve is used where there is no calibration.
-        reconstructor: is given the curve.
-        marks: told of each new calibration.
-        on_event: told of a calibration that is another device's.
-        calibration: the sensor's own; None where there is none.
-        taught: what the sensor was taught; None where nothing was.
-    """
+    """The pressure calibration in force; the reconstructor's curve and the recording follow it."""
 
     def __init__(
         self,
+        # the sensor, whose own curve is used where there is no calibration
         description: SensorDescription,
-        reconstructor: Reconstructor,
-        marks: FrameMarks,
-        on_event: OnEvent,
-        calibration: PressureCalibration | None,
-        taught: TaughtSkin | None,
+        reconstructor: Reconstructor,  # is given the curve
+        marks: FrameMarks,  # told of each new calibration
+        on_event: OnEvent,  # told of a calibration that is another device's
+        calibration: PressureCalibration | None,  # the sensor's own; None where there is none
+        taught: TaughtSkin | None,  # what the sensor was taught; None where nothing was
     ) -> None:
         # the calibration that is used; None for the description's curve
         self.in_force: PressureCalibration | None = None

@@ -59,35 +59,23 @@ log = structlog.get_logger()
 
 
 class Imaging:
-    """Reconstructs dual scans against the reference in force, and publishes the frames.
-
-    Args:
-        description: the sensor.
-        reconstructor: belongs to this class from now on.
-        machine_speed: what turns a budget of time into one of work.
-        calibration: of pressure, the sensor's own; None for the description's curve.
-        taught: what the sensor was taught; None where nothing was.
-        tare_scans: dual scans for a reference.
-        baseline: whether and how fast the reference follows the skin.
-        kept: the sensor's last reference; None where it is neither used nor kept.
-        recorder: is told of which scans frames were made.
-        publisher: gets the frames.
-        on_event: told what people should know.
-    """
+    """Reconstructs dual scans against the reference in force, and publishes the frames."""
 
     def __init__(
         self,
-        description: SensorDescription,
-        reconstructor: Reconstructor,
-        machine_speed: MachineSpeed,
+        description: SensorDescription,  # the sensor
+        reconstructor: Reconstructor,  # belongs to this class from now on
+        machine_speed: MachineSpeed,  # what turns a budget of time into one of work
+        # of pressure, the sensor's own; None for the description's curve
         calibration: PressureCalibration | None,
-        taught: TaughtSkin | None,
-        tare_scans: int,
-        baseline: BaselineConfig,
+        taught: TaughtSkin | None,  # what the sensor was taught; None where nothing was
+        tare_scans: int,  # dual scans for a reference
+        baseline: BaselineConfig,  # whether and how fast the reference follows the skin
+        # the sensor's last reference; None where it is neither used nor kept
         kept: KeptReference | None,
-        recorder: Recorder,
-        publisher: Publisher,
-        on_event: OnEvent,
+        recorder: Recorder,  # is told of which scans frames were made
+        publisher: Publisher,  # gets the frames
+        on_event: OnEvent,  # told what people should know
     ) -> None:
         # what changes are measured against; None before the first tare
         self.reference: Reference | None = None

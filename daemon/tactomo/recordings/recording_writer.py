@@ -276,25 +276,17 @@ def create(path: Path, origin: Origin) -> RecordingWriter:
 
 
 def write_recording(
-    path: str | Path,
-    hello: Hello,
-    scans: Iterable[tuple[float, Scan]],
+    path: str | Path,  # the file to write; it must not exist
+    hello: Hello,  # what the device would have said it is; repeated every second
+    scans: Iterable[tuple[float, Scan]],  # each with its time in seconds since the first, ascending
     *,
-    sensor: str,
-    description: str,
-    description_sha256: str,
+    sensor: str,  # the sensor's name
+    description: str,  # the sensor description's name or path
+    description_sha256: str,  # that description's hash
+    # the reference to be used on replay; None leaves that to the replay's tare
     reference: Reference | None = None,
 ) -> int:
     """Write a recording of scans that came from elsewhere, as one port would have said them.
-
-    Args:
-        path: the file to write; it must not exist.
-        hello: what the device would have said it is; repeated every second.
-        scans: each with its time in seconds since the first, ascending.
-        sensor: the sensor's name.
-        description: the sensor description's name or path.
-        description_sha256: that description's hash.
-        reference: the reference to be used on replay; None leaves that to the replay's tare.
 
     Returns the length of the file in bytes.
 

@@ -99,15 +99,6 @@ log = structlog.get_logger()
 class Daemon:
     """One sensor's daemon, to be run in this process.
 
-    Args:
-        config: what it serves.
-        reconstructor: what makes maps of voltages; by default the description's own, with an
-            artifact that is built if need be. Only that one can tell a load at the start by the
-            reference of before.
-        machine_speed: what turns a budget of time into one of work; by default what was measured on
-            this machine, if that was.
-        artifact: the description's; by default read, and built if need be.
-
     Raises:
         ModelError: the description or the artifact cannot be used.
         ConfigError: the ports are not all live, or not all of one recording.
@@ -117,10 +108,15 @@ class Daemon:
 
     def __init__(
         self,
-        config: DaemonConfig,
+        config: DaemonConfig,  # what it serves
         *,
+        # what makes maps of voltages; by default the description's own, with an artifact that is
+        # built if need be. Only that one can tell a load at the start by the reference of before
         reconstructor: Reconstructor | None = None,
+        # what turns a budget of time into one of work; by default what was measured on this
+        # machine, if that was
         machine_speed: MachineSpeed | None = None,
+        # the description's; by default read, and built if need be
         artifact: Artifact | None = None,
     ) -> None:
         self.config = config

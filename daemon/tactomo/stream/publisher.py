@@ -58,23 +58,18 @@ class Publisher(Worker):
     """Numbers, stamps and sends messages; publishes the status every second, or when asked to.
 
     `open` it, `start` its thread, `stop` it.
-
-    Args:
-        sensor: the name in every topic.
-        session: identity of this run of the daemon.
-        status: returns the current fields of a `status` message; called by the thread.
-        on_frame: called by the thread with kind and bytes of each frame's message, before it is
-            sent: whatever was seen is in the recording.
-        on_event: told of a flood of subscriptions, and of messages that cannot be sent.
     """
 
     def __init__(
         self,
-        sensor: str,
-        session: str,
+        sensor: str,  # the name in every topic
+        session: str,  # identity of this run of the daemon
+        # returns the current fields of a `status` message; called by the thread
         status: Callable[[], Mapping[str, Any]],
+        # called by the thread with kind and bytes of each frame's message, before it is sent:
+        # whatever was seen is in the recording
         on_frame: Callable[[str, bytes], None],
-        on_event: OnEvent,
+        on_event: OnEvent,  # told of a flood of subscriptions, and of messages that cannot be sent
     ) -> None:
         super().__init__("publisher")
         self.address = ""  # where it is bound, once open

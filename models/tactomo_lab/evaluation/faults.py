@@ -17,21 +17,13 @@ Reading = Callable[[int, float], float]
 
 
 def with_lead(
-    description: SensorDescription,
-    volts: FloatArray,
-    electrode: int,
-    current: float,
-    reading: Reading,
+    description: SensorDescription,  # the sensor
+    volts: FloatArray,  # (M,) what a good device reads
+    electrode: int,  # whose lead it is
+    current: float,  # share of the current that still passes
+    reading: Reading,  # from the drive and the potential there, in volts, to what is read
 ) -> FloatArray:
-    """Voltages (M,) of a skin with a bad lead; adjacent patterns only.
-
-    Args:
-        description: the sensor.
-        volts: (M,) what a good device reads.
-        electrode: whose lead it is.
-        current: share of the current that still passes.
-        reading: from the drive and the potential there, in volts, to what is read.
-    """
+    """Voltages (M,) of a skin with a bad lead; adjacent patterns only."""
     drive, measure = description.pairs.drive, description.pairs.measure
     volts = np.where((drive == electrode).any(axis=1), current * volts, volts)
     count = description.electrode_count

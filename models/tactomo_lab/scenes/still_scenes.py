@@ -100,24 +100,17 @@ class EvaluationScene:
 
 
 def scenes(
-    description: SensorDescription,
+    description: SensorDescription,  # the sensor; needs both channels
+    # "tuning" for whoever chooses a constant by what comes out, "reporting" for figures that are
+    # published
     seed_set: SeedSet,
-    count: int,
+    count: int,  # scenes of each number of contacts
     *,
-    contacts: Iterable[int] = CONTACTS,
-    snr_db: float = 40.0,
-    snr_of: SnrOf = "change",
+    contacts: Iterable[int] = CONTACTS,  # how many contacts
+    snr_db: float = 40.0,  # signal-to-noise ratio in decibels
+    snr_of: SnrOf = "change",  # what the noise is measured by; see `noise_std`
 ) -> Iterator[EvaluationScene]:
     """Scenes of a seed set, `count` of each number of contacts; the same ones every time.
-
-    Args:
-        description: the sensor; needs both channels.
-        seed_set: "tuning" for whoever chooses a constant by what comes out, "reporting" for
-            figures that are published.
-        count: scenes of each number of contacts.
-        contacts: how many contacts.
-        snr_db: signal-to-noise ratio in decibels.
-        snr_of: what the noise is measured by; see `noise_std`.
 
     Raises:
         DataError: the sensor has a single channel, or no room for that many contacts.

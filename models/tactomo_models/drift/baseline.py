@@ -150,19 +150,14 @@ class BaselineTracker:
 
     def reconstruct(
         self,
-        time_s: float,
-        magnitude: FloatArray | None,
-        structure: FloatArray | None,
+        time_s: float,  # when it was acquired, on any steady clock
+        magnitude: FloatArray | None,  # (M,) volts; None if that scan is missing
+        structure: FloatArray | None,  # (M,) volts; None if that scan is missing
         *,
+        # channels whose device says that its converter clipped this scan
         saturated: Collection[Channel] = (),
     ) -> Reconstruction:
         """Reconstruct one frame; before, the reference moves if need be.
-
-        Args:
-            time_s: when it was acquired, on any steady clock.
-            magnitude: (M,) volts; None if that scan is missing.
-            structure: (M,) volts; None if that scan is missing.
-            saturated: channels whose device says that its converter clipped this scan.
 
         Raises:
             DataError: a scan has another number of voltages than the sensor.

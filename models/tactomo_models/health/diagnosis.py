@@ -51,26 +51,19 @@ class Diagnosis:
 
 
 def diagnose(
-    layout: Layout,
-    scans: FloatArray,
+    layout: Layout,  # the sensor's description, or its pattern alone
+    scans: FloatArray,  # (T, M) volts, on any scale
     *,
-    times_s: FloatArray | None = None,
+    times_s: FloatArray | None = None,  # (T,) when each was taken; drift stays unknown without
+    # (L, L) transfer resistances of the sheet's model, see `BareSheet`; without them voltages are
+    # held against their likes further round the rim
     transfer: FloatArray | None = None,
-    contrast: float = 100.0,
-    saturated: int = 0,
+    contrast: float = 100.0,  # factor by which pressing changes conductivity at most
+    saturated: int = 0,  # scans of which the device said that it clipped
 ) -> Diagnosis:
     """Examine scans of a skin on which nothing presses.
 
     Where something does, the stillest scans are looked at for all but clipping and loose leads.
-
-    Args:
-        layout: the sensor's description, or its pattern alone.
-        scans: (T, M) volts, on any scale.
-        times_s: (T,) when each was taken; drift stays unknown without.
-        transfer: (L, L) transfer resistances of the sheet's model, see `BareSheet`; without them
-            voltages are held against their likes further round the rim.
-        contrast: factor by which pressing changes conductivity at most.
-        saturated: scans of which the device said that it clipped.
 
     Raises:
         DataError: there is no whole scan, or it has another number of voltages than the pattern.

@@ -34,25 +34,17 @@ BROKEN_SHARE = 1 / 3  # of the electrodes: so many are not broken one by one
 
 
 class Examination:
-    """All that is worked out from the scans of one channel, before it is put into words.
-
-    Args:
-        wiring: of the layout.
-        layout: the sensor's description, or its pattern alone.
-        scans: (T, M) volts.
-        still: those in which nothing moves; loose leads are looked for in all.
-        transfer: (L, L) transfer resistances of the sheet's model, if there is one.
-        contrast: factor by which pressing changes conductivity at most.
-    """
+    """All that is worked out from the scans of one channel, before it is put into words."""
 
     def __init__(
         self,
-        wiring: Wiring,
-        layout: Layout,
-        scans: FloatArray,
-        still: slice,
+        wiring: Wiring,  # of the layout
+        layout: Layout,  # the sensor's description, or its pattern alone
+        scans: FloatArray,  # (T, M) volts
+        still: slice,  # those in which nothing moves; loose leads are looked for in all
+        # (L, L) transfer resistances of the sheet's model, if there is one
         transfer: FloatArray | None,
-        contrast: float,
+        contrast: float,  # factor by which pressing changes conductivity at most
     ) -> None:
         self.wiring = wiring
         self.pairs = layout.pairs

@@ -27,24 +27,18 @@ class Order:
 
 
 def find_order(
-    description: SensorDescription,
-    transfer: FloatArray,
+    description: SensorDescription,  # the sensor
+    transfer: FloatArray,  # (L, L) the model's transfer resistances
+    # (M,) measured, on any scale; where none is negative, sizes alone are compared
     volts: FloatArray,
-    noise: FloatArray,
-    sought: BoolArray | bool = True,
+    noise: FloatArray,  # (M,) their standard deviation
+    sought: BoolArray | bool = True,  # (M,) those to go by
 ) -> Order:
     """Find the order of leads that explains the voltages (M,) of an unpressed skin.
 
     Where the order of the description does not, all leads are turned, or else one exchange of two
     leads at a time is taken, the one that explains most, and only where it halves the deviation.
     A turn by what leaves the sheet the same, such as a quarter of a square, cannot be seen.
-
-    Args:
-        description: the sensor.
-        transfer: (L, L) the model's transfer resistances.
-        volts: (M,) measured, on any scale; where none is negative, sizes alone are compared.
-        noise: (M,) their standard deviation.
-        sought: (M,) those to go by.
     """
     known = np.broadcast_to(sought, volts.shape)
     is_unsigned = bool((volts >= 0).all())

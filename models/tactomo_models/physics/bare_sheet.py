@@ -50,26 +50,21 @@ class BareSheet:
 
 
 def solve_bare_sheet(
-    description: SensorDescription,
-    sheet: SheetMesh,
+    description: SensorDescription,  # the sensor
+    sheet: SheetMesh,  # its mesh of N nodes
+    # (N,) of an uneven sheet, relative to the description's; 1 if None
     conductivity: FloatArray | None = None,
+    # (L,) contact impedances, relative to the description's; 1 if None
     impedance: FloatArray | None = None,
     *,
+    # leave the Green's function in pieces: a tenth of the time and memory, but a newly pressed area
+    # then costs a millisecond more
     quick: bool = False,
+    # a sheet of the same mesh, before its electrodes were moved: what can be pressed, and where
+    # that is on the map, is as on that one. Found anew if None
     drawn_on: BareSheet | None = None,
 ) -> BareSheet:
-    """Assemble and solve the complete electrode model of an unpressed sheet.
-
-    Args:
-        description: the sensor.
-        sheet: its mesh of N nodes.
-        conductivity: (N,) of an uneven sheet, relative to the description's; 1 if None.
-        impedance: (L,) contact impedances, relative to the description's; 1 if None.
-        quick: leave the Green's function in pieces: a tenth of the time and memory, but a newly
-            pressed area then costs a millisecond more.
-        drawn_on: a sheet of the same mesh, before its electrodes were moved: what can be pressed,
-            and where that is on the map, is as on that one. Found anew if None.
-    """
+    """Assemble and solve the complete electrode model of an unpressed sheet."""
     mesh = sheet.mesh
     # The integral of a linear conductivity over a triangle is that of its corners' mean.
     nodal = np.ones(mesh.p.shape[1]) if conductivity is None else conductivity
@@ -100,18 +95,13 @@ def solve_bare_sheet(
 
 
 def transfer_resistances(
-    description: SensorDescription,
-    sheet: SheetMesh,
-    conductivity: FloatArray,
+    description: SensorDescription,  # the sensor
+    sheet: SheetMesh,  # its mesh of T triangles
+    conductivity: FloatArray,  # (T,) of each triangle, relative to the bare sheet's
+    # (L,) contact impedances, relative to the description's; 1 if None
     impedance: FloatArray | None = None,
 ) -> FloatArray:
     """Solve a sheet of any conductivity directly: a fraction of a second, no Green's function.
-
-    Args:
-        description: the sensor.
-        sheet: its mesh of T triangles.
-        conductivity: (T,) of each triangle, relative to the bare sheet's.
-        impedance: (L,) contact impedances, relative to the description's; 1 if None.
 
     Returns:
         (L, L) electrode potentials for a unit current into each electrode and out of the last;
@@ -195,18 +185,13 @@ def _conduction(u: Any, v: Any, w: Any) -> Any:
 
 
 def assemble_sheet(
-    description: SensorDescription,
-    sheet: SheetMesh,
-    conductivity: FloatArray,
+    description: SensorDescription,  # the sensor
+    sheet: SheetMesh,  # its mesh of N nodes and T triangles
+    conductivity: FloatArray,  # (T,) of each triangle, relative to the description's
+    # (L,) contact impedances, relative to the description's; 1 if None
     impedance: FloatArray | None = None,
 ) -> sp.csc_matrix:
     """Assemble the complete electrode model.
-
-    Args:
-        description: the sensor.
-        sheet: its mesh of N nodes and T triangles.
-        conductivity: (T,) of each triangle, relative to the description's.
-        impedance: (L,) contact impedances, relative to the description's; 1 if None.
 
     Returns:
         (N + L - 1, N + L - 1), symmetric positive definite, of the potentials of the nodes and of

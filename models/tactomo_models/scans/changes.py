@@ -94,16 +94,6 @@ class ChannelResult(NamedTuple):
 class MeasuredChannel:
     """What is known of one channel since the last tare, and what its scans say against that.
 
-    Args:
-        description: the sensor.
-        artifact: what is precomputed for it.
-        forward: the model of its sheet.
-        wiring: which voltages belong to which electrodes.
-        name: the channel.
-        volts: (M,) of the unpressed sheet.
-        noise: (M,) standard deviation of one scan in volts; None where it is not known.
-        scans: how many `volts` is the mean of.
-
     Attributes:
         reference: (M,) volts of the unpressed sheet, as it was at the tare.
         usable: (M,) voltages that the tare has found nothing wrong with.
@@ -115,14 +105,15 @@ class MeasuredChannel:
 
     def __init__(
         self,
-        description: SensorDescription,
-        artifact: Artifact,
-        forward: ForwardModel,
-        wiring: Wiring,
-        name: Channel,
-        volts: FloatArray,
+        description: SensorDescription,  # the sensor
+        artifact: Artifact,  # what is precomputed for it
+        forward: ForwardModel,  # the model of its sheet
+        wiring: Wiring,  # which voltages belong to which electrodes
+        name: Channel,  # the channel
+        volts: FloatArray,  # (M,) of the unpressed sheet
+        # (M,) standard deviation of one scan in volts; None where it is not known
         noise: FloatArray | None,
-        scans: int,
+        scans: int,  # how many `volts` is the mean of
     ) -> None:
         trace = 1e-9  # relative noise of data that have none
         max_invalid = 0.5  # share of voltages that may be invalid before the channel is given up

@@ -138,24 +138,16 @@ def _cross(drive: IntArray, measure: IntArray) -> BoolArray:
 
 
 class ScanCheck:
-    """Holds scans of one channel against the voltages that are expected.
-
-    Args:
-        wiring: of the sensor.
-        expected: (M,) volts of the unpressed sheet.
-        noise: (M,) standard deviation of a scan, volts.
-        usable: (M,) voltages for which there is an expectation.
-        contrast: factor by which pressing changes conductivity at most, up or down.
-        asymmetry: (pairs,) what a tare has seen of `asymmetry_of` the device; unknown if None.
-    """
+    """Holds scans of one channel against the voltages that are expected."""
 
     def __init__(
         self,
-        wiring: Wiring,
-        expected: FloatArray,
-        noise: FloatArray,
-        usable: BoolArray,
-        contrast: float,
+        wiring: Wiring,  # of the sensor
+        expected: FloatArray,  # (M,) volts of the unpressed sheet
+        noise: FloatArray,  # (M,) standard deviation of a scan, volts
+        usable: BoolArray,  # (M,) voltages for which there is an expectation
+        contrast: float,  # factor by which pressing changes conductivity at most, up or down
+        # (pairs,) what a tare has seen of `asymmetry_of` the device; unknown if None
         asymmetry: FloatArray | None = None,
     ) -> None:
         quietest_share = 1e-6  # of the largest voltage, that any converter's noise exceeds
@@ -282,25 +274,18 @@ class ScanCheck:
 
 
 def examine_reference(
-    wiring: Wiring,
-    volts: FloatArray,
-    predicted: FloatArray,
-    noise: FloatArray,
-    contrast: float,
+    wiring: Wiring,  # of the sensor
+    volts: FloatArray,  # (M,) the reference
+    predicted: FloatArray,  # (M,) by the model
+    noise: FloatArray,  # (M,) standard deviation of the reference, volts
+    contrast: float,  # factor by which pressing changes conductivity at most, up or down
+    # (M,) voltages that are to be used; the others are nobody's fault
     sought: BoolArray | bool = True,
 ) -> Verdict:
     """Say what is wrong with a reference (M,): hold it against the model of the unloaded sheet.
 
     The model may be off by a common factor: the sheet's resistance, the current and the gain are
     not known well, and whatever unit the voltages have divides out.
-
-    Args:
-        wiring: of the sensor.
-        volts: (M,) the reference.
-        predicted: (M,) by the model.
-        noise: (M,) standard deviation of the reference, volts.
-        contrast: factor by which pressing changes conductivity at most, up or down.
-        sought: (M,) voltages that are to be used; the others are nobody's fault.
     """
     smallest = (
         1e-6  # of the voltage expected: less in a reference is none to measure changes against

@@ -61,26 +61,18 @@ class Contact:
 
 
 def contacts_of(
-    areas: Areas,
-    ids: Sequence[int],
-    size: FloatArray,
-    sigma: FloatArray,
-    curve: PressureCurve | None,
+    areas: Areas,  # where they are
+    ids: Sequence[int],  # the identity of each
+    size: FloatArray,  # (K,) magnitudes; NaN where unknown
+    sigma: FloatArray,  # (K,) their standard uncertainties
+    curve: PressureCurve | None,  # the sensor's; None where it has none
     *,
+    # the range that each identity was in; a new one has none
     last: Mapping[int, PressureRange] | None = None,
+    # what a fitted field says of them; the magnitudes are even ones if None
     field: FieldContacts | None = None,
 ) -> tuple[Contact, ...]:
-    """Make contacts of K areas.
-
-    Args:
-        areas: where they are.
-        ids: the identity of each.
-        size: (K,) magnitudes; NaN where unknown.
-        sigma: (K,) their standard uncertainties.
-        curve: the sensor's; None where it has none.
-        last: the range that each identity was in; a new one has none.
-        field: what a fitted field says of them; the magnitudes are even ones if None.
-    """
+    """Make contacts of K areas."""
     ago = [(last or {}).get(known, PressureRange.UNKNOWN) for known in ids]
     pressures = pressures_of(
         curve, size, sigma, areas.areas_m2, areas.sigmas[:, 2], field=field, last=ago

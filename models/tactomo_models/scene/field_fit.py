@@ -250,22 +250,15 @@ class FieldFit:
 
     def refine(
         self,
-        fitted: FittedField,
-        measured: Measured,
-        budget: Budget,
+        fitted: FittedField,  # where to start; its residuals must belong to the same data
+        measured: Measured,  # the data
+        budget: Budget,  # work after which no further step is begun; one step is always tried
+        # misfit at which the data are explained to their noise (discrepancy principle): no further
+        # step is taken
         good_enough: float,
-        steps: int = 100,
+        steps: int = 100,  # no more than these
     ) -> FittedField:
-        """Improve an estimate by Levenberg-Marquardt.
-
-        Args:
-            fitted: where to start; its residuals must belong to the same data.
-            measured: the data.
-            budget: work after which no further step is begun; one step is always tried.
-            good_enough: misfit at which the data are explained to their noise (discrepancy
-                principle): no further step is taken.
-            steps: no more than these.
-        """
+        """Improve an estimate by Levenberg-Marquardt."""
         for _ in range(steps):
             if fitted.misfit <= good_enough:
                 return replace(fitted, converged=True)

@@ -150,28 +150,21 @@ def described_curve(description: SensorDescription) -> PressureCurve | None:
 
 
 def pressures_of(
-    curve: PressureCurve | None,
-    magnitude: FloatArray,
-    magnitude_sigma: FloatArray,
-    areas_m2: FloatArray,
-    area_sigmas_m2: FloatArray,
+    curve: PressureCurve | None,  # the sensor's; None where it has none
+    magnitude: FloatArray,  # (K,) |relative conductivity change|; NaN where unknown
+    magnitude_sigma: FloatArray,  # (K,) standard uncertainties
+    areas_m2: FloatArray,  # (K,)
+    area_sigmas_m2: FloatArray,  # (K,) standard uncertainties; NaN where unknown
     *,
+    # what a fitted field says of them; the magnitudes are even ones if None
     field: FieldContacts | None = None,
+    # K ranges of the same contacts a frame ago; none is known if None
     last: Sequence[PressureRange] | None = None,
 ) -> Pressures:
     """Pressures and forces of K contacts from their magnitudes and areas.
 
     An area taken too large makes the magnitude too small, and the magnitude's uncertainty says so
     already: in the force the two errors partly cancel.
-
-    Args:
-        curve: the sensor's; None where it has none.
-        magnitude: (K,) |relative conductivity change|; NaN where unknown.
-        magnitude_sigma: (K,) standard uncertainties.
-        areas_m2: (K,).
-        area_sigmas_m2: (K,) standard uncertainties; NaN where unknown.
-        field: what a fitted field says of them; the magnitudes are even ones if None.
-        last: K ranges of the same contacts a frame ago; none is known if None.
     """
     if curve is None:
         nothing = np.full(len(magnitude), np.nan)

@@ -99,26 +99,18 @@ def need_lerobot() -> None:
 
 
 def write_dataset(
-    moments: Iterator[Moment],
-    folder: Path,
-    sensor: str,
-    gaps: Gaps,
+    moments: Iterator[Moment],  # the frames, in the order of their times
+    folder: Path,  # the dataset, which must not be there yet
+    sensor: str,  # the sensor's name
+    gaps: Gaps,  # watches `moments`
+    # a robot's steps; None for a step every 1 / fps from the first frame to the last
     log: RobotLog | None = None,
-    fps: int | None = None,
-    task: str = "touch",
+    fps: int | None = None,  # steps a second; None for the log's, or LeRobot's default
+    task: str = "touch",  # what is done there, in words
 ) -> tuple[int, list[str]]:
     """Write a dataset; return how many steps there are, and what did not fit, a sentence each.
 
     LeRobot holds an episode in memory: some 40 kB for each step.
-
-    Args:
-        moments: the frames, in the order of their times.
-        folder: the dataset, which must not be there yet.
-        sensor: the sensor's name.
-        gaps: watches `moments`.
-        log: a robot's steps; None for a step every 1 / fps from the first frame to the last.
-        fps: steps a second; None for the log's, or LeRobot's default.
-        task: what is done there, in words.
 
     Raises:
         TactomoError: there is no map, the clock that is aligned by was set, or no rate is known.

@@ -131,20 +131,14 @@ def _arrivals(path: Path) -> Iterator[tuple[int, int]]:
 
 @contextlib.contextmanager
 def recorded_frames(
-    path: Path,
-    description: str | None,
+    path: Path,  # a recording, or the folder of one that was cut into files
+    description: str | None,  # what the sensor is made of; None for what the recording says
+    # leave out what was acquired before, seconds from the recording's beginning
     start_s: float = 0.0,
-    end_s: float | None = None,
-    scratch: Path | None = None,
+    end_s: float | None = None,  # leave out what was acquired from there on
+    scratch: Path | None = None,  # a folder with room for the frames, if they have to be made
 ) -> Iterator[RecordedFrames]:
     """Open a recording's frames; where it has none, reconstruct it first, by the code of live.
-
-    Args:
-        path: a recording, or the folder of one that was cut into files.
-        description: what the sensor is made of; None for what the recording says.
-        start_s: leave out what was acquired before, seconds from the recording's beginning.
-        end_s: leave out what was acquired from there on.
-        scratch: a folder with room for the frames, if they have to be made.
 
     Raises:
         TactomoError: the recording cannot be read or reconstructed, or the times are no times.
