@@ -79,10 +79,8 @@ class Curve(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    secret: Path
-    """The daemon's secret key, which only its user may read."""
-    clients: Path
-    """A folder of the public keys of those who may connect."""
+    secret: Path  # the daemon's secret key, which only its user may read
+    clients: Path  # a folder of the public keys of those who may connect
 
 
 class RecordingConfig(BaseModel):
@@ -90,24 +88,21 @@ class RecordingConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
+    # Record to this one file from the start; it is not cut and not deleted
     file: Path | None = None
-    """Record to this one file from the start; it is not cut and not deleted."""
-    at_start: bool = False
-    """Record to the folder from the start."""
-    maps: bool = False
-    """Put maps and contacts into recordings, beside the raw bytes."""
+    at_start: bool = False  # record to the folder from the start
+    maps: bool = False  # put maps and contacts into recordings, beside the raw bytes
+    # Where recordings without a name of their own go, cut into files as follows
     folder: Path | None = None
-    """Where recordings without a name of their own go, cut into files as follows."""
     rotate_mb: Annotated[float, Field(ge=0.01, le=100_000)] = 256.0
     rotate_minutes: Annotated[float, Field(ge=0.01, le=1440)] = 60.0
+    # Of this sensor's files in the folder, the newest so many; 0 for no limit
     keep_gb: Annotated[float, Field(ge=0)] = 10.0
-    """Of this sensor's files in the folder, the newest so many; 0 for no limit."""
-    keep_days: Annotated[float, Field(ge=0)] = 0.0
-    """Likewise by age."""
+    keep_days: Annotated[float, Field(ge=0)] = 0.0  # likewise by age
+    # What recording leaves free on the disk, or a tenth of it if that is less
     reserve_mb: Annotated[float, Field(ge=0)] = 200.0
-    """What recording leaves free on the disk, or a tenth of it if that is less."""
+    # How much may be lost with the power; 0 leaves it to the operating system
     sync_s: Annotated[float, Field(ge=0, le=3600)] = 5.0
-    """How much may be lost with the power; 0 leaves it to the operating system."""
 
     @model_validator(mode="after")
     def _agree(self) -> Self:
@@ -128,8 +123,7 @@ class BaselineConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    track: bool = True
-    """Off: changes are measured against the last tare as it was."""
+    track: bool = True  # off: changes are measured against the last tare as it was
     time_constant_s: Annotated[float, Field(ge=5, le=3600)] = TIME_CONSTANT_S
 
 
@@ -138,42 +132,37 @@ class DaemonConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
+    # This sensor's name in every topic, such as ``left_forearm``
     name: Annotated[str, AfterValidator(_sensor_name)] = "skin"
-    """This sensor's name in every topic, such as ``left_forearm``."""
+    # A shipped sensor description's name, or the path of a TOML file
     description: str = "paper_square"
-    """A shipped sensor description's name, or the path of a TOML file."""
+    # Of pressure, by `tactomo calibrate`; None for the sensor's own, where there is one
     calibration: Path | None = None
-    """Of pressure, by `tactomo calibrate`; None for the sensor's own, where there is one."""
+    # Device paths or pyserial URLs: one that carries both channels, or one for each
     ports: Annotated[tuple[str, ...], Field(min_length=1, max_length=MAX_PORTS)]
-    """Device paths or pyserial URLs: one that carries both channels, or one for each."""
+    # The devices that make up this sensor, as their hello says; empty accepts any
     device_ids: tuple[DeviceId, ...] = ()
-    """The devices that make up this sensor, as their hello says; empty accepts any."""
-    wait_for_ports: bool = False
-    """Start without a port that cannot be opened yet, and wait for it."""
+    wait_for_ports: bool = False  # start without a port that cannot be opened yet, and wait for it
+    # What the device speaks: ours, or that of other people's hardware
     protocol: ProtocolName = NATIVE
-    """What the device speaks: ours, or that of other people's hardware."""
+    # Of a real UART; None for what is usual with the protocol
     baud: Annotated[int, Field(ge=1200, le=12_000_000)] | None = None
-    """Of a real UART; None for what is usual with the protocol."""
     stream: Endpoint = DEFAULT_STREAM
     control: Endpoint = DEFAULT_CONTROL
+    # Encrypt ``tcp://`` addresses and let in the listed clients only; needed beyond loopback
     curve: Curve | None = None
-    """Encrypt ``tcp://`` addresses and let in the listed clients only; needed beyond loopback."""
-    method: MethodName = "auto"
-    """How to reconstruct: a method's name, or ``my_module:MyMethod``."""
+    method: MethodName = "auto"  # how to reconstruct: a method's name, or ``my_module:MyMethod``
+    # Time that one reconstruction may take; None leaves it to the method
     budget_ms: BudgetMs | None = None
-    """Time that one reconstruction may take; None leaves it to the method."""
-    tare_scans: Annotated[int, Field(ge=2, le=10_000)] = 20
-    """Dual scans averaged into a reference."""
+    tare_scans: Annotated[int, Field(ge=2, le=10_000)] = 20  # dual scans averaged into a reference
+    # How long a scan waits for the other channel's scan of the same instant
     sync_wait_ms: Annotated[float, Field(ge=0, le=1000)] = 30.0
-    """How long a scan waits for the other channel's scan of the same instant."""
-    lossless: bool = False
-    """Reconstruct every dual scan, however late, instead of the newest one."""
+    lossless: bool = False  # reconstruct every dual scan, however late, instead of the newest one
     baseline: BaselineConfig = BaselineConfig()
     recording: RecordingConfig = RecordingConfig()
+    # ``HOST:PORT`` of this computer where Prometheus may scrape
     metrics: MetricsAddress | None = None
-    """``HOST:PORT`` of this computer where Prometheus may scrape."""
-    exit_at_end: bool = False
-    """Stop once every replayed port has reached the end of its recording."""
+    exit_at_end: bool = False  # stop once every replayed port has reached the end of its recording
     log_level: LogLevel = "info"
     log_format: LogFormat = "auto"
 
@@ -204,8 +193,8 @@ class Robot(BaseModel):
     """Several skins of one computer, as their file has them: each in a table ``[skins.NAME]``."""
 
     skins: Annotated[dict[str, dict[str, Any]], Field(min_length=1)]
+    # Where the streams of all skins are available together
     proxy: Annotated[Endpoint, AfterValidator(_local)] | None = None
-    """Where the streams of all skins are available together."""
 
 
 class Skins(NamedTuple):

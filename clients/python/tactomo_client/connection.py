@@ -19,8 +19,7 @@ from tactomo_client.errors import ControlError, KeysError
 from tactomo_client.keys import Handshakes, Keys, secure
 from tactomo_client.messages import MAX_MESSAGE_BYTES
 
-KNOCK_PERIOD_S: Final = 1.0
-"""How often a client that was not let in tries again."""
+KNOCK_PERIOD_S: Final = 1.0  #: how often a client that was not let in tries again
 
 T = TypeVar("T")
 Owner = zmq.Socket[Any]

@@ -20,14 +20,11 @@ from tactomo_client.messages import DEFAULT_CONTROL, decode_reply, encode_reques
 from tactomo_client.status import STALE_AFTER_S, Calibration, Status, Taught
 
 TIMEOUT_S: Final = 2.0
-TARE_TIMEOUT_S: Final = 30.0
-"""For a tare: as long as its dual scans take to come."""
-RECORD_TIMEOUT_S: Final = 10.0
-"""For a recording: a disk may take its time."""
+TARE_TIMEOUT_S: Final = 30.0  #: for a tare: as long as its dual scans take to come
+RECORD_TIMEOUT_S: Final = 10.0  #: for a recording: a disk may take its time
 CONNECT_TIMEOUT_S: Final = 5.0
 """How long nothing may listen at the address: a daemon that was started just now takes 2 to 3 s."""
-RELOAD_TIMEOUT_S: Final = 10.0
-"""For a calibration: until the frame that is being made is done."""
+RELOAD_TIMEOUT_S: Final = 10.0  #: for a calibration: until the frame that is being made is done
 LOOK_S: Final = 0.1
 
 
@@ -147,26 +144,22 @@ class ControlLine:
 class Tare:
     """A new reference is in force."""
 
-    scans: int
-    """How many dual scans it is made of."""
-    contacts: int = 0
-    """How many contacts were shown meanwhile: they count as nothing pressed now."""
+    scans: int  #: how many dual scans it is made of
+    contacts: int = 0  #: how many contacts were shown meanwhile: they count as nothing pressed now
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingStarted:
     """A recording runs."""
 
-    path: str
-    """The file, on the daemon's computer."""
+    path: str  #: the file, on the daemon's computer
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedFile:
     """A recording that was stopped."""
 
-    path: str
-    """The file, on the daemon's computer; the last one of several."""
+    path: str  #: the file, on the daemon's computer; the last one of several
     bytes: int
 
 
@@ -174,36 +167,30 @@ class RecordedFile:
 class MethodInForce:
     """What solves frames from now on."""
 
-    tier: str
-    """The method's name; the stream calls it a tier."""
+    tier: str  #: the method's name; the stream calls it a tier
 
 
 @dataclass(frozen=True, slots=True)
 class BudgetInForce:
     """How long a frame may take from now on."""
 
-    budget_ms: float | None
-    """None for the method's own."""
+    budget_ms: float | None  #: None for the method's own
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationInForce:
     """What changes are turned into pressures by from now on."""
 
-    calibration: Calibration | None
-    """None for the table of the sensor's description."""
-    taught: Taught | None = None
-    """What corrects where contacts are; None for nothing."""
+    calibration: Calibration | None  #: None for the table of the sensor's description
+    taught: Taught | None = None  #: what corrects where contacts are; None for nothing
 
 
 @dataclass(slots=True)
 class RunningRecording:
     """A recording that runs as long as its `with` block."""
 
-    path: str
-    """The file, on the daemon's computer; the first one of several."""
-    file: RecordedFile | None = None
-    """What was recorded; None as long as it runs."""
+    path: str  #: the file, on the daemon's computer; the first one of several
+    file: RecordedFile | None = None  #: what was recorded; None as long as it runs
 
 
 class Control(ControlLine):

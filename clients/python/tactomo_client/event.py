@@ -19,14 +19,9 @@ class Event(Received):
     """
 
     sensor: str
-    session: str
-    """Changes when the daemon restarts; `sequence` starts anew then."""
-    sequence: int
-    """Counts the events; a gap means that some were missed."""
+    session: str  #: changes when the daemon restarts; `sequence` starts anew then
+    sequence: int  #: counts the events; a gap means that some were missed
     name: str
-    severity: str = "info"
-    """``info``, ``warning`` or ``error``."""
-    detail: str = ""
-    """What happened, in words."""
-    next_step: str = ""
-    """What to do about it, in words; may be empty."""
+    severity: str = "info"  #: ``info``, ``warning`` or ``error``
+    detail: str = ""  #: what happened, in words
+    next_step: str = ""  #: what to do about it, in words; may be empty

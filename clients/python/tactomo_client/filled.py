@@ -24,8 +24,8 @@ Reader = Callable[[str, object], Any]
 class Received:
     """A message that has come, by its fields."""
 
+    #: The whole message, as in STREAM.md
     fields: Mapping[str, Any] = dataclasses.field(default_factory=dict, repr=False, compare=False)
-    """The whole message, as in STREAM.md."""
     _received_ns: int = dataclasses.field(default=0, repr=False, compare=False)
     _stale_after_s: float = dataclasses.field(default=math.inf, repr=False, compare=False)
 

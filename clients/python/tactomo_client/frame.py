@@ -59,42 +59,34 @@ class Contact:
     """One pressed area. It keeps its `id` for as long as it is followed from frame to frame."""
 
     id: int
-    x_mm: float
-    """Centre, from the middle of the skin to the right, seen from the pressed side."""
-    y_mm: float
-    """Centre, from the middle of the skin upwards."""
+    x_mm: float  #: centre, from the middle of the skin to the right, seen from the pressed side
+    y_mm: float  #: centre, from the middle of the skin upwards
     area_mm2: float
+    #: |Δσ|/σ₀ inside the contact: how much the conductivity changed, a ratio
     magnitude: float | None
-    """|Δσ|/σ₀ inside the contact: how much the conductivity changed, a ratio."""
-    magnitude_sigma: float | None
-    """Standard uncertainty of `magnitude`."""
+    magnitude_sigma: float | None  #: standard uncertainty of `magnitude`
     pressure_kpa: float | None
+    #: Standard uncertainty of `x_mm`; None where the method gives none
     x_sigma_mm: float | None = None
-    """Standard uncertainty of `x_mm`; None where the method gives none."""
-    y_sigma_mm: float | None = None
-    """Standard uncertainty of `y_mm`."""
-    area_sigma_mm2: float | None = None
-    """Standard uncertainty of `area_mm2`."""
+    y_sigma_mm: float | None = None  #: standard uncertainty of `y_mm`
+    area_sigma_mm2: float | None = None  #: standard uncertainty of `area_mm2`
+    #: Standard uncertainty of `pressure_kpa`, the sensor's calibration included
     pressure_sigma_kpa: float | None = None
-    """Standard uncertainty of `pressure_kpa`, the sensor's calibration included."""
-    force_n: float | None = None
-    """Pressure times area."""
-    force_sigma_n: float | None = None
-    """Standard uncertainty of `force_n`."""
+    force_n: float | None = None  #: pressure times area
+    force_sigma_n: float | None = None  #: standard uncertainty of `force_n`
+    #: ``within``; ``below``: touched, too lightly to be measured, `pressure_kpa` is None;
+    #: ``above``: `pressure_kpa` is the least that it can be; ``unknown``
     pressure_range: str = "unknown"
-    """``within``; ``below``: touched, too lightly to be measured, `pressure_kpa` is None;
-    ``above``: `pressure_kpa` is the least that it can be; ``unknown``."""
+    #: Highest pressure under it; `pressure_kpa` is a mean over its area
     peak_kpa: float | None = None
-    """Highest pressure under it; `pressure_kpa` is a mean over its area."""
-    peak_sigma_kpa: float | None = None
-    """Standard uncertainty of `peak_kpa`."""
+    peak_sigma_kpa: float | None = None  #: standard uncertainty of `peak_kpa`
+    #: Upper bound of its highest pressure, 95 %, whatever `pressure_range` says; None: no bound
     max_kpa: float | None = None
-    """Upper bound of its highest pressure, 95 %, whatever `pressure_range` says; None: no bound."""
+    #: Exponent γ of the pressure (1 - ρ²)^γ from the middle to the edge: 0 flat, 0.5 Hertz
     edge: float | None = None
-    """Exponent γ of the pressure (1 - ρ²)^γ from the middle to the edge: 0 flat, 0.5 Hertz."""
+    #: Whether presses at known places say where it is, by `tactomo teach`; else the physics alone
+    #: does
     taught: bool = False
-    """Whether presses at known places say where it is, by `tactomo teach`; else the physics alone
-    does."""
 
     def exceeds(self, limit_kpa: float) -> Answer:
         """Return whether it presses with `limit_kpa` or more.
@@ -124,37 +116,30 @@ class Frame:
     """
 
     sensor: str
-    session: str
-    """Changes when the daemon restarts; contact ids and `sequence` start anew then."""
-    sequence: int
-    """Counts the messages of this kind; a gap means that frames were missed."""
+    session: str  #: changes when the daemon restarts; contact ids and `sequence` start anew then
+    sequence: int  #: counts the messages of this kind; a gap means that frames were missed
     scan_counter: int
+    #: When the scan was acquired, nanoseconds since 1970 (UTC): see STREAM.md for what that is
     acquired_realtime_ns: int
-    """When the scan was acquired, nanoseconds since 1970 (UTC): see STREAM.md for what that is."""
-    acquired_monotonic_ns: int
-    """The same instant on that computer's monotonic clock."""
-    device_us: int | None
-    """The device's own clock, microseconds."""
-    delay_ns: int | None
-    """From then until the daemon had read the scan's last byte."""
+    acquired_monotonic_ns: int  #: the same instant on that computer's monotonic clock
+    device_us: int | None  #: the device's own clock, microseconds
+    delay_ns: int | None  #: from then until the daemon had read the scan's last byte
+    #: The magnitude scan's time less the structure scan's; None where that is not known
     skew_ms: float | None
-    """The magnitude scan's time less the structure scan's; None where that is not known."""
+    #: What made the frame: ``quiet``, ``fit``, ``network``, ..., or an own method's name
     tier: str | None
-    """What made the frame: ``quiet``, ``fit``, ``network``, ..., or an own method's name."""
     tier_reason: str | None
+    #: What to be wary of, such as ``misfit_high``; empty when all is well. See STREAM.md.
     flags: frozenset[str]
-    """What to be wary of, such as ``misfit_high``; empty when all is well. See STREAM.md."""
+    #: Rms of what the model left unexplained, in units of the noise: about 1 is good
     misfit: float | None
-    """Rms of what the model left unexplained, in units of the noise: about 1 is good."""
+    #: Correlation of the map with the truth that a network expects, 0 to 1; None where none was
+    #: asked
     confidence: float | None
-    """Correlation of the map with the truth that a network expects, 0 to 1; None where none was
-    asked."""
     contacts: tuple[Contact, ...]
-    map: Image | None
-    """|Δσ|/σ₀ of the magnitude channel, a ratio."""
+    map: Image | None  #: |Δσ|/σ₀ of the magnitude channel, a ratio
     pressure_kpa: Image | None
-    structure: Image | None
-    """Pressed (1) or not (0), with everything between for in between."""
+    structure: Image | None  #: pressed (1) or not (0), with everything between for in between
     x_mm: tuple[float, float] | None
     y_mm: tuple[float, float] | None
     _age_at_receipt_ns: int = field(repr=False)

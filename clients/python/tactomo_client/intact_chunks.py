@@ -19,8 +19,7 @@ import zstandard
 from mcap.records import Channel, Chunk, McapRecord, Message
 from mcap.stream_reader import breakup_chunk
 
-MAX_RECORD_BYTES: Final = 64 << 20
-"""Of a record, and of what a chunk is unpacked to."""
+MAX_RECORD_BYTES: Final = 64 << 20  #: of a record, and of what a chunk is unpacked to
 _MARK: Final = b"\x04\0\0\0zstd"
 _BEFORE_MARK: Final = 37
 _HEADER: Final = struct.Struct("<BQQQQI8sQ")
@@ -32,8 +31,8 @@ class IntactChunk(NamedTuple):
 
     start: int
     end: int
+    #: Where its message indexes end and the next chunk begins, if nothing is damaged
     end_of_index: int
-    """Where its message indexes end and the next chunk begins, if nothing is damaged."""
     messages: list[Message]
     channels: list[Channel]
 

@@ -39,10 +39,8 @@ EVENT: Final = "event"
 KINDS: Final = (MAP, CONTACTS, SCAN, STATUS, EVENT)
 
 MAX_MESSAGE_BYTES: Final = 16 * 1024 * 1024
-MAX_ENTRIES: Final = 4096
-"""Of one list or map."""
-MAX_DEPTH: Final = 16
-"""Of lists and maps in each other."""
+MAX_ENTRIES: Final = 4096  #: of one list or map
+MAX_DEPTH: Final = 16  #: of lists and maps in each other
 MAX_ARRAY_VALUES: Final = 1024 * 1024
 MAX_ARRAY_DIMENSIONS: Final = 4
 ARRAY_DTYPES: Final = ("<f4", "<f8", "<i2", "<i4", "<i8", "<u2", "<u4", "<u8", "|i1", "|u1")

@@ -12,8 +12,7 @@ from typing import Final
 
 from tactomo_client.filled import Received
 
-STALE_AFTER_S: Final = 3.0
-"""A daemon sends its status every second."""
+STALE_AFTER_S: Final = 3.0  #: a daemon sends its status every second
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,17 +35,14 @@ class MagnitudeResponse:
 class Calibration:
     """A pressure calibration: what it rests on, and how good it is."""
 
-    taken: str = ""
-    """ISO 8601, UTC."""
+    taken: str = ""  #: ISO 8601, UTC
     readings: int = 0
-    range_kpa: tuple[float, ...] = ()
-    """Between which two pressures it answers."""
-    sigma_kpa: float | None = None
-    """Its own standard uncertainty: median over the range."""
+    range_kpa: tuple[float, ...] = ()  #: between which two pressures it answers
+    sigma_kpa: float | None = None  #: its own standard uncertainty: median over the range
+    #: From where the channel answers; None where its lightest reading did already
     onset_kpa: float | None = None
-    """From where the channel answers; None where its lightest reading did already."""
+    #: By how much falling loads read higher; None where that was not measured
     hysteresis_kpa: float | None = None
-    """By how much falling loads read higher; None where that was not measured."""
     device_ids: tuple[str, ...] = ()
 
 
@@ -54,43 +50,33 @@ class Calibration:
 class Taught:
     """What presses at known places have taught a skin."""
 
-    taken: str = ""
-    """ISO 8601, UTC."""
+    taken: str = ""  #: ISO 8601, UTC
     presses: int = 0
-    median_mm: float | None = None
-    """Error of place on presses that were held out."""
-    untaught_median_mm: float | None = None
-    """The same of the physics alone."""
+    median_mm: float | None = None  #: error of place on presses that were held out
+    untaught_median_mm: float | None = None  #: the same of the physics alone
 
 
 @dataclass(frozen=True, slots=True)
 class SensorDescription:
     """The sensor: its sheet, its electrodes and what it answers to."""
 
-    model: str = ""
-    """The description's name, such as ``paper_square``."""
+    model: str = ""  #: the description's name, such as ``paper_square``
     sha256: str = ""
-    file: str | None = None
-    """On the daemon's computer; None for a shipped one."""
-    shape: str = ""
-    """``rectangle`` or ``disc``."""
+    file: str | None = None  #: on the daemon's computer; None for a shipped one
+    shape: str = ""  #: ``rectangle`` or ``disc``
     width_mm: float | None = None
     height_mm: float | None = None
-    sensing_width_mm: float | None = None
-    """Of the area that can be pressed, centred."""
+    sensing_width_mm: float | None = None  #: of the area that can be pressed, centred
     sensing_height_mm: float | None = None
+    #: Centre of each electrode, x and y, electrode 0 first
     electrodes_mm: tuple[tuple[float, float], ...] = ()
-    """Centre of each electrode, x and y, electrode 0 first."""
-    modalities: tuple[str, ...] = ()
-    """``magnitude``, ``structure``, or both."""
-    magnitude_max: float | None = None
-    """The top of a sensible colour scale for `Frame.map`."""
+    modalities: tuple[str, ...] = ()  #: ``magnitude``, ``structure``, or both
+    magnitude_max: float | None = None  #: the top of a sensible colour scale for `Frame.map`
     pressure_max_kpa: float | None = None
     magnitude_response: MagnitudeResponse | None = None
+    #: Of pressure, in force; None where pressures go by the description
     calibration: Calibration | None = None
-    """Of pressure, in force; None where pressures go by the description."""
-    taught: Taught | None = None
-    """In force; None where the physics alone says where contacts are."""
+    taught: Taught | None = None  #: in force; None where the physics alone says where contacts are
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,14 +102,10 @@ class Device:
 class DeviceClock:
     """How the daemon knows a device's clock."""
 
-    state: str = ""
-    """``settling``, ``settled``, ``unusable`` or ``absent``."""
-    offset_ns: int | None = None
-    """The daemon's monotonic clock less the device's."""
-    rate_ppm: float | None = None
-    """By how much the device's clock is slow."""
-    delay_ms: Percentiles | None = None
-    """How much later than need be scans come."""
+    state: str = ""  #: ``settling``, ``settled``, ``unusable`` or ``absent``
+    offset_ns: int | None = None  #: the daemon's monotonic clock less the device's
+    rate_ppm: float | None = None  #: by how much the device's clock is slow
+    delay_ms: Percentiles | None = None  #: how much later than need be scans come
     jumps: int = 0
 
 
@@ -133,30 +115,23 @@ class Port:
 
     url: str
     protocol: str = "tactomo"
-    connected: bool = False
-    """Whether it is open at present."""
+    connected: bool = False  #: whether it is open at present
+    #: ``closed``, ``starting``, ``running``, ``idle``, ``garbage``, ``silent``, ``refused`` or
+    #: ``ended``
     state: str = ""
-    """``closed``, ``starting``, ``running``, ``idle``, ``garbage``, ``silent``, ``refused`` or
-    ``ended``."""
-    problem: str | None = None
-    """Why it is closed or of no use, in words."""
-    device: Device | None = None
-    """None before the device's first hello."""
+    problem: str | None = None  #: why it is closed or of no use, in words
+    device: Device | None = None  #: None before the device's first hello
     bytes: int = 0
     packets: int = 0
-    corrupt: int = 0
-    """Packets that were damaged on their way."""
-    faulty: int = 0
-    """Intact packets that break the protocol."""
+    corrupt: int = 0  #: packets that were damaged on their way
+    faulty: int = 0  #: intact packets that break the protocol
+    #: By how much `packets`, `corrupt` and `faulty` have risen within it
     received_last_minute: Mapping[str, int] = field(default_factory=dict)
-    """By how much `packets`, `corrupt` and `faulty` have risen within it."""
-    refusal: str | None = None
-    """Why the device's scans are not used, if they are not."""
+    refusal: str | None = None  #: why the device's scans are not used, if they are not
     unused_scans: int = 0
-    reopened: int = 0
-    """How often it was closed and opened because the device did not speak."""
+    reopened: int = 0  #: how often it was closed and opened because the device did not speak
+    #: How long an FTDI adapter holds bytes back at most; None for any other port
     latency_timer_ms: int | None = None
-    """How long an FTDI adapter holds bytes back at most; None for any other port."""
     clock: DeviceClock | None = None
 
 
@@ -193,34 +168,26 @@ class WallClock:
 class Reference:
     """The unloaded scans that changes are measured against."""
 
-    scans: int
-    """Dual scans that it is made of."""
-    taken_realtime_ns: int
-    """When, nanoseconds since 1970 (UTC)."""
+    scans: int  #: dual scans that it is made of
+    taken_realtime_ns: int  #: when, nanoseconds since 1970 (UTC)
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelDrift:
     """How far one channel's voltages have drifted since the tare."""
 
-    gain: float
-    """Their common relative change."""
-    uneven: float
-    """The rms of their relative changes beyond that."""
+    gain: float  #: their common relative change
+    uneven: float  #: the rms of their relative changes beyond that
 
 
 @dataclass(frozen=True, slots=True)
 class Baseline:
     """How the reference follows the skin's drift."""
 
-    state: str = "off"
-    """``off``, ``waiting``, ``following``, ``held`` or ``refused``."""
-    refusal: str | None = None
-    """Why it does not follow, in words."""
-    moves: int = 0
-    """How often the reference has moved since the tare."""
-    drift: Mapping[str, ChannelDrift] = field(default_factory=dict)
-    """By channel."""
+    state: str = "off"  #: ``off``, ``waiting``, ``following``, ``held`` or ``refused``
+    refusal: str | None = None  #: why it does not follow, in words
+    moves: int = 0  #: how often the reference has moved since the tare
+    drift: Mapping[str, ChannelDrift] = field(default_factory=dict)  #: by channel
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,38 +195,31 @@ class Plan:
     """What frames are given for the method and the budget that were asked for."""
 
     tier: str = ""
-    modelled_ms: float | None = None
-    """Work, in milliseconds of a 2.5 GHz core."""
+    modelled_ms: float | None = None  #: work, in milliseconds of a 2.5 GHz core
+    #: Of the time that was asked for; less than 1 while others take the processor
     share: float = 1.0
-    """Of the time that was asked for; less than 1 while others take the processor."""
-    source: str = ""
-    """Where the measure between time and work comes from, in words."""
+    source: str = ""  #: where the measure between time and work comes from, in words
 
 
 @dataclass(frozen=True, slots=True)
 class Replay:
     """How far a replay is, and how it goes on: the control command ``replay`` changes that."""
 
-    position_s: float
-    """On the recording's own clock, seconds from its beginning."""
+    position_s: float  #: on the recording's own clock, seconds from its beginning
     duration_s: float
-    speed: float
-    """Factor of the recorded speed; 0: as fast as frames are made."""
+    speed: float  #: factor of the recorded speed; 0: as fast as frames are made
     paused: bool = False
     loop: bool = False
-    waits_for_page: bool = False
-    """Whether it is paused until a viewer's page is open."""
+    waits_for_page: bool = False  #: whether it is paused until a viewer's page is open
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingProgress:
     """The recording that runs."""
 
-    path: str
-    """On the daemon's computer."""
+    path: str  #: on the daemon's computer
     bytes: int
-    queued_bytes: int = 0
-    """What waits for the disk."""
+    queued_bytes: int = 0  #: what waits for the disk
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,13 +227,11 @@ class Recorder:
     """Recordings since the daemon's start."""
 
     files: int = 0
-    deleted: int = 0
-    """Files that were deleted to keep to the rules."""
+    deleted: int = 0  #: files that were deleted to keep to the rules
     failures: int = 0
-    failure: str | None = None
-    """Why the last recording did not go on; None once there is another."""
+    failure: str | None = None  #: why the last recording did not go on; None once there is another
+    #: Why a recording that is wanted does not run, until it begins again by itself
     waits_for: str | None = None
-    """Why a recording that is wanted does not run, until it begins again by itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,20 +242,16 @@ class Trouble:
     severity: str
     detail: str
     next_step: str = ""
-    realtime_ns: int | None = None
-    """When, nanoseconds since 1970 (UTC)."""
-    age_s: float | None = None
-    """How long before the status."""
+    realtime_ns: int | None = None  #: when, nanoseconds since 1970 (UTC)
+    age_s: float | None = None  #: how long before the status
 
 
 @dataclass(frozen=True, slots=True)
 class EventCounts:
     """What happened since the daemon's start, for those who were not there."""
 
-    counts: Mapping[str, int] = field(default_factory=dict)
-    """How often, by the event's name."""
-    troubles: tuple[Trouble, ...] = ()
-    """Newest first."""
+    counts: Mapping[str, int] = field(default_factory=dict)  #: how often, by the event's name
+    troubles: tuple[Trouble, ...] = ()  #: newest first
 
 
 @dataclass(frozen=True, slots=True)
@@ -322,56 +276,44 @@ class Status(Received):
         print(status.state, [port.problem for port in status.ports])
     """
 
-    session: str = ""
-    """Changes when the daemon restarts; `sequence` starts anew then."""
+    session: str = ""  #: changes when the daemon restarts; `sequence` starts anew then
     sequence: int = 0
     sensor: str = ""
     version: str = ""
+    #: ``waiting_for_port``, ``waiting_for_data``, ``taring``, ``running``, ``late`` (scans come,
+    #: frames lag) or ``stale``
     state: str = ""
-    """``waiting_for_port``, ``waiting_for_data``, ``taring``, ``running``, ``late`` (scans come,
-    frames lag) or ``stale``."""
     uptime_s: float = 0.0
-    flags: frozenset[str] = frozenset()
-    """The newest frame's, as are `tier` and `misfit`."""
+    flags: frozenset[str] = frozenset()  #: the newest frame's, as are `tier` and `misfit`
     tier: str | None = None
     misfit: float | None = None
     description: SensorDescription | None = None
     source: Source = field(default_factory=Source)
-    replay: Replay | None = None
-    """None where the ports are live."""
+    replay: Replay | None = None  #: None where the ports are live
     ports: tuple[Port, ...] = ()
     rates: Rates = field(default_factory=Rates)
-    dropped_scans: int = 0
-    """Dual scans left out because newer ones had come."""
-    incomplete_scans: int = 0
-    """Dual scans of which one channel did not come."""
+    dropped_scans: int = 0  #: dual scans left out because newer ones had come
+    incomplete_scans: int = 0  #: dual scans of which one channel did not come
+    #: By how much `frames`, `dropped_scans` and `incomplete_scans` have risen within it
     last_minute: Mapping[str, int] = field(default_factory=dict)
-    """By how much `frames`, `dropped_scans` and `incomplete_scans` have risen within it."""
     late_scans: int = 0
     scan_tally: ScanTally = field(default_factory=ScanTally)
     channel_skew_ms: Percentiles | None = None
     wall_clock: WallClock = field(default_factory=WallClock)
-    reference: Reference | None = None
-    """None before the first tare."""
+    reference: Reference | None = None  #: None before the first tare
     baseline: Baseline = field(default_factory=Baseline)
+    #: For each stage of the pipeline
     stage_ms: Mapping[str, Percentiles] = field(default_factory=dict)
-    """For each stage of the pipeline."""
-    latency_ms: Percentiles | None = None
-    """From the last byte read to publication."""
-    methods: tuple[str, ...] = ()
-    """Those that `Daemon.set_method` takes."""
-    tier_requested: str = ""
-    """The method that was asked for."""
-    budget_ms: float | None = None
-    """Time that a frame may take; None: the method's own."""
+    latency_ms: Percentiles | None = None  #: from the last byte read to publication
+    methods: tuple[str, ...] = ()  #: those that `Daemon.set_method` takes
+    tier_requested: str = ""  #: the method that was asked for
+    budget_ms: float | None = None  #: time that a frame may take; None: the method's own
     plan: Plan = field(default_factory=Plan)
     recording: RecordingProgress | None = None
     recorder: Recorder = field(default_factory=Recorder)
-    subscribers: int = 0
-    """Subscriptions in force."""
+    subscribers: int = 0  #: subscriptions in force
+    #: Scans that came since the start, by channel
     scans: Mapping[str, int] = field(default_factory=dict)
-    """Scans that came since the start, by channel."""
-    frames: int = 0
-    """Frames published since the start."""
+    frames: int = 0  #: frames published since the start
     events: EventCounts = field(default_factory=EventCounts)
     process: Process | None = None

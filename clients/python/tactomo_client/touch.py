@@ -32,8 +32,7 @@ from tactomo_client.traces import Traces
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-CONTACTS: Final = 16
-"""Rows for contacts; a hand of five fingers, thrice."""
+CONTACTS: Final = 16  #: rows for contacts; a hand of five fingers, thrice
 IMAGES: Final = {"pressure_kpa": "pressure_kpa", "magnitude": "map", "structure": "structure"}
 CONTACT_COLUMNS: Final = tuple(field.name for field in fields(Contact))
 """A contact's fields; `pressure_range` is its place in `frame.PRESSURE_RANGES`."""

@@ -110,10 +110,8 @@ class PortProtocol:
 class Reading(NamedTuple):
     """One scan of a foreign device."""
 
-    volts: FloatArray
-    """(M,) in the description's order."""
-    device_us: int = 0
-    """By its clock; 0 where it has none."""
+    volts: FloatArray  #: (M,) in the description's order
+    device_us: int = 0  #: by its clock; 0 where it has none
 
 
 _POSITION: Final = struct.Struct("<IQB")

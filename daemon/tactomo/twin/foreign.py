@@ -32,12 +32,10 @@ PUMP_S = 0.001
 class Frame:
     """What an instrument has measured in one go round the electrodes."""
 
-    volts: FloatArray
-    """(M,) in the description's order."""
+    volts: FloatArray  #: (M,) in the description's order
     potentials: NDArray[np.complexfloating] | None
     """(injections, electrodes) volts against ground, where measured ones are played."""
-    time_s: float
-    """When it began, by the instrument's clock."""
+    time_s: float  #: when it began, by the instrument's clock
 
 
 class Emulator(Protocol):

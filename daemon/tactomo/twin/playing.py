@@ -22,8 +22,7 @@ from tactomo.recordings.imported_scans import (
     read_scans,
 )
 
-REST_FRAMES = 40
-"""How often a file's reference is said first, so that a daemon can tare by it."""
+REST_FRAMES = 40  #: how often a file's reference is said first, so that a daemon can tare by it
 
 
 class PlayedFrame(Mapping[Channel, FloatArray]):

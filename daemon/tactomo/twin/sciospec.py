@@ -33,8 +33,7 @@ from tactomo.twin.foreign import Frame, Grounded
 GROUPS: Final = 4
 RATE_HZ: Final = (0.1, 100.0)
 FREQUENCY_HZ: Final = (100.0, 1e6)
-TIMEOUT_S: Final = 0.2
-"""How long it waits for the rest of a message."""
+TIMEOUT_S: Final = 0.2  #: how long it waits for the rest of a message
 
 
 class SciospecEmulator:

@@ -6,8 +6,7 @@ Each block is a code and code - 1 bytes that are not zero; a zero follows where 
 
 from __future__ import annotations
 
-_RUN = 254
-"""Bytes without a zero that a block holds at most."""
+_RUN = 254  #: bytes without a zero that a block holds at most
 
 
 def max_encoded_length(size: int) -> int:

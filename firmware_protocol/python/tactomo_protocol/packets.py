@@ -89,8 +89,7 @@ class AckStatus(IntEnum):
     BUSY = 3
 
 
-SCAN_COUNTERS = 1 << 32
-"""How many values a scan's counter has before it begins again at 0."""
+SCAN_COUNTERS = 1 << 32  #: how many values a scan's counter has before it begins again at 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
