@@ -33,17 +33,14 @@ class SkinAtStart(Enum):
 
 
 def skin_at_start(
-    reconstructor: Reconstructor, known: Reference, now: Reference, elapsed_s: float
+    reconstructor: Reconstructor,  # of the sensor
+    known: Reference,  # taken of the unloaded skin
+    now: Reference,  # what may be loaded
+    elapsed_s: float,  # how long ago `known` held
 ) -> SkinAtStart:
     """Hold what a tare at a start took against a reference that is known to hold.
 
     Takes some tenths of a second. The reconstructor measures against `known` from then on.
-
-    Args:
-        reconstructor: of the sensor.
-        known: taken of the unloaded skin.
-        now: what may be loaded.
-        elapsed_s: how long ago `known` held.
     """
     tracker = BaselineTracker(reconstructor)
     tracker.begin(known)

@@ -78,15 +78,12 @@ class MachineSpeed(_Table):
 
     @classmethod
     def of_rows(
-        cls, description: SensorDescription, taken: str, rows: Sequence[Row]
+        cls,
+        description: SensorDescription,  # the sensor
+        taken: str,  # the day
+        rows: Sequence[Row],  # some of them of `auto`, under different budgets
     ) -> MachineSpeed:
-        """Make one of what was measured just now on this machine.
-
-        Args:
-            description: the sensor.
-            taken: the day.
-            rows: some of them of `auto`, under different budgets.
-        """
+        """Make one of what was measured just now on this machine."""
         overhead_s, speed = _law([row for row in rows if row.method == "auto"])
         return cls(
             tactomo=version("tactomo"),
@@ -187,13 +184,11 @@ def load_machine_speed(path: Path, description: SensorDescription) -> MachineSpe
     return found
 
 
-def machine_speed_for(description: SensorDescription, warn: Callable[[str], None]) -> MachineSpeed:
-    """What is in force: what was measured here, or else what comes with tactomo.
-
-    Args:
-        description: the sensor.
-        warn: told in one line why what was measured here is not used.
-    """
+def machine_speed_for(
+    description: SensorDescription,  # the sensor
+    warn: Callable[[str], None],  # told in one line why what was measured here is not used
+) -> MachineSpeed:
+    """What is in force: what was measured here, or else what comes with tactomo."""
     try:
         found = load_machine_speed(machine_speed_path(description), description)
     except FileNotFoundError:

@@ -53,17 +53,15 @@ class KnownSkin:
 
 
 class KeptReference:
-    """Reads and keeps one sensor's last reference. For use by the pipeline thread.
-
-    Args:
-        sensor: its name.
-        description: what it is made of; a reference of another one is not used.
-        recorder: its thread writes, so that a stuck disk holds up nobody.
-        on_event: told when it cannot be kept.
-    """
+    """Reads and keeps one sensor's last reference. For use by the pipeline thread."""
 
     def __init__(
-        self, sensor: str, description: SensorDescription, recorder: Recorder, on_event: OnEvent
+        self,
+        sensor: str,  # its name
+        # what it is made of; a reference of another one is not used
+        description: SensorDescription,
+        recorder: Recorder,  # its thread writes, so that a stuck disk holds up nobody
+        on_event: OnEvent,  # told when it cannot be kept
     ) -> None:
         self.is_unreadable = False  # whether there is one that could not be read
         self._path = reference_path(sensor)

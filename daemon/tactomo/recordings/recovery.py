@@ -80,14 +80,11 @@ class Recovery:
 
 
 def recover(
-    damaged: Path, output: Path, progress: Callable[[int, int], None] = lambda *_: None
+    damaged: Path,  # the recording; a whole one is copied
+    output: Path,  # the file to write; it appears when it is complete, and nothing is written over
+    progress: Callable[[int, int], None] = lambda *_: None,  # called with the bytes done and in all
 ) -> Recovery:
     """Write what is intact in `damaged` to a new file, with an index; `damaged` stays as it is.
-
-    Args:
-        damaged: the recording; a whole one is copied.
-        output: the file to write; it appears when it is complete, and nothing is written over.
-        progress: called with the bytes done and in all.
 
     Raises:
         RecordingError: there is nothing of a recording in `damaged`, it cannot be read, or

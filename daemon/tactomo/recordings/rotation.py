@@ -72,13 +72,11 @@ def _recordings(folder: Path, sensor: str) -> Iterator[KeptRecording]:
             yield KeptRecording(int(name["number"]), path, size, begin.timestamp(), end_s)
 
 
-def to_delete(recordings: list[KeptRecording], rules: RecordingConfig) -> list[Deletion]:
-    """Return what has to go, oldest first, so that the newest may grow to its full size.
-
-    Args:
-        recordings: all there are; the last one, which is being written, stays.
-        rules: what is to be kept.
-    """
+def to_delete(
+    recordings: list[KeptRecording],  # all there are; the last one, which is being written, stays
+    rules: RecordingConfig,  # what is to be kept
+) -> list[Deletion]:
+    """Return what has to go, oldest first, so that the newest may grow to its full size."""
     *closed, newest = recordings
     ages_s = _ages_s(recordings)
     room = rules.keep_gb * 1e9 - max(newest.size, rules.rotate_mb * 1e6)

@@ -105,16 +105,14 @@ class Plan:
             run(command)
 
 
-def plan_install(name: str, ports: Sequence[str], rules: str, root: Path, program: str) -> Plan:
-    """Return what installs the service of one skin.
-
-    Args:
-        name: of the skin, and of the service's instance.
-        ports: as the daemon is to open them.
-        rules: for udev, see `tactomo.acquisition.udev.rules`; may be empty.
-        root: ``/``, or where an image's disk is mounted.
-        program: `tactomo` as the service is to call it.
-    """
+def plan_install(
+    name: str,  # of the skin, and of the service's instance
+    ports: Sequence[str],  # as the daemon is to open them
+    rules: str,  # for udev, see `tactomo.acquisition.udev.rules`; may be empty
+    root: Path,  # ``/``, or where an image's disk is mounted
+    program: str,  # `tactomo` as the service is to call it
+) -> Plan:
+    """Return what installs the service of one skin."""
     files = [File(path, text) for path, text in _shared(root, program)]
     if rules:
         files.append(File(_rules_file(name), rules))
@@ -122,13 +120,11 @@ def plan_install(name: str, ports: Sequence[str], rules: str, root: Path, progra
     return Plan(root, tuple(files), tuple(_commands(root, files, name)))
 
 
-def plan_uninstall(name: str | None, root: Path) -> Plan:
-    """Return what removes the service of one skin, or of all; configurations and recordings stay.
-
-    Args:
-        name: of the skin; None for all of them and what they share.
-        root: as in `plan_install`.
-    """
+def plan_uninstall(
+    name: str | None,  # of the skin; None for all of them and what they share
+    root: Path,  # as in `plan_install`
+) -> Plan:
+    """Return what removes the service of one skin, or of all; configurations and recordings stay."""
     names = installed(root) if name is None else [name]
     paths = [_rules_file(each) for each in names]
     if name is None:

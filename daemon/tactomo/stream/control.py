@@ -117,16 +117,14 @@ class _Pending(NamedTuple):
 
 
 class Control(Worker):
-    """Answers commands. `open` it, `start` its thread, `stop` it.
-
-    Args:
-        handlers: one for each of COMMANDS; called by the thread with the checked arguments.
-        on_idle: called by the thread several times a second.
-        on_event: told of connections that were cut.
-    """
+    """Answers commands. `open` it, `start` its thread, `stop` it."""
 
     def __init__(
-        self, handlers: Mapping[str, Handler], on_idle: Callable[[], None], on_event: OnEvent
+        self,
+        # one for each of COMMANDS; called by the thread with the checked arguments
+        handlers: Mapping[str, Handler],
+        on_idle: Callable[[], None],  # called by the thread several times a second
+        on_event: OnEvent,  # told of connections that were cut
     ) -> None:
         super().__init__("control")
         self.address = ""  # where it is bound, once open

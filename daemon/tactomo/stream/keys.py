@@ -96,16 +96,14 @@ def make_pair(folder: Path, name: str, *, is_server: bool = False, force: bool =
 
 
 def allow(
-    folder: Path, public: Path, server: str, *, may_command: bool = False, force: bool = False
+    folder: Path,  # the server's folder of keys
+    public: Path,  # the client's ``NAME.key``; NAME is its name on the list
+    server: str,  # the server's name
+    *,
+    may_command: bool = False,  # the client may use the control socket, too
+    force: bool = False,  # replace another key of the same name
 ) -> Client:
     """Put a client's public key on a server's list, or change what it may do.
-
-    Args:
-        folder: the server's folder of keys.
-        public: the client's ``NAME.key``; NAME is its name on the list.
-        server: the server's name.
-        may_command: the client may use the control socket, too.
-        force: replace another key of the same name.
 
     Raises:
         KeysError: the file holds no public key, or a secret one; there is no such server; another

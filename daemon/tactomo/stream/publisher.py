@@ -131,15 +131,13 @@ class Publisher(Worker):
         return any(name.startswith(prefix) for prefix in self._prefixes)
 
     def publish(
-        self, kind: str, fields: Mapping[str, Any], header: Mapping[str, Any] | None = None
+        self,
+        kind: str,  # one of the stream's kinds
+        fields: Mapping[str, Any],  # the kind's own
+        # acquisition, tier, flags and misfit; by default the newest frame's
+        header: Mapping[str, Any] | None = None,
     ) -> None:
-        """Hand over a message; for any thread, and never waits.
-
-        Args:
-            kind: one of the stream's kinds.
-            fields: the kind's own.
-            header: acquisition, tier, flags and misfit; by default the newest frame's.
-        """
+        """Hand over a message; for any thread, and never waits."""
         self._queue.append(self._number(kind, self.header if header is None else header, fields))
         if not self._stopping.is_set():
             self._wake()

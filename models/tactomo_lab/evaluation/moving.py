@@ -76,13 +76,11 @@ class Step:
     tare: bool = False  # whether the reference is taken anew before it
 
 
-def choreography(indenters: Presses, millimetre_m: float) -> list[Step]:
-    """All frames.
-
-    Args:
-        indenters: by the names in `INDENTERS`, radii up to 12 mm; places are given here.
-        millimetre_m: a millimetre on the paper's sensor, on this one.
-    """
+def choreography(
+    indenters: Presses,  # by the names in `INDENTERS`, radii up to 12 mm; places are given here
+    millimetre_m: float,  # a millimetre on the paper's sensor, on this one
+) -> list[Step]:
+    """All frames."""
 
     def at(name: str, x_mm: float, y_mm: float) -> Press:
         return replace(indenters[name], x_m=x_mm * millimetre_m, y_m=y_mm * millimetre_m)

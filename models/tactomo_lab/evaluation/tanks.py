@@ -164,16 +164,13 @@ class TankImager:
 
 
 def evaluate_tanks(
-    imager: TankImager, tanks: Tanks, methods: Iterable[str], scale: float | None = None
+    imager: TankImager,  # of these tanks
+    tanks: Tanks,  # measured or simulated
+    methods: Iterable[str],  # `network`, or any of the daemon's
+    # of the changes, in units of the model's voltages; not known if None
+    scale: float | None = None,
 ) -> Iterator[TankOutcome]:
-    """Reconstruct every tank by every method and compare with the truth.
-
-    Args:
-        imager: of these tanks.
-        tanks: measured or simulated.
-        methods: `network`, or any of the daemon's.
-        scale: of the changes, in units of the model's voltages; not known if None.
-    """
+    """Reconstruct every tank by every method and compare with the truth."""
     largest = imager.largest_scale(tanks.changes)
     scales = [share * largest for share in SHARES] if scale is None else [scale]
     for name, change, truth in zip(tanks.names, tanks.changes, tanks.truth, strict=True):

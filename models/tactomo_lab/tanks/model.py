@@ -99,17 +99,14 @@ class TankModel:
 
 
 class Readings:
-    """Readings of one tank, as independent numbers of unit noise.
-
-    Args:
-        model: the tank.
-        currents: (n, L) into the electrodes at each reading; a row's sum is 0.
-        weights: (n, L) of the electrodes' potentials; a row's sum is 0.
-        reference: (n,) readings of the empty tank, in the model's unit.
-    """
+    """Readings of one tank, as independent numbers of unit noise."""
 
     def __init__(
-        self, model: TankModel, currents: FloatArray, weights: FloatArray, reference: FloatArray
+        self,
+        model: TankModel,  # the tank
+        currents: FloatArray,  # (n, L) into the electrodes at each reading; a row's sum is 0
+        weights: FloatArray,  # (n, L) of the electrodes' potentials; a row's sum is 0
+        reference: FloatArray,  # (n,) readings of the empty tank, in the model's unit
     ) -> None:
         one, other = model.pairs
         to_readings = currents[:, one] * weights[:, other] + currents[:, other] * weights[:, one]

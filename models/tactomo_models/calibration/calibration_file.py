@@ -274,17 +274,15 @@ def calibration_of(description: SensorDescription, path: Path) -> PressureCalibr
 
 
 def calibration_for(
-    sensor: str, description: SensorDescription, source: str, warn: Callable[[str], None]
+    sensor: str,  # its name in the stream
+    description: SensorDescription,  # what it is made of
+    source: str,  # where that came from: a shipped name, or a file
+    # called with one line that says why a calibration that is there is not used
+    warn: Callable[[str], None],
 ) -> PressureCalibration | None:
     """The calibration in force for a sensor, or None.
 
     It is looked for in the data folder by the sensor's name, then beside its description's file.
-
-    Args:
-        sensor: its name in the stream.
-        description: what it is made of.
-        source: where that came from: a shipped name, or a file.
-        warn: called with one line that says why a calibration that is there is not used.
     """
     for path in _places(sensor, source):
         try:

@@ -112,14 +112,11 @@ def transfer_resistances(
 
 
 def transfer_slopes(
-    description: SensorDescription, sheet: SheetMesh, changes: FloatArray
+    description: SensorDescription,  # the sensor
+    sheet: SheetMesh,  # its mesh of T triangles
+    changes: FloatArray,  # (K, T) of conductivity, relative to the description's
 ) -> tuple[FloatArray, FloatArray]:
     """Transfer resistances of an even sheet, and their derivatives by changes of conductivity.
-
-    Args:
-        description: the sensor.
-        sheet: its mesh of T triangles.
-        changes: (K, T) of conductivity, relative to the description's.
 
     Returns:
         (L, L) as `transfer_resistances`, and (K, L, L): dR = -u^T dA u, with the fields u.

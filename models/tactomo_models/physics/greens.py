@@ -125,13 +125,11 @@ def _separators(system: sp.csr_matrix, box: IntArray) -> BoolArray:
     return separates
 
 
-def _onto_rim(outside: sp.csc_matrix, coupling: sp.csc_matrix) -> FloatArray:
-    """What the elimination of all outside takes from the stiffness of the nodes it is coupled to.
-
-    Args:
-        outside: (m, m) stiffness of the unknowns outside.
-        coupling: (m, s) of them with nodes that are kept.
-    """
+def _onto_rim(
+    outside: sp.csc_matrix,  # (m, m) stiffness of the unknowns outside
+    coupling: sp.csc_matrix,  # (m, s) of them with nodes that are kept
+) -> FloatArray:
+    """What the elimination of all outside takes from the stiffness of the nodes it is coupled to."""
     seen = np.flatnonzero(np.diff(coupling.indptr))
     edge = coupling[:, seen].toarray()
     factor = spla.splu(outside.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})

@@ -25,17 +25,15 @@ class SheetMesh:
 
 
 def mesh_sheet(
-    description: SensorDescription, spacing_m: float | None = None, refinements: int = 3
+    description: SensorDescription,  # the sensor
+    # distance of the regular nodes; the map's own spacing if None, so that every map node of a
+    # rectangle is a mesh node
+    spacing_m: float | None = None,
+    # how often triangles at the electrodes' ends are halved; more often where electrodes or the
+    # gaps between them are narrower than the nodes' distance
+    refinements: int = 3,
 ) -> SheetMesh:
-    """Mesh a sheet.
-
-    Args:
-        description: the sensor.
-        spacing_m: distance of the regular nodes; the map's own spacing if None, so that every
-            map node of a rectangle is a mesh node.
-        refinements: how often triangles at the electrodes' ends are halved; more often where
-            electrodes or the gaps between them are narrower than the nodes' distance.
-    """
+    """Mesh a sheet."""
     disc = description.sheet.shape == "disc"
     mesh = _disc(description, spacing_m) if disc else _rectangle(description, spacing_m)
     ends = description.electrode_ends_m.reshape(-1, 2)

@@ -41,13 +41,11 @@ def even_scale(areas_m2: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(areas_m2.mean() / areas_m2))
 
 
-def noser_scale(J: FloatArray, noise: FloatArray) -> FloatArray:
-    """Expected size of each node's change (P,), up to a factor, by the NOSER prior.
-
-    Args:
-        J: (M, P) Jacobian of the relative voltage changes.
-        noise: (M,) their standard deviations.
-    """
+def noser_scale(
+    J: FloatArray,  # (M, P) Jacobian of the relative voltage changes
+    noise: FloatArray,  # (M,) their standard deviations
+) -> FloatArray:
+    """Expected size of each node's change (P,), up to a factor, by the NOSER prior."""
     sensitivity = np.einsum("mp,mp,m->p", J, J, noise**-2)
     # A node that no voltage sees is no reason to divide by zero.
     floor = 1e-12 * float(sensitivity.max())
@@ -55,43 +53,33 @@ def noser_scale(J: FloatArray, noise: FloatArray) -> FloatArray:
 
 
 def tikhonov_matrix(
-    J: FloatArray, noise: FloatArray, weight: float, prior_scale: FloatArray = EVEN
+    J: FloatArray,  # (M, P) derivative of the relative voltage changes by the nodes' conductivity
+    noise: FloatArray,  # (M,) standard deviations of the relative voltage changes
+    weight: float,  # the regularisation parameter lambda
+    prior_scale: FloatArray = EVEN,  # (P,) expected size of each node's change, up to a factor
 ) -> FloatArray:
-    """Reconstruction matrix (P, M).
-
-    Args:
-        J: (M, P) derivative of the relative voltage changes by the nodes' conductivity.
-        noise: (M,) standard deviations of the relative voltage changes.
-        weight: the regularisation parameter lambda.
-        prior_scale: (P,) expected size of each node's change, up to a factor.
-    """
+    """Reconstruction matrix (P, M)."""
     # (J'N⁻¹J + λS⁻²)⁻¹J'N⁻¹ = S²J'(JS²J' + λN)⁻¹, which inverts M x M instead of P x P.
     scaled = J * prior_scale**2
     data_space = scaled @ J.T + np.diag(weight * noise**2)
     return np.asarray(np.linalg.solve(data_space, scaled).T)
 
 
-def prior_weight(size: float, prior_scale: FloatArray) -> float:
-    """Regularisation parameter by Bayes: noise and changes are both what they are expected to be.
-
-    Args:
-        size: expected size of a node's change, root mean square over the nodes.
-        prior_scale: (P,) of `tikhonov_matrix`.
-    """
+def prior_weight(
+    size: float,  # expected size of a node's change, root mean square over the nodes
+    prior_scale: FloatArray,  # (P,) of `tikhonov_matrix`
+) -> float:
+    """Regularisation parameter by Bayes: noise and changes are both what they are expected to be."""
     return float(np.mean(prior_scale**2)) / size**2
 
 
 def noise_figure_weight(
-    J: FloatArray, noise: FloatArray, target: FloatArray, prior_scale: FloatArray = EVEN
+    J: FloatArray,  # (M, P) Jacobian of the relative voltage changes
+    noise: FloatArray,  # (M,) their standard deviations
+    target: FloatArray,  # (P,) conductivity change of the target
+    prior_scale: FloatArray = EVEN,  # (P,) expected size of each node's change, up to a factor
 ) -> float:
-    """Regularisation parameter at which the noise figure of a small central target is 1.
-
-    Args:
-        J: (M, P) Jacobian of the relative voltage changes.
-        noise: (M,) their standard deviations.
-        target: (P,) conductivity change of the target.
-        prior_scale: (P,) expected size of each node's change, up to a factor.
-    """
+    """Regularisation parameter at which the noise figure of a small central target is 1."""
     whitened = J / noise[:, None]
     signal = whitened @ target
     left, singular, right = np.linalg.svd(whitened * prior_scale, full_matrices=False)

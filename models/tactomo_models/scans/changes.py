@@ -240,13 +240,11 @@ def missing(name: Channel) -> Flag:
     return Flag.MAGNITUDE_MISSING if name == Channel.MAGNITUDE else Flag.STRUCTURE_MISSING
 
 
-def _leading_modes(jacobian: FloatArray, variance: FloatArray) -> FloatArray:
-    """Orthonormal directions (M, K) that the sheet's conductivity moves voltages over noise in.
-
-    Args:
-        jacobian: (M, P) of the relative voltage changes.
-        variance: (M,) of their noise; infinite where they are not measured.
-    """
+def _leading_modes(
+    jacobian: FloatArray,  # (M, P) of the relative voltage changes
+    variance: FloatArray,  # (M,) of their noise; infinite where they are not measured
+) -> FloatArray:
+    """Orthonormal directions (M, K) that the sheet's conductivity moves voltages over noise in."""
     least = 0.02  # of the largest singular value: 45 of 208; with half or twice that, 50 or 40
     whitened = jacobian / np.sqrt(variance)[:, None]
     squares, vectors = np.linalg.eigh(whitened @ whitened.T)

@@ -55,16 +55,13 @@ class Measurement:
 
 
 class Comparator:
-    """Holds scans against a reference.
-
-    Args:
-        description: the sensor.
-        artifact: what is precomputed for it.
-        forward: the model of its sheet.
-    """
+    """Holds scans against a reference."""
 
     def __init__(
-        self, description: SensorDescription, artifact: Artifact, forward: ForwardModel
+        self,
+        description: SensorDescription,  # the sensor
+        artifact: Artifact,  # what is precomputed for it
+        forward: ForwardModel,  # the model of its sheet
     ) -> None:
         much_more = 5.0  # ratio of the channels' contrasts (logarithms) for that
         # those that the reference has; others after a tare

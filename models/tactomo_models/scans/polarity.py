@@ -17,16 +17,13 @@ from tactomo_models.sensor.description import SensorDescription
 
 
 class Polarity:
-    """What turns a device's readings into voltages.
-
-    Args:
-        description: the sensor; says whether its instrument tells signs.
-        wiring: of the same sensor.
-        predicted: (M,) voltages of the bare sheet by the model, on any scale.
-    """
+    """What turns a device's readings into voltages."""
 
     def __init__(
-        self, description: SensorDescription, wiring: Wiring, predicted: FloatArray
+        self,
+        description: SensorDescription,  # the sensor; says whether its instrument tells signs
+        wiring: Wiring,  # of the same sensor
+        predicted: FloatArray,  # (M,) voltages of the bare sheet by the model, on any scale
     ) -> None:
         min_crossing = 0.2  # of the voltages' root mean square
         least = min_crossing * float(np.sqrt(np.mean(predicted**2)))

@@ -110,15 +110,12 @@ def map_of(areas: Areas, values: FloatArray) -> Image:
 
 
 def pressure_map(
-    areas: Areas, contacts: Sequence[Contact], pressure_kpa: FloatArray | None = None
+    areas: Areas,  # K areas
+    contacts: Sequence[Contact],  # one for each
+    # (nodes_y, nodes_x) as it falls over each area; even if None
+    pressure_kpa: FloatArray | None = None,
 ) -> Image:
-    """Each contact's pressure on its area; NaN, and not 0, where it is touched but unknown.
-
-    Args:
-        areas: K areas.
-        contacts: one for each.
-        pressure_kpa: (nodes_y, nodes_x) as it falls over each area; even if None.
-    """
+    """Each contact's pressure on its area; NaN, and not 0, where it is touched but unknown."""
     touched = 0.05  # share of a node that a contact covers, from which it is touched
     values = np.array([contact.pressure_kpa for contact in contacts])
     fused = map_of(areas, values)

@@ -86,15 +86,13 @@ class FieldAccountant:
         self._shape = x.shape
 
     def account(
-        self, fitted: FittedField, measured: Measured, doubts: Sequence[Doubt] = ()
+        self,
+        fitted: FittedField,  # the field
+        measured: Measured,  # the data that it explains
+        # other accounts; where they are likely, images are the mean of all
+        doubts: Sequence[Doubt] = (),
     ) -> FieldAccount:
-        """Account for a field.
-
-        Args:
-            fitted: the field.
-            measured: the data that it explains.
-            doubts: other accounts; where they are likely, images are the mean of all.
-        """
+        """Account for a field."""
         negligible = 0.02  # odds of what need not be drawn
         shown, family, weight = self._drawn(fitted, measured, None), fitted.family, 1.0
         shown = replace(shown, uncertainty=_uncertainty(shown))

@@ -322,16 +322,12 @@ def _seen(name: Channel, drawing: Drawing) -> FloatArray:
 
 
 def covariance_of(
-    jacobian: FloatArray, precision: FloatArray, measured: Measured, misfit: float
+    jacobian: FloatArray,  # (sum M, n) of the weighted residual
+    precision: FloatArray,  # (n,) inverse variances of the prior
+    measured: Measured,  # the data
+    misfit: float,  # that is left of them
 ) -> FloatArray:
-    """Covariance (n, n) of parameters; larger where the data are left unexplained.
-
-    Args:
-        jacobian: (sum M, n) of the weighted residual.
-        precision: (n,) inverse variances of the prior.
-        measured: the data.
-        misfit: that is left of them.
-    """
+    """Covariance (n, n) of parameters; larger where the data are left unexplained."""
     inflation = np.concatenate([each.variance_inflation for each in measured.values()])
     prior = np.diag(precision)
     inverse = np.linalg.inv(jacobian.T @ jacobian + prior)

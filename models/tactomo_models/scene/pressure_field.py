@@ -429,16 +429,12 @@ def _linear_step(t: FloatArray) -> FloatArray:
 
 
 def ellipses_of(
-    images: FloatArray, x_m: FloatArray, y_m: FloatArray, typical_peak: float
+    images: FloatArray,  # (K, rows, columns) share pressed by each contact, nowhere all 0
+    x_m: FloatArray,  # (rows, columns) places, evenly spaced
+    y_m: FloatArray,  # (rows, columns) places
+    typical_peak: float,  # peak that each starts with, in the field's unit
 ) -> FloatArray:
-    """Parameters (K, COLUMNS) of ellipses of the same centre, area and second moments.
-
-    Args:
-        images: (K, rows, columns) share pressed by each contact, nowhere all 0.
-        x_m: (rows, columns) places, evenly spaced.
-        y_m: (rows, columns) places.
-        typical_peak: peak that each starts with, in the field's unit.
-    """
+    """Parameters (K, COLUMNS) of ellipses of the same centre, area and second moments."""
     cell_m2 = float((x_m[0, 1] - x_m[0, 0]) * (y_m[1, 0] - y_m[0, 0]))
     each = np.zeros((len(images), COLUMNS))
     each[:, PEAK] = typical_peak

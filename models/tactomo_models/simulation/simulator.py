@@ -78,14 +78,11 @@ class SkinSimulator:
         return self.solve(self.ratio(channel, scene))
 
     def voltages_under(
-        self, pressure_kpa: FloatArray, coverage: FloatArray
+        self,
+        pressure_kpa: FloatArray,  # (P,) where the nodes are covered
+        coverage: FloatArray,  # (P,) share of each node's neighbourhood that is covered, 0 to 1
     ) -> dict[Channel, FloatArray]:
-        """Noise-free voltages (M,) of each channel for any pressure at the nodes.
-
-        Args:
-            pressure_kpa: (P,) where the nodes are covered.
-            coverage: (P,) share of each node's neighbourhood that is covered, 0 to 1.
-        """
+        """Noise-free voltages (M,) of each channel for any pressure at the nodes."""
         return {
             name: self.solve(conductivity_ratio(self.description, name, pressure_kpa, coverage))
             for name in self.channels
@@ -109,14 +106,12 @@ class SkinSimulator:
         return smooth_noise(x, y, self.description.width_m / 4, rng)
 
     def sensitivity(
-        self, field: FloatArray | float = 0.0, impedance: FloatArray | float = 0.0
+        self,
+        # (N,) change of the logarithm of conductivity at the mesh's nodes
+        field: FloatArray | float = 0.0,
+        impedance: FloatArray | float = 0.0,  # (L,) that of the contact impedances
     ) -> FloatArray:
-        """By how much the logarithms of the bare sheet's voltages (M,) change.
-
-        Args:
-            field: (N,) change of the logarithm of conductivity at the mesh's nodes.
-            impedance: (L,) that of the contact impedances.
-        """
+        """By how much the logarithms of the bare sheet's voltages (M,) change."""
         step = 0.01  # central differences: the error is of the order of its square
         up, down = (self._directly(side * step, field, impedance) for side in (1, -1))
         with np.errstate(divide="ignore", invalid="ignore"):
