@@ -27,19 +27,13 @@ import re
 
 
 class ClientError(Exception):
-    """Anything this package raises on purpose.
-
-    Attributes:
-        name: a short stable identifier such as ``no_answer``, for programs.
-        cause: what went wrong, for people.
-        next_step: what to do about it, for people; may be empty.
-    """
+    """Anything this package raises on purpose."""
 
     def __init__(self, cause: str, next_step: str = "", name: str = "client_error") -> None:
         super().__init__(f"{cause}; {next_step}" if next_step else cause)
-        self.name = name
-        self.cause = cause
-        self.next_step = next_step
+        self.name = name  #: a short stable identifier such as ``no_answer``, for programs
+        self.cause = cause  #: what went wrong, for people
+        self.next_step = next_step  #: what to do about it, for people; may be empty
 
 
 class MessageError(ClientError, ValueError):

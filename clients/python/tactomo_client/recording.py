@@ -63,26 +63,18 @@ def open_recording(path: str | Path, *, sensor: str | None = None) -> Recording:
 
 
 class Recording:
-    """A recording opened for reading; every iteration reads the files anew, a chunk at a time.
-
-    Attributes:
-        path: the file or the folder.
-        files: the file, or those of the folder in order.
-        sensor: the sensor's name.
-        description: its description: the name of a shipped one, or the path of the file on the
-            computer that recorded.
-        description_sha256: that description's hash.
-        version: the version of the daemon that recorded.
-    """
+    """A recording opened for reading; every iteration reads the files anew, a chunk at a time."""
 
     def __init__(self, path: Path, files: tuple[Path, ...]) -> None:
-        self.path = path
-        self.files = files
+        self.path = path  #: the file or the folder
+        self.files = files  #: the file, or those of the folder in order
         metadata = read_metadata(files[0])
-        self.sensor = metadata.get("sensor", "")
+        self.sensor = metadata.get("sensor", "")  #: the sensor's name
+        #: its description: the name of a shipped one, or the path of the file on the computer that
+        #: recorded
         self.description = metadata.get("description", "")
-        self.description_sha256 = metadata.get("description_sha256", "")
-        self.version = metadata.get("version", "")
+        self.description_sha256 = metadata.get("description_sha256", "")  #: that description's hash
+        self.version = metadata.get("version", "")  #: the version of the daemon that recorded
 
     @cached_property
     def start_ns(self) -> int:

@@ -45,9 +45,6 @@ class Touch:
         shape: of the maps, (ny, nx).
         contacts: how many rows there are for contacts.
 
-    Attributes:
-        crowded: how many contacts found no row so far.
-
     Example::
 
         touch = Touch((51, 51))
@@ -56,7 +53,7 @@ class Touch:
     """
 
     def __init__(self, shape: tuple[int, int], contacts: int = CONTACTS) -> None:
-        self.crowded = 0
+        self.crowded = 0  #: how many contacts found no row so far
         self._shape = shape
         self._rows = contacts
         self._traces = Traces()

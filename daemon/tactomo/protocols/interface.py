@@ -41,33 +41,22 @@ class Trouble(NamedTuple):
 
 
 class PortProtocol:
-    """A language of devices, as one port speaks it; a subclass decodes with `feed`.
+    """A language of devices, as one port speaks it; a subclass decodes with `feed`."""
 
-    Attributes:
-        name: in configurations, recordings and `status`.
-        baud: of a real UART, where the configuration names none.
-        emulator: ``my_module:MyBoard``, what the twin speaks the protocol with; may be empty.
-        patience_s: how long a device may send no scan before it is introduced to us again.
-        preamble_period_s: how often a recording is given a preamble, for what comes after damage;
-            may be inf.
-        says_hello: whether a device says hello every second, scans or not.
-        has_clock: whether scans say by the device's own clock when they were taken.
-        counts: what was understood and what was not, over all connections.
-        trouble: why scans cannot be used at present; None where they can, or none came yet.
-        acknowledges: whether a device answers every command.
-        fault: which rule of the protocol the last intact message broke; empty for none.
-    """
-
-    name: ClassVar[str]
-    baud: ClassVar[int] = 115_200
+    name: ClassVar[str]  #: in configurations, recordings and `status`
+    baud: ClassVar[int] = 115_200  #: of a real UART, where the configuration names none
+    #: ``my_module:MyBoard``, what the twin speaks the protocol with; may be empty
     emulator: ClassVar[str] = ""
+    #: how long a device may send no scan before it is introduced to us again
     patience_s: float = 4.0
+    #: how often a recording is given a preamble, for what comes after damage; may be inf
     preamble_period_s: float = 1.0
-    says_hello: bool = False
-    has_clock: bool = False
-    acknowledges: bool = False
-    fault: str = ""
-    counts: DecoderCounts
+    says_hello: bool = False  #: whether a device says hello every second, scans or not
+    has_clock: bool = False  #: whether scans say by the device's own clock when they were taken
+    acknowledges: bool = False  #: whether a device answers every command
+    fault: str = ""  #: which rule of the protocol the last intact message broke; empty for none
+    counts: DecoderCounts  #: what was understood and what was not, over all connections
+    #: why scans cannot be used at present; None where they can, or none came yet
     trouble: Trouble | None = None
 
     @classmethod
@@ -152,14 +141,9 @@ class ForeignProtocol(PortProtocol):
 
     Raises:
         ConfigError: the description has two channels, or more voltages than a scan can have.
-
-    Attributes:
-        device_id: what the device is called in `status`.
-        device_us: the newest reading's time, to go on from.
-        clock_format: of several that a device's clock may have, a number that `parse` understands.
     """
 
-    device_id: ClassVar[str]
+    device_id: ClassVar[str]  #: what the device is called in `status`
     counts: ForeignCounts
 
     def __init__(self, description: SensorDescription | None, rate_hz: float = 0.0) -> None:
@@ -183,7 +167,8 @@ class ForeignProtocol(PortProtocol):
         self.description = description
         self.counts = ForeignCounts()
         self._failure: Trouble | None = None  # a mistake of the subclass, the last one
-        self.device_us = 0
+        self.device_us = 0  #: the newest reading's time, to go on from
+        #: of several that a device's clock may have, a number that `parse` understands
         self.clock_format = 0
         [self._channel] = description.channels
         self._rate_hz = rate_hz

@@ -124,7 +124,7 @@ def plan_uninstall(
     name: str | None,  # of the skin; None for all of them and what they share
     root: Path,  # as in `plan_install`
 ) -> Plan:
-    """Return what removes the service of one skin, or of all; configurations and recordings stay."""
+    """Return what removes the service of a skin, or of all; configurations and recordings stay."""
     names = installed(root) if name is None else [name]
     paths = [_rules_file(each) for each in names]
     if name is None:

@@ -87,38 +87,26 @@ def make_skin(
 
 @dataclass(frozen=True)
 class TwinConfig:
-    """How the twin is set up.
+    """How the twin is set up."""
 
-    Attributes:
-        description: the sensor that it simulates.
-        ports: 1 for one line that carries every channel, 2 for a line for each.
-        rate_hz: scans a second, at first; the host may change it. None for those of the file that
-            is played, or 20.
-        noise_v: noise in volts rms; None for a usual converter's.
-        skin_drift: how the skin itself drifts; the scene's if that says so.
-        unevenness: standard deviation of the sheet's conductivity, a ratio.
-        seed: equal seeds give equal noise, drift and unevenness.
-        scene: a scripted scene; it starts with the first scan that a host can receive.
-        protocol: what the device speaks; foreign ones have one port and one channel.
-        play: an .npz file of measured frames, said in the place of simulated ones.
-        play_once: stop after the file's last frame instead of beginning again.
-        control: address of the control socket; port 0 takes a free one.
-        link_folder: where to keep links with stable names to the lines.
-    """
-
-    description: SensorDescription
-    ports: int = 1
+    description: SensorDescription  #: the sensor that it simulates
+    ports: int = 1  #: 1 for one line that carries every channel, 2 for a line for each
+    #: scans a second, at first; the host may change it. None for those of the file that is played,
+    #: or 20
     rate_hz: float | None = None
-    noise_v: float | None = None
+    noise_v: float | None = None  #: noise in volts rms; None for a usual converter's
+    #: how the skin itself drifts; the scene's if that says so
     skin_drift: SkinDrift = field(default_factory=SkinDrift)
-    unevenness: float = UNEVENNESS
-    seed: int = 0
+    unevenness: float = UNEVENNESS  #: standard deviation of the sheet's conductivity, a ratio
+    seed: int = 0  #: equal seeds give equal noise, drift and unevenness
+    #: a scripted scene; it starts with the first scan that a host can receive
     scene: Scene | None = None
-    protocol: str = NATIVE
+    protocol: str = NATIVE  #: what the device speaks; foreign ones have one port and one channel
+    #: an .npz file of measured frames, said in the place of simulated ones
     play: Path | None = None
-    play_once: bool = False
-    control: str = DEFAULT_TWIN_CONTROL
-    link_folder: Path | None = None
+    play_once: bool = False  #: stop after the file's last frame instead of beginning again
+    control: str = DEFAULT_TWIN_CONTROL  #: address of the control socket; port 0 takes a free one
+    link_folder: Path | None = None  #: where to keep links with stable names to the lines
 
     def __post_init__(self) -> None:
         try:

@@ -116,15 +116,12 @@ class Decoder:
 
     Holds at most one frame's bytes between calls. What comes before the first delimiter is the
     rest of a frame whose start was missed: it is dropped and not counted.
-
-    Attributes:
-        counts: of all that was fed.
-        fault: which rule the last intact frame that gave no packet breaks, for the firmware's
-            author; empty before there is one.
     """
 
     def __init__(self) -> None:
-        self.counts = DecoderCounts()
+        self.counts = DecoderCounts()  #: of all that was fed
+        #: which rule the last intact frame that gave no packet breaks, for the firmware's author;
+        #: empty before there is one
         self.fault = ""
         self._pending = bytearray()
         self._dropping = True  # until the next delimiter

@@ -60,34 +60,25 @@ def match(found: Sequence[Contact], true: Sequence[TrueContact]) -> list[tuple[i
 
 @dataclass(frozen=True)
 class ContactScore:
-    """How one true contact was found.
+    """How one true contact was found."""
 
-    Attributes:
-        shape: of the indenter.
-        area_mm2: true area.
-        pressure_kpa: true pressure.
-        magnitude: true |relative conductivity change|.
-        centre_error_mm: distance of the centroids; NaN if missed, as everything below.
-        area_error: relative error of the area.
-        magnitude_error: found minus true, as a share of the range.
-        magnitude_sigma: its standard uncertainty as reported, as a share of the range.
-        pressure_error_kpa: found minus true; NaN, too, where no pressure was reported.
-        peak_error: relative error of the peak pressure, or of the pressure where no peak was
-            reported; NaN, too, where neither was.
-        x_error_sigmas, y_error_sigmas, area_error_sigmas: errors of place and area over their
-            standard uncertainties; NaN, too, where none was reported.
-    """
-
-    shape: str
-    area_mm2: float
-    pressure_kpa: float
-    magnitude: float
+    shape: str  #: of the indenter
+    area_mm2: float  #: true area
+    pressure_kpa: float  #: true pressure
+    magnitude: float  #: true |relative conductivity change|
+    #: distance of the centroids; NaN if missed, as everything below
     centre_error_mm: float = float("nan")
-    area_error: float = float("nan")
-    magnitude_error: float = float("nan")
+    area_error: float = float("nan")  #: relative error of the area
+    magnitude_error: float = float("nan")  #: found minus true, as a share of the range
+    #: its standard uncertainty as reported, as a share of the range
     magnitude_sigma: float = float("nan")
+    #: found minus true; NaN, too, where no pressure was reported
     pressure_error_kpa: float = float("nan")
+    #: relative error of the peak pressure, or of the pressure where no peak was reported; NaN, too,
+    #: where neither was
     peak_error: float = float("nan")
+    #: x_error_sigmas, y_error_sigmas, area_error_sigmas: errors of place and area over their
+    #: standard uncertainties; NaN, too, where none was reported
     x_error_sigmas: float = float("nan")
     y_error_sigmas: float = float("nan")
     area_error_sigmas: float = float("nan")
@@ -105,24 +96,16 @@ class ContactScore:
 
 @dataclass(frozen=True)
 class FrameScore:
-    """How one frame was reconstructed.
+    """How one frame was reconstructed."""
 
-    Attributes:
-        contacts: one for each true contact.
-        found: contacts reported.
-        rie, icc: of the magnitude map.
-        icc_structure: of the pressed shape.
-        distrusted: whether a flag told the user not to trust the frame.
-        seconds: that it took.
-    """
-
-    contacts: tuple[ContactScore, ...]
-    found: int
+    contacts: tuple[ContactScore, ...]  #: one for each true contact
+    found: int  #: contacts reported
+    #: rie, icc: of the magnitude map
     rie: float
     icc: float
-    icc_structure: float
-    distrusted: bool
-    seconds: float
+    icc_structure: float  #: of the pressed shape
+    distrusted: bool  #: whether a flag told the user not to trust the frame
+    seconds: float  #: that it took
 
     @property
     def count_right(self) -> bool | None:
@@ -142,20 +125,13 @@ class FrameScore:
 
 @dataclass(frozen=True)
 class SceneScore(FrameScore):
-    """How one still scene was reconstructed.
+    """How one still scene was reconstructed."""
 
-    Attributes:
-        scene: its seed set, number of contacts and number, e.g. "tuning 3/17".
-        flags: names of what was flagged.
-        tier: what made it.
-        misfit: as reported.
-        shape, contrast, opposite, snr_db: of the scene.
-    """
-
-    scene: str
-    flags: tuple[str, ...]
-    tier: str
-    misfit: float
+    scene: str  #: its seed set, number of contacts and number, e.g. "tuning 3/17"
+    flags: tuple[str, ...]  #: names of what was flagged
+    tier: str  #: what made it
+    misfit: float  #: as reported
+    #: shape, contrast, opposite, snr_db: of the scene
     shape: str
     contrast: float
     opposite: bool
@@ -237,56 +213,40 @@ def full_range(description: SensorDescription) -> float:
 
 @dataclass(frozen=True)
 class Summary:
-    """Many frames' measures. Means, where nothing else is said; NaN where nothing was measured.
+    """Many frames' measures. Means, where nothing else is said; NaN where nothing was measured."""
 
-    Attributes:
-        frames: how many, of a scene each where scenes are still.
-        icc, rie: of the magnitude map.
-        icc_worst: of the worst scene in twenty (5th percentile).
-        icc_structure: of the pressed shape.
-        count_right: share of scenes with the right number of contacts.
-        missed: share of the true contacts.
-        false: contacts that are none, a scene.
-        centre_mm, centre_mm_95: median and 95th percentile, matched contacts.
-        area_error: median of the relative error's size.
-        magnitude_error: size of the error as a share of the range.
-        magnitude_spread: largest minus smallest error at one pressure (bands of `BAND_KPA`), a
-            share of the range: the paper's measure.
-        pressure_error_kpa: size of the error where a pressure was reported.
-        within_sigma: share of magnitude errors within one reported standard uncertainty;
-            0.68 where those are right.
-        place_within_sigma, area_within_sigma: likewise of x and y, and of the area.
-        peak_right: share of the true contacts whose peak pressure is right to `RIGHT_PEAK`, of
-            those that the magnitude channel answers to.
-        distrusted: share of scenes flagged as not to be trusted.
-        bad_unflagged: share of scenes with an ICC below `BAD_ICC` and not flagged so.
-        good_flagged: share of the other scenes that are flagged so.
-        confidently_wrong: share of scenes that are wrong and not flagged.
-        seconds, seconds_99: median and 99th percentile of the compute time.
-    """
-
-    frames: int
+    frames: int  #: how many, of a scene each where scenes are still
+    #: icc, rie: of the magnitude map
     icc: float
-    icc_worst: float
+    icc_worst: float  #: of the worst scene in twenty (5th percentile)
     rie: float
-    icc_structure: float
-    count_right: float
-    missed: float
-    false: float
+    icc_structure: float  #: of the pressed shape
+    count_right: float  #: share of scenes with the right number of contacts
+    missed: float  #: share of the true contacts
+    false: float  #: contacts that are none, a scene
+    #: centre_mm, centre_mm_95: median and 95th percentile, matched contacts
     centre_mm: float
     centre_mm_95: float
-    area_error: float
-    magnitude_error: float
+    area_error: float  #: median of the relative error's size
+    magnitude_error: float  #: size of the error as a share of the range
+    #: largest minus smallest error at one pressure (bands of `BAND_KPA`), a share of the range: the
+    #: paper's measure
     magnitude_spread: float
-    pressure_error_kpa: float
+    pressure_error_kpa: float  #: size of the error where a pressure was reported
+    #: share of magnitude errors within one reported standard uncertainty; 0.68 where those are
+    #: right
     within_sigma: float
+    #: place_within_sigma, area_within_sigma: likewise of x and y, and of the area
     place_within_sigma: float
     area_within_sigma: float
+    #: share of the true contacts whose peak pressure is right to `RIGHT_PEAK`, of those that the
+    #: magnitude channel answers to
     peak_right: float
-    distrusted: float
-    bad_unflagged: float
-    good_flagged: float
-    confidently_wrong: float
+    distrusted: float  #: share of scenes flagged as not to be trusted
+    bad_unflagged: float  #: share of scenes with an ICC below `BAD_ICC` and not flagged so
+    good_flagged: float  #: share of the other scenes that are flagged so
+    confidently_wrong: float  #: share of scenes that are wrong and not flagged
+    #: seconds, seconds_99: median and 99th percentile of the compute time
     seconds: float
     seconds_99: float
 

@@ -53,35 +53,23 @@ DISPLACED_M = 0.0007  # standard deviation of the electrodes' places along the r
 
 @dataclass(frozen=True)
 class SheetErrors:
-    """How one sheet differs from its description.
+    """How one sheet differs from its description."""
 
-    Attributes:
-        seed: of the field of conductivity errors.
-        unevenness: standard deviation of that smooth field.
-        impedance: (L,) contact impedances, relative to the description's.
-        displaced_m: (L,) by how much each electrode sits off along the rim, counter-clockwise.
-    """
-
-    seed: int
-    unevenness: float
-    impedance: FloatArray
+    seed: int  #: of the field of conductivity errors
+    unevenness: float  #: standard deviation of that smooth field
+    impedance: FloatArray  #: (L,) contact impedances, relative to the description's
+    #: (L,) by how much each electrode sits off along the rim, counter-clockwise
     displaced_m: FloatArray
 
 
 @dataclass(frozen=True)
 class TrainingScene:
-    """A scene to simulate.
+    """A scene to simulate."""
 
-    Attributes:
-        presses: what presses.
-        contrast: of the structure channel when saturated.
-        opposite: whether the magnitude channel changes against the description's sign.
-        sheets: errors of the magnitude and of the structure sheet; None where there are none.
-    """
-
-    presses: tuple[Press, ...]
-    contrast: float
-    opposite: bool
+    presses: tuple[Press, ...]  #: what presses
+    contrast: float  #: of the structure channel when saturated
+    opposite: bool  #: whether the magnitude channel changes against the description's sign
+    #: errors of the magnitude and of the structure sheet; None where there are none
     sheets: tuple[SheetErrors, SheetErrors] | None
 
 

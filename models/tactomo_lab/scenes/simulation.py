@@ -55,18 +55,12 @@ def fine_mesh(description: SensorDescription) -> SheetMesh:
 
 @dataclass(frozen=True)
 class SheetState:
-    """What has become of a sheet; as it was made by default.
+    """What has become of a sheet; as it was made by default."""
 
-    Attributes:
-        warming: relative change of its conductivity, everywhere alike.
-        drift: standard deviation of a smooth relative change of its conductivity.
-        impedance: (L,) factors on its contact impedances; 1 where empty.
-        leads: (L,) the electrode that each of the device's leads is on; its own where empty.
-    """
-
-    warming: float = 0.0
-    drift: float = 0.0
-    impedance: tuple[float, ...] = ()
+    warming: float = 0.0  #: relative change of its conductivity, everywhere alike
+    drift: float = 0.0  #: standard deviation of a smooth relative change of its conductivity
+    impedance: tuple[float, ...] = ()  #: (L,) factors on its contact impedances; 1 where empty
+    #: (L,) the electrode that each of the device's leads is on; its own where empty
     leads: tuple[int, ...] = ()
 
 
@@ -219,39 +213,28 @@ def displaced(
 
 @dataclass(frozen=True)
 class TrueContact:
-    """What really presses in one place.
+    """What really presses in one place."""
 
-    Attributes:
-        x_m, y_m: its centroid.
-        area_m2: its area.
-        pressure_kpa: its highest pressure.
-        magnitude: |relative conductivity change| of the magnitude channel, mean over its area.
-        shape: of its indenter.
-    """
-
+    #: x_m, y_m: its centroid
     x_m: float
     y_m: float
-    area_m2: float
-    pressure_kpa: float
-    magnitude: float
-    shape: Shape
+    area_m2: float  #: its area
+    pressure_kpa: float  #: its highest pressure
+    magnitude: float  #: |relative conductivity change| of the magnitude channel, mean over its area
+    shape: Shape  #: of its indenter
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What a perfect reconstruction of a scene would show.
+    """What a perfect reconstruction of a scene would show."""
 
-    Attributes:
-        map: (nodes_y, nodes_x) |relative conductivity change| of the magnitude channel, averaged
-            over the cell around each node.
-        pressed: (nodes_y, nodes_x) share of each cell that is pressed; below saturation, of the
-            structure channel's change, in logarithm.
-        contacts: one for each indenter.
-    """
-
+    #: (nodes_y, nodes_x) |relative conductivity change| of the magnitude channel, averaged over the
+    #: cell around each node
     map: FloatArray
+    #: (nodes_y, nodes_x) share of each cell that is pressed; below saturation, of the structure
+    #: channel's change, in logarithm
     pressed: FloatArray
-    contacts: tuple[TrueContact, ...]
+    contacts: tuple[TrueContact, ...]  #: one for each indenter
 
 
 def truth_of(description: SensorDescription, presses: Sequence[Press]) -> Truth:

@@ -94,17 +94,13 @@ class BaselineTracker:
         reconstructor: is given the references, from `begin` on by nobody else.
         time_constant_s: by which the reference follows while nothing presses.
 
-    Attributes:
-        reference: the one in force; None before the first tare.
-        moves: how often the reference has moved since the tare.
-        refusal: why what is seen is not followed; empty while it is, or may be a contact.
-
     Not thread-safe: one thread owns it.
     """
 
     def __init__(self, reconstructor: Solver, time_constant_s: float = TIME_CONSTANT_S) -> None:
-        self.reference: Reference | None = None
-        self.moves = 0
+        self.reference: Reference | None = None  #: the one in force; None before the first tare
+        self.moves = 0  #: how often the reference has moved since the tare
+        #: why what is seen is not followed; empty while it is, or may be a contact
         self.refusal = ""
         self._reconstructor = reconstructor
         self._time_constant_s = time_constant_s

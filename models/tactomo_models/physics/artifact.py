@@ -37,23 +37,14 @@ TARGET_SHARE = 0.1  # radius of the noise figure's target over the smaller half 
 
 @dataclass(frozen=True)
 class Artifact:
-    """All that is precomputed for one sensor.
+    """All that is precomputed for one sensor."""
 
-    Attributes:
-        sensor: name of the description it was built for.
-        sha256: that description's hash.
-        bare: the solved bare sheet.
-        jacobian: (M, P) derivative of relative voltage changes by relative conductivity.
-        tikhonov: (P, M) reconstruction matrix for the nominal noise.
-        regularisation: its lambda, for changes of a typical size.
-    """
-
-    sensor: str
-    sha256: str
-    bare: BareSheet
-    jacobian: FloatArray
-    tikhonov: FloatArray
-    regularisation: float
+    sensor: str  #: name of the description it was built for
+    sha256: str  #: that description's hash
+    bare: BareSheet  #: the solved bare sheet
+    jacobian: FloatArray  #: (M, P) derivative of relative voltage changes by relative conductivity
+    tikhonov: FloatArray  #: (P, M) reconstruction matrix for the nominal noise
+    regularisation: float  #: its lambda, for changes of a typical size
 
 
 def nominal_noise(bare_voltages: FloatArray) -> FloatArray:

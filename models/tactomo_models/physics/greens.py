@@ -129,7 +129,7 @@ def _onto_rim(
     outside: sp.csc_matrix,  # (m, m) stiffness of the unknowns outside
     coupling: sp.csc_matrix,  # (m, s) of them with nodes that are kept
 ) -> FloatArray:
-    """What the elimination of all outside takes from the stiffness of the nodes it is coupled to."""
+    """What eliminating all outside takes from the stiffness of the nodes that it is coupled to."""
     seen = np.flatnonzero(np.diff(coupling.indptr))
     edge = coupling[:, seen].toarray()
     factor = spla.splu(outside.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})

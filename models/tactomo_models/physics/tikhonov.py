@@ -69,7 +69,7 @@ def prior_weight(
     size: float,  # expected size of a node's change, root mean square over the nodes
     prior_scale: FloatArray,  # (P,) of `tikhonov_matrix`
 ) -> float:
-    """Regularisation parameter by Bayes: noise and changes are both what they are expected to be."""
+    """Regularisation parameter by Bayes: noise and changes are both what is expected of them."""
     return float(np.mean(prior_scale**2)) / size**2
 
 

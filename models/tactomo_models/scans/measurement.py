@@ -24,21 +24,16 @@ LEFT_OUT: Final = Flag.ELECTRODE_FAULT | Flag.INVALID_VOLTAGE  # what is known t
 
 @dataclass(frozen=True)
 class Measurement:
-    """One frame's relative voltage changes.
+    """One frame's relative voltage changes."""
 
-    Attributes:
-        changes: of each channel that has a usable scan; the others are absent.
-        flags: what stands in the way of trusting them.
-        standing_flags: those of `flags` that say what was left out at the tare, and ever since:
-            these scans have nothing to add.
-        faults: in words, which electrodes are left out.
-        stage_s: seconds spent in each stage of this frame so far.
-    """
-
+    #: of each channel that has a usable scan; the others are absent
     changes: Mapping[Channel, Changes]
-    flags: Flag = field(default_factory=lambda: Flag(0))
+    flags: Flag = field(default_factory=lambda: Flag(0))  #: what stands in the way of trusting them
+    #: those of `flags` that say what was left out at the tare, and ever since: these scans have
+    #: nothing to add
     standing_flags: Flag = field(default_factory=lambda: Flag(0))
-    faults: tuple[str, ...] = ()
+    faults: tuple[str, ...] = ()  #: in words, which electrodes are left out
+    #: seconds spent in each stage of this frame so far
     stage_s: dict[str, float] = field(default_factory=dict)
 
     @property

@@ -18,26 +18,18 @@ TRUSTED_SCANS = 20  # a variance from as many is known to a third
 
 @dataclass(frozen=True)
 class Reference:
-    """Voltages of the unpressed skin; None for a channel that is not there.
+    """Voltages of the unpressed skin; None for a channel that is not there."""
 
-    Attributes:
-        magnitude: (M,) volts.
-        structure: (M,) volts.
-        magnitude_noise: (M,) standard deviation of one scan, volts; None where unknown.
-        structure_noise: (M,) likewise.
-        scans: how many were averaged.
-        magnitude_drift: (M,) logarithm of the factor by which each voltage has drifted since; None
-            where nothing has been followed.
-        structure_drift: (M,) likewise.
-    """
-
-    magnitude: FloatArray | None
-    structure: FloatArray | None
+    magnitude: FloatArray | None  #: (M,) volts
+    structure: FloatArray | None  #: (M,) volts
+    #: (M,) standard deviation of one scan, volts; None where unknown
     magnitude_noise: FloatArray | None = None
-    structure_noise: FloatArray | None = None
-    scans: int = 1
+    structure_noise: FloatArray | None = None  #: (M,) likewise
+    scans: int = 1  #: how many were averaged
+    #: (M,) logarithm of the factor by which each voltage has drifted since; None where nothing has
+    #: been followed
     magnitude_drift: FloatArray | None = None
-    structure_drift: FloatArray | None = None
+    structure_drift: FloatArray | None = None  #: (M,) likewise
 
     @property
     def lacks_noise(self) -> bool:

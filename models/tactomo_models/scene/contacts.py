@@ -14,49 +14,39 @@ from tactomo_models.scene.pressure import FieldContacts, PressureCurve, Pressure
 
 @dataclass(frozen=True)
 class Contact:
-    """One pressed area.
+    """One pressed area."""
 
-    Attributes:
-        id: its identity over time, counted up from 1.
-        x_m, y_m: its centroid.
-        area_m2: its area.
-        magnitude: relative conductivity change of the magnitude channel, without its sign;
-            NaN if unknown.
-        magnitude_sigma: standard uncertainty of the magnitude.
-        pressure_kpa: see `pressure_range`; NaN if unknown, the range's top if above.
-        x_sigma_m, y_sigma_m: standard uncertainties of the centroid; NaN if unknown.
-        area_sigma_m2: that of the area; NaN if unknown.
-        pressure_sigma_kpa: standard uncertainty of the pressure; NaN but within the range.
-        force_n: pressure times area; NaN if unknown.
-        force_sigma_n: standard uncertainty of the force; NaN if unknown.
-        pressure_range: where the pressure lies, seen from what the magnitude channel answers to.
-        peak_kpa: highest pressure under it; NaN if unknown, the range's top if above.
-        peak_sigma_kpa: standard uncertainty of the peak; NaN but within the range.
-        max_kpa: upper bound of its highest pressure, 95 %, whatever the range; +inf where the
-            curve ends below it, NaN where nothing bounds it: no magnitude, or no uncertainty.
-        edge: exponent γ of the pressure (1 - ρ²)^γ from the middle to the edge: 0 flat,
-            0.5 Hertz; NaN if unknown.
-        taught: whether presses at known places say where it is; else the physics alone does.
-    """
-
-    id: int
+    id: int  #: its identity over time, counted up from 1
+    #: x_m, y_m: its centroid
     x_m: float
     y_m: float
-    area_m2: float
+    area_m2: float  #: its area
+    #: relative conductivity change of the magnitude channel, without its sign; NaN if unknown
     magnitude: float = float("nan")
-    magnitude_sigma: float = float("nan")
+    magnitude_sigma: float = float("nan")  #: standard uncertainty of the magnitude
+    #: see `pressure_range`; NaN if unknown, the range's top if above
     pressure_kpa: float = float("nan")
+    #: x_sigma_m, y_sigma_m: standard uncertainties of the centroid; NaN if unknown
     x_sigma_m: float = float("nan")
     y_sigma_m: float = float("nan")
-    area_sigma_m2: float = float("nan")
+    area_sigma_m2: float = float("nan")  #: that of the area; NaN if unknown
+    #: standard uncertainty of the pressure; NaN but within the range
     pressure_sigma_kpa: float = float("nan")
-    force_n: float = float("nan")
-    force_sigma_n: float = float("nan")
+    force_n: float = float("nan")  #: pressure times area; NaN if unknown
+    force_sigma_n: float = float("nan")  #: standard uncertainty of the force; NaN if unknown
+    #: where the pressure lies, seen from what the magnitude channel answers to
     pressure_range: PressureRange = PressureRange.UNKNOWN
+    #: highest pressure under it; NaN if unknown, the range's top if above
     peak_kpa: float = float("nan")
+    #: standard uncertainty of the peak; NaN but within the range
     peak_sigma_kpa: float = float("nan")
+    #: upper bound of its highest pressure, 95 %, whatever the range; +inf where the curve ends
+    #: below it, NaN where nothing bounds it: no magnitude, or no uncertainty
     max_kpa: float = float("nan")
+    #: exponent γ of the pressure (1 - ρ²)^γ from the middle to the edge: 0 flat, 0.5 Hertz; NaN if
+    #: unknown
     edge: float = float("nan")
+    #: whether presses at known places say where it is; else the physics alone does
     taught: bool = False
 
 

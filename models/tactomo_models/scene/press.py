@@ -16,26 +16,19 @@ Profile = Literal["flat", "dome"]
 
 @dataclass(frozen=True)
 class Press:
-    """One indenter of a shape and size, and the pressure under it.
+    """One indenter of a shape and size, and the pressure under it."""
 
-    Attributes:
-        x_m, y_m: its centre.
-        pressure_kpa: pressure under it; the largest, of a dome.
-        radius_m: half its width along its own x axis.
-        radius_y_m: half its width along its own y axis; `radius_m` if None.
-        angle_rad: turned by this, counter-clockwise.
-        shape: an ellipse, a rectangle, or a ring (an ellipse with its inner half left out).
-        profile: "flat", a punch that presses evenly, or "dome", a ball whose pressure falls to
-            nothing at the rim (Hertz) of the ellipse or of the ellipse around a rectangle.
-    """
-
+    #: x_m, y_m: its centre
     x_m: float
     y_m: float
-    pressure_kpa: float
-    radius_m: float = 0.015
-    radius_y_m: float | None = None
-    angle_rad: float = 0.0
+    pressure_kpa: float  #: pressure under it; the largest, of a dome
+    radius_m: float = 0.015  #: half its width along its own x axis
+    radius_y_m: float | None = None  #: half its width along its own y axis; `radius_m` if None
+    angle_rad: float = 0.0  #: turned by this, counter-clockwise
+    #: an ellipse, a rectangle, or a ring (an ellipse with its inner half left out)
     shape: Shape = "ellipse"
+    #: "flat", a punch that presses evenly, or "dome", a ball whose pressure falls to nothing at the
+    #: rim (Hertz) of the ellipse or of the ellipse around a rectangle
     profile: Profile = "flat"
 
     def pressure_at(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray | float:

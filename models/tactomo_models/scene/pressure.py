@@ -69,17 +69,11 @@ class FieldContacts:
 
 @dataclass(frozen=True)
 class PressureCurve:
-    """Pressure against |relative conductivity change|, straight between knots.
+    """Pressure against |relative conductivity change|, straight between knots."""
 
-    Attributes:
-        magnitude: (n,) rising; the first is the onset.
-        pressure_kpa: (n,) rising.
-        sigma_kpa: (n,) standard uncertainty of the curve itself; 0 where nobody has said.
-    """
-
-    magnitude: FloatArray
-    pressure_kpa: FloatArray
-    sigma_kpa: FloatArray
+    magnitude: FloatArray  #: (n,) rising; the first is the onset
+    pressure_kpa: FloatArray  #: (n,) rising
+    sigma_kpa: FloatArray  #: (n,) standard uncertainty of the curve itself; 0 where nobody has said
 
     @classmethod
     def of_response(cls, response: MagnitudeResponse) -> PressureCurve:

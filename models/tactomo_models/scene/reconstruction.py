@@ -11,35 +11,26 @@ from tactomo_models.scene.contacts import Contact
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """One frame.
+    """One frame."""
 
-    Attributes:
-        map: (nodes_y, nodes_x) |relative conductivity change| of the magnitude channel; None
-            where it cannot be computed.
-        pressure_kpa: (nodes_y, nodes_x); None where it cannot be computed. 0 where nothing
-            touches, NaN in contacts whose pressure is not known.
-        structure: (nodes_y, nodes_x) 0 bare to 1 pressed; None where it cannot be computed. For
-            a sensor whose objects conduct `either_way`, -1 where one conducts worse.
-        contacts: pressed areas.
-        tier: what made this frame, in a word: `quiet`, or a method, or a part of `auto`.
-        reason: why that made it.
-        misfit: root mean square of the noise-weighted residual; about 1 where all is explained.
-            Of a quiet frame, `Changes.signal`.
-        flags: what stands in the way of trusting it.
-        stage_s: seconds spent in each stage.
-        confidence: expected correlation of the map with the truth, 0 to 1, as a network judges
-            it; NaN where none did.
-        failure: what a method of the user's own failed of; empty where none did.
-    """
-
+    #: (nodes_y, nodes_x) |relative conductivity change| of the magnitude channel; None where it
+    #: cannot be computed
     map: Image | None
+    #: (nodes_y, nodes_x); None where it cannot be computed. 0 where nothing touches, NaN in
+    #: contacts whose pressure is not known
     pressure_kpa: Image | None
+    #: (nodes_y, nodes_x) 0 bare to 1 pressed; None where it cannot be computed. For a sensor whose
+    #: objects conduct `either_way`, -1 where one conducts worse
     structure: Image | None
-    contacts: tuple[Contact, ...]
-    tier: str
-    reason: str
+    contacts: tuple[Contact, ...]  #: pressed areas
+    tier: str  #: what made this frame, in a word: `quiet`, or a method, or a part of `auto`
+    reason: str  #: why that made it
+    #: root mean square of the noise-weighted residual; about 1 where all is explained. Of a quiet
+    #: frame, `Changes.signal`
     misfit: float
-    flags: Flag = field(default_factory=lambda: Flag(0))
-    stage_s: dict[str, float] = field(default_factory=dict)
+    flags: Flag = field(default_factory=lambda: Flag(0))  #: what stands in the way of trusting it
+    stage_s: dict[str, float] = field(default_factory=dict)  #: seconds spent in each stage
+    #: expected correlation of the map with the truth, 0 to 1, as a network judges it; NaN where
+    #: none did
     confidence: float = float("nan")
-    failure: str = ""
+    failure: str = ""  #: what a method of the user's own failed of; empty where none did

@@ -28,10 +28,6 @@ class SkinSimulator:
         unevenness: standard deviation of the sheet's smooth conductivity error (0.05 is 5 %).
         impedance_spread: standard deviation of the logarithm of the contact impedances.
         seed: of that unevenness.
-
-    Attributes:
-        forward: its forward model; P of its mesh's nodes can be pressed.
-        spacing_m: distance of the nodes.
     """
 
     def __init__(
@@ -44,6 +40,7 @@ class SkinSimulator:
         seed: int = 0,
     ) -> None:
         self.description = description
+        #: distance of the nodes
         self.spacing_m = spacing_m or description.width_m / (description.map.nodes_x - 1) * 2 / 3
         self._sheet = mesh_sheet(description, self.spacing_m)
         rng = np.random.default_rng(seed)
@@ -54,6 +51,7 @@ class SkinSimulator:
         bare = solve_bare_sheet(
             description, self._sheet, self._conductivity, self._impedance, quick=True
         )
+        #: its forward model; P of its mesh's nodes can be pressed
         self.forward = ForwardModel(description, bare)
         self._background = self._conductivity[bare.pressable]
         self._x, self._y = bare.points[:, bare.pressable]
