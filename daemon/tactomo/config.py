@@ -212,9 +212,8 @@ def load_config(path: str | Path | None = None, **overrides: Any) -> DaemonConfi
         **overrides: values that win over the file's; None means "not given". A key of a table is
             written with a dot: ``recording.file``.
 
-    Raises:
-        ConfigError: the file cannot be read or is not TOML, or a key is unknown, missing or
-            out of range.
+    Raises ConfigError where the file cannot be read or is not TOML, or a key is unknown, missing or
+    out of range.
     """
     given = {key: value for key, value in overrides.items() if value is not None}
     values = {} if path is None else _read_toml(Path(path))
@@ -228,8 +227,7 @@ def load_skins(path: Path | None, **overrides: Any) -> Skins | DaemonConfig:
     default ones, the n-th skin ``20 n`` TCP ports further. Where `name` is overridden, that skin
     alone is meant.
 
-    Raises:
-        ConfigError: as `load_config` does, or two skins share what each needs for itself.
+    Raises ConfigError as `load_config` does, or where two skins share what each needs for itself.
     """
     values = {} if path is None else _read_toml(path)
     if path is None or "skins" not in values:

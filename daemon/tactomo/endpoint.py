@@ -104,9 +104,8 @@ def bind(
 
     The socket is closed when that fails.
 
-    Raises:
-        AddressError: the address is in use, cannot be had, or can be reached from other computers
-            and there are no keys.
+    Raises AddressError where the address is in use, cannot be had, or can be reached from other
+    computers and there are no keys.
     """
     option = option or f"--{purpose}"
     try:
@@ -135,8 +134,7 @@ def bind(
 def rebind(socket: zmq.Socket[bytes], address: str) -> None:
     """Cut every connection to a bound socket; who is still allowed in connects again by itself.
 
-    Raises:
-        AddressError: another program has taken the address meanwhile.
+    Raises AddressError where another program has taken the address meanwhile.
     """
     socket.unbind(address)
     deadline_s = time.monotonic() + REBIND_S

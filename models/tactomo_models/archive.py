@@ -39,8 +39,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 def write_arrays(path: Path, arrays: dict[str, Any]) -> None:
     """Write an .npz file as a whole, see `write_whole`.
 
-    Raises:
-        OSError: the file cannot be written.
+    Raises OSError where the file cannot be written.
     """
     write_whole(path, lambda file: np.savez_compressed(file, **arrays))
 
@@ -54,8 +53,7 @@ def write_whole(path: Path, write: Callable[[IO[bytes]], object]) -> None:
         path: the file.
         write: writes its content.
 
-    Raises:
-        OSError: the file cannot be written.
+    Raises OSError where the file cannot be written.
     """
     if path.is_dir():  # "." has no name that another could be made of
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))

@@ -146,8 +146,7 @@ def machine_speed_path(description: SensorDescription) -> Path:
 def save_machine_speed(measured: MachineSpeed, path: Path) -> None:
     """Write what was measured; a half-written one is never left under that name.
 
-    Raises:
-        ArtifactError: the file cannot be written.
+    Raises ArtifactError where the file cannot be written.
     """
     content = (measured.model_dump_json(indent=1) + "\n").encode()
     try:

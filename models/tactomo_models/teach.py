@@ -52,8 +52,7 @@ class KnownPresses:
 def read_presses(path: Path, description: SensorDescription) -> KnownPresses:
     """Read what `tactomo reconstruct` reads, and `xy_mm` (P, 2).
 
-    Raises:
-        DataError: the file cannot be read or does not fit the sensor.
+    Raises DataError where the file cannot be read or does not fit the sensor.
     """
     scans, reference = read_scans(path, description)
     count = len(next(iter(scans.values())))

@@ -90,11 +90,7 @@ class Bridge:
         return f"{FOXGLOVE_ORIGIN}?{query}"
 
     def run(self, stop: threading.Event) -> None:
-        """Serve until `stop` is set.
-
-        Raises:
-            KeysError: the daemon does not let us in.
-        """
+        """Serve until `stop` is set; raise KeysError where the daemon does not let us in."""
         next_health_s = time.monotonic()
         while not stop.is_set():
             wait_s = max(0.0, next_health_s - time.monotonic())

@@ -34,8 +34,7 @@ def hidden_address() -> str:
 class Door:
     """Listens in the server's stead, from a thread of its own; `open` it to a server, `close` it.
 
-    Raises:
-        OSError: the address cannot be listened on.
+    Raises OSError where the address cannot be listened on.
     """
 
     def __init__(self, host: str, port: int, origins: Collection[str]) -> None:

@@ -48,8 +48,7 @@ def find(port: str, adapters: list[Adapter]) -> Adapter | None:
 def rule(mark: str, adapter: Adapter, adapters: list[Adapter]) -> list[str]:
     """Return the lines that mark a USB adapter.
 
-    Raises:
-        ServiceError: it can be known by nothing.
+    Raises ServiceError where it can be known by nothing.
     """
     is_told_apart = not look_alikes(adapter, adapters)
     if _PLAIN.fullmatch(adapter.serial_number) and is_told_apart:

@@ -83,8 +83,7 @@ class Child:
     def wait_ready(self) -> Mapping[str, Any]:
         """Return what the child announced when it was ready.
 
-        Raises:
-            ChildError: it ended before, or takes too long.
+        Raises ChildError where it ended before, or takes too long.
         """
         if not self._changed.wait(START_S):
             raise ChildError(
@@ -95,11 +94,7 @@ class Child:
         return self._ready
 
     def wait_done(self) -> None:
-        """Wait until a child that does one thing has done it.
-
-        Raises:
-            ChildError: it failed.
-        """
+        """Wait until a child that does one thing has done it; raise ChildError where it failed."""
         if self.status != 0:
             self._reader.join()
             raise self.failure()

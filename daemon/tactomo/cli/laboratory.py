@@ -27,8 +27,7 @@ def installed_measurement(name: str) -> Any:
 def measurement(name: str) -> Any:
     """Return the function that the laboratory adds to `tactomo bench` under a name.
 
-    Raises:
-        TactomoError: the laboratory is not installed.
+    Raises TactomoError where the laboratory is not installed.
     """
     measure = installed_measurement(name)
     if measure is None:

@@ -67,8 +67,7 @@ class CalibrationInForce:
     def replace(self, calibration: PressureCalibration | None, taught: TaughtSkin | None) -> None:
         """Put another calibration and teaching in force; None for what the description says.
 
-        Raises:
-            CommandError: one is another device's or skin's; what was in force stays so.
+        Raises CommandError where one is another device's or skin's; what was in force stays so.
         """
         for foreign in self._foreign(calibration, taught):
             step = f"what was in force stays so; run: {foreign.command}"

@@ -198,8 +198,7 @@ class Imaging:
     ) -> dict[str, Any]:
         """Put both in force, None for what the description says; return what a client gets.
 
-        Raises:
-            CommandError: one is another device's or skin's; what was in force stays so.
+        Raises CommandError where one is another device's or skin's; what was in force stays so.
         """
         self.calibration.replace(calibration, taught)
         self._publisher.tell_status()

@@ -46,8 +46,7 @@ class MethodInForce:
     def request_method(self, method: str) -> None:
         """Have frames made by another method.
 
-        Raises:
-            CommandError: it cannot be set up; what was in force stays so.
+        Raises CommandError where it cannot be set up; what was in force stays so.
         """
         try:
             self._request(self.requested._replace(method=method))

@@ -35,11 +35,7 @@ ANOTHER_MODE: Final = "start imaging: `[instrument] start` of the description sa
 
 
 class OpenEit(LineProtocol):
-    """See `PortProtocol`.
-
-    Raises:
-        ConfigError: the description is of no such board.
-    """
+    """See `PortProtocol`; raise ConfigError where the description is of no such board."""
 
     name = "openeit"
     device_id = "openeit"

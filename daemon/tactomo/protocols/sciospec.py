@@ -128,8 +128,7 @@ STOP: Final = message(DATA_TAG, 0)
 class Sciospec(ForeignProtocol):
     """See `PortProtocol` and this module's beginning.
 
-    Raises:
-        ConfigError: the instrument cannot do what the description has.
+    Raises ConfigError where the instrument cannot do what the description has.
     """
 
     name = "sciospec"

@@ -109,8 +109,7 @@ class Recorder(Worker):
     def do(self, work: Callable[[], None]) -> None:
         """Have other work with files done by the thread that may wait for disks.
 
-        Raises:
-            RecordingError: the thread has died.
+        Raises RecordingError where the thread has died.
         """
         self._ask(work)
 

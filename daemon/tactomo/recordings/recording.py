@@ -105,8 +105,7 @@ class Origin:
     def new_protocol(self) -> PortProtocol:
         """Return what turns a port's bytes into packets.
 
-        Raises:
-            RecordingError: it is not known here, or needs a description that is not here.
+        Raises RecordingError where it is not known here, or needs a description that is not here.
         """
         try:
             known = None if self.protocol == NATIVE else load_description(self.description)

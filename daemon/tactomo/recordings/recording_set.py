@@ -34,9 +34,8 @@ REMEMBERED_READS: Final = 50_000  # of the end of a file; more than an overlap h
 class RecordingSet(Recording):
     """The files of a folder, one after another; for playing them.
 
-    Raises:
-        RecordingError: it holds no recordings that a daemon has cut, those of several sensors, or
-            such as do not belong together.
+    Raises RecordingError where it holds no recordings that a daemon has cut, those of several
+    sensors, or such as do not belong together.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -109,8 +108,7 @@ class RecordingSet(Recording):
 def open_replayable(path: str | Path) -> Recording:
     """Open a recording, or a folder of those that a daemon has cut.
 
-    Raises:
-        RecordingError: it is neither.
+    Raises RecordingError where it is neither.
     """
     return RecordingSet(Path(path)) if Path(path).is_dir() else open_recording(path)
 

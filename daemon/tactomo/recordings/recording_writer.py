@@ -143,8 +143,7 @@ class _File:
 class RecordingWriter:
     """Writes one recording. Its methods raise OSError as files do.
 
-    Raises:
-        FileExistsError: the file exists: nothing is ever written over.
+    Raises FileExistsError where the file exists: nothing is ever written over.
     """
 
     def __init__(self, path: Path, origin: Origin) -> None:
@@ -252,8 +251,7 @@ class RecordingWriter:
 def create(path: Path, origin: Origin) -> RecordingWriter:
     """Begin a recording's file, in a folder that is there.
 
-    Raises:
-        RecordingError: the file exists or cannot be created.
+    Raises RecordingError where the file exists or cannot be created.
     """
     try:
         return RecordingWriter(path, origin)
@@ -290,8 +288,7 @@ def write_recording(
 
     Returns the length of the file in bytes.
 
-    Raises:
-        RecordingError: the file exists or cannot be written.
+    Raises RecordingError where the file exists or cannot be written.
     """
     origin = Origin(sensor, description, description_sha256, ("import",), version("tactomo"))
     path = Path(path).absolute()

@@ -86,9 +86,8 @@ def recover(
 ) -> Recovery:
     """Write what is intact in `damaged` to a new file, with an index; `damaged` stays as it is.
 
-    Raises:
-        RecordingError: there is nothing of a recording in `damaged`, it cannot be read, or
-            `output` exists or cannot be written.
+    Raises RecordingError where there is nothing of a recording in `damaged`, it cannot be read, or
+    `output` exists or cannot be written.
     """
     part = part_of(output)
     with open_file(damaged) as file:
@@ -242,8 +241,7 @@ def _ends_well(file: IO[bytes], end: int) -> bool:
 def _read_origin(path: Path, file: IO[bytes]) -> Origin | None:
     """Return what a damaged file still says that it is of; None where it does not any more.
 
-    Raises:
-        RecordingError: it says that another program made it.
+    Raises RecordingError where it says that another program made it.
     """
     try:
         return open_recording(path).origin

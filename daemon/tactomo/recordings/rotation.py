@@ -51,8 +51,7 @@ def next_path(folder: Path, sensor: str, now_s: float) -> Path:
 def list_recordings(folder: Path, sensor: str) -> list[KeptRecording]:
     """Return a sensor's recordings in a folder, in the order in which they were made.
 
-    Raises:
-        OSError: the folder cannot be read.
+    Raises OSError where the folder cannot be read.
     """
     return sorted(_recordings(folder, sensor)) if folder.is_dir() else []
 

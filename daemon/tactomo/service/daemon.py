@@ -526,8 +526,7 @@ def _find_calibration(
 ) -> tuple[PressureCalibration | None, list[str]]:
     """Return the pressure calibration to be used, and why others are not.
 
-    Raises:
-        CalibrationError: the configured one cannot be used.
+    Raises CalibrationError where the configured one cannot be used.
     """
     unused: list[str] = []
     if description.magnitude is None:

@@ -89,11 +89,7 @@ class Plan:
     commands: tuple[tuple[str, ...], ...]
 
     def carry_out(self) -> None:
-        """Do it.
-
-        Raises:
-            ServiceError: a file cannot be written, or a command fails.
-        """
+        """Do it; raise ServiceError where a file cannot be written, or a command fails."""
         try:
             for file in self.files:
                 file.carry_out(self.root)
@@ -148,8 +144,7 @@ def installed(root: Path) -> list[str]:
 def this_program() -> str:
     """Return the path of the `tactomo` that runs, as a service may call it.
 
-    Raises:
-        ServiceError: it lies where a service cannot see it.
+    Raises ServiceError where it lies where a service cannot see it.
     """
     program = Path(sys.executable).with_name("tactomo")
     interpreter = os.path.realpath(sys.executable)

@@ -48,9 +48,8 @@ class ServerKeys:
 def load_server_keys(secret: Path, clients: Path) -> ServerKeys:
     """Read a server's secret key.
 
-    Raises:
-        KeysError: it cannot be used, see `read_secret`, or there is no such folder of clients, or
-            others than its owner may write to that.
+    Raises KeysError where it cannot be used, see `read_secret`, or there is no such folder of
+    clients, or others than its owner may write to that.
     """
     if not clients.is_dir():
         raise KeysError(

@@ -72,9 +72,8 @@ def how_to_allow(clients: Path, *, may_command: bool = False) -> str:
 def make_pair(folder: Path, name: str, *, is_server: bool = False, force: bool = False) -> None:
     """Make a pair of keys; for a server the folder of its clients, too, empty.
 
-    Raises:
-        KeysError: there are keys of this name and `force` is not given, or the folder cannot be
-            written to.
+    Raises KeysError where there are keys of this name and `force` is not given, or the folder
+    cannot be written to.
     """
     secret_file, public_file = secret_path(folder, name), public_path(folder, name)
     if not force and (secret_file.exists() or public_file.exists()):
@@ -105,9 +104,8 @@ def allow(
 ) -> Client:
     """Put a client's public key on a server's list, or change what it may do.
 
-    Raises:
-        KeysError: the file holds no public key, or a secret one; there is no such server; another
-            key has this name; or the list cannot be written.
+    Raises KeysError where the file holds no public key, or a secret one; there is no such server;
+    another key has this name; or the list cannot be written.
     """
     if public.suffix == SECRET_SUFFIX:
         raise KeysError(
@@ -139,8 +137,7 @@ def allow(
 def revoke(folder: Path, name: str, server: str) -> None:
     """Take a client off a server's list.
 
-    Raises:
-        KeysError: it is not on it, there is no such server, or the list cannot be written.
+    Raises KeysError where it is not on it, there is no such server, or the list cannot be written.
     """
     _check_server(folder, server)
     places = [path for path in _places(folder, server, name) if path.exists()]

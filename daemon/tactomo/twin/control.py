@@ -93,8 +93,7 @@ COMMANDS: Mapping[str, type[BaseModel]] = {
 class ControlSocket:
     """A bound REP socket that hands checked commands to their handlers. For use by one thread.
 
-    Raises:
-        AddressError: the address is in use, or is no address.
+    Raises AddressError where the address is in use, or is no address.
     """
 
     def __init__(self, address: str, handlers: Mapping[str, Handler]) -> None:

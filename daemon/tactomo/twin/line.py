@@ -174,8 +174,7 @@ def _claim(link: Path) -> socket.socket:
     by whom. The link itself could not tell: what a killed twin left behind points to a terminal
     whose number may be another's by now.
 
-    Raises:
-        TactomoError: a twin that runs has the name.
+    Raises TactomoError where a twin that runs has the name.
     """
     place = str(link.parent.resolve() / link.name).encode(errors="surrogateescape")
     name = b"\0tactomo-twin-" + hashlib.sha256(place).hexdigest().encode()

@@ -51,8 +51,7 @@ class Player:
 
     Used by one thread; `is_over` may be read by others.
 
-    Raises:
-        ImportFileError: the file cannot be read, or does not fit the sensor.
+    Raises ImportFileError where the file cannot be read, or does not fit the sensor.
     """
 
     def __init__(self, path: Path, description: SensorDescription, once: bool = False) -> None:

@@ -201,9 +201,8 @@ class Scene(_Strict):
 def load_scene(source: str | Path) -> Scene:
     """Read a scene by its shipped name or from a TOML file.
 
-    Raises:
-        ConfigError: the file cannot be read, is not TOML, or a key is unknown, missing or out of
-            range; the message names the key, its value and what is allowed.
+    Raises ConfigError where the file cannot be read, is not TOML, or a key is unknown, missing or
+    out of range; the message names the key, its value and what is allowed.
     """
     path = SHIPPED.get(str(source), Path(source))
     try:

@@ -166,8 +166,7 @@ def rows_of(points: Sequence[Point]) -> list[dict[str, Any]]:
 def write_table(rows: Sequence[dict[str, Any]], machine: str, path: Path) -> None:
     """Write the chart's rows as comma-separated values, each with the machine it was measured on.
 
-    Raises:
-        TactomoError: the file cannot be written.
+    Raises TactomoError where the file cannot be written.
     """
     try:
         with path.open("w", newline="", encoding="utf-8") as file:

@@ -70,8 +70,7 @@ def method_times(
         what memory the method has taken by then (MB, its models included; None where nobody says),
         and if they could not be measured (None) a note why. The rows as a table to print.
 
-    Raises:
-        ModelError: there is no such sensor.
+    Raises ModelError where there is no such sensor.
     """
     return_freed_memory()  # else a method is measured in what the one before it has left
     report("methods: the models, pyEIT")
@@ -173,8 +172,7 @@ def _frames(
 ) -> list[float]:
     """Reconstruct one scan after the other, and return the seconds of each.
 
-    Raises:
-        ModelError: a method of the user's own failed.
+    Raises ModelError where a method of the user's own failed.
     """
     seconds = []
     for number in range(len(next(iter(scans.values())))):

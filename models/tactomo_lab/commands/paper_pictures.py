@@ -36,8 +36,7 @@ MARKS: tuple[tuple[dict[str, Any], str], ...] = (
 def draw_simulation(points: Sequence[Cell], output: Path) -> None:
     """Fig. 5: RIE above ICC by number of contacts, a column for each signal-to-noise ratio.
 
-    Raises:
-        TactomoError: the picture cannot be written; so of all that follow.
+    Raises TactomoError where the picture cannot be written; so of all that follow.
     """
     from matplotlib.figure import Figure
 

@@ -24,8 +24,7 @@ DPI = 120  # legible at a page's width, and below 300 kB
 def draw_outcomes(outcomes: Sequence[Outcome], output: Path) -> None:
     """Draw the worst scenes and those in the middle: true and found magnitude and shape.
 
-    Raises:
-        TactomoError: the picture cannot be written.
+    Raises TactomoError where the picture cannot be written.
     """
     from matplotlib.figure import Figure
 
@@ -77,8 +76,7 @@ def draw_press(outcomes: Sequence[Outcome], output: Path) -> None:
         outcomes: of one scene, the even pressure first.
         output: the picture.
 
-    Raises:
-        TactomoError: the picture cannot be written.
+    Raises TactomoError where the picture cannot be written.
     """
     from matplotlib.figure import Figure
 

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 def draw_overview(scores: Sequence[CaseScore], output: Path) -> None:
     """Draw regimes by methods: mean ICC as colour, and how many bad maps nothing warned of.
 
-    Raises:
-        TactomoError: the picture cannot be written.
+    Raises TactomoError where the picture cannot be written.
     """
     from matplotlib.figure import Figure
 

@@ -59,8 +59,7 @@ class ChallengeOutcome:
 def read_challenge(path: Path, description: SensorDescription) -> Challenge:
     """Read a file of the challenge's tanks.
 
-    Raises:
-        DataError: the file cannot be read or holds something else.
+    Raises DataError where the file cannot be read or holds something else.
     """
     keys = ("injection", "measurement", "reference", "voltages", "truth")
     try:
@@ -112,8 +111,7 @@ class ChallengeImager:
     ) -> tuple[TankFit, FloatArray]:
         """What fits one tank of a `Challenge`, and its changes (n,) in the model's unit.
 
-        Raises:
-            DataError: the reference is none of this tank.
+        Raises DataError where the reference is none of this tank.
         """
         of_drive, of_reading = every_reading(currents, weights)
         kept = np.isfinite(reference) & np.isfinite(volts)

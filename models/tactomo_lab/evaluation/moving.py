@@ -168,8 +168,7 @@ def draw_sequence(
 ) -> Sequence:
     """Draw and simulate a moving scene: about a minute, or read from the cache.
 
-    Raises:
-        DataError: the sensor has a single channel.
+    Raises DataError where the sensor has a single channel.
     """
     require_both_channels(description)
     rng = np.random.default_rng(seed_of(seed_set, "moving", number))

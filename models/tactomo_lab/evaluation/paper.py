@@ -96,8 +96,7 @@ def paper_scenes(
 ) -> Iterator[EvaluationScene]:
     """Test scenes of Fig. 5, drawn as the paper's training scenes are but from other seeds.
 
-    Raises:
-        DataError: the sensor has a single channel, or no room for that many contacts.
+    Raises DataError where the sensor has a single channel, or no room for that many contacts.
     """
     require_both_channels(description)
     assert description.magnitude is not None
@@ -215,8 +214,7 @@ class Rig:
 
     Each `sheet` is uneven in its own way; `snr_db` is of the voltages at rest.
 
-    Raises:
-        DataError: the sensor has a single channel.
+    Raises DataError where the sensor has a single channel.
     """
 
     def __init__(

@@ -132,8 +132,7 @@ class Draw:
     ) -> tuple[Press, ...]:
         """What is drawn, anew until all of it lies inside the sensing area and nothing overlaps.
 
-        Raises:
-            DataError: there is no room.
+        Raises DataError where there is no room.
         """
         for _ in range(1000):
             presses = tuple(draw())
@@ -446,8 +445,7 @@ def _lost_scans(draw: Draw) -> Plan:
 def draw_plan(description: SensorDescription, regime: str, seed_set: SeedSet, number: int) -> Plan:
     """Draw a case of a regime; the same one every time.
 
-    Raises:
-        DataError: there is no room on the sensor for what presses.
+    Raises DataError where there is no room on the sensor for what presses.
     """
     rng = np.random.default_rng(seed_of(seed_set, f"stability {regime}", number))
     return REGIMES[regime].draw(Draw(description, rng, number))

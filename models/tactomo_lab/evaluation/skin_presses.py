@@ -64,8 +64,7 @@ class Localisation:
 def read_presses(path: Path, description: SensorDescription) -> Presses:
     """Read `lookup` (M, 4) source, sink, v+, v-; `dv` (n, M); `pos_m` (n, 2 or 3).
 
-    Raises:
-        DataError: the file cannot be read, or its pattern is not the description's.
+    Raises DataError where the file cannot be read, or its pattern is not the description's.
     """
     try:
         arrays = read_arrays(path)
@@ -92,8 +91,7 @@ def read_presses(path: Path, description: SensorDescription) -> Presses:
 def scan_order(lookup: IntArray, description: SensorDescription) -> tuple[IntArray, FloatArray]:
     """Where each voltage of a lookup (M, 4) is in a scan (M,), and 1 or -1 for its sign (M,).
 
-    Raises:
-        DataError: it is not the description's pattern.
+    Raises DataError where it is not the description's pattern.
     """
     pairs = description.pairs
     place = {

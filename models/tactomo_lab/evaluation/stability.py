@@ -71,8 +71,7 @@ class Case:
 def make_case(description: SensorDescription, regime: str, seed_set: SeedSet, number: int) -> Case:
     """Draw, simulate and measure a case; the same one every time.
 
-    Raises:
-        DataError: the sensor has a single channel, or no room for what presses.
+    Raises DataError where the sensor has a single channel, or no room for what presses.
     """
     require_both_channels(description)
     description = REGIMES[regime].sensor_of(description)
@@ -210,8 +209,7 @@ def reconstruct_case(case: Case, *methods: str, artifact: Artifact | None = None
 
     One frame alone is run to its end, as a file's are; several have the daemon's budget.
 
-    Raises:
-        ModelError: a method's network is not there.
+    Raises ModelError where a method's network is not there.
     """
     artifact = artifact or _artifact(case.description)
     budget_s = BUDGET_S if len(case.frames) == 1 else None
@@ -275,8 +273,7 @@ def evaluate_regimes(
         Each case's outcomes, of the methods that its sensor has; in the order of regimes and
         numbers whatever `jobs`.
 
-    Raises:
-        DataError: the sensor has a single channel, or no room for what presses.
+    Raises DataError where the sensor has a single channel, or no room for what presses.
     """
     require_both_channels(description)
     _artifact(description)  # built once, by this process

@@ -74,8 +74,7 @@ class TankOutcome:
 def read_tanks(path: Path, description: SensorDescription) -> Tanks:
     """Read `dv` (n, M), `truth` (n, rows, columns) and `name` (n,).
 
-    Raises:
-        DataError: the file cannot be read or holds something else.
+    Raises DataError where the file cannot be read or holds something else.
     """
     try:
         arrays = read_arrays(path)

@@ -49,8 +49,7 @@ class Judgement:
 def read_skins(path: Path) -> list[SkinPresses]:
     """Read `NAME_voltages` (P, M) and `NAME_xy_mm` (P, 2) of each skin.
 
-    Raises:
-        DataError: the file cannot be read, or holds no such skin.
+    Raises DataError where the file cannot be read, or holds no such skin.
     """
     try:
         arrays = read_arrays(path)
@@ -81,8 +80,7 @@ def _skin(path: Path, name: str, arrays: Mapping[str, Any]) -> SkinPresses:
 def judge(skins: list[SkinPresses], train: int) -> Iterator[Judgement]:
     """Learn from the first presses of each skin, and judge on the last.
 
-    Raises:
-        DataError: a skin has too few presses, or presses that cannot be learnt from.
+    Raises DataError where a skin has too few presses, or presses that cannot be learnt from.
     """
     for skin in skins:
         rest = len(skin.xy_mm) - train

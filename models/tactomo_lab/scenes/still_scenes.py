@@ -112,8 +112,7 @@ def scenes(
 ) -> Iterator[EvaluationScene]:
     """Scenes of a seed set, `count` of each number of contacts; the same ones every time.
 
-    Raises:
-        DataError: the sensor has a single channel, or no room for that many contacts.
+    Raises DataError where the sensor has a single channel, or no room for that many contacts.
     """
     require_both_channels(description)
     simulation = Simulation(description)
@@ -124,11 +123,7 @@ def scenes(
 
 
 def require_both_channels(description: SensorDescription) -> None:
-    """Refuse a sensor that has a single channel.
-
-    Raises:
-        DataError: it has.
-    """
+    """Refuse a sensor that has a single channel, by a DataError."""
     if len(description.channels) < 2:
         raise DataError(
             f"sensor {description.name!r} has one channel; scenes need a magnitude and a "
@@ -150,8 +145,7 @@ def draw_layout(
     Outlines lie inside the sensing area, up to its edge, and at least `GAP_M` apart: an indenter
     that finds no room is drawn anew, so that many contacts are smaller ones on average.
 
-    Raises:
-        DataError: there is no room for so many.
+    Raises DataError where there is no room for so many.
     """
     rng = np.random.default_rng(seed_of(seed_set, "layout", contacts, number))
     shape = SCENE_SHAPES[rng.integers(4 if contacts > 1 else 3)]

@@ -86,8 +86,7 @@ def subject_of(
 ) -> Subject:
     """What a calibration of such a sensor is of.
 
-    Raises:
-        CalibrationError: it has no pressure that could be calibrated.
+    Raises CalibrationError where it has no pressure that could be calibrated.
     """
     if description.magnitude is None:
         raise CalibrationError(
@@ -129,11 +128,7 @@ class PressureCalibration(BaseModel):
 
     @classmethod
     def of_readings(cls, subject: Subject, readings: Sequence[Reading]) -> PressureCalibration:
-        """Fit readings.
-
-        Raises:
-            CalibrationError: they make no curve.
-        """
+        """Fit readings; raise CalibrationError where they make no curve."""
         return cls.of_fit(subject, readings, fit_curve(readings))
 
     @classmethod
@@ -183,8 +178,7 @@ def calibration_path(sensor: str) -> Path:
 def save_calibration(calibration: PressureCalibration, path: Path) -> None:
     """Write a calibration; a half-written one is never left under that name.
 
-    Raises:
-        CalibrationError: the file cannot be written.
+    Raises CalibrationError where the file cannot be written.
     """
     content = (calibration.model_dump_json(indent=1) + "\n").encode()
     write_kept(path, lambda file: file.write(content))
@@ -227,8 +221,7 @@ def reading(path: Path, next_step: str) -> Iterator[None]:
 def parse_calibration(content: bytes | str, source: str) -> PressureCalibration:
     """Read a calibration's text; `source` names it in errors.
 
-    Raises:
-        CalibrationError: it is damaged, or of another format.
+    Raises CalibrationError where it is damaged, or of another format.
     """
     try:
         return PressureCalibration.model_validate_json(content)

@@ -121,9 +121,8 @@ def fit_curve(readings: Sequence[Reading], *, seed: int = 0) -> Fit:
         readings: in any order; those below the onset, too, they are what it is found from.
         seed: of the bootstrap.
 
-    Raises:
-        CalibrationError: there are too few readings, none is answered to, units look wrong, or
-            the magnitude does not rise with the pressure.
+    Raises CalibrationError where there are too few readings, none is answered to, units look wrong,
+    or the magnitude does not rise with the pressure.
     """
     data = _columns(readings)
     _check_units(data)

@@ -150,8 +150,7 @@ def direct_readings(cell: LoadCell) -> Joined:
 def joined_readings(cell: LoadCell, seen: Seen) -> Joined:
     """Readings of a log that has times, and what a sensor showed at those.
 
-    Raises:
-        CalibrationError: at most of the times there was no contact, or more than one.
+    Raises CalibrationError where at most of the times there was no contact, or more than one.
     """
     pieces = _still_pieces(cell)
     if not pieces:

@@ -67,8 +67,7 @@ class PressRegression:
     Attributes:
         found_mm: (N, 2) where the voltages of each have it, by presses of other folds alone.
 
-    Raises:
-        DataError: there are too few presses, or they hold what is no number or no press.
+    Raises DataError where there are too few presses, or they hold what is no number or no press.
     """
 
     def __init__(

@@ -125,8 +125,7 @@ def taught_path(sensor: str) -> Path:
 def save_taught(taught: TaughtSkin, path: Path) -> None:
     """Write what was taught; a half-written file is never left under that name.
 
-    Raises:
-        CalibrationError: the file cannot be written.
+    Raises CalibrationError where the file cannot be written.
     """
     guess = np.zeros((0, 2)) if taught.guess_mm is None else taught.guess_mm
     arrays: dict[str, Any] = {
@@ -202,8 +201,7 @@ def load_taught(path: Path, sensor: str, description: SensorDescription) -> Taug
 def taught_of(description: SensorDescription, path: Path) -> TaughtSkin:
     """Read what a sensor of such a description was taught, whatever its name.
 
-    Raises:
-        CalibrationError: there is none, or it is of another description; see `read_taught`.
+    Raises CalibrationError where there is none, or it is of another description; see `read_taught`.
     """
     try:
         found = read_taught(path)

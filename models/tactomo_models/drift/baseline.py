@@ -155,8 +155,7 @@ class BaselineTracker:
     ) -> Reconstruction:
         """Reconstruct one frame; before, the reference moves if need be.
 
-        Raises:
-            DataError: a scan has another number of voltages than the sensor.
+        Raises DataError where a scan has another number of voltages than the sensor.
         """
         scans: Scans = {Channel.MAGNITUDE: magnitude, Channel.STRUCTURE: structure}
         if time_s - self._moved_s >= MOVE_S and any(c.has_moved for c in self._channels.values()):

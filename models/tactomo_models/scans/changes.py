@@ -99,8 +99,7 @@ class MeasuredChannel:
         usable: (M,) voltages that the tare has found nothing wrong with.
         relative_noise: (M,) standard deviation of a relative change by noise, at the tare.
 
-    Raises:
-        DataError: another number of voltages than the sensor has.
+    Raises DataError for another number of voltages than the sensor has.
     """
 
     def __init__(
@@ -180,8 +179,7 @@ class MeasuredChannel:
     def compare(self, scan: FloatArray, *, saturated: bool = False) -> ChannelResult:
         """Relative changes of a scan (M,), volts; `saturated` where its converter clipped.
 
-        Raises:
-            DataError: another number of voltages than the sensor has.
+        Raises DataError for another number of voltages than the sensor has.
         """
         still_share = 0.01  # of the model error's variance, that a still scene may change by
         median_square = 0.455  # of a normal distribution of unit variance

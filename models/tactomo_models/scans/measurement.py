@@ -73,8 +73,7 @@ class Comparator:
     def set_reference(self, reference: Reference) -> bool:
         """Measure changes against a reference; whether it is another than the last one, drifted.
 
-        Raises:
-            DataError: a channel has another number of voltages than the sensor.
+        Raises DataError where a channel has another number of voltages than the sensor.
         """
         is_new = self._reference is None or not reference.is_followed_from(self._reference)
         if is_new:

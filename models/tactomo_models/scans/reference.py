@@ -79,8 +79,7 @@ class Reference:
     def from_scans(cls, magnitude: FloatArray | None, structure: FloatArray | None) -> Reference:
         """Average scans (n, M) of an unpressed skin and estimate their noise.
 
-        Raises:
-            DataError: there is no scan, or one of the voltages is not a number.
+        Raises DataError where there is no scan, or one of the voltages is not a number.
         """
         present = [scans for scans in (magnitude, structure) if scans is not None]
         if not present or any(len(scans) == 0 for scans in present):

@@ -27,8 +27,7 @@ def shipped_descriptions() -> list[str]:
 def shipped_text(name: str) -> str:
     """The TOML text of a shipped description, comments and all.
 
-    Raises:
-        DescriptionError: there is none of that name.
+    Raises DescriptionError where there is none of that name.
     """
     if name not in shipped_descriptions():
         raise DescriptionError(

@@ -27,8 +27,7 @@ NOTICEABLE: Final = 1.3  # ratio that is marked; p50s of two runs on a busy mach
 def read_results(path: Path) -> Mapping[str, Any]:
     """Return what an earlier run has printed with --json.
 
-    Raises:
-        TactomoError: it cannot be read, or is something else.
+    Raises TactomoError where it cannot be read, or is something else.
     """
     try:
         results = json.loads(path.read_text("utf-8"))

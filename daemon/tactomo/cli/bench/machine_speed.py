@@ -52,8 +52,7 @@ BUSY: Final = 0.8  # share of a core below which times are those of whatever els
 def measure(name: str) -> MachineSpeed:
     """Time a sensor's methods on this machine and keep what came out, with a progress bar.
 
-    Raises:
-        ModelError: the models cannot be built, or the file cannot be written.
+    Raises ModelError where the models cannot be built, or the file cannot be written.
     """
     sensor = load_description(name)
     artifact = load_or_build_artifact(sensor)

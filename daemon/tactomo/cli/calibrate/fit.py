@@ -114,8 +114,7 @@ def _devices_in(path: Path) -> tuple[str, ...]:
 def seen_of(frames: Sequence[tuple[float, Frame]]) -> Seen:
     """What a sensor showed in frames with their times; untrustworthy ones are left out.
 
-    Raises:
-        CalibrationError: there is none to be trusted.
+    Raises CalibrationError where there is none to be trusted.
     """
     trusted = [(time_s, frame) for time_s, frame in frames if not distrusted(frame)]
     if not trusted:

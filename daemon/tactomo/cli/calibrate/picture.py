@@ -17,8 +17,7 @@ LABELS = {"up": "load rising", "down": "load falling", "unknown": "reading"}
 def draw_calibration(made: PressureCalibration, output: Path) -> None:
     """Draw readings and curve, and where it says nothing.
 
-    Raises:
-        TactomoError: the picture cannot be written.
+    Raises TactomoError where the picture cannot be written.
     """
     from matplotlib.figure import Figure
 

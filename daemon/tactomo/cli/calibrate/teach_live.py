@@ -41,8 +41,7 @@ def guided(
 ) -> tuple[SensorDescription, Subject]:
     """Take presses together with the user into a file; of which sensor they are.
 
-    Raises:
-        TactomoError: no daemon answers, or the file is of other presses.
+    Raises TactomoError where no daemon answers, or the file is of other presses.
     """
     from rich.console import Console
 

@@ -86,11 +86,7 @@ def of_daemon(
     keys: Keys | None,
     progress: Callable[[float], None],
 ) -> Evidence:
-    """Listen to a running daemon.
-
-    Raises:
-        DoctorError: no daemon answers, or it has no scans.
-    """
+    """Listen to a running daemon; raise DoctorError where no daemon answers, or it has no scans."""
     from tactomo_client.messages import MAP, SCAN, STATUS
 
     listener = _Listener(sensor, stream, keys)
@@ -268,8 +264,7 @@ def _period(device_ms: FloatArray, counters: list[int]) -> float | None:
 def of_recording(recording: Recording, description: str | None, frames: slice | None) -> Evidence:
     """Read a recording's ports; `description` is its own if None.
 
-    Raises:
-        DoctorError: there are no scans in it.
+    Raises DoctorError where there are no scans in it.
     """
     known = load_description(description or recording.origin.description)
     ports = [_PortScans(recording, n) for n in range(len(recording.origin.ports))]

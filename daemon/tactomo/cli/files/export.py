@@ -204,8 +204,7 @@ def _need_rosbags() -> None:
 def _written(output: Path, write: Callable[[], int]) -> int:
     """Write; return how many frames were written.
 
-    Raises:
-        TactomoError: it cannot be written, or there is no frame to be written.
+    Raises TactomoError where it cannot be written, or there is no frame to be written.
     """
     try:
         return write()

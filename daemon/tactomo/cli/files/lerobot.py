@@ -81,11 +81,7 @@ class Alignment:
 
 
 def need_lerobot() -> None:
-    """Make sure that LeRobot is there.
-
-    Raises:
-        TactomoError: it is not installed.
-    """
+    """Make sure that LeRobot is there; raise TactomoError where it is not installed."""
     logging.getLogger("lerobot").setLevel(logging.ERROR)  # it misses decoders of videos: no matter
     try:
         import datasets

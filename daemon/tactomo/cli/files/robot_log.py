@@ -58,8 +58,7 @@ class RobotLog:
 def read_robot_log(path: Path) -> RobotLog:
     """Read a robot's log.
 
-    Raises:
-        TactomoError: it cannot be read, or a line of it is wrong, which is named.
+    Raises TactomoError where it cannot be read, or a line of it is wrong, which is named.
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:

@@ -91,8 +91,7 @@ def _panels(what: str) -> tuple[str, ...]:
 def prepare_picture(output: Path, *, force: bool = True) -> None:
     """Make sure before the work that a picture of it can be drawn, without a display.
 
-    Raises:
-        TactomoError: matplotlib is not installed, or as `prepare_file`.
+    Raises TactomoError where matplotlib is not installed, or as `prepare_file` does.
     """
     next_step = "give a .png, .svg or .pdf in a folder that you may write"
     if output.suffix.lower() not in (".png", ".svg", ".pdf"):
@@ -111,8 +110,7 @@ def prepare_picture(output: Path, *, force: bool = True) -> None:
 def prepare_folder(folder: Path) -> None:
     """Make sure before the work that pictures can be drawn into a folder, which is made.
 
-    Raises:
-        TactomoError: as `prepare_picture`, or the folder cannot be made.
+    Raises TactomoError as `prepare_picture` does, or where the folder cannot be made.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -157,11 +155,7 @@ def prepare_file(output: Path, *, force: bool = True, source: Path | None = None
 
 
 def save_figure(figure: Figure, output: Path, dpi: int = 150) -> None:
-    """Write a picture.
-
-    Raises:
-        TactomoError: it cannot be written.
-    """
+    """Write a picture; raise TactomoError where it cannot be written."""
     from tactomo_models.archive import write_whole
 
     kind = output.suffix[1:].lower()

@@ -104,11 +104,7 @@ def _print_addresses(bridge: Bridge, layout: Path | None, announce: bool) -> Non
 
 
 def write_layout(path: Path, sensor: str) -> None:
-    """Write the layout that shows a sensor.
-
-    Raises:
-        TactomoError: it cannot be written.
-    """
+    """Write the layout that shows a sensor; raise TactomoError where it cannot be written."""
     from tactomo_foxglove import layout_for
 
     try:
@@ -130,11 +126,7 @@ def placement_of(parent: str, pose: str) -> Placement:
 
 
 def need_foxglove() -> None:
-    """Make sure that Foxglove's SDK is there.
-
-    Raises:
-        TactomoError: it is not installed.
-    """
+    """Make sure that Foxglove's SDK is there; raise TactomoError where it is not installed."""
     try:
         import foxglove  # noqa: F401
     except ImportError as error:

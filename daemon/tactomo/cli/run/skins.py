@@ -75,8 +75,7 @@ class SkinProcesses:
     Args:
         skins: their configurations, and the proxy's address.
 
-    Raises:
-        ModelError: a description or an artifact cannot be used.
+    Raises ModelError where a description or an artifact cannot be used.
     """
 
     def __init__(self, skins: Skins) -> None:
