@@ -13,16 +13,19 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tactomo_models.array_files import READERS
 from tactomo_models.errors import DataError
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Arrays of an .npz file by name.
+    """Arrays of an .npz file by name, or of another program's, see `array_files`.
 
     Raises:
         OSError: the file cannot be read.
-        DataError: it is damaged, or no .npz file of plain arrays.
+        DataError: it is damaged, or no file of plain arrays.
     """
+    if read := READERS.get(path.suffix.lower()):
+        return read(path)
     try:
         # numpy leaves a file open that turns out to be no archive.
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
@@ -30,7 +33,10 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     except OSError:
         raise
     except Exception as error:  # a flipped bit makes zip and header parsers raise almost anything
-        raise DataError(f"cannot read {path}: damaged, or no .npz file of numbers") from error
+        raise DataError(
+            f"cannot read {path}: damaged, or no .npz file of numbers; read are .npz, "
+            f"{', '.join(READERS)}, and what they hold is told by that ending"
+        ) from error
     if not all(isinstance(array, np.ndarray) for array in arrays.values()):
         raise DataError(f"cannot read {path}: it holds other things than arrays of numbers")
     return arrays

@@ -55,9 +55,33 @@ def reconstruct_file(
         CalibrationError: another skin was taught.
         ModelError: the method is unknown, or lacks what it needs.
     """
+    scans, reference = read_scans(source, description)
+    return reconstruct_scans(
+        scans,
+        reference,
+        target,
+        description=description,
+        method=method,
+        curve=curve,
+        taught=taught,
+        progress=progress,
+    )
+
+
+def reconstruct_scans(
+    scans: Mapping[str, FloatArray],
+    reference: Reference,
+    target: Path,
+    *,
+    description: SensorDescription,
+    method: str = "auto",
+    curve: PressureCurve | None = None,
+    taught: TaughtSkin | None = None,
+    progress: Progress | None = None,
+) -> list[Reconstruction]:
+    """Reconstruct scans (T, M) of each channel into `target`, see `reconstruct_file`."""
     if not target.parent.is_dir():
         raise DataError(f"cannot write {target}: there is no folder {target.parent}; make it first")
-    scans, reference = read_scans(source, description)
     total = max(len(channel) for channel in scans.values())
     frames: list[Reconstruction] = []
     seconds = np.zeros(total)
@@ -90,7 +114,7 @@ def reconstruct_file(
     return frames
 
 
-def _scan(scans: dict[str, FloatArray], name: str, index: int) -> FloatArray | None:
+def _scan(scans: Mapping[str, FloatArray], name: str, index: int) -> FloatArray | None:
     """One scan; None where it is missing: an all-NaN row is a scan that was not taken."""
     channel = scans.get(name)
     if channel is None or np.isnan(channel[index]).all():
@@ -113,16 +137,33 @@ def read_scans(
             f"cannot read {source}: {error.strerror}; give an .npz file of scans"
         ) from error
     scans, references = scans_of(source, arrays, description)
+    return scans, reference_at_rest(source, scans, references, description)
+
+
+def reference_at_rest(
+    source: Path,
+    scans: Mapping[str, FloatArray],
+    references: Mapping[str, FloatArray],
+    description: SensorDescription,
+) -> Reference:
+    """Return the reference of scans (T, M) whose noise nobody has told.
+
+    Raises:
+        DataError: a channel has none, or one without a voltage.
+    """
     for name in scans:
         if name not in references:
-            raise DataError(f"{source} has {name} but no {name}_reference: add the unpressed scan")
+            raise DataError(
+                f"{source} has {name} but no {name}_reference: add the unpressed scan, or give "
+                "--reference-frames FIRST:END, or --reference FILE"
+            )
         if not np.any(np.nan_to_num(references[name])):
             raise DataError(
                 f"{source}: {name}_reference holds no voltage; take the unpressed scan again"
             )
     # The file does not say how noisy the scans are, nor of how many the reference is the mean.
     rest = Reference(references.get("magnitude"), references.get("structure"))
-    return scans, rest.with_noise_of(description, scans.get("magnitude"), scans.get("structure"))
+    return rest.with_noise_of(description, scans.get("magnitude"), scans.get("structure"))
 
 
 def scans_of(
@@ -163,6 +204,8 @@ def all_nan(array: Any) -> bool:
 
 
 def _checked(source: Path, name: str, array: Any, shape: tuple[int | None, ...]) -> FloatArray:
+    if array.ndim == 2 and len(shape) == 1 and 1 in array.shape:
+        array = array.ravel()  # MATLAB has no vectors
     fits = array.ndim == len(shape) and all(
         want in (None, have) for want, have in zip(shape, array.shape, strict=True)
     )

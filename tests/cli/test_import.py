@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from shared_data import measured
 from tactomo.recordings.recording import Recording, open_recording
 from tactomo_models import load_description
 from tactomo_models.arrays import FloatArray
@@ -19,7 +19,6 @@ from tactomo_protocol import Channel, Decoder, Scan
 Run = Callable[..., Any]
 
 ELECTRODES = 16
-SCIOSPEC = Path(os.environ.get("TACTOMO_DATA", "data")) / "tank_sciospec_20fps.npz"
 
 
 def scans(recording: Recording) -> list[tuple[float, Scan]]:
@@ -124,7 +123,7 @@ def test_the_batch_layout_keeps_channels_reference_and_gaps(tactomo: Run, tmp_pa
 @pytest.mark.parametrize(
     ("arrays", "options", "says"),
     [
-        ({"x": np.zeros(3)}, [], "in.npz holds x; it must hold"),
+        ({"x": np.zeros(3)}, [], "in.npz holds x (3,): no scans of 208 voltages"),
         ({"magnitude": np.zeros((4, 207))}, ["--rate", "1"], "real numbers of shape T x 208"),
         ({"magnitude": np.zeros((4, 208))}, [], "give --rate"),
         (
@@ -162,7 +161,7 @@ def test_the_batch_layout_keeps_channels_reference_and_gaps(tactomo: Run, tmp_pa
             "(T, 16, 16)",
         ),
         (
-            {"injection": INJECTION, "volts": potentials(2) * np.exp(1j)},
+            {"injection": INJECTION, "volts": potentials(2) + 1j * potentials(2, 1)},
             ["--rate", "1", "--description", "tank_disc"],
             "out of phase with the current",
         ),
@@ -189,13 +188,16 @@ def test_what_is_no_npz_is_refused(tactomo: Run, tmp_path: Path) -> None:
     assert "cannot read none.npz" in tactomo("import", "none.npz", "out.mcap").stderr
 
 
-def eit_text(volts: NDArray[np.complex128], date: str, frequencies: int = 1) -> str:
-    """A frame as Sciospec's program saves it."""
-    header = [18, 2, "setup_00001", date, "10000.0", "10000.0", 0, frequencies, "0.001", "20.0"]
-    lines = [*map(str, header), *[""] * 7, "MeasurementChannels: 1,2,3"]
-    for pair, row in zip(INJECTION, volts, strict=True):
+def eit_text(volts: NDArray[np.complex128], date: str, first: int = 1) -> str:
+    """A frame as Sciospec's program saves it, of all channels up to the last that was measured."""
+    header = [18, 2, "setup_00001", date, "10000.0", "10000.0", 0, 1, "0.001", "20.0"]
+    channels = ",".join(str(first + n) for n in range(ELECTRODES))
+    independent = "MeasurementChannelsIndependentFromInjectionPattern: 1"
+    lines = [*map(str, header), *[""] * 6, f"MeasurementChannels: {channels}", independent]
+    for pair, row in zip(INJECTION + first - 1, volts, strict=True):
         lines.append(f"{pair[0]} {pair[1]}")
-        lines.append("\t".join(f"{v.real:.9E}\t{v.imag:.9E}" for v in row))
+        every = np.concatenate([np.full(first - 1, 7.0), row])
+        lines.append("\t".join(f"{v.real:.9E}\t{v.imag:.9E}" for v in every))
     return "\n".join(lines) + "\n"
 
 
@@ -222,6 +224,23 @@ def test_sciospecs_files_are_read_in_the_order_of_their_dates(
     assert [time_s for time_s, _ in read] == pytest.approx([0, 0.05, 0.1, 0.15], abs=1e-6)
     got = np.array([scan.samples for _, scan in read])
     assert np.allclose(got, expected(volts), rtol=1e-6, atol=1e-6)
+
+
+def test_channels_that_were_not_measured_are_left_out(tactomo: Run, tmp_path: Path) -> None:
+    """Electrodes on the instrument's channels 17 to 32, and columns of 1 to 32."""
+    volts = potentials(1)
+    text = eit_text(volts[0] * (1 + 0j), "2024.01.31. 12:30:05.000", 17)
+    (tmp_path / "a.eit").write_text(text)
+    result = tactomo("import", "a.eit", "out.mcap", "-d", "tank_disc", "--rate", "1")
+    assert result.returncode == 0, result.stderr
+    [(_, scan)] = scans(open_recording(tmp_path / "out.mcap"))
+    assert np.allclose(scan.samples, expected(volts)[0], rtol=1e-6, atol=1e-6)
+    (tmp_path / "b.eit").write_text(text.replace("\n17 18\n", "\n3 18\n"))
+    told = tactomo("import", "b.eit", "out2.mcap", "-d", "tank_disc", "--rate", "1").stderr
+    assert "b.eit, line 17: channel 3 is injected at, not measured" in told
+    (tmp_path / "c.eit").write_text(text.replace("Channels: 17,", "Channels: 77,"))
+    told = tactomo("import", "c.eit", "out3.mcap", "-d", "tank_disc", "--rate", "1").stderr
+    assert "c.eit, line 17: 16 channels, and 32 were saved" in told
 
 
 @pytest.mark.parametrize(
@@ -283,12 +302,11 @@ def test_info_of_an_imported_recording(tactomo: Run, tmp_path: Path) -> None:
     assert "magnitude: 4" in tactomo("info", "out.mcap").stdout
 
 
-@pytest.mark.skipif(not SCIOSPEC.exists(), reason="the measured tank is not on this machine")
 def test_a_measured_tank(tactomo: Run, tmp_path: Path) -> None:
     result = tactomo(
         *(
             "import",
-            SCIOSPEC,
+            measured("tank_sciospec_20fps.npz"),
             "tank.mcap",
             "--description",
             "tank_disc",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import typer
 
@@ -121,6 +121,13 @@ GivenProtocol: TypeAlias = Annotated[str | None, _protocol(" [tactomo]")]
 Description: TypeAlias = Annotated[str, _description()]
 GivenDescription: TypeAlias = Annotated[str | None, _description(f" [{DEFAULT_DESCRIPTION}]")]
 RecordedDescription: TypeAlias = Annotated[str | None, _description(" [the recorded one]")]
+ReferenceFrames: TypeAlias = Annotated[
+    str | None, typer.Option(metavar="FIRST:END", help="Unpressed frames, from 0: the reference.")
+]
+GivenChannel: TypeAlias = Annotated[
+    Literal["magnitude", "structure"] | None,
+    typer.Option(help="Which channel a file of one is of. [the sensor's only one]"),
+]
 SensorName: TypeAlias = Annotated[
     str, typer.Option("--sensor", "-s", help="The sensor's name in the stream.")
 ]

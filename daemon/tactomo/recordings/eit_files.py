@@ -4,11 +4,13 @@ The first line says how many lines the header has (9, 11 or 18), and, but for th
 second one the version. Then come a name, the date, the least and the greatest frequency, its scale,
 how many frequencies, the amplitude in A and the frames a second. After the header there are two
 lines for each injection: source and sink, numbered from 1, and the potential of every channel
-against ground in volts, real and imaginary part by turns, with tabs between them.
+against ground in volts, real and imaginary part by turns, with tabs between them. A header of 18
+lines names the channels that were measured; other columns are left out.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -22,6 +24,7 @@ from tactomo.errors import TactomoError
 
 SUFFIX: Final = ".eit"
 HEADERS: Final = (9, 11, 18)
+MEASURED: Final = "MeasurementChannels"
 MAX_BYTES: Final = 1 << 24
 _DATES: Final = ("%Y.%m.%d. %H:%M:%S.%f", "%Y.%m.%d. %H:%M:%S")
 _ANOTHER: Final = "is it a Sciospec file? Other programs have a format of that name, too"
@@ -118,7 +121,34 @@ class _Lines:
             volts.append(self._potentials(number + 1, len(volts[0]) if volts else None))
         if not injection:
             raise self._wrong(int(header) + 1, "no injection", "it was cut off: save it anew")
-        return _Frame(injection, volts, time_s)
+        return self._measured(int(header), _Frame(injection, volts, time_s))
+
+    def _measured(self, header: int, frame: _Frame) -> _Frame:
+        """Leave out the channels that the header does not name, and number the others from 1."""
+        for number in range(1, header + 1):
+            word, _, listed = self._text(number).partition(":")
+            channels = [int(digits) for digits in re.findall(r"\d+", listed)]
+            if word != MEASURED or not channels:
+                continue
+            columns = len(frame.volts[0])
+            if columns == len(channels):
+                places = list(range(columns))
+            elif 0 < min(channels) <= max(channels) <= columns:
+                places = [channel - 1 for channel in channels]
+            else:
+                raise self._wrong(number, f"{len(channels)} channels, and {columns} were saved")
+            electrode = {channel: n for n, channel in enumerate(channels, start=1)}
+            try:
+                injection = [(electrode[a], electrode[b]) for a, b in frame.injection]
+            except KeyError as error:
+                raise self._wrong(
+                    number,
+                    f"channel {error} is injected at, not measured",
+                    "measure all electrodes",
+                ) from None
+            volts = [[row[place] for place in places] for row in frame.volts]
+            return frame._replace(injection=injection, volts=volts)
+        return frame
 
     def _text(self, number: int) -> str:
         if number > len(self._lines):

@@ -1,7 +1,7 @@
 """Scans from files of other programs, as volts in the order of a sensor description.
 
-Two layouts of .npz files are read, told apart by their arrays; Sciospec's .eit files are of the
-second (see `eit_files`):
+Three layouts are read, told apart by their arrays; Sciospec's .eit files are of the second (see
+`eit_files`), text and .get of the third (see `tactomo_models.array_files`):
 
 batch
     what `tactomo reconstruct` takes: `magnitude` and/or `structure` (T, M) volts in the
@@ -13,11 +13,15 @@ single-ended
     real, each electrode against ground; `injection` (injections, 2), source and sink, numbered
     from 0 or from 1; optionally `t` (T,) seconds.
 
+plain
+    any other array of one frame a row or a column: the description's voltages in order, or every
+    drive by every measuring pair; beside it maybe a reference by one of the names in `AT_REST`.
+
 A single-ended scan becomes differences V(m) - V(m + offset), and of complex volts the *real part*
 is taken. The field's own unit is the volt in phase with the current; in a mostly resistive body the
 quadrature part comes from stray capacitance and adds noise but no contrast, and a modulus would
-lose the sign. The share that is left out is told, so that a file whose phase was never calibrated
-does not pass unnoticed.
+lose the sign. Where it is large the phase was never calibrated: all volts are turned by the one
+angle that leaves least of it. The share that is left out is told.
 """
 
 from __future__ import annotations
@@ -34,6 +38,8 @@ from tactomo_models.archive import read_arrays
 from tactomo_models.arrays import FloatArray
 from tactomo_models.batch import all_nan, scans_of
 from tactomo_models.scans.plausibility import Layout
+from tactomo_models.sensor.named_pattern import NamedPattern, fitting_patterns
+from tactomo_models.sensor.pattern import rim_signs, touching
 from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag
 
 from tactomo.errors import TactomoError
@@ -42,6 +48,8 @@ from tactomo.scans import MAX_QUADRATURE
 
 # Of times and electrodes' numbers: seconds since 1970 until 2096.
 MOST = 4e9
+TURNED_ROUND = 0.9  # share of voltages of the wrong sign; under an object few change theirs
+AT_REST = ("reference", "baseline", "rest", "empty", "vh")  # vh: homogeneous, in EIDORS' tutorials
 
 
 class ImportFileError(TactomoError):
@@ -59,12 +67,14 @@ class Scans:
         time_s: (T,) seconds, rising, from 0; None where the file does not say.
         reference: (M,) volts of each channel whose unloaded scan the file holds.
         notes: what a user should know about how the file was read.
+        turned_rad: the angle that complex volts were turned by.
     """
 
     volts: Mapping[Channel, FloatArray]
     time_s: FloatArray | None
     reference: Mapping[Channel, FloatArray] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    turned_rad: float | None = None
 
     @property
     def count(self) -> int:
@@ -97,10 +107,10 @@ class Scans:
         volts = self.volts.get(channel)
         if volts is None:
             return None
-        if len(volts[frames]) < 2:
+        if not len(volts[frames]):
             raise ImportFileError(
-                f"the reference frames are {len(volts[frames])} of the {len(volts)} scans",
-                "give at least two, such as --reference-frames 0:20",
+                f"the reference frames are 0 of the {len(volts)} scans",
+                "give some, such as --reference-frames 0:20",
             )
         return volts[frames]
 
@@ -138,7 +148,13 @@ class Scans:
 
 
 def read_scans(
-    path: Path | Sequence[Path], description: SensorDescription, channel: Channel | None
+    path: Path | Sequence[Path],
+    description: SensorDescription,
+    channel: Channel | None,
+    *,
+    array: str | None = None,
+    pattern: NamedPattern | None = None,
+    turn_rad: float | None = None,
 ) -> Scans:
     """Read the scans of a measurement.
 
@@ -146,24 +162,32 @@ def read_scans(
         path: as of `load_arrays`.
         description: the sensor, whose pattern the voltages follow.
         channel: which channel a file of one channel holds; None for the sensor's only one.
+        array: name of the scans, where the layout is plain; None for the only one that fits.
+        pattern: of plain scans, where the order differs from the description's.
+        turn_rad: angle to turn complex volts by, such as the reference's; None for their own.
 
     Raises:
-        ImportFileError, EitFileError, DataError: it cannot be read, is neither layout, or does not
+        ImportFileError, EitFileError, DataError: it cannot be read, is of no layout, or does not
             fit the sensor.
     """
     arrays = load_arrays(path)
     path = path if isinstance(path, Path) else path[0]
-    if is_single_ended(arrays):
-        channel = channel or _only_channel(description)
-        volts, time_s, notes = single_ended(path, arrays, description)
-        return Scans({channel: volts}, time_s, notes=notes)
-    if any(name in arrays for name in Channel):
+    if array is None and any(name in arrays for name in Channel):
         return _batch(path, arrays, description)
-    raise ImportFileError(
-        f"{path} holds {', '.join(arrays) or 'nothing'}",
-        "it must hold `magnitude` and/or `structure` (T, M), or `volts` (T, injections, "
-        "electrodes) and `injection` (injections, 2)",
-    )
+    rest: NDArray[Any] | None = None
+    if array is None and is_single_ended(arrays):
+        raw, time_s = _differences(path, arrays, description)
+    else:
+        raw, rest, time_s = _plain(path, arrays, description, array, pattern)
+    channel = channel or _only_channel(description)
+    volts, notes, turned_rad = _in_phase(path, raw, turn_rad)
+    reference = {} if rest is None else {channel: _in_phase(path, rest, turned_rad)[0]}
+    signs = rim_signs(description.pairs, description.electrode_count)
+    known = volts[:, signs != 0] * signs[signs != 0]
+    if description.instrument.voltages == "signed" and (known < 0).mean() > TURNED_ROUND:
+        notes += ("all voltages turned round, as if plus and minus were exchanged",)
+        volts, reference = -volts, {name: -each for name, each in reference.items()}
+    return Scans({channel: volts}, time_s, reference, notes, turned_rad)
 
 
 def load_arrays(path: Path | Sequence[Path]) -> dict[str, NDArray[Any]]:
@@ -182,7 +206,7 @@ def load_arrays(path: Path | Sequence[Path]) -> dict[str, NDArray[Any]]:
         return read_eit_files(files)
     if len(files) > 1:
         raise ImportFileError(
-            f"{len(files)} files were given, not all of them {SUFFIX}", "import one .npz at a time"
+            f"{len(files)} files were given, not all of them {SUFFIX}", "give one at a time"
         )
     [one] = files
     try:
@@ -190,7 +214,7 @@ def load_arrays(path: Path | Sequence[Path]) -> dict[str, NDArray[Any]]:
     except OSError as error:
         raise ImportFileError(
             f"cannot read {one}: {error.strerror or error}",
-            f"give the path of an .npz or {SUFFIX} file",
+            f"give the path of a file such as .npz, {SUFFIX}, .mat or .csv",
         ) from error
 
 
@@ -227,27 +251,127 @@ def single_ended(
     """Return single-ended readings as differences (T, M), their times, and notes for people.
 
     Raises:
-        ImportFileError: they do not fit the sensor, or are out of phase with the current.
+        ImportFileError: they do not fit the sensor, or are of no one phase.
     """
+    raw, time_s = _differences(path, arrays, layout)
+    volts, notes, _ = _in_phase(path, raw, None)
+    return volts, time_s, notes
+
+
+def _differences(
+    path: Path, arrays: dict[str, NDArray[Any]], layout: Layout
+) -> tuple[NDArray[Any], FloatArray | None]:
     injection, raw = _single_ended_arrays(path, arrays, layout)
     rows, signs = _injection_rows(path, injection - injection.min(), layout)
     plus, minus = layout.pairs.measure.T
     differences = signs * (raw[:, rows, plus] - raw[:, rows, minus])
-    quadrature = _quadrature(differences)
-    notes = () if raw.dtype.kind != "c" else (f"real part taken; {quadrature:.0%} is quadrature",)
+    return differences, _times(path, arrays, len(raw))
+
+
+def phase_rad(volts: NDArray[Any]) -> float:
+    """Return the phase that complex volts of either sign have in common, within half a turn."""
+    return float(np.angle(np.nansum(volts**2))) / 2
+
+
+def _in_phase(
+    path: Path, raw: NDArray[Any], turn_rad: float | None
+) -> tuple[FloatArray, tuple[str, ...], float | None]:
+    """Return the volts in phase with the current, notes, and the angle they were turned by."""
+    if raw.dtype.kind != "c":
+        return raw.astype(np.float64), (), None
+    notes: tuple[str, ...] = ()
+    if turn_rad is None:
+        turn_rad = -phase_rad(raw) if _quadrature(raw) > MAX_QUADRATURE else 0.0
+    if turn_rad:
+        notes = (f"turned by {np.degrees(turn_rad):.0f} degrees, into phase with the current",)
+        raw = raw * np.exp(1j * turn_rad)
+    quadrature = _quadrature(raw)
     if quadrature > MAX_QUADRATURE:
         raise ImportFileError(
-            f"{path}: {quadrature:.0%} of the signal is out of phase with the current",
-            "multiply volts by the phase factor of a resistor's reading, then import again",
+            f"{path}: {quadrature:.0%} of the signal is out of phase with the current, by whatever "
+            "angle all of it is turned",
+            "calibrate the instrument by a resistor, and measure again",
         )
-    volts = np.asarray(differences.real, dtype=np.float64)
-    return volts, _times(path, arrays, len(raw)), notes
+    notes += (f"real part taken; {quadrature:.0%} is quadrature",)
+    return np.asarray(raw.real, dtype=np.float64), notes, turn_rad
 
 
-def _quadrature(differences: NDArray[Any]) -> float:
+def _quadrature(volts: NDArray[Any]) -> float:
     """Return the share of the signal that is out of phase with the current."""
-    known = differences[np.isfinite(differences)]
+    known = volts[np.isfinite(volts)]
     return float(np.linalg.norm(known.imag) / max(np.linalg.norm(known), np.finfo(float).tiny))
+
+
+def _plain(
+    path: Path,
+    arrays: Mapping[str, NDArray[Any]],
+    description: SensorDescription,
+    name: str | None,
+    pattern: NamedPattern | None,
+) -> tuple[NDArray[Any], NDArray[Any] | None, FloatArray | None]:
+    """Return scans (T, M), a reference (M,) if there is one, and times if there are."""
+    numbers = {key: each for key, each in arrays.items() if each.dtype.kind in "fiuc"}
+    if name is not None and name not in numbers:
+        raise _unlike(path, arrays, f"no numbers called {name!r}", "name one of these by --array")
+    frames = {key: _frames(each, description, pattern) for key, each in numbers.items()}
+    fitting = {key: each for key, each in frames.items() if each is not None}
+    scans = [name] if name else [key for key in fitting if key not in AT_REST] or list(fitting)
+    if len(scans) > 1:
+        raise _unlike(path, arrays, "several arrays of scans", "name one of them by --array")
+    if not scans or scans[0] not in fitting:
+        raise _unlike(path, arrays, *_misfit(numbers, name, description))
+    volts, time_s = fitting[scans[0]]
+    rest = [each[0].mean(axis=0) for key, each in fitting.items() if key in AT_REST and key != name]
+    if time_s is None:
+        time_s = _times(path, arrays, len(volts))
+    return volts, rest[0] if rest and len(fitting) > 1 else None, time_s
+
+
+def _frames(
+    array: NDArray[Any], description: SensorDescription, pattern: NamedPattern | None
+) -> tuple[NDArray[Any], FloatArray | None] | None:
+    """Return an array as frames (T, M) in the sensor's order, and times, or None if none fit."""
+    drive, measure = description.drive_pairs, description.measure_pairs
+    every = np.repeat(drive, len(measure), axis=0), np.tile(measure, (len(drive), 1))
+    order = None if pattern is None else pattern.order
+    orders = {len(every[0]): np.flatnonzero(~touching(*every)), description.measurements: order}
+    array = np.atleast_2d(array)
+    if array.ndim > 2 or not array.size:
+        return None
+    for frames in (array, array.T):
+        width = frames.shape[1]
+        if width in orders:
+            at = orders[width]
+            return (frames if at is None else frames[:, at]), None
+        times = frames[:, 0].real
+        if width - 1 in orders and len(frames) > 1 and (np.diff(times) > 0).all():
+            at = orders[width - 1]
+            return (frames[:, 1:] if at is None else frames[:, 1 + at]), times - times[0]
+    return None
+
+
+def _misfit(
+    numbers: Mapping[str, NDArray[Any]], name: str | None, description: SensorDescription
+) -> tuple[str, str]:
+    """Say that no array has the sensor's voltages, and which patterns they would fit."""
+    said = f"no scans of {description.measurements} voltages, as of {description.name}"
+    tables = [np.atleast_2d(a) for key, a in numbers.items() if name in (key, None) and a.size]
+    for scans in (turned for table in tables if table.ndim == 2 for turned in (table, table.T)):
+        if found := fitting_patterns(np.abs(scans) if scans.dtype.kind == "c" else scans):
+            names = " or ".join(map(str, found[:3]))
+            next_step = f"reconstruct with --pattern {found[0]}, or give another --description"
+            return f"{said}, but {scans.shape[1]} numbers a frame, which fit {names}", next_step
+    return said, (
+        "save one frame a row or a column; `magnitude` and/or `structure` (T, M); or `volts` (T, "
+        "injections, electrodes) and `injection` (injections, 2)"
+    )
+
+
+def _unlike(
+    path: Path, arrays: Mapping[str, NDArray[Any]], cause: str, next_step: str
+) -> ImportFileError:
+    held = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
+    return ImportFileError(f"{path} holds {held or 'nothing'}: {cause}", next_step)
 
 
 def electrode_potentials(
@@ -297,7 +421,7 @@ def _injection_rows(
     return rows, signs
 
 
-def _times(path: Path, arrays: dict[str, NDArray[Any]], count: int) -> FloatArray | None:
+def _times(path: Path, arrays: Mapping[str, NDArray[Any]], count: int) -> FloatArray | None:
     if "t" not in arrays:
         return None
     time_s = _checked(path, "t", arrays["t"], (count,))
@@ -309,6 +433,8 @@ def _times(path: Path, arrays: dict[str, NDArray[Any]], count: int) -> FloatArra
 
 
 def _checked(path: Path, name: str, array: NDArray[Any], shape: tuple[int, ...]) -> FloatArray:
+    if array.ndim == 2 and len(shape) == 1 and 1 in array.shape:
+        array = array.ravel()  # MATLAB has no vectors
     fits = array.ndim == len(shape) and all(
         wanted in (-1, actual) for wanted, actual in zip(shape, array.shape, strict=True)
     )

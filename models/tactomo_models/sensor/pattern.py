@@ -44,6 +44,18 @@ def touching(drive: IntArray, measure: IntArray) -> BoolArray:
     return np.asarray((drive[:, :, None] == measure[:, None, :]).any(axis=(1, 2)))
 
 
+def rim_signs(pairs: Pairs, electrodes: int) -> IntArray:
+    """Signs (M,) of a bare sheet's voltages, 0 where drive and measuring pair cross.
+
+    Potential falls along the rim from the source to the sink, whichever way one goes.
+    """
+    source, sink, plus, minus = np.hstack([pairs.drive, pairs.measure]).T
+    sink, plus, minus = ((end - source) % electrodes for end in (sink, plus, minus))
+    one_way = (plus <= sink) & (minus <= sink)
+    other_way = (plus >= sink) & (minus >= sink)
+    return np.asarray(np.sign(minus - plus) * (one_way.astype(int) - other_way))
+
+
 def reciprocal_pairs(pairs: Pairs) -> IntArray:
     """Positions (n, 2) in a scan of voltages that are the same but for noise: V(k, m) = V(m, k)."""
     order = {

@@ -28,11 +28,17 @@ from tactomo_models.sensor.pattern import (
 from tactomo_protocol import SCAN_COUNTERS, Channel, Hello, Scan, ScanFlag
 
 from tactomo.errors import TactomoError
-from tactomo.recordings.imported_scans import is_single_ended, load_arrays, read_scans, single_ended
+from tactomo.recordings.imported_scans import (
+    AT_REST,
+    is_single_ended,
+    load_arrays,
+    phase_rad,
+    read_scans,
+    single_ended,
+)
 from tactomo.recordings.recording import Recording
 
 STATUS_WAIT_S = 3.0  # a daemon sends its status every second
-AT_REST = ("baseline", "reference", "rest", "empty")  # names of arrays of scans at rest
 CHANGES = "dv"
 
 
@@ -447,7 +453,7 @@ def _real(raw: NDArray[Any]) -> tuple[FloatArray, tuple[str, ...]]:
     """Return complex scans turned by one angle, so that they are as real as can be."""
     if raw.dtype.kind != "c":
         return raw.astype(np.float64), ()
-    angle = float(np.angle(np.nansum(raw**2))) / 2
+    angle = phase_rad(raw)
     turned = raw * np.exp(-1j * angle)
     left = float(np.linalg.norm(turned.imag) / np.linalg.norm(turned))
     note = f"turned by {np.degrees(-angle):.0f} degrees; {left:.0%} is out of phase and left out"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -23,18 +23,15 @@ app = options.typer_app()
 def import_scans(
     scans: Annotated[
         list[Path],
-        typer.Argument(metavar="IN", help="An .npz file; .eit files, or a folder of them."),
+        typer.Argument(
+            metavar="IN",
+            help="A file such as .npz, .mat, .csv; or .eit files, or a folder of them.",
+        ),
     ],
     recording: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="The recording to write.")],
     description: options.Description = options.DEFAULT_DESCRIPTION,
-    channel: Annotated[
-        Literal["magnitude", "structure"] | None,
-        typer.Option(help="Which channel single-ended volts are. [the sensor's only one]"),
-    ] = None,
-    reference_frames: Annotated[
-        str | None,
-        typer.Option(metavar="FIRST:END", help="Unloaded frames to be the reference, from 0."),
-    ] = None,
+    channel: options.GivenChannel = None,
+    reference_frames: options.ReferenceFrames = None,
     rate: Annotated[
         float | None, typer.Option(min=0.01, help="Scans a second. [the file's own times, t]")
     ] = None,
@@ -42,10 +39,11 @@ def import_scans(
 ) -> None:
     """Turn measured scans (.npz, .eit) into a recording that replays through the daemon.
 
-    Reads the layout of `tactomo reconstruct` (magnitude, structure and their references), and
-    single-ended readings as EIT instruments save them: `volts` (T, injections, electrodes) with
-    `injection` (injections, 2) and `t`. Those become differences of neighbouring electrodes in the
-    description's order; of complex volts the real part counts. So do the .eit files that Sciospec's
+    Reads the layouts of `tactomo reconstruct` (magnitude, structure and their references; frames of
+    one channel in a .mat, text or .get), and single-ended readings as EIT instruments save them:
+    `volts` (T, injections, electrodes) with `injection` (injections, 2) and `t`. Those become
+    differences of neighbouring electrodes in the description's order; of complex volts the part in
+    phase with the current counts. So do the .eit files that Sciospec's
     own program saves, one a frame, in the order of their dates.
     """
     from rich.progress import track

@@ -11,8 +11,11 @@ from tactomo.cli.options import (
     DEFAULT_DESCRIPTION,
     Description,
     Force,
+    GivenChannel,
     Method,
+    ReferenceFrames,
     examples,
+    frame_slice,
     typer_app,
 )
 from tactomo.cli.plot.plot import prepare_file
@@ -24,10 +27,14 @@ app = typer_app()
     epilog=examples(
         "tactomo reconstruct scans.npz maps.npz",
         "tactomo reconstruct scans.npz maps.npz --method tikhonov -d my_skin.toml",
+        "tactomo reconstruct tank.mat maps.npz -d tank_disc --reference-frames 0:20",
+        "tactomo reconstruct full.csv maps.npz -d tank_disc --reference empty.csv --pattern 32:1",
     ),
 )
 def reconstruct(
-    scans: Annotated[Path, typer.Argument(metavar="IN.npz", help="Scans and references.")],
+    scans: Annotated[
+        Path, typer.Argument(metavar="IN", help="Scans: .npz, .mat, .csv, .txt, .get, .eit.")
+    ],
     maps: Annotated[Path, typer.Argument(metavar="OUT.npz", help="The file to write.")],
     method: Method = "auto",
     description: Description = DEFAULT_DESCRIPTION,
@@ -38,6 +45,18 @@ def reconstruct(
     taught: Annotated[
         Path | None, typer.Option(help="By `tactomo teach`: corrects where single contacts are.")
     ] = None,
+    rest: Annotated[
+        Path | None, typer.Option("--reference", help="File of scans of the unpressed sensor.")
+    ] = None,
+    reference_frames: ReferenceFrames = None,
+    pattern: Annotated[
+        str | None,
+        typer.Option(help="ELECTRODES:DRIVE[:MEASURE][:rotated]. [the description's pattern]"),
+    ] = None,
+    array: Annotated[
+        str | None, typer.Option(help="Name of the array of scans in IN. [the one that fits]")
+    ] = None,
+    channel: GivenChannel = None,
     force: Force = False,
 ) -> None:
     """Reconstruct a file of scans, without a daemon.
@@ -45,7 +64,14 @@ def reconstruct(
     OUT may be an earlier one of this command; anything else is written over with `--force` only.
 
     IN holds `magnitude` and `structure` (T, M) volts and `magnitude_reference`,
-    `structure_reference` (M,); structure may be missing. OUT gets `map` (T, ny, nx), the relative
+    `structure_reference` (M,); structure may be missing. Or it is what `tactomo import` reads, or
+    frames of one channel, one a row or a column: an array of a .mat (up to version 7), numbers in
+    text (.csv, .txt), or a .get of 16 electrodes. Then the reference is an array called reference,
+    baseline, rest, empty or vh, `--reference-frames` of IN, or the mean of the file `--reference`.
+    `--pattern 32:adjacent`, `16:opposite:adjacent` or `16:adjacent:rotated` says which electrodes
+    the numbers are of, where the description says otherwise; it gets as many electrodes.
+
+    OUT gets `map` (T, ny, nx), the relative
     conductivity change; `pressure_kpa` (T, ny, nx), NaN where unknown; `structure` (T, ny, nx) from
     0 to 1; `misfit`, `confidence` (the correlation with the truth that the network expects, where a
     network made the map), `flags` and `seconds` (T,); and the contacts as flat arrays
@@ -83,22 +109,47 @@ def reconstruct(
     """
     from rich.progress import Progress
     from tactomo_models import load_description
-    from tactomo_models.batch import reconstruct_file
+    from tactomo_models.batch import reconstruct_scans, reference_at_rest
     from tactomo_models.calibration.calibration_file import calibration_of
     from tactomo_models.calibration.taught_skin import taught_of
+    from tactomo_models.sensor.named_pattern import NamedPattern
+    from tactomo_protocol import Channel
+
+    from tactomo.recordings.imported_scans import read_scans
 
     prepare_file(maps, force=force or _is_of_reconstruct(maps), source=scans)
     sensor = load_description(description)
+    named = None if pattern is None else NamedPattern.of_name(pattern)
+    if named is not None:
+        sensor = named.applied(sensor)
     curve = None if calibration is None else calibration_of(sensor, calibration).curve
     lesson = None if taught is None else taught_of(sensor, taught)
+    one = None if channel is None else Channel(channel)
+    frames_at_rest = frame_slice(reference_frames)
+    unpressed = None if rest is None else read_scans(rest, sensor, one, pattern=named)
+    turn_rad = None if unpressed is None else unpressed.turned_rad
+    read = read_scans(scans, sensor, one, array=array, pattern=named, turn_rad=turn_rad)
+    given = {str(name): volts for name, volts in read.volts.items()}
+    if unpressed is not None:
+        reference = unpressed.reference_of(slice(None))
+    else:
+        reference = read.reference_of(frames_at_rest) if frames_at_rest else None
+    if reference is None:
+        own = {str(name): volts for name, volts in read.reference.items()}
+        reference = reference_at_rest(scans, given, own, sensor)
+    elif reference.lacks_noise:
+        reference = reference.with_noise_of(sensor, *map(given.get, Channel))
+    for note in read.notes:
+        typer.echo(note, err=True)
     with Progress(transient=True) as progress:
         task = progress.add_task("reconstructing", total=None)
 
         def show(done: int, total: int) -> None:
             progress.update(task, completed=done, total=total)
 
-        frames = reconstruct_file(
-            scans,
+        frames = reconstruct_scans(
+            given,
+            reference,
             maps,
             description=sensor,
             method=method,

@@ -1,0 +1,142 @@
+"""Patterns by name, such as `32:adjacent` or `16:opposite:adjacent`: what a file does not say.
+
+ELECTRODES:DRIVE[:MEASURE][:rotated], where DRIVE and MEASURE (DRIVE's, if left out) are *adjacent*,
+*opposite*, or how many electrodes further round the other electrode of a pair is. Each drive's
+measuring pairs ascend from 0 or, *rotated*, from the drive's own (EIDORS calls it rotate_meas).
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple, Self
+
+import numpy as np
+
+from tactomo_models.arrays import FloatArray, IntArray
+from tactomo_models.errors import DataError, DescriptionError
+from tactomo_models.sensor.description import SensorDescription
+from tactomo_models.sensor.pattern import (
+    PatternLayout,
+    pattern_of_zeros,
+    reciprocal_pairs,
+    scan_pairs,
+)
+
+ROTATED: Final = "rotated"
+MIN_ELECTRODES: Final = 6
+MAX_ELECTRODES: Final = 64  # of a description, likewise
+MAX_ASYMMETRY: Final = 0.2
+"""Difference of reciprocal voltages over their size, rms, that a device which serves is below."""
+BEST: Final = 2.0
+"""Times the least difference, within which others count as fitting. On a simulated tank with 2 %
+noise the true offset leaves 0.02, the next one 0.10 (32 electrodes) to 0.14 (16)."""
+
+
+class NamedPattern(NamedTuple):
+    """Electrodes in a ring, and by how many the two of a pair are apart."""
+
+    electrodes: int
+    drive: int
+    measure: int
+    rotated: bool = False
+
+    @classmethod
+    def of_name(cls, name: str) -> Self:
+        """Read a pattern's name.
+
+        Raises:
+            DataError: it is none.
+        """
+        count, *offsets = name.lower().split(":")
+        rotated = offsets[-1:] == [ROTATED]
+        try:
+            electrodes = int(count)
+            words = {"adjacent": 1, "opposite": electrodes // 2}
+            told = [words.get(o) or int(o) for o in (offsets[:-1] if rotated else offsets)]
+            drive, measure = told if len(told) == 2 else told * 2
+            if not 0 < min(drive, measure) <= max(drive, measure) < electrodes <= MAX_ELECTRODES:
+                raise ValueError
+        except ValueError:
+            raise DataError(
+                f"{name!r} is no pattern; give ELECTRODES:DRIVE or ELECTRODES:DRIVE:MEASURE, such "
+                "as 16:adjacent, 16:opposite:adjacent or 32:5:5, and :rotated behind it where "
+                "measuring pairs begin at the drive's"
+            ) from None
+        return cls(electrodes, drive, measure, rotated)
+
+    def __str__(self) -> str:
+        """The name."""
+        words = {self.electrodes // 2: "opposite", 1: "adjacent"}
+        pairs = [self.drive] if self.drive == self.measure else [self.drive, self.measure]
+        parts = [words.get(offset, str(offset)) for offset in pairs]
+        return ":".join([str(self.electrodes), *parts, *([ROTATED] if self.rotated else [])])
+
+    @property
+    def layout(self) -> PatternLayout:
+        """Which electrodes each voltage is of, measuring pairs ascending."""
+        return PatternLayout(scan_pairs(*self[:3]), self.electrodes)
+
+    @property
+    def order(self) -> IntArray:
+        """Where a file has each voltage of the layout, (M,)."""
+        pairs = self.layout.pairs
+        drive, measure = pairs.drive[:, 0], pairs.measure[:, 0]
+        key = (measure - drive) % self.electrodes if self.rotated else measure
+        return np.argsort(np.lexsort((key, drive)))
+
+    def applied(self, description: SensorDescription) -> SensorDescription:
+        """The sensor with this pattern; other electrodes cover the share of the rim that its do.
+
+        Raises:
+            DescriptionError: there can be no such sensor.
+        """
+        raw = description.model_dump(by_alias=True, exclude_none=True)
+        now, electrodes = description.electrode_count, raw["electrodes"]
+        if now != self.electrodes:
+            if description.sheet.shape != "disc":
+                raise DescriptionError(
+                    f"{description.name!r} has {now} electrodes on four sides, and the pattern has "
+                    f"{self.electrodes}; give --description with as many, or that of a disc"
+                )
+            electrodes["count"] = self.electrodes
+            electrodes["length_m"] *= now / self.electrodes
+        raw["pattern"] = {
+            "current_a": description.pattern.current_a,
+            "drive_offset": self.drive,
+            "measure_offset": self.measure,
+        }
+        return SensorDescription.model_validate(raw)
+
+
+def fitting_patterns(scans: FloatArray) -> list[NamedPattern]:
+    """Patterns that scans (T, M) may have, by their count and zeros, and then by reciprocity.
+
+    Where drive and measuring pairs differ no voltages are reciprocal, so that nothing but the count
+    is known: the usual *opposite:adjacent* alone is named.
+    """
+    count = scans.shape[1]
+    root = round(np.sqrt(count))
+    if root * root == count and (scans == 0).all(axis=0).any():
+        try:
+            layout = pattern_of_zeros(scans)
+        except DataError:
+            return []
+        drive, measure = (p[0, 1] - p[0, 0] for p in (layout.pairs.drive, layout.pairs.measure))
+        return [NamedPattern(root, int(drive % root), int(measure % root))]
+    mean = scans.mean(axis=0)
+    tried, other = [], []
+    for electrodes in range(MIN_ELECTRODES, MAX_ELECTRODES + 1):
+        half = electrodes // 2
+        if electrodes * (electrodes - 4) == count and electrodes % 2 == 0:
+            other.append(NamedPattern(electrodes, half, 1))
+        for offset in range(1, half + 1):
+            kept = electrodes - (2 if 2 * offset == electrodes else 3)
+            if electrodes * kept != count:
+                continue
+            for rotated in (False, True):
+                named = NamedPattern(electrodes, offset, offset, rotated)
+                first, second = mean[named.order[reciprocal_pairs(named.layout.pairs).T]]
+                asymmetry = np.linalg.norm(first - second) / np.linalg.norm([first, second])
+                if asymmetry < MAX_ASYMMETRY:
+                    tried.append((float(asymmetry), named))
+    least = min((asymmetry for asymmetry, _ in tried), default=0.0)
+    return [named for asymmetry, named in tried if asymmetry <= BEST * least] + other

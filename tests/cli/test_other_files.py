@@ -1,0 +1,237 @@
+"""Files that people have: MATLAB's, text, .get and .eit go through `reconstruct` as .npz does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.io import savemat
+from tactomo.errors import TactomoError
+from tactomo.recordings.imported_scans import read_scans
+from tactomo_models import DataError, Press, SkinSimulator, load_description
+from tactomo_models.archive import read_arrays
+from tactomo_models.array_files import READERS
+from tactomo_models.arrays import FloatArray
+from tactomo_models.sensor.named_pattern import NamedPattern, fitting_patterns
+
+Run = Callable[..., Any]
+WHERE = Press(0.05, 0.02, 150.0, 0.02)
+FRAMES = 4
+
+
+def tank(pattern: str = "16:adjacent") -> tuple[FloatArray, FloatArray]:
+    """Scans of an empty tank (FRAMES, M), and with an object at (50, 20) mm, with some noise."""
+    named = NamedPattern.of_name(pattern)
+    skin = SkinSimulator(named.applied(load_description("tank_disc")))
+    noise = np.random.default_rng(0)
+    scans = []
+    for presses in ([], [WHERE]):
+        [volts] = skin.voltages(presses).values()
+        scans.append(volts + 1e-4 * np.abs(volts).mean() * noise.normal(size=(FRAMES, len(volts))))
+    order = np.argsort(named.order)
+    return scans[0][:, order], scans[1][:, order]
+
+
+def located(tactomo: Run, folder: Path, *arguments: Any) -> str:
+    """Reconstruct, see that the object is where it is, and return what was said."""
+    result = tactomo(
+        *("reconstruct", arguments[0], folder / "maps.npz", "-d", "tank_disc", "--force"),
+        *("--method", "tikhonov", *arguments[1:]),
+    )
+    assert result.returncode == 0, result.stderr
+    maps = read_arrays(folder / "maps.npz")
+    assert not maps["flags"].any()
+    last = maps["contact_frame"] == maps["contact_frame"].max()
+    place = maps["contact_x_mm"][last], maps["contact_y_mm"][last]
+    assert np.hypot(place[0] - 50, place[1] - 20).min() < 10
+    return str(result.stderr)
+
+
+def text(rows: FloatArray, delimiter: str = ",", comma: bool = False) -> str:
+    lines = [delimiter.join(f"{v:.9g}" for v in row) for row in rows]
+    return "\n".join(line.replace(".", ",") if comma else line for line in lines) + "\n"
+
+
+def test_matlab_arrays(tactomo: Run, tmp_path: Path) -> None:
+    """Frames in columns, as of EIDORS, or in rows, in structs or not; and the names of .npz."""
+    rest, there = tank()
+    savemat(tmp_path / "a.mat", {"vh": rest.mean(0)[:, None], "vi": there.T, "note": "text"})
+    savemat(tmp_path / "b.mat", {"vh": {"meas": rest[0][:, None]}})
+    savemat(tmp_path / "c.mat", {"data": {"meas": there.T, "name": "full"}})
+    times = np.arange(FRAMES)[:, None]
+    savemat(tmp_path / "d.mat", {"structure": there, "structure_reference": rest[:1], "t": times})
+    located(tactomo, tmp_path, tmp_path / "a.mat")
+    located(tactomo, tmp_path, tmp_path / "c.mat", "--reference", tmp_path / "b.mat")
+    located(tactomo, tmp_path, tmp_path / "d.mat")
+
+
+def test_a_sign_of_their_own(tactomo: Run, tmp_path: Path) -> None:
+    rest, there = tank()
+    (tmp_path / "in.csv").write_text(text(-np.vstack([rest, there])))
+    said = located(tactomo, tmp_path, tmp_path / "in.csv", "--reference-frames", "0:4")
+    assert "turned round" in said
+
+
+@pytest.mark.parametrize("ending", [".csv", ".txt", ".tsv", ".dat"])
+@pytest.mark.parametrize("columns", [False, True])
+def test_text(tactomo: Run, tmp_path: Path, ending: str, columns: bool) -> None:
+    rows = np.vstack(tank())
+    delimiter = {".csv": ", ", ".txt": " ", ".tsv": "\t", ".dat": ";"}[ending]
+    said = "# made by hand\nvolts of one tank\n\n" + text(rows.T if columns else rows, delimiter)
+    (tmp_path / f"in{ending}").write_text(said)
+    located(tactomo, tmp_path, tmp_path / f"in{ending}", "--reference-frames", f"0:{FRAMES}")
+
+
+def test_a_decimal_comma_and_times(tactomo: Run, tmp_path: Path) -> None:
+    rest, there = tank()
+    rows = np.column_stack([0.5 * np.arange(2 * FRAMES), np.vstack([rest, there])])
+    (tmp_path / "in.csv").write_text(text(rows, ";", comma=True))
+    located(tactomo, tmp_path, tmp_path / "in.csv", "--reference-frames", "0:1")
+    scans = read_scans(tmp_path / "in.csv", load_description("tank_disc"), None)
+    np.testing.assert_allclose(scans.times(None), rows[:, 0])
+    [volts] = scans.volts.values()
+    np.testing.assert_allclose(volts[:FRAMES], rest, rtol=1e-7)
+
+
+@pytest.mark.parametrize("pattern", ["32:adjacent", "16:opposite:adjacent", "16:adjacent:rotated"])
+def test_another_pattern_is_proposed_and_then_read(
+    tactomo: Run, tmp_path: Path, pattern: str
+) -> None:
+    rest, there = tank(pattern)
+    (tmp_path / "rest.csv").write_text(text(rest))
+    (tmp_path / "there.csv").write_text(text(there))
+    files = tmp_path / "there.csv", "--reference", tmp_path / "rest.csv"
+    if rest.shape[1] != 208:  # as many as the description's are taken as its
+        refused = tactomo("reconstruct", files[0], tmp_path / "maps.npz", "-d", "tank_disc")
+        assert refused.returncode == 1
+        assert f"{rest.shape[1]} numbers a frame, which fit {pattern}" in refused.stderr
+        assert f"--pattern {pattern}" in refused.stderr
+    located(tactomo, tmp_path, *files, "--pattern", pattern)
+    assert fitting_patterns(rest)[0] == NamedPattern.of_name(pattern)
+
+
+def test_every_drive_by_every_pair_is_read_and_named(tactomo: Run, tmp_path: Path) -> None:
+    """Whatever stands where a pair touches a driven electrode; zeros tell the pattern."""
+    pairs = load_description("tank_disc").pairs
+    rest, there = (np.zeros((FRAMES, 256)) for _ in range(2))
+    for full, kept in zip((rest, there), tank(), strict=True):
+        full[:, pairs.drive[:, 0] * 16 + pairs.measure[:, 0]] = kept
+    assert list(map(str, fitting_patterns(there))) == ["16:adjacent"]
+    savemat(tmp_path / "in.mat", {"rest": rest, "full": there, "note": "text"})
+    located(tactomo, tmp_path, tmp_path / "in.mat")
+
+
+def test_no_pattern_is_made_up() -> None:
+    noise = np.random.default_rng(0).normal(size=(3, 928))
+    assert fitting_patterns(noise) == []
+    assert fitting_patterns(noise[:, :207]) == []
+    assert [str(p) for p in fitting_patterns(noise[:, :192])] == ["16:opposite:adjacent"]
+
+
+def get_file(rows: FloatArray, half: bool) -> bytes:
+    """Frames as Goettingen's program saves them: 208 voltages, rotated, of 256 floats."""
+    frames = np.full((len(rows), 256), 0.5)
+
+    named = NamedPattern.of_name("16:adjacent:rotated")
+    frames[:, :208][:, named.order] = rows
+    if half:
+        drive = named.layout.pairs.drive[:, 0]
+        measure = named.layout.pairs.measure[:, 0]
+        frames[:, named.order[drive > measure]] = 0
+    return frames.astype("<f4").tobytes()
+
+
+@pytest.mark.parametrize("half", [False, True])
+@pytest.mark.parametrize(
+    "header", [b"", b"---Draeger EIT-Software---\r\n---Protocol---\r\n\r\nGain: 5\r\n\r\n\r\n"]
+)
+def test_get_files(tactomo: Run, tmp_path: Path, half: bool, header: bytes) -> None:
+    rows = np.vstack(tank())
+    (tmp_path / "in.get").write_bytes(header + get_file(rows, half))
+    located(tactomo, tmp_path, tmp_path / "in.get", "--reference-frames", f"0:{FRAMES}")
+    read = read_arrays(tmp_path / "in.get")["numbers"]
+    np.testing.assert_allclose(read, rows, rtol=0.05 if half else 1e-6, atol=1e-3 * rows.std())
+
+
+@pytest.mark.parametrize("degrees", [50, 140, -100])
+def test_volts_out_of_phase_are_turned_as_the_reference_is(
+    tactomo: Run, tmp_path: Path, degrees: float
+) -> None:
+    rest, there = (volts * np.exp(1j * np.radians(degrees)) for volts in tank())
+    savemat(tmp_path / "rest.mat", {"vh": rest})
+    savemat(tmp_path / "there.mat", {"vi": there})
+    said = located(
+        *(tactomo, tmp_path, tmp_path / "there.mat", "--reference", tmp_path / "rest.mat")
+    )
+    assert "turned by" in said
+    angles = np.random.default_rng(0).uniform(0, 2 * np.pi, 208)
+    savemat(tmp_path / "in.mat", {"vi": there * np.exp(1j * angles)})
+    result = tactomo("import", tmp_path / "in.mat", "out.mcap", "-d", "tank_disc", "--rate", "1")
+    assert result.returncode == 1
+    assert "out of phase with the current" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "told"),
+    [
+        ("a.mat", b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(600), "save('a.mat', '-struct'"),
+        ("a.mat", b"MATLAB 5.0 MAT-file".ljust(140), "damaged, or no .mat"),
+        ("a.csv", b"x,y\nvolts\n", "no line of numbers"),
+        ("a.csv", b"1,2\n3\n", "line 2: 1 numbers, and 2 in the lines before"),
+        ("a.csv", b"1,2\n3,x\n", "line 2: what is no number"),
+        ("a.csv", b"\xff\xfe1\x00", "is not text"),
+        ("a.txt", b"1 2 3\n", "no scans of 208 voltages, as of tank_disc; save one frame"),
+        ("a.get", b"short", "256 floats a frame"),
+        ("a.get", b"\x88" * 4096, "University of Cape Town"),
+        ("a.xyz", b"1 2 3", "read are .npz, .mat"),
+    ],
+)
+def test_what_is_wrong_is_named(
+    tactomo: Run, tmp_path: Path, name: str, content: bytes, told: str
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    result = tactomo("reconstruct", tmp_path / name, tmp_path / "o.npz", "-d", "tank_disc")
+    assert result.returncode == 1
+    assert told in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_what_cannot_be_told_apart_is_asked_for(tactomo: Run, tmp_path: Path) -> None:
+    rest, there = tank()
+    savemat(tmp_path / "in.mat", {"a": rest, "b": there})
+    asked = "reconstruct", tmp_path / "in.mat", tmp_path / "o.npz", "-d", "tank_disc"
+    assert "several arrays of scans; name one of them by --array" in tactomo(*asked).stderr
+    assert "give --reference-frames" in tactomo(*asked, "--array", "b").stderr
+    assert "no numbers called 'c'" in tactomo(*asked, "--array", "c").stderr
+    assert "is no pattern; give" in tactomo(*asked, "--pattern", "16:far").stderr
+
+
+@pytest.mark.parametrize("ending", sorted(READERS))
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(data=st.data())
+def test_any_bytes_become_scans_or_a_named_error(
+    tmp_path_factory: pytest.TempPathFactory, ending: str, data: st.DataObject
+) -> None:
+    path = tmp_path_factory.mktemp("any") / f"in{ending}"
+    rows = np.arange(416.0).reshape(2, 208) + 1
+    if ending == ".mat":
+        savemat(path, {"vh": rows[:1], "vi": {"meas": rows}}, do_compression=True)
+    elif ending == ".get":
+        path.write_bytes(get_file(rows, False))
+    else:
+        path.write_text(text(rows))
+    whole = bytearray(path.read_bytes())
+    for place, byte in data.draw(
+        st.lists(st.tuples(st.integers(0, len(whole) - 1), st.integers(0, 255)), max_size=8)
+    ):
+        whole[place] = byte
+    path.write_bytes(data.draw(st.sampled_from([bytes(whole), bytes(whole[: len(whole) // 2])])))
+    with suppress(TactomoError, DataError):
+        scans = read_scans(path, load_description("tank_disc"), None)
+        assert all(volts.shape[1] == 208 for volts in scans.volts.values())
