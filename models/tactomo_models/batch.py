@@ -35,6 +35,7 @@ def reconstruct_file(
     curve: PressureCurve | None = None,
     taught: TaughtSkin | None = None,
     progress: Progress | None = None,
+    read: tuple[Mapping[str, FloatArray], Reference] | None = None,
 ) -> list[Reconstruction]:
     """Reconstruct every frame of `source` into `target`, and return the frames.
 
@@ -48,6 +49,7 @@ def reconstruct_file(
         curve: of a pressure calibration; the description's if None.
         taught: what the skin was taught; None where nothing.
         progress: called with frames done and frames in all.
+        read: scans and reference of `source`, of another layout; None to read them here.
 
     Raises:
         DataError: the input cannot be read, has the wrong shape, or no channel of the sensor;
@@ -55,33 +57,9 @@ def reconstruct_file(
         CalibrationError: another skin was taught.
         ModelError: the method is unknown, or lacks what it needs.
     """
-    scans, reference = read_scans(source, description)
-    return reconstruct_scans(
-        scans,
-        reference,
-        target,
-        description=description,
-        method=method,
-        curve=curve,
-        taught=taught,
-        progress=progress,
-    )
-
-
-def reconstruct_scans(
-    scans: Mapping[str, FloatArray],
-    reference: Reference,
-    target: Path,
-    *,
-    description: SensorDescription,
-    method: str = "auto",
-    curve: PressureCurve | None = None,
-    taught: TaughtSkin | None = None,
-    progress: Progress | None = None,
-) -> list[Reconstruction]:
-    """Reconstruct scans (T, M) of each channel into `target`, see `reconstruct_file`."""
     if not target.parent.is_dir():
         raise DataError(f"cannot write {target}: there is no folder {target.parent}; make it first")
+    scans, reference = read or read_scans(source, description)
     total = max(len(channel) for channel in scans.values())
     frames: list[Reconstruction] = []
     seconds = np.zeros(total)

@@ -51,7 +51,7 @@ def reconstruct(
     reference_frames: ReferenceFrames = None,
     pattern: Annotated[
         str | None,
-        typer.Option(help="ELECTRODES:DRIVE[:MEASURE][:rotated]. [the description's pattern]"),
+        typer.Option(help="Of what IN's numbers are, see below. [the description's pattern]"),
     ] = None,
     array: Annotated[
         str | None, typer.Option(help="Name of the array of scans in IN. [the one that fits]")
@@ -109,7 +109,7 @@ def reconstruct(
     """
     from rich.progress import Progress
     from tactomo_models import load_description
-    from tactomo_models.batch import reconstruct_scans, reference_at_rest
+    from tactomo_models.batch import reconstruct_file, reference_at_rest
     from tactomo_models.calibration.calibration_file import calibration_of
     from tactomo_models.calibration.taught_skin import taught_of
     from tactomo_models.sensor.named_pattern import NamedPattern
@@ -147,10 +147,10 @@ def reconstruct(
         def show(done: int, total: int) -> None:
             progress.update(task, completed=done, total=total)
 
-        frames = reconstruct_scans(
-            given,
-            reference,
+        frames = reconstruct_file(
+            scans,
             maps,
+            read=(given, reference),
             description=sensor,
             method=method,
             progress=show,
