@@ -115,14 +115,17 @@ lock:            ## refresh the lock files (needs uv on the PATH)
 clean:           ## remove the environment and caches
 	rm -rf $(VENV) $(PEERS) .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
+# The inner loop is compiled (hatch_build.py): for those without a compiler a package brings one.
 # Built in place under a temporary marker so that an interrupted install is simply redone. First what
 # runs, then on top of that what tests, then what trains.
-$(RUN_READY): requirements-run.lock pyproject.toml clients/python/pyproject.toml
+$(RUN_READY): requirements-run.lock pyproject.toml hatch_build.py models/tactomo_models/inner_loop.c clients/python/pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "tactomo needs Python 3.11 or newer")'
 	@echo "setting up $(VENV): what runs"
 	@$(PYTHON) -m venv $(VENV)
 	@$(INSTALL) --require-hashes -r requirements-run.lock | $(SHOW)
+	@command -v $${CC:-cc} >/dev/null || $(INSTALL) ziglang | $(SHOW) || true
 	@$(INSTALL) $(BUILD) -e clients/python -e .
+	@command -v $${CC:-cc} >/dev/null || $(BIN)/python -m pip uninstall --quiet --yes ziglang
 	@touch $@
 
 $(READY): $(RUN_READY) requirements.lock $(LAB)/pyproject.toml

@@ -43,7 +43,7 @@ ALLOWED: dict[str, set[str]] = {
 # Folders, and modules beside them, of each package: each imports those before it alone.
 ORDER = {
     "tactomo_models": (
-        *("errors", "arrays", "array_files", "archive", "toml_file", "robust"),
+        *("errors", "arrays", "array_files", "archive", "toml_file", "robust", "inner_loop"),
         *("sensor", "physics", "scans", "scene", "methods", "simulation"),
         *("calibration", "health", "drift", "reconstruct", "known_skin", "batch", "teach"),
         *("machine_speed", "mujoco_skin", "gymnasium_skin"),

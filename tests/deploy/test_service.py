@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -231,9 +232,20 @@ def test_the_examples_load(example: Path) -> None:
 
 
 @pytest.mark.slow
-def test_an_installed_package_has_the_files_along(tmp_path: Path) -> None:
+@pytest.mark.parametrize("has_compiler", [True, False])
+def test_an_installed_package_has_the_files_along(tmp_path: Path, has_compiler: bool) -> None:
+    environment = {**os.environ, "CC": ""} | ({} if has_compiler else {"PATH": str(tmp_path)})
     build = "from hatchling.build import build_wheel; import sys; build_wheel(sys.argv[1])"
-    subprocess.run([sys.executable, "-c", build, str(tmp_path)], cwd=ROOT, check=True, timeout=100)
+    subprocess.run(
+        [sys.executable, "-c", build, str(tmp_path)],
+        cwd=ROOT,
+        env=environment,
+        check=True,
+        timeout=100,
+    )
     (wheel,) = tmp_path.glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {f"tactomo/deploy/{file}" for file in installation.SHARED} <= names
+    # Without a compiler it is for any machine, and runs in NumPy.
+    assert ("tactomo_models/libinner_loop.so" in names) == has_compiler
+    assert wheel.name.endswith("-none-any.whl") != has_compiler

@@ -21,7 +21,9 @@ import numpy as np
 import scipy.sparse as sp
 
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
+from tactomo_models.inner_loop import LIBRARY
 from tactomo_models.physics.bare_sheet import BareSheet, scan_voltages, volts_per_unit
+from tactomo_models.physics.compiled_sheet import CompiledSheet
 from tactomo_models.physics.condensation import Condensation
 from tactomo_models.sensor.description import SensorDescription
 
@@ -92,12 +94,36 @@ class ForwardModel:
         self._index_pairs()
         self._index_triangles()
         self._index_nodes()
+        self._compiled = self._compile() if LIBRARY is not None else None
+
+    def _compile(self) -> CompiledSheet:
+        pairs = self.description.pairs
+        arrays = {
+            "corner_support": self._corner_support,
+            "corner_pressable": self._corner_pressable,
+            "triangles_of": self._triangles_of,
+            "neighbours": self._neighbours,
+            "triangle_count": self._triangle_count,
+            "closed": self._closed,
+            "gradient": self._gradient,
+            "stiffness": self._stiffness,
+            "area": self._area,
+            "conductivity": self._bare_conductivity,
+            "transfer": self.bare.transfer,
+            "electrodes": np.concatenate([pairs.drive, pairs.measure], axis=1),
+            "pair": self._different_pairs,
+            "product": self._products.T,
+            "product_of": self._product_of,
+            "sign": self._sign,
+        }
+        return CompiledSheet(self.bare, arrays)
 
     def _index_pairs(self) -> None:
         """The different electrode pairs, and which two of them each voltage belongs to."""
         pairs = self.description.pairs
         both = np.concatenate([pairs.drive, pairs.measure])
         different, pair = np.unique(np.sort(both, axis=1), axis=0, return_inverse=True)
+        self._different_pairs = different
         matrix = np.zeros((len(different), self.description.electrode_count))
         np.put_along_axis(matrix, different, [[1.0, -1.0]], axis=1)
         self._pair_matrix = matrix[:, :-1]  # the last electrode's potential is 0
@@ -168,11 +194,17 @@ class ForwardModel:
         Raises:
             numpy.linalg.LinAlgError: a conductivity is not above 0.
         """
-        triangles = self._around(np.flatnonzero(change) if within is None else within)
-        if len(triangles) == 0:
+        where = np.flatnonzero(change) if within is None else within
+        if len(where) == 0:
             nowhere = np.zeros(0, np.intp)
             none = self.bare.potentials[nowhere]
             return Solution(self.bare_voltages, nowhere, none, nowhere, none)
+        mixed = change if mix_resistivities else None
+        if self._compiled is not None:
+            found = self._compiled.areas(where)
+            voltages, potentials, injected = self._compiled.solve(found, change, mix_resistivities)
+            return Solution(voltages, found.nodes, potentials, found.rim, injected, mixed)
+        triangles = self._around(where)
         areas = self._areas(triangles)
         at_corners = self._at_corners(triangles, change)
         conductivity = at_corners.sum(axis=1) / 3
@@ -195,7 +227,7 @@ class ForwardModel:
             potentials=condensed.inwards(areas.potentials + areas.green @ injected),
             rim=areas.rim,
             injected=injected,
-            mixed=change if mix_resistivities else None,
+            mixed=mixed,
         )
 
     def _at_corners(self, triangles: IntArray, change: FloatArray) -> FloatArray:
@@ -275,6 +307,11 @@ class ForwardModel:
         Returns:
             (M, K), or (M, n) by the nodes' relative conductivity (the paper's equation 2).
         """
+        if self._compiled is not None and onto is not None:
+            areas = self._compiled.areas(where)
+            inside = solution.nodes is areas.nodes
+            found = solution.potentials if inside else self.potentials(solution, areas.nodes)
+            return self._compiled.jacobian(areas, found, solution.mixed, onto)
         triangles, nodes, corners = self._touched(where)
         fields = self.potentials(solution, nodes) @ self._pair_matrix.T  # (nodes, pairs)
         gradient = self._gradient[triangles] @ fields[corners]  # (t, 2, pairs)

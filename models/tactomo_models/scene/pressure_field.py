@@ -18,12 +18,14 @@ Where contacts overlap, what is pressed is pressed once, with the mean of their 
 from __future__ import annotations
 
 from collections.abc import Callable
+from ctypes import Structure, byref, c_double, c_int64
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 
 import numpy as np
 
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
+from tactomo_models.inner_loop import LIBRARY, at
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scene.sheet_response import GradedResponse
 
@@ -47,6 +49,15 @@ PRIOR_SIGMA = np.array([5.0, 5.0, 0.6, 0.3, 0.3, 0.05, 0.05, 0.07, 0.07, 1.0, 0.
 NOWHERE = 1e-6  # distance from a contact's centre, over its size, that has no direction
 GRADED_WIDTH = 0.7
 RIM = 0.1  # of the nodes' distance: how far inside its edge a falling pressure is averaged
+
+
+class _Field(Structure):
+    """What C knows of a field: see `inner_loop.c`."""
+
+    _fields_ = (
+        *((name, c_double) for name in ("half_width_m", "offset_m", "unit_kpa")),
+        *((name, c_int64) for name in ("forms", "is_sharp")),
+    )
 
 
 @dataclass(frozen=True)
@@ -95,7 +106,7 @@ class PressureField:
         """
         offset = 0.05  # see above
         least, beyond = 0.01, 1.3  # of the table's end, that a peak may come to
-        x, y = forward.bare.points[:, forward.bare.pressable]
+        x, y = np.ascontiguousarray(forward.bare.points[:, forward.bare.pressable])
         description = forward.description
         spacing = description.width_m / (description.map.nodes_x - 1)
         end_kpa = graded.end_kpa if graded else 300.0
@@ -203,6 +214,8 @@ class PressureField:
     def draw(self, parameters: FloatArray) -> Drawing:
         """Draw the field on the nodes."""
         each = self.split(parameters)
+        if LIBRARY is not None:
+            return self._compiled(each)
         near = self._near(each)
         drawn = _Contacts(self, each, _Outlines(self, each, self.x_m[near], self.y_m[near]))
         there = np.flatnonzero((drawn.wide > -1).any(axis=0))
@@ -220,6 +233,31 @@ class PressureField:
             slopes=slopes,
         )
 
+    def _for_c(self, is_sharp: bool) -> _Field:
+        return _Field(self.half_width_m, self.offset_m, self.unit_kpa, self.forms, is_sharp)
+
+    def _compiled(self, each: FloatArray) -> Drawing:
+        """The same as `draw`, by `inner_loop.c`."""
+        assert LIBRARY is not None
+        of = byref(self._for_c(False))
+        nodes, found = np.empty(len(self.x_m), np.intp), np.empty((3, len(self.x_m)))
+        points = len(self.x_m), at(self.x_m), at(self.y_m)
+        count = LIBRARY.draw(of, len(each), at(each), *points, at(nodes), *map(at, found))
+        nodes = nodes[:count].copy()
+
+        @cache
+        def slopes() -> tuple[FloatArray, FloatArray, FloatArray]:
+            x_m, y_m = self.x_m[nodes], self.y_m[nodes]
+            by = np.empty((3, count, int(self.free.sum())))
+            points = count, at(x_m), at(y_m)
+            LIBRARY.draw_slopes(
+                of, len(each), at(each), *points, at(self.index), by.shape[2], *map(at, by)
+            )
+            return by[0], by[1], by[2]
+
+        enclosed, share, pressure = found[:, :count].copy()
+        return Drawing(nodes, enclosed, share, pressure, slopes)
+
     def sampled(
         self, each: FloatArray, x_m: FloatArray, y_m: FloatArray, step_m: float
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -228,6 +266,19 @@ class PressureField:
         Outlines are as sharp as the points can show them.
         """
         sharp = replace(self, half_width_m=step_m)
+        if LIBRARY is not None:
+            found = np.empty((3, len(x_m)))
+            LIBRARY.draw(
+                byref(sharp._for_c(True)),
+                len(each),
+                at(each),
+                len(x_m),
+                at(x_m),
+                at(y_m),
+                None,
+                *map(at, found),
+            )
+            return found[0], found[1], found[2]
         drawn = _Contacts(sharp, each, _Outlines(sharp, each, x_m, y_m), is_sharp=True)
         return 1 - np.prod(1 - drawn.whole, axis=0), drawn.share, drawn.pressure_kpa
 
