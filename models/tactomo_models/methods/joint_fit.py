@@ -175,11 +175,12 @@ class JointFit:
             each = start.family.split(start.parameters)
             field = self._field.of(each, start.family.order)
             family: Family = field
-            parameters = field.join(each)
+            parameters, solved = field.join(each), start.solutions
         else:
             assert isinstance(start.family, LevelSet)
             family, parameters = self._with_peaks(start.family, start.parameters)
-        started = self._fit.evaluate(family, parameters, start.log_ratio, measured)
+            solved = {}  # with other pressures
+        started = self._fit.evaluate(family, parameters, start.log_ratio, measured, solved=solved)
         assert started is not None  # it was small enough for one sheet
         return started
 

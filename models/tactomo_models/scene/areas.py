@@ -71,10 +71,12 @@ class AreaFinder:
             none = np.zeros((0, *pressed.shape))
             on_nodes = np.zeros((0, len(pressed_nodes)))
             return Areas(none, on_nodes, np.zeros((0, 2)), np.zeros(0), np.zeros((0, 3)))
-        nearest = ndimage.distance_transform_edt(
-            label == 0, return_distances=False, return_indices=True
-        )
-        owner = label[tuple(nearest)]
+        owner = np.ones_like(label)
+        if count > 1:
+            nearest = ndimage.distance_transform_edt(
+                label == 0, return_distances=False, return_indices=True
+            )
+            owner = label[tuple(nearest)]
         mine = owner[None] == np.arange(1, count + 1)[:, None, None]
         on_map = mine * pressed
         areas = on_map.sum(axis=(1, 2)) * self._cell_m2

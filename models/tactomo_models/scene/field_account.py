@@ -115,58 +115,62 @@ class FieldAccountant:
         self, fitted: FittedField, measured: Measured, changed: FloatArray | None
     ) -> FieldAccount:
         """Account for a field, or for the same with its contacts (K, COLUMNS) changed."""
-        family = fitted.family
+        family, needs_sigmas = fitted.family, True
         if changed is not None:
             assert isinstance(family, PressureField)
+            # Of another account only what is felt of evener pressures is shown with its own sigma.
+            before = family.split(fitted.parameters)
+            needs_sigmas = bool((changed[:, EDGE] < before[:, EDGE]).any())
             family = family.of(changed, family.order)
             parameters = family.join(changed)
             fitted = replace(
                 fitted, family=family, parameters=parameters, drawing=family.draw(parameters)
             )
-        solid, share, pressure = self._images(fitted)
-        magnitude = np.zeros(share.shape)
+        near, (solid, share, pressure) = self._images(fitted)
+        magnitude, saturation = np.zeros(share.shape), np.ones(share.shape)
         if isinstance(self._graded, GradedResponse):
             magnitude = np.abs(self._graded.relative_change(pressure)[0])
-        saturation = np.ones(share.shape)
         if isinstance(self._saturating, SaturatingResponse):
             saturation = self._saturating.saturation(pressure)[0]
 
         def seen(values: FloatArray) -> FloatArray:
-            return np.asarray(values.mean(axis=1).reshape(self._shape))
+            image = np.zeros(self._x.shape[0])
+            image[near] = values.sum(axis=1) / values.shape[1]
+            return image.reshape(self._shape)
 
-        covered, whole = seen(np.abs(share)), seen(np.abs(solid))
+        pressed = np.abs(share)
+        covered, whole = seen(pressed), seen(np.abs(solid))
         drawing = fitted.drawing
         there = np.zeros(len(self._fit.forward.bare.pressable))
         there[drawing.nodes] = 1.0
         areas = self._areas.find(whole, there)
         mine = areas.on_nodes[:, drawing.nodes] > 0
         areas = self._areas.less(areas, covered / np.maximum(whole, 1e-12))
-        known = self._contacts(fitted, measured, areas, mine)
+        known = self._contacts(fitted, measured, areas, mine, needs_sigmas)
         return FieldAccount(
-            map=seen(np.abs(share) * magnitude),
+            map=seen(pressed * magnitude),
             structure=seen(share * saturation),
-            pressure_kpa=seen(np.abs(share) * pressure),
+            pressure_kpa=seen(pressed * pressure),
             **known,
         )
 
-    def _images(self, fitted: FittedField) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """What is enclosed, share, and pressure at each sample, (cells, samples) each."""
-        samples = self._x.shape
+    def _images(self, fitted: FittedField) -> tuple[IntArray, FloatArray]:
+        """Cells near what is pressed, and what is enclosed, share and pressure (3, cells, samples).
+
+        Elsewhere nothing is pressed.
+        """
         family, drawing = fitted.family, fitted.drawing
         if not isinstance(family, PressureField):
             on_nodes = np.zeros((2, len(self._fit.forward.bare.pressable)))
             on_nodes[:, drawing.nodes] = drawing.share, np.abs(drawing.share) * drawing.pressure_kpa
             share, pressed = (self._areas.on_map(each).reshape(-1, 1) for each in on_nodes)
             pressure = pressed / np.maximum(np.abs(share), 1e-12)
-            return share, share, pressure
-        solid, share, pressure = np.zeros((3, *samples))
-        if family.count:
-            near = self._near(drawing)
-            x, y = self._x[near], self._y[near]
-            each = family.split(fitted.parameters)
-            found = family.sampled(each, x.ravel(), y.ravel(), self._step_m)
-            solid[near], share[near], pressure[near] = (one.reshape(x.shape) for one in found)
-        return solid, share, pressure
+            return np.arange(len(share)), np.stack([share, share, pressure])
+        near = self._near(drawing)
+        x, y = self._x[near], self._y[near]
+        each = family.split(fitted.parameters)
+        found = family.sampled(each, x.ravel(), y.ravel(), self._step_m)
+        return near, np.reshape(found, (3, *x.shape))
 
     def _near(self, drawing: Drawing) -> IntArray:
         """Map cells next to a node that is pressed."""
@@ -182,7 +186,12 @@ class FieldAccountant:
         return np.flatnonzero(grown)
 
     def _contacts(
-        self, fitted: FittedField, measured: Measured, areas: Areas, mine: BoolArray
+        self,
+        fitted: FittedField,
+        measured: Measured,
+        areas: Areas,
+        mine: BoolArray,
+        needs_sigmas: bool,
     ) -> dict[str, Any]:
         """Numbers of each area's contact, and what they do not know of themselves."""
         count = len(areas)
@@ -197,9 +206,12 @@ class FieldAccountant:
         if count == 0:
             return known
         family, drawing = fitted.family, fitted.drawing
-        precision = self._fit.prior(fitted)[0]
-        J = self._fit.jacobian(fitted, measured, drawing)
-        covariance = covariance_of(J, precision, measured, fitted.misfit)[:-1, :-1]
+        count_free = len(fitted.parameters)
+        J, covariance = np.zeros((0, count_free)), np.zeros((count_free, count_free))
+        if needs_sigmas:
+            J = self._fit.jacobian(fitted, measured, drawing)
+            precision = self._fit.prior(fitted)[0]
+            covariance = covariance_of(J, precision, measured, fitted.misfit)[:-1, :-1]
         _, by_share, by_pressure = drawing.slopes()
         cell = self._areas.node_areas_m2[drawing.nodes]
         share, pressure = drawing.share, drawing.pressure_kpa
@@ -241,11 +253,12 @@ class FieldAccountant:
             index = family.index
             by_peak = np.zeros_like(by_peak)
             by_peak[np.arange(count), index[owner, PEAK]] = family.unit_kpa
-            known["goes_wrong_way"] = self._goes_wrong_way(
-                J[:, index[owner, PEAK]],
-                fitted.residual,
-                each[owner, PEAK] <= family.peak_limits[0],
-            )
+            if needs_sigmas:
+                known["goes_wrong_way"] = self._goes_wrong_way(
+                    J[:, index[owner, PEAK]],
+                    fitted.residual,
+                    each[owner, PEAK] <= family.peak_limits[0],
+                )
         peak_size, peak_slope = (np.abs(v) for v in self._graded.relative_change(peaks))
         scale = areas.areas_m2 / area  # the map's, over the mesh's
         by_force = signed * pressure[:, None] + share[:, None] * by_pressure

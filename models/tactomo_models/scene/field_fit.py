@@ -150,7 +150,13 @@ class FieldFit:
         Sheets that the estimate has not solved are solved.
         """
         if measured.keys() - fitted.solutions.keys():
-            again = self.evaluate(fitted.family, fitted.parameters, fitted.log_ratio, measured)
+            again = self.evaluate(
+                fitted.family,
+                fitted.parameters,
+                fitted.log_ratio,
+                measured,
+                solved=fitted.solutions,
+            )
             assert again is not None
             return again
         judged = self._judged(
@@ -170,16 +176,18 @@ class FieldFit:
         log_ratio: float,
         measured: Measured,
         max_pressed: int = MAX_PRESSED,
+        solved: Mapping[Channel, Solution] | None = None,
     ) -> FittedField | None:
         """Solve the forward model for given parameters and compare it with the data.
 
-        None where so much would be pressed that no deadline could be kept.
+        None where so much would be pressed that no deadline could be kept. Sheets that are `solved`
+        for these very contacts and ratio are not solved again.
         """
         drawing = family.draw(parameters)
         if len(drawing.nodes) > max_pressed:
             return None
-        solutions = {}
-        for name in measured:
+        solutions = dict(solved or {})
+        for name in [each for each in measured if each not in solutions]:
             response, forward = self.responses[name], self._sheet(name)
             share = _seen(name, drawing)
             ratio = response.conductivity(share, drawing.pressure_kpa, log_ratio)[0]
@@ -188,6 +196,7 @@ class FieldFit:
             solutions[name] = forward.solve(
                 change, mix_resistivities=response.rises(log_ratio), within=drawing.nodes
             )
+        solutions = {name: solutions[name] for name in measured}
         return self._judged(family, parameters, log_ratio, drawing, solutions, measured)
 
     def _judged(
