@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -17,6 +21,7 @@ from tactomo_models.physics.bare_sheet import scan_voltages
 from tactomo_models.sensor.description_file import shipped_text
 from tactomo_models.sensor.pattern import reciprocal_pairs, scan_pairs
 from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag
+from waiting import wait_until
 from whole_system import SENSOR, Demo, running_demo
 
 Run = Callable[..., Any]
@@ -274,6 +279,33 @@ def test_the_description_that_a_daemon_holds_is_found(
         outcome = tactomo("doctor", "-s", SENSOR, "--stream", demo.stream, "--seconds", "2")
     assert outcome.returncode == 0
     assert "is not here" not in outcome.stdout
+
+
+def wait_for_more(count: str, address: str) -> None:
+    """Wait until a status counts four more."""
+    before = request("status", address)[count]
+    wait_until(lambda: request("status", address)[count] >= before + 4)
+
+
+def test_a_healthy_skin_on_a_busy_computer_is_healthy(demo: Demo) -> None:
+    """The daemon gets the processor for moments only; its frames are fewer, and none is wrong."""
+    request("tare", demo.control, 30.0)
+    daemon = request("status", demo.control)["process"]["pid"]
+    look = ["-s", SENSOR, "--stream", demo.stream, "--seconds", "4", "--json"]
+    program = (sys.executable, "-m", "tactomo.cli", "doctor", *look)
+    with subprocess.Popen(program, stdout=subprocess.PIPE, text=True) as doctor:
+        while doctor.poll() is None:
+            os.kill(daemon, signal.SIGSTOP)
+            try:
+                wait_for_more("counter", demo.twin)
+            finally:
+                os.kill(daemon, signal.SIGCONT)
+            wait_for_more("frames", demo.control)
+        assert doctor.stdout is not None
+        found = json.loads(doctor.stdout.read())
+    left_out = about(found["stream"], "dropped_scans")
+    assert left_out["number"] > 3
+    assert (left_out["level"], found["verdict"], doctor.returncode) == ("advice", "healthy", 0)
 
 
 def test_a_running_daemon(tactomo: Run, demo: Demo) -> None:

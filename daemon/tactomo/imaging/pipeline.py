@@ -195,6 +195,12 @@ class Pipeline(Worker):
         """Have the replay go on elsewhere; for any thread. The future is done when that is so."""
         return self._ask(lambda: self._move(position_s))
 
+    def step(self) -> None:
+        """Have the replay go on by one dual scan; for any thread. The next may be here already."""
+        assert self._replay is not None
+        self._replay.playback.step()
+        self._wake()
+
     def use_calibration(
         self, calibration: PressureCalibration | None, taught: TaughtSkin | None
     ) -> Future[Mapping[str, Any]]:
@@ -212,8 +218,8 @@ class Pipeline(Worker):
             before = self._sync_state()
             ready = self._gather()
             self._tell_changes(before)
-            self._ready.extend(ready if self._is_lossless else self._newest(ready))
-            while self._ready and not self._stopping.is_set():
+            self._ready.extend(ready if self._takes_all else self._newest(ready))
+            while self._ready and not self._stopping.is_set() and self._is_let_through():
                 self.turns += 1
                 taken_ns = self._imaging.reference_realtime_ns
                 self._process(self._ready.popleft())
@@ -222,11 +228,20 @@ class Pipeline(Worker):
                 self._obey_commands()
             self._obey_commands()
             self._imaging.taring.check()
-            if self._replay_clock is not None and self._replay_clock.has_ended:
+            if self._replay_clock is not None and self._replay_clock.has_ended and not self._ready:
                 if self._replay is not None and self._replay.playback.loops:
                     self._move(0.0)
                 else:
                     self.finished.set()
+
+    @property
+    def _takes_all(self) -> bool:
+        playback = None if self._replay is None else self._replay.playback
+        return self._is_lossless or (playback is not None and playback.leaves_none_out)
+
+    def _is_let_through(self) -> bool:
+        """Whether the next dual scan is made a frame now: ports may run ahead of a step's one."""
+        return self._replay is None or self._replay.playback.lets_through()
 
     def _new_sync(self) -> ScanPairer:
         replay = self._replay
@@ -327,8 +342,6 @@ class Pipeline(Worker):
                 ready += self.sync.finish()
             elif now_ns is not None:
                 ready += self.sync.advance(now_ns)
-        if ready and self._replay is not None:
-            self._replay.playback.note_dual_scan()
         return ready
 
     def _note_device(self, delivery: Delivery) -> None:

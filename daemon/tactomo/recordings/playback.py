@@ -38,6 +38,11 @@ class Playback:
         self._changed = threading.Condition(threading.RLock())
 
     @property
+    def leaves_none_out(self) -> bool:
+        """Whether every dual scan is to be shown, as it is while somebody steps."""
+        return self._is_paused
+
+    @property
     def is_paused(self) -> bool:
         """Whether nothing is due."""
         return self._is_paused and not self._is_stepping
@@ -96,19 +101,21 @@ class Playback:
             self._changed.notify_all()
 
     def step(self) -> None:
-        """Go on, paced, until the next dual scan."""
+        """Go on, paced, until a dual scan is let through."""
         with self._changed:
             self._settle()
             self._is_paused = self._is_stepping = True
             self.waits_for_page = False
             self._changed.notify_all()
 
-    def note_dual_scan(self) -> None:
-        """End a step: its dual scan is there."""
+    def lets_through(self) -> bool:
+        """Return whether a dual scan may be made a frame now; one that may ends a step."""
         with self._changed:
+            may = not self.is_paused
             if self._is_stepping:
                 self._settle()
                 self._is_stepping = False
+            return may
 
     def move(self, position_s: float) -> None:
         """Go on `position_s` seconds after the beginning."""

@@ -412,7 +412,7 @@ class Daemon:
             )
         playback.steer(arguments.paused, arguments.speed, arguments.loop)
         if arguments.step:
-            playback.step()
+            self._pipeline.step()
         moved = None if arguments.position_s is None else self._pipeline.move(arguments.position_s)
         self._publisher.tell_status()
         fields = playback.fields()

@@ -186,6 +186,25 @@ def torn(tmp_path: Path) -> Path:
     return path
 
 
+def test_a_step_gives_one_frame_of_a_read_that_brought_several(play: Any, tmp_path: Path) -> None:
+    path = tmp_path / "coarse.mcap"
+    writer = RecordingWriter(path, Origin("left", "paper_square", "", ("/dev/x",), "0"))
+    writer.write("port/0", encode(HELLO), 10**18, 10**18)
+    for first in range(1, 13, 4):
+        read = b"".join(encode(scan(c, n)) for n in range(first, first + 4) for c in Channel)
+        at_ns = 10**18 + first * 5 * 10**7
+        writer.write("port/0", read, at_ns, at_ns)
+    writer.flush()
+    writer.close()
+    b = play(path)
+    for count in range(1, 13):
+        b.ask("replay", step=True)
+        b.until(lambda count=count: len(counters(b)) >= count)
+        assert counters(b) == list(range(1, count + 1))
+        assert count == 12 or b.ask("status")["state"] == "paused"
+    b.until(lambda: b.ask("status")["state"] == "ended")
+
+
 def test_a_move_into_the_middle_of_a_packet_is_no_damage(play: Any, torn: Path) -> None:
     b = play(torn)
     b.ask("replay", paused=False)

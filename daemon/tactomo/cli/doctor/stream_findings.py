@@ -9,13 +9,20 @@ import numpy as np
 from tactomo_models.health.findings import Finding, Level
 
 from tactomo.cli.doctor.evidence import Evidence, Heard
-from tactomo.cli.health_issues import CORRUPT_NOTED, FIRMWARE_STEP, FLAG_ADVICE, health_issues
+from tactomo.cli.health_issues import (
+    CORRUPT_NOTED,
+    FASTER,
+    FIRMWARE_STEP,
+    FLAG_ADVICE,
+    health_issues,
+)
 
 FLAG_FAULTS = frozenset(
     {"electrode_fault", "noise_high", "saturated", "channels_swapped", "reference_mismatch"}
 )
 FLAG_SHARE = 0.05  # of the frames: what comes and goes more rarely is advice
 LOST_SHARE = 0.01  # of the dual scans: less is advice
+LATE_SHARE = 0.5  # what a busy computer does to fewer is advice: most frames are in time
 FEWEST_LOST = 3  # below that it is no rate: one of the first 41 says little of the next thousand
 
 
@@ -66,27 +73,41 @@ def _lost_found(evidence: Evidence) -> Iterator[Finding]:
         "is the line too slow for the rate, or the computer too busy to read it?",
     )
     if evidence.after:
-        for key, what, step in (
-            (
-                "dropped_scans",
-                "were left out because newer ones had come",
-                "give the daemon more of the processor, or choose a faster method or a budget",
-            ),
-            (
-                "incomplete_scans",
-                "lacked a channel",
-                "check that channel's cable; if its scans come late, raise sync_wait_ms",
-            ),
-        ):
-            yield _share_found(key, evidence.after[key] - evidence.before[key], count, what, step)
+        dropped, incomplete = (
+            evidence.after[key] - evidence.before[key]
+            for key in ("dropped_scans", "incomplete_scans")
+        )
+        yield _share_found(
+            "dropped_scans",
+            dropped,
+            count,
+            "were left out because newer ones had come",
+            FASTER,
+            LATE_SHARE,
+        )
+        # Scans that came and were left out tell that the computer was busy: then a channel's may
+        # have come too late for the same reason, and nothing is known against its cable.
+        is_busy = dropped > LOST_SHARE * count
+        yield _share_found(
+            "incomplete_scans",
+            incomplete,
+            count,
+            "lacked a channel",
+            "the computer is busy: look again when it is not"
+            if is_busy
+            else "check that channel's cable; if its scans come late, raise sync_wait_ms",
+            LATE_SHARE if is_busy else LOST_SHARE,
+        )
 
 
-def _share_found(about: str, number: int, count: int, what: str, step: str) -> Finding:
+def _share_found(
+    about: str, number: int, count: int, what: str, step: str, fault_share: float = LOST_SHARE
+) -> Finding:
     figures: dict[str, Any] = {"number": float(number)}
     if not number:
         return Finding(about, Level.OK, f"none of {count + number} dual scans", "", figures)
     share = number / (count + number)
-    is_fault = share > LOST_SHARE and number >= FEWEST_LOST
+    is_fault = share > fault_share and number >= FEWEST_LOST
     level = Level.FAULT if is_fault else Level.ADVICE
     detail = f"{number} of {count + number} dual scans ({share:.1%}) {what}"
     return Finding(about, level, detail, step, figures)
