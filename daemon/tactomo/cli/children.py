@@ -191,6 +191,12 @@ class no_interruption:  # noqa: N801 - reads as a statement
             signal.signal(number, handler)
 
 
+def new_family(verbose: bool = False) -> Family:
+    """Return a new family, which SIGTERM ends as Ctrl-C does."""
+    interrupt_on_sigterm()
+    return Family(verbose)
+
+
 def interrupt_on_sigterm() -> None:
     """Let SIGTERM unwind the main thread as Ctrl-C does."""
 

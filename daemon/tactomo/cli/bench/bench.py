@@ -12,7 +12,9 @@ from __future__ import annotations
 import json
 import os
 import platform
+import tempfile
 import time
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -27,9 +29,8 @@ from tactomo.cli.laboratory import installed_measurement, measurement, not_insta
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
+    from tactomo_client import Frame, Subscription
     from tactomo_models import SensorDescription
-
-    from tactomo.cli.children import Family
 
 SENSOR = "bench"
 PAGE_WIDTH = 150
@@ -228,10 +229,16 @@ def _measure_twin(
     results: Results, ports: int | None, rate: float, seconds: float, report: Callable[[str], None]
 ) -> None:
     """Press a twin in several ways and measure each."""
-    from tactomo_client import request
+    from tactomo_client import request, subscribe
     from tactomo_models import load_description
 
-    with _sockets() as at, _family() as family:
+    from tactomo.cli.children import new_family
+
+    with tempfile.TemporaryDirectory(prefix="tactomo-") as folder, new_family() as family:
+
+        def at(name: str) -> str:
+            return f"ipc://{folder}/{name}"
+
         size = load_description(results.description)
         spots = [_spot(size, place) for place in PLACES]
         described = ("--description", results.description)
@@ -256,8 +263,8 @@ def _measure_twin(
             x_mm, y_mm = _spot(size, (1.2 * share - 0.6, 0.2))
             request("press", skin["control"], id="0", x_mm=x_mm, y_mm=y_mm)
 
-        with _Stream(at("stream")) as stream:
-            stream.wait_for_reference()
+        with subscribe(SENSOR, address=at("stream"), kind="contacts", timeout_s=START_S) as frames:
+            next(frame for frame in frames if "no_reference" not in frame.flags)
             for scene, count, moves in (
                 ("nothing pressed", 0, None),
                 ("one contact, still", 1, None),
@@ -266,73 +273,53 @@ def _measure_twin(
             ):
                 report(f"live: {scene}")
                 press(count)
-                stream.skip(SETTLE_S)
-                results.live.append(stream.measure(scene, seconds, at("control"), moves))
+                deque(_during(frames, SETTLE_S), maxlen=0)
+                results.live.append(_measure(frames, scene, seconds, at("control"), moves))
         results.late_scans = request("status", skin["control"])["late_scans"]
         results.dropped_scans = request("status", at("control"))["dropped_scans"]
 
 
-class _Stream:
-    """A subscriber to contacts that takes the time of every message."""
+def _measure(
+    frames: Subscription[Frame],
+    scene: str,
+    seconds: float,
+    control: str,
+    moves: Callable[[float], None] | None,  # gets the share of the time that has passed
+) -> Phase:
+    """Measure what comes within a time."""
+    import numpy as np
+    from tactomo_client import request
 
-    def __init__(self, address: str) -> None:
-        from tactomo_client import subscribe
+    ages_ms: list[float] = []
+    tiers: Counter[str] = Counter()
+    begin_s = time.monotonic()
+    for frame in _during(frames, seconds):
+        ages_ms.append(frame.age_s * 1e3 - (frame.delay_ns or 0) * 1e-6)
+        tiers[str(frame.tier)] += 1
+        if moves is not None:
+            moves(min(1.0, (time.monotonic() - begin_s) / seconds))
+    passed_s = time.monotonic() - begin_s
+    p50, p99 = np.percentile(ages_ms, (50, 99)).tolist()
+    status = request("status", control)
+    memory_bytes = status["process"]["memory_bytes"]
+    return Phase(
+        scene=scene,
+        frames=len(ages_ms),
+        frames_per_s=len(ages_ms) / passed_s,
+        latency_p50_ms=p50,
+        latency_p99_ms=p99,
+        stage_ms=status["stage_ms"],
+        tiers=dict(tiers),
+        memory_mb=memory_bytes and memory_bytes / 1e6,
+    )
 
-        self._frames = subscribe(SENSOR, address=address, kind="contacts", timeout_s=START_S)
 
-    def __enter__(self) -> _Stream:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._frames.close()
-
-    def wait_for_reference(self) -> None:
-        """Wait for the first frame that has something to be measured against."""
-        for frame in self._frames:
-            if "no_reference" not in frame.flags:
-                return
-
-    def skip(self, seconds: float) -> None:
-        """Let frames pass."""
-        for _ in self._during(seconds):
-            pass
-
-    def measure(
-        self, scene: str, seconds: float, control: str, moves: Callable[[float], None] | None
-    ) -> Phase:
-        """Measure for `seconds`; `moves` gets the share that has passed."""
-        import numpy as np
-        from tactomo_client import request
-
-        ages_ms: list[float] = []
-        tiers: dict[str, int] = {}
-        begin_s = time.monotonic()
-        for frame in self._during(seconds):
-            ages_ms.append(frame.age_s * 1e3 - (frame.delay_ns or 0) * 1e-6)
-            tiers[str(frame.tier)] = tiers.get(str(frame.tier), 0) + 1
-            if moves is not None:
-                moves(min(1.0, (time.monotonic() - begin_s) / seconds))
-        passed_s = time.monotonic() - begin_s
-        p50, p99 = np.percentile(ages_ms, (50, 99)).tolist()
-        status = request("status", control)
-        memory_bytes = status["process"]["memory_bytes"]
-        return Phase(
-            scene=scene,
-            frames=len(ages_ms),
-            frames_per_s=len(ages_ms) / passed_s,
-            latency_p50_ms=p50,
-            latency_p99_ms=p99,
-            stage_ms=status["stage_ms"],
-            tiers=tiers,
-            memory_mb=memory_bytes and memory_bytes / 1e6,
-        )
-
-    def _during(self, seconds: float) -> Iterator[Any]:
-        end_s = time.monotonic() + seconds
-        for frame in self._frames:
-            yield frame
-            if time.monotonic() >= end_s:
-                return
+def _during(frames: Subscription[Frame], seconds: float) -> Iterator[Frame]:
+    end_s = time.monotonic() + seconds
+    for frame in frames:
+        yield frame
+        if time.monotonic() >= end_s:
+            return
 
 
 def _spot(description: SensorDescription, place: tuple[float, float]) -> tuple[float, float]:
@@ -406,23 +393,3 @@ def machine() -> str:
     return (
         f"{processor()}, {cores} cores, Python {platform.python_version()}, NumPy {np.__version__}"
     )
-
-
-class _sockets:  # noqa: N801 - reads as a statement
-    """A folder for sockets: addresses that nobody else has."""
-
-    def __enter__(self) -> Callable[[str], str]:
-        import tempfile
-
-        self._folder = tempfile.TemporaryDirectory(prefix="tactomo-")
-        return lambda name: f"ipc://{self._folder.name}/{name}"
-
-    def __exit__(self, *_: object) -> None:
-        self._folder.cleanup()
-
-
-def _family() -> Family:
-    from tactomo.cli.children import Family, interrupt_on_sigterm
-
-    interrupt_on_sigterm()
-    return Family()

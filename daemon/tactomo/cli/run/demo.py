@@ -65,6 +65,8 @@ def demo(
     The first start builds the sensor's models, which takes a moment. Ctrl-C stops everything.
     With tcp addresses of port 0 it takes free ports and prints them.
     """
+    from tactomo.cli.children import new_family
+
     twin_options = [
         *("--description", description, "--rate", str(rate), "--twin-control", twin_control),
         *_optional("--ports", ports),
@@ -77,7 +79,10 @@ def demo(
         *_optional("--method", method),
         *([] if record is None else ["--set", f"recording.file={json.dumps(str(record))}"]),
     ]
-    with tempfile.TemporaryDirectory(prefix="tactomo-") as folder, _family(verbose) as family:
+    with (
+        tempfile.TemporaryDirectory(prefix="tactomo-") as folder,
+        new_family(verbose) as family,
+    ):
         # On a first start the daemon's models take as long to build as the twin's: do both at once.
         builder = family.start("models build", "models", "build", "--description", description)
         skin = family.start("twin", "twin", "--link", folder, "--announce", *twin_options)
@@ -116,7 +121,9 @@ def show_replay(
     more: list[str],
 ) -> None:
     """Play a recording through a daemon and show it in the viewer until Ctrl-C."""
-    with _family(verbose=False) as family:
+    from tactomo.cli.children import new_family
+
+    with new_family() as family:
         daemon = family.start(
             *("replay", "replay", str(recording), "--speed", speed, "--sensor", sensor),
             *("--stream", stream, "--control", control, "--stay", *more),
@@ -198,10 +205,3 @@ def _optional(name: str, value: object) -> list[str]:
 def _has_desktop() -> bool:
     has_display = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
     return sys.stdout.isatty() and (has_display or sys.platform == "darwin")
-
-
-def _family(verbose: bool) -> Family:
-    from tactomo.cli.children import Family, interrupt_on_sigterm
-
-    interrupt_on_sigterm()
-    return Family(verbose)
