@@ -12,47 +12,9 @@ from dataclasses import fields
 from typing import Any, Final
 
 import numpy as np
-from foxglove.messages import (
-    CircleAnnotation,
-    Color,
-    CubePrimitive,
-    CylinderPrimitive,
-    FrameTransform,
-    FrameTransforms,
-    Grid,
-    ImageAnnotations,
-    KeyValuePair,
-    LinePrimitive,
-    LinePrimitiveLineType,
-    Log,
-    LogLevel,
-    PackedElementField,
-    PackedElementFieldNumericType,
-    Point2,
-    Point3,
-    Pose,
-    Quaternion,
-    RawImage,
-    SceneEntity,
-    SceneEntityDeletion,
-    SceneEntityDeletionType,
-    SceneUpdate,
-    TextAnnotation,
-    TextPrimitive,
-    Timestamp,
-    Vector2,
-    Vector3,
-)
+from foxglove import messages as fox
 from numpy.typing import NDArray
-from tactomo_client import Contact, Frame
-from tactomo_client.appearance import (
-    COLOURS,
-    force_words,
-    known_nodes,
-    map_pixels,
-    pressure_words,
-    shown_image,
-)
+from tactomo_client import Contact, Frame, appearance
 from tactomo_client.placement import Placement
 
 Pixels = NDArray[np.uint8]
@@ -61,44 +23,51 @@ TALLEST: Final = 0.25
 """Height of the disc at the top of the pressure range, as a share of the sheet's width."""
 FLAT_M: Final = 0.001  # height of a disc whose pressure is not known
 STALE_ALPHA: Final = 0.45
-WHITE: Final = Color(r=1.0, g=1.0, b=1.0, a=1.0)
-GREY: Final = Color(r=0.55, g=0.55, b=0.55, a=1.0)
-LIGHT_TOUCH: Final = Color(r=0.45, g=0.62, b=0.85, a=0.9)
-LEVELS: Final = {"info": LogLevel.Info, "warning": LogLevel.Warning, "error": LogLevel.Error}
+WHITE: Final = fox.Color(r=1.0, g=1.0, b=1.0, a=1.0)
+GREY: Final = fox.Color(r=0.55, g=0.55, b=0.55, a=1.0)
+LIGHT_TOUCH: Final = fox.Color(r=0.45, g=0.62, b=0.85, a=0.9)
+LEVELS: Final = {
+    "info": fox.LogLevel.Info,
+    "warning": fox.LogLevel.Warning,
+    "error": fox.LogLevel.Error,
+}
 
-_FLOAT: Final = PackedElementFieldNumericType.Float32
-_BYTE: Final = PackedElementFieldNumericType.Uint8
-_UPRIGHT: Final = Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
+_FLOAT: Final = fox.PackedElementFieldNumericType.Float32
+_BYTE: Final = fox.PackedElementFieldNumericType.Uint8
+_UPRIGHT: Final = fox.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
 
 
-def to_timestamp(time_ns: int) -> Timestamp:
+def to_timestamp(time_ns: int) -> fox.Timestamp:
     """Return nanoseconds since 1970 as Foxglove's timestamp."""
-    return Timestamp(*divmod(time_ns, 1_000_000_000))
+    return fox.Timestamp(*divmod(time_ns, 1_000_000_000))
 
 
-def transforms(sensor: str, placement: Placement, time_ns: int) -> FrameTransforms:
+def transforms(sensor: str, placement: Placement, time_ns: int) -> fox.FrameTransforms:
     """Return where the sensor hangs."""
     x, y, z, w = placement.quaternion
-    return FrameTransforms(
+    return fox.FrameTransforms(
         transforms=[
-            FrameTransform(
+            fox.FrameTransform(
                 timestamp=to_timestamp(time_ns),
                 parent_frame_id=placement.parent,
                 child_frame_id=sensor,
-                translation=Vector3(x=placement.x_m, y=placement.y_m, z=placement.z_m),
-                rotation=Quaternion(x=x, y=y, z=z, w=w),
+                translation=fox.Vector3(x=placement.x_m, y=placement.y_m, z=placement.z_m),
+                rotation=fox.Quaternion(x=x, y=y, z=z, w=w),
             )
         ]
     )
 
 
-def grid(frame: Frame, description: Mapping[str, Any], time_ns: int, stale: str) -> Grid | None:
+def grid(frame: Frame, description: Mapping[str, Any], time_ns: int, stale: str) -> fox.Grid | None:
     """Return the map as a grid: its colours, and the numbers behind them as fields of their own.
 
     The fields are `pressure_kpa`, `magnitude` (|Δσ|/σ₀) and `structure`, as far as the frame has
     them; NaN where there is no value. None for a frame without images.
     """
-    pixels, shown = map_pixels(frame, description), shown_image(frame, description)
+    pixels, shown = (
+        appearance.map_pixels(frame, description),
+        appearance.shown_image(frame, description),
+    )
     if pixels is None or shown is None or frame.x_mm is None or frame.y_mm is None:
         return None
     images = [
@@ -112,18 +81,18 @@ def grid(frame: Frame, description: Mapping[str, Any], time_ns: int, stale: str)
     cells = np.zeros((rows, columns), [(n, "u1") for n in colours] + [(n, "<f4") for n in values])
     for number, name in enumerate(colours[:3]):
         cells[name] = _faded(pixels, stale)[..., number]
-    cells["alpha"] = np.where(known_nodes(frame, shown[0]), 255, 0)
+    cells["alpha"] = np.where(appearance.known_nodes(frame, shown[0]), 255, 0)
     for name, image in values.items():
         cells[name] = image
     (left, right), (bottom, top) = frame.x_mm, frame.y_mm
     dx, dy = (right - left) * 1e-3 / (columns - 1), (top - bottom) * 1e-3 / (rows - 1)
-    corner = Vector3(x=left * 1e-3 - dx / 2, y=bottom * 1e-3 - dy / 2, z=0.0)
-    return Grid(
+    corner = fox.Vector3(x=left * 1e-3 - dx / 2, y=bottom * 1e-3 - dy / 2, z=0.0)
+    return fox.Grid(
         timestamp=to_timestamp(time_ns),
         frame_id=frame.sensor,
-        pose=Pose(position=corner, orientation=_UPRIGHT),
+        pose=fox.Pose(position=corner, orientation=_UPRIGHT),
         column_count=columns,
-        cell_size=Vector2(x=dx, y=dy),
+        cell_size=fox.Vector2(x=dx, y=dy),
         row_stride=columns * cells.itemsize,
         cell_stride=cells.itemsize,
         fields=_fields(cells.dtype),
@@ -131,20 +100,20 @@ def grid(frame: Frame, description: Mapping[str, Any], time_ns: int, stale: str)
     )
 
 
-def _fields(cells: np.dtype[Any]) -> list[PackedElementField]:
+def _fields(cells: np.dtype[Any]) -> list[fox.PackedElementField]:
     return [
-        PackedElementField(name=name, offset=offset, type=_BYTE if kind == np.uint8 else _FLOAT)
+        fox.PackedElementField(name=name, offset=offset, type=_BYTE if kind == np.uint8 else _FLOAT)
         for name, (kind, offset, *_) in (cells.fields or {}).items()
     ]
 
 
 def image(frame: Frame, description: Mapping[str, Any], time_ns: int, stale: str) -> Any:
     """Return the map as a picture for the Image panel, y up; None for a frame without images."""
-    pixels = map_pixels(frame, description)
+    pixels = appearance.map_pixels(frame, description)
     if pixels is None:
         return None
     rows, columns, _ = pixels.shape
-    return RawImage(
+    return fox.RawImage(
         timestamp=to_timestamp(time_ns),
         frame_id=frame.sensor,
         width=columns,
@@ -157,9 +126,9 @@ def image(frame: Frame, description: Mapping[str, Any], time_ns: int, stale: str
 
 def image_annotations(
     frame: Frame, description: Mapping[str, Any], time_ns: int, stale: str
-) -> ImageAnnotations | None:
+) -> fox.ImageAnnotations | None:
     """Return the contacts as circles and labels on that picture."""
-    shown = shown_image(frame, description)
+    shown = appearance.shown_image(frame, description)
     if shown is None or frame.x_mm is None or frame.y_mm is None:
         return None
     at = to_timestamp(time_ns)
@@ -171,9 +140,9 @@ def image_annotations(
         y = (frame.y_mm[1] - contact.y_mm) / step_mm + 0.5
         diameter = contact_diameter_mm(contact) / step_mm
         circles.append(
-            CircleAnnotation(
+            fox.CircleAnnotation(
                 timestamp=at,
-                position=Point2(x=x, y=y),
+                position=fox.Point2(x=x, y=y),
                 diameter=diameter,
                 thickness=0.3,
                 outline_color=colour,
@@ -181,29 +150,29 @@ def image_annotations(
             )
         )
         texts.append(
-            TextAnnotation(
+            fox.TextAnnotation(
                 timestamp=at,
-                position=Point2(x=x - diameter / 2, y=y - diameter / 2 - 0.5),
+                position=fox.Point2(x=x - diameter / 2, y=y - diameter / 2 - 0.5),
                 text=label(contact),
                 font_size=2.2,
                 text_color=colour,
-                background_color=Color(r=0.0, g=0.0, b=0.0, a=0.5),
+                background_color=fox.Color(r=0.0, g=0.0, b=0.0, a=0.5),
             )
         )
-    return ImageAnnotations(timestamp=at, circles=circles, texts=texts)
+    return fox.ImageAnnotations(timestamp=at, circles=circles, texts=texts)
 
 
 def contacts_scene(
     frame: Frame, description: Mapping[str, Any], time_ns: int, stale: str
-) -> SceneUpdate:
+) -> fox.SceneUpdate:
     """Return the contacts as discs, the higher the harder, with their numbers above them.
 
     `stale` says in words that this is old; it is shown over the sheet, and all turns grey.
     """
     at = to_timestamp(time_ns)
-    everything = SceneEntityDeletion(timestamp=at, type=SceneEntityDeletionType.All)
+    everything = fox.SceneEntityDeletion(timestamp=at, type=fox.SceneEntityDeletionType.All)
     entities = [
-        SceneEntity(
+        fox.SceneEntity(
             timestamp=at,
             frame_id=frame.sensor,
             id=f"contact {contact.id}",
@@ -215,35 +184,39 @@ def contacts_scene(
     ]
     if stale:
         above = _pose(0.0, 0.6 * float(description.get("height_mm") or 150.0), 0.02)
-        red = Color(r=1.0, g=0.35, b=0.3, a=1.0)
+        red = fox.Color(r=1.0, g=0.35, b=0.3, a=1.0)
         words = _text(stale.replace("; ", "\n"), above, red, 16.0)
-        entities.append(SceneEntity(timestamp=at, frame_id=frame.sensor, id="stale", texts=[words]))
-    return SceneUpdate(deletions=[everything], entities=entities)
+        entities.append(
+            fox.SceneEntity(timestamp=at, frame_id=frame.sensor, id="stale", texts=[words])
+        )
+    return fox.SceneUpdate(deletions=[everything], entities=entities)
 
 
-def _disc(contact: Contact, description: Mapping[str, Any], stale: str) -> CylinderPrimitive:
+def _disc(contact: Contact, description: Mapping[str, Any], stale: str) -> fox.CylinderPrimitive:
     diameter_m = contact_diameter_mm(contact) * 1e-3
     height_m = disc_height_m(contact, description)
-    return CylinderPrimitive(
+    return fox.CylinderPrimitive(
         pose=_pose(contact.x_mm, contact.y_mm, height_m / 2),
-        size=Vector3(x=diameter_m, y=diameter_m, z=height_m),
+        size=fox.Vector3(x=diameter_m, y=diameter_m, z=height_m),
         bottom_scale=1.0,
         top_scale=1.0,
         color=_disc_colour(contact, description, stale),
     )
 
 
-def _floating_label(contact: Contact, description: Mapping[str, Any], stale: str) -> TextPrimitive:
+def _floating_label(
+    contact: Contact, description: Mapping[str, Any], stale: str
+) -> fox.TextPrimitive:
     above = _pose(contact.x_mm, contact.y_mm, disc_height_m(contact, description) + 0.006)
     return _text(label(contact), above, GREY if stale else WHITE, 12.0)
 
 
-def _pose(x_mm: float, y_mm: float, z_m: float) -> Pose:
-    return Pose(position=Vector3(x=x_mm * 1e-3, y=y_mm * 1e-3, z=z_m), orientation=_UPRIGHT)
+def _pose(x_mm: float, y_mm: float, z_m: float) -> fox.Pose:
+    return fox.Pose(position=fox.Vector3(x=x_mm * 1e-3, y=y_mm * 1e-3, z=z_m), orientation=_UPRIGHT)
 
 
-def _text(text: str, pose: Pose, colour: Color, pixels: float) -> TextPrimitive:
-    return TextPrimitive(
+def _text(text: str, pose: fox.Pose, colour: fox.Color, pixels: float) -> fox.TextPrimitive:
+    return fox.TextPrimitive(
         pose=pose, billboard=True, font_size=pixels, scale_invariant=True, color=colour, text=text
     )
 
@@ -269,21 +242,21 @@ def _level(contact: Contact, description: Mapping[str, Any]) -> float | None:
     return None
 
 
-def _disc_colour(contact: Contact, description: Mapping[str, Any], stale: str) -> Color:
+def _disc_colour(contact: Contact, description: Mapping[str, Any], stale: str) -> fox.Color:
     if stale:
-        return Color(r=0.5, g=0.5, b=0.5, a=STALE_ALPHA)
+        return fox.Color(r=0.5, g=0.5, b=0.5, a=STALE_ALPHA)
     level = _level(contact, description)
     if level is None:
         return LIGHT_TOUCH
-    at = min(max(level, 0.0), 1.0) * (len(COLOURS) - 1)
-    channels = zip(*COLOURS, strict=True)
-    red, green, blue = (np.interp(at, range(len(COLOURS)), c) / 255 for c in channels)
-    return Color(r=float(red), g=float(green), b=float(blue), a=0.6)
+    at = min(max(level, 0.0), 1.0) * (len(appearance.COLOURS) - 1)
+    channels = zip(*appearance.COLOURS, strict=True)
+    red, green, blue = (np.interp(at, range(len(appearance.COLOURS)), c) / 255 for c in channels)
+    return fox.Color(r=float(red), g=float(green), b=float(blue), a=0.6)
 
 
-def sheet_scene(sensor: str, description: Mapping[str, Any], time_ns: int) -> SceneUpdate:
+def sheet_scene(sensor: str, description: Mapping[str, Any], time_ns: int) -> fox.SceneUpdate:
     """Return the sensor itself: the sheet's outline, what can be pressed, and its electrodes."""
-    white, thin = Color(r=0.9, g=0.9, b=0.9, a=1.0), Color(r=0.6, g=0.6, b=0.6, a=0.7)
+    white, thin = fox.Color(r=0.9, g=0.9, b=0.9, a=1.0), fox.Color(r=0.6, g=0.6, b=0.6, a=0.7)
     width, height = float(description["width_mm"]), float(description["height_mm"])
     lines = [_outline(description, width, height, white, 2.0)]
     inner = description.get("sensing_width_mm"), description.get("sensing_height_mm")
@@ -293,7 +266,7 @@ def sheet_scene(sensor: str, description: Mapping[str, Any], time_ns: int) -> Sc
     for number, (x, y) in enumerate(description.get("electrodes_mm") or []):
         cubes.append(_electrode(x, y, width))
         texts.append(_text(str(number), _pose(1.07 * x, 1.07 * y, 0.0), thin, 11.0))
-    entity = SceneEntity(
+    entity = fox.SceneEntity(
         timestamp=to_timestamp(time_ns),
         frame_id=sensor,
         id="sheet",
@@ -301,46 +274,50 @@ def sheet_scene(sensor: str, description: Mapping[str, Any], time_ns: int) -> Sc
         lines=lines,
         cubes=cubes,
         texts=texts,
-        metadata=[KeyValuePair(key="model", value=str(description.get("model")))],
+        metadata=[fox.KeyValuePair(key="model", value=str(description.get("model")))],
     )
-    return SceneUpdate(entities=[entity])
+    return fox.SceneUpdate(entities=[entity])
 
 
 def _outline(
-    description: Mapping[str, Any], width_mm: float, height_mm: float, colour: Color, pixels: float
-) -> LinePrimitive:
+    description: Mapping[str, Any],
+    width_mm: float,
+    height_mm: float,
+    colour: fox.Color,
+    pixels: float,
+) -> fox.LinePrimitive:
     if description.get("shape") == "disc":
         turns = np.linspace(0.0, 2.0 * np.pi, 96, endpoint=False)
         xy = np.column_stack([np.cos(turns) * width_mm, np.sin(turns) * height_mm]) / 2
     else:
         xy = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * (width_mm / 2, height_mm / 2)
-    return LinePrimitive(
-        type=LinePrimitiveLineType.LineLoop,
-        pose=Pose(position=Vector3(), orientation=_UPRIGHT),
+    return fox.LinePrimitive(
+        type=fox.LinePrimitiveLineType.LineLoop,
+        pose=fox.Pose(position=fox.Vector3(), orientation=_UPRIGHT),
         thickness=pixels,
         scale_invariant=True,
-        points=[Point3(x=x, y=y, z=0.0) for x, y in (xy * 1e-3).tolist()],
+        points=[fox.Point3(x=x, y=y, z=0.0) for x, y in (xy * 1e-3).tolist()],
         color=colour,
     )
 
 
-def _electrode(x_mm: float, y_mm: float, width_mm: float) -> CubePrimitive:
+def _electrode(x_mm: float, y_mm: float, width_mm: float) -> fox.CubePrimitive:
     side = 0.02 * width_mm * 1e-3
-    return CubePrimitive(
+    return fox.CubePrimitive(
         pose=_pose(x_mm, y_mm, 0.0),
-        size=Vector3(x=side, y=side, z=side / 2),
-        color=Color(r=0.85, g=0.65, b=0.3, a=1.0),
+        size=fox.Vector3(x=side, y=side, z=side / 2),
+        color=fox.Color(r=0.85, g=0.65, b=0.3, a=1.0),
     )
 
 
-def log(sensor: str, event: Mapping[str, Any], time_ns: int) -> Log:
+def log(sensor: str, event: Mapping[str, Any], time_ns: int) -> fox.Log:
     """Return an event as a line of the log."""
     words = f"{event['name']}: {event.get('detail') or ''}"
     if event.get("next_step"):
         words += f" -> {event['next_step']}"
-    return Log(
+    return fox.Log(
         timestamp=to_timestamp(time_ns),
-        level=LEVELS.get(str(event.get("severity")), LogLevel.Unknown),
+        level=LEVELS.get(str(event.get("severity")), fox.LogLevel.Unknown),
         message=words,
         name=sensor,
         file=str(event["name"]),
@@ -350,13 +327,13 @@ def log(sensor: str, event: Mapping[str, Any], time_ns: int) -> Log:
 def label(contact: Contact) -> str:
     """Return what a contact is, in a few words: identity, pressure, force, place."""
     place = f"({contact.x_mm:.0f}, {contact.y_mm:.0f}) mm"
-    force = f"{words} at " if (words := force_words(contact)) else ""
-    return f"{contact.id}: {pressure_words(contact)}\n{force}{place}"
+    force = f"{words} at " if (words := appearance.force_words(contact)) else ""
+    return f"{contact.id}: {appearance.pressure_words(contact)}\n{force}{place}"
 
 
-def _metadata(contact: Contact) -> list[KeyValuePair]:
+def _metadata(contact: Contact) -> list[fox.KeyValuePair]:
     return [
-        KeyValuePair(key=name, value=f"{value:.6g}" if isinstance(value, float) else str(value))
+        fox.KeyValuePair(key=name, value=f"{value:.6g}" if isinstance(value, float) else str(value))
         for name, value in contact_numbers(contact).items()
     ]
 

@@ -25,14 +25,7 @@ from dataclasses import fields
 from typing import Any, Final
 
 import foxglove
-from foxglove.channels import (
-    FrameTransformsChannel,
-    GridChannel,
-    ImageAnnotationsChannel,
-    LogChannel,
-    RawImageChannel,
-    SceneUpdateChannel,
-)
+from foxglove import channels
 from tactomo_client import Contact, Frame
 from tactomo_client.placement import Placement
 from tactomo_client.traces import Traces
@@ -108,7 +101,7 @@ class SensorTopics:
         self,
         sensor: str,
         context: foxglove.Context,
-        transforms: FrameTransformsChannel,
+        transforms: channels.FrameTransformsChannel,
         placement: Placement,
     ) -> None:
         self.sensor = sensor
@@ -122,14 +115,14 @@ class SensorTopics:
         def topic(name: str) -> str:
             return f"/{sensor}/{name}"
 
-        self._sheet = SceneUpdateChannel(topic("sheet"), context=context)
-        self._contacts = SceneUpdateChannel(topic("contacts"), context=context)
-        self._grid = GridChannel(topic("grid"), context=context)
-        self._image = RawImageChannel(topic("image"), context=context)
-        self._annotations = ImageAnnotationsChannel(topic("annotations"), context=context)
+        self._sheet = channels.SceneUpdateChannel(topic("sheet"), context=context)
+        self._contacts = channels.SceneUpdateChannel(topic("contacts"), context=context)
+        self._grid = channels.GridChannel(topic("grid"), context=context)
+        self._image = channels.RawImageChannel(topic("image"), context=context)
+        self._annotations = channels.ImageAnnotationsChannel(topic("annotations"), context=context)
         self._frame = foxglove.Channel(topic("frame"), schema=FRAME_SCHEMA, context=context)
         self._health = foxglove.Channel(topic("health"), schema=HEALTH_SCHEMA, context=context)
-        self._events = LogChannel(topic("events"), context=context)
+        self._events = channels.LogChannel(topic("events"), context=context)
 
     def sheet(self, description: Mapping[str, Any], time_ns: int) -> None:
         """Say what the sensor is and where it hangs."""

@@ -21,14 +21,7 @@ from typing import Any, Final
 
 import serial
 
-from tactomo.acquisition.adapters import (
-    LOW_LATENCY_MS,
-    PTY_MAJORS,
-    ROOT,
-    Holder,
-    holders,
-    latency_timer_ms,
-)
+from tactomo.acquisition import adapters
 from tactomo.acquisition.replay_port import ReplayPort
 from tactomo.errors import PortAbsentError, PortBusyError, PortError, TactomoError
 from tactomo.recordings.recording import REPLAY_SCHEME
@@ -78,23 +71,23 @@ def is_path(url: str) -> bool:
     return "://" not in url
 
 
-def other_holders(url: str, root: Path = ROOT) -> list[Holder]:
+def other_holders(url: str, root: Path = adapters.ROOT) -> list[adapters.Holder]:
     """Return the other processes that use the port, as far as this user may see."""
-    found = holders(url, root) if is_path(url) else []
+    found = adapters.holders(url, root) if is_path(url) else []
     return [who for who in found if who.pid != os.getpid() and not who.is_far_end]
 
 
-def lower_latency(port: serial.Serial, root: Path = ROOT) -> int | None:
+def lower_latency(port: serial.Serial, root: Path = adapters.ROOT) -> int | None:
     """Have an FTDI adapter send every millisecond rather than every 16, where that is allowed.
 
     Returns the latency timer in force then, in ms; None for an adapter without one.
     """
     path = port.name or ""
-    timer_ms = latency_timer_ms(path, root)
-    if timer_ms is not None and timer_ms > LOW_LATENCY_MS:
+    timer_ms = adapters.latency_timer_ms(path, root)
+    if timer_ms is not None and timer_ms > adapters.LOW_LATENCY_MS:
         with contextlib.suppress(ValueError):  # not allowed, or the driver cannot
             port.set_low_latency_mode(True)
-        timer_ms = latency_timer_ms(path, root)
+        timer_ms = adapters.latency_timer_ms(path, root)
     return timer_ms
 
 
@@ -111,7 +104,7 @@ def _claim(port: serial.Serial, path: str, baud: int) -> None:
     """Keep others out of an open port, or close it and raise PortBusyError naming them."""
     try:
         # A pseudo-terminal keeps the mark when its last user has gone, killed ones too.
-        if os.major(os.fstat(port.fileno()).st_rdev) not in PTY_MAJORS:
+        if os.major(os.fstat(port.fileno()).st_rdev) not in adapters.PTY_MAJORS:
             fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
         if other_holders(path):
             time.sleep(_GLANCE_S)  # another daemon that was turned away needs a moment to close it
@@ -128,7 +121,7 @@ def _claim(port: serial.Serial, path: str, baud: int) -> None:
 def _explain(url: str, baud: int, error: Exception) -> PortError:
     number = getattr(error, "errno", None)
     if number in (errno.EAGAIN, errno.EBUSY):
-        return _busy(url, holders(url))
+        return _busy(url, adapters.holders(url))
     if number == errno.ENOENT:
         return PortAbsentError(
             f"{url} does not exist",
@@ -141,7 +134,7 @@ def _explain(url: str, baud: int, error: Exception) -> PortError:
     return PortError(f"{url} is not a serial device", "give a path such as /dev/ttyACM0")
 
 
-def _busy(url: str, by: list[Holder]) -> PortBusyError:
+def _busy(url: str, by: list[adapters.Holder]) -> PortBusyError:
     who = "; ".join(map(str, by)) or "whose, this user may not see"
     return PortBusyError(
         f"{url} is held by another process ({who})",

@@ -30,17 +30,9 @@ from tactomo_protocol import Channel, ScanFlag
 
 from tactomo.config import BaselineConfig
 from tactomo.events import OnEvent, RateLimit
+from tactomo.imaging import frames
 from tactomo.imaging.calibration_in_force import CalibrationInForce
 from tactomo.imaging.frame_marks import FrameMarks
-from tactomo.imaging.frames import (
-    calibration_fields,
-    contacts_fields,
-    frame_header,
-    map_fields,
-    scan_fields,
-    scan_header,
-    taught_fields,
-)
 from tactomo.imaging.kept_reference import KeptReference, KnownSkin
 from tactomo.imaging.method_in_force import Effort, MethodInForce
 from tactomo.imaging.processor_share import ProcessorShare
@@ -203,8 +195,8 @@ class Imaging:
         self.calibration.replace(calibration, taught)
         self._publisher.tell_status()
         return {
-            "calibration": calibration and calibration_fields(calibration),
-            "taught": taught and taught_fields(taught),
+            "calibration": calibration and frames.calibration_fields(calibration),
+            "taught": taught and frames.taught_fields(taught),
         }
 
     def process(self, dual: DualScan, timing: Timing, lost: set[Channel]) -> None:
@@ -326,19 +318,19 @@ class Imaging:
             )
 
     def _publish_scan(self, dual: DualScan, timing: Timing, volts: Volts) -> None:
-        header = scan_header(dual, timing)
+        header = frames.scan_header(dual, timing)
         self.acquired_monotonic_ns = header["acquired_monotonic_ns"]
         if self._publisher.wants(SCAN):
-            self._publisher.publish(SCAN, scan_fields(dual.counter, volts), header)
+            self._publisher.publish(SCAN, frames.scan_fields(dual.counter, volts), header)
 
     def _publish_frame(self, dual: DualScan, timing: Timing, frame: Reconstruction) -> None:
         started_s = time.perf_counter()
-        header = frame_header(dual, timing, frame)
+        header = frames.frame_header(dual, timing, frame)
         self._publisher.header = header
-        self._publisher.publish(CONTACTS, contacts_fields(dual.counter, frame), header)
+        self._publisher.publish(CONTACTS, frames.contacts_fields(dual.counter, frame), header)
         active = self._recorder.active
         if self._publisher.wants(MAP) or (active is not None and active.with_maps):
-            fields = map_fields(dual.counter, frame, self._description)
+            fields = frames.map_fields(dual.counter, frame, self._description)
             self._publisher.publish(MAP, fields, header)
         self.frame_rate.add(time.monotonic_ns())
         self._time("publish", time.perf_counter() - started_s)

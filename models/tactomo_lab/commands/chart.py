@@ -21,18 +21,8 @@ from tactomo.cli.plot.plot import prepare_file, prepare_picture, save_figure
 from tactomo.errors import TactomoError
 from tactomo_models import SensorDescription, available_methods, load_description
 
-from tactomo_lab.evaluation import moving
+from tactomo_lab.evaluation import moving, trade_off
 from tactomo_lab.evaluation.still import Variant
-from tactomo_lab.evaluation.trade_off import (
-    STILL_BUDGETS_S,
-    Point,
-    left_out,
-    measure_moving,
-    measure_still,
-    panels,
-    pareto_front,
-    variants,
-)
 from tactomo_lab.scenes.still_scenes import scenes as draw_scenes
 
 if TYPE_CHECKING:
@@ -86,7 +76,7 @@ def sequences(count: int) -> int:
     return -(-count // SCENES_A_SEQUENCE)
 
 
-def measure_chart(name: str, count: int, methods: Sequence[str] = ()) -> list[Point]:
+def measure_chart(name: str, count: int, methods: Sequence[str] = ()) -> list[trade_off.Point]:
     """Measure methods, with a progress bar in the terminal.
 
     Raises:
@@ -107,20 +97,20 @@ def measure_chart(name: str, count: int, methods: Sequence[str] = ()) -> list[Po
         ]
         numbers = progress.track(range(sequences(count)), description="simulating moving scenes")
         played = [moving.draw_sequence(sensor, SEEDS, n, snr_db=MOVING_SNR_DB) for n in numbers]
-        points: list[Point] = []
+        points: list[trade_off.Point] = []
         with warned_if_busy():
             for scenes in still:
-                asked = variants(methods, STILL_BUDGETS_S)
+                asked = trade_off.variants(methods, trade_off.STILL_BUDGETS_S)
                 what = f"measuring on still scenes, {scenes[0].snr_db:g} dB"
                 task = progress.add_task(what, total=len(scenes) * len(asked))
-                points += measure_still(scenes, asked, partial(progress.advance, task))
-            points += follow(played, variants(methods), progress)
+                points += trade_off.measure_still(scenes, asked, partial(progress.advance, task))
+            points += follow(played, trade_off.variants(methods), progress)
     return points
 
 
 def usable(sensor: SensorDescription, methods: Sequence[str]) -> list[str]:
     """Return the methods that serve a sensor; say on standard error why others are left out."""
-    missing = left_out(sensor, methods)
+    missing = trade_off.left_out(sensor, methods)
     for method, reason in missing.items():
         typer.echo(f"left out: {method}: {reason}", err=True)
     return [method for method in methods if method not in missing]
@@ -128,22 +118,22 @@ def usable(sensor: SensorDescription, methods: Sequence[str]) -> list[str]:
 
 def follow(
     sequences: Sequence[moving.Sequence], asked: Sequence[Variant], progress: Progress
-) -> list[Point]:
+) -> list[trade_off.Point]:
     """Measure variants on moving scenes, a bar for each of them."""
-    points: list[Point] = []
+    points: list[trade_off.Point] = []
     for variant in asked:
         frames = sum(len(sequence.steps) for sequence in sequences)
         task = progress.add_task(f"measuring on moving scenes: {variant}", total=frames)
-        points += measure_moving(sequences, [variant], partial(progress.advance, task))
+        points += trade_off.measure_moving(sequences, [variant], partial(progress.advance, task))
         progress.remove_task(task)
     return points
 
 
-def rows_of(points: Sequence[Point]) -> list[dict[str, Any]]:
+def rows_of(points: Sequence[trade_off.Point]) -> list[dict[str, Any]]:
     """Return the points as flat rows, for JSON and tables; in each panel the fastest first."""
     rows = []
-    for panel in panels(points):
-        front = pareto_front(panel)
+    for panel in trade_off.panels(points):
+        front = trade_off.pareto_front(panel)
         for point in sorted(panel, key=lambda p: p.p50_s):
             row = asdict(point)
             variant, p50_s, p99_s = row.pop("variant"), row.pop("p50_s"), row.pop("p99_s")
@@ -183,15 +173,15 @@ def write_table(rows: Sequence[dict[str, Any]], machine: str, path: Path) -> Non
         ) from error
 
 
-def table_of(points: Sequence[Point]) -> Table:
+def table_of(points: Sequence[trade_off.Point]) -> Table:
     """Lay out the Pareto fronts: that than which nothing is both faster and more right."""
     from rich.table import Table
 
     table = Table(title="Pareto fronts (simulated, one thread): the best for its time")
     for name in ("scenes", "method", "p50 ms", "p99 ms", "ICC", "worst", "count", "wrong"):
         table.add_column(name, justify="left" if name in ("scenes", "method") else "right")
-    for panel in panels(points):
-        for point in pareto_front(panel):
+    for panel in trade_off.panels(points):
+        for point in trade_off.pareto_front(panel):
             table.add_row(
                 f"{point.scene}, {point.snr_db:g} dB",
                 str(point.variant),

@@ -10,15 +10,7 @@ import typer
 from tactomo.cli import options
 from tactomo.cli.plot.plot import prepare_picture
 
-from tactomo_lab.commands.evaluate import (
-    Seeds,
-    chosen_names,
-    print_json,
-    print_settings,
-    settings_of,
-    shown,
-    summary_table,
-)
+from tactomo_lab.commands import evaluate
 
 if TYPE_CHECKING:
     from tactomo_lab.scenes.measures import FrameScore
@@ -37,7 +29,7 @@ app = options.typer_app()
     )
 )
 def field(
-    seeds: Seeds = "tuning",
+    seeds: evaluate.Seeds = "tuning",
     count: Annotated[int, typer.Option(min=1, help="Scenes of each line.")] = 10,
     rows: Annotated[str | None, typer.Option(help="Which rows, with commas. [all of them]")] = None,
     method: options.Method = "auto",
@@ -70,16 +62,16 @@ def field(
         prepare_picture(picture)
     description = load_description(sensor)
     scores: dict[str, list[FrameScore]] = {}
-    for row in chosen_names(rows, ROWS, "--rows"):
+    for row in evaluate.chosen_names(rows, ROWS, "--rows"):
         total = count if row in STILL_ROWS else None
         for line, frames in scores_of_row(description, row, method, seeds, count).items():
             try:
-                scores[line] = list(shown(frames, total, line))
+                scores[line] = list(evaluate.shown(frames, total, line))
             except ModelError as error:  # of a row's own sensor, for which a method may not serve
                 typer.echo(f"left out: {line}: {error}", err=True)
-    settings = settings_of(description.name, seeds, "change", method)
+    settings = evaluate.settings_of(description.name, seeds, "change", method)
     if as_json:
-        print_json({**settings, "scenes_each": count, "lines": _as_json(scores)})
+        evaluate.print_json({**settings, "scenes_each": count, "lines": _as_json(scores)})
     else:
         _print(settings, scores)
     if picture is not None:
@@ -104,10 +96,10 @@ def _print(settings: dict[str, Any], scores: dict[str, list[FrameScore]]) -> Non
     from tactomo_lab.scenes.measures import summarise
 
     console = Console()
-    print_settings(console, settings)
+    evaluate.print_settings(console, settings)
     groups = {line: summarise(own) for line, own in scores.items()}
-    console.print(summary_table("maps", groups, MAPS))
-    console.print(summary_table("contacts", groups, CONTACTS))
+    console.print(evaluate.summary_table("maps", groups, MAPS))
+    console.print(evaluate.summary_table("contacts", groups, CONTACTS))
     console.print(
         "[dim]worst: ICC that 95 % exceed; silent: maps with an ICC below 0.7 and no flag that "
         "tells to distrust, of all; alarms: good maps with one, of the good ones. mm: centre "

@@ -1,7 +1,6 @@
 """The sensor description: what a skin is made of.
 
 Nothing about a sensor is hard-coded elsewhere.
-.
 """
 
 from __future__ import annotations

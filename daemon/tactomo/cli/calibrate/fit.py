@@ -12,15 +12,8 @@ import numpy as np
 import typer
 from tactomo_client.recording import open_recording
 from tactomo_models import CalibrationError, load_description
+from tactomo_models.calibration import load_cell
 from tactomo_models.calibration.calibration_file import PressureCalibration, Subject, subject_of
-from tactomo_models.calibration.load_cell import (
-    Joined,
-    LoadCell,
-    Seen,
-    direct_readings,
-    joined_readings,
-    read_load_cell,
-)
 from tactomo_models.calibration.outliers import find_outliers
 
 from tactomo.cli.calibrate.live import distrusted
@@ -42,11 +35,11 @@ def fitted(
     device_ids: tuple[str, ...],
 ) -> tuple[PressureCalibration, list[str]]:
     """Fit what a load cell says, with the magnitudes in it or in a recording; and its odd lines."""
-    cell = read_load_cell(readings, area_mm2)
+    cell = load_cell.read_load_cell(readings, area_mm2)
     if recording is None:
         _need(cell, readings, "magnitude")
         subject = subject_of(sensor, load_description(description or DEFAULT_DESCRIPTION))
-        joined = direct_readings(cell)
+        joined = load_cell.direct_readings(cell)
     else:
         _need(cell, readings, "time")
         subject, joined = _with_recording(sensor, cell, recording, offset_s, description)
@@ -58,7 +51,7 @@ def fitted(
     return PressureCalibration.of_readings(subject, joined.readings), odd
 
 
-def _odd_lines(joined: Joined) -> list[str]:
+def _odd_lines(joined: load_cell.Joined) -> list[str]:
     """Name the lines that the others contradict."""
     odd = [(joined.lines[i], joined.readings[i]) for i in find_outliers(joined.readings)]
     return [
@@ -67,7 +60,7 @@ def _odd_lines(joined: Joined) -> list[str]:
     ]
 
 
-def _need(cell: LoadCell, path: Path, what: str) -> None:
+def _need(cell: load_cell.LoadCell, path: Path, what: str) -> None:
     if what == "magnitude" and not (cell.magnitude >= 0).any():
         raise CalibrationError(
             f"{path} tells times and no magnitude; give the recording of that time by --recording"
@@ -80,8 +73,8 @@ def _need(cell: LoadCell, path: Path, what: str) -> None:
 
 
 def _with_recording(
-    sensor: str, cell: LoadCell, path: Path, offset_s: float, description: str | None
-) -> tuple[Subject, Joined]:
+    sensor: str, cell: load_cell.LoadCell, path: Path, offset_s: float, description: str | None
+) -> tuple[Subject, load_cell.Joined]:
     recorded = open_recording(path).sensor
     if recorded and recorded != sensor:
         raise CalibrationError(
@@ -102,7 +95,7 @@ def _with_recording(
                 for m in moments
             ]
         )
-    return subject, joined_readings(replace(cell, times_s=cell.times_s + offset_s), seen)
+    return subject, load_cell.joined_readings(replace(cell, times_s=cell.times_s + offset_s), seen)
 
 
 def _devices_in(path: Path) -> tuple[str, ...]:
@@ -111,7 +104,7 @@ def _devices_in(path: Path) -> tuple[str, ...]:
     return tuple(sorted({hello.device_id for hello in hellos}))
 
 
-def seen_of(frames: Sequence[tuple[float, Frame]]) -> Seen:
+def seen_of(frames: Sequence[tuple[float, Frame]]) -> load_cell.Seen:
     """What a sensor showed in frames with their times; untrustworthy ones are left out.
 
     Raises CalibrationError where there is none to be trusted.
@@ -122,7 +115,7 @@ def seen_of(frames: Sequence[tuple[float, Frame]]) -> Seen:
             f"none of the {len(frames)} frames can be trusted; `tactomo doctor` tells why"
         )
     single = [frame.contacts[0] if len(frame.contacts) == 1 else None for _, frame in trusted]
-    return Seen(
+    return load_cell.Seen(
         times_s=np.array([time_s for time_s, _ in trusted]),
         magnitude=np.array([_number(c.magnitude if c else None) for c in single]),
         magnitude_sigma=np.array([_number(c.magnitude_sigma if c else None) for c in single]),
