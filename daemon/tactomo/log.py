@@ -23,16 +23,15 @@ LogFormat = Literal["auto", "text", "json", "journal"]
 _logfmt = structlog.processors.LogfmtRenderer()
 
 
-def configure_logging(level: LogLevel = "info", form: LogFormat = "auto", sensor: str = "") -> None:
-    """Set up the process's logs.
-
-    Args:
-        level: the least severe level shown.
-        form: ``text`` for people, ``journal`` for journald, ``json`` for collectors; ``auto`` takes
-            ``journal`` where standard error is journald's, ``text`` where it is a terminal, and
-            ``json`` elsewhere.
-        sensor: named in each line, where several write to one log; empty for none.
-    """
+def configure_logging(
+    level: LogLevel = "info",  # the least severe level shown
+    # ``text`` for people, ``journal`` for journald, ``json`` for collectors; ``auto`` takes
+    # ``journal`` where standard error is journald's, ``text`` where it is a terminal, and ``json``
+    # elsewhere
+    form: LogFormat = "auto",
+    sensor: str = "",  # named in each line, where several write to one log; empty for none
+) -> None:
+    """Set up the process's logs."""
 
     def name_sensor(
         _: Any, __: str, event: structlog.typing.EventDict

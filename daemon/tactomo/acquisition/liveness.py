@@ -37,14 +37,13 @@ class DeviceState(StrEnum):
 
 
 class Liveness:
-    """Follows what comes; says how the device does. For use by one thread.
+    """Follows what comes; says how the device does. For use by one thread."""
 
-    Args:
-        says_hello: every second, scans or not, so that silence tells.
-        first_s: how long it may take until its pace is known.
-    """
-
-    def __init__(self, says_hello: bool = True, first_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        says_hello: bool = True,  # every second, scans or not, so that silence tells
+        first_s: float = 0.0,  # how long it may take until its pace is known
+    ) -> None:
         self.state = DeviceState.STARTING  # as of the last call
         self._says_hello = says_hello
         self._first_s = first_s

@@ -92,14 +92,13 @@ def _build(name: str, app: typer.Typer) -> Any:
 
 
 class _Commands(Mapping[str, Any]):
-    """The commands of a group by name, each built when it is looked up.
+    """The commands of a group by name, each built when it is looked up."""
 
-    Args:
-        group: the group's name and a dot; empty for the commands at the top.
-        built: those that its Typer holds.
-    """
-
-    def __init__(self, group: str, built: Mapping[str, Any]) -> None:
+    def __init__(
+        self,
+        group: str,  # the group's name and a dot; empty for the commands at the top
+        built: Mapping[str, Any],  # those that its Typer holds
+    ) -> None:
         self._group = group
         self._built = dict(built)
 

@@ -42,15 +42,14 @@ class ProcessorShare:
         self._noted_s = self._looked_s = self._changed_s = self._raised_s = float("-inf")
         self._hold_s = HOLD_S
 
-    def note(self, cpu_s: float, wall_s: float, dropped: int, now_s: float) -> bool:
-        """Take note of a frame in which something presses; return whether `of_time` has changed.
-
-        Args:
-            cpu_s: processor time that the frame took.
-            wall_s: time that passed meanwhile.
-            dropped: dual scans left out since the start.
-            now_s: monotonic seconds.
-        """
+    def note(
+        self,
+        cpu_s: float,  # processor time that the frame took
+        wall_s: float,  # time that passed meanwhile
+        dropped: int,  # dual scans left out since the start
+        now_s: float,  # monotonic seconds
+    ) -> bool:
+        """Take note of a frame in which something presses; return whether `of_time` has changed."""
         if now_s - self._noted_s > LOOK_S:  # what was left out while nothing pressed
             self._dropped, self._frames, self._looked_s = dropped, 0, now_s
         self._noted_s = now_s

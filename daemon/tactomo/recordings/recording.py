@@ -239,12 +239,11 @@ class Recording:
         first = next(data, None)
         return None if first is None else _read_reference(first)
 
-    def replay_urls(self, speed: float = 1.0) -> tuple[str, ...]:
-        """Return the serial URLs that say again what each port said.
-
-        Args:
-            speed: 1 as recorded, 10 ten times as fast, 0 as fast as it is taken.
-        """
+    def replay_urls(
+        self,
+        speed: float = 1.0,  # 1 as recorded, 10 ten times as fast, 0 as fast as it is taken
+    ) -> tuple[str, ...]:
+        """Return the serial URLs that say again what each port said."""
         path = quote(str(self.path.resolve()))
         ports = range(len(self.origin.ports))
         return tuple(f"{REPLAY_SCHEME}://{path}?port={n}&speed={speed:g}" for n in ports)

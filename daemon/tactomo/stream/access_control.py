@@ -154,16 +154,15 @@ class AccessControl:
 
     `start` it before the sockets of its context are bound, and `stop` it after they are closed.
     A socket's purpose in `tactomo.endpoint.bind` is its domain here.
-
-    Args:
-        context: the sockets' context; there is one access control in it.
-        keys: who may come in.
-        on_event: told of those who were refused.
-        on_revoked: called by whoever calls `check` when somebody was taken off the list.
     """
 
     def __init__(
-        self, context: Context, keys: ServerKeys, on_event: OnEvent, on_revoked: Callable[[], None]
+        self,
+        context: Context,  # the sockets' context; there is one access control in it
+        keys: ServerKeys,  # who may come in
+        on_event: OnEvent,  # told of those who were refused
+        # called by whoever calls `check` when somebody was taken off the list
+        on_revoked: Callable[[], None],
     ) -> None:
         self._allowed = AllowList(keys.clients, on_event)
         self._clients = keys.clients

@@ -71,14 +71,13 @@ class Relay:
 
 
 class Proxy(Relay):
-    """Passes on the streams of several daemons.
+    """Passes on the streams of several daemons."""
 
-    Args:
-        sources: the daemons' stream addresses.
-        endpoint: where to bind; no other computer may reach it.
-    """
-
-    def __init__(self, sources: Sequence[str], endpoint: str) -> None:
+    def __init__(
+        self,
+        sources: Sequence[str],  # the daemons' stream addresses
+        endpoint: str,  # where to bind; no other computer may reach it
+    ) -> None:
         super().__init__(sources)
         self._endpoint = endpoint
         self._sensors: dict[bytes, tuple[str, float]] = {}  # who sent it last, and when

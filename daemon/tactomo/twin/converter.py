@@ -19,15 +19,14 @@ ADC_BITS = 24
 
 
 class Converter:
-    """Turns volts into counts. `noise_v` may be changed between scans.
+    """Turns volts into counts. `noise_v` may be changed between scans."""
 
-    Args:
-        full_scale_v: volts at the end of the converter's range, either sign.
-        noise_v: standard deviation of the noise in volts, the same on every measurement.
-        seed: equal seeds give equal noise.
-    """
-
-    def __init__(self, full_scale_v: float, noise_v: float, seed: int = 0) -> None:
+    def __init__(
+        self,
+        full_scale_v: float,  # volts at the end of the converter's range, either sign
+        noise_v: float,  # standard deviation of the noise in volts, the same on every measurement
+        seed: int = 0,  # equal seeds give equal noise
+    ) -> None:
         self.full_scale_v = full_scale_v
         self.noise_v = noise_v
         self._seed = seed

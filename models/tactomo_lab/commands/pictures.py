@@ -69,12 +69,11 @@ def _draw_outcome(axes: Any, outcome: Outcome) -> None:
     axes[3].set_xlabel("\n".join(score.flags), fontsize=6, color="tab:red")
 
 
-def draw_press(outcomes: Sequence[Outcome], output: Path) -> None:
+def draw_press(
+    outcomes: Sequence[Outcome],  # of one scene, the even pressure first
+    output: Path,  # the picture
+) -> None:
     """Draw one contact: the truth, an even pressure fitted, the field; and a cut through it, kPa.
-
-    Args:
-        outcomes: of one scene, the even pressure first.
-        output: the picture.
 
     Raises TactomoError where the picture cannot be written.
     """

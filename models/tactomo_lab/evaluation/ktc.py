@@ -96,13 +96,12 @@ def read_challenge(path: Path, description: SensorDescription) -> Challenge:
 
 
 class ChallengeImager:
-    """Finds what stands in the challenge's tanks.
+    """Finds what stands in the challenge's tanks."""
 
-    Args:
-        description: of the tank.
-    """
-
-    def __init__(self, description: SensorDescription) -> None:
+    def __init__(
+        self,
+        description: SensorDescription,  # of the tank
+    ) -> None:
         self._model = TankModel(description)
         self._known: tuple[bytes, TankFit] | None = None  # tanks in a row are read one way
 

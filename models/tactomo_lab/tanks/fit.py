@@ -43,14 +43,13 @@ class Tank:
 
 
 class TankFit:
-    """Finds what stands in tanks that are read one way.
+    """Finds what stands in tanks that are read one way."""
 
-    Args:
-        model: the tank.
-        readings: that there are.
-    """
-
-    def __init__(self, model: TankModel, readings: Readings) -> None:
+    def __init__(
+        self,
+        model: TankModel,  # the tank
+        readings: Readings,  # that there are
+    ) -> None:
         self._model, self._readings = model, readings
         self._images = LinearImages(model, readings)
         structure = model.description.structure
@@ -70,13 +69,12 @@ class TankFit:
         off = points[:, None] - self._centres
         return np.asarray(np.exp(-(off**2).sum(axis=2) / (2 * WIDTH**2)))
 
-    def find(self, changes: FloatArray, scale_sigma: float) -> Tank:
-        """Find what explains readings' changes (n,), known but for a factor.
-
-        Args:
-            changes: full minus empty, in the model's unit.
-            scale_sigma: s_0, standard deviation of that factor's logarithm.
-        """
+    def find(
+        self,
+        changes: FloatArray,  # full minus empty, in the model's unit
+        scale_sigma: float,  # s_0, standard deviation of that factor's logarithm
+    ) -> Tank:
+        """Find what explains readings' changes (n,), known but for a factor."""
         v = self._readings.reduced(changes)
         likely = probabilities(self._images.inputs(v[None]))[0]
         axis = pixel_grid(PIXELS)[0][0]

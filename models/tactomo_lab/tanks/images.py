@@ -35,14 +35,13 @@ def pixel_grid(pixels: int) -> tuple[FloatArray, FloatArray, BoolArray]:
 
 
 class LinearImages:
-    """What the network is shown of one way to read a tank.
+    """What the network is shown of one way to read a tank."""
 
-    Args:
-        model: the tank.
-        readings: that there are.
-    """
-
-    def __init__(self, model: TankModel, readings: Readings) -> None:
+    def __init__(
+        self,
+        model: TankModel,  # the tank
+        readings: Readings,  # that there are
+    ) -> None:
         x, y, self.inside = pixel_grid(PIXELS)
         width = LENGTH / np.sqrt(2)  # whose square's autocorrelation has that length
         step = SPACING * width

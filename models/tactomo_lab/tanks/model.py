@@ -84,13 +84,12 @@ class TankModel:
         transfer[tuple(self.pairs)] = transfer[tuple(self.pairs[::-1])] = self.empty
         return np.asarray(((currents @ transfer) * weights).sum(axis=1))
 
-    def derivative(self, by_pair: FloatArray, fields: FloatArray | None = None) -> FloatArray:
-        """Derivative (r, T) by the triangles' conductivities; of the empty tank if no fields.
-
-        Args:
-            by_pair: (r, P) how numbers follow from the transfer resistances.
-            fields: (N, L) of the tank that is differentiated.
-        """
+    def derivative(
+        self,
+        by_pair: FloatArray,  # (r, P) how numbers follow from the transfer resistances
+        fields: FloatArray | None = None,  # (N, L) of the tank that is differentiated
+    ) -> FloatArray:
+        """Derivative (r, T) by the triangles' conductivities; of the empty tank if no fields."""
         fields = self._fields if fields is None else fields
         one, other = self.pairs
         gradients = [np.ascontiguousarray((slope @ fields).T) for slope in self._slope]

@@ -81,12 +81,11 @@ class Joined:
     notes: tuple[str, ...]
 
 
-def read_load_cell(path: Path, area_mm2: float | None = None) -> LoadCell:
+def read_load_cell(
+    path: Path,  # the CSV file
+    area_mm2: float | None = None,  # of the indenter, where the file does not say
+) -> LoadCell:
     """Read a load cell's log.
-
-    Args:
-        path: the CSV file.
-        area_mm2: of the indenter, where the file does not say.
 
     Raises:
         CalibrationError: it cannot be read, a column is missing, or a value is no such number.

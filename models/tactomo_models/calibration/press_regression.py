@@ -58,12 +58,6 @@ class Located(NamedTuple):
 class PressRegression:
     """Locates presses on the skin whose presses it was made of.
 
-    Args:
-        changes: (N, M) voltage changes under each press, on any one scale.
-        xy_mm: (N, 2) where each was.
-        guess_mm: (N, 2) where a model of the skin has them, to be corrected; if None, the voltages
-            alone tell.
-
     Attributes:
         found_mm: (N, 2) where the voltages of each have it, by presses of other folds alone.
 
@@ -71,7 +65,12 @@ class PressRegression:
     """
 
     def __init__(
-        self, changes: FloatArray, xy_mm: FloatArray, guess_mm: FloatArray | None = None
+        self,
+        changes: FloatArray,  # (N, M) voltage changes under each press, on any one scale
+        xy_mm: FloatArray,  # (N, 2) where each was
+        # (N, 2) where a model of the skin has them, to be corrected; if None, the voltages alone
+        # tell
+        guess_mm: FloatArray | None = None,
     ) -> None:
         if len(changes) < MIN_PRESSES:
             raise DataError(

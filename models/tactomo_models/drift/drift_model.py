@@ -93,14 +93,13 @@ class DriftSubspace:
                 variance += float(np.mean(fields[-1] ** 2))
         return [field / np.sqrt(variance) for field in fields]
 
-    def explain(self, change: FloatArray, precision: FloatArray, sigma: FloatArray) -> Explained:
-        """The most likely amounts of drift behind a change.
-
-        Args:
-            change: (M,) of the logarithm of the voltages.
-            precision: (M,) its inverse variances by noise; 0 where it is not known.
-            sigma: (K,) prior standard deviation of each mode; 0 where it has no say.
-        """
+    def explain(
+        self,
+        change: FloatArray,  # (M,) of the logarithm of the voltages
+        precision: FloatArray,  # (M,) its inverse variances by noise; 0 where it is not known
+        sigma: FloatArray,  # (K,) prior standard deviation of each mode; 0 where it has no say
+    ) -> Explained:
+        """The most likely amounts of drift behind a change."""
         active = np.flatnonzero(sigma)
         modes, prior = self.modes[:, active], 1 / sigma[active] ** 2
         weighted = modes * precision[:, None]

@@ -55,15 +55,14 @@ class Condensed:
 
 
 class Condensation:
-    """How pressed areas are condensed: all that does not depend on their conductivity.
+    """How pressed areas are condensed: all that does not depend on their conductivity."""
 
-    Args:
-        neighbours: (n, most) of each node, filled up with -1.
-        rim: (n,) nodes that are not to be eliminated, one at least in each area.
-        corners: (t, 3) nodes of each triangle.
-    """
-
-    def __init__(self, neighbours: IntArray, rim: BoolArray, corners: IntArray) -> None:
+    def __init__(
+        self,
+        neighbours: IntArray,  # (n, most) of each node, filled up with -1
+        rim: BoolArray,  # (n,) nodes that are not to be eliminated, one at least in each area
+        corners: IntArray,  # (t, 3) nodes of each triangle
+    ) -> None:
         area, depth = _areas(neighbours), _depths(neighbours, rim)
         # (n,) nodes area by area and, in each, by layers from the rim inwards
         self.order = np.lexsort((depth, area))

@@ -294,15 +294,14 @@ class ForwardModel:
         return potentials
 
     def jacobian(
-        self, solution: Solution, where: IntArray, onto: FloatArray | None = None
+        self,
+        solution: Solution,  # where to differentiate
+        where: IntArray,  # (n,) pressable nodes
+        # (n, K) derivative of these nodes' conductivities by K parameters: sooner done here than
+        # with the (M, n) derivative by nodes
+        onto: FloatArray | None = None,
     ) -> FloatArray:
         """Derivative of the voltages with respect to conductivity.
-
-        Args:
-            solution: where to differentiate.
-            where: (n,) pressable nodes.
-            onto: (n, K) derivative of these nodes' conductivities by K parameters: sooner done
-                here than with the (M, n) derivative by nodes.
 
         Returns:
             (M, K), or (M, n) by the nodes' relative conductivity (the paper's equation 2).

@@ -30,14 +30,13 @@ class Visibility:
     place_m: FloatArray
 
 
-def find_visibility(description: SensorDescription, artifact: Artifact) -> Visibility:
+def find_visibility(
+    description: SensorDescription,  # the sensor
+    artifact: Artifact,  # what was built for it
+) -> Visibility:
     """Return how well a round press is seen at every map node.
 
     It changes the conductivity by a tenth; its radius is a tenth of the sheet's shorter side.
-
-    Args:
-        description: the sensor.
-        artifact: what was built for it.
     """
     radius_m = TARGET_SHARE * min(description.width_m, description.height_m)
     forward = ForwardModel(description, artifact.bare)

@@ -30,13 +30,12 @@ from tactomo_models.arrays import FloatArray
 EVEN: Final = np.ones(1)  # s of Tikhonov
 
 
-def even_scale(areas_m2: FloatArray) -> FloatArray:
+def even_scale(
+    areas_m2: FloatArray,  # (P,) that each node stands for
+) -> FloatArray:
     """Expected size of each node's change (P,), up to a factor, of an image that is white noise.
 
     A node that stands for a smaller area varies more: without that the image follows the mesh.
-
-    Args:
-        areas_m2: (P,) that each node stands for.
     """
     return np.asarray(np.sqrt(areas_m2.mean() / areas_m2))
 

@@ -183,15 +183,14 @@ class ScanCheck:
         self._silence = np.where(told, SILENT / contrast * expected_sum + doubt, -np.inf)
 
     def examine(
-        self, scan: FloatArray, *, saturated: bool = False, suspect: BoolArray | None = None
+        self,
+        scan: FloatArray,  # (M,) volts
+        *,
+        saturated: bool = False,  # its device says that it clipped
+        # (M,) voltages that speak against their electrodes, but no more than that
+        suspect: BoolArray | None = None,
     ) -> Verdict:
-        """Say what is wrong with a scan.
-
-        Args:
-            scan: (M,) volts.
-            saturated: its device says that it clipped.
-            suspect: (M,) voltages that speak against their electrodes, but no more than that.
-        """
+        """Say what is wrong with a scan."""
         high_noise = 10.0  # times what the tare saw: interference
         size = np.abs(scan)
         usable = self._usable & (size <= self._limit)

@@ -20,14 +20,13 @@ from tactomo_protocol import Channel
 from tactomo_models.scans.changes import Changes
 
 
-def is_still(settled: Changes, new: Changes) -> bool:
+def is_still(
+    settled: Changes,  # changes of one channel's scan, which a solution is of
+    new: Changes,  # changes of a later scan of the same channel since the same tare
+) -> bool:
     """Tell whether a scan is of the same scene as the one that was settled on.
 
     Changes that are far below the model's own error (`Changes.tolerance`) count as still.
-
-    Args:
-        settled: changes of one channel's scan, which a solution is of.
-        new: changes of a later scan of the same channel since the same tare.
     """
     valid = (settled.weight > 0) & (new.weight > 0)
     sigma = np.sqrt(new.noise_variance)

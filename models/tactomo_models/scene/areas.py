@@ -58,13 +58,12 @@ class AreaFinder:
         """What an image (nodes_y, nodes_x) shows at the pressable nodes, (P,)."""
         return np.asarray(image[self.nearest], np.float64)
 
-    def find(self, pressed: FloatArray | Image, pressed_nodes: FloatArray) -> Areas:
-        """Find connected areas above one half; what lies around each goes to the nearest.
-
-        Args:
-            pressed: (nodes_y, nodes_x) share pressed, 0 to 1.
-            pressed_nodes: (P,) the same at the pressable nodes.
-        """
+    def find(
+        self,
+        pressed: FloatArray | Image,  # (nodes_y, nodes_x) share pressed, 0 to 1
+        pressed_nodes: FloatArray,  # (P,) the same at the pressable nodes
+    ) -> Areas:
+        """Find connected areas above one half; what lies around each goes to the nearest."""
         smallest_area_m2 = 20e-6  # below this, a spot is a trace of the fit, not a contact
         label, count = ndimage.label(pressed > 0.5, structure=np.ones((3, 3)))
         if count == 0:

@@ -65,14 +65,13 @@ class Doubt:
 
 
 class FieldAccountant:
-    """Makes accounts of one sensor's fields.
+    """Makes accounts of one sensor's fields."""
 
-    Args:
-        fit: what fits them.
-        areas: finds areas on the map.
-    """
-
-    def __init__(self, fit: FieldFit, areas: AreaFinder) -> None:
+    def __init__(
+        self,
+        fit: FieldFit,  # what fits them
+        areas: AreaFinder,  # finds areas on the map
+    ) -> None:
         self._fit, self._areas = fit, areas
         self._graded = fit.responses.get(Channel.MAGNITUDE)
         self._saturating = fit.responses.get(Channel.STRUCTURE)
@@ -281,14 +280,13 @@ class FieldAccountant:
         return known
 
     @staticmethod
-    def _goes_wrong_way(by_peak: FloatArray, residual: FloatArray, is_least: BoolArray) -> bool:
-        """Tell whether a contact that hardly presses would have to press less than nothing.
-
-        Args:
-            by_peak: (sum M, K) derivative of the weighted residual by each contact's peak.
-            residual: (sum M,) weighted.
-            is_least: (K,) whether a peak is as small as it may be.
-        """
+    def _goes_wrong_way(
+        # (sum M, K) derivative of the weighted residual by each contact's peak
+        by_peak: FloatArray,
+        residual: FloatArray,  # (sum M,) weighted
+        is_least: BoolArray,  # (K,) whether a peak is as small as it may be
+    ) -> bool:
+        """Tell whether a contact that hardly presses would have to press less than nothing."""
         power = np.maximum((by_peak**2).sum(axis=0), 1e-12)
         return bool((is_least & (by_peak.T @ residual > WRONG_WAY * np.sqrt(power))).any())
 

@@ -227,14 +227,13 @@ class FieldFit:
         return self._judged(family, parameters, fitted.log_ratio, drawing, solutions, measured)
 
     def jacobian(
-        self, fitted: FittedField, measured: Measured, drawing: Drawing | None = None
+        self,
+        fitted: FittedField,  # where to differentiate
+        measured: Measured,  # the data
+        # the same field with other parameters free; that of `fitted` if None
+        drawing: Drawing | None = None,
     ) -> FloatArray:
         """Derivative of the weighted residual by the parameters and the log ratio.
-
-        Args:
-            fitted: where to differentiate.
-            measured: the data.
-            drawing: the same field with other parameters free; that of `fitted` if None.
 
         Returns:
             (sum M, N + 1).

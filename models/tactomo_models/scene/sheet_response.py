@@ -26,15 +26,14 @@ class SheetResponse(Protocol):
     """How one sheet's conductivity, over its own at rest, follows from the pressure."""
 
     def conductivity(
-        self, share: FloatArray, pressure_kpa: FloatArray, log_ratio: float
+        self,
+        # (n,) share of each that is pressed; where it is negative (`objects`), pressing goes the
+        # other way
+        share: FloatArray,
+        pressure_kpa: FloatArray,  # (n,) pressure on that share
+        log_ratio: float,  # logarithm of the structure sheet's ratio where it is saturated
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Conductivity ratio (n,) of nodes, and its slopes.
-
-        Args:
-            share: (n,) share of each that is pressed; where it is negative (`objects`), pressing
-                goes the other way.
-            pressure_kpa: (n,) pressure on that share.
-            log_ratio: logarithm of the structure sheet's ratio where it is saturated.
 
         Returns:
             The ratio, its derivatives by share, by pressure and by the log ratio, each (n,).

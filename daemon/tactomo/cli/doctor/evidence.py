@@ -348,16 +348,15 @@ def _heard_on_ports(ports: list[_PortScans]) -> Heard:
 
 
 def of_arrays(
-    path: Path, description: str | None, array: str | None, lookup: str, frames: slice | None
+    path: Path,  # the file
+    # of the sensor that was measured; its pattern alone is worked out if None
+    description: str | None,
+    # name of the array of scans at rest, where the layout is neither of import's
+    array: str | None,
+    lookup: str,  # name of the array that says which electrodes each voltage is of
+    frames: slice | None,  # which scans; all if None
 ) -> Evidence:
     """Read an .npz file; see `tactomo doctor --help` for the layouts.
-
-    Args:
-        path: the file.
-        description: of the sensor that was measured; its pattern alone is worked out if None.
-        array: name of the array of scans at rest, where the layout is neither of import's.
-        lookup: name of the array that says which electrodes each voltage is of.
-        frames: which scans; all if None.
 
     Raises:
         DoctorError: it holds nothing that can be examined.

@@ -46,15 +46,14 @@ CONTACT_TYPES: Final[Mapping[str, str]] = {
 }
 
 
-def write_maps(moments: Iterable[Moment], output: IO[bytes], scratch: Path) -> int:
+def write_maps(
+    moments: Iterable[Moment],  # the frames
+    output: IO[bytes],  # the file
+    scratch: Path,  # a folder with room for all of it, uncompressed
+) -> int:
     """Write frames as an .npz file; return how many there were.
 
     An image that a frame does not have, and a number that is not known, is NaN.
-
-    Args:
-        moments: the frames.
-        output: the file.
-        scratch: a folder with room for all of it, uncompressed.
     """
     with (
         tempfile.TemporaryDirectory(prefix=".tactomo-", dir=scratch) as folder,
