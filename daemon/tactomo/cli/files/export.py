@@ -25,7 +25,6 @@ from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
     from tactomo_client import Frame
-    from tactomo_client.placement import Placement
 
 KINDS = {".mcap": "frames for Foxglove", ".csv": "contacts", ".npz": "maps and contacts"}
 BAG, DATASET = "a ROS 2 bag", "a LeRobot dataset"
@@ -133,7 +132,13 @@ def export(
         moments = frames.moments("contacts" if kind == ".csv" else "map")
         watched = gaps.watch(frames.with_progress(moments, "exporting"))
         into = _write_folder if is_folder else _write_file
-        count = _written(output, lambda: into(output, lambda out: write(frames, watched, out)))
+        try:
+            count = into(output, lambda out: write(frames, watched, out))
+        except OSError as error:
+            raise TactomoError(
+                f"cannot write {output}: {error.strerror or error}",
+                "make room, or name a file that you may write",
+            ) from error
         if layout is not None:
             write_layout(layout, frames.sensor)
     for line in (*gaps.lines(), *told):
@@ -152,17 +157,34 @@ def _kind(output: Path) -> str:
 
 
 def _writer(kind: str, parent: str | None, pose: str, scratch: Path) -> Writer:
+    if kind == ".csv":
+        from tactomo.cli.files.csv import write_contacts
+
+        return lambda _, moments, file: write_contacts(moments, file)
+    if kind == ".npz":
+        from tactomo.cli.files.npz import write_maps
+
+        return lambda _, moments, file: write_maps(moments, file, scratch)
     if kind == ".mcap":
         need_foxglove()
+        from tactomo_foxglove import write_mcap
+
+        from tactomo.imaging.frames import description_fields
+
         placement = placement_of(parent or "world", pose)
-        return lambda frames, moments, file: _write_mcap(frames, moments, file, placement)
-    if kind == ".csv":
-        return _write_csv
-    if kind == ".npz":
-        return lambda _, moments, file: _write_npz(moments, file, scratch)
+
+        def write(frames: RecordedFrames, moments: Moments, file: IO[bytes]) -> int:
+            about = {} if frames.description is None else description_fields(frames.description)
+            return write_mcap(_timed(frames, moments), file, frames.sensor, about, placement)
+
+        return write
     _need_rosbags()
+    from tactomo_ros2.bag import write_bag
+
     hung = None if parent is None else placement_of(parent, pose)
-    return lambda frames, moments, folder: _write_bag(frames, moments, folder, hung)
+    return lambda frames, moments, folder: write_bag(
+        _timed(frames, moments), folder, frames.sensor, hung
+    )
 
 
 def _dataset_writer(
@@ -201,20 +223,6 @@ def _need_rosbags() -> None:
         ) from error
 
 
-def _written(output: Path, write: Callable[[], int]) -> int:
-    """Write; return how many frames were written.
-
-    Raises TactomoError where it cannot be written, or there is no frame to be written.
-    """
-    try:
-        return write()
-    except OSError as error:
-        raise TactomoError(
-            f"cannot write {output}: {error.strerror or error}",
-            "make room, or name a file that you may write",
-        ) from error
-
-
 def _checked(count: int) -> int:
     if not count:
         raise TactomoError(
@@ -249,34 +257,3 @@ def _timed(frames: RecordedFrames, moments: Moments) -> Iterator[tuple[int, Fram
     """Yield the moments with their times in nanoseconds since 1970."""
     for time_s, frame, age_s in moments:
         yield frames.start_ns + round(time_s * 1e9), frame, age_s
-
-
-def _write_mcap(
-    frames: RecordedFrames, moments: Moments, file: IO[bytes], placement: Placement
-) -> int:
-    from tactomo_foxglove import write_mcap
-
-    from tactomo.imaging.frames import description_fields
-
-    about = {} if frames.description is None else description_fields(frames.description)
-    return write_mcap(_timed(frames, moments), file, frames.sensor, about, placement)
-
-
-def _write_bag(
-    frames: RecordedFrames, moments: Moments, folder: Path, placement: Placement | None
-) -> int:
-    from tactomo_ros2.bag import write_bag
-
-    return write_bag(_timed(frames, moments), folder, frames.sensor, placement)
-
-
-def _write_csv(_: RecordedFrames, moments: Moments, file: IO[bytes]) -> int:
-    from tactomo.cli.files.csv import write_contacts
-
-    return write_contacts(moments, file)
-
-
-def _write_npz(moments: Moments, file: IO[bytes], scratch: Path) -> int:
-    from tactomo.cli.files.npz import write_maps
-
-    return write_maps(moments, file, scratch)
