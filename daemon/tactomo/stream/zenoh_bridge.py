@@ -159,6 +159,7 @@ class _ZenohInlet(Inlet):
         self._subscribers: dict[str, Any] = {}
         self._lock = threading.Lock()  # of what follows, and of `_arriving`
         self._counts: dict[str, int] = {}
+        self._statuses: dict[str, bytes] = {}  # the newest of each key
         self._robots: dict[str, str] = {}  # whose skin each is here
         self._lost = 0
         self._loss_limit, self._name_limit = RateLimit(), RateLimit()
@@ -179,12 +180,19 @@ class _ZenohInlet(Inlet):
             self._subscribers.pop(key).undeclare()
         for key in wanted - self._subscribers.keys():
             self._subscribers[key] = self._session.declare_subscriber(key, self._take)
-        for key in {_key(self.address, prefix) for prefix in more}:
+        self._ask_status({_key(self.address, prefix) for prefix in more}, only_news=False)
+
+    def knock_again(self) -> None:
+        """Ask for each status that somebody wants, as a daemon sends one every second."""
+        self._ask_status(set(self._subscribers), only_news=True)
+
+    def _ask_status(self, keys: set[str], only_news: bool) -> None:
+        for key in keys:
             above, _, kind = key.rpartition("/")
             if kind in ("*", STATUS):
                 self._session.get(
                     f"{above}/{STATUS}",
-                    lambda reply: self._arrive(reply.ok) if reply.ok else None,
+                    lambda reply: self._arrive(reply.ok, only_news) if reply.ok else None,
                     consolidation=zenoh.ConsolidationMode.NONE,
                 )
 
@@ -211,18 +219,21 @@ class _ZenohInlet(Inlet):
             if not came and self._robots.get(sensor) == robot:
                 del self._robots[sensor]
 
-    def _arrive(self, sample: zenoh.Sample) -> None:
-        _, robot, sensor, kind = str(sample.key_expr).split("/")
+    def _arrive(self, sample: zenoh.Sample, only_news: bool = False) -> None:
+        key = str(sample.key_expr)
+        _, robot, sensor, kind = key.split("/")
         data = f"{sensor}/{kind}".encode() + b"\0" + sample.payload.to_bytes()
         with self._lock:
-            if self._arriving.closed:
-                return
+            if self._arriving.closed or (only_news and self._statuses.get(key) == data):
+                return  # of a daemon that has gone, the bridge still has the last status
             if (other := self._robots.setdefault(sensor, robot)) != robot:
                 if self._name_limit.allows():
                     detail = f"{robot} and {other} both have a skin {sensor!r}"
                     next_step = f"--robot {robot} serves the one that is left out"
                     tell("same_sensor_twice", "warning", detail, next_step)
                 return
+            if kind == STATUS:
+                self._statuses[key] = data
             try:
                 self._arriving.send(data, zmq.DONTWAIT)
             except zmq.Again:

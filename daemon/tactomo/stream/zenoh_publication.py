@@ -24,6 +24,9 @@ from tactomo.events import RateLimit
 HEARTBEAT_S: Final = 0.3
 """Of a skin on which nothing changes. A client takes a frame older than 0.5 s for stale, so 0.2 s
 are left for the network; at 20 frames a second it is every sixth one."""
+STATUS_HEARTBEAT_S: Final = 5.0
+"""Of a status that says what the last one said: with contacts, a skin at rest then sends a sixth of
+what it sends by the clock. That a daemon is gone, the token tells; its numbers are asked for."""
 REMEMBERED_S: Final = 3.0
 """A daemon that has said nothing for so long is gone (STREAM.md): a status comes every second."""
 MAX_SENSORS: Final = 1024
@@ -36,7 +39,15 @@ _MOMENTARY: Final = frozenset(
     }
 )
 """Fields that differ from frame to frame of a skin at rest."""
-_HELD: Final = (MAP, CONTACTS)
+_COUNTED: Final = frozenset(
+    {
+        *("uptime_s", "ports", "rates", "scans", "frames", "last_minute", "scan_tally", "events"),
+        *("channel_skew_ms", "wall_clock", "stage_ms", "latency_ms", "baseline", "process"),
+    }
+)
+"""Fields of a status that differ from second to second; of ports and events, what they say."""
+_HEARTBEATS_S: Final[Mapping[str, float]] = {STATUS: STATUS_HEARTBEAT_S}
+_HELD: Final = (MAP, CONTACTS, STATUS)
 _ANSWERED: Final = (STATUS, CONTACTS)
 _PRIORITIES: Final[Mapping[str, zenoh.Priority]] = {
     CONTACTS: zenoh.Priority.INTERACTIVE_HIGH,
@@ -135,11 +146,19 @@ class _Skin:
         return is_due
 
     def _is_news(self, message: Message, now_s: float) -> bool:
-        content = {name: v for name, v in message.fields.items() if name not in _MOMENTARY}
-        sent_s, last = self._sent.get(message.kind, (0.0, {}))
-        if content == last and now_s - sent_s < HEARTBEAT_S:
+        fields, kind = message.fields, message.kind
+        content = {name: v for name, v in fields.items() if name not in _MOMENTARY}
+        if kind == STATUS:
+            content = {name: v for name, v in content.items() if name not in _COUNTED}
+            ports, events = fields.get("ports"), fields.get("events")
+            if isinstance(ports, list):
+                content["ports"] = [p.get("state") for p in ports if isinstance(p, dict)]
+            if isinstance(events, dict):
+                content["events"] = events.get("counts")
+        sent_s, last = self._sent.get(kind, (0.0, {}))
+        if content == last and now_s - sent_s < _HEARTBEATS_S.get(kind, HEARTBEAT_S):
             return False
-        self._sent[message.kind] = now_s, content
+        self._sent[kind] = now_s, content
         return True
 
     def withdraw(self) -> None:

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgpack  # type: ignore[import-untyped]
@@ -22,11 +23,12 @@ import zenoh
 import zmq
 from page import Page
 from tactomo.stream import zenoh_bridge
-from tactomo.stream.zenoh_publication import ENCODING, HEARTBEAT_S
-from tactomo_client import Contact, subscribe
+from tactomo.stream.zenoh_publication import ENCODING, HEARTBEAT_S, STATUS_HEARTBEAT_S
+from tactomo_client import Contact, request, subscribe
 from tactomo_client.fake import FakeSensor
 from tactomo_client.messages import decode_message, topic
 from waiting import PATIENCE_S, wait_until
+from whole_system import SENSOR, running_demo
 
 EXAMPLES = Path(__file__).parents[3] / "deploy/examples"
 TOUCH = [Contact(1, 10.0, 0.0, 700.0, 0.1, 0.01, 170.0)]
@@ -189,6 +191,61 @@ def test_a_skin_at_rest_is_sent_by_a_heartbeat_and_a_touch_at_once(
     assert [len(fields["contacts"]) for _, fields, _ in samples.all[-2:]] == [1, 0]
     counts = [count for _, _, count in samples.all]
     assert counts == list(range(counts[0], counts[0] + len(counts)))  # none is missed
+
+
+def test_a_status_is_sent_when_it_says_something_else_and_its_numbers_are_asked_for(
+    left: FakeSensor, start: Callable[..., Running], desk: zenoh.Session, reader: Any
+) -> None:
+    samples = Samples(desk, "tactomo/arm/left/status")
+    start(left, robot="arm")
+    one = reader(start(bind="tcp://127.0.0.1:0").address, topic("left", "status"))
+    said: dict[str, Any] = {"state": "running", "frames": 0, "ports": [{"state": "running"}]}
+
+    def send() -> None:
+        said["frames"] += 1
+        left.publish_message("status", said)
+
+    samples.until(lambda: samples.all, send)
+    began_s, seen = time.monotonic(), set[int]()
+    while len(seen) < 4:  # the proxy asks every second, so that clients of ZeroMQ hear of it
+        seen.add(next_of(one, send).fields["frames"])
+    least = (time.monotonic() - began_s) / STATUS_HEARTBEAT_S
+    assert len(samples.all) <= least + 2
+    said["ports"] = [{"state": "silent"}]
+    samples.until(lambda: samples.all[-1][1]["ports"] == said["ports"], send)
+    said["state"] = "stale"
+    samples.until(lambda: samples.all[-1][1]["state"] == "stale", send)
+    assert len(samples.all) <= (time.monotonic() - began_s) / STATUS_HEARTBEAT_S + 4
+
+
+@pytest.mark.slow
+def test_contacts_and_status_of_a_skin_at_rest_are_a_fifth_of_those_by_the_clock(
+    start: Callable[..., Running], desk: zenoh.Session, reader: Any
+) -> None:
+    """A simulated skin behind a real daemon; bytes as a subscriber of all of both gets them."""
+    by_zenoh: list[tuple[float, int]] = []
+    with running_demo() as demo:
+        request("tare", demo.control, 30.0)
+        both = [topic(SENSOR, "contacts"), topic(SENSOR, "status")]
+        by_the_clock = reader(demo.stream, *both)
+        subscribers = [
+            desk.declare_subscriber(
+                f"tactomo/arm/{SENSOR}/{kind}",
+                lambda s: by_zenoh.append((time.monotonic(), len(s.payload) + len(s.attachment))),
+            )
+            for kind in ("contacts", "status")
+        ]
+        start(SimpleNamespace(address=demo.stream), robot="arm")
+        wait_until(lambda: by_zenoh)
+        sent, statuses, began_s = 0, 0, time.monotonic()
+        while statuses <= 4 * STATUS_HEARTBEAT_S:
+            data = by_the_clock.recv()
+            sent += len(data)
+            statuses += data.startswith(both[1])
+        held = sum(size for at_s, size in by_zenoh if at_s >= began_s)
+        assert len(subscribers) == 2
+    print(f"{held} of {sent} bytes: {held / sent:.3f}")
+    assert held <= sent / 5
 
 
 def test_a_query_gets_the_newest_contacts_and_status(
