@@ -107,6 +107,11 @@ def unpressed(arrays: Arrays) -> Arrays:
     return changed(arrays, **{name: noise * volts for name, volts in rest.items()})
 
 
+def turned(xy_mm: Any, degrees: float) -> Any:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return xy_mm @ np.array([[c, s], [-s, c]])
+
+
 def first(arrays: Arrays, count: int) -> Arrays:
     return {k: v[:count] if len(v) == len(arrays["xy_mm"]) else v for k, v in arrays.items()}
 
@@ -117,7 +122,14 @@ def first(arrays: Arrays, count: int) -> Arrays:
         (lambda a: changed(a, xy_mm=1e-3 * a["xy_mm"]), "seem to be metres; give millimetres"),
         (lambda a: changed(a, xy_mm=a["xy_mm"][:, ::-1]), "x and y seem swapped"),
         (lambda a: changed(a, xy_mm=2 * a["xy_mm"]), "they seem doubled"),
+        (lambda a: changed(a, xy_mm=1e3 * a["xy_mm"]), "x is multiplied by 0.001, y by 0.00"),
+        (lambda a: changed(a, xy_mm=a["xy_mm"] * [1, 0.1]), "x is multiplied by 1, y by 9.9"),
+        (lambda a: changed(a, xy_mm=a["xy_mm"] * [2, 1]), "x is multiplied by 0.5, y by 0.99"),
         (lambda a: changed(a, xy_mm=-a["xy_mm"]), "half a turn"),
+        (lambda a: changed(a, xy_mm=turned(a["xy_mm"], 20)), "turned by -20 degrees"),
+        (lambda a: changed(a, xy_mm=np.insert(a["xy_mm"], 8, a["xy_mm"][8], 0)[:-1]), "from press"),
+        (lambda a: changed(a, xy_mm=np.roll(a["xy_mm"], 1, 0)), "60 places fit the contacts of"),
+        (lambda a: changed(a, xy_mm=np.roll(a["xy_mm"], 23, 0)), "do not belong together"),
         (lambda a: changed(a, xy_mm=a["xy_mm"] + 75), "counted from a corner"),
         (lambda a: changed(a, xy_mm=a["xy_mm"] * [1, np.nan]), "press 0 has no place"),
         (lambda a: changed(a, xy_mm=a["xy_mm"][:-1]), "xy_mm is float64 of shape (59, 2)"),
