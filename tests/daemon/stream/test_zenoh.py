@@ -231,7 +231,9 @@ def test_contacts_and_status_of_a_skin_at_rest_are_a_fifth_of_those_by_the_clock
         subscribers = [
             desk.declare_subscriber(
                 f"tactomo/arm/{SENSOR}/{kind}",
-                lambda s: by_zenoh.append((time.monotonic(), len(s.payload) + len(s.attachment))),
+                lambda s: by_zenoh.append(
+                    (time.monotonic(), len(s.payload) + len(s.attachment or b""))
+                ),
             )
             for kind in ("contacts", "status")
         ]
