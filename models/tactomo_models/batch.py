@@ -72,7 +72,6 @@ def reconstruct_file(
             budget_s=BUDGET_S,
             curve=curve,
             taught=taught,
-            finds_sheets=False,  # as the daemon does
         )
         reconstructor.set_reference(reference)
         for index in range(total):

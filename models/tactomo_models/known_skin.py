@@ -43,7 +43,7 @@ def skin_at_start(
     Takes some tenths of a second. The reconstructor measures against `known` from then on.
     """
     tracker = BaselineTracker(reconstructor)
-    tracker.begin(known)
+    tracker.begin(known, sheets={})  # as even ones they tell well enough, and at once
     if tracker.explains_as_drift(now, elapsed_s):
         return SkinAtStart.KNOWN
     gained = _without_gain(known, now)

@@ -11,7 +11,7 @@ counted in modelled work, so that a recording reconstructs exactly as the live s
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Final
 
@@ -24,7 +24,9 @@ from tactomo_models.errors import DataError, ModelError
 from tactomo_models.methods.magnitudes import BAD_MISFIT
 from tactomo_models.methods.method import Estimate, Method, Skin, UnsolvableError
 from tactomo_models.methods.registry import check_method, make_method
+from tactomo_models.physics.actual_sheet import SheetEstimator, Sheets
 from tactomo_models.physics.artifact import Artifact
+from tactomo_models.scans.changes import MeasuredChannel
 from tactomo_models.scans.measurement import Comparator, Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scans.reference import Reference
@@ -50,8 +52,6 @@ class Reconstructor:
             has.
         budget_s: compute time a frame may take, on a machine of the 2.5 GHz class.
         regularisation: factor on what a rule chooses for the linear methods.
-        finds_sheets: whether a reference tells how uneven the sheets are, and where electrodes
-            sit: at each tare a second of work.
         curve: turns magnitudes into pressures; the description's own table if None.
         taught: corrects where single contacts are, see `taught_skin`.
 
@@ -77,7 +77,6 @@ class Reconstructor:
         method: str | Method = "auto",
         budget_s: float | None = None,
         regularisation: float = 1.0,
-        finds_sheets: bool = True,
         curve: PressureCurve | None = None,
         taught: TaughtSkin | None = None,
     ) -> None:
@@ -88,8 +87,9 @@ class Reconstructor:
         skin = Skin.of(description, artifact)
         self.artifact = skin.artifact
         factor = regularisation * description.instrument.regularisation
-        self._skin = replace(skin, regularisation=factor, finds_sheets=finds_sheets)
+        self._skin = replace(skin, regularisation=factor)
         self._comparator = Comparator(description, skin.artifact, skin.forward)
+        self._sheets: Sheets | None = None  # as the reference tells; None if nobody has asked
         self._methods: dict[str, Method] = {}  # by their names, once they were asked for
         self._failures: dict[str, str] = {}  # of methods prepared since the tare; empty if good
         self._previous: Estimate | None = None
@@ -98,8 +98,7 @@ class Reconstructor:
         self._name = method if isinstance(method, str) else type(method).__name__
         if isinstance(method, str):
             check_method(method, description)
-        else:
-            self._methods[self._name] = method
+        self._methods[self._name] = make_method(method) if isinstance(method, str) else method
 
     @property
     def method(self) -> str:
@@ -120,20 +119,48 @@ class Reconstructor:
         if self._skin.channels:
             self._prepared(name)
 
-    def set_reference(self, reference: Reference) -> None:
+    def set_reference(self, reference: Reference, sheets: Sheets | None = None) -> None:
         """Measure changes against this unpressed scan from now on.
 
         Forgets the warm start, unless it is the last reference, drifted.
 
+        Args:
+            reference: the unpressed scan.
+            sheets: what `find_sheets` has found by it; if None, they are found now.
+
         Raises:
             DataError: a channel has another number of voltages than the sensor.
         """
-        if self._comparator.set_reference(reference):
+        if self._comparator.set_reference(reference) or sheets is not None:
+            self._sheets = sheets
             self._prepare()
             self.reset()
 
+    def find_sheets(self, reference: Reference) -> Sheets | None:
+        """Find how the sheets were made, as their reference tells; for any thread.
+
+        Half a second of processor time a sheet. None where the method makes nothing of it.
+
+        Raises:
+            DataError: a channel has another number of voltages than the sensor.
+        """
+        if not _uses_sheets(self._methods[self._name]):
+            return None
+        return self._sheets_of(self._comparator.channels_of(reference))
+
+    def _sheets_of(self, channels: Mapping[Channel, MeasuredChannel]) -> Sheets:
+        structure = self.description.structure
+        if structure is not None and structure.either_way:
+            return {}  # a tank is no skin: its water is even
+        estimator = SheetEstimator(self.description, self.artifact.bare)
+        found = {
+            name: estimator.estimate(each.reference, each.usable, each.relative_noise)
+            for name, each in channels.items()
+        }
+        return {name: sheet for name, sheet in found.items() if sheet is not None}
+
     def _prepare(self) -> None:
-        """Prepare the method with the channels as they are now."""
+        """Prepare the method with the channels and sheets as they are now."""
         self._skin = replace(self._skin, channels=self._comparator.channels)
         self._failures.clear()
         self._prepared(self._name)
@@ -236,8 +263,10 @@ class Reconstructor:
         self._methods[name] = method
         if name not in self._failures:
             self._failures[name] = ""
+            if self._sheets is None and _uses_sheets(method):
+                self._sheets = self._sheets_of(self._skin.channels)
             try:
-                method.prepare(self._skin)
+                method.prepare(replace(self._skin, sheets=self._sheets or {}))
             except (Exception, SystemExit) as error:
                 if _is_ours(method) or isinstance(error, ModelError):
                     del self._failures[name]
@@ -367,6 +396,10 @@ class _MethodFailedError(Exception):
 
 def _is_ours(method: Method) -> bool:
     return type(method).__module__.startswith("tactomo_models.")
+
+
+def _uses_sheets(method: Method) -> bool:
+    return bool(getattr(method, "uses_sheets", False))
 
 
 def _in_words(error: BaseException) -> str:

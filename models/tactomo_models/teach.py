@@ -161,7 +161,7 @@ def _reconstructed(
 ) -> _Seen:
     """Reconstruct each press from a cold start, as the daemon does by default."""
     # As the daemon does, whose places are corrected: it takes sheets as even.
-    reconstructor = Reconstructor(description, finds_sheets=False)
+    reconstructor = Reconstructor(description)
     reconstructor.set_reference(presses.reference)
     channels = [name for name in description.channels if name in presses.scans]
     width = len(channels) * description.measurements

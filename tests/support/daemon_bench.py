@@ -222,7 +222,10 @@ class Memory:
         self.curve: PressureCurve | None = None
         self._before = np.zeros((51, 51), np.float32)
 
-    def set_reference(self, reference: Reference) -> None:
+    def find_sheets(self, _: Reference) -> None:
+        pass
+
+    def set_reference(self, reference: Reference, sheets: None = None) -> None:
         self.reference = reference
         self.reset()
 

@@ -26,6 +26,7 @@ from tactomo_models.calibration.calibration_file import PressureCalibration
 from tactomo_models.calibration.taught_skin import TaughtSkin
 from tactomo_models.known_skin import SkinAtStart, skin_at_start
 from tactomo_models.machine_speed import MachineSpeed
+from tactomo_models.physics.actual_sheet import Sheets
 from tactomo_protocol import Channel, ScanFlag
 
 from tactomo.config import BaselineConfig
@@ -62,6 +63,7 @@ class Imaging:
         calibration: PressureCalibration | None,
         taught: TaughtSkin | None,  # what the sensor was taught; None where nothing was
         tare_scans: int,  # dual scans for a reference
+        waits: bool,  # whether frames wait while it is found how a reference's sheets are
         baseline: BaselineConfig,  # whether and how fast the reference follows the skin
         # the sensor's last reference; None where it is neither used nor kept
         kept: KeptReference | None,
@@ -88,7 +90,14 @@ class Imaging:
         )
         # takes references
         self.taring = Taring(
-            tare_scans, description.channels, self.frame_rate, self._take, self._fall_back, on_event
+            tare_scans,
+            description.channels,
+            self.frame_rate,
+            reconstructor.find_sheets,
+            waits,
+            self._take,
+            self._fall_back,
+            on_event,
         )
         self._kept = kept
         self._is_disputed = False  # the skin at the start was not as the reference in force has it
@@ -118,16 +127,18 @@ class Imaging:
         """Whether there is something to measure this channel's changes against."""
         return getattr(self.reference, channel, None) is not None
 
-    def use_reference(self, reference: Reference, realtime_ns: int) -> None:
+    def use_reference(
+        self, reference: Reference, realtime_ns: int, sheets: Sheets | None = None
+    ) -> None:
         """Measure changes against `reference` from the next dual scan on, and follow from it."""
         self.reference_realtime_ns = realtime_ns
         if self._tracker is None:
-            self._reconstructor.set_reference(reference)
+            self._reconstructor.set_reference(reference, sheets)
             self._note_reference(reference)
         else:
-            self._note_reference(self._tracker.begin(reference))
+            self._note_reference(self._tracker.begin(reference, sheets))
 
-    def _take(self, reference: Reference, is_asked: bool) -> bool:
+    def _take(self, reference: Reference, sheets: Sheets | None, is_asked: bool) -> bool:
         """Use a reference that was taken; at the start only if nothing lies on the skin.
 
         Returns whether it is in force.
@@ -148,7 +159,7 @@ class Imaging:
         self._is_disputed = False
         is_first = not is_asked and self.reference is None
         self._is_unchecked = is_first and self._kept is not None and self._kept.is_unreadable
-        self.use_reference(reference, time.time_ns())
+        self.use_reference(reference, time.time_ns(), sheets)
         if self._kept is not None and not self._is_unchecked:
             self._kept.keep(reference, self.calibration.device_ids)
         return True
@@ -165,7 +176,8 @@ class Imaging:
 
     def _prefer(self, known: KnownSkin, why: str) -> None:
         self._is_disputed = True
-        self.use_reference(known.reference, known.realtime_ns)
+        sheets = self._reconstructor.find_sheets(known.reference)
+        self.use_reference(known.reference, known.realtime_ns, sheets)
         self._on_event(
             "reference_disputed",
             "warning",

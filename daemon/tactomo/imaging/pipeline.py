@@ -59,7 +59,7 @@ class Pipeline(Worker):
         channels: those that the sensor has.
         ports: how many ports deliver.
         sync_wait_ns: how long a scan waits for its partner.
-        lossless: reconstruct every dual scan, however late.
+        is_lossless: reconstruct every dual scan, however late.
         replay: what the recording says, where the ports replay one.
         zero_counters: asks every device to count from 0 again.
         on_event: told what happens to scans and channels.
@@ -80,7 +80,7 @@ class Pipeline(Worker):
         channels: tuple[Channel, ...],
         ports: int,
         sync_wait_ns: int,
-        lossless: bool,
+        is_lossless: bool,
         replay: Replay | None,
         zero_counters: Callable[[], None],
         on_event: OnEvent,
@@ -95,8 +95,7 @@ class Pipeline(Worker):
         self._ports = ports
         self._replay = replay
         self._is_exact = replay is not None and bool(replay.marks)
-        is_unpaced = replay is not None and not replay.is_paced
-        self._is_lossless = lossless or self._is_exact or is_unpaced
+        self._is_lossless = is_lossless
         self._sync_wait_ns = sync_wait_ns
         self.sync = self._new_sync()
         self.skew = Skew()
@@ -242,6 +241,9 @@ class Pipeline(Worker):
     def _is_let_through(self) -> bool:
         """Whether the next dual scan is made a frame now: ports may run ahead of a step's one."""
         return self._replay is None or self._replay.playback.lets_through()
+
+    def _close(self) -> None:
+        self._imaging.taring.close()
 
     def _new_sync(self) -> ScanPairer:
         replay = self._replay

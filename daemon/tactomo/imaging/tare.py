@@ -4,18 +4,23 @@
 them. Somebody who presses meanwhile would be averaged into the reference, so scans that move while
 they are collected are refused. A press that lasts and stays the same cannot be told from a bare
 skin whose reference is out of date: whoever tares is told how many contacts were shown meanwhile.
+
+A reference tells how the sheets were made, which takes about a second to find. That is done beside
+the frames, which are made against the reference before until then.
 """
 
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Collection, Mapping
-from concurrent.futures import Future
-from typing import Any, Final
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from tactomo_models import ModelError, Reference
 from tactomo_models.arrays import FloatArray
+from tactomo_models.physics.actual_sheet import Sheets
 from tactomo_protocol import Channel
 
 from tactomo.errors import CommandError
@@ -34,15 +39,28 @@ slowly, a few of their periods."""
 Volts = FloatArray
 
 
+class _Taken(NamedTuple):
+    """A reference that was taken, while it is found how its sheets were made."""
+
+    tare: Tare
+    reference: Reference
+    contacts: int
+    sheets: Future[Sheets | None]
+
+
 class Taring:
     """Takes references for one sensor. For use by the pipeline thread.
+
+    Its own thread finds how sheets were made: it is handed a reference, and hands back a future.
 
     Args:
         scans: dual scans for each reference.
         channels: those of the sensor.
         frame_rate: how often frames come.
-        put_in_force: called with a reference that was taken and whether somebody asked for it;
-            returns whether it is in force, and not an older one.
+        find_sheets: finds how the sheets of a reference were made; for any thread.
+        waits: whether frames wait for that, so that each is made against what was taken before.
+        put_in_force: called with a reference that was taken, its sheets and whether somebody asked
+            for it; returns whether it is in force, and not an older one.
         fall_back: called with why none was taken while there is none; returns whether an older
             one is in force now.
         on_event: told what a tare became.
@@ -53,24 +71,34 @@ class Taring:
         scans: int,
         channels: Collection[Channel],
         frame_rate: Rate,
-        put_in_force: Callable[[Reference, bool], bool],
+        find_sheets: Callable[[Reference], Sheets | None],
+        waits: bool,
+        put_in_force: Callable[[Reference, Sheets | None, bool], bool],
         fall_back: Callable[[str], bool],
         on_event: OnEvent,
     ) -> None:
         self._scans = scans
         self._channels = channels
         self._frame_rate = frame_rate
+        self._find_sheets = find_sheets
+        self._waits = waits
         self._put_in_force = put_in_force
         self._fall_back = fall_back
         self._on_event = on_event
         self._has_reference = False
         self._tare: Tare | None = None
         self._deadline_s = 0.0
+        self._taken: deque[_Taken] = deque()
+        self._finder = ThreadPoolExecutor(1, "sheets")  # the thread starts with the first tare
 
     @property
     def is_on(self) -> bool:
         """Whether a reference is being taken; for any thread."""
-        return self._tare is not None
+        return self._tare is not None or bool(self._taken)
+
+    def close(self) -> None:
+        """Find no more; for any thread, once the pipeline has ended."""
+        self._finder.shutdown(cancel_futures=True)
 
     def start(self, answer: Future[Mapping[str, Any]] | None = None) -> None:
         """Take a reference from the dual scans to come; `answer` gets what it became, or why."""
@@ -84,10 +112,13 @@ class Taring:
         self._has_reference = True
 
     def check(self) -> None:
-        """Give up a tare on command for which nothing comes."""
-        if self._tare and self._tare.answers and time.monotonic() > self._deadline_s:
+        """Put in force what is ready; give up a tare on command for which nothing comes."""
+        while self._taken and (self._waits or self._taken[0].sheets.done()):
+            self._finish(self._taken.popleft())
+        if (tare := self._tare) and tare.answers and time.monotonic() > self._deadline_s:
+            self._tare = None
             self._refuse(
-                self._tare,
+                tare,
                 CommandError(
                     f"no usable dual scan for {self._patience_s:.3g} s",
                     "`tactomo status` shows what the ports say",
@@ -110,16 +141,27 @@ class Taring:
         self._put_off()
         if not tare.add(volts, needed):
             return
+        self._tare = None
         try:
             reference = tare.reference()
         except CommandError as refusal:
             self._refuse(tare, refusal)
             return
         except ModelError as error:
-            self._refuse(tare, CommandError(str(error), "", "tare_refused"))
+            self._refuse(tare, _refusal_of(error))
             return
-        self._tare = None
-        if not self._put_in_force(reference, bool(tare.answers)):
+        sheets = self._finder.submit(self._find_sheets, reference)
+        self._taken.append(_Taken(tare, reference, contacts, sheets))
+        self.check()
+
+    def _finish(self, taken: _Taken) -> None:
+        tare, reference, contacts, sheets = taken
+        try:
+            is_new = self._put_in_force(reference, sheets.result(), bool(tare.answers))
+        except ModelError as error:
+            self._refuse(tare, _refusal_of(error))
+            return
+        if not is_new:
             return
         shown = f", while {contacts} contact(s) were shown" if contacts else ""
         self._on_event("tared", "info", f"{reference.scans} dual scans{shown}")
@@ -127,7 +169,6 @@ class Taring:
             answer.set_result({"scans": reference.scans, "contacts": contacts})
 
     def _refuse(self, tare: Tare, refusal: CommandError) -> None:
-        self._tare = None
         self._on_event("tare_refused", "warning", refusal.cause, refusal.next_step)
         if not self._has_reference and not self._fall_back(refusal.cause):
             self.start()  # without a reference there is nothing else to do
@@ -140,6 +181,10 @@ class Taring:
     @property
     def _patience_s(self) -> float:
         return max(NO_DATA_S, self._frame_rate.pace.few_s)
+
+
+def _refusal_of(error: ModelError) -> CommandError:
+    return CommandError(str(error), "", "tare_refused")
 
 
 class Tare:

@@ -34,6 +34,11 @@ class Replay:
     knows_calibration: bool = False
     """Whether it had that one, or none, and no other is to be looked for."""
 
+    @property
+    def is_lossless(self) -> bool:
+        """Whether every dual scan is reconstructed: those that were, or as fast as they come."""
+        return bool(self.marks) or not self.is_paced
+
     def marks_of_pass(self) -> list[Mark]:
         """Return the marks from where the playback's pass began on.
 

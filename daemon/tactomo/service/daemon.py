@@ -150,6 +150,7 @@ class Daemon:
         self._publisher = Publisher(
             config.name, self.session, self._status_fields, self._record_message, self._on_event
         )
+        is_lossless = config.lossless or (replay is not None and replay.is_lossless)
         self._imaging = Imaging(
             description,
             reconstructor or _make_reconstructor(config, description, artifact),
@@ -157,6 +158,7 @@ class Daemon:
             calibration,
             taught,
             config.tare_scans,
+            is_lossless,
             config.baseline,
             self._make_kept_reference() if replay is None and reconstructor is None else None,
             self._recorder,
@@ -168,7 +170,7 @@ class Daemon:
             channels,
             len(config.ports),
             round(config.sync_wait_ms * 1e6),
-            config.lossless,
+            is_lossless,
             replay,
             self._zero_counters,
             self._on_event,
@@ -484,10 +486,7 @@ def _make_reconstructor(
     budget_s = None if config.budget_ms is None else config.budget_ms * 1e-3
     if artifact is None or artifact.sha256 != description.sha256:
         artifact = load_model(description)
-    # A second of work at the tare would hold up the frames: sheets are taken as even.
-    return Reconstructor(
-        description, artifact, method=config.method, budget_s=budget_s, finds_sheets=False
-    )
+    return Reconstructor(description, artifact, method=config.method, budget_s=budget_s)
 
 
 def _check_methods(

@@ -35,6 +35,7 @@ from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.drift.channel_baseline import ChannelBaseline, Drift
 from tactomo_models.drift.drift_model import DriftSubspace
 from tactomo_models.drift.press_memory import PressMemory
+from tactomo_models.physics.actual_sheet import Sheets
 from tactomo_models.physics.artifact import Artifact
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
@@ -68,7 +69,7 @@ class Solver(Protocol):
     def artifact(self) -> Artifact:
         """What is precomputed for the sensor."""
 
-    def set_reference(self, reference: Reference) -> None:
+    def set_reference(self, reference: Reference, sheets: Sheets | None = None) -> None:
         """Measure changes against this unpressed scan from now on."""
 
     def usable(self, name: Channel) -> BoolArray:
@@ -112,13 +113,17 @@ class BaselineTracker:
         self._moved_s = self._last_s = 0.0
         self._distrusted_s: float | None = None
 
-    def begin(self, reference: Reference) -> Reference:
+    def begin(self, reference: Reference, sheets: Sheets | None = None) -> Reference:
         """Measure against a reference, and follow from there; returns it as it is in force.
 
         Where it had drifted itself, that is as good as a tare.
+
+        Args:
+            reference: the unpressed scan.
+            sheets: what has been found by it; if None, they are found now.
         """
         self.reference = reference = reference.taken_as_it_is()
-        self._reconstructor.set_reference(reference)
+        self._reconstructor.set_reference(reference, sheets)
         self._channels = {
             name: ChannelBaseline(self._subspace, tare, self._reconstructor.usable(name))
             for name in self._reconstructor.description.channels

@@ -7,7 +7,6 @@ either one is the fit of both kinds (`objects`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -20,8 +19,6 @@ from tactomo_models.methods.magnitudes import BAD_MISFIT
 from tactomo_models.methods.method import Estimate, Skin, UnsolvableError
 from tactomo_models.methods.objects import ObjectFit
 from tactomo_models.methods.warm_started_fit import Propose, ShapeModel, WarmStartedFit
-from tactomo_models.physics.actual_sheet import SheetEstimator
-from tactomo_models.scans.changes import MeasuredChannel
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scene.field_account import FieldAccount, FieldAccountant
@@ -35,6 +32,7 @@ class OutlineFit:
 
     shape_model = ShapeModel.OUTLINES
     questions: tuple[Question, ...] = QUESTIONS
+    uses_sheets = True
 
     def prepare(self, skin: Skin) -> None:
         """Make the fit of this sensor, unless the last tare was of the same."""
@@ -44,40 +42,20 @@ class OutlineFit:
         self._frames_held = 0  # since the last structure scan
         self._last: tuple[FittedField, FieldAccount] | None = None
         self._odds: list[float] = []  # of what the last account was made with
-        self._error_ratios: dict[Channel, float] = {}  # of sheets that are known as they are
-        if before is not None and before.forward is skin.forward:
-            self._look_at_sheets(before.channels)
-            return
-        self._field_fit = FieldFit(skin.forward, skin.description)
-        self._accountant = FieldAccountant(self._field_fit, skin.areas)
-        structure = skin.description.structure
-        self._fit: WarmStartedFit | ObjectFit
-        if structure is not None and structure.either_way:
-            self._fit = ObjectFit(self._field_fit, self._linear_image)
-        else:
-            self._fit = WarmStartedFit(self._field_fit, self.shape_model, self.questions)
-            self._typical_peak = self._fit.typical_peak
-            self._estimator = SheetEstimator(skin.description, skin.artifact.bare)
-            self._look_at_sheets({})
-
-    def _look_at_sheets(self, before: Mapping[Channel, MeasuredChannel]) -> None:
-        """Find how each sheet was made by its reference, unless that is as it was before."""
-        if isinstance(self._fit, ObjectFit) or not self._skin.finds_sheets:
-            return
-        sheets, self._field_fit.sheets = self._field_fit.sheets, {}
-        for name, channel in self._skin.channels.items():
-            if name not in before or not channel.has_reference_of(before[name]):
-                sheets.pop(name, None)  # it takes tens of megabytes
-                found = self._estimator.estimate(
-                    channel.reference, channel.usable, channel.relative_noise
-                )
-                if found is not None:
-                    sheets[name] = found
-        self._field_fit.sheets = sheets
+        if before is None or before.forward is not skin.forward:
+            self._field_fit = FieldFit(skin.forward, skin.description)
+            self._accountant = FieldAccountant(self._field_fit, skin.areas)
+            structure = skin.description.structure
+            self._fit: WarmStartedFit | ObjectFit
+            if structure is not None and structure.either_way:
+                self._fit = ObjectFit(self._field_fit, self._linear_image)
+            else:
+                self._fit = WarmStartedFit(self._field_fit, self.shape_model, self.questions)
+                self._typical_peak = self._fit.typical_peak
+        self._field_fit.sheets = dict(skin.sheets)
         self._error_ratios = {
-            name: self._skin.channels[name].error_ratio(sheet.bare_voltages)
-            for name, sheet in sheets.items()
-            if name in self._skin.channels
+            name: skin.channels[name].error_ratio(sheet.bare_voltages)
+            for name, sheet in skin.sheets.items()
         }
 
     def solve(

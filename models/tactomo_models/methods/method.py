@@ -26,6 +26,7 @@ from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray, Image
 from tactomo_models.methods.trained_networks import SensorNetworks
+from tactomo_models.physics.actual_sheet import Sheets
 from tactomo_models.physics.artifact import Artifact, load_or_build_artifact
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scans.changes import MeasuredChannel
@@ -48,7 +49,8 @@ class Skin:
         networks: trained for this sensor.
         channels: those that have a reference, with their noise.
         regularisation: factor on the linear methods' regularisation parameter.
-        finds_sheets: whether references tell how the sheets are; else they are taken as even.
+        sheets: the models of those sheets whose references tell how they were made; all others
+            are taken as even. Found for methods alone that say `uses_sheets`.
     """
 
     description: SensorDescription
@@ -58,7 +60,7 @@ class Skin:
     networks: SensorNetworks
     channels: Mapping[Channel, MeasuredChannel] = field(default_factory=dict)
     regularisation: float = 1.0
-    finds_sheets: bool = True
+    sheets: Sheets = field(default_factory=dict)
 
     @property
     def magnitude_sign(self) -> float:
@@ -128,7 +130,7 @@ class Method(Protocol):
     likes between frames, as long as the outcome depends on the sequence of frames alone, never on
     the clock. A class may name the channels that it cannot do without as `needs`, and have a
     static method `check(description)` that raises `ArtifactError` where the sensor lacks anything
-    else.
+    else. One that solves presses on each sheet as it is sets `uses_sheets` to True.
     """
 
     def prepare(self, skin: Skin) -> None:

@@ -15,10 +15,12 @@ Inverse Probl. Imaging 6 (2012).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import skfem
+from tactomo_protocol import Channel
 
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 from tactomo_models.physics.artifact import INVERSE_REFINEMENTS, MODEL_ERROR
@@ -43,7 +45,10 @@ IMPEDANCE = 0.4  # of the logarithm of a contact impedance
 DISPLACED_M = 1e-3  # of an electrode along the rim
 REACH = 0.4  # radius that an electrode draws along, over their distance: none meets another
 FAR = 1.0  # error of a slope, as a share of what is left to explain; with 0.3 places run away
-STEPS = 6  # of Gauss-Newton: electrodes 1.5 mm off take them all, ordinary ones three
+STEPS = 6  # of Gauss-Newton at most: electrodes 1.5 mm off take them all, ordinary ones three
+SETTLED = 1.0  # of the sum of squares, that a last step takes off; with 0.1 nothing gets better
+
+Sheets = Mapping[Channel, ForwardModel]
 
 
 @dataclass(frozen=True)
@@ -119,13 +124,21 @@ class SheetEstimator:
             slopes = np.append(slopes, np.ones((len(left), 1)), axis=1)
             normal = slopes.T @ (precision[:, None] * slopes) + np.diag(prior)
             gradient = slopes.T @ (precision * left) - prior * np.append(parameters, 0.0)
-            parameters = parameters + np.linalg.solve(normal, gradient)[:-1]
+            step = np.linalg.solve(normal, gradient)
+            parameters = parameters + step[:-1]
+            if step @ gradient < SETTLED:
+                break
         shape = self._shape(parameters)
         left = self._left(voltages, shape, usable)
         if left is None or np.sqrt(np.mean(left[usable] ** 2)) > MAX_LEFT:
             return None
         bare = solve_bare_sheet(
-            self._description, shape.mesh, shape.conductivity, shape.impedance, drawn_on=self._even
+            self._description,
+            shape.mesh,
+            shape.conductivity,
+            shape.impedance,
+            drawn_on=self._even,
+            green_dtype=np.float32,  # seven digits of what is known to three
         )
         return ForwardModel(self._description, bare)
 

@@ -18,6 +18,7 @@ import scipy.linalg
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 import skfem
+from numpy.typing import DTypeLike
 from skfem.helpers import dot, grad
 from threadpoolctl import threadpool_limits
 
@@ -63,6 +64,7 @@ def solve_bare_sheet(
     # a sheet of the same mesh, before its electrodes were moved: what can be pressed, and where
     # that is on the map, is as on that one. Found anew if None
     drawn_on: BareSheet | None = None,
+    green_dtype: DTypeLike = np.float64,  # what a Green's function that is whole is kept in
 ) -> BareSheet:
     """Assemble and solve the complete electrode model of an unpressed sheet."""
     mesh = sheet.mesh
@@ -80,7 +82,7 @@ def solve_bare_sheet(
     fields = electrode_fields(description, system)
     with threadpool_limits(1):
         green = GreensFunction(system, support, mesh.p[:, support])
-        kept = green if quick else green.packed()
+        kept = green if quick else green.packed(green_dtype)
     return BareSheet(
         points=mesh.p,
         triangles=mesh.t.astype(np.intp),

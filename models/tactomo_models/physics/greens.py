@@ -13,9 +13,12 @@ Source: Przemieniecki, "Matrix structural analysis of substructures", AIAA J. 1 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
+from numpy.typing import DTypeLike
 
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 
@@ -26,19 +29,22 @@ class PackedGreensFunction:
     A block of it is a look-up: for one contact 5 us more than in all of it.
 
     Args:
-        whole: (S, S) potentials at nodes for unit currents into others.
+        rows: S rows (S,) of potentials at nodes for unit currents into others.
+        dtype: of what is kept.
     """
 
-    def __init__(self, whole: FloatArray) -> None:
-        self._lower = np.concatenate([row[: place + 1] for place, row in enumerate(whole)])
-        place = np.arange(len(whole))
+    def __init__(self, rows: Iterable[FloatArray], dtype: DTypeLike = np.float64) -> None:
+        halves = [row[: place + 1].astype(dtype) for place, row in enumerate(rows)]
+        self._lower = np.concatenate(halves)
+        place = np.arange(len(halves))
         self._start = place * (place + 1) // 2  # of each row
 
     def between(self, rows: IntArray, columns: IntArray) -> FloatArray:
         """Potentials (r, c) at some of the nodes for unit currents into others, by their places."""
         row = rows[:, None]
         lower, upper = self._start[row] + columns, self._start[columns] + row
-        return np.asarray(self._lower.take(np.where(row >= columns, lower, upper)))
+        found = self._lower.take(np.where(row >= columns, lower, upper))
+        return np.asarray(found, np.float64)
 
     def rows(self, rows: IntArray) -> FloatArray:
         """Potentials (r, S) at all nodes for unit currents into some."""
@@ -102,9 +108,16 @@ class GreensFunction:
         """Potentials (r, S) at all nodes for unit currents into some."""
         return self.between(rows, np.arange(self._weights.shape[0]))
 
-    def packed(self) -> PackedGreensFunction:
+    def packed(self, dtype: DTypeLike = np.float64) -> PackedGreensFunction:
         """All of it, of which a block is a look-up: up to hundreds of megabytes."""
-        return PackedGreensFunction(self.rows(np.arange(self._weights.shape[0])))
+        onto = (self._weights @ self._between).T
+        blocks = np.array_split(np.arange(len(onto.T)), 12)  # a few megabytes each
+        rows = (
+            row
+            for block in blocks
+            for row in self._within[block].toarray() + self._weights[block] @ onto
+        )
+        return PackedGreensFunction(rows, dtype)
 
 
 def _boxes(points: FloatArray) -> IntArray:

@@ -158,11 +158,6 @@ class MeasuredChannel:
         valid = self.usable
         return max(least, mismatch_share * _mismatch(self.reference[valid], predicted[valid]))
 
-    def has_reference_of(self, other: MeasuredChannel) -> bool:
-        """Whether another tare took the same voltages, and left out the same."""
-        same = np.array_equal(self.reference, other.reference)
-        return same and np.array_equal(self.usable, other.usable)
-
     def error_ratio(self, predicted: FloatArray) -> float:
         """Variance of the errors of a model that predicts this reference (M,), over those told."""
         return (self._error_share_of(predicted) / self._error_share) ** 2

@@ -84,12 +84,20 @@ class Comparator:
         return is_new
 
     def _tare(self, reference: Reference) -> None:
+        self.channels = self.channels_of(reference)
+
+    def channels_of(self, reference: Reference) -> dict[Channel, MeasuredChannel]:
+        """The channels of a reference, with nothing put in force; for any thread.
+
+        Raises:
+            DataError: a channel has another number of voltages than the sensor.
+        """
         volts = {Channel.MAGNITUDE: reference.magnitude, Channel.STRUCTURE: reference.structure}
         noise = {
             Channel.MAGNITUDE: reference.magnitude_noise,
             Channel.STRUCTURE: reference.structure_noise,
         }
-        self.channels = {
+        return {
             name: MeasuredChannel(
                 self._description,
                 self._artifact,

@@ -19,6 +19,10 @@ from waiting import wait_until
 BOTH = (Channel.MAGNITUDE, Channel.STRUCTURE)
 
 
+def nothing() -> None:
+    pass
+
+
 class Frames:
     """In the place of imaging: keeps what it is given; `go` lets it take the next."""
 
@@ -26,7 +30,7 @@ class Frames:
         self.counters: list[int] = []
         self.go = threading.Event()
         self.reference_realtime_ns = 0
-        self.taring = SimpleNamespace(start=lambda: None, check=lambda: None)
+        self.taring = SimpleNamespace(start=nothing, check=nothing, close=nothing)
         self.calibration = SimpleNamespace(meet=lambda _: None)
 
     def has_reference(self, _: Channel) -> bool:
@@ -42,6 +46,7 @@ class Frames:
 
 def started(frames: Any, *, lossless: bool = False, replay: Replay | None = None) -> Pipeline:
     ports = 1 if replay is None else 2
+    lossless = lossless or (replay is not None and replay.is_lossless)
     pipeline = Pipeline(
         frames, BOTH, ports, 10**8, lossless, replay, lambda: None, lambda *_, **__: None
     )
