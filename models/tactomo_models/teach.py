@@ -160,7 +160,6 @@ def _reconstructed(
     presses: KnownPresses, description: SensorDescription, progress: Progress | None
 ) -> _Seen:
     """Reconstruct each press from a cold start, as the daemon does by default."""
-    # As the daemon does, whose places are corrected: it takes sheets as even.
     reconstructor = Reconstructor(description)
     reconstructor.set_reference(presses.reference)
     channels = [name for name in description.channels if name in presses.scans]
@@ -272,24 +271,19 @@ def _check_order(xy_mm: FloatArray, guess_mm: FloatArray) -> None:
 def _odd(
     changes: FloatArray, xy_mm: FloatArray, guess_mm: FloatArray, numbers: IntArray
 ) -> list[str]:
-    """Name the presses that the physics or the others contradict, whichever locates better."""
-
-    def errors_mm(found_mm: FloatArray) -> FloatArray:
-        return np.asarray(np.linalg.norm(found_mm - xy_mm, axis=1))
-
-    found_mm = min(
-        (guess_mm, PressRegression(changes, xy_mm).found_mm),
-        key=lambda found: float(np.median(errors_mm(found))),
-    )
-    off_mm = errors_mm(found_mm)
-    odd = []
-    for k in np.flatnonzero(off_mm > ODD * np.median(off_mm)):
-        x, y = xy_mm[k]
-        words = f"press {numbers[k]} at ({x:.1f}, {y:.1f}) mm"
-        if np.linalg.norm(found_mm[k] - (y, x)) < 0.5 * off_mm[k]:
-            words += ", which x and y swapped explains"
-        odd.append(words)
-    return odd
+    """Name the presses that the physics contradicts, or the others where they locate better."""
+    odd: dict[int, str] = {}
+    best_mm = np.inf
+    for found_mm in (guess_mm, PressRegression(changes, xy_mm).found_mm):
+        off_mm = np.asarray(np.linalg.norm(found_mm - xy_mm, axis=1))
+        median_mm = float(np.median(off_mm))
+        for k in np.flatnonzero(off_mm > ODD * median_mm) if median_mm < best_mm else ():
+            x, y = xy_mm[k]
+            swapped = np.linalg.norm(found_mm[k] - (y, x)) < 0.5 * off_mm[k]
+            why = ", which x and y swapped explains" if swapped else ""
+            odd[numbers[k]] = f"press {numbers[k]} at ({x:.1f}, {y:.1f}) mm{why}"
+        best_mm = median_mm
+    return [odd[number] for number in sorted(odd)]
 
 
 def _best(changes: FloatArray, xy_mm: FloatArray, guess_mm: FloatArray) -> tuple[str, float, float]:

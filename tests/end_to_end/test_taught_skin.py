@@ -1,7 +1,7 @@
 """A skin whose electrodes sit off their places: taught at the terminal, its contacts are right.
 
-The twin's electrodes are two millimetres farther apart than the description says. The session is
-at a terminal, the daemon reads the twin's serial ports, and goes by what was taught as soon as it
+The twin's electrodes are two millimetres farther apart than the description says, and its sheet is
+glued onto the robot with folds, which no voltage tells. The session is at a terminal, the daemon reads the twin's serial ports, and goes by what was taught as soon as it
 is kept.
 """
 
@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 from daemon_process import DaemonProcess
+from handmade_skin import on_sheet
 from tactomo_client import Frame, subscribe
 from tactomo_client import request as ask
 from terminal import Terminal
@@ -62,10 +63,11 @@ class Bench:
         wait_until(lambda: self.daemon.status()["state"] == "running", "a reference")
 
     def press(self, x_mm: float, y_mm: float) -> Frame:
-        """Press one place alone; returns a frame of a scan that was taken since."""
+        """Press one place of the robot alone; returns a frame of a scan that was taken since."""
+        sheet_mm = on_sheet(np.array([x_mm, y_mm]))
         where: dict[str, Any] = {
-            "x_mm": x_mm,
-            "y_mm": y_mm,
+            "x_mm": float(sheet_mm[0]),
+            "y_mm": float(sheet_mm[1]),
             "radius_mm": RADIUS_MM,
             "pressure_kpa": KPA,
         }

@@ -1,4 +1,7 @@
-"""A skin made by hand, simulated: electrodes a millimetre off, uneven contacts, an uneven sheet."""
+"""A skin made by hand, simulated: electrodes a millimetre off, uneven contacts, an uneven sheet.
+
+It is glued on with folds, too, which no voltage tells: a place on the robot is another one on it.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,11 @@ from typing import Any
 
 import numpy as np
 from tactomo_models import Press, SensorDescription, SkinSimulator, load_description
+from tactomo_models.arrays import FloatArray
 from variants import variant
 
 COARSE = {"nodes_x": 25, "nodes_y": 25}
+FOLD_MM, FOLD_LENGTH_MM = 1.5, 25.0
 SNR = 100.0  # of a voltage's change: 40 dB
 
 
@@ -25,6 +30,19 @@ def write_description(path: Path) -> Path:
     return path
 
 
+def on_robot(sheet_mm: FloatArray) -> FloatArray:
+    """Where places (..., 2) on the sheet are on the robot that it was glued on: up to 2 mm off."""
+    return np.asarray(sheet_mm + FOLD_MM * np.sin(sheet_mm[..., ::-1] / FOLD_LENGTH_MM))
+
+
+def on_sheet(robot_mm: FloatArray) -> FloatArray:
+    """The other way round."""
+    sheet_mm = robot_mm
+    for _ in range(8):  # each leaves a tenth of the error
+        sheet_mm = sheet_mm + robot_mm - on_robot(sheet_mm)
+    return sheet_mm
+
+
 def presses(count: int, *, seed: int, skin: int = 0) -> dict[str, Any]:
     """The arrays of a file of presses on one of several such skins."""
     made = variant(described(), electrodes={"pitch_m": 0.037})
@@ -36,7 +54,7 @@ def presses(count: int, *, seed: int, skin: int = 0) -> dict[str, Any]:
         simulator.voltages([Press(1e-3 * x, 1e-3 * y, rng.uniform(160, 220), 0.010)])
         for x, y in xy_mm
     ]
-    arrays: dict[str, Any] = {"xy_mm": xy_mm}
+    arrays: dict[str, Any] = {"xy_mm": on_robot(xy_mm)}
     for name, volts in rest.items():
         scans = np.array([each[name] for each in pressed])
         noise = np.sqrt(np.mean((scans - volts) ** 2)) / SNR

@@ -147,8 +147,9 @@ class SheetEstimator:
         ratio = np.where(usable, voltages / shape.voltages, 1.0)
         if not usable.any():
             return None
-        ratio[usable] /= np.median(ratio[usable])
-        return np.log(ratio) if (ratio > 0).all() else None
+        with np.errstate(over="ignore"):
+            ratio[usable] /= np.median(ratio[usable])
+        return np.log(ratio) if ((ratio > 0) & (ratio < np.inf)).all() else None
 
     def _shape(self, parameters: FloatArray) -> _Shape:
         modes, impedances, places = np.split(
