@@ -1,8 +1,8 @@
 """A skin whose electrodes sit off their places: taught at the terminal, its contacts are right.
 
 The twin's electrodes are two millimetres farther apart than the description says, and its sheet is
-glued onto the robot with folds, which no voltage tells. The session is at a terminal, the daemon reads the twin's serial ports, and goes by what was taught as soon as it
-is kept.
+glued onto the robot with folds, which no voltage tells. The session is at a terminal, the daemon
+reads the twin's serial ports, and goes by what was taught as soon as it is kept.
 """
 
 from __future__ import annotations
