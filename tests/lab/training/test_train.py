@@ -13,11 +13,14 @@ import numpy as np
 import pytest
 import torch
 from small_sensor import SMALL
-from tactomo_lab.baselines.paper_network import PaperNetwork, preprocessed
+from tactomo_lab.baselines import paper_network
+from tactomo_lab.baselines.paper_network import preprocessed
 from tactomo_lab.commands.training import ConfigurationName
 from tactomo_lab.scenes.presets import PresetName
 from tactomo_lab.training.batches import Batch, SceneBatches
 from tactomo_lab.training.configurations import CONFIGURATIONS, Prepared, export_trained, prepare
+from tactomo_lab.training.networks import PaperNetwork
+from tactomo_lab.training.objectives import PaperObjective, correlations
 from tactomo_lab.training.preliminary import make_images, read_images
 from tactomo_lab.training.train import (
     Settings,
@@ -202,7 +205,31 @@ class TestExported:
         with torch.inference_mode():
             expected = training.averaged(*(torch.as_tensor(one)[None] for one in ready.values()))
         np.testing.assert_allclose(network.run(ready)["map"], expected[0].numpy(), atol=5e-3)
-        assert PaperNetwork(network).image(images).shape == (21, 21)
+        assert paper_network.PaperNetwork(network).image(images).shape == (21, 21)
+
+
+def test_the_papers_network_begins_as_a_regression() -> None:
+    """Begun at random, it settles on the mean of all maps: silent everywhere."""
+    random = torch.Generator().manual_seed(0)
+    scenes, features, maps = (
+        torch.randn(n, generator=random) for n in ((300, 5), (5, 8192), (5, 441))
+    )
+    goals = 20 + scenes @ maps  # nowhere below 0, where the last ReLU is silent
+    network = PaperNetwork(2, (21, 21), width=2, hidden=16).train()
+    network.start_linear(scenes @ features, goals)
+    with torch.inference_mode():
+        made = network.connected(scenes @ features)
+    assert torch.square(made - goals).mean() < 0.02 * goals.var(0).mean()
+
+
+def test_images_are_turned_as_their_maps_are(paper: Path, square: SensorDescription) -> None:
+    objective = PaperObjective(paper, square, multimodal=True, scale=0.25)
+    scenes = torch.zeros(24, dtype=torch.int64)
+    images, maps = objective.draw(scenes, torch.Generator().manual_seed(0))
+    assert len({one.numpy().tobytes() for one in maps}) == 8
+    for image in images:
+        alike = correlations(image, maps)
+        assert torch.allclose(alike, alike[:1], atol=1e-5)
 
 
 def test_permuted_electrodes_are_a_turned_scene(ours: Prepared, square: SensorDescription) -> None:
