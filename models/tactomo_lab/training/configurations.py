@@ -41,8 +41,8 @@ class Configuration:
     hidden: int = 0
 
 
-# The paper: 200 epochs in batches of 128 at a constant rate of 1e-4, without turning the scenes. A
-# rate that rises and falls takes a tenth of that, an hour or two on a core, on narrower convolutions.
+# The paper: 200 epochs in batches of 128 at a constant rate of 1e-4, without turning the scenes.
+# Begun as a regression, at a rate that rises and falls, a tenth of that is enough.
 _PAPER = Settings(epochs=24, batch=64, rate=5e-4, weight_decay=0.0)
 
 _OURS = Settings(epochs=40, batch=64)
