@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 from tactomo.errors import TactomoError
 from tactomo.recordings.imported_scans import read_scans
-from tactomo_models import DataError, Press, SkinSimulator, load_description
+from tactomo_models import DataError, DescriptionError, Press, SkinSimulator, load_description
 from tactomo_models.archive import read_arrays
 from tactomo_models.array_files import READERS
 from tactomo_models.arrays import FloatArray
@@ -210,6 +210,22 @@ def test_what_cannot_be_told_apart_is_asked_for(tactomo: Run, tmp_path: Path) ->
     assert "give --reference-frames" in tactomo(*asked, "--array", "b").stderr
     assert "no numbers called 'c'" in tactomo(*asked, "--array", "c").stderr
     assert "is no pattern; give" in tactomo(*asked, "--pattern", "16:far").stderr
+
+
+@given(st.from_regex(r"[0-9]{1,3}(:[a-z0-9-]{1,9}){0,3}(:rotated)?", fullmatch=True))
+def test_any_pattern_is_applied_or_refused_by_name(name: str) -> None:
+    with suppress(DataError, DescriptionError):
+        named = NamedPattern.of_name(name)
+        sensor = named.applied(load_description("tank_disc"))
+        assert NamedPattern.of_name(str(named)) == named
+        assert sorted(named.order) == list(range(sensor.measurements))
+
+
+def test_doctor_examines_them_too(tactomo: Run, tmp_path: Path) -> None:
+    (tmp_path / "rest.csv").write_text(text(np.vstack([tank()[0]] * 5)))
+    result = tactomo("doctor", tmp_path / "rest.csv")
+    assert result.returncode == 0, result.stdout
+    assert "healthy" in result.stdout
 
 
 @pytest.mark.parametrize("ending", sorted(READERS))

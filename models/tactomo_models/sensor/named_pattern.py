@@ -10,9 +10,10 @@ from __future__ import annotations
 from typing import Final, NamedTuple, Self
 
 import numpy as np
+from pydantic import ValidationError
 
 from tactomo_models.arrays import FloatArray, IntArray
-from tactomo_models.errors import DataError, DescriptionError
+from tactomo_models.errors import DataError, DescriptionError, explain
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.sensor.pattern import (
     PatternLayout,
@@ -53,7 +54,9 @@ class NamedPattern(NamedTuple):
             words = {"adjacent": 1, "opposite": electrodes // 2}
             told = [words.get(o) or int(o) for o in (offsets[:-1] if rotated else offsets)]
             drive, measure = told if len(told) == 2 else told * 2
-            if not 0 < min(drive, measure) <= max(drive, measure) < electrodes <= MAX_ELECTRODES:
+            if not MIN_ELECTRODES <= electrodes <= MAX_ELECTRODES:
+                raise ValueError
+            if not 0 < min(drive, measure) <= max(drive, measure) <= electrodes // 2:
                 raise ValueError
         except ValueError:
             raise DataError(
@@ -104,7 +107,11 @@ class NamedPattern(NamedTuple):
             "drive_offset": self.drive,
             "measure_offset": self.measure,
         }
-        return SensorDescription.model_validate(raw)
+        try:
+            return SensorDescription.model_validate(raw)
+        except ValidationError as error:
+            why = explain(error.errors()[0])
+            raise DescriptionError(f"{description.name!r} with {self}: {why}") from error
 
 
 def fitting_patterns(scans: FloatArray) -> list[NamedPattern]:

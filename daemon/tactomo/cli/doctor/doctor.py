@@ -44,7 +44,7 @@ def doctor(
         Path | None,
         typer.Argument(
             metavar="[FILE]",
-            help="A recording (.mcap) or measured scans (.npz); without, a daemon that runs.",
+            help="A recording (.mcap) or scans (.npz, .mat, text); without, a daemon that runs.",
         ),
     ] = None,
     sensor: options.SensorName = options.DEFAULT_NAME,
@@ -127,6 +127,8 @@ def doctor(
 def _of_file(
     what: Path, description: str | None, frames: slice | None, array: str | None, lookup: str
 ) -> Evidence:
+    from tactomo_models.array_files import READERS
+
     from tactomo.cli.doctor.evidence import DoctorError, of_arrays, of_recording
 
     suffix = what.suffix.lower()
@@ -137,7 +139,7 @@ def _of_file(
         recording = open_recording(what)
         warn_of_damage(recording)
         return of_recording(recording, description, frames)
-    if suffix == ".npz":
+    if suffix in (".npz", *READERS):
         return of_arrays(what, description, array, lookup, frames)
     raise DoctorError(f"{what} is neither .mcap nor .npz", "give a recording, scans, or no file")
 

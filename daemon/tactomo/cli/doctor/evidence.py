@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tactomo_client import Keys
 from tactomo_models import DescriptionError, SensorDescription, load_description
+from tactomo_models.array_files import NUMBERS
 from tactomo_models.arrays import FloatArray
 from tactomo_models.scans.plausibility import Layout
 from tactomo_models.sensor.pattern import (
@@ -427,7 +428,7 @@ def _plain_evidence(
     lookup: str,
     frames: slice | None,
 ) -> Evidence:
-    name = name or next((known for known in AT_REST if known in arrays), None)
+    name = name or next((known for known in (*AT_REST, NUMBERS) if known in arrays), None)
     if name is None and CHANGES in arrays:
         raise DoctorError(
             f"{path} holds changes of voltages ({CHANGES}) and no scans at rest: noise and "
