@@ -219,6 +219,7 @@ def test_any_pattern_is_applied_or_refused_by_name(name: str) -> None:
         sensor = named.applied(load_description("tank_disc"))
         assert NamedPattern.of_name(str(named)) == named
         assert sorted(named.order) == list(range(sensor.measurements))
+        assert sensor.electrodes.length_m * sensor.electrode_count == pytest.approx(0.008 * 16)
 
 
 def test_doctor_examines_them_too(tactomo: Run, tmp_path: Path) -> None:
