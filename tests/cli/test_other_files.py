@@ -212,7 +212,17 @@ def test_what_cannot_be_told_apart_is_asked_for(tactomo: Run, tmp_path: Path) ->
     assert "is no pattern; give" in tactomo(*asked, "--pattern", "16:far").stderr
 
 
-@given(st.from_regex(r"[0-9]{1,3}(:[a-z0-9-]{1,9}){0,3}(:rotated)?", fullmatch=True))
+OFFSETS = st.sampled_from(["adjacent", "opposite", "far", ""]) | st.integers(-1, 40).map(str)
+
+
+@given(
+    st.builds(
+        lambda count, offsets, rotated: ":".join([str(count), *offsets, *rotated]),
+        st.integers(0, 70),
+        st.lists(OFFSETS, max_size=3),
+        st.sampled_from([[], ["rotated"]]),
+    )
+)
 def test_any_pattern_is_applied_or_refused_by_name(name: str) -> None:
     with suppress(DataError, DescriptionError):
         named = NamedPattern.of_name(name)
