@@ -124,24 +124,28 @@ int find_areas(const Sheet *s, int64_t count, const int64_t *where, Areas *a) {
     }
   }
   a->start[a->layers] = done;
-  for (int64_t i = 0; i < t; i++)
+  for (int64_t i = 0; i < t && done == n; i++)
     for (int c = 0; c < 3; c++)
       a->corner[3 * i + c] = place[s->corner_support[3 * a->triangle[i] + c]];
   free(place), free(hit);
-  return 0;
+  return done == n ? 0 : 1; /* an area without a rim: on no sheet is there one */
 }
 
 /* What the bare areas' law makes of potentials: `bare` (rim, width), columns, is the law on the rims
- * times `both` (near, width). */
-void apply_rim_law(const Sheet *s, const Areas *a, int64_t width, const double *both,
+ * times `both` (near, width). Returns -1 without memory. */
+int apply_rim_law(const Sheet *s, const Areas *a, int64_t width, const double *both,
                    double *bare) {
   int64_t rim = 0, near = 0;
   int64_t *row = malloc(sizeof(int64_t) * 2 * (a->nodes + 1)), *column = row + a->nodes;
+  double *law = calloc(a->rim * a->near + 1, sizeof(double)); /* columns (near, rim) */
+  if (!row || !law) {
+    free(row), free(law);
+    return -1;
+  }
   for (int64_t i = 0; i < a->nodes; i++) {
     row[i] = a->depth[i] == 0 ? rim++ : -1;
     column[i] = a->depth[i] <= 1 ? near++ : -1;
   }
-  double *law = calloc(rim * near + 1, sizeof(double)); /* columns (near, rim) */
   for (int64_t i = 0; i < a->triangles; i++) {
     int64_t t = a->triangle[i];
     const int64_t *corner = a->corner + 3 * i;
@@ -153,6 +157,7 @@ void apply_rim_law(const Sheet *s, const Areas *a, int64_t width, const double *
   }
   multiply('T', 'T', rim, width, near, 1.0, law, near, both, width, 0.0, bare, rim);
   free(law), free(row);
+  return 0;
 }
 
 /* Conductivity of a triangle as its corners have it, and whether none is worse than at rest. */
@@ -177,19 +182,22 @@ int solve(const Sheet *s, const Areas *a, int mixes_resistivities, const double 
           const double *both, const double *bare, double *voltages, double *potentials,
           double *injected) {
   int F = s->fields, r = a->rim, width = r + F, failed = 0;
-  int64_t total = 0, largest = 0, i, l;
+  int64_t total = 0, i, l;
   int64_t *offset = malloc(sizeof(int64_t) * (a->layers + 1));
-  for (l = 0; l < a->layers; l++) {
+  for (l = 0; offset && l < a->layers; l++) {
     int64_t size = a->start[l + 1] - a->start[l];
     int64_t outer = a->depth[a->start[l]] ? a->start[l] - a->start[l - 1] : 0;
     offset[l] = total, total += (outer + size) * size;
-    if (size > largest) largest = size;
   }
   /* Of each layer its coupling (outer, size) with the next one outwards, and its own block. */
   double *flat = calloc(total + 1, sizeof(double));
-  double *added = malloc(sizeof(double) * (width * r + largest * F + F * F + 1));
-  double *scratch = added + width * r, *moved = scratch + largest * F;
+  double *added = malloc(sizeof(double) * (width * r + F * F + 1));
+  double *moved = added + width * r;
   int *pivots = malloc(sizeof(int) * (r + 1));
+  if (!offset || !flat || !added || !pivots) {
+    free(offset), free(flat), free(added), free(pivots);
+    return -1;
+  }
   for (i = 0; i < a->triangles; i++) {
     int64_t t = a->triangle[i];
     const int64_t *corner = a->corner + 3 * i;

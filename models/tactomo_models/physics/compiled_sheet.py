@@ -59,8 +59,8 @@ class CompiledAreas:
         starts = (sizes.cumsum() - sizes).tolist()
         address = self._kept.ctypes.data
         self.found = _Areas(0, 0, 0, 0, 0, *(address + 8 * start for start in starts))
-        if LIBRARY.find_areas(ctypes.byref(sheet), len(where), at(where), ctypes.byref(self.found)):
-            raise MemoryError
+        of, found = ctypes.byref(sheet), ctypes.byref(self.found)
+        _check(LIBRARY.find_areas(of, len(where), at(where), found))
         count = self.found.nodes
         self.nodes = self._kept[starts[2] : starts[2] + count]
         depth = self._kept[starts[4] : starts[4] + count]
@@ -68,13 +68,7 @@ class CompiledAreas:
         self.rim = self.nodes[depth == 0]
         both = np.concatenate([bare.green.between(near, self.rim), bare.potentials[near]], axis=1)
         self.bare_both = np.empty((both.shape[1], len(self.rim)))
-        LIBRARY.apply_rim_law(
-            ctypes.byref(sheet),
-            ctypes.byref(self.found),
-            both.shape[1],
-            at(both),
-            at(self.bare_both),
-        )
+        _check(LIBRARY.apply_rim_law(of, found, both.shape[1], at(both), at(self.bare_both)))
         self.both = both[depth[depth <= 1] == 0]
 
 
@@ -126,15 +120,14 @@ class CompiledSheet:
         voltages = np.empty(self._sheet.voltages)
         potentials = np.empty((len(areas.nodes), self._sheet.fields))
         injected = np.empty((self._sheet.fields, len(areas.rim)))
-        failed = LIBRARY.solve(
+        made = LIBRARY.solve(
             ctypes.byref(self._sheet),
             ctypes.byref(areas.found),
             int(mix_resistivities),
             *(at(each) for each in (change, areas.both, areas.bare_both)),
             *(at(each) for each in (voltages, potentials, injected)),
         )
-        if failed:
-            raise np.linalg.LinAlgError("a conductivity of zero or less has no solution")
+        _check(made)
         return voltages, potentials, injected.T
 
     def jacobian(
@@ -150,11 +143,20 @@ class CompiledSheet:
         place = np.full(self._sheet.pressable, -1)
         place[areas.where] = np.arange(len(areas.where))
         jacobian = np.empty((self._sheet.voltages, onto.shape[1]))
-        LIBRARY.differentiate(
+        made = LIBRARY.differentiate(
             ctypes.byref(self._sheet),
             ctypes.byref(areas.found),
             *(at(each) for each in (potentials, mixed, place)),
             onto.shape[1],
             *(at(each) for each in (onto, jacobian)),
         )
+        _check(made)
         return jacobian
+
+
+def _check(made: int) -> None:
+    """Raise what a call into C has to say."""
+    if made < 0:
+        raise MemoryError
+    if made > 0:
+        raise np.linalg.LinAlgError("a conductivity of zero or less has no solution")

@@ -205,13 +205,13 @@ class FieldAccountant:
         if count == 0:
             return known
         family, drawing = fitted.family, fitted.drawing
-        count_free = len(fitted.parameters)
-        J, covariance = np.zeros((0, count_free)), np.zeros((count_free, count_free))
+        by_share = by_pressure = np.zeros((len(drawing.nodes), 0))
+        covariance = np.zeros((0, 0))  # what is known for sure
         if needs_sigmas:
             J = self._fit.jacobian(fitted, measured, drawing)
             precision = self._fit.prior(fitted)[0]
             covariance = covariance_of(J, precision, measured, fitted.misfit)[:-1, :-1]
-        _, by_share, by_pressure = drawing.slopes()
+            _, by_share, by_pressure = drawing.slopes()
         cell = self._areas.node_areas_m2[drawing.nodes]
         share, pressure = drawing.share, drawing.pressure_kpa
 
@@ -249,14 +249,12 @@ class FieldAccountant:
             each = family.split(fitted.parameters)
             owner = self._owners(each, places[:, highest])
             peaks, edges = family.unit_kpa * each[owner, PEAK], each[owner, EDGE]
-            index = family.index
-            by_peak = np.zeros_like(by_peak)
-            by_peak[np.arange(count), index[owner, PEAK]] = family.unit_kpa
             if needs_sigmas:
+                index = family.index[owner, PEAK]
+                by_peak = family.unit_kpa * np.eye(by_share.shape[1])[index]
+                is_least = each[owner, PEAK] <= family.peak_limits[0]
                 known["goes_wrong_way"] = self._goes_wrong_way(
-                    J[:, index[owner, PEAK]],
-                    fitted.residual,
-                    each[owner, PEAK] <= family.peak_limits[0],
+                    J[:, index], fitted.residual, is_least
                 )
         peak_size, peak_slope = (np.abs(v) for v in self._graded.relative_change(peaks))
         scale = areas.areas_m2 / area  # the map's, over the mesh's
