@@ -139,8 +139,8 @@ def train(
     *ours* takes both channels' voltages, *ours-small* is half as wide, *ours-single* has the
     magnitude channel alone. All these want the preset robust. *paper-single* and *paper-multimodal*
     are the paper's, on scenes of the preset paper, whose images are computed first and kept beside
-    them. All take one to two hours on two cores; stopped early, one is finished by --start with a few
-    epochs at a lower --rate.
+    them. All take one to two hours on two cores; after less, a few epochs with --start and a lower
+    --rate finish one.
 
     A network that is written to the cache is used from then on for this sensor, instead of the one
     that ships; delete it to go back. Needs `pip install 'tactomo-lab[train]'`.
