@@ -25,6 +25,7 @@ from tactomo_protocol import Channel
 
 from tactomo.errors import CommandError
 from tactomo.events import OnEvent
+from tactomo.memory import trim_memory
 from tactomo.timing import Rate
 
 MOVEMENT_LIMIT: Final = 1e-3
@@ -161,6 +162,7 @@ class Taring:
         except ModelError as error:
             self._refuse(tare, _refusal_of(error))
             return
+        trim_memory()
         if not is_new:
             return
         shown = f", while {contacts} contact(s) were shown" if contacts else ""

@@ -18,10 +18,10 @@ from tactomo.events import EventBook
 from tactomo.imaging.frames import description_fields, port_fields, pressure_fields, taught_fields
 from tactomo.imaging.imaging import Imaging
 from tactomo.imaging.pipeline import Pipeline
+from tactomo.memory import resident_bytes
 from tactomo.recordings.playback import Playback
 from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording import REPLAY_SCHEME
-from tactomo.service.memory import resident_bytes
 from tactomo.timing import Durations, LastMinute
 
 VERSION: Final = version("tactomo")  # read from a file, which may fail later

@@ -235,7 +235,7 @@ def _run_skins(skins: Skins) -> int:
 
 def _prepare(settings: DaemonConfig) -> None:
     from tactomo.log import configure_logging
-    from tactomo.service.memory import return_freed_memory
+    from tactomo.memory import return_freed_memory
 
     return_freed_memory()
     configure_logging(settings.log_level, settings.log_format)

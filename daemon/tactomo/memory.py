@@ -27,3 +27,9 @@ def return_freed_memory() -> None:
         set_option = ctypes.CDLL(None).mallopt
         set_option(arena_max, 1)
         set_option(mmap_threshold, large_bytes)
+
+
+def trim_memory() -> None:
+    """Give back what is freed already, but lies between what is held: 28 MB after a tare."""
+    with suppress(AttributeError, OSError):
+        ctypes.CDLL(None).malloc_trim(0)
