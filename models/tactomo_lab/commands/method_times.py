@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from tactomo.cli.bench.machine_speed import warned_if_busy
-from tactomo.service.memory import resident_bytes, return_freed_memory
+from tactomo.memory import resident_bytes, return_freed_memory
 from tactomo.twin import make_skin
 from tactomo.twin.device import NOISE_SHARE
 from tactomo_models import (
