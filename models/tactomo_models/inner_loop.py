@@ -48,7 +48,11 @@ def _loaded() -> ctypes.CDLL | None:
 LIBRARY = _loaded()
 
 
-def at(array: NDArray[Any] | None) -> int | None:
-    """Where a contiguous array's values are, for C; NULL for None."""
+def at(array: NDArray[Any] | None) -> ctypes.c_void_p | None:
+    """Where a contiguous array's values are, for C; NULL for None.
+
+    It holds the array: one that nobody else has, such as a property's, would be freed before C
+    reads it.
+    """
     assert array is None or array.flags.c_contiguous
-    return None if array is None else array.ctypes.data
+    return None if array is None else array.ctypes.data_as(ctypes.c_void_p)

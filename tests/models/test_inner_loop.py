@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import weakref
+
 import numpy as np
 import pytest
 from tactomo_models import Artifact, SensorDescription
 from tactomo_models.arrays import FloatArray, IntArray
-from tactomo_models.inner_loop import LIBRARY
+from tactomo_models.inner_loop import LIBRARY, at
 from tactomo_models.physics import forward
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scene import pressure_field
@@ -112,3 +114,14 @@ def test_a_sheet_is_solved_and_differentiated_alike(
         model.jacobian(one, elsewhere, onto := np.ones((100, 1))),
         in_numpy.jacobian(other, elsewhere, onto),
     )
+
+
+def test_what_c_is_given_lives_as_long_as_its_address() -> None:
+    """A property's array has nobody else: C once read what was freed."""
+    array = np.arange(3)
+    alive = weakref.ref(array)
+    address = at(array)
+    del array
+    assert alive() is not None
+    del address
+    assert alive() is None
