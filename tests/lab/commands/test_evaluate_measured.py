@@ -129,4 +129,4 @@ def test_the_page_in_docs_can_be_made_again() -> None:
     text = (repository() / "docs" / "measured.md").read_text()
     assert text.count(BEGIN) == text.count(END) == 1
     between = text[text.index(BEGIN) : text.index(END)]
-    assert all(f"### {each.file}\n" in between and each.published in between for each in SETS)
+    assert all(f"## {each.file}\n" in between and each.published in between for each in SETS)
