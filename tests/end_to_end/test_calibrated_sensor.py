@@ -99,7 +99,11 @@ def test_a_guided_session_makes_pressures_right(
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     bench = Bench(twin, tmp_path)
     wrong = bench.contact(200)
-    assert wrong.pressure_kpa == pytest.approx(200 / STIFFER, abs=6), "the description's table"
+    assert wrong.pressure_kpa is not None
+    assert wrong.pressure_sigma_kpa is not None
+    too_low = (wrong.pressure_kpa - 200 / STIFFER) / wrong.pressure_sigma_kpa
+    assert abs(too_low) < 3.5, "the description's table"
+    assert wrong.pressure_kpa < 190
     bench.clear()
     addresses = ("--stream", bench.daemon.stream, "--control", bench.daemon.control)
     with Terminal("calibrate", "live", "--sensor", NAME, *addresses) as terminal:

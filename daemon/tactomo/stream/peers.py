@@ -114,8 +114,8 @@ class Peers:
 
     def _discard(self) -> None:
         for _ in range(DISCARDED_AT_ONCE):
-            self._socket.recv()
-            if not self._socket.rcvmore:
+            # Frames know whether more follow; asking the socket each time takes twice as long again.
+            if not self._socket.recv(copy=False, track=False).more:
                 self._is_discarding = False
                 return
 

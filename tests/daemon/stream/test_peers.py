@@ -63,7 +63,8 @@ def test_a_message_of_a_million_parts_holds_up_nobody(daemon: DaemonProcess, par
             begin_s = time.monotonic()
             request("status", daemon.control, 10.0)
             slowest_s = max(slowest_s, time.monotonic() - begin_s)
-    assert slowest_s < 2.0
+    # Where its parts are in before it is cut, some seconds on a busy computer; uncut, without end.
+    assert slowest_s < 5.0
 
 
 @pytest.mark.parametrize(("socket_name", "kind"), [("control", b"DEALER"), ("stream", b"SUB")])
