@@ -19,6 +19,9 @@ status 1; a traceback is for a mistake of ours.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class TactomoError(Exception):
     """Base of everything that tactomo raises on purpose."""
@@ -31,6 +34,15 @@ class TactomoError(Exception):
         self.name = name or type(self).name
         self.cause = cause  # what went wrong, for people
         self.next_step = next_step  # what to do about it, for people; may be empty
+
+
+@contextmanager
+def needs(what: str, install: str) -> Iterator[None]:
+    """Raise TactomoError, which says how to install it, where a block lacks what it imports."""
+    try:
+        yield
+    except ImportError as error:
+        raise TactomoError(f"{what} needs {error.name}, which is not installed", install) from error
 
 
 class ConfigError(TactomoError):

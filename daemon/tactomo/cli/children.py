@@ -206,6 +206,14 @@ def interrupt_on_sigterm() -> None:
     signal.signal(signal.SIGTERM, interrupt)
 
 
+def stop_asked() -> threading.Event:
+    """Return an event that SIGINT and SIGTERM set, which otherwise do nothing from then on."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    return stop
+
+
 def print_ready(addresses: Mapping[str, object]) -> None:
     """Print the one line of JSON by which other programs know that this one is ready."""
     print(json.dumps({"ready": True, **addresses}), flush=True)

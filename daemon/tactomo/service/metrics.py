@@ -20,18 +20,14 @@ from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 from tactomo_client.web_access import names_this_computer
 from tactomo_models import Flag
 
-from tactomo.errors import AddressError, ConfigError
+from tactomo.errors import AddressError, needs
 from tactomo.timing import Durations
 from tactomo.worker import Worker
 
-try:
+with needs("`metrics`", "pip install 'tactomo[metrics]'"):
     from prometheus_client import CollectorRegistry, ProcessCollector, make_wsgi_app
     from prometheus_client.core import Metric
     from prometheus_client.registry import Collector
-except ImportError as error:
-    raise ConfigError(
-        "metrics need prometheus_client, which is not installed", "pip install 'tactomo[metrics]'"
-    ) from error
 
 STATES: Final = (
     *("waiting_for_port", "waiting_for_data", "taring", "running", "late", "stale"),

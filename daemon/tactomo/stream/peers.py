@@ -114,7 +114,7 @@ class Peers:
 
     def _discard(self) -> None:
         for _ in range(DISCARDED_AT_ONCE):
-            # Frames know whether more follow; asking the socket each time takes twice as long again.
+            # Frames know whether more follow; to ask the socket takes twice as long again.
             if not self._socket.recv(copy=False, track=False).more:
                 self._is_discarding = False
                 return

@@ -17,6 +17,7 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 from tactomo.cli.bench.machine_speed import warned_if_busy
+from tactomo.cli.output import table
 from tactomo.cli.plot.plot import prepare_file, prepare_picture, save_figure
 from tactomo.errors import TactomoError
 from tactomo_models import SensorDescription, available_methods, load_description
@@ -175,14 +176,14 @@ def write_table(rows: Sequence[dict[str, Any]], machine: str, path: Path) -> Non
 
 def table_of(points: Sequence[trade_off.Point]) -> Table:
     """Lay out the Pareto fronts: that than which nothing is both faster and more right."""
-    from rich.table import Table
-
-    table = Table(title="Pareto fronts (simulated, one thread): the best for its time")
-    for name in ("scenes", "method", "p50 ms", "p99 ms", "ICC", "worst", "count", "wrong"):
-        table.add_column(name, justify="left" if name in ("scenes", "method") else "right")
+    shown = table(
+        *("scenes", "method", "p50 ms", "p99 ms", "ICC", "worst", "count", "wrong"),
+        left=("method",),
+        title="Pareto fronts (simulated, one thread): the best for its time",
+    )
     for panel in trade_off.panels(points):
         for point in trade_off.pareto_front(panel):
-            table.add_row(
+            shown.add_row(
                 f"{point.scene}, {point.snr_db:g} dB",
                 str(point.variant),
                 f"{point.p50_s * 1e3:.1f}",
@@ -192,5 +193,5 @@ def table_of(points: Sequence[trade_off.Point]) -> Table:
                 f"{point.count_right:.0%}",
                 f"{point.confidently_wrong:.0%}",
             )
-        table.add_section()
-    return table
+        shown.add_section()
+    return shown

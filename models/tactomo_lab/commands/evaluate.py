@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 import typer
 from tactomo.cli import options
 from tactomo.cli.commands import Group
+from tactomo.cli.output import print_json, table
 from tactomo.cli.plot.plot import prepare_picture
 
 if TYPE_CHECKING:
@@ -205,19 +205,6 @@ def shown(items: Iterable[Item], total: int | None, what: str) -> Iterator[Item]
     )
 
 
-def print_json(told: dict[str, Any]) -> None:
-    """Print what programs read; what is not a finite number is null."""
-    typer.echo(json.dumps(_finite(told), indent=2))
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def _as_json(outcomes: Sequence[Outcome]) -> dict[str, Any]:
     from tactomo_lab.scenes.measures import summaries, summarise
 
@@ -321,13 +308,8 @@ def _print_moving(settings: dict[str, Any], title: str, phases: dict[str, PhaseS
 
 def summary_table(title: str, groups: Mapping[str, object], columns: Sequence[str]) -> Table:
     """Return a table of summaries by the name of each, its columns some of `FIGURES`."""
-    from rich import box
-    from rich.table import Table
-
-    table = Table(title=title, box=box.SIMPLE_HEAD, padding=0, title_justify="left")
-    table.add_column("", no_wrap=True)
-    for name in columns:
-        table.add_column(name, justify="right", no_wrap=True, min_width=3)
+    made = table("", *columns, title=title)
     for name, summary in groups.items():
-        table.add_row(name, *(FIGURES[column](summary).replace("nan", "-") for column in columns))
-    return table
+        cells = (FIGURES[column](summary).replace("nan", "-") for column in columns)
+        made.add_row(name, *cells)
+    return made

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from tactomo.cli.options import DEFAULT_DESCRIPTION, Description, JsonOutput, examples, typer_app
+from tactomo.cli.output import print_json, table
 from tactomo.cli.plot.plot import prepare_picture, save_figure
 
-from tactomo_lab.commands.evaluate import Picture, Seeds, print_json, shown
+from tactomo_lab.commands.evaluate import Picture, Seeds, shown
 
 if TYPE_CHECKING:
     from tactomo_lab.evaluation.drifting import Day, DaySummary, Seen
@@ -84,20 +85,15 @@ def drift(
 
 
 def _print(sensor: str, hours: float, told: Sequence[tuple[str, DaySummary, DaySummary]]) -> None:
-    from rich import box
     from rich.console import Console
-    from rich.table import Table
 
     console = Console()
     console.print(f"Simulated, not measured: {sensor}, {hours:g} hours after one tare.")
     for name, tracked, untracked in told:
-        table = Table(box=box.SIMPLE_HEAD)
-        table.add_column(name)
-        for how in ("tracked", "untracked"):
-            table.add_column(how, justify="right")
+        made = table(name, "tracked", "untracked")
         for figure, with_it, without in zip(FIGURES, _told(tracked), _told(untracked), strict=True):
-            table.add_row(figure, with_it, without)
-        console.print(table)
+            made.add_row(figure, with_it, without)
+        console.print(made)
 
 
 def _told(summary: DaySummary) -> list[str]:

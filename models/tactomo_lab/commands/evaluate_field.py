@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from tactomo.cli import options
+from tactomo.cli.output import print_json
 from tactomo.cli.plot.plot import prepare_picture
 
 from tactomo_lab.commands import evaluate
@@ -71,7 +72,7 @@ def field(
                 typer.echo(f"left out: {line}: {error}", err=True)
     settings = evaluate.settings_of(description.name, seeds, "change", method)
     if as_json:
-        evaluate.print_json({**settings, "scenes_each": count, "lines": _as_json(scores)})
+        print_json({**settings, "scenes_each": count, "lines": _as_json(scores)})
     else:
         _print(settings, scores)
     if picture is not None:

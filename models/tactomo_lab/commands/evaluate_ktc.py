@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from tactomo.cli.options import Description, JsonOutput, examples, typer_app
+from tactomo.cli.output import print_json, table
 from tactomo.cli.plot.plot import prepare_picture, save_figure
 from tactomo.errors import TactomoError
 
-from tactomo_lab.commands.evaluate import Picture, print_json, shown
+from tactomo_lab.commands.evaluate import Picture, shown
 
 if TYPE_CHECKING:
     from tactomo_lab.evaluation.ktc import Challenge, ChallengeOutcome
@@ -72,17 +73,15 @@ def ktc(
 
 
 def _print(tanks: list[ChallengeOutcome]) -> None:
-    from rich import box
     from rich.console import Console
-    from rich.table import Table
 
-    table = Table("tank", "level", "readings", "score", "misfit", "CPU s", box=box.SIMPLE_HEAD)
+    made = table("tank", "level", "readings", "score", "misfit", "CPU s")
     for number, tank in enumerate(tanks):
         figures = f"{tank.score:.3f}", f"{tank.misfit:.2f}", f"{tank.seconds:.1f}"
-        table.add_row(str(number), str(tank.level), str(tank.readings), *figures)
-    table.add_section()
-    table.add_row("[bold]sum[/]", "", "", f"[bold]{sum(tank.score for tank in tanks):.3f}[/]")
-    Console().print(table)
+        made.add_row(str(number), str(tank.level), str(tank.readings), *figures)
+    made.add_section()
+    made.add_row("[bold]sum[/]", "", "", f"[bold]{sum(tank.score for tank in tanks):.3f}[/]")
+    Console().print(made)
 
 
 def _draw(given: Challenge, tanks: list[ChallengeOutcome], output: Path) -> None:

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from tactomo.cli.options import Description, JsonOutput, examples, method_option, typer_app
+from tactomo.cli.output import print_json, table
 from tactomo.cli.plot.plot import prepare_picture, save_figure
 from tactomo.errors import TactomoError
 
-from tactomo_lab.commands.evaluate import Picture, print_json, shown
+from tactomo_lab.commands.evaluate import Picture, shown
 
 if TYPE_CHECKING:
     from rich.status import Status
@@ -103,29 +104,23 @@ def _tanks_as_json(methods: Sequence[str], outcomes: Sequence[TankOutcome]) -> d
 def _print_tanks(
     facts: dict[str, Any], methods: Sequence[str], outcomes: Sequence[TankOutcome]
 ) -> None:
-    from rich import box
     from rich.console import Console
-    from rich.table import Table
 
-    table = Table(box=box.SIMPLE_HEAD)
-    table.add_column("correlation with the truth")
-    for method in methods:
-        table.add_column(method, justify="right")
-    table.add_column("confidence", justify="right")
+    made = table("correlation with the truth", *methods, "confidence")
     by_tank = [outcomes[i : i + len(methods)] for i in range(0, len(outcomes), len(methods))]
     for of_tank in by_tank:
         figures = (f"{outcome.correlation:.3f}" for outcome in of_tank)
         sure = [f"{o.confidence:.2f}" for o in of_tank if o.method == "network"]
-        table.add_row(of_tank[0].name, *figures, *sure)
-    table.add_section()
+        made.add_row(of_tank[0].name, *figures, *sure)
+    made.add_section()
     means = (f"{_mean(outcomes, method):.3f}" for method in methods)
-    table.add_row("[bold]mean[/]", *(f"[bold]{mean}[/]" for mean in means))
+    made.add_row("[bold]mean[/]", *(f"[bold]{mean}[/]" for mean in means))
     longest = (max(o.seconds for o in outcomes if o.method == method) for method in methods)
-    table.add_row("seconds, longest", *(f"{seconds:.2f}" for seconds in longest))
+    made.add_row("seconds, longest", *(f"{seconds:.2f}" for seconds in longest))
     console = Console()
     scale = "not known" if facts["scale"] is None else f"{facts['scale']:.3g}"
     console.print(f"measured tanks, {facts['sensor']}, scale {scale}")
-    console.print(table)
+    console.print(made)
 
 
 def _draw_tanks(
@@ -167,9 +162,7 @@ def skin(
     by how much each voltage grew under the press; and `pos_m` (n, 2), where the robot pressed, in
     its own frame. How the skin lies in that frame is fitted to some presses and judged on others.
     """
-    from rich import box
     from rich.console import Console
-    from rich.table import Table
     from tactomo_models import load_description
 
     from tactomo_lab.evaluation.skin_presses import localise, read_presses
@@ -182,11 +175,9 @@ def skin(
         facts = {one.method: {"median_mm": one.median_mm, "most_mm": one.most_mm} for one in found}
         print_json({"presses": len(measured.changes), "methods": facts})
         return
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("localisation error, mm", "median", "95 %"):
-        table.add_column(heading, justify="left" if heading.startswith("loc") else "right")
+    made = table("localisation error, mm", "median", "95 %")
     for one in found:
-        table.add_row(one.method, f"{one.median_mm:.1f}", f"{one.most_mm:.1f}")
+        made.add_row(one.method, f"{one.median_mm:.1f}", f"{one.most_mm:.1f}")
     console = Console()
     console.print(f"{len(measured.changes)} measured presses, {description.name}, cross-validated")
-    console.print(table)
+    console.print(made)

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from tactomo.cli import options
+from tactomo.cli.output import print_json, table
 from tactomo.cli.plot.plot import prepare_folder
 from tactomo.errors import TactomoError
 
-from tactomo_lab.commands.evaluate import Seeds, print_json, shown
+from tactomo_lab.commands.evaluate import Seeds, shown
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -164,18 +165,19 @@ def _simulation_study(study: _Study, asked: set[int]) -> _Part:
     )
     total = study.count * len(COUNTS) * len(SNR_DB) * len(study.methods)
     points = cells(shown(reconstruct_scenes(drawn, *study.methods), total, "Fig. 5"))
-    table = _table("noise", "method", *(f"RIE {n}" for n in COUNTS), *(f"ICC {n}" for n in COUNTS))
+    measures = (f"{measure} {n}" for measure in ("RIE", "ICC") for n in COUNTS)
+    made = table("noise", "method", *measures, left=("method",))
     summary = {(p.snr_db, p.method, p.contacts): p.summary for p in points}
     for snr_db in SNR_DB:
         for method in study.methods:
             of = [summary[snr_db, method, n] for n in COUNTS]
             values = (*(f"{s.rie:.2f}" for s in of), *(f"{s.icc:.3f}" for s in of))
             noise = f"{snr_db:g} dB" if math.isfinite(snr_db) else "none"
-            table.add_row(noise if method == study.methods[0] else "", method, *values)
-        table.add_section()
+            made.add_row(noise if method == study.methods[0] else "", method, *values)
+        made.add_section()
     return _Part(
         "Fig. 5: error and correlation of the map by number of contacts, simulated",
-        table,
+        made,
         "",
         {5: [asdict(point) for point in points]},
         {5: partial(draw_simulation, points)},
@@ -188,14 +190,14 @@ def _response_test(study: _Study, asked: set[int]) -> _Part:
 
     total = len(RESPONSE_KPA) * len(study.rigs)
     points = list(shown(measure_response(study.rigs), total, "Fig. 7"))
-    table = _table("pressure, kPa", "magnitude channel", "structure channel")
+    made = table("pressure, kPa", "magnitude channel", "structure channel")
     for kpa in RESPONSE_KPA:
         at = [point for point in points if point.pressure_kpa == kpa]
         values = [[point.peak[name] for point in at] for name in study.description.channels]
-        table.add_row(f"{kpa:g}", *(_mean_and_deviation(of, "{:.4f}") for of in values))
+        made.add_row(f"{kpa:g}", *(_mean_and_deviation(of, "{:.4f}") for of in values))
     return _Part(
         "Fig. 7: largest value of the Tikhonov image at (36, 36) mm, simulated",
-        table,
+        made,
         "",
         {7: [asdict(point) for point in points]},
         {7: partial(draw_response, points)},
@@ -213,13 +215,13 @@ def _single_areas(study: _Study, asked: set[int]) -> _Part:
 
     frames = _image(study, SINGLE, "Figs. 8 and 9")
     errors = magnitude_errors(frames, study.description)
-    table = _table("method", "paper, hardware", "ours, simulated", "of range", "of contacts")
+    made = table("method", "paper, hardware", "ours, simulated", "of range", "of contacts")
     for method in study.methods:
         of = [error for error in errors if error.method == method]
         theirs = PAPER_MAGNITUDE_ERROR.get(method)
         worst = max(of, key=lambda error: error.error)
         ours = _mean_and_deviation([e.error for e in of], "{:.0%}")
-        table.add_row(
+        made.add_row(
             method,
             f"{theirs[0]:.0%} (at {theirs[1]:g} kPa)" if theirs else "",
             f"{ours} (at {worst.pressure_kpa:g} kPa)",
@@ -243,7 +245,7 @@ def _single_areas(study: _Study, asked: set[int]) -> _Part:
     }
     return _Part(
         "Figs. 8 and 9: magnitude error over cases 1 to 4, at its worst pressure",
-        table,
+        made,
         "ours: of the method's own largest estimate, the paper's 0-1 normalisation; of range: of "
         "the change at 200 kPa; of contacts: likewise, of the magnitudes that contacts have",
         {9: facts},
@@ -256,11 +258,11 @@ def _localisation(study: _Study, asked: set[int]) -> _Part:
     from tactomo_lab.evaluation.paper import LOCALISATION, PAPER_LOCALISATION_MM, locate
 
     places = [locate(frame, study.description) for frame in _image(study, LOCALISATION, "Fig. 10")]
-    table = _table("method", "paper, hardware", "ours, simulated", "contact", "one contact")
+    made = table("method", "paper, hardware", "ours, simulated", "contact", "one contact")
     for method in study.methods:
         of = [place for place in places if place.method == method]
         theirs = PAPER_LOCALISATION_MM.get(method)
-        table.add_row(
+        made.add_row(
             method,
             f"{theirs[0]:.1f} ± {theirs[1]:.1f}" if theirs else "",
             _mean_and_deviation([place.mass_error_mm for place in of], "{:.1f}"),
@@ -279,7 +281,7 @@ def _localisation(study: _Study, asked: set[int]) -> _Part:
     }
     return _Part(
         "Fig. 10: localisation error in 25 places, mm, mean ± standard deviation",
-        table,
+        made,
         "ours: of the image's mass, as the paper's; contact: of the contact that is reported; "
         "one contact: share of presses in which one is",
         {10: facts},
@@ -296,11 +298,12 @@ def _several_areas(study: _Study, asked: set[int]) -> _Part:
     chosen = list(chain.from_iterable(cases.values()))
     frames = _image(study, chosen, " and ".join(f"Fig. {number}" for number in cases))
     read = [read_areas(frame, study.description) for frame in frames]
-    table = _table("case", "method", "ICC", "told apart", "in order", "alike", "counted")
+    columns = ("ICC", "told apart", "in order", "alike", "counted")
+    made = table("case", "method", *columns, left=("method",))
     for case in chosen:
         for method in study.methods:
             of = [one for one in read if (one.case, one.method) == (case.number, method)]
-            table.add_row(
+            made.add_row(
                 (f"{case.number}{'*' * case.ours}" if method == study.methods[0] else ""),
                 method,
                 f"{mean(one.icc for one in of):.3f}",
@@ -309,7 +312,7 @@ def _several_areas(study: _Study, asked: set[int]) -> _Part:
                 f"{mean(share for one in of for share in one.alike):.0%}",
                 f"{mean(one.counted for one in of):.0%}",
             )
-        table.add_section()
+        made.add_section()
     facts: dict[int, Any] = {}
     pictures: dict[int, Callable[[Path], None]] = {}
     for number, of_figure in cases.items():
@@ -323,7 +326,7 @@ def _several_areas(study: _Study, asked: set[int]) -> _Part:
         pictures[number] = partial(draw_images, own, study.description, traces=number == 11)
     return _Part(
         "Figs. 11 and 12: two to four areas, simulated; the paper prints no numbers",
-        table,
+        made,
         "told apart: the image falls below half between any two areas; in order: pairs of which "
         "the harder pressed one reads higher; alike: of pairs under one pressure, the lower "
         "reading over the other; counted: right number of contacts; *: places and sizes are ours",
@@ -357,18 +360,6 @@ def _mean_and_deviation(values: Iterable[float], form: str) -> str:
         return "-"
     mean = form.format(np.mean(known))
     return f"{mean} ± {form.format(np.std(known))}" if len(known) > 1 else mean
-
-
-def _table(*columns: str) -> Table:
-    """Return a table with numbers to the right, and cases, noise and methods to the left."""
-    from rich import box
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD, padding=0)
-    for name in columns:
-        left = name in ("case", "method", "noise")
-        table.add_column(name, justify="left" if left else "right", no_wrap=True)
-    return table
 
 
 def _print_settings(settings: dict[str, Any]) -> None:

@@ -8,8 +8,9 @@ from typing import Annotated
 
 import typer
 from tactomo.cli.options import JsonOutput, examples, typer_app
+from tactomo.cli.output import print_json, table
 
-from tactomo_lab.commands.evaluate import print_json, shown
+from tactomo_lab.commands.evaluate import shown
 
 app = typer_app()
 
@@ -33,9 +34,7 @@ def presses(
     is learnt from, of each skin by itself.
     """
     import numpy as np
-    from rich import box
     from rich.console import Console
-    from rich.table import Table
     from threadpoolctl import threadpool_limits
 
     from tactomo_lab.evaluation.taught_presses import judge, read_skins
@@ -46,17 +45,14 @@ def presses(
     if as_json:
         print_json({"skins": [asdict(one) for one in found]})
         return
-    table = Table(box=box.SIMPLE_HEAD)
-    table.add_column("error, mm")
-    for heading in ("judged", "median", "95 %", "in σ", "taught", "since then"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    made = table("error, mm", "judged", "median", "95 %", "in σ", "taught", "since then")
     for one in found:
         errors = (f"{one.median_mm:.2f}", f"{one.p95_mm:.1f}")
         shares = (f"{one.within_sigma:.0%}", f"{one.is_taught:.0%}")
         since = " ".join(f"{median:.1f}" for median in one.median_mm_since)
-        table.add_row(one.name, str(one.judged), *errors, *shares, since)
-    table.add_section()
-    table.add_row(
+        made.add_row(one.name, str(one.judged), *errors, *shares, since)
+    made.add_section()
+    made.add_row(
         "[bold]mean[/]",
         "",
         f"[bold]{np.mean([one.median_mm for one in found]):.2f}[/]",
@@ -64,7 +60,7 @@ def presses(
     )
     console = Console()
     console.print(f"measured presses, learnt from the first {train} of each skin")
-    console.print(table)
+    console.print(made)
     console.print(
         "[dim]in σ: coordinates within one reported standard uncertainty, 68 % where that is "
         "right; taught: presses of which the like was taught; since then: medians of the "

@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from tactomo.cli import options
+from tactomo.cli.output import print_json, table
 from tactomo.cli.plot.plot import prepare_picture
 
-from tactomo_lab.commands.evaluate import Seeds, chosen_names, print_json, shown
+from tactomo_lab.commands.evaluate import Seeds, chosen_names, shown
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -125,13 +126,7 @@ def _print(settings: dict[str, Any], scores: Sequence[CaseScore]) -> None:
 
 
 def _counts(rows: dict[str, dict[str, Trust]], methods: Sequence[str]) -> Table:
-    from rich import box
-    from rich.table import Table
-
-    made = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    made.add_column("", no_wrap=True)
-    for method in methods:
-        made.add_column(method, justify="right", no_wrap=True)
+    made = table("", *methods)
     for regime, by_method in rows.items():
         if regime == "all":
             made.add_section()
@@ -150,14 +145,10 @@ def _cell(counts: Trust) -> str:
 
 def _doings(method: str, scores: Sequence[CaseScore]) -> Table:
     """What one method did in each regime: tiers that made the maps, and flags."""
-    from rich import box
-    from rich.table import Table
-
     from tactomo_lab.evaluation.regimes import REGIMES
 
-    made = Table(title=f"what {method} did", box=box.SIMPLE_HEAD, title_justify="left")
-    for name in ("", "what goes wrong", "made by", "flags"):
-        made.add_column(name)
+    columns = ("", "what goes wrong", "made by", "flags")
+    made = table(*columns, left=columns, title=f"what {method} did")
     for regime in dict.fromkeys(one.regime for one in scores):
         own = [one for one in scores if one.regime == regime]
         tiers = Counter(one.tier for one in own)

@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from tactomo.cli.bench.machine_speed import warned_if_busy
+from tactomo.cli.output import table
 from tactomo.memory import resident_bytes, return_freed_memory
 from tactomo.twin import make_skin
 from tactomo.twin.device import NOISE_SHARE
@@ -244,19 +245,17 @@ def _row(
 
 
 def _table_of(rows: Sequence[Row]) -> Table:
-    from rich.table import Table
-
-    table = Table(
-        title="one frame, processor time of one thread; products: times the p50 of a bare product"
+    made = table(
+        *("method", "contacts", "scene", "p50 products", "p99 products", "p50 ms", "p99 ms", "MB"),
+        *("frames", "note"),
+        left=("scene", "note"),
+        title="one frame, processor time of one thread; products: times the p50 of a bare product",
     )
-    numbers = ("p50 products", "p99 products", "p50 ms", "p99 ms", "MB", "frames")
-    for heading in ("method", "contacts", "scene", *numbers, "note"):
-        table.add_column(heading, justify="right" if heading in numbers else "left")
     for row in rows:
         keys = ("of_product", "p99_of_product", "p50_ms", "p99_ms", "memory_mb")
         times = [row[key] for key in keys]
         # Three significant digits, thousands apart, and no power of ten.
         shown = ["" if t is None else f"{t:,.0f}" if t >= 100 else f"{t:.3g}" for t in times]
         what = (row["method"], str(row["contacts"]), row["state"])
-        table.add_row(*what, *shown, str(row["frames"] or ""), row["note"])
-    return table
+        made.add_row(*what, *shown, str(row["frames"] or ""), row["note"])
+    return made

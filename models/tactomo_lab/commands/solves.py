@@ -17,8 +17,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from tactomo.cli.options import DEFAULT_DESCRIPTION, Description, JsonOutput, examples, typer_app
-
-from tactomo_lab.commands.evaluate import print_json
+from tactomo.cli.output import print_json, table
 
 if TYPE_CHECKING:
     from tactomo_models import SensorDescription
@@ -56,7 +55,6 @@ app = typer_app()
 def solves(description: Description = DEFAULT_DESCRIPTION, as_json: JsonOutput = False) -> None:
     """Measure one forward solve against pressed area, mesh and sheet size. Takes about a minute."""
     from rich.console import Console
-    from rich.table import Table
     from tactomo.cli.bench.bench import machine
     from tactomo_models import load_description
     from threadpoolctl import threadpool_limits
@@ -68,14 +66,14 @@ def solves(description: Description = DEFAULT_DESCRIPTION, as_json: JsonOutput =
         told = {"machine": machine(), "description": description}
         print_json({**told, "rows": [asdict(row) for row in rows]})
         return
-    table = Table(title=f"one forward solve, {description}, one thread of {machine()}")
-    for name in ("series", "sparse / solve", *(name for name in asdict(rows[0]) if "_" in name)):
-        table.add_column(name.replace("_", " "), justify="left" if name == "series" else "right")
+    numbered = (name.replace("_", " ") for name in asdict(rows[0]) if "_" in name)
+    title = f"one forward solve, {description}, one thread of {machine()}"
+    shown = table("series", "sparse / solve", *numbered, title=title)
     for row in rows:
         numbers = [value for value in asdict(row).values() if not isinstance(value, str)]
         ratio = f"{row.sparse_ms / row.solve_ms:.1f}"
-        table.add_row(row.series, ratio, *(f"{number:.3g}" for number in numbers))
-    Console().print(table)
+        shown.add_row(row.series, ratio, *(f"{number:.3g}" for number in numbers))
+    Console().print(shown)
 
 
 def _by_area(sensor: SensorDescription) -> Iterator[Row]:

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import typer
 from tactomo.cli.options import DEFAULT_DESCRIPTION, Description, JsonOutput, examples, typer_app
-from tactomo.errors import TactomoError
-
-from tactomo_lab.commands.evaluate import print_json
+from tactomo.cli.output import print_json
+from tactomo.errors import needs
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -21,7 +19,10 @@ if TYPE_CHECKING:
     from tactomo_lab.training.configurations import Prepared
     from tactomo_lab.training.train import Epoch, Settings, Training
 
-EXTRA = frozenset({"joblib", "onnx", "onnxscript", "torch"})
+EXTRA = (
+    "pip install 'tactomo-lab[train]'; without a GPU, install the smaller PyTorch for CPUs first: "
+    "see https://pytorch.org/get-started"
+)
 INTERRUPTED = 130
 TANKS_IN_SHARD = 250  # as many as a minute's work on a slow core
 
@@ -80,7 +81,7 @@ def simulate(
     description = load_description(sensor)
     total = scenes or SCENES[preset]
     steps = simulate_scenes(description, preset, folder, total, seed=seed, jobs=jobs or -1)
-    with _training_extra():
+    with needs("training", EXTRA):
         before, now = _follow(steps, total, f"{preset} scenes", folder)
     if as_json:
         settings = {"folder": str(folder), "preset": preset, "seed": seed}
@@ -145,7 +146,7 @@ def train(
     A network that is written to the cache is used from then on for this sensor, instead of the one
     that ships; delete it to go back. Needs `pip install 'tactomo-lab[train]'`.
     """
-    with _training_extra():
+    with needs("training", EXTRA):
         from tactomo_models import load_description
         from tactomo_models.methods.trained_networks import own_path
 
@@ -204,7 +205,7 @@ def train_tanks(
     simulated again. Some three minutes and a quarter of an hour on one core; what ships was made
     so. Needs `pip install 'tactomo-lab[train]'`.
     """
-    with _training_extra():
+    with needs("training", EXTRA):
         from joblib import Parallel, delayed
 
         from tactomo_lab.training.tank_network import train as train_network
@@ -322,18 +323,3 @@ def _progress() -> Progress:
     from rich.progress import Progress
 
     return Progress(console=Console(stderr=True), transient=True, speed_estimate_period=600)
-
-
-@contextmanager
-def _training_extra() -> Iterator[None]:
-    """Tell what to install where a package that only training needs is missing."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] not in EXTRA:
-            raise
-        raise TactomoError(
-            f"training needs {error.name}, which is not installed",
-            "pip install 'tactomo-lab[train]'; without a GPU, install the smaller PyTorch for CPUs "
-            "first: see https://pytorch.org/get-started",
-        ) from error

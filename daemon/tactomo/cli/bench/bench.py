@@ -9,7 +9,6 @@ contacts here, by the clock that both processes share. *Machine speed* is
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import tempfile
@@ -25,6 +24,7 @@ import typer
 from tactomo.cli import options
 from tactomo.cli.bench.comparison import compared, read_results, table_of
 from tactomo.cli.laboratory import installed_measurement, measurement, not_installed
+from tactomo.cli.output import print_json, table
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -178,33 +178,33 @@ def bench(
         return
     from rich.console import Console
 
-    time_methods, table = installed_measurement("methods"), None
+    time_methods, methods = installed_measurement("methods"), None
     if time_methods is None and (method or not live):
         raise not_installed("the table of methods")
     with Console(stderr=True).status("starting") as line:
         if live:
             _measure_twin(results, ports, rate, seconds, line.update)
         if time_methods is not None:
-            results.methods, table = time_methods(description, method or [], line.update)
+            results.methods, methods = time_methods(description, method or [], line.update)
     if earlier is not None:
         results.compared = compared(earlier, asdict(results))
     if as_json:
-        typer.echo(json.dumps(asdict(results), indent=2))
+        print_json(asdict(results))
     else:
-        _print(results, table)
+        _print(results, methods)
         if compare is not None:
             _console(results).print(table_of(results.compared, compare))
 
 
 def _chart(results: Results, picture: Path, count: int, methods: list[str], as_json: bool) -> None:
     """Measure and draw speed against accuracy, and print the table."""
-    results.chart, table = measurement("chart")(
+    results.chart, fronts = measurement("chart")(
         results.description, picture, count, results.machine, methods
     )
     if as_json:
-        typer.echo(json.dumps(asdict(results), indent=2))
+        print_json(asdict(results))
     else:
-        _console(results).print(table)
+        _console(results).print(fronts)
 
 
 def _machine_speed(results: Results, show: bool, as_json: bool) -> None:
@@ -217,8 +217,8 @@ def _machine_speed(results: Results, show: bool, as_json: bool) -> None:
         typer.echo(made.model_dump_json(indent=2))
         return
     console = _console(results)
-    for table in bench_machine_speed.tables_of(made):
-        console.print(table)
+    for each in bench_machine_speed.tables_of(made):
+        console.print(each)
     console.print(
         f"This machine's speed: {made.source}. A frame takes {made.overhead_s * 1e3:.1f} ms and "
         f"{made.speed:.2f} times its modelled budget (p99)."
@@ -352,13 +352,14 @@ def _console(results: Results) -> Console:
 
 
 def _live_table(results: Results) -> Table:
-    from rich.table import Table
-
-    table = Table(title="live: last byte read to contacts in another process", min_width=80)
-    for name in ("scene", "frames/s", "p50 ms", "p99 ms", "daemon MB", "frames by method"):
-        table.add_column(name, justify="left" if name in ("scene", "frames by method") else "right")
+    methods = "frames by method"
+    shown = table(
+        *("scene", "frames/s", "p50 ms", "p99 ms", "daemon MB", methods),
+        left=(methods,),
+        title="live: last byte read to contacts in another process",
+    )
     for phase in results.live:
-        table.add_row(
+        shown.add_row(
             phase.scene,
             f"{phase.frames_per_s:.1f}",
             f"{phase.latency_p50_ms:.1f}",
@@ -366,22 +367,18 @@ def _live_table(results: Results) -> Table:
             f"{phase.memory_mb:.0f}" if phase.memory_mb else "-",
             ", ".join(f"{tier} {count}" for tier, count in phase.tiers.items()),
         )
-    return table
+    return shown
 
 
 def _stage_table(phases: list[Phase]) -> Table:
     """Return the daemon's own account of its newest 256 frames at the end of each scene."""
-    from rich.table import Table
-
-    table = Table(title="stages of the daemon, p50 / p99 ms", min_width=80)
-    table.add_column("stage")
-    for phase in phases:
-        table.add_column(phase.scene, justify="right")
+    scenes = (phase.scene for phase in phases)
+    shown = table("stage", *scenes, title="stages of the daemon, p50 / p99 ms")
     for stage in dict.fromkeys(stage for phase in phases for stage in phase.stage_ms):
         times = (phase.stage_ms.get(stage) for phase in phases)
         cells = (f"{t['p50']:.1f} / {t['p99']:.1f}" if t else "-" for t in times)
-        table.add_row(stage, *cells)
-    return table
+        shown.add_row(stage, *cells)
+    return shown
 
 
 def machine() -> str:

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from tactomo.cli.output import table
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
@@ -72,14 +73,10 @@ def _named(results: Mapping[str, Any]) -> dict[str, tuple[Row, str, str, str, st
 
 def table_of(rows: Iterable[Row], path: Path) -> Table:
     """Lay out a comparison; what has grown noticeably is red, what has shrunk so is green."""
-    from rich.table import Table
-
-    table = Table(title=f"{path}, and now")
-    for heading in ("measured", "unit", "p50", "p99", "memory MB"):
-        table.add_column(heading, justify="left" if heading == "measured" else "right")
+    shown = table("measured", "unit", "p50", "p99", "memory MB", title=f"{path}, and now")
     for row in rows:
-        table.add_row(row["what"], row["unit"], *(_change(row[figure]) for figure in _FIGURES))
-    return table
+        shown.add_row(row["what"], row["unit"], *(_change(row[figure]) for figure in _FIGURES))
+    return shown
 
 
 def _change(pair: list[float] | None) -> str:

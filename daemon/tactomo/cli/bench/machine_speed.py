@@ -36,6 +36,8 @@ from tactomo_models.methods.registry import BUDGETED
 from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
 
+from tactomo.cli.output import table
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -126,11 +128,8 @@ def in_force(name: str) -> MachineSpeed:
 
 def tables_of(speed: MachineSpeed) -> Sequence[Table]:
     """Lay out what was measured, and what each time buys."""
-    from rich.table import Table
-
-    measured = Table(title="one frame of a moving scene (simulated), one thread")
-    for heading in ("method", "modelled budget ms", "p50 ms", "p99 ms", "ICC, as shipped"):
-        measured.add_column(heading, justify="left" if heading == "method" else "right")
+    columns = ("method", "modelled budget ms", "p50 ms", "p99 ms", "ICC, as shipped")
+    measured = table(*columns, title="one frame of a moving scene (simulated), one thread")
     for row in speed.rows:
         measured.add_row(
             row.method,
@@ -139,9 +138,11 @@ def tables_of(speed: MachineSpeed) -> Sequence[Table]:
             f"{row.p99_s * 1e3:.1f}",
             f"{row.icc:.3f}",
         )
-    bought = Table(title="what auto does within a time")
-    for heading in ("within ms", "method", "modelled budget ms"):
-        bought.add_column(heading, justify="left" if heading == "method" else "right")
+    bought = table(
+        *("within ms", "method", "modelled budget ms"),
+        left=("method",),
+        title="what auto does within a time",
+    )
     for time_ms in TIMES_MS:
         plan = speed.plan("auto", time_ms * 1e-3)
         budget = f"{plan.budget_s * 1e3:.1f}" if plan.method in BUDGETED and plan.budget_s else ""

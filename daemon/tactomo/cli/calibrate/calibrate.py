@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tactomo.cli import options
+from tactomo.cli.output import table
 from tactomo.cli.plot.plot import prepare_picture
 
 if TYPE_CHECKING:
@@ -244,16 +245,12 @@ def print_calibration(made: PressureCalibration) -> None:
 
 def _table(made: PressureCalibration) -> Table:
     import numpy as np
-    from rich.table import Table
 
-    curve = made.curve
-    table = Table()
-    for heading in ("|Δσ|/σ₀", "kPa", "± kPa"):
-        table.add_column(heading, justify="right")
+    curve, shown = made.curve, table("|Δσ|/σ₀", "kPa", "± kPa")
     for kpa in np.linspace(*curve.range_kpa, ROWS):
         magnitude = np.interp(kpa, curve.pressure_kpa, curve.magnitude)
-        table.add_row(f"{magnitude:.3f}", f"{kpa:.0f}", f"{float(curve.sigma(magnitude)):.1f}")
-    return table
+        shown.add_row(f"{magnitude:.3f}", f"{kpa:.0f}", f"{float(curve.sigma(magnitude)):.1f}")
+    return shown
 
 
 def _facts(made: PressureCalibration) -> list[str]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from tactomo.cli import options
+from tactomo.cli.output import print_json
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -118,7 +118,7 @@ def doctor(
     levels += [finding.level for finding in line if finding.level != "unknown"]
     verdict = worst(iter(levels))
     if as_json:
-        typer.echo(json.dumps(report(evidence, channels, line, verdict), indent=2))
+        print_json(report(evidence, channels, line, verdict))
     else:
         _print(Console(), evidence, channels, line, verdict)
     raise typer.Exit(0 if VERDICTS[verdict] == "healthy" else 1)
@@ -168,7 +168,7 @@ def _diagnose(evidence: Evidence) -> dict[str, Diagnosis]:
 def report(
     evidence: Evidence, channels: dict[str, Diagnosis], line: list[Finding], verdict: Level
 ) -> dict[str, Any]:
-    """Return all that was found, for programs; figures that are unknown are null."""
+    """Return all that was found, for programs."""
     return {
         "examined": evidence.title,
         "notes": list(evidence.notes),
@@ -178,7 +178,7 @@ def report(
                 "verdict": VERDICTS[diagnosis.level],
                 "electrodes": list(diagnosis.electrodes),
                 "findings": [_plain(finding) for finding in diagnosis.findings],
-                "snr_db": [None if db != db else round(db, 2) for db in diagnosis.snr_db.tolist()],
+                "snr_db": diagnosis.snr_db.round(2).tolist(),
             }
             for name, diagnosis in channels.items()
         },
@@ -192,7 +192,7 @@ def _plain(finding: Finding) -> dict[str, Any]:
         "level": str(finding.level),
         "detail": finding.detail,
         "next_step": finding.next_step,
-        **{name: None if value != value else value for name, value in finding.figures.items()},
+        **finding.figures,
     }
 
 

@@ -20,8 +20,8 @@ from tactomo.cli.files.recorded_frames import (
 )
 from tactomo.cli.options import Force, Pose, RecordedDescription, examples, typer_app
 from tactomo.cli.plot.plot import prepare_file
-from tactomo.cli.run.foxglove import need_foxglove, placement_of, write_layout
-from tactomo.errors import TactomoError
+from tactomo.cli.run.foxglove import placement_of, write_layout
+from tactomo.errors import TactomoError, needs
 
 if TYPE_CHECKING:
     from tactomo_client import Frame
@@ -166,8 +166,8 @@ def _writer(kind: str, parent: str | None, pose: str, scratch: Path) -> Writer:
 
         return lambda _, moments, file: write_maps(moments, file, scratch)
     if kind == ".mcap":
-        need_foxglove()
-        from tactomo_foxglove import write_mcap
+        with needs("Foxglove", "pip install 'tactomo[foxglove]'"):
+            from tactomo_foxglove import write_mcap
 
         from tactomo.imaging.frames import description_fields
 
@@ -178,9 +178,8 @@ def _writer(kind: str, parent: str | None, pose: str, scratch: Path) -> Writer:
             return write_mcap(_timed(frames, moments), file, frames.sensor, about, placement)
 
         return write
-    _need_rosbags()
-    from tactomo_ros2.bag import write_bag
-
+    with needs("a ROS 2 bag", "pip install 'tactomo[ros2]'"):
+        from tactomo_ros2.bag import write_bag
     hung = None if parent is None else placement_of(parent, pose)
     return lambda frames, moments, folder: write_bag(
         _timed(frames, moments), folder, frames.sensor, hung
@@ -212,15 +211,6 @@ def _prepare_folder(output: Path) -> None:
         raise TactomoError(f"{output} exists already", "name another folder, or delete this one")
     if not os.access(output.parent, os.W_OK):
         raise TactomoError(f"cannot write {output}", "name a folder in one that you may write to")
-
-
-def _need_rosbags() -> None:
-    try:
-        import rosbags.rosbag2  # noqa: F401
-    except ImportError as error:
-        raise TactomoError(
-            "a ROS 2 bag needs rosbags, which is not installed", "pip install 'tactomo[ros2]'"
-        ) from error
 
 
 def _checked(count: int) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from tactomo.cli.options import JsonOutput, examples, typer_app
+from tactomo.cli.output import print_json
 
 if TYPE_CHECKING:
     from tactomo_models import SensorDescription
@@ -43,7 +43,7 @@ def info(
         return
     facts = _facts(what)
     if as_json:
-        typer.echo(json.dumps(facts, indent=2))
+        print_json(facts)
         return
     from rich.console import Console
     from rich.table import Table
@@ -61,7 +61,7 @@ def _show_folder(folder: Path, as_json: bool) -> None:
     """
     rows = [_recording_line(path) for path in sorted(folder.glob("*.mcap"))]
     if as_json:
-        typer.echo(json.dumps(rows, indent=2))
+        print_json(rows)
         return
     from rich.console import Console
     from rich.table import Table

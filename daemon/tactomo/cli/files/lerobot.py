@@ -17,7 +17,7 @@ import numpy as np
 from tactomo.cli.files.gaps import Gaps
 from tactomo.cli.files.recorded_frames import Moment
 from tactomo.cli.files.robot_log import RobotLog
-from tactomo.errors import TactomoError
+from tactomo.errors import TactomoError, needs
 
 if TYPE_CHECKING:
     from tactomo_client.touch import Touch
@@ -83,14 +83,9 @@ class Alignment:
 def need_lerobot() -> None:
     """Make sure that LeRobot is there; raise TactomoError where it is not installed."""
     logging.getLogger("lerobot").setLevel(logging.ERROR)  # it misses decoders of videos: no matter
-    try:
+    with needs("a dataset", "pip install 'lerobot[dataset]', in Python 3.12 or newer"):
         import datasets
         import lerobot.datasets  # noqa: F401
-    except ImportError as error:
-        raise TactomoError(
-            f"a dataset needs lerobot, and {error.name} is not installed",
-            "pip install 'lerobot[dataset]', in Python 3.12 or newer",
-        ) from error
     datasets.disable_progress_bars()
 
 

@@ -11,7 +11,7 @@ import typer
 
 from tactomo.cli.files.recorded_frames import FromOption, ToOption, recorded_frames
 from tactomo.cli.options import Force, RecordedDescription, examples, typer_app
-from tactomo.errors import TactomoError
+from tactomo.errors import TactomoError, needs
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -96,13 +96,8 @@ def prepare_picture(output: Path, *, force: bool = True) -> None:
     next_step = "give a .png, .svg or .pdf in a folder that you may write"
     if output.suffix.lower() not in (".png", ".svg", ".pdf"):
         raise TactomoError(f"cannot write {output}: not a kind of picture", next_step)
-    try:
+    with needs("drawing", "pip install 'tactomo[plot]', or `make setup` in a checkout"):
         import matplotlib
-    except ImportError as error:
-        raise TactomoError(
-            "drawing needs matplotlib, which is not installed",
-            "pip install 'tactomo[plot]', or `make setup` in a checkout",
-        ) from error
     matplotlib.use("Agg")
     prepare_file(output, force=force)
 

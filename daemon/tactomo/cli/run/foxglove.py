@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from tactomo.cli import options
-from tactomo.errors import TactomoError
+from tactomo.cli.children import print_ready, stop_asked
+from tactomo.errors import TactomoError, needs
 
 if TYPE_CHECKING:
     from tactomo_client.placement import Placement
@@ -69,16 +68,15 @@ def foxglove(
     Needs foxglove-sdk: `pip install 'tactomo[foxglove]'`. Recordings open there, too, after
     `tactomo export RECORDING OUT.mcap`.
     """
-    need_foxglove()
+    with needs("Foxglove", "pip install 'tactomo[foxglove]'"):
+        import foxglove as _  # noqa: F401
     from tactomo_client.keys import as_keys
     from tactomo_foxglove import Bridge
 
     names = sensors or [options.DEFAULT_NAME]
     if layout is not None:
         write_layout(layout, names[0])
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop = stop_asked()
     with Bridge(
         names,
         stream,
@@ -93,8 +91,6 @@ def foxglove(
 
 
 def _print_addresses(bridge: Bridge, layout: Path | None, announce: bool) -> None:
-    from tactomo.cli.children import print_ready
-
     typer.echo(f"foxglove: {bridge.url}")
     typer.echo(f"or open   {bridge.app_url}")
     if layout is not None:
@@ -123,13 +119,3 @@ def placement_of(parent: str, pose: str) -> Placement:
         return Placement.parse(parent, pose)
     except ValueError as error:
         raise typer.BadParameter(f"--pose {pose}: {error}") from error
-
-
-def need_foxglove() -> None:
-    """Make sure that Foxglove's SDK is there; raise TactomoError where it is not installed."""
-    try:
-        import foxglove  # noqa: F401
-    except ImportError as error:
-        raise TactomoError(
-            "Foxglove needs foxglove-sdk, which is not installed", "pip install 'tactomo[foxglove]'"
-        ) from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tactomo.cli.options import JsonOutput, examples, typer_app
+from tactomo.cli.output import print_json
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -66,7 +66,7 @@ def ports(
     asked = [row.path for row in found if paths or (row.adapter and row.adapter.is_usb)]
     answers = question(asked, baud, protocol) if ask else {}
     if as_json:
-        typer.echo(json.dumps({"ports": [as_fields(row, answers) for row in found]}, indent=2))
+        print_json({"ports": [as_fields(row, answers) for row in found]})
         return
     from rich.console import Console
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from tactomo.cli import options
+from tactomo.cli.children import stop_asked
 from tactomo.cli.run.foxglove import placement_of
-from tactomo.errors import TactomoError
+from tactomo.errors import needs
 
 app = options.typer_app()
 
@@ -49,20 +48,14 @@ def ros2(
 
     Needs rosbags and eclipse-zenoh: `pip install 'tactomo[ros2]'`.
     """
-    try:
+    with needs("ROS 2", "pip install 'tactomo[ros2]'"):
         from tactomo_ros2.live import run
         from tactomo_ros2.messages import topic_name, topic_types
         from tactomo_ros2.rmw_zenoh import ZenohNode
-    except ImportError as error:
-        raise TactomoError(
-            f"ROS 2 needs {error.name}, which is not installed", "pip install 'tactomo[ros2]'"
-        ) from error
     from tactomo_client import subscribe
 
     hung = None if parent is None else placement_of(parent, pose)
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop = stop_asked()
     name, topics = f"tactomo_{topic_name(sensor)}", topic_types(sensor)
     with (
         subscribe(sensor, address=stream, keys=keys) as skin,

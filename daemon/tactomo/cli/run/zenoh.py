@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from tactomo.cli.options import KeysFolder, examples, typer_app
-from tactomo.errors import TactomoError
+from tactomo.errors import needs
 
 LogLevel = Literal["debug", "info", "warning", "error"]
 LogFormat = Literal["auto", "text", "json", "journal"]
@@ -65,12 +65,12 @@ def zenoh(
     """
     if bool(sources) == bool(bind):
         raise typer.BadParameter("give --from or --bind, one of the two")
-    _need_zenoh()
+    with needs("Zenoh", "pip install 'tactomo[zenoh]'"):
+        from tactomo.stream.zenoh_bridge import ZenohBridge, ZenohProxy
     from tactomo_client.keys import as_keys
 
     from tactomo.log import configure_logging
     from tactomo.stream.proxy import serve
-    from tactomo.stream.zenoh_bridge import ZenohBridge, ZenohProxy
 
     configure_logging(log_level, log_format)
     if bind:
@@ -98,12 +98,3 @@ def _endpoint(text: str) -> str:
         return check_endpoint(text)
     except ValueError as error:
         raise typer.BadParameter(f"--bind {text}: {error}") from error
-
-
-def _need_zenoh() -> None:
-    try:
-        import zenoh  # noqa: F401
-    except ImportError as error:
-        raise TactomoError(
-            "Zenoh needs eclipse-zenoh, which is not installed", "pip install 'tactomo[zenoh]'"
-        ) from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,6 +9,7 @@ import typer
 
 from tactomo.cli import options
 from tactomo.cli.health_issues import health_issues
+from tactomo.cli.output import print_json
 from tactomo.errors import TactomoError
 
 HEARD_WITHIN_S = 3.0  # a status comes every second
@@ -50,7 +50,7 @@ def status(
     if answer is None:
         answer = _heard_status(str(sensor), stream, keys)
     if as_json:
-        typer.echo(json.dumps(answer, indent=2, default=str))
+        print_json(answer)
         return
     for issue in health_issues(answer):
         typer.secho(issue.what, fg="red" if issue.severity == "error" else "yellow", bold=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tactomo.cli import options
+from tactomo.cli.output import print_json
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
@@ -173,7 +173,7 @@ def poke(
     if answer.get("released") is False:
         raise TactomoError("nothing of this id presses", "`tactomo poke scene` lists what does")
     if answer:
-        typer.echo(json.dumps(answer, indent=2))
+        print_json(answer)
 
 
 def _record_for(daemon: Daemon, path: Path, seconds: float | None, maps: bool | None) -> None:

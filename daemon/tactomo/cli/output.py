@@ -1,0 +1,38 @@
+"""What commands print: tables for people, JSON for programs."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Container
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+def table(*columns: str, left: Container[str] = (), title: str | None = None) -> Table:
+    """Return a table without rows: numbers to the right, the first column and some others left."""
+    from rich import box
+    from rich.table import Table
+
+    made = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=0)
+    for name in columns:
+        words = name in left or name == columns[0]
+        made.add_column(name, justify="left" if words else "right", no_wrap=not words)
+    return made
+
+
+def print_json(told: Any) -> None:
+    """Print what programs read; what is not a finite number is null."""
+    typer.echo(json.dumps(_finite(told), indent=2, default=str))
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
