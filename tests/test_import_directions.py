@@ -43,7 +43,16 @@ ALLOWED: dict[str, set[str]] = {
 # Folders, and modules beside them, of each package: each imports those before it alone.
 ORDER = {
     "tactomo_models": (
-        *("errors", "arrays", "array_files", "archive", "toml_file", "robust", "inner_loop"),
+        *(
+            "errors",
+            "arrays",
+            "matlab_hdf5",
+            "array_files",
+            "archive",
+            "toml_file",
+            "robust",
+            "inner_loop",
+        ),
         *("sensor", "physics", "scans", "scene", "methods", "simulation"),
         *("calibration", "health", "drift", "reconstruct", "known_skin", "batch", "teach"),
         *("machine_speed", "mujoco_skin", "gymnasium_skin"),
@@ -62,6 +71,7 @@ FOREIGN = {
     "onnx": ("tactomo_lab.training.",),
     "mujoco": ("tactomo_models.mujoco_skin.",),
     "gymnasium": ("tactomo_models.gymnasium_skin.",),
+    "h5py": ("tactomo_models.matlab_hdf5",),
     "serial": ("tactomo.",),
     "zmq": ("tactomo.", "tactomo_client.", "tactomo_foxglove."),
 }

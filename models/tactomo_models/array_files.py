@@ -8,8 +8,12 @@ measured.
 
 from __future__ import annotations
 
+import pickle
 import re
+import subprocess
+import sys
 from collections.abc import Callable, Iterator, Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
@@ -28,27 +32,37 @@ _LARGEST: Final = 1e9  # in any unit of voltage; of other bytes, read as floats,
 
 
 def read_matlab(path: Path) -> Arrays:
-    """Read the numbers of a .mat file up to version 7, those in structs as `struct.field`.
+    """Read the numbers of a .mat file, those in structs as `struct.field`.
+
+    A cell of one array is that array. Version 7.3 needs h5py.
 
     Raises:
         OSError: the file cannot be read.
-        DataError: it is damaged, or of version 7.3.
+        DataError: it is damaged, or h5py is missing.
     """
     from scipy.io import loadmat
 
     with path.open("rb") as file:
-        if b"MATLAB 7.3" in file.read(128):
+        hdf5 = b"MATLAB 7.3" in file.read(128)
+        if hdf5 and not find_spec("h5py"):
             raise DataError(
-                f"{path} is a .mat of version 7.3, which is not read; in MATLAB: "
-                f"x = load('{path.name}'); save('{path.name}', '-struct', 'x', '-v7')"
+                f"{path} is a .mat of version 7.3, which needs h5py; pip install "
+                f"'tactomo[matlab]', or in MATLAB: x = load('{path.name}'); "
+                f"save('{path.name}', '-struct', 'x', '-v7')"
             )
         file.seek(0)
         try:
-            return dict(_numbers("", loadmat(file)))
-        except Exception as error:  # a flipped bit makes the parser raise almost anything
+            return dict(_numbers("", _hdf5(path) if hdf5 else loadmat(file)))
+        except Exception as error:  # a flipped bit makes the parsers raise almost anything
             raise DataError(
                 f"cannot read {path}: damaged, or no .mat file; save it anew"
             ) from error
+
+
+def _hdf5(path: Path) -> Arrays:
+    program = Path(__file__).with_name("matlab_hdf5.py")
+    ended = subprocess.run([sys.executable, program, path], capture_output=True, check=True)
+    return dict(pickle.loads(ended.stdout))
 
 
 def _numbers(prefix: str, held: Mapping[str, Any]) -> Iterator[tuple[str, NDArray[Any]]]:
@@ -59,6 +73,8 @@ def _numbers(prefix: str, held: Mapping[str, Any]) -> Iterator[tuple[str, NDArra
         if array.dtype.names and array.size == 1:  # a struct
             fields = {field: array[field].flat[0] for field in array.dtype.names}
             yield from _numbers(f"{prefix}{name}.", fields)
+        elif array.dtype == object and array.size == 1:  # a cell
+            yield from _numbers(prefix, {name: array.flat[0]})
         elif array.dtype.kind in "biufc" and array.size:
             yield prefix + name, array
 

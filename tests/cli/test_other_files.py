@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -23,6 +25,7 @@ from tactomo_models.sensor.named_pattern import NamedPattern, fitting_patterns
 Run = Callable[..., Any]
 WHERE = Press(0.05, 0.02, 150.0, 0.02)
 FRAMES = 4
+ROWS = np.arange(416.0).reshape(2, 208) + 1
 
 
 def tank(pattern: str = "16:adjacent") -> tuple[FloatArray, FloatArray]:
@@ -69,6 +72,66 @@ def test_matlab_arrays(tactomo: Run, tmp_path: Path) -> None:
     located(tactomo, tmp_path, tmp_path / "a.mat")
     located(tactomo, tmp_path, tmp_path / "c.mat", "--reference", tmp_path / "b.mat")
     located(tactomo, tmp_path, tmp_path / "d.mat")
+
+
+def save_hdf5(path: Path, arrays: dict[str, Any]) -> None:
+    """Save as MATLAB does with -v7.3: axes reversed, complex fields, cells of references."""
+
+    def put(group: h5py.Group, name: str, value: Any) -> Any:
+        if isinstance(value, dict):
+            made = group.create_group(name)
+            for field, each in value.items():
+                put(made, field, each)
+            kind = "struct"
+        elif isinstance(value, list):
+            held = group.file.require_group("#refs#")
+            links = [[put(held, f"{name}{i}", each).ref] for i, each in enumerate(value)]
+            made, kind = group.create_dataset(name, data=links, dtype=h5py.ref_dtype), "cell"
+        elif isinstance(value, str):
+            codes = np.array([[ord(letter)] for letter in value], np.uint16)
+            made, kind = group.create_dataset(name, data=codes), "char"
+        else:
+            turned = np.ascontiguousarray(value.T)
+            if turned.dtype.kind == "c":
+                turned = turned.view([("real", "f8"), ("imag", "f8")])
+            made = group.create_dataset(name, data=turned, chunks=turned.shape, compression=3)
+            kind = "double"
+        made.attrs["MATLAB_class"] = np.bytes_(kind)
+        return made
+
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, value in arrays.items():
+            put(file, name, value)
+    header = b"MATLAB 7.3 MAT-file, Platform: GLNXA64, HDF5 schema 1.00 .".ljust(124) + b"\0\2IM"
+    with path.open("r+b") as whole:
+        whole.write(header)
+
+
+def test_matlab_arrays_of_version_7_3(tactomo: Run, tmp_path: Path) -> None:
+    rest, there = tank()
+    save_hdf5(tmp_path / "a.mat", {"vh": [rest], "vi": {"meas": there.T}, "note": 208 * "x"})
+    save_hdf5(tmp_path / "b.mat", {"several": [rest, there], "vi": [{"meas": there * 1j}]})
+    located(tactomo, tmp_path, tmp_path / "a.mat")
+    read = read_arrays(tmp_path / "a.mat")
+    assert list(read) == ["vh", "vi.meas"]
+    np.testing.assert_array_equal(read["vi.meas"], there.T)
+    read = read_arrays(tmp_path / "b.mat")
+    assert list(read) == ["vi.meas"]
+    np.testing.assert_array_equal(read["vi.meas"], there * 1j)
+    cells = np.empty((2, 1), object)
+    cells[:, 0] = rest, there
+    savemat(tmp_path / "c.mat", {"vh": cells[:1], "several": cells})
+    np.testing.assert_array_equal(read_arrays(tmp_path / "c.mat")["vh"], rest)
+    assert list(read_arrays(tmp_path / "c.mat")) == ["vh"]
+
+
+def test_matlab_arrays_of_version_7_3_without_h5py(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_hdf5(tmp_path / "in.mat", {"vh": np.ones((1, 208))})
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(DataError, match=r"pip install 'tactomo\[matlab\]', or in MATLAB: x = load"):
+        read_arrays(tmp_path / "in.mat")
 
 
 def test_a_sign_of_their_own(tactomo: Run, tmp_path: Path) -> None:
@@ -180,7 +243,7 @@ def test_volts_out_of_phase_are_turned_as_the_reference_is(
 @pytest.mark.parametrize(
     ("name", "content", "told"),
     [
-        ("a.mat", b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(600), "save('a.mat', '-struct'"),
+        ("a.mat", b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(600), "damaged, or no .mat"),
         ("a.mat", b"MATLAB 5.0 MAT-file".ljust(140), "damaged, or no .mat"),
         ("a.csv", b"x,y\nvolts\n", "no line of numbers"),
         ("a.csv", b"1,2\n3\n", "line 2: 1 numbers, and 2 in the lines before"),
@@ -246,13 +309,26 @@ def test_any_bytes_become_scans_or_a_named_error(
     tmp_path_factory: pytest.TempPathFactory, ending: str, data: st.DataObject
 ) -> None:
     path = tmp_path_factory.mktemp("any") / f"in{ending}"
-    rows = np.arange(416.0).reshape(2, 208) + 1
     if ending == ".mat":
-        savemat(path, {"vh": rows[:1], "vi": {"meas": rows}}, do_compression=True)
+        savemat(path, {"vh": ROWS[:1], "vi": {"meas": ROWS}}, do_compression=True)
     elif ending == ".get":
-        path.write_bytes(get_file(rows, False))
+        path.write_bytes(get_file(ROWS, False))
     else:
-        path.write_text(text(rows))
+        path.write_text(text(ROWS))
+    read_damaged(path, data)
+
+
+@settings(max_examples=10, deadline=None, suppress_health_check=list(HealthCheck))
+@given(data=st.data())
+def test_any_bytes_of_version_7_3(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    path = tmp_path_factory.mktemp("any") / "in.mat"
+    save_hdf5(path, {"vh": [ROWS[:1]], "vi": {"meas": ROWS}})
+    read_damaged(path, data)
+
+
+def read_damaged(path: Path, data: st.DataObject) -> None:
     whole = bytearray(path.read_bytes())
     for place, byte in data.draw(
         st.lists(st.tuples(st.integers(0, len(whole) - 1), st.integers(0, 255)), max_size=8)
