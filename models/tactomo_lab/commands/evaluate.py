@@ -13,13 +13,9 @@ import typer
 from tactomo.cli import options
 from tactomo.cli.commands import Group
 from tactomo.cli.output import print_json, table
-from tactomo.cli.plot.plot import prepare_picture
+from tactomo.cli.plot.plot import picture_option
 
 if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
-
-    from tactomo_lab.evaluation.moving import PhaseSummary
     from tactomo_lab.evaluation.still import Outcome
 
 Item = TypeVar("Item")
@@ -42,9 +38,7 @@ SnrOf = Annotated[
         "voltages at rest, of which changes are a few percent or less."
     ),
 ]
-Picture = Annotated[
-    Path | None, typer.Option(help="Draw truth and outcome: .png, .svg or .pdf. Needs matplotlib.")
-]
+Picture = Annotated[Path | None, picture_option("Draw truth and outcome")]
 
 
 @app.command(
@@ -81,8 +75,6 @@ def scenes(
     from tactomo_lab.evaluation.still import reconstruct_scenes
     from tactomo_lab.scenes.still_scenes import scenes as draw_scenes
 
-    if picture is not None:
-        prepare_picture(picture)
     numbers, ratios = _range(contacts), _decibels(snr)
     description = load_description(sensor)
     drawn = chain.from_iterable(
@@ -156,7 +148,14 @@ def moving(
         frames = [[asdict(score) for score in scores] for scores in played]
         print_json({**settings, "phases": rows, "sequences": frames})
     else:
-        _print_moving(settings, f"{count} sequences, {snr:g} dB", phases)
+        print_tables(
+            settings,
+            phases,
+            {f"{count} sequences, {snr:g} dB": PHASES},
+            "worst: ICC that 95 % exceed; shape: ICC of the pressed shape; lost: longest run of "
+            "frames in which that is below 0.8, median and most; ids: identities lost; wrong: "
+            "frames with an ICC below 0.8 or another count, and no flag that says so.",
+        )
 
 
 def _range(text: str) -> range:
@@ -224,34 +223,46 @@ def settings_of(sensor: str, seeds: str, snr_of: str, method: str) -> dict[str, 
     return {"simulated": True, "sensor": sensor, "seeds": seeds, "snr_of": snr_of, "method": method}
 
 
-def print_settings(console: Console, settings: dict[str, Any]) -> None:
-    """Print what was evaluated."""
+def print_tables(
+    settings: dict[str, Any],
+    groups: Mapping[str, object],  # summaries by their names
+    tables: Mapping[str, Sequence[str]],  # by their titles, columns out of `FIGURES`
+    legend: str,
+) -> None:
+    """Print what was evaluated, and tables of what came out."""
+    from rich.console import Console
+
+    console = Console()
     console.print(
         f"Simulated, not measured: {settings['sensor']}, {settings['seeds']} seeds, method "
         f"[bold]{settings['method']}[/], SNR of the {settings['snr_of']}."
     )
+    for title, columns in tables.items():
+        made = table("", *columns, title=title)
+        for name, summary in groups.items():
+            cells = (FIGURES[column](summary).replace("nan", "-") for column in columns)
+            made.add_row(name, *cells)
+        console.print(made)
+    console.print(f"[dim]{legend}[/]")
 
 
 def _print_scenes(settings: dict[str, Any], outcomes: Sequence[Outcome]) -> None:
-    from rich.console import Console
-
     from tactomo_lab.scenes.measures import summaries, summarise
 
     scores = [outcome.score for outcome in outcomes]
-    console = Console()
-    print_settings(console, settings)
     groups = {"all": summarise(scores)}
     for name, rows in summaries(scores).items():
         if len(rows) > 1:
             groups |= {f"{name} {value}": summary for value, summary in rows.items()}
-    console.print(summary_table("maps, cold start", groups, MAPS))
-    console.print(summary_table("contacts", groups, CONTACTS))
-    console.print(
-        "[dim]worst: ICC that 95 % exceed; shape: ICC of the pressed shape; wrong: ICC below 0.8 "
+    print_tables(
+        settings,
+        groups,
+        {"maps, cold start": MAPS, "contacts": CONTACTS},
+        "worst: ICC that 95 % exceed; shape: ICC of the pressed shape; wrong: ICC below 0.8 "
         "or another count, and no flag that says so. count: right; missed: of the true contacts; "
         "false: a scene; mm: centre error, median; Δσ: error of the magnitude, mean, share of the "
         "range; spread: largest minus smallest at one pressure; in σ: within one reported "
-        "standard uncertainty, 68 % where that is right.[/]"
+        "standard uncertainty, 68 % where that is right.",
     )
 
 
@@ -291,25 +302,3 @@ PHASES = (
     *("frames", "ICC", "worst", "shape", "count", "lost", "most", "ids"),
     *("flagged", "wrong", "ms", "p99"),
 )
-
-
-def _print_moving(settings: dict[str, Any], title: str, phases: dict[str, PhaseSummary]) -> None:
-    from rich.console import Console
-
-    console = Console()
-    print_settings(console, settings)
-    console.print(summary_table(title, phases, PHASES))
-    console.print(
-        "[dim]worst: ICC that 95 % exceed; shape: ICC of the pressed shape; lost: longest run of "
-        "frames in which that is below 0.8, median and most; ids: identities lost; wrong: frames "
-        "with an ICC below 0.8 or another count, and no flag that says so.[/]"
-    )
-
-
-def summary_table(title: str, groups: Mapping[str, object], columns: Sequence[str]) -> Table:
-    """Return a table of summaries by the name of each, its columns some of `FIGURES`."""
-    made = table("", *columns, title=title)
-    for name, summary in groups.items():
-        cells = (FIGURES[column](summary).replace("nan", "-") for column in columns)
-        made.add_row(name, *cells)
-    return made

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from tactomo.cli.options import DEFAULT_DESCRIPTION, Description, JsonOutput, examples, typer_app
 from tactomo.cli.output import print_json, table
-from tactomo.cli.plot.plot import prepare_picture, save_figure
+from tactomo.cli.plot.plot import save_figure
 
 from tactomo_lab.commands.evaluate import Picture, Seeds, shown
 
@@ -58,8 +58,6 @@ def drift(
 
     from tactomo_lab.evaluation.drifting import live, simulate_day, summarise_day
 
-    if picture is not None:
-        prepare_picture(picture)
     description = load_description(sensor)
     days, told = [], []
     for number in range(count):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from tactomo.cli import options
 from tactomo.cli.output import print_json
-from tactomo.cli.plot.plot import prepare_picture
+from tactomo.cli.plot.plot import picture_option
 
 from tactomo_lab.commands import evaluate
 
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from tactomo_lab.scenes.measures import FrameScore
 
 EVEN_FIT = "tactomo_lab.baselines.even_fit:EvenFit"
+MAPS = ("frames", "ICC", "RIE", "worst", "flagged", "silent", "alarms", "ms", "p99")
+CONTACTS = ("count", "mm", "peak", "in σ", "place in σ", "area in σ")
 
 app = options.typer_app()
 
@@ -37,9 +39,9 @@ def field(
     sensor: options.Description = options.DEFAULT_DESCRIPTION,
     picture: Annotated[
         Path | None,
-        typer.Option(
-            help="Draw one soft contact, the middle one by correlation: truth, an even pressure "
-            "fitted, the method: .png, .svg or .pdf. Needs matplotlib."
+        picture_option(
+            "Draw one soft contact, the middle one by correlation: truth, an even pressure fitted, "
+            "the method"
         ),
     ] = None,
     as_json: options.JsonOutput = False,
@@ -58,9 +60,8 @@ def field(
     from tactomo_models import ModelError, load_description
 
     from tactomo_lab.evaluation.field import ROWS, STILL_ROWS, middle_press, scores_of_row
+    from tactomo_lab.scenes.measures import summarise
 
-    if picture is not None:
-        prepare_picture(picture)
     description = load_description(sensor)
     scores: dict[str, list[FrameScore]] = {}
     for row in evaluate.chosen_names(rows, ROWS, "--rows"):
@@ -72,42 +73,23 @@ def field(
                 typer.echo(f"left out: {line}: {error}", err=True)
     settings = evaluate.settings_of(description.name, seeds, "change", method)
     if as_json:
-        print_json({**settings, "scenes_each": count, "lines": _as_json(scores)})
+        lines = {
+            line: {**asdict(summarise(own)), "scores": [asdict(one) for one in own]}
+            for line, own in scores.items()
+        }
+        print_json({**settings, "scenes_each": count, "lines": lines})
     else:
-        _print(settings, scores)
+        evaluate.print_tables(
+            settings,
+            {line: summarise(own) for line, own in scores.items()},
+            {"maps": MAPS, "contacts": CONTACTS},
+            "worst: ICC that 95 % exceed; silent: maps with an ICC below 0.7 and no flag that "
+            "tells to distrust, of all; alarms: good maps with one, of the good ones. mm: centre "
+            "error, median; peak: right to 10 %, of the true contacts; in σ: magnitudes, places "
+            "and areas within one reported standard uncertainty, 68 % where that is right.",
+        )
     if picture is not None:
         from tactomo_lab.commands.pictures import draw_press
 
         draw_press(middle_press(description, (EVEN_FIT, method), seeds, count), picture)
         typer.echo(f"wrote {picture}", err=True)
-
-
-def _as_json(scores: dict[str, list[FrameScore]]) -> dict[str, Any]:
-    from tactomo_lab.scenes.measures import summarise
-
-    return {
-        line: {**asdict(summarise(own)), "scores": [asdict(one) for one in own]}
-        for line, own in scores.items()
-    }
-
-
-def _print(settings: dict[str, Any], scores: dict[str, list[FrameScore]]) -> None:
-    from rich.console import Console
-
-    from tactomo_lab.scenes.measures import summarise
-
-    console = Console()
-    evaluate.print_settings(console, settings)
-    groups = {line: summarise(own) for line, own in scores.items()}
-    console.print(evaluate.summary_table("maps", groups, MAPS))
-    console.print(evaluate.summary_table("contacts", groups, CONTACTS))
-    console.print(
-        "[dim]worst: ICC that 95 % exceed; silent: maps with an ICC below 0.7 and no flag that "
-        "tells to distrust, of all; alarms: good maps with one, of the good ones. mm: centre "
-        "error, median; peak: right to 10 %, of the true contacts; in σ: magnitudes, places and "
-        "areas within one reported standard uncertainty, 68 % where that is right.[/]"
-    )
-
-
-MAPS = ("frames", "ICC", "RIE", "worst", "flagged", "silent", "alarms", "ms", "p99")
-CONTACTS = ("count", "mm", "peak", "in σ", "place in σ", "area in σ")

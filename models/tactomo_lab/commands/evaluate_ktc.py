@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from tactomo.cli.options import Description, JsonOutput, examples, typer_app
 from tactomo.cli.output import print_json, table
-from tactomo.cli.plot.plot import prepare_picture, save_figure
+from tactomo.cli.plot.plot import save_figure
 from tactomo.errors import TactomoError
 
 from tactomo_lab.commands.evaluate import Picture, shown
@@ -50,8 +50,6 @@ def ktc(
 
     from tactomo_lab.evaluation.ktc import evaluate_challenge, read_challenge
 
-    if picture is not None:
-        prepare_picture(picture)
     description = load_description(sensor)
     if description.sheet.shape != "disc" or description.structure is None:
         raise TactomoError(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from tactomo.cli.options import Description, JsonOutput, examples, method_option, typer_app
 from tactomo.cli.output import print_json, table
-from tactomo.cli.plot.plot import prepare_picture, save_figure
+from tactomo.cli.plot.plot import save_figure
 from tactomo.errors import TactomoError
 
 from tactomo_lab.commands.evaluate import Picture, shown
@@ -58,8 +58,6 @@ def tanks(
 
     from tactomo_lab.evaluation.tanks import TankImager, evaluate_tanks, read_tanks
 
-    if picture is not None:
-        prepare_picture(picture)
     description = load_description(sensor)
     if description.channels != ("structure",):
         raise TactomoError(

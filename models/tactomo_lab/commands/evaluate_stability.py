@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from tactomo.cli import options
 from tactomo.cli.output import print_json, table
-from tactomo.cli.plot.plot import prepare_picture
+from tactomo.cli.plot.plot import picture_option
 
 from tactomo_lab.commands.evaluate import Seeds, chosen_names, shown
 
@@ -42,9 +42,7 @@ def stability(
     method: Annotated[list[str] | None, options.methods_option(" [all that are available]")] = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes that share the work.")] = 1,
     sensor: options.Description = options.DEFAULT_DESCRIPTION,
-    picture: Annotated[
-        Path | None, typer.Option(help="Draw an overview: .png, .svg or .pdf. Needs matplotlib.")
-    ] = None,
+    picture: Annotated[Path | None, picture_option("Draw an overview")] = None,
     as_json: options.JsonOutput = False,
 ) -> None:
     """Break what reconstruction relies on, one regime at a time, and see whether it is flagged.
@@ -63,8 +61,6 @@ def stability(
     from tactomo_lab.evaluation.stability import evaluate_regimes
 
     regimes = chosen_names(regime, REGIMES, "--regime")
-    if picture is not None:
-        prepare_picture(picture)
     description = load_description(sensor)
     chosen = method or usable(description, available_methods())
     cases = evaluate_regimes(description, regimes, chosen, seeds, count, jobs=jobs)

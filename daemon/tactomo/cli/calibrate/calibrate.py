@@ -10,7 +10,7 @@ import typer
 
 from tactomo.cli import options
 from tactomo.cli.output import table
-from tactomo.cli.plot.plot import prepare_picture
+from tactomo.cli.plot.plot import picture_option
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -50,7 +50,7 @@ Output = Annotated[
     Path | None,
     typer.Option("--output", "-o", help="Keep it in this file. [where the daemon looks]"),
 ]
-Picture = Annotated[Path | None, typer.Option(help="Draw readings and curve: .png, .svg or .pdf.")]
+Picture = Annotated[Path | None, picture_option("Draw readings and curve")]
 
 
 @app.command(
@@ -76,11 +76,12 @@ def live(
     when there are enough. Ctrl-C keeps what was taken; the same command goes on from there.
     """
     from tactomo.cli.calibrate.live import guided
+    from tactomo.cli.calibrate.reload import keep
 
     path = _path(sensor, output)
     made = guided(sensor, stream, keys, _area_mm2(diameter_mm, area_mm2), path, fresh=fresh)
     print_calibration(made)
-    _keep(made, path, control, keys)
+    keep(made, path, control, keys)
 
 
 @app.command(
@@ -128,9 +129,8 @@ def fit(
     if not math.isfinite(time_offset):
         raise typer.BadParameter(f"--time-offset {time_offset}: give seconds")
     area = _area_mm2(diameter_mm, area_mm2)
-    if picture is not None:
-        prepare_picture(picture)
     from tactomo.cli.calibrate.fit import fitted
+    from tactomo.cli.calibrate.reload import keep
 
     path = _path(sensor, output)
     made, odd = fitted(
@@ -139,7 +139,7 @@ def fit(
     print_calibration(made)
     is_refused = bool(odd) and not keep_odd
     if not (dry_run or is_refused):
-        _keep(made, path, control, keys)
+        keep(made, path, control, keys)
     _draw(made, picture)
     if is_refused and not dry_run:
         from tactomo_models import CalibrationError
@@ -169,8 +169,6 @@ def show(
     from tactomo_models import CalibrationError
     from tactomo_models.calibration.calibration_file import read_calibration
 
-    if picture is not None:
-        prepare_picture(picture)
     path = _path(sensor, file)
     try:
         made = read_calibration(path)
@@ -211,17 +209,6 @@ def _area_mm2(diameter_mm: float | None, area_mm2: float | None) -> float | None
     if area_mm2 is not None:
         raise typer.BadParameter("--diameter-mm and --area-mm2: give one of them")
     return math.pi / 4 * diameter_mm**2
-
-
-def _keep(made: PressureCalibration, path: Path, control: str, keys: Path | None) -> None:
-    from tactomo_models.calibration.calibration_file import save_calibration
-
-    from tactomo.cli.calibrate.reload import taken_up
-
-    save_calibration(made, path)
-    typer.echo(f"kept in {path}")
-
-    typer.echo(taken_up(made, path, control, keys))
 
 
 def _draw(made: PressureCalibration, picture: Path | None) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+import typer
 from tactomo_client.status import Calibration, Taught
 
 from tactomo.errors import TactomoError
@@ -43,6 +44,21 @@ def reload_kept(sensor: str, control: str, keys: Path | None) -> str:
         f"in force now: the daemon of {sensor} goes by {found.readings} readings of "
         f"{found.taken[:10]}, {low:.0f} to {high:.0f} kPa"
     )
+
+
+def keep(
+    made: PressureCalibration | TaughtSkin, path: Path, control: str, keys: Path | None
+) -> None:
+    """Write what was made into a file, and have its sensor's daemon go by it, if that runs."""
+    from tactomo_models.calibration.calibration_file import PressureCalibration, save_calibration
+    from tactomo_models.calibration.taught_skin import save_taught
+
+    if isinstance(made, PressureCalibration):
+        save_calibration(made, path)
+    else:
+        save_taught(made, path)
+    typer.echo(f"kept in {path}")
+    typer.echo(taken_up(made, path, control, keys))
 
 
 def taken_up(

@@ -153,10 +153,9 @@ def _teach(
     """Learn from a file, keep what is learnt in `path`, if any, and have the daemon use it."""
     from rich.console import Console
     from rich.progress import Progress
-    from tactomo_models.calibration.taught_skin import save_taught
     from tactomo_models.teach import read_presses, teach
 
-    from tactomo.cli.calibrate.reload import taken_up
+    from tactomo.cli.calibrate.reload import keep
 
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("reconstructing presses", total=None)
@@ -169,12 +168,8 @@ def _teach(
     for note in notes:
         typer.echo(note, err=True)
     _print(taught)
-    if path is None:
-        return
-    save_taught(taught, path)
-    typer.echo(f"kept in {path}")
-
-    typer.echo(taken_up(taught, path, control, keys))
+    if path is not None:
+        keep(taught, path, control, keys)
 
 
 def _print(taught: TaughtSkin) -> None:

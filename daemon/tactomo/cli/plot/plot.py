@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -100,6 +100,17 @@ def prepare_picture(output: Path, *, force: bool = True) -> None:
         import matplotlib
     matplotlib.use("Agg")
     prepare_file(output, force=force)
+
+
+def picture_option(words: str) -> Any:
+    """Return the option of a picture, which is made sure of before the command begins."""
+
+    def prepared(context: typer.Context, output: Path | None) -> Path | None:
+        if output is not None and not context.resilient_parsing:
+            prepare_picture(output)
+        return output
+
+    return typer.Option(help=f"{words}: .png, .svg or .pdf. Needs matplotlib.", callback=prepared)
 
 
 def prepare_folder(folder: Path) -> None:
