@@ -13,9 +13,9 @@ from typing import Final
 from tactomo_models.arrays import FloatArray, Image
 from tactomo_models.methods.fit import OutlineFit
 from tactomo_models.methods.method import Estimate, Skin, UnsolvableError
+from tactomo_models.methods.moves import Propose, ShapeModel
 from tactomo_models.methods.network import network_estimate, network_image
 from tactomo_models.methods.trained_networks import NONE_TRAINED
-from tactomo_models.methods.warm_started_fit import Propose, ShapeModel
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scene.field_account import FieldAccount

@@ -17,8 +17,9 @@ from tactomo_models.methods.joint_fit import QUESTIONS, Question
 from tactomo_models.methods.linear import LinearImages
 from tactomo_models.methods.magnitudes import BAD_MISFIT
 from tactomo_models.methods.method import Estimate, Skin, UnsolvableError
+from tactomo_models.methods.moves import Propose, ShapeModel
 from tactomo_models.methods.objects import ObjectFit
-from tactomo_models.methods.warm_started_fit import Propose, ShapeModel, WarmStartedFit
+from tactomo_models.methods.warm_started_fit import WarmStartedFit
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scene.field_account import FieldAccount, FieldAccountant

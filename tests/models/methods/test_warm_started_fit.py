@@ -7,7 +7,8 @@ import pytest
 from pressed import Sensor, contact, contacts, data_of, described
 from tactomo_models import Channel, SensorDescription
 from tactomo_models.arrays import FloatArray
-from tactomo_models.methods.warm_started_fit import ShapeModel, WarmStartedFit
+from tactomo_models.methods.moves import ShapeModel
+from tactomo_models.methods.warm_started_fit import WarmStartedFit
 from tactomo_models.physics.bare_sheet import solve_bare_sheet
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import mesh_sheet
