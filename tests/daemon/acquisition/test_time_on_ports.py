@@ -191,7 +191,7 @@ def test_boards_out_of_step_are_flagged_zeroed_and_forgiven(bench: Start) -> Non
     b.until(are_asked)
     event = b.listener.event("channels_skewed")
     assert "sync line" in event["next_step"]
-    assert "channels_skewed" in b.listener.of("map")[-1]["flags"]
+    b.listener.wait("map", lambda frame: "channels_skewed" in frame["flags"])  # after the event
     for channel, status in ((MAGNITUDE, AckStatus.OK), (STRUCTURE, AckStatus.UNKNOWN_COMMAND)):
         command = heard[channel][0]
         b.skin.line_of(channel).say(Acknowledge(command.request, command.code, status))

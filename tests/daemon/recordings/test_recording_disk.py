@@ -223,7 +223,8 @@ def test_the_daemon_stops_although_the_disk_does_not_answer(
     b.ask("status")  # and others are answered
     begin_s = time.monotonic()
     b.daemon.stop()
-    assert time.monotonic() - begin_s < recorder.STOP_S + 2
+    # Beyond what is waited for the disk, what a stop takes on a busy computer.
+    assert time.monotonic() - begin_s < recorder.STOP_S + 10
     turn("-u")
     b.until(lambda: all(thread.name != "recorder" for thread in threading.enumerate()))
     assert counters(disk / "a.mcap") == [1, 2, 3, 4]

@@ -78,12 +78,18 @@ def test_a_late_joiner_gets_the_status_at_once(bench: Start, connect: Start) -> 
     b = bench()
     b.tare()
     b.until(lambda: len(b.listener.of("status")) >= 2)
-    # The next one is due in a second; a repetition comes at once and has the number of the last.
-    last = b.listener.of("status")[-1]["sequence"]
-    socket = connect(zmq.SUB, b.daemon.stream_address, topic("left", "status"))
-    assert socket.poll(30_000)
-    assert decode_message(socket.recv()).fields["sequence"] == last
-    socket.close()
+
+    def is_repeated() -> bool:
+        # The next one is due in a second; a repetition comes at once and has the number of the
+        # last. A joiner whom a busy computer holds up for that second gets a new one.
+        last: int = b.listener.of("status")[-1]["sequence"]
+        socket = connect(zmq.SUB, b.daemon.stream_address, topic("left", "status"))
+        assert socket.poll(30_000)
+        came: int = decode_message(socket.recv()).fields["sequence"]
+        socket.close()
+        return came == last
+
+    b.until(is_repeated)
     b.until(lambda: b.ask("status")["subscribers"] == 5)
 
 

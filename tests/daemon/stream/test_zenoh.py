@@ -177,14 +177,10 @@ def test_a_skin_at_rest_is_sent_by_a_heartbeat_and_a_touch_at_once(
     samples = Samples(desk, "tactomo/arm/left/contacts")
     start(left, robot="arm")
     samples.until(lambda: samples.all, left.publish)
-    frames, began_s = 0, time.monotonic()
-    while time.monotonic() - began_s < 5 * HEARTBEAT_S:
-        left.publish()
-        frames += 1
-        time.sleep(0.01)
+    began_s = time.monotonic()
+    samples.until(lambda: len(samples.all) >= 6, left.publish)  # its heart goes on beating
     took_s = time.monotonic() - began_s
-    assert frames > 3 * len(samples.all)
-    assert took_s / HEARTBEAT_S - 2 <= len(samples.all) <= took_s / HEARTBEAT_S + 2
+    assert len(samples.all) <= took_s / HEARTBEAT_S + 2
     left.publish(TOUCH)
     left.publish(flags=["misfit_high"])
     wait_until(lambda: samples.all[-1][1]["flags"])
