@@ -91,13 +91,19 @@ class Bench:
         self.daemon.popen.wait(PATIENCE_S)
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(300)
-def test_a_guided_session_makes_pressures_right(
+@pytest.fixture
+def bench(
     twin: dict[str, list[str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+) -> Iterator[Bench]:
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     bench = Bench(twin, tmp_path)
+    yield bench
+    bench.close()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_guided_session_makes_pressures_right(bench: Bench, tmp_path: Path) -> None:
     wrong = bench.contact(200)
     assert wrong.pressure_kpa is not None
     assert wrong.pressure_sigma_kpa is not None
@@ -149,7 +155,6 @@ def test_a_guided_session_makes_pressures_right(
     hard = bench.contact(300)
     assert hard.pressure_range == "above"
     assert hard.pressure_kpa == pytest.approx(max(LEVELS_KPA), abs=0.1)
-    bench.close()
     live, again = pressures(recording), replayed(recording, tmp_path / "again.mcap")
     shared = live.keys() & again.keys()  # at an end a frame may lack its mark, or a mark its frame
     assert len(shared) >= len(live) - 2

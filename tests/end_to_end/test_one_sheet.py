@@ -150,4 +150,5 @@ def test_the_page_shows_the_contact(one_sheet: tuple[Demo, str], browser: Chrome
     pressed_frame(demo)
     browser.get(demo.page)
     wait_until(lambda: browser.find_elements(By.CSS_SELECTOR, "#contacts [data-id]"), "the contact")
-    assert browser.execute_script("return document.body.dataset.health") == "good"
+    health = "return document.body.dataset.health"  # stale for a moment on a busy computer
+    wait_until(lambda: browser.execute_script(health) == "good", "a page that is well")

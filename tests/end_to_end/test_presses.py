@@ -90,11 +90,12 @@ def test_a_lost_channel_is_flagged_and_the_other_goes_on(any_demo: Demo) -> None
     any_demo.press(10.0, -10.0)
     settled_frame(any_demo, [(10.0, -10.0)])
     with subscribe(SENSOR, address=any_demo.stream, timeout_s=PATIENCE_S) as frames:
-        next(frames)  # so that none of what follows is missed
-        request("mute", any_demo.twin, channel="structure", seconds=3)
+        next(frame for frame in frames if frame.tier == "fit")  # none of what follows is missed
+        request("mute", any_demo.twin, channel="structure", seconds=PATIENCE_S)
         missing = (frame for frame in frames if "structure_missing" in frame.flags)
         bridged = next(missing)
         alone = next(frame for frame in missing if frame.tier == "network")
+    request("mute", any_demo.twin, channel="structure", seconds=1e-9)  # it is over
     assert bridged.tier == "fit", "the last shape stands in for a moment"
     for frame in (bridged, alone):
         assert frame.map is not None, "the magnitude channel's image goes on"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from fleet_measure import Case, measure
+from fleet_measure import DOWN_S, Case, measure
 
 
 @pytest.mark.slow
@@ -21,4 +21,4 @@ def test_a_router_killed_and_back_costs_what_the_counts_tell() -> None:
     assert figures["tokens"] == {"SampleKind.PUT": 40, "SampleKind.DELETE": 20}
     assert figures["lost"] > 0
     assert figures["untold"] == 0
-    assert figures["latency_ms"]["0.5"] < 100
+    assert figures["latency_ms"]["0.5"] < 500 * DOWN_S  # none was kept while the router was away

@@ -65,7 +65,11 @@ class DaemonProcess:
             )
         self.stream = self.control = ""
         if ready:
-            self.wait_ready()
+            try:
+                self.wait_ready()
+            except BaseException:
+                self.kill()  # nobody else has it yet
+                raise
 
     def wait_ready(self) -> None:
         """Wait until it serves, and take note of its addresses."""

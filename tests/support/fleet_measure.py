@@ -90,7 +90,7 @@ def touch() -> list[Contact]:
 
 
 def robot(ports: list[int], number: int, case: Case, start_s: float) -> None:
-    """Publish a robot's skins, and print how many messages of each key were sent."""
+    """Publish a robot's skins, print how many messages were sent, and stay until killed."""
     zenoh_publication.HEARTBEAT_S = case.heartbeat_s  # type: ignore[misc]
     with session("client", 0, *ports) as own:
         publication = zenoh_publication.Publication(own, f"robot{number}")
@@ -105,15 +105,15 @@ def robot(ports: list[int], number: int, case: Case, start_s: float) -> None:
                 data = frame(name, step, touch()) if is_touched[name] else at_rest[name]
                 publication.take("simulated", data)
         behind_s = time.monotonic() - start_s - case.seconds
-        wait_till(start_s + case.seconds + END_S)
+        time.sleep(END_S)
         sent = sum(skin._counts["contacts"] for skin in publication._skins.values())
-        print(
-            json.dumps({"sent": sent, "frames": steps // SLICES * len(names), "behind_s": behind_s})
-        )
+        said = {"sent": sent, "frames": steps // SLICES * len(names), "behind_s": behind_s}
+        print(json.dumps(said), flush=True)
+        signal.pause()  # its going away is not counted
 
 
-def reader(port: int, case: Case, start_s: float) -> None:
-    """Count what comes, and print it."""
+def reader(port: int) -> None:
+    """Count what comes until its input ends, and print it."""
     counts: dict[str, int] = {}
     said = {"received": 0, "bytes": 0, "lost": 0, "before_the_first": 0}
     latencies_ms: list[float] = []
@@ -139,7 +139,7 @@ def reader(port: int, case: Case, start_s: float) -> None:
             "tactomo/*/*", lambda s: tokens.update([str(s.kind)]), history=True
         )
         subscriber = own.declare_subscriber("tactomo/*/*/contacts", take)
-        wait_till(start_s + case.seconds + END_S)
+        sys.stdin.read()
         subscriber.undeclare()  # type: ignore[no-untyped-call]
         presence.undeclare()  # type: ignore[no-untyped-call]
     latencies_ms.sort()
@@ -170,9 +170,9 @@ def measure(case: Case) -> dict[str, Any]:
     with programs() as start:
         routers = [start("router", ports[0], 0), start("router", ports[1], ports[0])]
         start_s = time.monotonic() + SETTLE_S
-        shared = (json.dumps(asdict(case)), start_s)
-        reading = start("reader", ports[1], *shared)
+        reading = start("reader", ports[1])
         doors = json.dumps(ports if case.knows_both else ports[:1])
+        shared = (json.dumps(asdict(case)), start_s)
         robots = [start("robot", doors, n, *shared) for n in range(case.robots)]
         wait_till(start_s)
         everybody = {"router_1": routers[0], "router_2": routers[1], "reader": reading}
@@ -187,8 +187,8 @@ def measure(case: Case) -> dict[str, Any]:
             before["router_1"] = 0.0
         wait_till(start_s + case.seconds)
         used = {name: cpu_s(process) - before[name] for name, process in everybody.items()}
-        said = [json.loads(process.communicate()[0]) for process in robots]
-        figures: dict[str, Any] = json.loads(reading.communicate()[0])
+        said = [json.loads(process.stdout.readline()) for process in robots]
+        figures: dict[str, Any] = json.loads(reading.communicate()[0])  # which ends its input
     sent = sum(each["sent"] for each in said)
     return {
         "case": asdict(case),
@@ -211,15 +211,14 @@ def programs() -> Iterator[Any]:
 
     def start(*words: object) -> subprocess.Popen[str]:
         command = [sys.executable, __file__, *map(str, words)]
-        started.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+        started.append(subprocess.Popen(command, **pipes, text=True))
         return started[-1]
 
     yield start
     for process in started:
-        process.kill()
-        process.wait()
-        assert process.stdout is not None
-        process.stdout.close()
+        with process:  # closes its pipes
+            process.kill()
 
 
 def cpu_s(process: subprocess.Popen[str]) -> float:
@@ -269,7 +268,7 @@ if __name__ == "__main__":
     if role == "router":
         router(int(words[0]), int(words[1]))
     elif role == "reader":
-        reader(int(words[0]), Case(**json.loads(words[1])), float(words[2]))
+        reader(int(words[0]))
     elif role == "robot":
         robot(json.loads(words[0]), int(words[1]), Case(**json.loads(words[2])), float(words[3]))
     else:
