@@ -8,8 +8,9 @@ import pytest
 from newcomer import Newcomer
 from page import Page
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]  # doctor looks for ten seconds
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]  # a dozen programs, one after another
 
+SHORTER = {"--seconds 10": "--seconds 3", "doctor ": "doctor --seconds 2 "}
 PAGE = Page("docs/first_skin.md")
 NEED_OTHERS = ("ports", "daemon", "calibrate", "replay")  # adapters, a load cell, a browser
 
@@ -18,7 +19,7 @@ def test_a_simulated_skin_does_for_a_real_one(tmp_path: Path) -> None:
     commands = [line.split("#")[0] for line in PAGE.commands()]
     simulated = commands[-2:]
     done = {}
-    with Newcomer(tmp_path) as newcomer:
+    with Newcomer(tmp_path, SHORTER) as newcomer:
         newcomer.follow(simulated)
         for command in commands[:-2]:
             name = command.split()[1]
