@@ -17,7 +17,6 @@ import pytest
 import zmq
 from daemon_process import DaemonProcess
 from ears import Ears
-from tactomo_client import request
 from tactomo_client.messages import decode_reply, encode_request
 from waiting import wait_until
 
