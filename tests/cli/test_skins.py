@@ -119,7 +119,6 @@ def test_one_that_dies_is_started_again_and_the_other_goes_on(
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_busy_skins_degrade_and_starve_no_still_one(
     start: Callable[..., Robot], rest: Volts
 ) -> None:

@@ -12,7 +12,7 @@ import pytest
 from whole_system import repository
 
 pytest.importorskip("furo", reason="needs what `make docs` installs")
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]  # 12 s of one core
+pytestmark = pytest.mark.slow  # 12 s of one core
 
 
 @pytest.fixture(scope="module")

@@ -102,7 +102,6 @@ def bench(
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_a_guided_session_makes_pressures_right(bench: Bench, tmp_path: Path) -> None:
     wrong = bench.contact(200)
     assert wrong.pressure_kpa is not None

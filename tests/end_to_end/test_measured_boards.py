@@ -101,7 +101,6 @@ def frames_of(daemon: DaemonProcess, last: int, missed: int = 0) -> dict[int, Fr
 
 
 @pytest.mark.long
-@pytest.mark.timeout(300)
 def test_presses_on_a_round_skin_are_located_through_an_openeit_board(tmp_path: Path) -> None:
     """As near as by `tactomo evaluate skin`, whose NOSER image comes to 5.7 mm."""
     path = described(tmp_path, "skin_round", ONE_SIDED)
@@ -139,7 +138,6 @@ def off(seen: FloatArray, true_mm: FloatArray, test: BoolArray) -> FloatArray:
 
 
 @pytest.mark.long
-@pytest.mark.timeout(300)
 def test_tanks_come_as_well_through_a_board_that_prints_tables(tmp_path: Path) -> None:
     """Near what `tactomo evaluate tanks` makes of the same set: 0.86 on average."""
     path = described(tmp_path, "tank_uef2017", UNSIGNED)

@@ -17,8 +17,6 @@ from rosbags.highlevel import AnyReader
 from tactomo_client.fake import FakeSensor
 from waiting import wait_until
 
-pytestmark = pytest.mark.timeout(300)
-
 PAGE_OF_LEROBOT = Page("docs/lerobot.md")
 PRESSED = 50  # the frame of the recorded grasp that is published
 

@@ -14,8 +14,6 @@ from recorded_grasp import write_grasp
 from tactomo_lab.scenes.measures import correlation
 from whole_system import repository
 
-pytestmark = pytest.mark.timeout(300)  # a dozen programs, one after another
-
 PAGE = Page("docs/python.md")
 FILES = ("own_method.py", "float_board.py")
 RUN_AT_ONCE = ("Arrays in", "What a frame says", "Methods")

@@ -27,8 +27,6 @@ from tactomo_models import (
 )
 from tactomo_protocol import Channel, Hello, SampleFormat
 
-pytestmark = pytest.mark.timeout(300)  # a dozen programs, one after another
-
 PAGE = Page("docs/your_own_sensor.md")
 FILE = "my_sheet.toml"
 SMALLER = {"--count 5 --contacts 1-4": "--count 1 --contacts 1", "--seconds 3": "--seconds 1"}

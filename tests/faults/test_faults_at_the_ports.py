@@ -271,7 +271,6 @@ def twin(
 
 
 @pytest.mark.faults
-@pytest.mark.timeout(300)
 @pytest.mark.fault(
     "One channel lost for a minute",
     "flagged, maps go on at the same rate, both channels within 1 s of its return",

@@ -40,7 +40,6 @@ def at_rest(daemon: DaemonProcess) -> dict[str, Any]:
 
 
 @pytest.mark.faults
-@pytest.mark.timeout(200)
 @pytest.mark.fault(
     "Scans at 10 times the rate that can be reconstructed",
     "the newest wins; each dual scan is published or counted as dropped, exactly; no frame is "

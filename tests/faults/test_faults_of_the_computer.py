@@ -69,7 +69,6 @@ def counters(path: Path) -> set[int]:
 
 
 @pytest.mark.faults
-@pytest.mark.timeout(300)
 @pytest.mark.fault(
     "SIGKILL while recording, {loops} busy loops",
     "the file opens again; at most the last 0.25 s are lost, nothing before",

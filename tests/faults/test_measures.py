@@ -141,7 +141,6 @@ def a_third_of_a_core() -> Iterator[None]:
 
 
 @pytest.mark.faults
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize("rate", [5, 20])
 @pytest.mark.measure(
     "Processor time at {rate} Hz with nothing pressed",

@@ -351,7 +351,12 @@ def test_two_robots_skins_of_one_name_are_not_mixed(
     with FakeSensor("left") as other:
         start(other, robot="leg")
         samples = Samples(desk, "tactomo/leg/left/contacts")
-        samples.until(lambda: len(samples.all) > 5, lambda: other.publish(TOUCH))
+
+        def send() -> None:
+            left.publish(TOUCH)  # where the first falls silent, the other takes its place
+            other.publish(TOUCH)
+
+        samples.until(lambda: len(samples.all) > 5, send)
         warning = running.said("same_sensor_twice")
         assert warning["detail"] == "leg and arm both have a skin 'left'"
         assert "--robot leg" in warning["next_step"]
