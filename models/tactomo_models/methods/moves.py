@@ -217,7 +217,9 @@ class Moves:
         assert isinstance(shape.family, PressureField)
         if shape.family.order == 2 or shape.family.count == 0:
             return None
-        other = self._of_contacts(contacts_of(shape), shape, frame, further=1)
+        # Order 1 frees a saturated sheet's ratio; where there is none, it has nothing to gain by.
+        order = shape.family.order + 1 if Channel.STRUCTURE in frame.measured else 2
+        other = self.evaluate(contacts_of(shape), order, shape.log_ratio, frame)
         if other is None:
             return None
         further = len(other.parameters) - len(shape.parameters)
@@ -347,11 +349,11 @@ class Moves:
         return nothing
 
     def _of_contacts(
-        self, each: FloatArray, shape: FittedField, frame: Frame, further: int = 0
+        self, each: FloatArray, shape: FittedField, frame: Frame
     ) -> FittedField | None:
-        """A shape with these contacts instead, of a further order if asked for."""
+        """A shape with these contacts instead."""
         assert isinstance(shape.family, PressureField)
-        return self.evaluate(each, shape.family.order + further, shape.log_ratio, frame)
+        return self.evaluate(each, shape.family.order, shape.log_ratio, frame)
 
     def evaluate(
         self, each: FloatArray, order: int, log_ratio: float, frame: Frame

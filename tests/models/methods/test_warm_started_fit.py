@@ -13,7 +13,17 @@ from tactomo_models.physics.bare_sheet import solve_bare_sheet
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import mesh_sheet
 from tactomo_models.scene.field_fit import Budget, FittedField, Measured
-from tactomo_models.scene.pressure_field import EDGE, HOLE, PEAK, UNIT_M, PressureField, X, Y
+from tactomo_models.scene.pressure_field import (
+    E1,
+    E2,
+    EDGE,
+    HOLE,
+    PEAK,
+    UNIT_M,
+    PressureField,
+    X,
+    Y,
+)
 
 NOISE = 1e-3  # of each relative change
 PLENTY_S = 10.0
@@ -173,6 +183,15 @@ def test_edges_and_holes_are_what_the_data_say(graded: Skin, edge: float, hole: 
     assert (one[EDGE] > 0, one[HOLE]) == (edge > 0, hole)
     assert one[PEAK] == pytest.approx(pressed[PEAK], rel=0.1)
     assert shape.converged
+
+
+def test_a_long_contact_is_one_ellipse(graded: Skin) -> None:
+    """And no two circles: also where there is no saturated sheet whose ratio is fitted first."""
+    pressed = contact(-0.002, 0.003, 0.01, peak=0.85, e=(0.25, 0.1))
+    shape, _ = follow(WarmStartedFit(graded.sensor.fit), graded.frame(pressed, noise=1e-2))
+    assert isinstance(shape.family, PressureField)
+    (one,) = shape.family.split(shape.parameters)
+    assert one[[E1, E2]] == pytest.approx([0.25, 0.1], abs=0.1)
 
 
 def test_a_sheet_that_is_lost_and_comes_back_changes_no_contact(
