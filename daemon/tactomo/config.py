@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Self, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM, MessageError
 from tactomo_client.messages import check_sensor_name
@@ -74,19 +74,15 @@ MetricsAddress = Annotated[str, AfterValidator(check_metrics_address)]
 BudgetMs = Annotated[float, Field(gt=0, le=10_000)]
 
 
-class Curve(BaseModel):
+class Curve(BaseModel, extra="forbid", frozen=True):
     """Keys for addresses beyond this computer; `tactomo keys` makes and manages both."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     secret: Path  # the daemon's secret key, which only its user may read
     clients: Path  # a folder of the public keys of those who may connect
 
 
-class RecordingConfig(BaseModel):
+class RecordingConfig(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     """Where recordings go, how they are cut into files, and which of those are kept."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     # Record to this one file from the start; it is not cut and not deleted
     file: Path | None = None
@@ -118,19 +114,15 @@ class RecordingConfig(BaseModel):
         return (self.folder or data_folder() / "recordings").absolute()
 
 
-class BaselineConfig(BaseModel):
+class BaselineConfig(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     """Whether and how fast the reference follows a skin's drift while nothing presses."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     track: bool = True  # off: changes are measured against the last tare as it was
     time_constant_s: Annotated[float, Field(ge=5, le=3600)] = TIME_CONSTANT_S
 
 
-class DaemonConfig(BaseModel):
+class DaemonConfig(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     """What one daemon serves: one sensor, read over one port or two."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     # This sensor's name in every topic, such as ``left_forearm``
     name: Annotated[str, AfterValidator(_sensor_name)] = "skin"

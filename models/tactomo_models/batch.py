@@ -160,10 +160,10 @@ def scans_of(
     references: dict[str, FloatArray] = {}
     for name in description.channels:
         if name in arrays and not all_nan(arrays[name]):
-            scans[name] = _checked(source, name, arrays[name], (None, description.measurements))
+            scans[name] = checked(source, name, arrays[name], (None, description.measurements))
             key = f"{name}_reference"
             if key in arrays:
-                references[name] = _checked(source, key, arrays[key], (description.measurements,))
+                references[name] = checked(source, key, arrays[key], (description.measurements,))
     if not scans:
         raise DataError(
             f"{source} holds none of the channels of {description.name!r} "
@@ -180,7 +180,8 @@ def all_nan(array: Any) -> bool:
     return array.dtype.kind == "f" and bool(np.isnan(array).all())
 
 
-def _checked(source: Path, name: str, array: Any, shape: tuple[int | None, ...]) -> FloatArray:
+def checked(source: Path, name: str, array: Any, shape: tuple[int | None, ...]) -> FloatArray:
+    """Return real numbers of a shape, of any length where None; DataError where they are not."""
     if array.ndim == 2 and len(shape) == 1 and 1 in array.shape:
         array = array.ravel()  # MATLAB has no vectors
     fits = array.ndim == len(shape) and all(

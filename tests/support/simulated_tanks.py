@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 
 import numpy as np
-from tactomo_lab.evaluation.tanks import Tanks, pixels
+from tactomo_lab.evaluation.tanks import Tanks
 from tactomo_lab.scenes.simulation import (
     SHARP_M,
     UnevenSheet,
@@ -14,6 +14,7 @@ from tactomo_lab.scenes.simulation import (
     fitted_mesh,
 )
 from tactomo_lab.scenes.still_scenes import SeedSet
+from tactomo_lab.tanks.images import pixel_grid
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.mesh import SheetMesh
 from tactomo_models.scene.press import Press
@@ -52,11 +53,11 @@ def _simulated(
     radius_m = description.width_m / 2
     objects = _drawn_objects(radius_m, rng)
     mesh = fitted_mesh(mesh, [outline for outline, _ in objects], description)
-    points, grid = centroids(mesh), pixels(SIMULATED_ROWS, SIMULATED_ROWS, radius_m)
-    kind, truth = np.zeros(points.shape[1]), np.zeros(grid[0].shape)
+    points, (x, y, _) = centroids(mesh), pixel_grid(SIMULATED_ROWS)
+    kind, truth = np.zeros(points.shape[1]), np.zeros(x.shape)
     for outline, sign in objects:
         kind[outline.coverage(points[0], points[1], SHARP_M) > 0.5] = sign
-        truth[outline.coverage(*grid, SHARP_M) > 0.5] = sign
+        truth[outline.coverage(radius_m * x, radius_m * y, SHARP_M) > 0.5] = sign
     assert description.structure is not None
     saline = UnevenSheet(description, rng, UNEVENNESS, IMPEDANCE_SPREAD)
     full = np.abs(saline.voltages(mesh, description.structure.saturated_ratio**kind))

@@ -129,7 +129,7 @@ def _explain(url: str, baud: int, error: Exception) -> PortError:
         )
     if number in (errno.EACCES, errno.EPERM):
         return PortError(f"{url} may not be opened by this user", how_to_grant(url))
-    if not is_path(url) or number is not None or _is_device(url):
+    if not is_path(url) or number is not None or Path(url).is_char_device():
         return PortError(f"cannot open {url} at {baud} baud: {error}", "check port and baud rate")
     return PortError(f"{url} is not a serial device", "give a path such as /dev/ttyACM0")
 
@@ -142,7 +142,3 @@ def _busy(url: str, by: list[adapters.Holder]) -> PortBusyError:
         if by
         else f"`sudo fuser -v {url}` shows it; stop it, or give another port",
     )
-
-
-def _is_device(path: str) -> bool:
-    return Path(path).is_char_device()

@@ -221,7 +221,8 @@ class Imaging:
             self._reconstructor.forget_shape()
         volts = {scan.channel: scan.volts for scan in dual.scans}
         self._publish_scan(dual, timing, volts)
-        frame = self._reconstruct(volts, _saturated(dual), is_exact=mark is not None)
+        clipped = [scan.channel for scan in dual.scans if scan.flags & ScanFlag.SATURATED]
+        frame = self._reconstruct(volts, clipped, is_exact=mark is not None)
         if frame is not None and self._is_disputed:
             frame = self._judge_dispute(frame)
         elif frame is not None and self._is_unchecked:
@@ -351,8 +352,3 @@ class Imaging:
         if stage not in self.stages:  # a new dictionary, for those who iterate over the old one
             self.stages = {**self.stages, stage: Durations()}
         self.stages[stage].add(seconds)
-
-
-def _saturated(dual: DualScan) -> list[Channel]:
-    """Return the channels whose device says that its converter clipped."""
-    return [scan.channel for scan in dual.scans if scan.flags & ScanFlag.SATURATED]

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from tactomo_models import Reference, SensorDescription
 from tactomo_models.archive import read_arrays
 from tactomo_models.arrays import FloatArray
-from tactomo_models.batch import all_nan, scans_of
+from tactomo_models.batch import all_nan, checked, scans_of
 from tactomo_models.scans.plausibility import Layout
 from tactomo_models.sensor.named_pattern import NamedPattern, fitting_patterns
 from tactomo_models.sensor.pattern import rim_signs, touching
@@ -393,7 +393,7 @@ def electrode_potentials(
 def _single_ended_arrays(
     path: Path, arrays: dict[str, NDArray[Any]], layout: Layout
 ) -> tuple[NDArray[np.int_], NDArray[Any]]:
-    injection = _checked(path, "injection", arrays["injection"], (-1, 2)).astype(int)
+    injection = _checked(path, "injection", arrays["injection"], (None, 2)).astype(int)
     raw, electrodes = arrays["volts"], layout.electrode_count
     fits = raw.shape[1:] == (len(injection), electrodes) and raw.size > 0
     if not fits or raw.dtype.kind not in "fciu":
@@ -432,18 +432,10 @@ def _times(path: Path, arrays: Mapping[str, NDArray[Any]], count: int) -> FloatA
     return np.asarray(time_s - time_s[0])
 
 
-def _checked(path: Path, name: str, array: NDArray[Any], shape: tuple[int, ...]) -> FloatArray:
-    if array.ndim == 2 and len(shape) == 1 and 1 in array.shape:
-        array = array.ravel()  # MATLAB has no vectors
-    fits = array.ndim == len(shape) and all(
-        wanted in (-1, actual) for wanted, actual in zip(shape, array.shape, strict=True)
-    )
-    if not fits or array.dtype.kind not in "fiu" or array.size == 0:
-        wanted = str(shape).replace("-1", "T")
-        raise ImportFileError(
-            f"{path}: {name} is {array.dtype} {array.shape}", f"it must be real numbers {wanted}"
-        )
-    numbers = array.astype(np.float64)
-    if not np.all(np.abs(numbers) <= MOST):
+def _checked(
+    path: Path, name: str, array: NDArray[Any], shape: tuple[int | None, ...]
+) -> FloatArray:
+    numbers = checked(path, name, array, shape)
+    if not numbers.size or not np.all(np.abs(numbers) <= MOST):
         raise ImportFileError(f"{path}: {name} holds what is out of range", "correct it")
     return numbers

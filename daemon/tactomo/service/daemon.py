@@ -154,13 +154,18 @@ class Daemon:
         self._imaging = Imaging(
             description,
             reconstructor or _make_reconstructor(config, description, artifact),
-            machine_speed or _find_machine_speed(description),
+            machine_speed
+            or machine_speed_for(
+                description, lambda why: log.warning("machine_speed_unused", detail=why)
+            ),
             calibration,
             taught,
             config.tare_scans,
             is_lossless,
             config.baseline,
-            self._make_kept_reference() if replay is None and reconstructor is None else None,
+            None
+            if replay is not None or reconstructor is not None
+            else KeptReference(config.name, description, self._recorder, self._on_event),
             self._recorder,
             self._publisher,
             self._on_event,
@@ -347,9 +352,6 @@ class Daemon:
         for worker in self._workers:
             worker.start()
 
-    def _make_kept_reference(self) -> KeptReference:
-        return KeptReference(self.config.name, self._description, self._recorder, self._on_event)
-
     def _make_metrics(self) -> MetricsServer:
         # Imported where it is asked for: it needs an extra.
         from tactomo.service.metrics import MetricsServer
@@ -505,12 +507,6 @@ def _check_methods(
         )
     for method in made_by:
         check_method(method, description)
-
-
-def _find_machine_speed(description: SensorDescription) -> MachineSpeed:
-    return machine_speed_for(
-        description, lambda why: log.warning("machine_speed_unused", detail=why)
-    )
 
 
 def _protocol(config: DaemonConfig) -> str:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import socket
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from socketserver import TCPServer
 from typing import Any, Final
 from urllib.parse import urlsplit
@@ -147,13 +148,13 @@ class _Handler(WSGIRequestHandler):
         pass
 
 
+@dataclass(eq=False)
 class _StatusCollector(Collector):
     """Turns a status into metrics; called by the thread that answers a scrape."""
 
-    def __init__(self, status: Status, latency: Durations, stages: Times) -> None:
-        self._status = status
-        self._latency = latency
-        self._stages = stages
+    _status: Status
+    _latency: Durations
+    _stages: Times
 
     def describe(self) -> list[Metric]:
         """Return nothing: a registry that checks names would have to take a status first."""

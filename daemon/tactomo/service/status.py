@@ -6,6 +6,7 @@ import os
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
@@ -30,33 +31,26 @@ STALE_S: Final = 1.0
 they come more slowly, a few of their periods."""
 
 
+@dataclass
 class Status:
     """Reads the other parts, from any thread; nothing is written to them."""
 
-    def __init__(
-        self,
-        description: SensorDescription,
-        file: Path | None,
-        ports: list[PortReader],
-        pipeline: Pipeline,
-        imaging: Imaging,
-        recorder: Recorder,
-        events: EventBook,
-        methods: Sequence[str],
-        playback: Playback | None,
-    ) -> None:
-        self._sensor = description
-        self._description = {**description_fields(description), "file": file and str(file)}
-        self._ports = ports
-        self._pipeline = pipeline
-        self._imaging = imaging
-        self._recorder = recorder
-        self._events = events
-        self._methods = methods
-        self._playback = playback
+    _sensor: SensorDescription
+    _file: Path | None  # of the description; None for a shipped one
+    _ports: list[PortReader]
+    _pipeline: Pipeline
+    _imaging: Imaging
+    _recorder: Recorder
+    _events: EventBook
+    _methods: Sequence[str]
+    _playback: Playback | None
+
+    def __post_init__(self) -> None:
+        file = self._file and str(self._file)
+        self._description = {**description_fields(self._sensor), "file": file}
         self._started_s = time.monotonic()
         self._last_minute = LastMinute()
-        self._ports_last_minute = {port.url: LastMinute() for port in ports}
+        self._ports_last_minute = {port.url: LastMinute() for port in self._ports}
 
     def fields(self, latency: Durations, subscribers: int) -> dict[str, Any]:
         """Return the fields of a `status` message; the publisher's part is handed in."""

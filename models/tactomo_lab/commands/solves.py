@@ -61,7 +61,7 @@ def solves(description: Description = DEFAULT_DESCRIPTION, as_json: JsonOutput =
 
     sensor = load_description(description)
     with Console(stderr=True).status("solving"), threadpool_limits(1):
-        rows = [*_by_area(sensor), *_by_mesh(sensor), *_by_sheet(sensor)]
+        rows = list(_rows(sensor))
     if as_json:
         told = {"machine": machine(), "description": description}
         print_json({**told, "rows": [asdict(row) for row in rows]})
@@ -76,20 +76,12 @@ def solves(description: Description = DEFAULT_DESCRIPTION, as_json: JsonOutput =
     Console().print(shown)
 
 
-def _by_area(sensor: SensorDescription) -> Iterator[Row]:
-    measure = _on_sheet("area", sensor, sensor.width_m / (sensor.map.nodes_x - 1))
-    for radius in RADII:
-        yield measure(radius)
-
-
-def _by_mesh(sensor: SensorDescription) -> Iterator[Row]:
-    shipped_m = sensor.width_m / (sensor.map.nodes_x - 1)
+def _rows(sensor: SensorDescription) -> Iterator[Row]:
+    spacing_m = sensor.width_m / (sensor.map.nodes_x - 1)  # as shipped
+    measure = _on_sheet("area", sensor, spacing_m)
+    yield from map(measure, RADII)
     for finer in FINER:
-        yield _on_sheet("mesh", _pressable_in_the_middle(sensor), shipped_m / finer)(RADIUS)
-
-
-def _by_sheet(sensor: SensorDescription) -> Iterator[Row]:
-    spacing_m = sensor.width_m / (sensor.map.nodes_x - 1)
+        yield _on_sheet("mesh", _pressable_in_the_middle(sensor), spacing_m / finer)(RADIUS)
     for larger in LARGER:
         sheet = _pressable_in_the_middle(sensor, larger)
         yield _on_sheet("sheet", sheet, spacing_m)(RADIUS / larger)

@@ -55,12 +55,10 @@ def scores_of_row(
     if row == "moving":
         return {row: _moving(description, method, seed_set, count)}
     lines = scenes_of_row(description, row, seed_set, count)
-    return {line: _still(scenes, method) for line, scenes in lines.items()}
-
-
-def _still(scenes: Iterator[EvaluationScene], method: str) -> Iterator[FrameScore]:
-    for outcome in reconstruct_scenes(scenes, method):
-        yield outcome.score
+    return {
+        line: (outcome.score for outcome in reconstruct_scenes(scenes, method))
+        for line, scenes in lines.items()
+    }
 
 
 def _moving(

@@ -13,12 +13,13 @@ from pathlib import Path
 
 import numpy as np
 from tactomo_models.archive import read_arrays
-from tactomo_models.arrays import BoolArray, FloatArray, Image, IntArray
+from tactomo_models.arrays import FloatArray, Image, IntArray
 from tactomo_models.errors import DataError
 from tactomo_models.sensor.description import SensorDescription
 
 from tactomo_lab.tanks.challenge import every_reading, kept_readings, score
 from tactomo_lab.tanks.fit import TankFit
+from tactomo_lab.tanks.images import pixel_grid
 from tactomo_lab.tanks.model import Readings, TankModel
 
 WATER_SIGMA = 0.05  # of the scale's logarithm; four measured empty tanks leave the model 0.04 off
@@ -149,8 +150,5 @@ def evaluate_challenge(
 
 def classes(f: FloatArray) -> Image:
     """Kinds (rows, columns) as the challenge has them, of a level-set function."""
-    rows, columns = f.shape
-    y = 1 - (np.arange(rows) + 0.5) / rows * 2
-    x = (np.arange(columns) + 0.5) / columns * 2 - 1
-    inside: BoolArray = np.hypot(*np.meshgrid(x, y)) < 1
+    inside = pixel_grid(*f.shape)[2]
     return np.asarray(np.where(f > 0.5, 2, np.where(f < -0.5, 1, 0)) * inside, np.uint8)

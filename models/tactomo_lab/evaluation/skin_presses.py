@@ -25,6 +25,7 @@ from tactomo_models.physics.artifact import Artifact, load_or_build_artifact
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.tikhonov import EVEN, noser_scale, tikhonov_matrix
 from tactomo_models.sensor.description import SensorDescription
+from tactomo_models.sensor.pattern import scan_positions
 
 Estimator = Callable[[IntArray, IntArray], FloatArray]
 
@@ -93,13 +94,7 @@ def scan_order(lookup: IntArray, description: SensorDescription) -> tuple[IntArr
 
     Raises DataError where it is not the description's pattern.
     """
-    pairs = description.pairs
-    place = {
-        (*drive, *measure): index
-        for index, (drive, measure) in enumerate(
-            zip(pairs.drive.tolist(), pairs.measure.tolist(), strict=True)
-        )
-    }
+    place = scan_positions(description.pairs)
     order, sign = [], []
     for source, sink, plus, minus in lookup.tolist():
         turned = (source, sink, plus, minus) not in place

@@ -31,7 +31,7 @@ from tactomo_models.scene.reconstruction import Reconstruction
 from tactomo_models.sensor.description import SensorDescription
 
 from tactomo_lab.scenes import measures
-from tactomo_lab.tanks.images import LinearImages, pixel_grid, probabilities
+from tactomo_lab.tanks.images import LinearImages, pixel_grid, probabilities, signed_image
 from tactomo_lab.tanks.model import Readings, TankModel
 
 BUDGET_S = 20.0  # a file has no deadline
@@ -96,14 +96,6 @@ def read_tanks(path: Path, description: SensorDescription) -> Tanks:
     if not np.isfinite(changes).all():
         raise DataError(f"{path}: dv holds voltages that are not numbers; leave those tanks out")
     return Tanks(tuple(str(name) for name in names), changes, truth)
-
-
-def pixels(rows: int, columns: int, radius_m: float) -> tuple[FloatArray, FloatArray]:
-    """Centres of a picture's pixels, metres; row 0 is the top."""
-    x = ((np.arange(columns) + 0.5) / columns * 2 - 1) * radius_m
-    y = (1 - (np.arange(rows) + 0.5) / rows * 2) * radius_m
-    grid = np.meshgrid(x, y)
-    return grid[0], grid[1]
 
 
 class TankImager:
@@ -201,23 +193,17 @@ def expected_correlation(likely: FloatArray) -> float:
 
 def _network_image(likely: FloatArray, shape: tuple[int, ...]) -> FloatArray:
     """Probability of better minus that of worse on a picture's pixels; NaN off the disc."""
-    rows, columns = shape
-    x, y = pixels(rows, columns, 1.0)
-    axis = pixel_grid(likely.shape[-1])[0][0]
-    image = RegularGridInterpolator(
-        (axis, axis), (likely[2] - likely[1])[::-1], bounds_error=False, fill_value=None
-    )
-    return np.where(np.hypot(x, y) < 1, image(np.stack([y, x], axis=-1)), np.nan)
+    x, y, inside = pixel_grid(*shape)
+    return np.where(inside, signed_image(likely)((y, x)), np.nan)
 
 
 def on_pixels(description: SensorDescription, nodes: Image, shape: tuple[int, ...]) -> FloatArray:
     """A map (nodes_y, nodes_x) on the pixels of a picture; NaN off the disc."""
     radius_m = description.width_m / 2
-    rows, columns = shape
-    x, y = pixels(rows, columns, radius_m)
+    x, y, inside = pixel_grid(*shape)
     grid = (description.map_y_m, description.map_x_m)
-    image = RegularGridInterpolator(grid, nodes)(np.stack([y, x], axis=-1))
-    return np.where(np.hypot(x, y) < radius_m, image, np.nan)
+    image = RegularGridInterpolator(grid, nodes)((radius_m * y, radius_m * x))
+    return np.where(inside, image, np.nan)
 
 
 def correlation(image: FloatArray, truth: FloatArray) -> float:

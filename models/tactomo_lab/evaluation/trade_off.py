@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from tactomo_models.batch import BUDGET_S
@@ -103,19 +103,10 @@ def left_out(description: SensorDescription, methods: Iterable[str]) -> dict[str
 
 
 def _point(scene: SceneKind, snr_db: float, variant: Variant, summary: Summary) -> Point:
-    return Point(
-        scene=scene,
-        snr_db=snr_db,
-        variant=variant,
-        frames=summary.frames,
-        icc=summary.icc,
-        icc_worst=summary.icc_worst,
-        count_right=summary.count_right,
-        distrusted=summary.distrusted,
-        confidently_wrong=summary.confidently_wrong,
-        p50_s=summary.seconds,
-        p99_s=summary.seconds_99,
-    )
+    names = ("frames", "icc", "icc_worst", "count_right", "distrusted", "confidently_wrong")
+    measured: dict[str, Any] = {name: getattr(summary, name) for name in names}
+    measured |= {"p50_s": summary.seconds, "p99_s": summary.seconds_99}
+    return Point(scene, snr_db, variant, **measured)
 
 
 def panels(points: Iterable[Point]) -> Iterator[list[Point]]:

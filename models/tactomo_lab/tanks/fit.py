@@ -18,7 +18,14 @@ from scipy.interpolate import RegularGridInterpolator
 from tactomo_models.arrays import FloatArray
 from tactomo_models.scene.pressure_field import heaviside, heaviside_slope
 
-from tactomo_lab.tanks.images import PIXELS, LinearImages, pixel_grid, probabilities
+from tactomo_lab.tanks.images import (
+    PIXELS,
+    LinearImages,
+    gaussian_grid,
+    pixel_grid,
+    probabilities,
+    signed_image,
+)
 from tactomo_lab.tanks.model import Readings, TankModel
 
 WIDTH = 0.096  # of a Gaussian over the radius
@@ -55,10 +62,7 @@ class TankFit:
         structure = model.description.structure
         assert structure is not None
         self._log_contrast = np.log(structure.saturated_ratio)
-        step = SPACING * WIDTH
-        grid = np.arange(-np.ceil(1 / step), np.ceil(1 / step) + 1) * step
-        centres = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
-        self._centres = centres[np.hypot(*centres.T) < 1]
+        self._centres = gaussian_grid(SPACING * WIDTH, 1.0)
         self._kernels = self._gaussians(model.points)
         count = self._kernels.shape[1]
         ridge = 0.03 * np.eye(count)  # against coefficients of either sign that cancel
@@ -77,11 +81,8 @@ class TankFit:
         """Find what explains readings' changes (n,), known but for a factor."""
         v = self._readings.reduced(changes)
         likely = probabilities(self._images.inputs(v[None]))[0]
-        axis = pixel_grid(PIXELS)[0][0]
-        signed = RegularGridInterpolator(
-            (axis, axis), (likely[2] - likely[1])[::-1], bounds_error=False, fill_value=None
-        )
-        start = self._onto @ np.clip(signed(self._model.points[:, ::-1]), -1, 1)
+        signed = signed_image(likely)(self._model.points[:, ::-1])
+        start = self._onto @ np.clip(signed, -1, 1)
         return self._refined(v, likely, np.append(start, 0.0), scale_sigma)
 
     def _refined(
@@ -147,7 +148,5 @@ class TankFit:
         axis = np.linspace(-1, 1, 2 * PIXELS + 1)
         grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
         f = (self._gaussians(grid) @ tank.coefficients).reshape(len(axis), -1)
-        y = 1 - (np.arange(rows) + 0.5) / rows * 2
-        x = (np.arange(columns) + 0.5) / columns * 2 - 1
-        at = np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1)
-        return np.asarray(RegularGridInterpolator((axis, axis), f)(at))
+        x, y, _ = pixel_grid(rows, columns)
+        return np.asarray(RegularGridInterpolator((axis, axis), f)((y, x)))

@@ -17,6 +17,7 @@ from importlib import resources
 
 import numpy as np
 import onnxruntime as ort
+from scipy.interpolate import RegularGridInterpolator
 from tactomo_models.arrays import BoolArray, FloatArray
 
 from tactomo_lab.tanks.model import Readings, TankModel
@@ -28,10 +29,29 @@ SPACING = 0.9  # of the Gaussians that make the prior, over their standard devia
 INPUTS = len(PRIORS) + 3
 
 
-def pixel_grid(pixels: int) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Centres x, y (pixels, pixels) over the radius, row 0 at the top; which are in the tank."""
-    x, y = np.meshgrid(*[(np.arange(pixels) + 0.5) / pixels * 2 - 1] * 2)
-    return x, -y, np.hypot(x, y) < 1
+def pixel_grid(rows: int, columns: int | None = None) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Centres x, y (rows, columns) over the radius, row 0 at the top; which are in the tank.
+
+    Of a square picture where no columns are given.
+    """
+    down, across = ((np.arange(n) + 0.5) / n * 2 - 1 for n in (rows, columns or rows))
+    x, y = np.meshgrid(across, -down)
+    return x, y, np.hypot(x, y) < 1
+
+
+def gaussian_grid(step: float, reach: float) -> FloatArray:
+    """Centres (K, 2) of Gaussians on a square grid, those within so much of the middle."""
+    grid = np.arange(-np.ceil(1 / step), np.ceil(1 / step) + 1) * step
+    centres = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
+    return np.asarray(centres[np.hypot(*centres.T) < reach])
+
+
+def signed_image(likely: FloatArray) -> RegularGridInterpolator:
+    """Probability of better minus that of worse, to be asked at y, x over the radius."""
+    axis = pixel_grid(likely.shape[-1])[0][0]
+    return RegularGridInterpolator(
+        (axis, axis), (likely[2] - likely[1])[::-1], bounds_error=False, fill_value=None
+    )
 
 
 class LinearImages:
@@ -45,9 +65,7 @@ class LinearImages:
         x, y, self.inside = pixel_grid(PIXELS)
         width = LENGTH / np.sqrt(2)  # whose square's autocorrelation has that length
         step = SPACING * width
-        grid = np.arange(-np.ceil(1 / step), np.ceil(1 / step) + 1) * step
-        centres = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
-        centres = centres[np.hypot(*centres.T) < 1 + step]
+        centres = gaussian_grid(step, 1 + step)
         share = step / width / np.sqrt(np.pi)  # for a variance of 1
 
         def gaussians(points: FloatArray) -> FloatArray:

@@ -19,7 +19,7 @@ from typing import IO, Annotated, Final, Literal, Self
 
 import numpy as np
 from platformdirs import user_data_path
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from tactomo_models.archive import write_whole
 from tactomo_models.calibration.curve import Fit, Reading, fit_curve
@@ -33,10 +33,8 @@ READABLE: Final = "put a file there that may be read, or nothing"
 Points = Annotated[tuple[float, ...], Field(min_length=2, max_length=256)]
 
 
-class Subject(BaseModel):
+class Subject(BaseModel, extra="forbid", frozen=True):
     """What a calibration is of."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     sensor: str  # its name in the stream
     description: str  # name of its description
@@ -96,10 +94,8 @@ def subject_of(
     return Subject.of(sensor, description, device_ids)
 
 
-class PressureCalibration(BaseModel):
+class PressureCalibration(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     """What was found for one sensor, and from what."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     format: Literal[1] = 1  # of the file
     tactomo: str  # the version that made it

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from typing import Annotated, Final, Literal, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 from scipy.optimize import isotonic_regression, nnls
 
 from tactomo_models.arrays import BoolArray, FloatArray
@@ -42,10 +42,8 @@ MAX_KPA: Final = 5000.0  # no skin bears more: it is in Pa
 Direction = Literal["up", "down", "unknown"]
 
 
-class Reading(BaseModel):
+class Reading(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     """A press held still."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     pressure_kpa: Annotated[float, Field(ge=0)]  # what the load cell says, over the indenter's area
     magnitude: Annotated[float, Field(ge=0)]  # |relative conductivity change| inside the contact

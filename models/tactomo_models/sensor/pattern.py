@@ -56,14 +56,15 @@ def rim_signs(pairs: Pairs, electrodes: int) -> IntArray:
     return np.asarray(np.sign(minus - plus) * (one_way.astype(int) - other_way))
 
 
+def scan_positions(pairs: Pairs) -> dict[tuple[int, ...], int]:
+    """Position in a scan of each voltage by its electrodes: source, sink, plus, minus."""
+    rows = np.hstack([pairs.drive, pairs.measure]).tolist()
+    return {tuple(electrodes): position for position, electrodes in enumerate(rows)}
+
+
 def reciprocal_pairs(pairs: Pairs) -> IntArray:
     """Positions (n, 2) in a scan of voltages that are the same but for noise: V(k, m) = V(m, k)."""
-    order = {
-        (*drive, *measure): index
-        for index, (drive, measure) in enumerate(
-            zip(pairs.drive.tolist(), pairs.measure.tolist(), strict=True)
-        )
-    }
+    order = scan_positions(pairs)
     found = [(i, order[k[2:] + k[:2]]) for k, i in order.items() if k[2:] + k[:2] in order]
     return np.array([(i, j) for i, j in found if i < j], dtype=np.intp).reshape(-1, 2)
 

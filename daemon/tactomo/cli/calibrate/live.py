@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Final
 
 from tactomo.cli.steer.watch import View
 from tactomo.errors import TactomoError
@@ -64,13 +64,14 @@ def guided(
         CalibrationError: what was taken makes no curve yet.
     """
     from rich.console import Console
-    from tactomo_models.calibration.calibration_file import PressureCalibration
+    from tactomo_models.calibration.calibration_file import SUFFIX, PressureCalibration
 
     console = Console(highlight=False, soft_wrap=True)
+    log = path.with_name(path.name.removesuffix(SUFFIX) + ".readings.csv")
     view = View(sensor, stream, keys)
     try:
         status = _first_status(view)
-        session = _Session(view, console, status, area_mm2, _log_path(path), fresh=fresh)
+        session = _Session(view, console, status, area_mm2, log, fresh=fresh)
         session.run()
     finally:
         view.close()
@@ -82,12 +83,6 @@ def distrusted(frame: Frame) -> frozenset[str]:
     from tactomo_models.scans.plausibility import DISTRUST
 
     return frame.flags & frozenset(DISTRUST.names())
-
-
-def _log_path(path: Path) -> Path:
-    from tactomo_models.calibration.calibration_file import SUFFIX
-
-    return path.with_name(path.name.removesuffix(SUFFIX) + ".readings.csv")
 
 
 def _first_status(view: View) -> Status:
@@ -258,6 +253,8 @@ class _Session:
         return "" if _are_still(frames) else "moving: hold it still"
 
     def _keep(self, held: Held, force_n: float) -> None:
+        from tactomo_models.calibration.curve import directions_of
+
         assert self._area_mm2 is not None
         kpa = 1e3 * force_n / self._area_mm2
         before = [reading.pressure_kpa for reading in self.readings]
@@ -268,7 +265,7 @@ class _Session:
             "area_mm2": f"{self._area_mm2:.6g}",
             "magnitude": f"{held.magnitude:.6g}",
             "magnitude_sigma": f"{held.magnitude_sigma:.6g}",
-            "direction": _direction([*before, kpa]),
+            "direction": directions_of([*before, kpa])[-1],
             "x_mm": f"{held.x_mm:.2f}",
             "y_mm": f"{held.y_mm:.2f}",
             "contact_mm2": f"{held.contact_mm2:.6g}",
@@ -315,12 +312,6 @@ def _fit_so_far(readings: Sequence[Reading]) -> Fit | None:
         return fit_curve(readings)
     except CalibrationError:
         return None
-
-
-def _direction(pressures_kpa: list[float]) -> Literal["up", "down", "unknown"]:
-    from tactomo_models.calibration.curve import directions_of
-
-    return directions_of(pressures_kpa)[-1]
 
 
 def _are_still(frames: Sequence[Frame]) -> bool:

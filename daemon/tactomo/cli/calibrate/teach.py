@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tactomo.cli import options
+from tactomo.cli.output import progress_bar
 
 if TYPE_CHECKING:
     from tactomo_models import SensorDescription
@@ -151,18 +152,11 @@ def _teach(
     keep_odd: bool,
 ) -> None:
     """Learn from a file, keep what is learnt in `path`, if any, and have the daemon use it."""
-    from rich.console import Console
-    from rich.progress import Progress
     from tactomo_models.teach import read_presses, teach
 
     from tactomo.cli.calibrate.reload import keep
 
-    with Progress(console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("reconstructing presses", total=None)
-
-        def show(done: int, total: int) -> None:
-            progress.update(task, completed=done, total=total)
-
+    with progress_bar("reconstructing presses") as show:
         known = read_presses(presses, description)
         taught, notes = teach(known, description, subject, keep_odd=keep_odd, progress=show)
     for note in notes:

@@ -18,6 +18,7 @@ from tactomo.cli.options import (
     frame_slice,
     typer_app,
 )
+from tactomo.cli.output import progress_bar
 from tactomo.cli.plot.plot import prepare_file
 
 app = typer_app()
@@ -107,7 +108,6 @@ def reconstruct(
     *pls-paper*, the level set of the paper that tactomo is compared with, and the paper's networks,
     *cnn-single* and *cnn-multimodal*.
     """
-    from rich.progress import Progress
     from tactomo_models import load_description
     from tactomo_models.batch import reconstruct_file, reference_at_rest
     from tactomo_models.calibration.calibration_file import calibration_of
@@ -141,12 +141,7 @@ def reconstruct(
         reference = reference.with_noise_of(sensor, *map(given.get, Channel))
     for note in read.notes:
         typer.echo(note, err=True)
-    with Progress(transient=True) as progress:
-        task = progress.add_task("reconstructing", total=None)
-
-        def show(done: int, total: int) -> None:
-            progress.update(task, completed=done, total=total)
-
+    with progress_bar("reconstructing") as show:
         frames = reconstruct_file(
             scans,
             maps,

@@ -6,7 +6,7 @@ import contextlib
 import heapq
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 import typer
 
 from tactomo.cli.children import interrupt_on_sigterm
+from tactomo.cli.output import progress_bar
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
@@ -88,7 +89,7 @@ class RecordedFrames:
     def with_progress(self, moments: Iterator[Moment], doing: str) -> Iterator[Moment]:
         """Yield the moments, with a bar on standard error that shows how far this has come."""
         length_s = min(self.end_s, self._given.duration_s) - self.start_s
-        with _progress_bar(doing) as show:
+        with progress_bar(doing) as show:
             for moment in moments:
                 show(moment.time_s - self.start_s, max(length_s, 1e-9))
                 yield moment
@@ -180,18 +181,6 @@ def _reported_warnings() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: typer.echo(str(message), err=True)
         yield
-
-
-@contextlib.contextmanager
-def _progress_bar(doing: str) -> Iterator[Callable[[float, float], None]]:
-    """Show a bar on standard error while this lasts, if that is a terminal."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    with Progress(console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(doing, total=None)
-
-        yield lambda done, total: progress.update(task, completed=done, total=total)
 
 
 def _reconstructed(given: Recording, description: str, folder: Path) -> list[Recording]:
