@@ -26,20 +26,25 @@ UNEVENNESS = 0.03
 IMPEDANCE_SPREAD = 0.3
 NOISE_SHARE = 0.035  # of a tank's typical voltage change
 HALF_AXIS = (0.1, 0.28)  # of an object, over the tank's radius
+THIN = (0.2, 0.4), (0.2, 0.45)  # that of a thin one, and its other one over that
 GAP = 0.07  # least distance of two objects and from the wall, likewise
 
 
-def simulated_tanks(description: SensorDescription, seed_set: SeedSet, count: int) -> Tanks:
+def simulated_tanks(
+    description: SensorDescription, seed_set: SeedSet, count: int, thin: bool = False
+) -> Tanks:
     """Draw and solve tanks of one to three objects of either kind, on a finer mesh than ours.
 
     Args:
         description: the tank.
         seed_set: "tuning" for whoever chooses a constant, "reporting" for published figures.
         count: of tanks.
+        thin: whether objects are two to five times as long as wide.
     """
     mesh = fine_mesh(description)
     name = int.from_bytes(hashlib.sha256(f"{seed_set} tanks".encode()).digest()[:8])
-    drawn = [_simulated(description, mesh, np.random.default_rng([name, i])) for i in range(count)]
+    seeds = [np.random.default_rng([name, i]) for i in range(count)]
+    drawn = [_simulated(description, mesh, rng, thin) for rng in seeds]
     return Tanks(
         tuple(f"{seed_set} {i}" for i in range(count)),
         np.array([changes for changes, _ in drawn]),
@@ -48,10 +53,10 @@ def simulated_tanks(description: SensorDescription, seed_set: SeedSet, count: in
 
 
 def _simulated(
-    description: SensorDescription, mesh: SheetMesh, rng: np.random.Generator
+    description: SensorDescription, mesh: SheetMesh, rng: np.random.Generator, thin: bool
 ) -> tuple[FloatArray, FloatArray]:
     radius_m = description.width_m / 2
-    objects = _drawn_objects(radius_m, rng)
+    objects = _drawn_objects(radius_m, rng, thin)
     mesh = fitted_mesh(mesh, [outline for outline, _ in objects], description)
     points, (x, y, _) = centroids(mesh), pixel_grid(SIMULATED_ROWS)
     kind, truth = np.zeros(points.shape[1]), np.zeros(x.shape)
@@ -66,13 +71,17 @@ def _simulated(
     return changes + noise * rng.standard_normal(len(changes)), truth
 
 
-def _drawn_objects(radius_m: float, rng: np.random.Generator) -> list[tuple[Press, int]]:
+def _drawn_objects(
+    radius_m: float, rng: np.random.Generator, thin: bool
+) -> list[tuple[Press, int]]:
     """Outlines, and 1 or -1 for what conducts better or worse than the saline."""
     placed: list[tuple[Press, int]] = []
     wanted = int(rng.integers(1, 4))
     while len(placed) < wanted:
-        long = radius_m * rng.uniform(*HALF_AXIS)
+        long = radius_m * rng.uniform(*(THIN[0] if thin else HALF_AXIS))
         short = max(long * rng.uniform(0.5, 1), radius_m * HALF_AXIS[0])
+        if thin:
+            short = long * rng.uniform(*THIN[1])
         rectangle = bool(rng.integers(2))
         reach = float(np.hypot(long, short)) if rectangle else long
         away = np.sqrt(rng.uniform()) * radius_m

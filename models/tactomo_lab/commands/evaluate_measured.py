@@ -50,9 +50,9 @@ def tanks(
     -1 in what conducts worse, row 0 at the top, the disc filling the picture; and `name` (n,).
 
     The figure is the Pearson correlation of the structure map with the truth over the disc.
-    *network* makes objects of linear images, as in `tactomo evaluate ktc`, and where the scale is
-    not known averages over all that are likely; its confidence is the correlation to expect. Other
-    methods are the daemon's, which take the middle one of these scales.
+    *network* makes objects of linear images and refines them, as in `tactomo evaluate ktc`; where
+    the scale is not known, it averages over all that are likely. Its confidence is the correlation
+    to expect. Other methods are the daemon's, which take the middle one of these scales.
     """
     from tactomo_models import load_description
 

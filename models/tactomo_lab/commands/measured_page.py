@@ -237,7 +237,7 @@ def _page(found: dict[str, Measured]) -> Iterator[str]:
     yield from _table(heads, rows)
     for each in SETS:
         if each.file in found:
-            yield from (f"## {each.file}", "", *found[each.file].details, "")
+            yield from (f"## {each.file}", "", "\n".join(found[each.file].details).rstrip(), "")
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

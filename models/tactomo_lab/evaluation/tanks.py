@@ -3,7 +3,8 @@
 Measured sets often hold no more than each voltage's change, on some common scale, and the truth
 as a picture. The reference is then the model's own empty tank, and the scale is an unknown of
 the whole set. What the readings leave open of it stays open: the method `network`, that of
-`tactomo_lab.tanks`, is averaged over all likely scales. Other methods are the daemon's.
+`tactomo_lab.tanks`, is averaged over all likely scales, and half of it is the level set that starts
+there, with a scale of its own. Other methods are the daemon's.
 
 An image's likeness is its Pearson correlation with the truth over the pixels of the disc, of the
 signed `structure` map: 1 in what conducts better than the saline, -1 in what conducts worse; a
@@ -31,7 +32,8 @@ from tactomo_models.scene.reconstruction import Reconstruction
 from tactomo_models.sensor.description import SensorDescription
 
 from tactomo_lab.scenes import measures
-from tactomo_lab.tanks.images import LinearImages, pixel_grid, probabilities, signed_image
+from tactomo_lab.tanks.fit import TankFit
+from tactomo_lab.tanks.images import pixel_grid, probabilities, signed_image
 from tactomo_lab.tanks.model import Readings, TankModel
 
 BUDGET_S = 20.0  # a file has no deadline
@@ -40,6 +42,7 @@ EXACT = 10**6  # scans that a reference without noise is the mean of
 # 11 simulated tanks 0.71 to 0.92 (5 and 95 %), and less where metal keeps away from electrodes.
 SHARES = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 MIDDLE_SHARE = 0.7  # for methods that need one
+KNOWN_SIGMA = 0.05  # deviation of a known scale's logarithm: as of the challenge's water
 
 
 @dataclass(frozen=True)
@@ -112,15 +115,18 @@ class TankImager:
         return float(1 / np.max(-changes / np.abs(self._empty)))
 
     @cached_property
-    def _readings(self) -> tuple[Readings, LinearImages]:
+    def _fit(self) -> tuple[Readings, TankFit]:
         model, pairs = TankModel(self.description), self.description.pairs
         unit = np.eye(self.description.electrode_count)
         drive, measure = (unit[p[:, 0]] - unit[p[:, 1]] for p in (pairs.drive, pairs.measure))
         readings = Readings(model, drive, measure, model.readings_of_empty(drive, measure))
-        return readings, LinearImages(model, readings)
+        return readings, TankFit(model, readings)
 
     def probabilities(self, change: FloatArray, scales: Sequence[float]) -> FloatArray:
-        """The network's probabilities of nothing, worse and better, averaged over scales.
+        """Probabilities of nothing, worse and better, half the network's and half the fit's.
+
+        The network's are averaged over scales, the fit has its own: where the two disagree,
+        neither is sure.
 
         Args:
             change: (M,) by how much each voltage's size grew.
@@ -129,10 +135,13 @@ class TankImager:
         Returns:
             (3, PIXELS, PIXELS).
         """
-        readings, images = self._readings
-        signed = np.outer(scales, np.sign(self._empty) * change)
-        inputs = images.inputs(readings.reduced(signed))
-        return np.asarray(np.mean([probabilities(each[None])[0] for each in inputs], axis=0))
+        readings, fit = self._fit
+        signed = np.sign(self._empty) * change
+        inputs = fit.images.inputs(readings.reduced(np.outer(scales, signed)))
+        network = np.mean([probabilities(each[None])[0] for each in inputs], axis=0)
+        sigma = max(float(np.std(np.log(scales))), KNOWN_SIGMA)
+        found = fit.find(float(np.median(scales)) * signed, sigma)
+        return np.asarray(network + fit.likely(found)) / 2
 
     def reconstruct(self, change: FloatArray, method: str) -> Reconstruction:
         """Reconstruct one tank.

@@ -43,8 +43,6 @@ SETTLED = 3e-3  # share of the cost below which a gain is not worth another step
 class Tank:
     """What was found in a tank."""
 
-    # (3, PIXELS, PIXELS) probabilities of nothing, worse, better, as the network has them
-    likely: FloatArray
     coefficients: FloatArray  # (K,) mu
     misfit: float  # root mean square of what is left of the readings, over the noise assumed
 
@@ -58,7 +56,7 @@ class TankFit:
         readings: Readings,  # that there are
     ) -> None:
         self._model, self._readings = model, readings
-        self._images = LinearImages(model, readings)
+        self.images = LinearImages(model, readings)
         structure = model.description.structure
         assert structure is not None
         self._log_contrast = np.log(structure.saturated_ratio)
@@ -80,14 +78,12 @@ class TankFit:
     ) -> Tank:
         """Find what explains readings' changes (n,), known but for a factor."""
         v = self._readings.reduced(changes)
-        likely = probabilities(self._images.inputs(v[None]))[0]
+        likely = probabilities(self.images.inputs(v[None]))[0]
         signed = signed_image(likely)(self._model.points[:, ::-1])
         start = self._onto @ np.clip(signed, -1, 1)
-        return self._refined(v, likely, np.append(start, 0.0), scale_sigma)
+        return self._refined(v, np.append(start, 0.0), scale_sigma)
 
-    def _refined(
-        self, v: FloatArray, likely: FloatArray, start: FloatArray, scale_sigma: float
-    ) -> Tank:
+    def _refined(self, v: FloatArray, start: FloatArray, scale_sigma: float) -> Tank:
         noise = np.hypot(1, MODEL_ERROR * np.sqrt(np.mean(v**2)))
         precision = np.append(np.full(len(start) - 1, PRECISION), scale_sigma**-2)
 
@@ -117,7 +113,7 @@ class TankFit:
             if before - cost < SETTLED * before:
                 break
         misfit = float(np.sqrt(np.mean(left[: len(v)] ** 2)))
-        return Tank(likely, x[:-1], misfit)
+        return Tank(x[:-1], misfit)
 
     def _slopes(
         self,
@@ -150,3 +146,9 @@ class TankFit:
         f = (self._gaussians(grid) @ tank.coefficients).reshape(len(axis), -1)
         x, y, _ = pixel_grid(rows, columns)
         return np.asarray(RegularGridInterpolator((axis, axis), f)((y, x)))
+
+    def likely(self, tank: Tank) -> FloatArray:
+        """Shares (3, PIXELS, PIXELS) of nothing, worse and better, as `probabilities` has them."""
+        f = self.image(tank, PIXELS, PIXELS)
+        worse, better = (heaviside((sign * f - 0.5) / HALF_WIDTH) for sign in (-1, 1))
+        return np.stack([1 - worse - better, worse, better])

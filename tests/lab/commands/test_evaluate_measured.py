@@ -116,6 +116,7 @@ def test_a_page_of_the_sets_that_are_there(tactomo: Run, tmp_path: Path) -> None
     assert said.startswith("before\n" + ends[0])
     assert said.endswith(ends[1])
     assert "stale" not in said
+    assert "\n\n\n" not in said
     rows = [line.strip("| ").split(" | ") for line in said.splitlines() if line.startswith("|")]
     assert [row[2] for row in rows[2:5]] == ["not here"] * 3
     median = float(rows[5][2].split()[0])

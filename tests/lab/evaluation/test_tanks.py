@@ -192,19 +192,25 @@ def test_no_node_is_both(signed: tuple[FieldFit, SignedLevelSet], parameters: li
 
 
 @pytest.mark.slow
-def test_simulated_tanks_whatever_their_scale(tank: SensorDescription, imager: TankImager) -> None:
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("thin", [False, True])
+def test_simulated_tanks_whatever_their_scale(
+    tank: SensorDescription, imager: TankImager, thin: bool
+) -> None:
     """Seeds that nothing was chosen by; the confidence tells the bad ones."""
-    some = simulated_tanks(tank, "reporting", 16)
+    some = simulated_tanks(tank, "reporting", 60, thin)
     methods = ("noser", "network")
     outcomes = list(evaluate_tanks(imager, some, methods))
     mean = {
         method: np.mean([o.correlation for o in outcomes if o.method == method])
         for method in methods
     }
-    assert mean["network"] > 0.85
-    assert mean["network"] > mean["noser"] + 0.1
     found = [o for o in outcomes if o.method == "network"]
-    assert spearmanr([o.confidence for o in found], [o.correlation for o in found])[0] > 0.3
+    ranks = spearmanr([o.confidence for o in found], [o.correlation for o in found])[0]
+    print(f"thin={thin}: correlation {mean['network']:.3f}, ranked by {ranks:.2f}")
+    assert mean["network"] > (0.82 if thin else 0.905)  # the network alone: 0.78 and 0.901
+    assert mean["network"] > mean["noser"] + 0.1
+    assert ranks > 0.4
     first, other_unit = (
         Tanks(some.names[:1], factor * some.changes[:1], some.truth[:1]) for factor in (1, 1e4)
     )
