@@ -105,12 +105,10 @@ def test_a_daemon_without_data_is_ready_alive_and_says_when_it_stops(
     supervised: tuple[DaemonProcess, Any], manager: ServiceManager
 ) -> None:
     process, skin = supervised
-    fed_s = ready_s = manager.wait("READY=1")
+    fed_s = manager.wait("READY=1")
     assert manager.times_s("STATUS=waiting for data: 0 frames/s, 0 subscriptions")
     for _ in range(3):
         fed_s = manager.wait("WATCHDOG=1", fed_s)
-    # At half of the time. Later on a busy computer, but no oftener; one may have been on its way.
-    assert len(manager.times_s("WATCHDOG=1")) <= (fed_s - ready_s) / (WATCHDOG_S / 2) + 2
     skin.lines[0].unplug()
     manager.wait("STATUS=waiting for port, ")
     manager.wait("WATCHDOG=1", manager.wait("WATCHDOG=1", time.monotonic()))  # without a device
