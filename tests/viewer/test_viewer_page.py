@@ -590,6 +590,8 @@ def test_the_keyboard_presses(page: Page) -> None:
 def test_only_a_simulated_skin_can_be_pressed(page: Page, source: str) -> None:
     page.skin.status["source"] = {"kind": source}
     page.open()
+    wait_until(lambda: page.js("return tactomo.state.status.fields.source.kind") == source)
+    page.open()  # anew, for the first status that the viewer had was that of a twin
     wait_until(lambda: page.js("return tactomo.state.twinAnswers"))
     assert not page["press-card"].is_displayed()
     page.click(0, 0)
