@@ -74,6 +74,13 @@ def test_a_healthy_batch(tactomo: Run, rest: FloatArray) -> None:
     assert found["stream"] == []
 
 
+def test_what_one_scan_does_not_tell_is_null(tactomo: Run, rest: FloatArray) -> None:
+    np.savez("in.npz", rest=rest[None])
+    outcome = tactomo("doctor", "in.npz", "--json")
+    assert "NaN" not in outcome.stdout
+    assert set(report(outcome)["channels"]["rest"]["snr_db"]) == {None}
+
+
 def test_a_table_names_the_electrode(
     tactomo: Run, rest: FloatArray, paper: SensorDescription
 ) -> None:

@@ -32,6 +32,19 @@ def test_scenes_in_numbers(tactomo: Run, tmp_path: Path) -> None:
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.parametrize("command", ["scenes", "field", "stability", "drift"])
+@pytest.mark.parametrize(
+    ("picture", "told"),
+    [("scenes.txt", "not a kind of picture"), ("nowhere/scenes.png", "there is no folder nowhere")],
+)
+def test_a_picture_that_cannot_be_is_told_before_the_work(
+    tactomo: Run, command: str, picture: str, told: str
+) -> None:
+    result = tactomo("evaluate", command, "--count", 1, "--picture", picture)
+    assert result.returncode == 1
+    assert told in result.stderr
+
+
 def test_scenes_in_words(tactomo: Run) -> None:
     result = tactomo(*FEW, "--seeds", "tuning", "--snr-of", "voltage")
     assert result.returncode == 0
