@@ -40,7 +40,7 @@ from tactomo_models.methods.moves import (
 )
 from tactomo_models.scans.stillness import are_still
 from tactomo_models.scene.field_account import Doubt
-from tactomo_models.scene.field_fit import Budget, FieldFit, FittedField, Measured
+from tactomo_models.scene.field_fit import COLD_S, Budget, FieldFit, FittedField, Measured
 from tactomo_models.scene.pressure_field import (
     COLUMNS,
     EDGE,
@@ -229,6 +229,7 @@ class _Course:
         """What is proposed, where that explains something; else nothing at all."""
         proposed_order = 2  # ellipses
         nothing = self._moves.nothing(frame)
+        frame.budget.left_s -= COLD_S
         if frame.propose is not None and len(each := frame.propose()[:MAX_CONTACTS]):
             proposed = self._moves.evaluate(each, proposed_order, self._fit.likely, frame)
             if proposed is not None and proposed.cost < nothing.cost:

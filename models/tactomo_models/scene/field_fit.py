@@ -32,6 +32,12 @@ SETTLED = 5e-3  # share of the cost below which another gain is not worth a step
 # The same as the last step's Jacobian foresees it. With 5e-3 another 5 % of the work is saved, but
 # one of 36 scenes then goes another way, at a correlation lower by 0.13.
 FORESEEN = 1e-3
+# Processor time on a quiet core of the 2.5 GHz class, by least squares over frames of all kinds of
+# scenes, to 18 % (`tactomo evaluate solves --budget 8` fits the same). Measured on a busy core, the
+# least of three runs, and divided by 1.45: by so much cold frames took longer than on a quiet one.
+COLD_S = 1e-2  # a frame that starts cold, beside its steps: network, account
+SHEET_S = 1.3e-4  # a step on one sheet
+ENTRY_S = 9e-8  # the same, for each node that is pressed and each parameter
 WORST_DAMPING = 1e6  # no step downhill even at this: a minimum
 STEP_LIMIT = 0.5  # largest change of a parameter in one step
 
@@ -110,8 +116,7 @@ class Budget:
     def spend(self, fitted: FittedField) -> None:
         """Take off what a solve or a Jacobian of this size costs, on every sheet."""
         for solution in fitted.solutions.values():
-            nodes = len(solution.nodes)
-            self.left_s -= 0.0007 + 2.5e-6 * nodes + 2e-12 * nodes**3  # see tactomo evaluate solves
+            self.left_s -= SHEET_S + ENTRY_S * len(solution.nodes) * len(fitted.parameters)
 
 
 class FieldFit:
