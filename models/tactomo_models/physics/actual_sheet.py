@@ -23,7 +23,7 @@ import skfem
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
-from tactomo_models.physics.artifact import INVERSE_REFINEMENTS, MODEL_ERROR
+from tactomo_models.physics.artifact import GREEN_DTYPE, INVERSE_REFINEMENTS, MODEL_ERROR
 from tactomo_models.physics.bare_sheet import (
     BareSheet,
     assemble_sheet,
@@ -36,7 +36,7 @@ from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import SheetMesh, mesh_sheet
 from tactomo_models.sensor.description import SensorDescription
 
-MAX_NODES = 6000  # that can be pressed: 150 MB of Green's function a sheet; the paper's has 2,500
+MAX_NODES = 6000  # that can be pressed: 75 MB of Green's function a sheet; the paper's has 2,500
 MAX_LEFT = 0.02  # relative error of a reference that the sheet explains: a tenth of hand-made ones'
 MODES = 6  # cosines along each side: with 8 nothing gets better
 UNEVENNESS = 0.15  # prior standard deviation of the logarithm of conductivity
@@ -138,7 +138,7 @@ class SheetEstimator:
             shape.conductivity,
             shape.impedance,
             drawn_on=self._even,
-            green_dtype=np.float32,  # seven digits of what is known to three
+            green_dtype=GREEN_DTYPE,
         )
         return ForwardModel(self._description, bare)
 

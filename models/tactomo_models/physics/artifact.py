@@ -27,9 +27,10 @@ from tactomo_models.sensor.description import SensorDescription
 
 Progress = Callable[[str], None]
 
-FORMAT = 2  # of the file; rises when what is in it changes
+FORMAT = 3  # of the file; rises when what is in it changes
 NOMINAL_SNR_DB = 60.0  # of the voltages' root mean square; until a tare has seen the real noise
 MODEL_ERROR = 0.003  # relative error of any voltage that no noise accounts for
+GREEN_DTYPE = np.float32  # seven digits of what is known to three
 INVERSE_REFINEMENTS = 2  # of the mesh: one less than the one that simulates
 TYPICAL_CHANGE = 0.3  # of conductivity, by which presses change the magnitude channel
 TARGET_SHARE = 0.1  # radius of the noise figure's target over the smaller half side
@@ -71,7 +72,7 @@ def build_artifact(description: SensorDescription, progress: Progress | None = N
     say("meshing the sheet")
     sheet = mesh_sheet(description, refinements=INVERSE_REFINEMENTS)
     say("solving the bare sheet")
-    bare = solve_bare_sheet(description, sheet)
+    bare = solve_bare_sheet(description, sheet, green_dtype=GREEN_DTYPE)
     say("differentiating")
     forward = ForwardModel(description, bare)
     jacobian = forward.bare_jacobian() / np.abs(forward.bare_voltages)[:, None]
@@ -129,7 +130,8 @@ def save_artifact(artifact: Artifact, path: Path) -> None:
     }
     for name in _BARE_ARRAYS:
         arrays[name] = getattr(artifact.bare, name)
-    arrays["green"] = artifact.bare.green.rows(np.arange(len(artifact.bare.support)))
+    assert isinstance(artifact.bare.green, PackedGreensFunction)
+    arrays["green"] = artifact.bare.green.lower
     try:
         write_whole(path, lambda file: np.savez(file, **arrays))
     except OSError as error:

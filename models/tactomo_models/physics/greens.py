@@ -13,12 +13,13 @@ Source: Przemieniecki, "Matrix structural analysis of substructures", AIAA J. 1 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from math import isqrt
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
-from numpy.typing import DTypeLike
+from numpy.typing import DTypeLike, NDArray
 
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 
@@ -29,21 +30,20 @@ class PackedGreensFunction:
     A block of it is a look-up: for one contact 5 us more than in all of it.
 
     Args:
-        rows: S rows (S,) of potentials at nodes for unit currents into others.
-        dtype: of what is kept.
+        lower: (S (S + 1) / 2,) potentials at nodes for unit currents into others, row by row, each
+            up to its own node.
     """
 
-    def __init__(self, rows: Iterable[FloatArray], dtype: DTypeLike = np.float64) -> None:
-        halves = [row[: place + 1].astype(dtype) for place, row in enumerate(rows)]
-        self._lower = np.concatenate(halves)
-        place = np.arange(len(halves))
+    def __init__(self, lower: NDArray[Any]) -> None:
+        self.lower = lower
+        place = np.arange(isqrt(2 * len(lower)))
         self._start = place * (place + 1) // 2  # of each row
 
     def between(self, rows: IntArray, columns: IntArray) -> FloatArray:
         """Potentials (r, c) at some of the nodes for unit currents into others, by their places."""
         row = rows[:, None]
         lower, upper = self._start[row] + columns, self._start[columns] + row
-        found = self._lower.take(np.where(row >= columns, lower, upper))
+        found = self.lower.take(np.where(row >= columns, lower, upper))
         return np.asarray(found, np.float64)
 
     def rows(self, rows: IntArray) -> FloatArray:
@@ -51,8 +51,8 @@ class PackedGreensFunction:
         found = np.empty((len(rows), len(self._start)))
         for potentials, row in zip(found, rows, strict=True):
             start = self._start[row]
-            potentials[: row + 1] = self._lower[start : start + row + 1]
-            potentials[row + 1 :] = self._lower[self._start[row + 1 :] + row]
+            potentials[: row + 1] = self.lower[start : start + row + 1]
+            potentials[row + 1 :] = self.lower[self._start[row + 1 :] + row]
         return found
 
 
@@ -111,13 +111,15 @@ class GreensFunction:
     def packed(self, dtype: DTypeLike = np.float64) -> PackedGreensFunction:
         """All of it, of which a block is a look-up: up to hundreds of megabytes."""
         onto = (self._weights @ self._between).T
-        blocks = np.array_split(np.arange(len(onto.T)), 12)  # a few megabytes each
-        rows = (
-            row
-            for block in blocks
-            for row in self._within[block].toarray() + self._weights[block] @ onto
-        )
-        return PackedGreensFunction(rows, dtype)
+        size = len(onto.T)
+        lower = np.empty(size * (size + 1) // 2, dtype)
+        start = 0
+        for block in np.array_split(np.arange(size), 12):  # a few megabytes each
+            rows = self._within[block].toarray() + self._weights[block] @ onto
+            for place, row in zip(block, rows, strict=True):
+                lower[start : start + place + 1] = row[: place + 1]
+                start += place + 1
+        return PackedGreensFunction(lower)
 
 
 def _boxes(points: FloatArray) -> IntArray:
