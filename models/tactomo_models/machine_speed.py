@@ -21,7 +21,6 @@ from typing import Annotated, Final, Literal, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from scipy.optimize import nnls
 
 from tactomo_models.archive import write_whole
 from tactomo_models.errors import ArtifactError, ModelError, explain
@@ -134,6 +133,8 @@ def _law(rows: Sequence[Row]) -> tuple[float, float]:
     budget_s = np.array([row.budget_s or 0.0 for row in rows])
     p99_s = np.array([row.p99_s for row in rows])
     terms = np.stack([np.ones(len(rows)), budget_s], axis=1)
+    from scipy.optimize import nnls  # 10 MB, which a daemon need not hold
+
     (overhead_s, speed), _ = nnls(terms / p99_s[:, None], np.ones(len(rows)))
     return float(overhead_s), max(float(speed), 1e-3)
 

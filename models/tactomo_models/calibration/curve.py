@@ -24,7 +24,6 @@ from typing import Annotated, Final, Literal, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, Field
-from scipy.optimize import isotonic_regression, nnls
 
 from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.errors import CalibrationError
@@ -224,6 +223,8 @@ def _check_answers(data: _Columns) -> None:
             "needed"
         )
     total = float(np.sum((data.magnitude - data.magnitude.mean()) ** 2))
+    from scipy.optimize import isotonic_regression  # 10 MB, which a daemon need not hold
+
     rising = isotonic_regression(data.magnitude).x
     left = float(np.sum((data.magnitude - rising) ** 2))
     if left >= total / 2:  # a rise explains less than half of the variance
@@ -301,6 +302,8 @@ def _basis(data: _Columns, start: float, pieces: int) -> _Basis:
 
 def _rise(basis: _Basis, magnitude: FloatArray, weight: FloatArray) -> _Rise:
     """The best rise of a basis."""
+    from scipy.optimize import nnls
+
     steps, left = nnls(basis.terms * weight[:, None], magnitude * weight)
     has_onset = basis.terms.shape[1] < len(basis.knots)
     heights = np.cumsum(np.append(0.0, steps) if has_onset else steps)
@@ -323,6 +326,8 @@ class _Scatter(NamedTuple):
 def _own_scatter(data: _Columns, rise: _Rise) -> _Scatter:
     """What readings scatter beyond their own uncertainty: repeatability and hysteresis."""
     answered = rise(data.kpa) > 0  # those on the rise, not before it
+    from scipy.optimize import nnls
+
     expected = rise(data.kpa)[answered]
     free = max(1, int(answered.sum()) - len(rise.basis.knots))
     square = (data.magnitude[answered] - expected) ** 2 * (answered.sum() / free)

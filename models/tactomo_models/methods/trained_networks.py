@@ -15,6 +15,7 @@ from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
+from weakref import WeakValueDictionary
 
 import numpy as np
 from tactomo_protocol import Channel
@@ -262,6 +263,10 @@ def load_network(
     return Network(found, description, kind)
 
 
+# By file and its time: weights are in memory once, what differs are each network's buffers.
+_sessions: WeakValueDictionary[tuple[Path, int], ort.InferenceSession] = WeakValueDictionary()
+
+
 def _open(path: Path) -> ort.InferenceSession:
     newest_opset = 21  # that the oldest ONNX Runtime we support runs
     options = ort.SessionOptions()
@@ -270,7 +275,11 @@ def _open(path: Path) -> ort.InferenceSession:
     options.log_severity_level = 3
     try:
         path.open("rb").close()  # for an error of the system's; from bytes, a session keeps them
-        return ort.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+        version = path, path.stat().st_mtime_ns
+        if (session := _sessions.get(version)) is None:
+            session = ort.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+            _sessions[version] = session
+        return session
     except FileNotFoundError as error:
         raise ArtifactError(f"there is no network at {path}; name another file") from error
     except OSError as error:

@@ -23,7 +23,6 @@ Lionheart, "Temporal image reconstruction in electrical impedance tomography", P
 from typing import Final
 
 import numpy as np
-from scipy.optimize import brentq
 
 from tactomo_models.arrays import FloatArray
 
@@ -79,6 +78,8 @@ def noise_figure_weight(
     prior_scale: FloatArray = EVEN,  # (P,) expected size of each node's change, up to a factor
 ) -> float:
     """Regularisation parameter at which the noise figure of a small central target is 1."""
+    from scipy.optimize import brentq  # 10 MB, and only `noser` asks for it
+
     whitened = J / noise[:, None]
     signal = whitened @ target
     left, singular, right = np.linalg.svd(whitened * prior_scale, full_matrices=False)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import min_weight_full_bipartite_matching
 
 from tactomo_models.arrays import FloatArray
 
@@ -89,7 +91,7 @@ class ContactTracker:
         cost += FARTHEST_STEP_M * np.array([[track.missed > 0] for track in tracks]).reshape(-1, 1)
         owner = {
             new: tracks[old]
-            for old, new in zip(*linear_sum_assignment(cost), strict=True)
+            for old, new in zip(*_cheapest(cost), strict=True)
             if distance[old, new] < FARTHEST_STEP_M
         }
         for track in tracks:
@@ -109,3 +111,18 @@ class ContactTracker:
     def clear(self) -> None:
         """Forget all contacts; identities are not used again."""
         self._tracks = []
+
+
+def _cheapest(cost: FloatArray) -> tuple[Iterable[int], Iterable[int]]:
+    """Rows and columns of the assignment that costs least: a pair for each of the fewer.
+
+    By SciPy's graphs where two want the same: its `optimize` would take 10 MB.
+    """
+    if cost.shape[0] > cost.shape[1]:
+        columns, rows = _cheapest(cost.T)
+        return rows, columns
+    wanted = cost.argmin(axis=1) if cost.size else np.zeros(0, np.intp)
+    if len(set(wanted)) == len(wanted):
+        return range(len(wanted)), wanted
+    rows, columns = min_weight_full_bipartite_matching(csr_array(1 + cost))  # a 0 would be no pair
+    return rows, columns

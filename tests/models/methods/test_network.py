@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from noisy_skin import Skin
+from tactomo.memory import resident_bytes
 from tactomo_models import (
     Artifact,
     ArtifactError,
@@ -41,6 +42,19 @@ def shipped(paper: SensorDescription) -> Path:
     found = find_network(paper, "network")
     assert found is not None, "the paper's sensor comes with networks"
     return found
+
+
+def test_networks_of_one_file_hold_its_weights_once(
+    shipped: Path, paper: SensorDescription, tmp_path: Path
+) -> None:
+    file = Path(shutil.copy(shipped, tmp_path))
+    held = [resident_bytes() or 0]
+    networks = []
+    for _ in range(2):
+        networks.append(load_network(paper, "network", file))
+        held.append(resident_bytes() or 0)
+    first, second = np.diff(held)
+    assert second < 2e6 < first  # its weights are 11 MB
 
 
 def test_a_network_of_another_sensor_is_refused(shipped: Path, small: SensorDescription) -> None:

@@ -23,6 +23,7 @@ from typing import Final
 
 import structlog
 from tactomo_models import load_description
+from tactomo_models.methods.trained_networks import SensorNetworks
 
 from tactomo.cli.failure import explain
 from tactomo.cli.parent_watch import stop_at_end_of
@@ -81,8 +82,10 @@ class SkinProcesses:
     def __init__(self, skins: Skins) -> None:
         self._skins = skins
         self._is_stopping = False
-        descriptions = dict.fromkeys(skin.description for skin in skins.each)
-        self._artifacts = {each: load_model(load_description(each)) for each in descriptions}
+        descriptions = {skin.description: load_description(skin.description) for skin in skins.each}
+        self._artifacts = {name: load_model(each) for name, each in descriptions.items()}
+        networks = [SensorNetworks(each) for each in descriptions.values()]
+        self._networks = [each for each in networks if not each.missing]  # loaded by that
 
     def run(self) -> int:
         """Keep every skin's daemon running; return the exit status.
