@@ -111,7 +111,9 @@ def test_a_cancelled_wait_loses_no_frame(run: Run, pressed: FakeSensor) -> None:
 
 def test_latest_is_the_newest_and_does_not_wait(run: Run, sensor: FakeSensor) -> None:
     async def main() -> None:
-        async with aio.subscribe("left", address=sensor.address, latest_only=True) as skin:
+        async with aio.subscribe(
+            "left", address=sensor.address, latest_only=True, stale_after_s=PATIENCE_S
+        ) as skin:
             assert await skin.latest() is None
             assert skin.is_stale
             await asyncio.to_thread(sensor.wait_for_subscriber)

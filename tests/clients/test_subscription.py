@@ -40,6 +40,8 @@ CONTACT = Contact(
     pressure_kpa=170.0,
 )
 RAMP = np.tile(np.linspace(0, 1, 51, dtype=np.float32), (51, 1))
+# Far apart, for on a busy computer what was published this moment is some tenths of a second old.
+STALE_S, OLD_NS = 10.0, 20_000_000_000
 
 
 @pytest.mark.parametrize(
@@ -67,13 +69,13 @@ def test_no_answer_is_taken_for_another_by_a_bare_if(answer: Answer) -> None:
 
 
 def test_an_old_frame_or_a_flag_is_no_no(sensor: FakeSensor) -> None:
-    with subscribe("left", address=sensor.address, timeout_s=10) as frames:
+    with subscribe("left", address=sensor.address, timeout_s=10, stale_after_s=STALE_S) as frames:
         sensor.wait_for_subscriber()
         sensor.publish()
         assert next(frames).exceeds(150) is Answer.NO
         sensor.publish(flags=["no_reference"])
         assert next(frames).exceeds(150) is Answer.CANNOT_TELL
-        sensor.publish(acquired_monotonic_ns=time.monotonic_ns() - 2_000_000_000)
+        sensor.publish(acquired_monotonic_ns=time.monotonic_ns() - OLD_NS)
         assert next(frames).exceeds(150) is Answer.CANNOT_TELL
         sensor.publish([CONTACT], flags=["misfit_high"])
         assert next(frames).exceeds(150) is Answer.YES
@@ -92,11 +94,11 @@ def test_an_old_frame_or_a_flag_is_no_no(sensor: FakeSensor) -> None:
 def test_no_contacts_is_nothing_pressed_only_where_touches_are_seen(
     sensor: FakeSensor, flags: list[str], is_known: bool
 ) -> None:
-    with subscribe("left", address=sensor.address, timeout_s=10) as frames:
+    with subscribe("left", address=sensor.address, timeout_s=10, stale_after_s=STALE_S) as frames:
         sensor.wait_for_subscriber()
         sensor.publish(flags=flags)
         assert next(frames).is_known is is_known
-        sensor.publish(flags=flags, acquired_monotonic_ns=time.monotonic_ns() - 2_000_000_000)
+        sensor.publish(flags=flags, acquired_monotonic_ns=time.monotonic_ns() - OLD_NS)
         assert not next(frames).is_known
 
 
