@@ -67,6 +67,7 @@ class Identity:
 class _Sample:
     """A scan in the making: sampled at `time_s`, its voltages still being computed."""
 
+    counter: int
     time_s: float
     voltages: Future[Voltages]
 
@@ -144,36 +145,34 @@ class Firmware:
             return
         # The grid of instants is kept while the solves keep up with it; what was missed is missed.
         self._next_sample_s = max(self._next_sample_s + 1.0 / self.rate_hz, now_s)
-        self._pending = _Sample(now_s, self._sample(now_s))
+        self._pending = _Sample(self.counter, now_s, self._sample(now_s))
+        self.counter = (self.counter + 1) % 2**32
 
     def _finish_scan(self) -> None:
         if self._pending is None or not self._pending.voltages.done():
             return
-        time_s, voltages = self._pending.time_s, self._pending.voltages.result()
-        self._pending = None
+        sample, self._pending = self._pending, None
+        voltages = sample.voltages.result()
         flags = ScanFlag.SIMULATED
-        if self._clock() - time_s > 1.0 / self.rate_hz:
+        if self._clock() - sample.time_s > 1.0 / self.rate_hz:
             flags |= ScanFlag.LATE
             self.late += 1
         for port in self.ports:
             for channel in port.channels:
                 if port.is_streaming and self._mute_until_s.get(channel, 0.0) <= self._clock():
-                    self._say(port, channel, time_s, flags, voltages)
-        self.counter = (self.counter + 1) % 2**32
+                    scan = self._scan(channel, sample, flags, voltages[channel])
+                    port.line.send(encode(scan))
 
-    def _say(
-        self, port: Port, channel: Channel, time_s: float, flags: ScanFlag, voltages: Voltages
-    ) -> None:
-        port.line.send(encode(self._scan(channel, time_s, flags, voltages)))
-
-    def _scan(self, channel: Channel, time_s: float, flags: ScanFlag, voltages: Voltages) -> Scan:
+    def _scan(
+        self, channel: Channel, sample: _Sample, flags: ScanFlag, voltages: FloatArray
+    ) -> Scan:
         counts, saturated = self._converter.convert(
-            voltages[channel], channel=channel, counter=self.counter
+            voltages, channel=channel, counter=sample.counter
         )
         return Scan(
             channel=channel,
-            counter=self.counter,
-            device_us=round(time_s * 1e6),
+            counter=sample.counter,
+            device_us=round(sample.time_s * 1e6),
             flags=flags | ScanFlag.SATURATED if saturated else flags,
             samples=counts,
         )
@@ -187,6 +186,8 @@ class Firmware:
             port.is_streaming = True
         elif command.code == CommandCode.STOP:
             port.is_streaming = False
+            if not self._is_streaming:
+                self._pending = None  # a scan of before would be the next stream's first
         elif command.code == CommandCode.ZERO_COUNTERS:
             self.counter = 0
         elif command.code == CommandCode.SET_RATE:
