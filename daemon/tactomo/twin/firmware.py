@@ -64,7 +64,7 @@ class Identity:
 
 
 @dataclass(frozen=True, slots=True)
-class _Sample:
+class Sample:
     """A scan in the making: sampled at `time_s`, its voltages still being computed."""
 
     counter: int
@@ -95,7 +95,7 @@ class Firmware:
         self._sample = sample
         self._converter = converter
         self._clock = clock
-        self._pending: _Sample | None = None
+        self._pending: Sample | None = None
         self._next_sample_s = 0.0
         self._next_hello_s = 0.0
         self._mute_until_s: dict[Channel, float] = {}
@@ -145,7 +145,7 @@ class Firmware:
             return
         # The grid of instants is kept while the solves keep up with it; what was missed is missed.
         self._next_sample_s = max(self._next_sample_s + 1.0 / self.rate_hz, now_s)
-        self._pending = _Sample(self.counter, now_s, self._sample(now_s))
+        self._pending = Sample(self.counter, now_s, self._sample(now_s))
         self.counter = (self.counter + 1) % 2**32
 
     def _finish_scan(self) -> None:
@@ -160,14 +160,16 @@ class Firmware:
         for port in self.ports:
             for channel in port.channels:
                 if port.is_streaming and self._mute_until_s.get(channel, 0.0) <= self._clock():
-                    scan = self._scan(channel, sample, flags, voltages[channel])
-                    port.line.send(encode(scan))
+                    self._say(port, channel, sample, flags, voltages)
 
-    def _scan(
-        self, channel: Channel, sample: _Sample, flags: ScanFlag, voltages: FloatArray
-    ) -> Scan:
+    def _say(
+        self, port: Port, channel: Channel, sample: Sample, flags: ScanFlag, voltages: Voltages
+    ) -> None:
+        port.line.send(encode(self._scan(channel, sample, flags, voltages)))
+
+    def _scan(self, channel: Channel, sample: Sample, flags: ScanFlag, voltages: Voltages) -> Scan:
         counts, saturated = self._converter.convert(
-            voltages, channel=channel, counter=sample.counter
+            voltages[channel], channel=channel, counter=sample.counter
         )
         return Scan(
             channel=channel,

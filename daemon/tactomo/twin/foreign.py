@@ -20,7 +20,7 @@ from tactomo_models.arrays import FloatArray
 from tactomo_protocol import Channel, ScanFlag
 
 from tactomo.twin.converter import Converter
-from tactomo.twin.firmware import Firmware, Identity, Port, Voltages
+from tactomo.twin.firmware import Firmware, Identity, Port, Sample, Voltages
 from tactomo.twin.playing import PlayedFrame
 
 MAX_WAITING_BYTES = 1 << 17
@@ -128,13 +128,13 @@ class ForeignFirmware(Firmware):
         self._next_hello_s = self._clock() + 1.0  # it says no hello
 
     def _say(
-        self, port: Port, channel: Channel, time_s: float, flags: ScanFlag, voltages: Voltages
+        self, port: Port, channel: Channel, sample: Sample, flags: ScanFlag, voltages: Voltages
     ) -> None:
         if isinstance(voltages, PlayedFrame):
-            frame = Frame(voltages[channel], voltages.potentials, time_s)
+            frame = Frame(voltages[channel], voltages.potentials, sample.time_s)
         else:
-            scan = self._scan(channel, time_s, flags, voltages)
-            frame = Frame(scan.volts(self._converter.volts_per_count), None, time_s)
+            scan = self._scan(channel, sample, flags, voltages)
+            frame = Frame(scan.volts(self._converter.volts_per_count), None, sample.time_s)
         if not port.line.is_open:
             port.line.unheard += 1
         elif self._waiting_bytes > MAX_WAITING_BYTES:
