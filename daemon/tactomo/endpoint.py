@@ -116,7 +116,7 @@ def bind(
     except AddressError:
         socket.close()
         raise
-    except zmq.ZMQError as error:
+    except (zmq.ZMQError, OSError) as error:  # OSError: an ipc:// path that cannot be looked at
         socket.close()
         if error.errno == zmq.EADDRINUSE:
             raise AddressError(

@@ -393,7 +393,9 @@ async def test_a_foreign_name_is_turned_away(
             assert response.status == status
 
 
-@pytest.mark.parametrize("origin", [None, "null", "https://evil.example", "http://127.0.0.1:1"])
+@pytest.mark.parametrize(
+    "origin", [None, "null", "https://evil.example", "http://127.0.0.1:1", "http://[x"]
+)
 @on_loop
 async def test_a_page_from_elsewhere_gets_no_socket(sensor: FakeSensor, origin: str | None) -> None:
     async with viewer_of(sensor) as viewer:

@@ -12,7 +12,6 @@ import asyncio
 import signal
 from collections.abc import AsyncIterator
 from importlib import resources
-from urllib.parse import urlsplit
 
 from aiohttp import WSCloseCode, web
 from aiohttp.typedefs import Handler, Middleware
@@ -176,10 +175,8 @@ def _only_for(served_host: str) -> Middleware:
     async def check(request: web.Request, handler: Handler) -> web.StreamResponse:
         if not names_this_computer(request.host, served_host):
             raise web.HTTPForbidden(text=f"not served under the name {request.host!r}\n")
-        origin = request.headers.get("Origin")
-        if request.path == "/socket" and (
-            origin is None or urlsplit(origin).netloc.lower() != request.host.lower()
-        ):
+        _, _, origin = request.headers.get("Origin", "").lower().partition("://")
+        if request.path == "/socket" and origin != request.host.lower():
             raise web.HTTPForbidden(text="a page from elsewhere may not use this viewer\n")
         response = await handler(request)
         if not response.prepared:

@@ -523,6 +523,12 @@ def test_an_ipc_file_is_for_owner_and_group(bench: Start, tmp_path: Path) -> Non
     assert (tmp_path / "other").stat().st_mode & 0o777 == 0o666  # the process's own is untouched
 
 
+def test_an_ipc_path_that_cannot_be_looked_at_is_refused() -> None:
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    with context, pytest.raises(AddressError, match="File name too long"):
+        bind(context.socket(zmq.REP), f"ipc:///tmp/{'x' * 300}", "control")
+
+
 def test_a_stale_ipc_file_is_replaced_and_a_file_of_yours_is_not(tmp_path: Path) -> None:
     stale = tmp_path / "stale"
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as killed:
