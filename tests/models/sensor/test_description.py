@@ -80,6 +80,8 @@ def structure_table(ratios: str) -> str:
         (("[magnitude.response]", "[magnitude.reponse]"), ["unknown key magnitude.reponse"]),
         (("conductivity_ratio = 100.0", "conductivity_ratio = 0"), ["greater than 0"]),
         (("conductivity_ratio = 100.0", ""), ["structure.response or conductivity_ratio"]),
+        (("ohm_m = 10.0", "ohm_m = 1e-12"), ["contact_impedance_ohm_m = 1e-12", "check the units"]),
+        (("s_m = 1.0", "s_m = 1e-300"), ["contact_impedance_ohm_m", "1e-300 S/m", "check"]),
         (("width_m = 0.06", ""), ["sheet.width_m is missing"]),
         (("thickness_m", "thicness_m"), ["sheet.thicness_m", "unknown key"]),
         (('"rectangle"', '"hexagon"'), ["sheet.shape", "hexagon", "'rectangle' or 'disc'"]),
