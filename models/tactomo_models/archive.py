@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import glob
 import os
+import struct
+import zipfile
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -40,6 +42,21 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     if not all(isinstance(array, np.ndarray) for array in arrays.values()):
         raise DataError(f"cannot read {path}: it holds other things than arrays of numbers")
     return arrays
+
+
+def map_array(path: Path, name: str) -> NDArray[Any]:
+    """One array of an uncompressed .npz file, in the file: what nobody reads of it takes no memory.
+
+    Checks nothing: for files that `read_arrays` has read. An array at an odd place is copied.
+    """
+    with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as member:
+        np.lib.format.read_magic(member)
+        shape, _, dtype = np.lib.format.read_array_header_1_0(member)
+        start, header = archive.getinfo(f"{name}.npy").header_offset, member.tell()
+    with path.open("rb") as file:
+        file.seek(start + 26)  # lengths of the name and of the field that end the 30 bytes' header
+        start += 30 + sum(struct.unpack("<HH", file.read(4))) + header
+    return np.require(np.asarray(np.memmap(path, dtype, "r", start, shape)), requirements="A")
 
 
 def write_arrays(path: Path, arrays: dict[str, Any]) -> None:

@@ -88,8 +88,9 @@ class ContactSearch:
         clearest = max(measured, key=lambda name: abs(self._dipoles[name]))
         for name, own in zip(measured, np.split(J, len(measured)), strict=True):
             scale = self._dipoles[name] * measured[name].weight
-            by_area = self._forward.spot_sensitivity(self._probes, fitted.solutions[name])
-            by_area *= (scale / np.abs(self._forward.bare_voltages))[:, None]
+            sheet = self._fit.sheet(name)
+            by_area = sheet.spot_sensitivity(self._probes, fitted.solutions[name])
+            by_area *= (scale / np.abs(sheet.bare_voltages))[:, None]
             cross = own.T @ by_area
             spanned = (cross * np.linalg.solve(normal, cross)).sum(axis=0)
             power = np.maximum((by_area**2).sum(axis=0) - spanned, 1e-30)

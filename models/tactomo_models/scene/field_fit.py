@@ -146,7 +146,8 @@ class FieldFit:
         self._ratio_sigma = np.log(10) / np.sqrt(12)
         self._least_ratio, self._most_ratio = sorted((0.1 * saturated, 1.5 * saturated))
 
-    def _sheet(self, name: Channel) -> ForwardModel:
+    def sheet(self, name: Channel) -> ForwardModel:
+        """The model of a channel's sheet: as it is, or an even one."""
         return self.sheets.get(name, self.forward)
 
     def compare(self, fitted: FittedField, measured: Measured) -> FittedField:
@@ -193,7 +194,7 @@ class FieldFit:
             return None
         solutions = dict(solved or {})
         for name in [each for each in measured if each not in solutions]:
-            response, forward = self.responses[name], self._sheet(name)
+            response, forward = self.responses[name], self.sheet(name)
             share = _seen(name, drawing)
             ratio = response.conductivity(share, drawing.pressure_kpa, log_ratio)[0]
             change = np.zeros(len(forward.bare.pressable))
@@ -215,7 +216,7 @@ class FieldFit:
     ) -> FittedField:
         residuals = {}
         for name, changes in measured.items():
-            bare = self._sheet(name).bare_voltages
+            bare = self.sheet(name).bare_voltages
             change = (solutions[name].voltages - bare) / np.abs(bare)
             residuals[name] = changes.weight * (change - changes.change)
         off = (log_ratio - self.likely) / (family.ratio_freedom * self._ratio_sigma)
@@ -254,7 +255,7 @@ class FieldFit:
             onto = np.empty((len(drawing.nodes), share.shape[1] + 1))
             onto[:, :-1] = by_share[:, None] * seen + by_pressure[:, None] * pressure
             onto[:, -1] = by_log_ratio
-            forward = self._sheet(name)
+            forward = self.sheet(name)
             onto *= forward.at_rest[drawing.nodes, None]
             by_parameter = forward.jacobian(fitted.solutions[name], drawing.nodes, onto)
             volts = np.abs(forward.bare_voltages)

@@ -36,6 +36,7 @@ def test_an_artifact_comes_back_as_it_was(
     file = tmp_path / "new folder" / "small.npz"
     save_artifact(built, file)
     read = load_artifact(file, small)
+    assert str(file) in Path("/proc/self/maps").read_text()  # what is large stays in the file
     assert read.regularisation == built.regularisation
     for name in ("jacobian", "tikhonov"):
         np.testing.assert_array_equal(getattr(read, name), getattr(built, name))
