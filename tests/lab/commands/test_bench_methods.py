@@ -60,6 +60,8 @@ def test_every_method_is_timed_beside_what_it_is_compared_with(sensor: Path) -> 
         states = ("cold", "still", "moving") if method in BUDGETED else ("any",)
         contacts = (1,) if method in noted else (1, 2)
         expected |= {(method, each, state) for each in contacts for state in states}
+        if method not in noted:
+            expected.add((method, 4, states[0]))  # no more than cold
     assert rows.keys() == expected
     product = rows["bare product", 0, "any"]
     assert product["of_product"] == 1
@@ -79,6 +81,7 @@ def test_methods_of_ones_own_have_rows_and_what_cannot_be_timed_says_why(
     asked = ("--method", "own_timed:Mine", "--method", "own_timed:Failing")
     rows = rows_of(sensor, *asked)
     mine = {("own_timed:Mine", n, s) for n in (1, 2) for s in ("cold", "still", "moving")}
+    mine.add(("own_timed:Mine", 4, "cold"))
     failing, peer = ("own_timed:Failing", 1, "any"), ("pyEIT", 1, "any")
     assert rows.keys() == {("bare product", 0, "any"), *mine, failing, peer}
     assert all(rows[each]["of_product"] > 0 for each in mine)
