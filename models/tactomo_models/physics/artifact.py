@@ -217,7 +217,8 @@ def load_or_build_artifact(
     artifact = build_artifact(description, progress)
     try:
         save_artifact(artifact, target)
+        return load_artifact(target, description)  # what is large stays in the file
     except ArtifactError:
         if path is not None:
             raise  # the cache is a convenience, a path that was asked for is not
-    return artifact
+        return artifact
