@@ -39,7 +39,7 @@ class ClientError(Exception):
 class MessageError(ClientError, ValueError):
     """Bytes that are not a message of this schema, or values that cannot become one."""
 
-    def __init__(self, cause: str, next_step: str = "") -> None:
+    def __init__(self, cause: str, next_step: str = "compare it with STREAM.md") -> None:
         super().__init__(cause, next_step, name="malformed_message")
 
 

@@ -188,6 +188,7 @@ def test_malformed_requests_get_an_answer(bench: Start, connect: Start, body: by
     with pytest.raises(ControlError) as caught:
         decode_reply(socket.recv())
     assert caught.value.name == "malformed_message"
+    assert caught.value.next_step
     assert b.ask("status")
 
 

@@ -151,7 +151,8 @@ class SkinProcesses:
                     "skin_ended",
                     sensor=process.name,
                     exit_status=status,
-                    next_step=f"it is started again in {RESTART_S:g} s; the lines before say why",
+                    next_step="the lines before say why; "
+                    f"started again in {RESTART_S:g} s, unless no skin ever got ready",
                 )
         elif process.ear is not None and process.is_ready and now_s - process.fed_s > WATCHDOG_S:
             log.error("skin_hangs", sensor=process.name, watchdog_s=WATCHDOG_S)
