@@ -338,11 +338,11 @@ def _seen(name: Channel, drawing: Drawing) -> FloatArray:
 def covariance_of(
     jacobian: FloatArray,  # (sum M, n) of the weighted residual
     precision: FloatArray,  # (n,) inverse variances of the prior
-    measured: Measured,  # the data
-    misfit: float,  # that is left of them
+    # (sum M,) by which the data's variances exceed what independent errors would have
+    inflation: FloatArray,
+    misfit: float,  # that is left of the data
 ) -> FloatArray:
     """Covariance (n, n) of parameters; larger where the data are left unexplained."""
-    inflation = np.concatenate([each.variance_inflation for each in measured.values()])
     prior = np.diag(precision)
     inverse = np.linalg.inv(jacobian.T @ jacobian + prior)
     information = jacobian.T @ (inflation[:, None] * jacobian) + prior

@@ -12,7 +12,9 @@ from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scene.areas import AreaFinder
 from tactomo_models.scene.field_account import (
+    LIGHT_RIM,
     OUTLINE_ERROR,
+    UNFITTED,
     Doubt,
     FieldAccount,
     FieldAccountant,
@@ -173,13 +175,20 @@ NUMBERS: dict[str, Callable[[FieldAccount], tuple[FloatArray, FloatArray]]] = {
     "peak magnitude": lambda a: (a.contacts.peak_magnitude, a.contacts.peak_magnitude_sigma),  # type: ignore[union-attr]
     "force": lambda a: (a.contacts.force_n, a.contacts.force_sigma_n),  # type: ignore[union-attr]
 }
-BY_RADIUS = {"area": 2, "magnitude": -2, "peak magnitude": -2}  # powers by which numbers go
 
 
 @pytest.mark.parametrize("kind", ["flat", "soft"])
 def test_numbers_scatter_as_their_uncertainties_say(sensor: Sensor, kind: str) -> None:
-    """Edges are as wide apart as is likely; a mesh knows a radius no better than it says."""
-    sigma, spacing_m, rng = 0.02, 0.003, np.random.default_rng(9)
+    """Edges are as wide apart as is likely; a mesh knows a radius no better than it says.
+
+    The graded sheet keeps magnitude times area, so a force goes with the onset's share of it.
+    """
+    peaks = PEAK_KPA * np.array([0.99, 1.01])
+    steepness = np.diff(np.log(magnitude_at(sensor, peaks)))[0] / np.diff(np.log(peaks))[0]
+    by_area = {"area": 1, "magnitude": -1, "peak magnitude": -1, "force": 1 - 1 / steepness}
+    rim = 0.0 if Channel.STRUCTURE in sensor.fit.responses else LIGHT_RIM
+    outline = 0.0 if kind == "soft" else 2 * OUTLINE_ERROR * 0.003 / RADIUS_M
+    sigma, rng = 0.02, np.random.default_rng(9)
     accounts, off = accountant(sensor), []
     for _ in range(100):
         true = contacts(KINDS[kind])
@@ -192,16 +201,14 @@ def test_numbers_scatter_as_their_uncertainties_say(sensor: Sensor, kind: str) -
         found = sensor.settled(sensor.fit.compare(truth, data), data)
         account = accounts.account(found, data)
         assert len(account.areas) == 1
-        radius = 1 + OUTLINE_ERROR * spacing_m / RADIUS_M * rng.standard_normal()
-        off.append(
-            [
-                float(
-                    (of(account)[0] - radius ** BY_RADIUS.get(name, 0) * of(exact)[0])[0]
-                    / of(account)[1][0]
-                )
-                for name, of in NUMBERS.items()
-            ]
-        )
+        of_mesh, of_rim = rng.standard_normal(2) * (outline, rim)
+        errors = []
+        for name, of in NUMBERS.items():
+            (value, said), true_value = of(account), of(exact)[0]
+            off_by = of_mesh + of_rim * (name in ("area", "magnitude"))
+            error = (value - true_value) * (1 if name == "x" else UNFITTED)
+            errors.append((error / said + by_area.get(name, 0) * off_by * true_value / said)[0])
+        off.append(errors)
     within = dict(zip(NUMBERS, np.mean(np.abs(off) < 1, axis=0), strict=True))
     # Where a peak's range cuts off what noise alone would have it, it is better known than it says.
     assert min(within.values()) > 0.5, within
