@@ -292,6 +292,7 @@ FIGURES: dict[str, Callable[[Any], str]] = {
     "in σ": lambda s: f"{s.within_sigma:.0%}",
     "place in σ": lambda s: f"{s.place_within_sigma:.0%}",
     "area in σ": lambda s: f"{s.area_within_sigma:.0%}",
+    "peak in σ": lambda s: f"{s.peak_within_sigma:.0%}",
     "lost": lambda s: f"{s.recovery:.0f}",
     "most": lambda s: f"{s.recovery_most:.0f}",
     "ids": lambda s: str(s.switches),

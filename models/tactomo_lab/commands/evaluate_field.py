@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 EVEN_FIT = "tactomo_lab.baselines.even_fit:EvenFit"
 MAPS = ("frames", "ICC", "RIE", "worst", "flagged", "silent", "alarms", "ms", "p99")
-CONTACTS = ("count", "mm", "peak", "in σ", "place in σ", "area in σ")
+CONTACTS = ("count", "mm", "peak", "in σ", "place in σ", "area in σ", "peak in σ")
 
 app = options.typer_app()
 
@@ -85,8 +85,8 @@ def field(
             {"maps": MAPS, "contacts": CONTACTS},
             "worst: ICC that 95 % exceed; silent: maps with an ICC below 0.7 and no flag that "
             "tells to distrust, of all; alarms: good maps with one, of the good ones. mm: centre "
-            "error, median; peak: right to 10 %, of the true contacts; in σ: magnitudes, places "
-            "and areas within one reported standard uncertainty, 68 % where that is right.",
+            "error, median; peak: right to 10 %, of the true contacts; in σ: magnitudes, "
+            "places, areas and peaks within one reported sigma, 68 % where that is right.",
         )
     if picture is not None:
         from tactomo_lab.commands.pictures import draw_press

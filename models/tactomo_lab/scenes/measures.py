@@ -77,11 +77,12 @@ class ContactScore:
     #: relative error of the peak pressure, or of the pressure where no peak was reported; NaN, too,
     #: where neither was
     peak_error: float = float("nan")
-    #: x_error_sigmas, y_error_sigmas, area_error_sigmas: errors of place and area over their
-    #: standard uncertainties; NaN, too, where none was reported
+    #: x_error_sigmas, y_error_sigmas, area_error_sigmas, peak_error_sigmas: errors of place, area
+    #: and peak over their standard uncertainties; NaN, too, where none was reported
     x_error_sigmas: float = float("nan")
     y_error_sigmas: float = float("nan")
     area_error_sigmas: float = float("nan")
+    peak_error_sigmas: float = float("nan")
 
     @property
     def missed(self) -> bool:
@@ -194,6 +195,7 @@ def score_contact(
         x_error_sigmas=_sigmas(found.x_m - true.x_m, found.x_sigma_m),
         y_error_sigmas=_sigmas(found.y_m - true.y_m, found.y_sigma_m),
         area_error_sigmas=_sigmas(found.area_m2 - true.area_m2, found.area_sigma_m2),
+        peak_error_sigmas=_sigmas(found.peak_kpa - true.pressure_kpa, found.peak_sigma_kpa),
     )
 
 
@@ -236,9 +238,10 @@ class Summary:
     #: share of magnitude errors within one reported standard uncertainty; 0.68 where those are
     #: right
     within_sigma: float
-    #: place_within_sigma, area_within_sigma: likewise of x and y, and of the area
+    #: place_within_sigma, area_within_sigma, peak_within_sigma: likewise of x and y, ...
     place_within_sigma: float
     area_within_sigma: float
+    peak_within_sigma: float
     #: share of the true contacts whose peak pressure is right to `RIGHT_PEAK`, of those that the
     #: magnitude channel answers to
     peak_right: float
@@ -279,6 +282,7 @@ def summarise(scores: Sequence[FrameScore]) -> Summary:
         within_sigma=mean(np.where(np.isfinite(error), np.abs(error) <= sigma, np.nan)),
         place_within_sigma=_share_within_one(place),
         area_within_sigma=_share_within_one([contact.area_error_sigmas for contact in matched]),
+        peak_within_sigma=_share_within_one([contact.peak_error_sigmas for contact in matched]),
         peak_right=mean(contact.peak_right for contact in contacts if contact.magnitude > 0),
         distrusted=mean(one.distrusted for one in scores),
         bad_unflagged=mean(one.bad and not one.distrusted for one in scores),

@@ -62,6 +62,8 @@ def test_a_contact_is_scored_in_the_units_it_says(paper: SensorDescription) -> N
     off = replace(
         FOUND, x_m=0.013, y_m=-0.016, magnitude=0.1, area_m2=500e-6, pressure_kpa=float("nan")
     )
+    of_peak = replace(FOUND, peak_kpa=190.0, peak_sigma_kpa=4.0)
+    assert score_contact(paper, TRUE, of_peak).peak_error_sigmas == pytest.approx(2.5)
     one = score_contact(paper, TRUE, off)
     assert one.centre_error_mm == pytest.approx(5)
     assert one.area_error == pytest.approx(0.25)
@@ -119,6 +121,8 @@ def test_a_summary_by_hand(paper: SensorDescription) -> None:
     assert all_of.magnitude_error == pytest.approx((0.08 + 0 + 0.12 + 0) / 4)
     assert all_of.magnitude_spread == pytest.approx(0.2)
     assert all_of.within_sigma == pytest.approx(2 / 4)
+    peaks = [replace(FOUND, peak_kpa=kpa, peak_sigma_kpa=4.0) for kpa in (177.0, 185.0, 183.0)]
+    assert summarise([scene(paper, one) for one in peaks]).peak_within_sigma == pytest.approx(2 / 3)
     assert all_of.distrusted == pytest.approx(1 / 3)
     assert all_of.confidently_wrong == pytest.approx(1 / 3)
     assert all_of.seconds == 0.2

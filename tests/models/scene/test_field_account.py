@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -209,10 +210,31 @@ def test_numbers_scatter_as_their_uncertainties_say(sensor: Sensor, kind: str) -
             error = (value - true_value) * (1 if name == "x" else UNFITTED)
             errors.append((error / said + by_area.get(name, 0) * off_by * true_value / said)[0])
         off.append(errors)
+        assert account.contacts is not None
+        assert account.contacts.force_sigma_n / account.contacts.force_n > abs(
+            by_area["force"] * outline * 0.9
+        )
     within = dict(zip(NUMBERS, np.mean(np.abs(off) < 1, axis=0), strict=True))
     # Where a peak's range cuts off what noise alone would have it, it is better known than it says.
     assert min(within.values()) > 0.5, within
     assert max(within.values()) < 0.88, within
+
+
+def test_a_sheet_that_was_far_from_even_leaves_places_less_sure(sensor: Sensor) -> None:
+    """What is left of the errors of a sheet that is found displaces; areas do not know of it."""
+    field, data = explained(sensor, KINDS["flat"])
+
+    def sigmas(error_ratio: float) -> FloatArray:
+        errors = np.full(len(next(iter(data.values())).change), 5.0)
+        told = {
+            name: replace(each.judged_by(error_ratio), variance_inflation=errors)
+            for name, each in data.items()
+        }
+        return np.asarray(accountant(sensor).account(field, told).areas.sigmas[0])
+
+    like, unlike = sigmas(1.0), sigmas(0.05)
+    assert (unlike[:2] > 1.5 * like[:2]).all()
+    assert unlike[2] == like[2]
 
 
 def test_another_account_that_is_as_likely_is_half_of_what_is_shown(sensor: Sensor) -> None:
