@@ -178,15 +178,29 @@ NUMBERS: dict[str, Callable[[FieldAccount], tuple[FloatArray, FloatArray]]] = {
 }
 
 
+def force_by_area(sensor: Sensor) -> float:
+    """Power of an area by which a force goes where magnitude times area stays."""
+    peaks = PEAK_KPA * np.array([0.99, 1.01])
+    steepness = np.diff(np.log(magnitude_at(sensor, peaks)))[0] / np.diff(np.log(peaks))[0]
+    return float(1 - 1 / steepness)
+
+
+def test_without_noise_a_force_is_as_sure_as_its_outline(sensor: Sensor) -> None:
+    field, _ = explained(sensor, KINDS["flat"])
+    account = accountant(sensor).account(field, data_of(sensor.changes(field), 1e-5))
+    assert account.contacts is not None
+    share = account.contacts.force_sigma_n / account.contacts.force_n
+    outline = 2 * OUTLINE_ERROR * 0.003 / RADIUS_M
+    assert share == pytest.approx([abs(force_by_area(sensor)) * outline], rel=0.05, abs=1e-4)
+
+
 @pytest.mark.parametrize("kind", ["flat", "soft"])
 def test_numbers_scatter_as_their_uncertainties_say(sensor: Sensor, kind: str) -> None:
     """Edges are as wide apart as is likely; a mesh knows a radius no better than it says.
 
     The graded sheet keeps magnitude times area, so a force goes with the onset's share of it.
     """
-    peaks = PEAK_KPA * np.array([0.99, 1.01])
-    steepness = np.diff(np.log(magnitude_at(sensor, peaks)))[0] / np.diff(np.log(peaks))[0]
-    by_area = {"area": 1, "magnitude": -1, "peak magnitude": -1, "force": 1 - 1 / steepness}
+    by_area = {"area": 1, "magnitude": -1, "peak magnitude": -1, "force": force_by_area(sensor)}
     rim = 0.0 if Channel.STRUCTURE in sensor.fit.responses else LIGHT_RIM
     outline = 0.0 if kind == "soft" else 2 * OUTLINE_ERROR * 0.003 / RADIUS_M
     sigma, rng = 0.02, np.random.default_rng(9)
@@ -210,10 +224,6 @@ def test_numbers_scatter_as_their_uncertainties_say(sensor: Sensor, kind: str) -
             error = (value - true_value) * (1 if name == "x" else UNFITTED)
             errors.append((error / said + by_area.get(name, 0) * off_by * true_value / said)[0])
         off.append(errors)
-        assert account.contacts is not None
-        assert account.contacts.force_sigma_n / account.contacts.force_n > abs(
-            by_area["force"] * outline * 0.9
-        )
     within = dict(zip(NUMBERS, np.mean(np.abs(off) < 1, axis=0), strict=True))
     # Where a peak's range cuts off what noise alone would have it, it is better known than it says.
     assert min(within.values()) > 0.5, within
