@@ -151,7 +151,7 @@ class Moves:
         # What pressures leave unexplained in a crowd is a matter of edges and holes first.
         as_needed = self._shape_model == ShapeModel.AS_NEEDED and len(frame.measured) == 1
         free = [self._escalate] if as_needed else []
-        return [self.birth, *form, *free, *self._deaths(shape)]
+        return [self.birth, *form, self._parted, *free, *self._deaths(shape)]
 
     def joined(self, shape: FittedField, frame: Frame) -> FittedField:
         """The same contacts and others that landed away from them, before any is let move."""
@@ -243,6 +243,23 @@ class Moves:
         each[asked, HARMONIC:PEAK] = np.clip(steps[asked], -MAX_BULGE / 2, MAX_BULGE / 2)
         other = self._of_contacts(each, shape, frame)
         return Candidate(other, needed * asked.sum()) if other else None
+
+    def _parted(self, shape: FittedField, frame: Frame) -> Candidate | None:
+        """Circles for rounded outlines, and what they then miss: two may pass for one of those."""
+        assert isinstance(shape.family, PressureField)
+        each = contacts_of(shape)
+        if not each[:, HARMONIC:PEAK].any():
+            return None
+        each[:, E1:PEAK] = 0.0
+        order = 1 if Channel.STRUCTURE in frame.measured else 0
+        circles = self.evaluate(each, order, shape.log_ratio, frame)
+        if circles is None:
+            return None
+        circles = self.fit.refine(circles, frame.measured, frame.budget, 0.0, TRIALS)
+        missing, scale = self._missing(circles, frame), scale_of(shape, frame)
+        if not missing or missing[0].gain < SURE_GAIN * scale:
+            return None
+        return self._with_another(circles, missing[0], LONG_GAIN * scale, frame)
 
     def _with(self, question: Question, shape: FittedField, frame: Frame) -> Candidate | None:
         """Pressures that fall towards the edge, or rings, where the data leave that open."""

@@ -61,6 +61,16 @@ def test_what_a_field_explains_is_the_fields(
     assert right["auto"] > right["fit"] - 0.01
 
 
+def test_a_small_contact_beside_a_large_one_is_no_bulge_of_it(
+    paper: SensorDescription, methods: dict[str, Reconstructor], skin: Skin
+) -> None:
+    """The network takes them for one, and one rounded outline would pass for both."""
+    pair = (Press(0.011, -0.002, 180.0, radius_m=0.02), Press(0.016, 0.027, 180.0, radius_m=0.0042))
+    frame = methods["auto"].reconstruct(**skin.scan(*pair))
+    assert len(frame.contacts) == 2
+    assert icc(paper, frame, *pair) > 0.97
+
+
 def test_the_hole_of_a_ring_is_seen_where_there_is_little_noise(
     paper: SensorDescription, methods: dict[str, Reconstructor], simulator: SkinSimulator
 ) -> None:
