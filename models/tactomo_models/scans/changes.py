@@ -35,8 +35,8 @@ from tactomo_models.sensor.description import SensorDescription
 # voltages at a time, and average out so much less than noise does.
 CORRELATED = 10.0
 # Share of that variance which displaces contacts once the sheet is found as it is, over the even
-# sheet's own errors. On tuning scenes 66 % of hand-made skins' places are then within one sigma and
-# 76 % of crowds'; with a fifth less 64 and 75 %.
+# sheet's own errors. On tuning scenes 64 % of hand-made skins' places are then within one sigma and
+# 76 % of crowds'; with half as much more 75 and 81 %.
 DISPLACING = 0.13
 UNUSABLE = 1e3  # relative error of a voltage whose reference is zero or no number
 WRONG_WAY = 5.0  # standard uncertainties by which a conductivity may change against its sign

@@ -34,10 +34,10 @@ from tactomo_models.scene.sheet_response import GradedResponse, SaturatingRespon
 
 # Shares within one sigma are of tuning scenes of every kind.
 # Of an outline's radius, over the nodes' distance, that no noise accounts for where a pressure is
-# even: with 0.05, 52 % of the areas at 40 dB are within one sigma, with 0.07, 67 %.
+# even: with 0.05, 52 % of the areas at 40 dB are within one sigma, with 0.07, 66 %.
 OUTLINE_ERROR = 0.07
 # Sigmas of size and pressure over the fit's own: a form that is not fitted is no surer for that.
-# With 1, 57 % of the areas at 20 dB are within one sigma, with this 60 %.
+# With 1, 63 % of the magnitudes at 10 dB are within one sigma, with this 69 %.
 UNFITTED = 1.25
 # Relative error of an area and its magnitude where no sheet saturates: a light rim does not show.
 # With none, 50 % of one graded sheet's areas are within one sigma, with 0.15, 58 %.
