@@ -20,7 +20,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         data = file.read(MAX_TOML_BYTES + 1)
     if len(data) > MAX_TOML_BYTES:
         raise ValueError(f"it has more than {MAX_TOML_BYTES} bytes")
-    return parse_toml(data.decode("utf-8"))
+    return parse_toml(data.decode("utf-8-sig"))  # some editors mark it
 
 
 def parse_toml(text: str) -> dict[str, Any]:

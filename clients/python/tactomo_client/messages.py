@@ -193,8 +193,9 @@ def decode_request(data: bytes) -> tuple[str, dict[str, Any]]:
     """Return the command and arguments of a control request; raise MessageError if it is none."""
     fields = _unpack_map(data, object_pairs_hook=_without_repeats)
     command, arguments = fields.get("command"), fields.get("arguments", {})
-    if not isinstance(command, str) or not isinstance(arguments, dict):
-        raise MessageError("a request is {schema, command: string, arguments: map}")
+    further = fields.keys() - {"schema", "command", "arguments"}
+    if further or not isinstance(command, str) or not isinstance(arguments, dict):
+        raise MessageError("a request is {schema, command: string, arguments: map}, no more")
     return command, arguments
 
 

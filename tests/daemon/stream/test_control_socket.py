@@ -178,6 +178,7 @@ def test_what_cannot_be_done_is_refused_by_name(
         msgpack.packb({"schema": 2, "command": "status"}),
         msgpack.packb({"schema": 1, "command": 5}),
         msgpack.packb({"schema": 1, "command": "status", "arguments": [1]}),
+        msgpack.packb({"schema": 1, "command": "record_start", "path": "argument.mcap"}),
     ],
 )
 def test_malformed_requests_get_an_answer(bench: Start, connect: Start, body: bytes) -> None:
