@@ -248,11 +248,11 @@ class Moves:
         """Circles for rounded outlines, and what they then miss: two may pass for one of those."""
         assert isinstance(shape.family, PressureField)
         each = contacts_of(shape)
-        if not each[:, HARMONIC:PEAK].any():
+        # One graded sheet shows a soft edge where another has a bulge: it asks for edges instead.
+        if not each[:, HARMONIC:PEAK].any() or Channel.STRUCTURE not in frame.measured:
             return None
         each[:, E1:PEAK] = 0.0
-        order = 1 if Channel.STRUCTURE in frame.measured else 0
-        circles = self.evaluate(each, order, shape.log_ratio, frame)
+        circles = self.evaluate(each, 1, shape.log_ratio, frame)
         if circles is None:
             return None
         circles = self.fit.refine(circles, frame.measured, frame.budget, 0.0, TRIALS)

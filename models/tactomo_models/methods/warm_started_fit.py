@@ -140,6 +140,7 @@ class _Course:
         self._moves_tried = 0
         self._moved = False  # whether known contacts were let move, before any is added
         self._settled = False  # whether the shape in force is at its minimum
+        self._early = True  # whether a contact may be added before that
 
     def follow(self, frame: Frame) -> tuple[FittedField, str]:
         """Fit one frame more; see `WarmStartedFit.follow`."""
@@ -207,6 +208,7 @@ class _Course:
             return best, how if best is scratch else "warm start"
         if before.converged:  # all was done, but for other data
             self._moved = self._settled = False
+            self._early = True
         if self._candidate is not None:
             other = self._fit.compare(self._candidate.shape, frame.measured)
             self._candidate = replace(self._candidate, shape=replace(other, converged=False))
@@ -264,7 +266,8 @@ class _Course:
 
     def _is_crowding(self, shape: FittedField) -> bool:
         """Whether that much is left that a further contact need not wait for the others."""
-        return self._moved and not self._settled and shape.misfit > SUSPECT_MISFIT
+        waits = self._moved and not self._settled
+        return self._early and waits and shape.misfit > SUSPECT_MISFIT
 
     def _refined(self, shape: FittedField, frame: Frame) -> FittedField:
         steps = 4  # of a refinement, before what it leads to is judged
@@ -294,7 +297,8 @@ class _Course:
         trials = candidate.trials - (not frame.budget.over)
         if refined.converged or trials == 0:
             self._candidate = None
-            self._moves_tried += 1
+            self._moves_tried += self._settled
+            self._early = self._settled  # what came too early is tried again at the minimum
         else:
             self._candidate = replace(candidate, shape=refined, trials=trials)
         return shape

@@ -7,7 +7,7 @@ import pytest
 from pressed import Sensor, contact, contacts, data_of, described
 from tactomo_models import Channel, SensorDescription
 from tactomo_models.arrays import FloatArray
-from tactomo_models.methods.moves import ShapeModel
+from tactomo_models.methods.moves import Candidate, Frame, Moves, ShapeModel
 from tactomo_models.methods.warm_started_fit import WarmStartedFit
 from tactomo_models.physics.bare_sheet import solve_bare_sheet
 from tactomo_models.physics.forward import ForwardModel
@@ -192,6 +192,24 @@ def test_a_long_contact_is_one_ellipse(graded: Skin) -> None:
     assert isinstance(shape.family, PressureField)
     (one,) = shape.family.split(shape.parameters)
     assert one[[E1, E2]] == pytest.approx([0.25, 0.1], abs=0.1)
+
+
+def test_a_contact_that_is_added_in_vain_keeps_nothing_else_from_being_tried(
+    graded: Skin, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else it would be added again and again, while the known ones wait, until time is up."""
+    born = Moves.birth
+
+    def in_vain(self: Moves, shape: FittedField, frame: Frame) -> Candidate | None:
+        assert isinstance(shape.family, PressureField)
+        return Candidate(shape, np.inf) if shape.family.count else born(self, shape, frame)
+
+    monkeypatch.setattr(Moves, "birth", in_vain)
+    fit = WarmStartedFit(graded.sensor.fit)
+    follow(fit, graded.frame(contact(-0.002, 0.003, 0.01, peak=0.85)))
+    other = contact(0.004, -0.004, 0.006, peak=1.2, e=(0.3, 0.1))
+    shape, _ = follow(fit, graded.frame(other))
+    assert_at(shape, other)
 
 
 def test_a_sheet_that_is_lost_and_comes_back_changes_no_contact(
