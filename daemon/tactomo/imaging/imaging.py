@@ -338,6 +338,7 @@ class Imaging:
 
     def _publish_frame(self, dual: DualScan, timing: Timing, frame: Reconstruction) -> None:
         started_s = time.perf_counter()
+        self.frame_rate.add(time.monotonic_ns())  # first: what was seen is counted
         header = frames.frame_header(dual, timing, frame)
         self._publisher.header = header
         self._publisher.publish(CONTACTS, frames.contacts_fields(dual.counter, frame), header)
@@ -345,7 +346,6 @@ class Imaging:
         if self._publisher.wants(MAP) or (active is not None and active.with_maps):
             fields = frames.map_fields(dual.counter, frame, self._description)
             self._publisher.publish(MAP, fields, header)
-        self.frame_rate.add(time.monotonic_ns())
         self._time("publish", time.perf_counter() - started_s)
 
     def _time(self, stage: str, seconds: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -12,6 +13,7 @@ import zmq
 from tactomo.service import status
 from tactomo_client import subscribe
 from tactomo_client.messages import array_from_wire, decode_message, topic
+from waiting import PATIENCE_S
 
 Start = Callable[..., Any]
 
@@ -91,6 +93,21 @@ def test_a_late_joiner_gets_the_status_at_once(bench: Start, connect: Start) -> 
 
     b.until(is_repeated)
     b.until(lambda: b.ask("status")["subscribers"] == 5)
+
+
+def test_a_frame_that_was_heard_is_counted(bench: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    b = bench()
+    b.tare()
+    publish, is_asked = b.daemon._publisher.publish, threading.Event()
+
+    def held_up(kind: str, *given: Any) -> None:
+        publish(kind, *given)
+        assert kind != "map" or is_asked.wait(PATIENCE_S)
+
+    monkeypatch.setattr(b.daemon._publisher, "publish", held_up)
+    b.step()
+    assert b.ask("status")["frames"] == 4
+    is_asked.set()
 
 
 def test_a_map_is_made_for_subscribers_alone(bench: Start) -> None:
