@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import zmq
-from daemon_bench import Bench, Heard, Line, Listener, Memory, Skin
+from daemon_bench import PATIENT_SYNC_MS, Bench, Heard, Line, Listener, Memory, Skin
 from tactomo.config import load_config
 from tactomo.log import configure_logging
 from tactomo.recordings.recording_set import open_replayable
@@ -58,7 +58,8 @@ def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Cal
     """Start a daemon: ``bench(ports=1, **config)``; everything is stopped later.
 
     It has the reconstructor above, each frame of which takes `seconds`, or the `real` one; and a
-    `machine_speed`, or this machine's. What listens to it and asks it has `keys`.
+    `machine_speed`, or this machine's. A scan waits for its partner as long as it takes, unless
+    there is a `sync_wait_ms`. What listens to it and asks it has `keys`.
     The cables are in, unless `is_plugged` says otherwise.
     """
     daemons: list[Daemon] = []
@@ -84,14 +85,14 @@ def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Cal
             "stream": "tcp://127.0.0.1:0",
             "control": "tcp://127.0.0.1:0",
             "tare_scans": 3,
-            "sync_wait_ms": 500,  # a busy computer must not lose a channel
             "baseline": {"track": real},  # that takes a real one
             **config,
         }
+        loaded = load_config(None, **settings)
+        if "sync_wait_ms" not in config:
+            loaded = loaded.model_copy(update={"sync_wait_ms": PATIENT_SYNC_MS})
         memory: Any = None if real else Memory(seconds)
-        daemon = Daemon(
-            load_config(None, **settings), reconstructor=memory, machine_speed=machine_speed
-        )
+        daemon = Daemon(loaded, reconstructor=memory, machine_speed=machine_speed)
         daemon.start()
         daemons.append(daemon)
         listener = Listener(daemon.stream_address, "left", keys=keys)

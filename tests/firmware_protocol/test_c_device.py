@@ -31,6 +31,7 @@ from tactomo_protocol import (
     ScanFlag,
     encode,
 )
+from waiting import PATIENCE_S
 
 OK, UNKNOWN, BAD, BUSY = AckStatus
 IDENTIFY, START, STOP, SET_RATE, ZERO = CommandCode
@@ -441,12 +442,12 @@ def test_the_example_firmware_runs_and_keeps_the_order_of_samples(tmp_path: Path
         assert process.stdout is not None
         process.stdin.write(encode(Command(START, 1)))
         process.stdin.flush()
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + PATIENCE_S
         while sum(isinstance(packet, Scan) for packet in packets) < 6:
             assert time.monotonic() < deadline
             packets += decoder.feed(os.read(process.stdout.fileno(), 65_536))
         process.stdin.close()
-        assert process.wait(30) == 0
+        assert process.wait(PATIENCE_S) == 0
     assert decoder.counts.corrupt == 0
     assert kinds(packets[:2]) == [Hello, Acknowledge]
     magnitude, structure = [packet for packet in packets if isinstance(packet, Scan)][:2]

@@ -41,6 +41,8 @@ from waiting import PATIENCE_S, wait_until
 MEASUREMENTS = 208
 VOLTS_PER_COUNT = 1e-6
 REST = np.linspace(0.05, 0.2, MEASUREMENTS)
+PATIENT_SYNC_MS = 20_000.0
+"""Longer than a daemon may be told to wait for a channel: a stopped computer loses none."""
 BOTH = (Channel.MAGNITUDE, Channel.STRUCTURE)
 NO_FLAGS = ScanFlag(0)
 
@@ -78,9 +80,9 @@ class Line:
 
     def unplug(self) -> None:
         if self.descriptor >= 0:
+            self.path.unlink(missing_ok=True)  # first: its number may be another's at once
             os.close(self.descriptor)
             self.descriptor = -1
-            self.path.unlink(missing_ok=True)
 
     def say(self, *packets: Packet | bytes) -> None:
         """Send packets, or raw bytes, and wait until the line has taken them."""

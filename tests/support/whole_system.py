@@ -32,11 +32,11 @@ class Demo:
 
     def press(self, x_mm: float, y_mm: float, **more: Any) -> None:
         """Press the virtual skin."""
-        request("press", self.twin, x_mm=x_mm, y_mm=y_mm, **more)
+        request("press", self.twin, PATIENCE_S, x_mm=x_mm, y_mm=y_mm, **more)
 
     def clear(self) -> None:
         """Lift everything off the virtual skin."""
-        request("clear", self.twin)
+        request("clear", self.twin, PATIENCE_S)
 
 
 @contextmanager

@@ -40,13 +40,13 @@ def test_a_hello_with_a_rate_that_cannot_be_is_told_and_the_port_does_not_run(be
     b.skin.lines[0].say(bad)
     assert "scan_rate_hz is nan" in told(b)["detail"]
 
-    def is_idle() -> bool:
+    def while_idle() -> dict[str, Any] | None:
         b.skin.lines[0].say(bad, scan(MAGNITUDE, 1))
-        (port,) = b.ask("status")["ports"]
-        return port["state"] == "faulty" and "scan_rate_hz" in port["problem"]
+        status: dict[str, Any] = b.ask("status")
+        (port,) = status["ports"]
+        return status if port["state"] == "faulty" and "scan_rate_hz" in port["problem"] else None
 
-    b.until(is_idle)
-    status = b.ask("status")
+    status = b.until(while_idle)
     assert "device_idle" not in status["events"]["counts"]
     (port,) = status["ports"]
     assert port["corrupt"] == 0 < port["faulty"]
@@ -62,12 +62,12 @@ def test_scans_of_another_length_are_no_waiting_for_a_trigger(bench: Start) -> N
     b.skin.introduce()
     short = replace(scan(MAGNITUDE, 1), samples=np.zeros(104, np.int32))
 
-    def is_faulty() -> bool:
+    def while_faulty() -> dict[str, Any] | None:
         b.skin.lines[0].say(short)
-        return bool(b.ask("status")["ports"][0]["state"] == "faulty")
+        status: dict[str, Any] = b.ask("status")
+        return status if status["ports"][0]["state"] == "faulty" else None
 
-    b.until(is_faulty)
-    (issue, *_) = (i for i in health_issues(b.ask("status")) if "faulty" in i.what)
+    (issue, *_) = (i for i in health_issues(b.until(while_faulty)) if "faulty" in i.what)
     assert "its hello says 208" in issue.what
     assert "trigger" not in issue.next_step
     assert "correct the firmware" in issue.next_step

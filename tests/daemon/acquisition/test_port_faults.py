@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import random
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -43,7 +45,9 @@ def refusal(port: str | Path) -> PortError:
 def test_garbage_is_counted_and_told_and_costs_nothing_else(bench: Start) -> None:
     b = bench()
     b.tare()
-    b.skin.lines[0].say(b"\x00" + os.urandom(300).replace(b"\x00", b"\x01") + b"\x00")
+    b.skin.lines[0].say(
+        b"\x00" + random.Random(1).randbytes(300).replace(b"\x00", b"\x01") + b"\x00"
+    )
     event = b.listener.event("corrupt_packets")
     assert event["severity"] == "warning"
     assert b.step()["flags"] == []
@@ -75,11 +79,14 @@ def test_damage_that_is_over_is_not_told_as_present(
 def test_a_flood_of_garbage_makes_few_events(bench: Start) -> None:
     b = bench()
     b.tare()
+    first_s = time.monotonic()
     for _ in range(200):
         b.skin.lines[0].say(b"\x00garbage\x00")
     b.step()
+    passed_s = time.monotonic() - first_s
     assert b.ask("status")["ports"][0]["corrupt"] == 200
-    assert 1 <= sum(e["name"] == "corrupt_packets" for e in b.listener.of("event")) <= 3
+    told = sum(e["name"] == "corrupt_packets" for e in b.listener.of("event"))
+    assert 1 <= told <= 2 + passed_s  # once a second at most
 
 
 @pytest.mark.parametrize("ports", [1, 2])
@@ -99,7 +106,7 @@ def test_an_unplugged_port_is_waited_for_and_started_again(bench: Start, ports: 
 
 
 def test_the_other_port_goes_on_while_one_is_unplugged(bench: Start) -> None:
-    b = bench(ports=2)
+    b = bench(ports=2, sync_wait_ms=100)
     b.tare()
     b.skin.line_of(Channel.STRUCTURE).unplug()
     b.listener.event("port_lost")
@@ -165,9 +172,13 @@ def test_a_device_of_another_skin_is_refused_by_its_name(bench: Start) -> None:
     assert "theirs" in refused["detail"]
     assert "ours-a, ours-b" in refused["detail"]
     assert "by-path" in refused["next_step"]
-    b.skin.scan()
-    status = b.listener.wait("status", lambda s: s["ports"][0]["unused_scans"])
-    assert [port["state"] for port in status["ports"]] == ["refused", "running"]
+
+    def states() -> list[str]:
+        b.skin.scan()
+        return [port["state"] for port in b.ask("status")["ports"] if port["device"]]
+
+    b.until(lambda: states() == ["refused", "running"])
+    assert b.ask("status")["ports"][0]["unused_scans"]
     first.say(replace(ours, device_id="ours-b"))
     for _ in range(3):
         b.step()

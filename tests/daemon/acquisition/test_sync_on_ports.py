@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from tactomo_client.messages import array_from_wire
 from tactomo_protocol import Channel, SampleFormat, Scan, ScanFlag
+from waiting import PATIENCE_S
 
 Start = Callable[..., Any]
 
@@ -43,12 +44,13 @@ def test_the_order_in_which_the_channels_come_does_not_matter(bench: Start, port
 def test_one_channel_missing_is_flagged_and_the_maps_go_on(
     bench: Start, present: Channel, flag: str
 ) -> None:
-    b = bench(ports=2)
+    b = bench(ports=2, lossless=True)
     b.tare()
-    frame = b.step(load=0.1, channels=(present,))
+    alone = b.skin.scan(load=0.1, channels=(present,))
+    assert b.step()["flags"] == []  # both again: what waited for a partner waited in vain
+    frame = b.listener.frame(alone)
     assert frame["flags"] == [flag]
     assert array_from_wire(frame["map"])[0, 0] == pytest.approx(0.1, abs=1e-3)
-    assert b.step()["flags"] == []  # both again
     assert b.ask("status")["incomplete_scans"] == 1
 
 
@@ -58,12 +60,11 @@ def test_a_channel_that_stays_out_is_lost_and_comes_back(bench: Start) -> None:
     b.tare()
     while not any(e["name"] == "channel_lost" for e in b.listener.of("event")):
         b.step(channels=(Channel.MAGNITUDE,))
-    frame = b.step(channels=(Channel.MAGNITUDE,))
-    assert frame["age_ns"] < 750e6  # not waited for any more
+    b.until(lambda: b.step(channels=(Channel.MAGNITUDE,))["age_ns"] < 750e6)  # waited for no more
     # The first pair is what shows that the channel is back: it may still be sent on alone.
     b.step()
     b.listener.event("channel_back")
-    assert b.step()["flags"] == []
+    b.until(lambda: b.step()["flags"] == [])  # a busy computer may tear one of them apart
 
 
 def test_a_channel_that_comes_after_the_tare_says_that_it_has_no_reference(bench: Start) -> None:
@@ -73,6 +74,7 @@ def test_a_channel_that_comes_after_the_tare_says_that_it_has_no_reference(bench
     structure.hello = magnitude.hello
     b.skin.introduce()  # nobody announces the structure channel, so nobody waits for it
     structure.hello = both
+    b.until(lambda: all(port["device"] for port in b.ask("status")["ports"]))
     for _ in range(3):
         b.step(channels=(Channel.MAGNITUDE,))
     b.listener.event("tared")
@@ -84,11 +86,13 @@ def test_a_channel_that_comes_after_the_tare_says_that_it_has_no_reference(bench
 def test_a_scan_that_comes_too_late_is_counted_and_left_out(bench: Start) -> None:
     b = bench(ports=2, sync_wait_ms=20)
     b.tare()
+    before = b.ask("status")["late_scans"]  # of pairs that a busy computer tore apart
     counter = b.skin.counter + 1
     assert b.step(channels=(Channel.MAGNITUDE,))["flags"] == ["structure_missing"]
     b.skin.scan(channels=(Channel.STRUCTURE,), counter=counter)
-    b.step()
-    assert b.ask("status")["late_scans"] == 1
+    b.until(lambda: b.ask("status")["late_scans"] > before)
+    assert b.ask("status")["late_scans"] == before + 1
+    assert [f["scan_counter"] for f in b.listener.of("map")].count(counter) == 1
 
 
 @pytest.mark.parametrize("ports", [1, 2])
@@ -126,7 +130,8 @@ def test_counters_wrap_after_32_bits(bench: Start) -> None:
     for counter in (0, 1):  # the clock does not wrap
         frame = b.step(counter=counter, device_us=(2**32 + counter) * 50_000)
         assert frame["flags"] == []
-    assert all(event["name"] == "tared" for event in b.listener.of("event"))
+    silent = {"device_silent", "device_speaks"}  # so is a computer that stops for seconds
+    assert {event["name"] for event in b.listener.of("event")} - silent == {"tared"}
 
 
 def test_a_saturated_scan_is_used_and_flagged(bench: Start) -> None:
@@ -156,17 +161,17 @@ def test_voltages_that_are_no_numbers_are_left_to_the_models_and_never_tared(
             Scan(Channel.STRUCTURE, number, 0, ScanFlag(0), bad),
         )
         assert b.listener.frame(number)["flags"] == ["invalid_voltage"]
-    assert "not numbers" in str(answer.exception(30))
+    assert "not numbers" in str(answer.exception(PATIENCE_S))
     assert b.ask("status")["reference"]["scans"] == 3
 
 
 def test_a_channel_that_begins_after_the_other_was_never_missing(bench: Start) -> None:
-    b = bench(ports=2, sync_wait_ms=200)
+    b = bench(ports=2, lossless=True)
     b.skin.introduce()
-    for _ in range(2):
-        assert "structure_missing" in b.step(channels=(Channel.MAGNITUDE,))["flags"]
-    assert b.ask("status")["incomplete_scans"] == 0
+    alone = [b.skin.scan(channels=(Channel.MAGNITUDE,)) for _ in range(2)]
     b.tare()
+    assert all("structure_missing" in b.listener.frame(each)["flags"] for each in alone)
     assert b.ask("status")["incomplete_scans"] == 0
-    b.step(channels=(Channel.MAGNITUDE,))
+    b.skin.scan(channels=(Channel.MAGNITUDE,))
+    b.step()
     assert b.ask("status")["incomplete_scans"] == 1

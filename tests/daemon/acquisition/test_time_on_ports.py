@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -245,7 +246,9 @@ def test_a_wall_clock_set_back_by_a_day_moves_no_age(
     real = time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: real() - round(DAY_S * 1e9))
     event = b.listener.event("wall_clock_jumped")
-    assert "86400.0 s back" in event["detail"]
+    told = re.search(r"set (\S+) s back", event["detail"])
+    assert told
+    assert float(told[1]) == pytest.approx(DAY_S, abs=1)
     after = b.step()
     assert before["acquired_monotonic_ns"] < after["acquired_monotonic_ns"]
     assert 0 <= after["age_ns"] < 10e9
@@ -254,7 +257,7 @@ def test_a_wall_clock_set_back_by_a_day_moves_no_age(
     status = b.ask("status")
     assert status["wall_clock"]["jumps"] == 1
     assert status["wall_clock"]["last_jump_s"] == pytest.approx(-DAY_S, abs=1)
-    assert status["state"] == "running"
+    b.until(lambda: b.step() and b.ask("status")["state"] == "running")
 
 
 @pytest.mark.parametrize("lossless", [True, False])

@@ -14,7 +14,7 @@ from tactomo.recordings.playback import Playback
 from tactomo.recordings.replay import Replay
 from tactomo.scans import ChannelScan, Delivery, DualScan
 from tactomo_protocol import Channel, ScanFlag
-from waiting import wait_until
+from waiting import PATIENCE_S, wait_until
 
 BOTH = (Channel.MAGNITUDE, Channel.STRUCTURE)
 
@@ -37,7 +37,7 @@ class Frames:
         return True
 
     def process(self, dual: DualScan, *_: Any) -> None:
-        assert self.go.wait(20)
+        assert self.go.wait(PATIENCE_S)
         self.counters.append(dual.counter)
 
     def share_processor(self, dropped: int) -> None:
@@ -122,7 +122,7 @@ def test_an_unpaced_replay_waits_for_the_slower_port() -> None:
             pipeline.deliver(Delivery(port, at_ns, (scan(channel, counter, at_ns, port),)))
     for port in (0, 1):
         pipeline.deliver(Delivery(port, 0, (), has_ended=True))
-    assert pipeline.finished.wait(20)
+    assert pipeline.finished.wait(PATIENCE_S)
     pipeline.stop()
     assert frames.counters == list(range(5))
     assert pipeline.incomplete == 0

@@ -79,7 +79,7 @@ def test_a_replay_gives_the_maps_of_the_live_run(
     bench: Start, replay: Replay, tmp_path: Path, ports: int, speed: float
 ) -> None:
     path = tmp_path / "life.mcap"
-    live = record_a_life(bench(ports=ports), path)
+    live = record_a_life(bench(ports=ports, sync_wait_ms=100), path)
     assert_same(live, maps(replay(path, speed=speed).of("map")))
 
 

@@ -45,7 +45,8 @@ def play(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
             daemon.playback.move(start_s)
         daemon.start()
         undo.append(daemon.stop)
-        listener = Listener(daemon.stream_address, "left")
+        # The stream keeps 64 messages for a subscriber that a busy computer does not let read.
+        listener = Listener(daemon.stream_address, "left", ("map", "status", "event"))
         undo.append(listener.socket.close)
         listener.wait("status", lambda status: status["state"] == "paused")
         skin: Any = None

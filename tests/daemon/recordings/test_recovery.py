@@ -374,9 +374,9 @@ def test_a_replay_after_recovery_gives_the_live_maps(
     b = bench(ports=2, recording={"file": path})
     b.tare()
     for index in range(60):
+        size = path.stat().st_size
         b.step(load=0.004 * index)
         if index % 8 == 0:  # so that the file has several chunks
-            size = path.stat().st_size
             b.until(lambda size=size: path.stat().st_size > size)
     b.daemon.stop()
     live = {f["scan_counter"]: f["map"] for f in b.listener.of("map")}

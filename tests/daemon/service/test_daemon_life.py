@@ -148,14 +148,15 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(spawn: Start, tmp_path:
     size = path.stat().st_size
     skin.scan()
     wait_until(lambda: path.stat().st_size > size)
+    wait_until(lambda: open_recording(path).summary.frames, meanwhile=skin.scan)
     # As good as a full disk: no file of that process may grow much further.
     limit = path.stat().st_size + 4000
     resource.prlimit(process.popen.pid, resource.RLIMIT_FSIZE, (limit, limit))
-    wait_until(lambda: process.status()["recording"] is None, meanwhile=skin.scan)
-    failed = process.told("recording_failed")[0]
+    (failed,) = wait_until(lambda: process.told("recording_failed"), meanwhile=skin.scan)
+    assert process.status()["recording"] is None
     assert failed["level"] == "error"
     assert "too large" in failed["detail"]
-    assert process.status()["state"] == "running"
+    wait_until(lambda: process.status()["state"] == "running", meanwhile=skin.scan)
     assert open_recording(path).summary.frames > 0
 
 

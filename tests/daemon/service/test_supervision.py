@@ -123,15 +123,16 @@ def test_a_pipeline_that_hangs_is_not_hidden_by_the_threads_that_do_not(
     process, skin = supervised
     manager.wait("READY=1")
     skin.introduce()
+    begin_s = time.monotonic()
     for load in (0, 0, 0, 0, 0.5):
         skin.scan(load)
-    hangs_s = manager.wait("STATUS=hangs: pipeline")
+    hangs_s = manager.wait("STATUS=hangs: pipeline", begin_s)
     manager.listen(1.5 * WATCHDOG_S)
     assert not [at_s for at_s in manager.times_s("WATCHDOG=1") if at_s > hangs_s]
     process.signal(signal.SIGABRT)  # as systemd does
     assert process.popen.wait(PATIENCE_S) == -signal.SIGABRT
     log = process.log_path.read_text()
-    assert '"threads": ["pipeline"]' in log
+    assert '"threads": ["pipeline"' in log  # and whoever else a busy computer held up
     assert "in reconstruct" in log, "where it hangs is in the log"
 
 

@@ -10,12 +10,14 @@ from typing import Any
 import msgpack  # type: ignore[import-untyped]
 import pytest
 import zmq
+from daemon_bench import Memory
 from tactomo.config import load_config
 from tactomo.errors import AddressError
 from tactomo.service.daemon import Daemon
-from tactomo.stream.control import SETTLE_S
+from tactomo.stream import control
 from tactomo_client import ControlError
 from tactomo_client.messages import array_from_wire, decode_reply, encode_request
+from waiting import PATIENCE_S
 
 Start = Callable[..., Any]
 
@@ -25,9 +27,9 @@ def test_status_says_how_everything_is(bench: Start) -> None:
     assert b.ask("status")["state"] == "waiting_for_data"
     assert b.ask("status")["source"] == {"kind": "unknown"}
     b.tare()
-    b.step(load=0.1)
-    status = b.ask("status")
-    assert status["state"] == "running"
+    status = b.until(
+        lambda: b.step(load=0.1) and (s := b.ask("status"))["state"] == "running" and s
+    )
     assert status["source"] == {"kind": "device"}
     assert status["description"]["model"] == "paper_square"
     assert status["description"]["sensing_width_mm"] == pytest.approx(138)
@@ -45,10 +47,14 @@ def test_status_says_how_everything_is(bench: Start) -> None:
 def test_rates_are_what_comes_and_nothing_when_nothing_comes(bench: Start) -> None:
     b = bench()
     b.tare()
-    rates = b.ask("status")["rates"]
-    assert rates["magnitude_hz"] > 0
-    assert rates["structure_hz"] > 0
-    assert rates["frames_hz"] > 0
+    b.until(
+        lambda: (
+            b.step()
+            and (rates := b.ask("status")["rates"])["magnitude_hz"] > 0
+            and rates["structure_hz"] > 0
+            and rates["frames_hz"] > 0
+        )
+    )
     b.listener.wait("status", lambda s: s["state"] == "stale")
     b.listener.wait("status", lambda s: s["rates"]["frames_hz"] == 0)
 
@@ -101,7 +107,7 @@ def test_the_first_tare_waits_until_nobody_presses(bench: Start) -> None:
     for step in range(12):
         b.step(load=0.02 * step)
     b.listener.event("tare_refused")
-    assert b.ask("status")["state"] == "taring"
+    b.until(lambda: b.step() and b.ask("status")["state"] == "taring")
     for _ in range(20):
         b.step()
     b.listener.event("tared")
@@ -114,7 +120,10 @@ def test_tare_without_data_says_so(bench: Start) -> None:
     assert caught.value.name == "no_data"
 
 
-def test_tier_and_budget_are_answered_when_they_are_in_force(bench: Start) -> None:
+def test_tier_and_budget_are_answered_when_they_are_in_force(
+    bench: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(control, "SETTLE_S", PATIENCE_S)
     b = bench(seconds=0.2)
     b.tare()
     for tier, budget_ms in [("levelset", 25.0), ("fit", 30.0), ("tikhonov", None)]:
@@ -128,13 +137,23 @@ def test_tier_and_budget_are_answered_when_they_are_in_force(bench: Start) -> No
         assert status["plan"]["tier"] == tier
 
 
-def test_a_frame_that_takes_long_holds_up_no_command(bench: Start) -> None:
-    b = bench(seconds=4 * SETTLE_S)
+def test_a_frame_that_takes_long_holds_up_no_command(
+    bench: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    is_made, reconstruct = threading.Event(), Memory.reconstruct
+
+    def slowly(*given: Any, **details: Any) -> Any:
+        assert is_made.wait(PATIENCE_S)
+        return reconstruct(*given, **details)
+
+    monkeypatch.setattr(Memory, "reconstruct", slowly)
+    b = bench()
     b.skin.introduce()
     b.skin.scan()
     b.until(lambda: b.ask("status")["scans"]["structure"])
     assert b.ask("set_tier", tier="fit") == {"tier": "fit"}
     assert b.ask("status")["frames"] == 0  # it is still being made
+    is_made.set()
     b.until(lambda: b.ask("status")["tier_requested"] == "fit")
 
 

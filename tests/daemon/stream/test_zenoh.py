@@ -12,6 +12,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import groupby
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -176,15 +178,16 @@ def test_a_skin_at_rest_is_sent_by_a_heartbeat_and_a_touch_at_once(
 ) -> None:
     samples = Samples(desk, "tactomo/arm/left/contacts")
     start(left, robot="arm")
-    samples.until(lambda: samples.all, left.publish)
     began_s = time.monotonic()
+    samples.until(lambda: samples.all, left.publish)
     samples.until(lambda: len(samples.all) >= 6, left.publish)  # its heart goes on beating
-    took_s = time.monotonic() - began_s
-    assert len(samples.all) <= took_s / HEARTBEAT_S + 2
+    seen, took_s = len(samples.all), time.monotonic() - began_s
+    assert seen <= took_s / HEARTBEAT_S + 2
     left.publish(TOUCH)
     left.publish(flags=["misfit_high"])
     wait_until(lambda: samples.all[-1][1]["flags"])
-    assert [len(fields["contacts"]) for _, fields, _ in samples.all[-2:]] == [1, 0]
+    touches = [len(fields["contacts"]) for _, fields, _ in samples.all]
+    assert [each for each, _ in groupby(touches)] == [0, 1, 0]
     counts = [count for _, _, count in samples.all]
     assert counts == list(range(counts[0], counts[0] + len(counts)))  # none is missed
 
@@ -195,6 +198,7 @@ def test_a_status_is_sent_when_it_says_something_else_and_its_numbers_are_asked_
     samples = Samples(desk, "tactomo/arm/left/status")
     start(left, robot="arm")
     one = reader(start(bind="tcp://127.0.0.1:0").address, topic("left", "status"))
+    began_s, seen = time.monotonic(), set[int]()
     said: dict[str, Any] = {"state": "running", "frames": 0, "ports": [{"state": "running"}]}
 
     def send() -> None:
@@ -202,16 +206,16 @@ def test_a_status_is_sent_when_it_says_something_else_and_its_numbers_are_asked_
         left.publish_message("status", said)
 
     samples.until(lambda: samples.all, send)
-    began_s, seen = time.monotonic(), set[int]()
     while len(seen) < 4:  # the proxy asks every second, so that clients of ZeroMQ hear of it
         seen.add(next_of(one, send).fields["frames"])
-    least = (time.monotonic() - began_s) / STATUS_HEARTBEAT_S
-    assert len(samples.all) <= least + 2
+    came, took_s = len(samples.all), time.monotonic() - began_s
+    assert came <= took_s / STATUS_HEARTBEAT_S + 2
     said["ports"] = [{"state": "silent"}]
     samples.until(lambda: samples.all[-1][1]["ports"] == said["ports"], send)
     said["state"] = "stale"
     samples.until(lambda: samples.all[-1][1]["state"] == "stale", send)
-    assert len(samples.all) <= (time.monotonic() - began_s) / STATUS_HEARTBEAT_S + 4
+    came, took_s = len(samples.all), time.monotonic() - began_s
+    assert came <= took_s / STATUS_HEARTBEAT_S + 4
 
 
 @pytest.mark.slow
@@ -321,13 +325,20 @@ def test_late_joiners_get_the_last_status_at_once(
     start(left, robot="arm")
     address = start(bind="tcp://127.0.0.1:0", robot="arm").address
     first = reader(address, topic("left", "status"))
-    sequence = next_of(first, lambda: left.publish_message("status", {"state": "running"})).fields[
-        "sequence"
-    ]
+
+    def is_repeated(prefix: bytes) -> bool:
+        sent = next_of(first, lambda: left.publish_message("status", {"state": "running"}))
+        late = reader(address, prefix)
+        # It is remembered for 3 s; a joiner whom a busy computer holds up for longer gets none.
+        if not late.poll(2000):
+            return False
+        message = decode_message(late.recv())
+        assert message.fields["sequence"] >= sent.fields["sequence"]
+        assert message.kind == "status"
+        return True
+
     for prefix in (topic("left", "status"), b"left/", b""):
-        late = next_of(reader(address, prefix))
-        assert late.fields["sequence"] >= sequence
-        assert late.kind == "status"
+        wait_until(partial(is_repeated, prefix), "a status at once")
 
 
 def test_what_is_lost_is_counted_and_told(
@@ -370,13 +381,13 @@ def test_two_robots_skins_of_one_name_are_not_mixed(
 
 
 def test_a_daemon_may_come_and_go(
-    left: FakeSensor, start: Callable[..., Running], desk: zenoh.Session
+    tmp_path: Path, start: Callable[..., Running], desk: zenoh.Session
 ) -> None:
     samples = Samples(desk, "tactomo/arm/left/contacts")
-    start(left, robot="arm")
-    samples.until(lambda: samples.all, left.publish)
-    first = samples.all[-1][1]["session"]
-    left.close()
+    with FakeSensor("left", f"ipc://{tmp_path}/left") as left:  # a port may be another's meanwhile
+        start(left, robot="arm")
+        samples.until(lambda: samples.all, left.publish)
+        first = samples.all[-1][1]["session"]
     with FakeSensor("left", left.address) as again:
         samples.until(lambda: samples.all[-1][1]["session"] != first, again.publish)
 
@@ -412,11 +423,9 @@ def test_a_signal_ends_it(
 
 
 def test_without_a_configuration_the_two_meet_on_this_computer(
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        local = f"tcp/127.0.0.1:{free.getsockname()[1]}"
-    monkeypatch.setattr(zenoh_bridge, "LOCAL", local)
+    monkeypatch.setattr(zenoh_bridge, "LOCAL", f"unixsock-stream/{tmp_path / 'local'}")
     with (
         zenoh_bridge.open_session(None, "connect") as desk,  # whichever comes first
         zenoh_bridge.open_session(None, "listen") as robot,
@@ -521,7 +530,9 @@ def test_the_pages_program_prints_touches_and_who_is_there(
 
         publishing = threading.Thread(target=publish)
         publishing.start()
-        said = {process.stdout.readline().strip(), process.stdout.readline().strip()}
+        said: set[str] = set()
+        while len(said) < 2:  # it says a touch as often as it comes
+            said.add(process.stdout.readline().strip())
         stop.set()
         publishing.join()
         process.kill()
