@@ -21,7 +21,7 @@ from tactomo_models.physics.bare_sheet import scan_voltages
 from tactomo_models.sensor.description_file import shipped_text
 from tactomo_models.sensor.pattern import reciprocal_pairs, scan_pairs
 from tactomo_protocol import Channel, Hello, SampleFormat, Scan, ScanFlag
-from waiting import wait_until
+from waiting import PATIENCE_S, wait_until
 from whole_system import SENSOR, Demo, running_demo
 
 Run = Callable[..., Any]
@@ -290,14 +290,14 @@ def test_the_description_that_a_daemon_holds_is_found(
 
 def wait_for_more(count: str, address: str) -> None:
     """Wait until a status counts four more."""
-    before = request("status", address)[count]
-    wait_until(lambda: request("status", address)[count] >= before + 4)
+    before = request("status", address, PATIENCE_S)[count]
+    wait_until(lambda: request("status", address, PATIENCE_S)[count] >= before + 4)
 
 
 def test_a_healthy_skin_on_a_busy_computer_is_healthy(demo: Demo) -> None:
     """The daemon gets the processor for moments only; its frames are fewer, and none is wrong."""
-    request("tare", demo.control, 30.0)
-    daemon = request("status", demo.control)["process"]["pid"]
+    request("tare", demo.control, PATIENCE_S)
+    daemon = request("status", demo.control, PATIENCE_S)["process"]["pid"]
     look = ["-s", SENSOR, "--stream", demo.stream, "--seconds", "4", "--json"]
     program = (sys.executable, "-m", "tactomo.cli", "doctor", *look)
     with subprocess.Popen(program, stdout=subprocess.PIPE, text=True) as doctor:
@@ -317,15 +317,15 @@ def test_a_healthy_skin_on_a_busy_computer_is_healthy(demo: Demo) -> None:
 
 def test_a_running_daemon(tactomo: Run, demo: Demo) -> None:
     look = ("doctor", "-s", SENSOR, "--stream", demo.stream, "--seconds", "2", "--json")
-    request("tare", demo.control, 30.0)
+    request("tare", demo.control, PATIENCE_S)
     found = report(tactomo(*look))
     for channel in found["channels"].values():
         assert channel["verdict"] == "healthy"
         assert about(channel["findings"], "snr")["snr_db"] > 50
     assert about(found["stream"], "frames")["pressed"] == 0
     assert about(found["stream"], "latency")["p50_ms"] > 0
-    request("noise", demo.twin, noise_v=0.02)
-    request("garbage", demo.twin, count=4000)
+    request("noise", demo.twin, PATIENCE_S, noise_v=0.02)
+    request("garbage", demo.twin, PATIENCE_S, count=4000)
     outcome = tactomo(*look)
     assert outcome.returncode == 1
     found = report(outcome)

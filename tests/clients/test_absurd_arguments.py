@@ -18,7 +18,7 @@ NOWHERE = "tcp://127.0.0.1:1"
 NO_NUMBERS: list[Any] = ["0.5", "soon", True, b"1", [1.0], 1j]
 NEGATIVE: list[Any] = [-1, -0.001, -math.inf, -(10**400), np.float32(-2)]
 NAN: list[Any] = [math.nan, np.float64("nan")]
-SENSIBLE: list[Any] = [1, 0.25, np.float32(0.5), np.int64(2), 1e300, 10**400, math.inf]
+SENSIBLE: list[Any] = [60, 30.5, np.float32(30.5), np.int64(60), 1e300, 10**400, math.inf]
 
 
 def doors() -> dict[str, tuple[str, Callable[[Any], Any]]]:

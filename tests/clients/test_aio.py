@@ -91,7 +91,7 @@ def test_a_cancelled_wait_loses_no_frame(run: Run, pressed: FakeSensor) -> None:
         async with aio.subscribe("left", address=pressed.address) as skin:
             numbers = [(await anext(skin)).sequence]
             cancelled = 0
-            while len(numbers) < 40:
+            while len(numbers) < 40 or not cancelled:
                 waiting = asyncio.create_task(skin.wait(PATIENCE_S))
                 await asyncio.sleep(0 if len(numbers) % 3 else 0.002)
                 waiting.cancel()
@@ -102,8 +102,7 @@ def test_a_cancelled_wait_loses_no_frame(run: Run, pressed: FakeSensor) -> None:
                     frame = await skin.wait(PATIENCE_S)
                 assert frame is not None
                 numbers.append(frame.sequence)
-            assert cancelled
-            assert numbers == list(range(numbers[0], numbers[0] + 40))
+            assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
             assert skin.missed == 0
 
     run(main())

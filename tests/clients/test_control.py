@@ -59,7 +59,7 @@ def test_nothing_listens_is_told_long_before_a_commands_own_time_is_over() -> No
     begin_s = time.monotonic()
     with (
         Daemon("ipc:///nowhere/at/all", connect_timeout_s=0.3) as daemon,
-        pytest.raises(NoAnswer, match=r"within 0\.\d+ s: nothing listens there; start the daemon"),
+        pytest.raises(NoAnswer, match=r"within [\d.]+ s: nothing listens there; start the daemon"),
     ):
         daemon.tare()
     assert time.monotonic() - begin_s < TARE_TIMEOUT_S / 2
@@ -86,12 +86,12 @@ def test_a_busy_daemon_is_waited_for_though_it_says_nothing() -> None:
         address = f"tcp://127.0.0.1:{busy.getsockname()[1]}"
         begin_s = time.monotonic()
         with (
-            Daemon(address, connect_timeout_s=1.0) as daemon,
+            Daemon(address, connect_timeout_s=2.0) as daemon,
             pytest.raises(NoAnswer, match=r"though something listens there; .* its log") as caught,
         ):
-            daemon.tare(2.5)
-        assert time.monotonic() - begin_s >= 2.5
-        assert "2.5 s" in caught.value.cause
+            daemon.tare(4.0)
+        assert time.monotonic() - begin_s >= 4.0
+        assert "within 4 s" in caught.value.cause
 
 
 def test_a_daemon_that_goes_away_during_a_command_is_missed() -> None:

@@ -18,6 +18,7 @@ from tactomo_client import (
     NotRecording,
     errors,
 )
+from waiting import wait_until
 
 PATIENCE_S = 30.0
 
@@ -107,8 +108,13 @@ def test_a_daemon_that_was_away_answers_again() -> None:
         daemon = Daemon(control.address, timeout_s=PATIENCE_S)
         assert daemon.tare().scans == 1
     daemon.timeout_s = 0.05
-    with pytest.raises(NoAnswer, match=r"nothing answered at .* start the daemon"):
-        daemon.status()
+
+    def refusal() -> str:
+        with pytest.raises(NoAnswer, match="nothing answered at ") as caught:
+            daemon.status()
+        return str(caught.value)
+
+    wait_until(lambda: "start the daemon" in refusal(), "the end of the connection to be seen")
     daemon.timeout_s = PATIENCE_S
     with FakeControl({"tare": {"scans": 2}}, control.address):
         assert daemon.tare().scans == 2

@@ -6,7 +6,7 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -53,15 +53,20 @@ def test_it_prints_contacts_and_tells_stale_from_nothing_pressed(
                 return line.strip()
         raise AssertionError("the script has ended")
 
+    def publish(*contacts: Contact, flags: Sequence[str] = ()) -> None:
+        """Publish a frame of a time to come: not old by the time at which it is read."""
+        ahead_ns = time.monotonic_ns() + 10**12
+        sensor.publish(contacts, flags=flags, acquired_monotonic_ns=ahead_ns)
+
     assert sensor.wait_for_subscriber(60) == b"left/contacts\0"
-    sensor.publish([HEAVY, LIGHT], flags=["misfit_high"])
+    publish(HEAVY, LIGHT, flags=["misfit_high"])
     assert answer() == "contact 4 at x=12.3 mm y=-56.7 mm, 812 mm2, 183 kPa misfit_high"
     assert answer() == "contact 5 at x=-1.0 mm y=2.0 mm, 300 mm2, pressure unknown misfit_high"
-    sensor.publish([])
+    publish()
     assert answer() == "nothing pressed"
-    sensor.publish([], flags=["electrode_fault"])
+    publish(flags=["electrode_fault"])
     assert answer() == "nothing pressed electrode_fault"
-    sensor.publish([], flags=["electrode_fault", "no_usable_scan"])
+    publish(flags=["electrode_fault", "no_usable_scan"])
     assert answer() == "not known electrode_fault no_usable_scan"
     sensor.publish([], acquired_monotonic_ns=time.monotonic_ns() - 10**10)
     assert answer() == "stale"

@@ -242,45 +242,52 @@ def test_timeout_says_what_to_do(sensor: FakeSensor) -> None:
 
 
 def test_malformed_messages_do_not_put_off_the_timeout(sensor: FakeSensor) -> None:
+    def is_taken_in() -> bool:  # on a busy computer it may come after the time is over
+        with pytest.raises(StreamTimeout):
+            next(frames)
+        return frames.malformed == 1
+
     with subscribe("left", address=sensor.address, timeout_s=0.2) as frames:
         sensor.wait_for_subscriber()
         sensor.send(b"left/map\0")
-        with pytest.raises(StreamTimeout):
-            next(frames)
-        assert frames.malformed == 1
+        wait_until(is_taken_in)
 
 
 def test_age_is_exact_on_one_computer(sensor: FakeSensor) -> None:
-    with subscribe("left", address=sensor.address, stale_after_s=5, timeout_s=10) as frames:
+    with subscribe("left", address=sensor.address, timeout_s=10, stale_after_s=STALE_S) as frames:
         sensor.wait_for_subscriber()
         now_ns = time.monotonic_ns()
-        sensor.publish(acquired_monotonic_ns=now_ns - 9_000_000_000, age_ns=0)
+        sensor.publish(acquired_monotonic_ns=now_ns - OLD_NS, age_ns=0)
         sensor.publish(acquired_monotonic_ns=now_ns, age_ns=0)
         old, new = next(frames), next(frames)
-        elapsed_s = (time.monotonic_ns() - now_ns) * 1e-9
-        assert new.age_s == pytest.approx(elapsed_s, abs=0.5)
-        assert old.age_s - new.age_s == pytest.approx(9.0, abs=0.5)
+        for frame, older_s in ((new, 0.0), (old, OLD_NS * 1e-9)):
+            earliest_s = older_s + (time.monotonic_ns() - now_ns) * 1e-9
+            age_s = frame.age_s
+            latest_s = older_s + (time.monotonic_ns() - now_ns) * 1e-9
+            assert earliest_s - 1e-6 <= age_s <= latest_s + 1e-6
         assert old.is_stale
         assert not new.is_stale
 
 
 def test_age_from_another_computer_starts_at_the_age_at_publication(sensor: FakeSensor) -> None:
-    with subscribe("left", address=sensor.address, stale_after_s=5, timeout_s=10) as frames:
+    with subscribe("left", address=sensor.address, timeout_s=10, stale_after_s=STALE_S) as frames:
         sensor.wait_for_subscriber()
-        for age_ns in (7_000_000_000, 3_000_000):
+        for age_ns in (OLD_NS, 3_000_000):
             sensor.publish(clock_id="elsewhere", acquired_monotonic_ns=17, age_ns=age_ns)
         old, new = next(frames), next(frames)
         assert old.is_stale
         assert not new.is_stale
-        assert 0.003 <= new.age_s < 5
+        assert 0.003 <= new.age_s < STALE_S
 
 
 def test_a_frame_grows_old(sensor: FakeSensor) -> None:
-    with subscribe("left", address=sensor.address, stale_after_s=1.0, timeout_s=10) as frames:
+    with subscribe("left", address=sensor.address, timeout_s=10, stale_after_s=STALE_S) as frames:
         sensor.wait_for_subscriber()
-        sensor.publish()
+        begin_ns = time.monotonic_ns()
+        sensor.publish(acquired_monotonic_ns=begin_ns - round((STALE_S - 1) * 1e9))
         frame = next(frames)
         wait_until(lambda: frame.is_stale)
+        assert time.monotonic_ns() - begin_ns >= 1e9
         assert frames.is_stale
         sensor.publish()
         next(frames)
@@ -327,7 +334,7 @@ def test_ctrl_c_interrupts_the_wait(sensor: FakeSensor) -> None:
         sensor.publish()
         assert child.stdout.readline() == "1\n"
         child.send_signal(signal.SIGINT)
-        assert child.communicate(timeout=30)[0] == "interrupted\n"
+        assert child.communicate(timeout=60)[0] == "interrupted\n"
     finally:
         child.kill()
         child.communicate()

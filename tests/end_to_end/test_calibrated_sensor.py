@@ -16,6 +16,7 @@ import sys
 from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import pytest
 from daemon_process import DaemonProcess
@@ -66,12 +67,13 @@ class Bench:
         wait_until(lambda: self.daemon.status()["state"] == "running", "a reference")
 
     def clear(self) -> None:
-        request("clear", self._control)
+        request("clear", self._control, PATIENCE_S)
 
     def contact(self, kpa: float) -> Contact:
         """What the daemon says of a press that it has had time to look at."""
-        request("press", self._control, x_mm=5.0, y_mm=-8.0, radius_mm=15, pressure_kpa=kpa)
-        before = request("status", self._control)["counter"]
+        place: dict[str, Any] = {"x_mm": 5.0, "y_mm": -8.0, "radius_mm": 15}
+        request("press", self._control, PATIENCE_S, **place, pressure_kpa=kpa)
+        before = request("status", self._control, PATIENCE_S)["counter"]
         with subscribe(NAME, address=self.daemon.stream, timeout_s=PATIENCE_S) as frames:
             seen = 0
             for frame in frames:

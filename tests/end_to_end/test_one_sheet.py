@@ -105,7 +105,7 @@ def test_the_twin_has_no_sheet_but_its_own_to_mute(one_sheet: tuple[Demo, str]) 
     demo, channel = one_sheet
     other = {"magnitude": "structure", "structure": "magnitude"}[channel]
     with pytest.raises(ControlError, match=f"give {channel}"):
-        request("mute", demo.twin, channel=other, seconds=1.0)
+        request("mute", demo.twin, PATIENCE_S, channel=other, seconds=1.0)
 
 
 def test_what_is_recorded_replays_and_is_plotted(

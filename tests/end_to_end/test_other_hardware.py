@@ -17,7 +17,7 @@ from tactomo_client import request
 from tactomo_models import Press as Cup
 from tactomo_models import SkinSimulator, load_description
 from tactomo_protocol import Channel
-from waiting import wait_until
+from waiting import PATIENCE_S, wait_until
 from whole_system import repository
 
 PAGE = Page("docs/other_hardware.md")
@@ -31,7 +31,7 @@ def newcomer(tmp_path: Path) -> Iterator[Newcomer]:
 
 def wait_for_a_reference(newcomer: Newcomer) -> None:
     control = newcomer.addresses["control"]
-    wait_until(lambda: request("status", control)["reference"], "a reference")
+    wait_until(lambda: request("status", control, PATIENCE_S)["reference"], "a reference")
 
 
 @pytest.mark.long
@@ -44,7 +44,7 @@ def test_a_researcher_with_a_sciospec_and_no_instrument_yet(newcomer: Newcomer) 
     assert "sciospec" in status
     assert "sciospec, protocol sciospec" in info
     assert "1 contact(s)" in plot
-    port = request("status", newcomer.addresses["control"])["ports"][0]
+    port = request("status", newcomer.addresses["control"], PATIENCE_S)["ports"][0]
     assert (port["state"], port["protocol"]) == ("running", "sciospec")
 
 

@@ -45,7 +45,7 @@ def settled_frame(demo: Demo, places: Places) -> Frame:
 
 def scanned_from_now(demo: Demo) -> None:
     """Wait for a frame of a scan that the twin has yet to take."""
-    counter = request("status", demo.twin)["counter"]
+    counter = request("status", demo.twin, PATIENCE_S)["counter"]
     with subscribe(SENSOR, address=demo.stream, timeout_s=PATIENCE_S) as frames:
         next(frame for frame in frames if frame.scan_counter > counter + 1)
 
@@ -91,11 +91,11 @@ def test_a_lost_channel_is_flagged_and_the_other_goes_on(any_demo: Demo) -> None
     settled_frame(any_demo, [(10.0, -10.0)])
     with subscribe(SENSOR, address=any_demo.stream, timeout_s=PATIENCE_S) as frames:
         next(frame for frame in frames if frame.tier == "fit")  # none of what follows is missed
-        request("mute", any_demo.twin, channel="structure", seconds=PATIENCE_S)
+        request("mute", any_demo.twin, PATIENCE_S, channel="structure", seconds=PATIENCE_S)
         missing = (frame for frame in frames if "structure_missing" in frame.flags)
         bridged = next(missing)
         alone = next(frame for frame in missing if frame.tier == "network")
-    request("mute", any_demo.twin, channel="structure", seconds=1e-9)  # it is over
+    request("mute", any_demo.twin, PATIENCE_S, channel="structure", seconds=1e-9)  # it is over
     assert bridged.tier == "fit", "the last shape stands in for a moment"
     for frame in (bridged, alone):
         assert frame.map is not None, "the magnitude channel's image goes on"

@@ -14,7 +14,7 @@ from tactomo.twin import Twin, TwinConfig
 from tactomo_client import Frame, request, subscribe
 from tactomo_models import load_description
 from tactomo_models.sensor.shipped import __path__ as sensors_path
-from waiting import wait_until
+from waiting import PATIENCE_S, wait_until
 
 COARSE = "[map]\nnodes_x = 25\nnodes_y = 25\n\n[structure]"
 SINGLE_ENDED = (('"unsigned"', '"signed"'), ('= "pairs"', '= "single_ended"'))
@@ -77,7 +77,7 @@ def frame_where(daemon: DaemonProcess, condition: Callable[[Frame], bool]) -> Fr
 
 
 def press(twin: Twin, x_mm: float, y_mm: float, radius_mm: float = 9.0) -> None:
-    request("press", twin.control, x_mm=x_mm, y_mm=y_mm, radius_mm=radius_mm)
+    request("press", twin.control, PATIENCE_S, x_mm=x_mm, y_mm=y_mm, radius_mm=radius_mm)
 
 
 @pytest.mark.parametrize(
@@ -123,11 +123,11 @@ def test_it_stands_what_happens_to_a_cable(start: Start, tmp_path: Path) -> None
     board = changed(tmp_path, "openeit_disc")
     twin, daemon = start("openeit", board, link_folder=tmp_path / "links")
     tared(daemon)
-    request("garbage", twin.control, count=3000)
+    request("garbage", twin.control, PATIENCE_S, count=3000)
     wait_until(lambda: daemon.status()["ports"][0]["corrupt"] > 0, "damage that is counted")
-    request("unplug", twin.control)
+    request("unplug", twin.control, PATIENCE_S)
     wait_until(lambda: daemon.told("port_lost"), "a lost port")
-    request("replug", twin.control)
+    request("replug", twin.control, PATIENCE_S)
     wait_until(lambda: daemon.told("port_back"), "the port again")
     press(twin, -20.0, 10.0)
     frame_where(daemon, lambda frame: len(frame.contacts) == 1)

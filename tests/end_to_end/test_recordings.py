@@ -72,9 +72,9 @@ class Listener(threading.Thread):
 def test_a_replay_gives_the_maps_of_the_live_run(demo: Demo, tmp_path: Path) -> None:
     live, again = tmp_path / "live.mcap", tmp_path / "again.mcap"
     demo.press(15.0, 20.0, id="a")  # begun under load: the reference must come along
-    wait_until(lambda: request("status", demo.control)["tier"] == "fit", "a contact")
+    wait_until(lambda: request("status", demo.control, PATIENCE_S)["tier"] == "fit", "a contact")
     with Listener(demo) as listener:
-        request("record_start", demo.control, path=str(live))
+        request("record_start", demo.control, PATIENCE_S, path=str(live))
         for x_mm, y_mm in ((15.0, 20.0), (0.0, 0.0), (-40.0, -35.0)):
             demo.press(x_mm, y_mm, id="a", pressure_kpa=170)
             listener.hear_more(12)
@@ -82,8 +82,8 @@ def test_a_replay_gives_the_maps_of_the_live_run(demo: Demo, tmp_path: Path) -> 
         listener.hear_more(12)
         demo.clear()
         listener.hear_more(8)
-        request("record_stop", demo.control)
-        last = request("status", demo.twin)["counter"]
+        request("record_stop", demo.control, PATIENCE_S)
+        last = request("status", demo.twin, PATIENCE_S)["counter"]
         wait_until(lambda: max(listener.frames) > last, "all that was recorded")
     replayed = tactomo(
         *("daemon", "--port", f"replay://{live}?port=0&speed=0"),
@@ -159,9 +159,9 @@ def test_a_replay_with_a_page_begins_when_the_page_is_open(
 ) -> None:
     path = tmp_path / "short.mcap"
     with Listener(demo) as listener:
-        request("record_start", demo.control, path=str(path))
+        request("record_start", demo.control, PATIENCE_S, path=str(path))
         listener.hear_more(20)
-        request("record_stop", demo.control)
+        request("record_stop", demo.control, PATIENCE_S)
     control = f"ipc://{tmp_path}/control"
     command = ["replay", path, "--viewer", "--loop", "--viewer-port", 0, "--control", control]
     command += ["--stream", f"ipc://{tmp_path}/stream"]
@@ -174,10 +174,12 @@ def test_a_replay_with_a_page_begins_when_the_page_is_open(
         assert replay.stdout is not None
         words = (word for line in replay.stdout for word in line.split())
         page = next(word for word in words if word.startswith("http://"))
-        waiting = request("status", control)
+        waiting = request("status", control, PATIENCE_S)
         assert (waiting["state"], waiting["frames"]) == ("paused", 0)
         browser.get(page)
-        wait_until(lambda: request("status", control)["frames"] > 40, "the second round")
+        wait_until(
+            lambda: request("status", control, PATIENCE_S)["frames"] > 40, "the second round"
+        )
     finally:
         replay.terminate()
         replay.communicate(timeout=PATIENCE_S)

@@ -23,7 +23,7 @@ from tactomo_client.recording import open_recording as open_frames
 from tactomo_models import load_description
 from tactomo_models.sensor.shipped import __path__ as sensors_path
 from tactomo_protocol import Scan
-from waiting import wait_until
+from waiting import PATIENCE_S, wait_until
 
 COARSE = ("[structure]", "[map]\nnodes_x = 25\nnodes_y = 25\n\n[structure]")
 
@@ -78,7 +78,7 @@ def frame_where(daemon: DaemonProcess, condition: Callable[[Frame], bool]) -> Fr
 
 
 def is_streaming(twin: Twin) -> bool:
-    return bool(request("status", twin.control)["ports"][0]["streaming"])
+    return bool(request("status", twin.control, PATIENCE_S)["ports"][0]["streaming"])
 
 
 def tactomo(*arguments: object) -> str:
@@ -93,7 +93,7 @@ def test_an_instrument_is_configured_believed_and_stopped(start: Start, tmp_path
     twin, daemon = start(sensor(tmp_path, COARSE), record)
     wait_until(lambda: daemon.told("tared"), "a reference")
     for x_mm in (40.0, -40.0):
-        request("press", twin.control, x_mm=x_mm, y_mm=20.0, radius_mm=15.0)
+        request("press", twin.control, PATIENCE_S, x_mm=x_mm, y_mm=20.0, radius_mm=15.0)
         found = frame_where(
             daemon,
             lambda f, x=x_mm: len(f.contacts) == 1 and f.contacts[0].x_mm * x > 0,  # type: ignore[misc]
@@ -101,15 +101,15 @@ def test_an_instrument_is_configured_believed_and_stopped(start: Start, tmp_path
         frame = frame_where(daemon, lambda f, n=found.sequence: f.sequence > n + 3)  # type: ignore[misc]
         [contact] = frame.contacts
         assert math.hypot(contact.x_mm - x_mm, contact.y_mm - 20.0) < 3.0
-    request("clear", twin.control)
+    request("clear", twin.control, PATIENCE_S)
     # Junk between messages, and a cable that is pulled in the middle of one.
-    request("garbage", twin.control, count=3000)
+    request("garbage", twin.control, PATIENCE_S, count=3000)
     wait_until(lambda: daemon.status()["ports"][0]["corrupt"] > 0, "damage that is counted")
-    request("unplug", twin.control)
+    request("unplug", twin.control, PATIENCE_S)
     wait_until(lambda: daemon.told("port_lost"), "a lost port")
-    request("replug", twin.control)
+    request("replug", twin.control, PATIENCE_S)
     wait_until(lambda: daemon.told("port_back"), "the port again")
-    request("press", twin.control, x_mm=0.0, y_mm=-50.0, radius_mm=15.0)
+    request("press", twin.control, PATIENCE_S, x_mm=0.0, y_mm=-50.0, radius_mm=15.0)
     frame_where(daemon, lambda f: len(f.contacts) == 1 and f.contacts[0].y_mm < -40)
     assert not daemon.told("device_refused")
     assert daemon.status()["ports"][0]["device"]["device_id"] == "sciospec"
@@ -129,7 +129,7 @@ def test_a_daemon_that_was_killed_leaves_it_measuring_and_the_next_takes_over(
     twin, daemon = start(sensor(tmp_path, COARSE))
     wait_until(lambda: daemon.told("tared"), "a reference")
     daemon.signal(signal.SIGKILL)
-    daemon.popen.wait(30)
+    daemon.popen.wait(PATIENCE_S)
     assert is_streaming(twin)
     again = DaemonProcess(
         tmp_path, twin.ports, protocol="sciospec", description=str(tmp_path / "tank.toml")

@@ -71,9 +71,9 @@ class Bench:
             "radius_mm": RADIUS_MM,
             "pressure_kpa": KPA,
         }
-        ask("clear", self._control)
-        ask("press", self._control, **where)
-        before = ask("status", self._control)["counter"]
+        ask("clear", self._control, PATIENCE_S)
+        ask("press", self._control, PATIENCE_S, **where)
+        before = ask("status", self._control, PATIENCE_S)["counter"]
         with subscribe(NAME, address=self.daemon.stream, timeout_s=PATIENCE_S) as frames:
             seen = (f for f in frames if f.scan_counter > before + 4 and len(f.contacts) == 1)
             return next(frame for frame in seen if frame.tier == "fit")
@@ -86,7 +86,7 @@ class Bench:
         return errors.tolist(), [c.taught for c in contacts]
 
     def clear(self) -> None:
-        ask("clear", self._control)
+        ask("clear", self._control, PATIENCE_S)
         with subscribe(NAME, address=self.daemon.stream, timeout_s=PATIENCE_S) as frames:
             next(frame for frame in frames if frame.tier == "quiet")
 

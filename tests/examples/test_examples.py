@@ -8,15 +8,19 @@ import re
 import runpy
 import subprocess
 import sys
-import threading
+import time
 from collections.abc import Callable
 from ctypes.util import find_library
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+import tactomo_client.appearance  # not by the example, under its own clock
 from recorded_grasp import write_grasp
-from tactomo_client import Contact
+from tactomo_client import Contact, Frame, Subscription, subscribe
 from tactomo_client.fake import FakeSensor
+from waiting import wait_until
 from whole_system import repository
 
 EXAMPLES = repository() / "examples"
@@ -144,28 +148,47 @@ def test_the_robot_stops_once_for_each_cause_and_at_nothing_less() -> None:
 
 
 def said_by_the_robot(script: Script) -> list[str]:
-    """What the program says while frames come, 50 a second, and then none."""
+    """What the program says while frames come, 50 a second by its own clock, and then none.
+
+    Its clock stands still until a frame has arrived: none is late on a busy computer.
+    """
     said: list[str] = []
+    turns = 0  # of its loop, a millisecond each
+    frames: list[Subscription[Frame]] = []
 
     def note(text: str, **_: object) -> None:
         said.append(text)
         if text.endswith("no fresh frame"):
             raise EnoughError
 
-    with FakeSensor("skin") as sensor:
+    def sleep(seconds: float) -> None:
+        nonlocal turns
+        assert seconds == 0.001
+        number, is_between = divmod(turns, 20)
+        turns += 1
+        if is_between:
+            return
+        if number >= len(script):
+            wait_until(lambda: frames[0].is_stale, "the last frame to grow old")
+            return
+        contacts, flags = script[number]
+        is_last = number == len(script) - 1
+        ahead_ns = 0 if is_last else 10**12
+        sensor.publish(contacts, flags=flags, acquired_monotonic_ns=time.monotonic_ns() + ahead_ns)
+        wait_until(lambda: (at := frames[0].latest()) is not None and at.sequence == number + 1)
 
-        def publish() -> None:
-            sensor.wait_for_subscriber()
-            for contacts, flags in script:
-                sensor.publish(contacts, flags=flags)
-                threading.Event().wait(0.02)
+    def follow(*arguments: Any, **options: Any) -> Subscription[Frame]:
+        options["stale_after_s"] *= 10  # a busy computer may take its own 0.2 s over a turn
+        frames.append(subscribe(*arguments, **options))
+        sensor.wait_for_subscriber()
+        return frames[0]
 
-        publisher = threading.Thread(target=publish)
-        publisher.start()
-        program = EXAMPLES / "stop_robot.py"
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("sys.argv", [str(program), "skin", sensor.address])
-            with pytest.raises(EnoughError):
-                runpy.run_path(str(program), {"print": note}, run_name="__main__")
-        publisher.join()
+    program = EXAMPLES / "stop_robot.py"
+    with FakeSensor("skin") as sensor, pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", [str(program), "skin", sensor.address])
+        patch.setattr(tactomo_client, "subscribe", follow)
+        its_clock = SimpleNamespace(monotonic=lambda: 0.001 * turns, sleep=sleep)
+        patch.setitem(sys.modules, "time", its_clock)
+        with pytest.raises(EnoughError):
+            runpy.run_path(str(program), {"print": note}, run_name="__main__")
     return said
