@@ -6,6 +6,7 @@ import json
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -239,15 +240,31 @@ def test_record_start_gives_an_absolute_path(tactomo: Run, control: Any, tmp_pat
     ]
 
 
-def test_record_a_file_for_some_seconds(tactomo: Run, control: Any) -> None:
+def test_record_a_file_for_some_seconds(
+    tactomo: Run, control: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a clock that passes an hour over the start, which does not count."""
+    passed_s = 0.0
+
+    class SlowDisk(dict[str, Any]):
+        def get(self, command: str, otherwise: Any = None) -> Any:
+            nonlocal passed_s
+            passed_s += 3600.0 if command == "record_start" else 0.25
+            return super().get(command, otherwise)
+
+    control.answers = SlowDisk()
+    monkeypatch.setattr(
+        "tactomo.cli.steer.steer.time",
+        SimpleNamespace(monotonic=lambda: passed_s, sleep=lambda _: None),
+    )
     control.answers["record_start"] = {"path": "/x.mcap"}
     control.answers["record_stop"] = {"path": "/x.mcap", "bytes": 1_230_000}
     control.answers["status"] = STATUS
     result = tactomo("record", "x.mcap", "--seconds", "0.6", "--control", control.address)
     assert result.returncode == 0
     assert result.stdout.endswith("recorded /x.mcap (1.23 MB)\n")
-    assert [command for command, _ in control.requests[:2]] == ["record_start", "status"]
-    assert control.requests[-1][0] == "record_stop"
+    asked = [command for command, _ in control.requests]
+    assert asked == ["record_start", *["status"] * 3, "record_stop"]
 
 
 def test_tier_and_budget(tactomo: Run, control: Any) -> None:

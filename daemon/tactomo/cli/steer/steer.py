@@ -181,12 +181,12 @@ def _record_for(daemon: Daemon, path: Path, seconds: float | None, maps: bool | 
 
     size = TextColumn("{task.fields[size]}")
     columns = (TextColumn("recording"), BarColumn(), TimeElapsedColumn(), size)
-    begin_s = time.monotonic()
     with (
         daemon.record(path, maps=maps) as recording,
         suppress(KeyboardInterrupt),  # the way to end a recording without --seconds
         Progress(*columns, transient=True) as progress,
     ):
+        begin_s = time.monotonic()  # a disk may have taken seconds over the start
         task = progress.add_task(recording.path, total=seconds, size="")
         while seconds is None or time.monotonic() - begin_s < seconds:
             now = daemon.status().recording
