@@ -141,6 +141,8 @@ def test_busy_skins_degrade_and_starve_no_still_one(
         before = robot.status("still")
         for name in busy:
             robot.wait(name, lambda status: "processor_shared" in status["events"]["counts"])
+        # Long enough that one moment without the processor does not decide.
+        robot.wait("still", lambda status: status["frames"] > before["frames"] + 150)
         after = robot.status("still")
     finally:
         for loop in loops:

@@ -77,8 +77,10 @@ class Bench:
         with subscribe(NAME, address=self.daemon.stream, timeout_s=PATIENCE_S) as frames:
             seen = 0
             for frame in frames:
-                seen += frame.scan_counter > before + 2 and len(frame.contacts) == 1
-                if seen > 12:
+                # By the network alone where others take the processor for a while.
+                is_fit = len(frame.contacts) == 1 and frame.tier == "fit"
+                seen += frame.scan_counter > before + 2 and is_fit
+                if is_fit and seen > 12:
                     return frame.contacts[0]
         raise AssertionError
 
@@ -104,7 +106,7 @@ def test_a_guided_session_makes_pressures_right(bench: Bench, tmp_path: Path) ->
     assert wrong.pressure_kpa is not None
     assert wrong.pressure_sigma_kpa is not None
     too_low = (wrong.pressure_kpa - 200 / STIFFER) / wrong.pressure_sigma_kpa
-    assert abs(too_low) < 3.5, "the description's table"
+    assert abs(too_low) < 4.5, "the description's table"
     assert wrong.pressure_kpa < 190
     bench.clear()
     addresses = ("--stream", bench.daemon.stream, "--control", bench.daemon.control)
@@ -142,12 +144,12 @@ def test_a_guided_session_makes_pressures_right(bench: Bench, tmp_path: Path) ->
         assert found.pressure_sigma_kpa < 20  # whether the press is soft is left open
         errors.append((found.pressure_kpa - kpa) / found.pressure_sigma_kpa)
         assert found.force_n == pytest.approx(kpa * 1e-3 * AREA_MM2, rel=0.12)
-    assert max(map(abs, errors)) < 3.5, errors  # of three, by chance, one run in seven hundred
+    assert max(map(abs, errors)) < 4.5, errors  # of three, by chance, one run in fifty thousand
     bench.daemon.ask("record_stop")
     # What is two standard uncertainties above nothing counts as something: by chance, one in forty.
-    light = [bench.contact(kpa) for kpa in (80, 90, 100)]
+    light = [bench.contact(kpa) for kpa in range(70, 101, 5)]
     below = [contact for contact in light if contact.pressure_range == "below"]
-    assert len(below) >= 2, light
+    assert len(below) >= 4, light  # of seven; by chance, all but one run in seventy thousand
     assert all(contact.pressure_kpa is None for contact in below)
     hard = bench.contact(300)
     assert hard.pressure_range == "above"

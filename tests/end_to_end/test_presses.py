@@ -13,6 +13,8 @@ from whole_system import SENSOR, Demo
 
 Places = list[tuple[float, float]]
 
+FREE_AGAIN_S = 200.0
+"""Until a daemon on a busy computer has tried again what frames with all of their time take."""
 SCENES: list[Places] = [
     [(0.0, 0.0)],
     [(52.0, 5.0)],
@@ -32,15 +34,24 @@ def is_settled(frame: Frame, places: Places) -> bool:
     return not frame.flags and len(frame.contacts) == len(places)
 
 
-def settled_frame(demo: Demo, places: Places) -> Frame:
-    """First unflagged frame with as many contacts as there are presses."""
-    deadline = time.monotonic() + PATIENCE_S
+def settled_frame(demo: Demo, places: Places, tier: str | None = None) -> Frame:
+    """First unflagged frame with as many contacts as there are presses, of a tier if one is given.
+
+    Where others take the processor, frames are made by the network until it is free again.
+    """
+    deadline = time.monotonic() + (PATIENCE_S if tier is None else FREE_AGAIN_S)
     with subscribe(SENSOR, address=demo.stream, timeout_s=PATIENCE_S) as frames:
         for frame in frames:
-            if is_settled(frame, places):
+            if is_settled(frame, places) and tier in (None, frame.tier):
                 return frame
-            assert time.monotonic() < deadline, f"{frame.contacts} {frame.flags}"
+            assert time.monotonic() < deadline, f"{frame.tier} {frame.contacts} {frame.flags}"
     raise AssertionError("the stream ended")
+
+
+def shared(demo: Demo) -> int:
+    """How often others have taken the processor from the daemon."""
+    counts = request("status", demo.control, PATIENCE_S)["events"]["counts"]
+    return int(counts.get("processor_shared", 0))
 
 
 def scanned_from_now(demo: Demo) -> None:
@@ -56,7 +67,7 @@ def test_every_press_is_found_within_3_mm_with_its_pressure(any_demo: Demo, plac
     settled_frame(any_demo, [])
     for number, (x_mm, y_mm) in enumerate(places):
         any_demo.press(x_mm, y_mm, id=str(number), pressure_kpa=180, radius_mm=15)
-    frame = settled_frame(any_demo, places)
+    frame = settled_frame(any_demo, places, "fit")
     for place in places:
         assert distance_mm(frame, place) < 3.0
     for contact in frame.contacts:
@@ -88,14 +99,18 @@ def test_a_lost_channel_is_flagged_and_the_other_goes_on(any_demo: Demo) -> None
     any_demo.clear()
     settled_frame(any_demo, [])
     any_demo.press(10.0, -10.0)
-    settled_frame(any_demo, [(10.0, -10.0)])
-    with subscribe(SENSOR, address=any_demo.stream, timeout_s=PATIENCE_S) as frames:
-        next(frame for frame in frames if frame.tier == "fit")  # none of what follows is missed
-        request("mute", any_demo.twin, PATIENCE_S, channel="structure", seconds=PATIENCE_S)
-        missing = (frame for frame in frames if "structure_missing" in frame.flags)
-        bridged = next(missing)
-        alone = next(frame for frame in missing if frame.tier == "network")
-    request("mute", any_demo.twin, PATIENCE_S, channel="structure", seconds=1e-9)  # it is over
+    is_disturbed = True
+    while is_disturbed:  # by others, who take the processor: the network then makes every frame
+        settled_frame(any_demo, [(10.0, -10.0)], "fit")
+        before = shared(any_demo)
+        with subscribe(SENSOR, address=any_demo.stream, timeout_s=PATIENCE_S) as frames:
+            next(frames)  # none of what follows is missed
+            request("mute", any_demo.twin, PATIENCE_S, channel="structure", seconds=PATIENCE_S)
+            missing = (frame for frame in frames if "structure_missing" in frame.flags)
+            bridged = next(missing)
+            alone = next(frame for frame in missing if frame.tier == "network")
+        request("mute", any_demo.twin, PATIENCE_S, channel="structure", seconds=1e-9)  # it is over
+        is_disturbed = shared(any_demo) > before
     assert bridged.tier == "fit", "the last shape stands in for a moment"
     for frame in (bridged, alone):
         assert frame.map is not None, "the magnitude channel's image goes on"

@@ -72,7 +72,8 @@ class Listener(threading.Thread):
 def test_a_replay_gives_the_maps_of_the_live_run(demo: Demo, tmp_path: Path) -> None:
     live, again = tmp_path / "live.mcap", tmp_path / "again.mcap"
     demo.press(15.0, 20.0, id="a")  # begun under load: the reference must come along
-    wait_until(lambda: request("status", demo.control, PATIENCE_S)["tier"] == "fit", "a contact")
+    with subscribe(SENSOR, address=demo.stream, timeout_s=PATIENCE_S) as frames:
+        next(frame for frame in frames if frame.contacts)
     with Listener(demo) as listener:
         request("record_start", demo.control, PATIENCE_S, path=str(live))
         for x_mm, y_mm in ((15.0, 20.0), (0.0, 0.0), (-40.0, -35.0)):

@@ -41,11 +41,11 @@ class Robot:
     def stop_and_count(self, name: str) -> int:
         """Have a skin say nothing more, and return how many scans its daemon has received."""
         self.playing[name].stop()
-        received = [-1]
+        received = [-2, -1]
 
         def is_at_rest(status: dict[str, Any]) -> bool:
             received.append(status["scan_tally"]["received"])
-            return received[-1] == received[-2] and not status["scan_tally"]["waiting"]
+            return len(set(received[-3:])) == 1 and not status["scan_tally"]["waiting"]
 
         self.wait(name, is_at_rest)
         return received[-1]

@@ -174,6 +174,16 @@ class Page:
     def __getitem__(self, element: str) -> WebElement:
         return self.browser.find_element(By.ID, element)
 
+    @property
+    def row(self) -> list[str]:
+        """Words of the first contact's row, by the page itself, which may replace it meanwhile."""
+        script = "return document.querySelector('#contacts tbody tr')?.innerText ?? ''"
+        return str(self.js(script)).split()
+
+    @property
+    def map_classes(self) -> set[str]:
+        return set((self["map"].get_attribute("class") or "").split())
+
     def js(self, script: str, *arguments: Any) -> Any:
         return self.browser.execute_script(script, *arguments)
 
@@ -214,7 +224,7 @@ class Page:
         self.mouse("Released", x_mm, y_mm, modifiers)
 
     def wait_until_pressable(self) -> None:
-        wait_until(lambda: "pressable" in (self["map"].get_attribute("class") or ""))
+        wait_until(lambda: "pressable" in self.map_classes)
 
     def presses(self, command: str = "press") -> list[dict[str, Any]]:
         """Return the arguments of the presses (or releases) that reached the twin."""
@@ -327,19 +337,15 @@ def test_contacts_are_listed_with_value_and_uncertainty(page: Page) -> None:
     page.open()
     rows = "return [...document.querySelectorAll('#contacts tbody tr')].map(r => ({...r.dataset}))"
     wait_until(lambda: page.js(rows) == [{"id": "1", "xMm": "36", "yMm": "-48"}])
-
-    def row() -> list[str]:  # by the page itself: an element may be replaced meanwhile
-        return str(page.js("return document.querySelector('#contacts tbody tr').innerText")).split()
-
-    assert row() == ["1", "36.0", "−48.0", "452", "173", "±", "3", "78", "±", "3"]
+    # Nothing is listed for a moment where a busy computer lets a frame grow old.
+    wait_until(lambda: page.row == ["1", "36.0", "−48.0", "452", "173", "±", "3", "78", "±", "3"])
     page.browser.find_element(By.CSS_SELECTOR, "input[value=percent]").click()
-    wait_until(lambda: row()[4:] == ["15.1", "±", "1.0", "78", "±", "3"])
+    wait_until(lambda: page.row[4:] == ["15.1", "±", "1.0", "78", "±", "3"])
     page.browser.find_element(By.CSS_SELECTOR, "input[value=kpa]").click()
     page.skin.contacts = [replace(known, pressure_range="above")]
-    wait_until(lambda: row()[4:] == ["≥", "173", "≥", "78"])
+    wait_until(lambda: page.row[4:] == ["≥", "173", "≥", "78"])
     page.skin.contacts = []
-    wait_until(lambda: page.js(rows) == [])
-    assert page["no-contacts"].text == "Nothing pressed."
+    wait_until(lambda: page["no-contacts"].text == "Nothing pressed." and page.js(rows) == [])
 
 
 def test_what_is_touched_too_lightly_is_shown_and_has_no_number(page: Page) -> None:
@@ -430,7 +436,7 @@ def test_without_magnitudes_it_says_so(page: Page) -> None:
     page.skin.frame |= {"map": None, "pressure_kpa": None, "flags": ["magnitude_missing"]}
     page.open()
     wait_until(lambda: page["quality"].text == "Magnitude channel missing")
-    assert page["contacts"].find_element(By.CSS_SELECTOR, "tbody tr").text.endswith(" –")
+    wait_until(lambda: page.row[-1:] == ["–"])
 
 
 def test_status_is_shown_part_by_part(page: Page) -> None:
@@ -471,7 +477,7 @@ def test_foreign_text_stays_text(page: Page) -> None:
     page.open()
     page.skin.events = [{"name": nasty, "severity": "info", "detail": nasty, "next_step": ""}]
     wait_until(lambda: nasty in page["events"].text)
-    assert page["model"].text == nasty
+    wait_until(lambda: page["model"].text == nasty)
     assert page.browser.title == "left · tactomo"
 
 
@@ -547,9 +553,10 @@ def test_shift_holds_a_press_and_clear_lifts_it(page: Page) -> None:
     wait_until(lambda: page.js(held))
     page.click(-30, 0)
     wait_until(lambda: page.presses("release"))
-    held, lifted = page.presses()[0]["id"], page.presses()[-1]["id"]
+    # That the first is held may be told after the second is there.
+    held, lifted = dict.fromkeys(press["id"] for press in page.presses())
+    assert {round(p["x_mm"]) for p in page.presses() if p["id"] == held} == {10}
     assert [release["id"] for release in page.presses("release")] == [lifted]
-    assert held != lifted
     page["clear"].click()
     wait_until(lambda: ("clear", {}) in page.twin.requests)
     assert page.js("return tactomo.touch.held.length") == 0
@@ -653,15 +660,23 @@ def test_the_strip_shows_each_contacts_pressure_and_force_and_the_events(page: P
     page.skin.contacts.append(replace(contact, id=2))  # how hard in newtons is not known
     wait_until(lambda: lanes_with(page, second)[0])
     event = {"name": "port_lost", "severity": "error", "detail": "", "next_step": ""}
+    begin_s = time.monotonic()
     page.skin.events = [event]
-    at = "const e = tactomo.timeline.events; return e.length && performance.now() - e[0].at"
-    wait_until(lambda: 0 < page.js(at) < 5_000)
-    page.js(
-        "const strip = document.getElementById('strip');"
-        "strip.dispatchEvent(new PointerEvent('pointermove', {clientX:"
-        " strip.getBoundingClientRect().right - 16}))"
-    )
-    assert page["strip"].get_attribute("title") == "port lost"
+    wait_until(lambda: page.js("return tactomo.timeline.events.length"))
+    told, age_ms = page.js("""
+        const strip = document.getElementById('strip');
+        const {left, right} = strip.getBoundingClientRect();
+        const told = [];
+        for (let clientX = left; clientX < right; clientX++) {
+          strip.dispatchEvent(new PointerEvent('pointermove', {clientX}));
+          if (strip.title) told.push([strip.title, (right - clientX) / (right - left)]);
+        }
+        return [told, performance.now() - tactomo.timeline.events[0].at]""")
+    assert {title for title, _ in told} == {"port lost"}
+    shares = [share for _, share in told]  # of the strip's width, from its right end
+    assert max(shares) - min(shares) < 0.03
+    assert 0 < age_ms < 1e3 * (time.monotonic() - begin_s) + 50
+    assert np.mean(shares) == pytest.approx(age_ms / 60_000, abs=0.03)
 
 
 @pytest.mark.usefixtures("quiet_console")
@@ -678,7 +693,7 @@ def test_what_was_is_looked_at_and_left_again(page: Page) -> None:
     wait_until(lambda: sum(page.colour(30, -48)) > 350)
     wait_until(lambda: "36.0" in page["contacts"].text)
     assert page["moment"].get_attribute("aria-valuetext") == "60.0 s before the pause"
-    assert "ago" in page.banner
+    wait_until(lambda: "ago" in page.banner)
     page.skin.sends_frames = False  # what goes wrong now is said while one looks back, too
     wait_until(lambda: page.health == "stale")
     assert sum(page.colour(30, -48)) > 350
@@ -841,7 +856,7 @@ def test_stale_data_are_told_and_come_back(page: Page) -> None:
     wait_until(lambda: page.health == "stale")
     assert page.banner.startswith("Stale. The newest scan is ")
     assert page["state"].text == "stale"
-    assert page["map"].get_attribute("class") == "pressable stale"
+    wait_until(lambda: page.map_classes == {"pressable", "stale"})
     wait_until(lambda: page["no-contacts"].text == "Not known.")  # and not "Nothing pressed."
     page.skin.status |= {"ports": [{"url": "/dev/ttySKIN", "connected": False}]}
     wait_until(lambda: page.banner.endswith("Not connected: /dev/ttySKIN."))
@@ -850,8 +865,8 @@ def test_stale_data_are_told_and_come_back(page: Page) -> None:
     wait_until(lambda: "it has 8 electrodes" in page.banner)
     page.skin.sends_frames = True
     wait_until(lambda: page.health == "good")
-    assert not page["banner"].is_displayed()
-    assert page["map"].get_attribute("class") == "pressable"
+    wait_until(lambda: not page["banner"].is_displayed())
+    wait_until(lambda: page.map_classes == {"pressable"})
 
 
 def test_a_daemon_that_is_gone_is_told_and_comes_back(page: Page) -> None:
@@ -864,7 +879,7 @@ def test_a_daemon_that_is_gone_is_told_and_comes_back(page: Page) -> None:
         again.press(-30, 30)
         wait_until(lambda: page.health == "good")
         wait_until(lambda: sum(page.colour(-36, 30)) > 350)
-        assert page["tare"].is_enabled()
+        wait_until(page["tare"].is_enabled)
 
 
 def test_a_viewer_that_is_gone_is_told_and_comes_back(page: Page) -> None:
@@ -907,13 +922,14 @@ def test_what_the_daemon_does_is_told(
 def test_a_missing_reference_is_told(page: Page) -> None:
     page.open()
     page.skin.frame = {"flags": ["no_reference"]}
-    wait_until(lambda: page.health == "no-reference")
-    assert "press Tare" in page.banner
+    wait_until(lambda: page.health == "no-reference" and "press Tare" in page.banner)
     assert page["no-contacts"].text == "Not known."
 
 
 def test_a_daemon_that_never_came_is_waited_for(page: Page) -> None:
     page.skin.__exit__()
+    page.stop_viewer()  # it may have heard of the daemon by now
+    page.serve()
     page.browser.get(f"http://127.0.0.1:{page.port}/")
     wait_until(lambda: page.health == "no-daemon")
     assert f"“left” at {page.skin.address}" in page.banner
@@ -944,9 +960,18 @@ def test_a_laptop_shows_contacts_method_and_health_without_scrolling(page: Page)
     (contact,) = page.skin.contacts
     page.skin.contacts = [replace(contact, id=number) for number in range(1, 6)]
     page.open(width=1280, height=800)
-    wait_until(lambda: page["count"].text == "5")
-    for name in ("contacts", "method", "made-by", "quality", "confidence", "moment"):
-        assert page[name].rect["y"] + page[name].rect["height"] <= 800, name
+    names = ("contacts", "method", "made-by", "quality", "confidence", "moment")
+
+    def ends() -> dict[str, float]:
+        bottom = "document.getElementById(id).getBoundingClientRect().bottom"
+        bottoms = page.js(f"return arguments[0].map((id) => {bottom})", names)
+        return dict(zip(names, bottoms, strict=True))
+
+    # A banner is above them where a busy computer lets a frame grow old.
+    wait_until(
+        lambda: page["count"].text == "5" and page.health == "good" and max(ends().values()) <= 800,
+        f"all of {ends()}",
+    )
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
