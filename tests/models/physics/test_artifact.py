@@ -84,6 +84,20 @@ def test_a_damaged_or_foreign_file_is_refused(
         load_artifact(file, small)
 
 
+def test_a_header_that_says_fewer_numbers_is_refused(
+    built: Artifact, small: SensorDescription, tmp_path: Path
+) -> None:
+    """The checksum is beyond what such a header has one read."""
+    file = tmp_path / "small.npz"
+    save_artifact(built, file)
+    content = bytearray(file.read_bytes())
+    digit = content.index(b"'shape': (", content.index(b"greens.npy")) + len(b"'shape': (")
+    content[digit] -= 1
+    file.write_bytes(content)
+    with pytest.raises(ArtifactError, match="tactomo models build"):
+        load_artifact(file, small)
+
+
 @given(st.data())
 def test_a_flipped_bit_is_refused_or_harmless(
     built: Artifact,
