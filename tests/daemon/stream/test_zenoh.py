@@ -225,7 +225,7 @@ def test_contacts_and_status_of_a_skin_at_rest_are_a_fifth_of_those_by_the_clock
     """A simulated skin behind a real daemon; bytes as a subscriber of all of both gets them."""
     by_zenoh: list[tuple[float, int]] = []
     with running_demo() as demo:
-        request("tare", demo.control, 30.0)
+        request("tare", demo.control, PATIENCE_S)
         both = [topic(SENSOR, "contacts"), topic(SENSOR, "status")]
         by_the_clock = reader(demo.stream, *both)
         subscribers = [
