@@ -312,7 +312,9 @@ def test_a_healthy_skin_on_a_busy_computer_is_healthy(demo: Demo) -> None:
         found = json.loads(doctor.stdout.read())
     left_out = about(found["stream"], "dropped_scans")
     assert left_out["number"] > 3
-    assert (left_out["level"], found["verdict"], doctor.returncode) == ("advice", "healthy", 0)
+    assert left_out["level"] == "advice"
+    assert [each for each in found["stream"] if each["level"] == "fault"] == []
+    assert (found["verdict"], doctor.returncode) == ("healthy", 0)
 
 
 def test_a_running_daemon(tactomo: Run, demo: Demo) -> None:

@@ -195,7 +195,7 @@ def test_a_loop_of_1_khz_allocates_nothing_once_frames_come(
     daemon = start()
     request("press", twin.control, PATIENCE_S, x_mm=0.0, y_mm=0.0)
     for kind in (CONTACTS, MAP):
-        did = json.loads(run(probe, "loop", SENSOR, daemon.stream, kind, 1500))
+        did = json.loads(run(probe, "loop", SENSOR, daemon.stream, kind, 3000))
         assert did["counts"]
         assert did["frames"] > 5
         assert did["before_first"] > 0
@@ -472,7 +472,7 @@ def test_no_allocation_however_frames_differ(sensor: FakeSensor, probe: Path) ->
     publisher = threading.Thread(target=publish)
     publisher.start()
     try:
-        did = json.loads(run(probe, "loop", "left", sensor.address, "contacts", 2000))
+        did = json.loads(run(probe, "loop", "left", sensor.address, "contacts", 3000))
     finally:
         stop.set()
         publisher.join()

@@ -47,7 +47,7 @@ def twin(tmp_path: Path) -> Iterator[dict[str, list[str]]]:
     sensor.write_text(text.replace(table[1], higher, 1))
     command = [
         *(sys.executable, "-m", "tactomo.cli", "twin", "--announce", "--twin-control", ANYWHERE),
-        *("--description", str(sensor), "--link", str(tmp_path / "ports")),
+        *("--description", str(sensor), "--link", str(tmp_path / "ports"), "--rate", "10"),
     ]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None

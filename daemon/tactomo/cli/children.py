@@ -25,7 +25,7 @@ from tactomo.errors import TactomoError
 
 VIEWER_SAYS = "viewer: "
 KEPT_LINES = 12
-STOP_S = 2.0
+STOP_S = 10.0
 START_S = 180.0
 
 

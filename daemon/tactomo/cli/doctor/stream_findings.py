@@ -65,18 +65,24 @@ def _packets_found(heard: Heard) -> Finding:
 def _lost_found(evidence: Evidence) -> Iterator[Finding]:
     assert evidence.heard is not None
     count = max(len(scans) for scans in evidence.scans.values())
+    dropped, incomplete = (
+        evidence.after.get(key, 0) - evidence.before.get(key, 0)
+        for key in ("dropped_scans", "incomplete_scans")
+    )
+    # Scans that came and were left out tell that the computer was busy: then others may have been
+    # lost or come too late for the same reason, and nothing is known against cable and board.
+    is_busy = dropped > LOST_SHARE * count
+    fault_share = LATE_SHARE if is_busy else LOST_SHARE
+    again = "the computer is busy: look again when it is not"
     yield _share_found(
         "lost_scans",
         evidence.heard.lost,
         count,
         "did not arrive",
-        "is the line too slow for the rate, or the computer too busy to read it?",
+        again if is_busy else "is the line too slow for the rate, or the computer too busy?",
+        fault_share,
     )
     if evidence.after:
-        dropped, incomplete = (
-            evidence.after[key] - evidence.before[key]
-            for key in ("dropped_scans", "incomplete_scans")
-        )
         yield _share_found(
             "dropped_scans",
             dropped,
@@ -85,23 +91,20 @@ def _lost_found(evidence: Evidence) -> Iterator[Finding]:
             FASTER,
             LATE_SHARE,
         )
-        # Scans that came and were left out tell that the computer was busy: then a channel's may
-        # have come too late for the same reason, and nothing is known against its cable.
-        is_busy = dropped > LOST_SHARE * count
         yield _share_found(
             "incomplete_scans",
             incomplete,
             count,
             "lacked a channel",
-            "the computer is busy: look again when it is not"
+            again
             if is_busy
             else "check that channel's cable; if its scans come late, raise sync_wait_ms",
-            LATE_SHARE if is_busy else LOST_SHARE,
+            fault_share,
         )
 
 
 def _share_found(
-    about: str, number: int, count: int, what: str, step: str, fault_share: float = LOST_SHARE
+    about: str, number: int, count: int, what: str, step: str, fault_share: float
 ) -> Finding:
     figures: dict[str, Any] = {"number": float(number)}
     if not number:
