@@ -144,8 +144,11 @@ class Moves:
             return [self.birth, self._escalate]
         questions = self._questions if [*shape.residuals] == [Channel.MAGNITUDE] else ()
         inside: list[Move] = [partial(self._with, question) for question in questions]
-        form = [self._of_higher_order, self._modulate, *inside, *self._splits(shape)]
         crowd = shape.family.count >= CROWD
+        # What one sheet takes for one contact of a crowd, both are asked for afterwards.
+        later = crowd and len(frame.measured) < len(self.fit.responses)
+        splits = self._splits(shape, crowd and not later)
+        form = [self._of_higher_order, self._modulate, *inside, *splits]
         if shape.misfit > GOOD_MISFIT or crowd:
             form += [self._birth_anywhere(k) for k in range(ASKED_OF_CROWD if crowd else 1)]
         # What pressures leave unexplained in a crowd is a matter of edges and holes first.
@@ -271,17 +274,15 @@ class Moves:
         other = self._of_contacts(each, shape, frame)
         return Candidate(other, ONE_SHEET_WORTH * question.worth * scale) if other else None
 
-    def _splits(self, shape: FittedField) -> list[Move]:
+    def _splits(self, shape: FittedField, crowd: bool) -> list[Move]:
         """Moves that make two contacts of one: those that stand it best, one after the other."""
         elongated = 0.4  # half the logarithm of the axes' ratio (2.2), from which it may be two
         each = contacts_of(shape)
         if not 0 < len(each) < MAX_CONTACTS:
             return []
         long = np.hypot(each[:, E1], each[:, E2]) > elongated
-        crowd = len(each) >= CROWD
-        asked = (
-            np.arange(len(each)) if shape.misfit > GOOD_MISFIT or crowd else np.flatnonzero(long)
-        )
+        unexplained = shape.misfit > GOOD_MISFIT and len(each) < CROWD
+        asked = np.arange(len(each)) if unexplained or crowd else np.flatnonzero(long)
         count = ASKED_OF_CROWD if crowd else 1
 
         def split(rank: int) -> Move:

@@ -52,6 +52,7 @@ from tactomo_models.scene.pressure_field import (
     Y,
 )
 
+STEPS = 4  # of a refinement, before what it leads to is judged
 SLACK = 1.1  # contacts that are explained as well as before are not questioned again
 
 
@@ -253,7 +254,7 @@ class _Course:
             elif self._is_crowding(shape) and (early := self._moves.birth(shape, frame)):
                 self._candidate = early
             elif not self._settled:
-                before, shape = shape, self._refined(shape, frame)
+                before, shape = shape, self._refined(shape, frame, STEPS)
                 # A budget of a step or so a frame lets it follow each frame's noise, no more.
                 follows = before.cost - shape.cost < FOLLOWED * len(shape.parameters)
                 self._settled = shape.converged or (budget.over and follows)
@@ -269,8 +270,7 @@ class _Course:
         waits = self._moved and not self._settled
         return self._early and waits and shape.misfit > SUSPECT_MISFIT
 
-    def _refined(self, shape: FittedField, frame: Frame) -> FittedField:
-        steps = 4  # of a refinement, before what it leads to is judged
+    def _refined(self, shape: FittedField, frame: Frame, steps: int) -> FittedField:
         if len(shape.parameters) == 0:
             return replace(shape, converged=True)
         # Few parameters are better known at the minimum; many would begin to explain the noise.
@@ -279,7 +279,12 @@ class _Course:
 
     def _judge(self, candidate: Candidate, shape: FittedField, frame: Frame) -> FittedField:
         """Refine a candidate: it takes the shape's place, is given up, or goes on."""
-        refined = self._refined(candidate.shape, frame)
+        refined, hopeless = candidate.shape, False
+        for _ in range(STEPS):
+            refined = self._refined(refined, frame, 1)
+            hopeless = self._is_hopeless(refined, shape, candidate)
+            if refined.converged or hopeless or frame.budget.over:
+                break
         wins = refined.cost < shape.cost - candidate.gain
         if wins and self._settled_on is not frame.measured and len(shape.parameters):
             # What follows this frame's noise must not win by that alone.
@@ -295,13 +300,22 @@ class _Course:
             return refined
         # A trial that was cut short does not count.
         trials = candidate.trials - (not frame.budget.over)
-        if refined.converged or trials == 0:
+        if refined.converged or hopeless or trials == 0:
             self._candidate = None
             self._moves_tried += self._settled
             self._early = self._settled  # what came too early is tried again at the minimum
         else:
             self._candidate = replace(candidate, shape=refined, trials=trials)
         return shape
+
+    def _is_hopeless(self, refined: FittedField, shape: FittedField, candidate: Candidate) -> bool:
+        """Whether a candidate would not win with all that its last step leaves to be gained.
+
+        It saves a third to two thirds of a cold start of four contacts and more.
+        """
+        if refined.jacobian is None or len(contacts_of(shape)) < CROWD:
+            return False
+        return refined.cost - self._fit.foreseen(refined) > shape.cost - candidate.gain
 
     def _doubt(self, shape: FittedField, other: FittedField, gain: float, frame: Frame) -> None:
         """Remember another account of the same contacts, as likely as the data leave it."""

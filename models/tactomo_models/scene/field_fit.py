@@ -282,14 +282,14 @@ class FieldFit:
             # No gain because the budget ended says nothing about a minimum.
             settled = 0 < gain < SETTLED * fitted.cost or better.damping >= WORST_DAMPING
             if gain > 0 and not settled:
-                settled = self._foreseen(better) < FORESEEN * better.cost
+                settled = self.foreseen(better) < FORESEEN * better.cost
             fitted = replace(better, converged=settled)
             if settled or budget.over:
                 break
         return fitted
 
-    def _foreseen(self, fitted: FittedField) -> float:
-        """What one more step would gain, by the Jacobian of the last one: no solve."""
+    def foreseen(self, fitted: FittedField) -> float:
+        """What further steps would gain in cost, by the Jacobian of the last one: no solve."""
         assert fitted.jacobian is not None
         normal, gradient = self._normal_equations(fitted, fitted.jacobian)
         return float(gradient @ np.linalg.solve(normal, gradient))
