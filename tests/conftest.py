@@ -35,7 +35,7 @@ CHROMIUM_OPTIONS = (
 
 
 # Nothing depends on the wall clock, nor on how fast the computer is, nor on chance: a change is not
-# refused for what was there before it. `make test-all ARGS="--hypothesis-profile new"` looks further.
+# refused for what was there before it. For that look with `--hypothesis-profile new`.
 PATIENT: dict[str, Any] = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
 settings.register_profile("few", max_examples=20, derandomize=True, **PATIENT)
 settings.register_profile("many", max_examples=100, derandomize=True, **PATIENT)  # `make test-all`

@@ -347,10 +347,11 @@ int differentiate(const Sheet *s, const Areas *a, const double *potentials, cons
 /* Contacts: the columns of their parameters, and constants, as in `scene.pressure_field`. */
 enum { X, Y, SIZE, E1, E2, HARMONIC, PEAK = 9, EDGE, HOLE, COLUMNS };
 static const double UNIT_M = 0.01, NOWHERE = 1e-6, GRADED_WIDTH = 0.7, RIM = 0.1;
+static const double MOST_BLURRED = 0.4;
 static const double PI = 3.14159265358979323846;
 
 typedef struct {
-  double half_width_m, offset_m, unit_kpa;
+  double half_width_m, offset_m, unit_kpa, blur_m2;
   int64_t forms;    /* columns of the form that any contact has: 3, 5 or 9 */
   int64_t is_sharp; /* outlines as sharp as the points can show them */
 } Field;
@@ -360,6 +361,13 @@ typedef struct {
   double size;        /* the logarithm of its radius: less where it is the rim of a hole */
   double B[2][2], dB[3][2][2];
 } Contact;
+
+/* A contact and its hole as they are, and as they are drawn on a graded sheet: smaller, and stronger,
+ * for the mesh's blur; how the logarithm of that size goes by that of its own, over 1, and by gamma. */
+typedef struct {
+  Contact as_is, hole, smaller, smaller_hole;
+  double stronger, by_size, by_edge;
+} Contacts;
 
 /* An outline at a point: t = phi / w, log q, and their derivatives by the form. */
 typedef struct {
@@ -381,6 +389,19 @@ static Contact contact_of(const double *each, double size) {
       c.dB[2][i][j] = shrink * (e2 * common - ratio * of[1][i][j]);
     }
   return c;
+}
+
+static Contacts contacts_of(const Field *f, const double *each) {
+  double moment = 2 * (each[EDGE] + 2), blur = moment * f->blur_m2 * exp(-2 * each[SIZE]);
+  double held = tanh(blur / MOST_BLURRED), left = 1 - MOST_BLURRED * held;
+  double size = each[SIZE] + log(left) / 2, by_size = blur * (1 - held * held) / left;
+  return (Contacts){.as_is = contact_of(each, each[SIZE]),
+                    .hole = contact_of(each, each[SIZE] - log(2)),
+                    .smaller = contact_of(each, size),
+                    .smaller_hole = contact_of(each, size - log(2)),
+                    .stronger = 1 / left,
+                    .by_size = by_size,
+                    .by_edge = -by_size / moment};
 }
 
 static Outline outline_at(const Field *f, const Contact *c, double x, double y, int with_slopes) {
@@ -437,19 +458,21 @@ static double step(const Field *f, double t) {
 
 static double step_slope(double t) { return (1 + cos(PI * fmin(fmax(t, -1.0), 1.0))) / 2; }
 
-/* What one contact does at a point. */
+/* What one contact, of one size, does at a point. */
 typedef struct {
   Outline outline, hole;
-  double wide, whole, enclosed, left, share, fall, root, rim, depth, profile, pressure;
+  double whole, left, share, fall, root, rim, depth, profile, pressure;
 } Pressed;
 
-/* Whether a contact reaches a point, and what it does there. */
-static int press(const Field *f, const Contact *c, const Contact *hole, double x, double y,
-                 int with_slopes, Pressed *p) {
-  p->outline = outline_at(f, c, x, y, with_slopes);
-  p->wide = p->outline.t + f->offset_m / f->half_width_m;
-  if (p->wide <= -1) return 0;
-  p->enclosed = step(f, p->wide), p->whole = step(f, p->outline.t / GRADED_WIDTH), p->left = 1.0;
+/* It as it is and as it is drawn on a graded sheet. */
+typedef struct {
+  Pressed as_is, drawn;
+  double wide, enclosed;
+} Press;
+
+static void press_by(const Field *f, const Contact *c, const Contact *hole, double x, double y,
+                     int with_slopes, Pressed *p) {
+  p->whole = step(f, p->outline.t / GRADED_WIDTH), p->left = 1.0;
   if (hole) {
     p->hole = outline_at(f, hole, x, y, with_slopes);
     p->left -= c->each[HOLE] * step(f, p->hole.t);
@@ -461,19 +484,57 @@ static int press(const Field *f, const Contact *c, const Contact *hole, double x
   p->depth = 0.5 * (p->fall + p->root);
   p->profile = c->each[EDGE] == 0 ? 1.0 : pow(p->depth, c->each[EDGE]);
   p->pressure = f->unit_kpa * c->each[PEAK] * p->profile;
+}
+
+/* Whether a contact reaches a point, and what it does there. */
+static int press(const Field *f, const Contacts *c, int is_ring, double x, double y,
+                 int with_slopes, Press *p) {
+  p->as_is.outline = outline_at(f, &c->as_is, x, y, with_slopes);
+  p->wide = p->as_is.outline.t + f->offset_m / f->half_width_m;
+  if (p->wide <= -1) return 0;
+  p->enclosed = step(f, p->wide);
+  press_by(f, &c->as_is, is_ring ? &c->hole : NULL, x, y, with_slopes, &p->as_is);
+  p->drawn = p->as_is;
+  if (f->blur_m2 > 0) {
+    p->drawn.outline = outline_at(f, &c->smaller, x, y, with_slopes);
+    press_by(f, &c->smaller, is_ring ? &c->smaller_hole : NULL, x, y, with_slopes, &p->drawn);
+  }
   return 1;
+}
+
+/* Derivatives of share and pressure, by all parameters: by the size that is drawn. */
+static void by_parameters(const Field *f, const double *c, const Pressed *p, int is_ring,
+                          double *share, double *pressure) {
+  double edge = c[EDGE], by_depth = 0.0, by_q = 0.0, away = 0.0;
+  double by_whole = step_slope(p->outline.t / GRADED_WIDTH) / GRADED_WIDTH * p->left;
+  if (c[HOLE] != 0) away = c[HOLE] * p->whole * step_slope(p->hole.t);
+  if (edge != 0) {
+    by_depth = f->unit_kpa * c[PEAK] * edge * p->profile / p->depth;
+    if (p->outline.log_q < 1.0)
+      by_q = by_depth * 0.5 * (1 + p->fall / p->root) * -2 * (1 - p->fall);
+  }
+  memset(share, 0, sizeof(double) * COLUMNS), memset(pressure, 0, sizeof(double) * COLUMNS);
+  for (int q = 0; q < f->forms; q++) {
+    share[q] = by_whole * p->outline.by_t[q];
+    if (away != 0) share[q] -= away * p->hole.by_t[q];
+    pressure[q] = by_q * p->outline.by_log_q[q];
+  }
+  pressure[SIZE] -= by_depth * 2 * p->rim * p->rim / p->root;
+  pressure[PEAK] = f->unit_kpa * p->profile;
+  pressure[EDGE] = p->pressure * log(p->depth);
+  if (is_ring) share[HOLE] = -p->whole * step(f, p->hole.t);
 }
 
 /* Draw contacts (count, COLUMNS) at points (n,); see `PressureField.draw` and `sampled`.
  *
  * Out, for each point that a contact reaches, or for all where `points` is NULL: which it is, the
- * share enclosed (all of it within sharp outlines), the share pressed and the pressure. Returns how
- * many, -1 without memory.
+ * share enclosed (all of it within sharp outlines) and the pressure there, the share pressed and the
+ * pressure as drawn on a graded sheet. Returns how many, -1 without memory.
  */
 int64_t draw(const Field *f, int64_t count, const double *each, int64_t n, const double *x,
-             const double *y, int64_t *points, double *enclosed, double *share,
-             double *pressure) {
-  Contact *contact = malloc(sizeof(Contact) * (2 * count + 1)), *hole = contact + count;
+             const double *y, int64_t *points, double *enclosed, double *enclosed_kpa,
+             double *share, double *pressure) {
+  Contacts *contact = malloc(sizeof(Contacts) * (count + 1));
   double *reach2 = malloc(sizeof(double) * (count + 1));
   if (!contact || !reach2) {
     free(contact), free(reach2);
@@ -481,7 +542,7 @@ int64_t draw(const Field *f, int64_t count, const double *each, int64_t n, const
   }
   for (int64_t k = 0; k < count; k++) {
     const double *c = each + COLUMNS * k;
-    contact[k] = contact_of(c, c[SIZE]), hole[k] = contact_of(c, c[SIZE] - log(2));
+    contact[k] = contacts_of(f, c);
     double longest = c[SIZE] + hypot(c[E1], c[E2]);
     for (int h = HARMONIC; h < PEAK; h++) longest += fabs(c[h]);
     double reach = exp(longest) + 2 * (f->half_width_m + f->offset_m);
@@ -489,22 +550,26 @@ int64_t draw(const Field *f, int64_t count, const double *each, int64_t n, const
   }
   int64_t there = 0;
   for (int64_t i = 0; i < n; i++) {
-    double no_wide = 1.0, no_share = 1.0, shares = 0.0, sum = 0.0;
+    double no_wide = 1.0, no_share = 1.0, stronger = 0.0;
+    double of_as_is = 0.0, as_is = 0.0, of_drawn = 0.0, drawn = 0.0;
     int hit = 0;
     for (int64_t k = 0; k < count; k++) {
-      double dx = x[i] - UNIT_M * contact[k].each[X], dy = y[i] - UNIT_M * contact[k].each[Y];
-      Pressed p;
+      const double *c = each + COLUMNS * k;
+      double dx = x[i] - UNIT_M * c[X], dy = y[i] - UNIT_M * c[Y];
+      Press p;
       if (dx * dx + dy * dy >= reach2[k]) continue;
-      if (!press(f, contact + k, contact[k].each[HOLE] ? hole + k : NULL, x[i], y[i], 0, &p))
-        continue;
+      if (!press(f, contact + k, c[HOLE] != 0, x[i], y[i], 0, &p)) continue;
       hit = 1;
-      no_wide *= 1 - (f->is_sharp ? p.whole : p.enclosed);
-      no_share *= 1 - p.share, shares += p.share, sum += p.share * p.pressure;
+      no_wide *= 1 - (f->is_sharp ? p.as_is.whole : p.enclosed), no_share *= 1 - p.drawn.share;
+      of_as_is += p.as_is.share, as_is += p.as_is.share * p.as_is.pressure;
+      of_drawn += p.drawn.share, drawn += p.drawn.share * p.drawn.pressure;
+      stronger += p.drawn.share * contact[k].stronger;
     }
     if (points && !hit) continue;
     if (points) points[there] = i;
-    enclosed[there] = 1 - no_wide, share[there] = 1 - no_share;
-    pressure[there++] = sum / fmax(shares, 1e-12);
+    of_as_is = fmax(of_as_is, 1e-12), of_drawn = fmax(of_drawn, 1e-12);
+    enclosed[there] = 1 - no_wide, enclosed_kpa[there] = as_is / of_as_is;
+    share[there] = (1 - no_share) * stronger / of_drawn, pressure[there++] = drawn / of_drawn;
   }
   free(contact), free(reach2);
   return there;
@@ -512,70 +577,64 @@ int64_t draw(const Field *f, int64_t count, const double *each, int64_t n, const
 
 /* Derivatives of what `draw` gives, by the parameters that are free; see `_Contacts.slopes`.
  *
- * index: (count, COLUMNS) place of each among `free` parameters, -1 where it is fixed. Out: three of
+ * index: (count, COLUMNS) place of each among `free` parameters, -1 where it is fixed. Out: four of
  * (n, parameters). Returns -1 without memory.
  */
 int draw_slopes(const Field *f, int64_t count, const double *each, int64_t n, const double *x,
                 const double *y, const int64_t *index, int64_t parameters, double *by_enclosed,
-                double *by_share, double *by_pressure) {
-  Contact *contact = malloc(sizeof(Contact) * (2 * count + 1)), *hole = contact + count;
-  Pressed *pressed = malloc(sizeof(Pressed) * (count + 1));
+                double *by_enclosed_kpa, double *by_share, double *by_pressure) {
+  Contacts *contact = malloc(sizeof(Contacts) * (count + 1));
+  Press *pressed = malloc(sizeof(Press) * (count + 1));
   int64_t *of = malloc(sizeof(int64_t) * (count + 1));
   if (!contact || !pressed || !of) {
     free(contact), free(pressed), free(of);
     return -1;
   }
-  for (int64_t k = 0; k < count; k++) {
-    contact[k] = contact_of(each + COLUMNS * k, each[COLUMNS * k + SIZE]);
-    hole[k] = contact_of(each + COLUMNS * k, each[COLUMNS * k + SIZE] - log(2));
-  }
+  for (int64_t k = 0; k < count; k++) contact[k] = contacts_of(f, each + COLUMNS * k);
   size_t size = sizeof(double) * n * parameters;
-  memset(by_enclosed, 0, size), memset(by_share, 0, size), memset(by_pressure, 0, size);
+  memset(by_enclosed, 0, size), memset(by_enclosed_kpa, 0, size);
+  memset(by_share, 0, size), memset(by_pressure, 0, size);
   for (int64_t i = 0; i < n; i++) {
     int there = 0;
-    double sum = 0.0, mean = 0.0;
+    double of_as_is = 0.0, as_is = 0.0, of_drawn = 0.0, drawn = 0.0, stronger = 0.0;
+    double no_share = 1.0;
     for (int64_t k = 0; k < count; k++) {
-      int ring = contact[k].each[HOLE] != 0 || index[COLUMNS * k + HOLE] >= 0;
-      if (!press(f, contact + k, ring ? hole + k : NULL, x[i], y[i], 1, pressed + there)) continue;
-      sum += pressed[there].share, mean += pressed[there].share * pressed[there].pressure;
+      int is_ring = each[COLUMNS * k + HOLE] != 0 || index[COLUMNS * k + HOLE] >= 0;
+      Press *p = pressed + there;
+      if (!press(f, contact + k, is_ring, x[i], y[i], 1, p)) continue;
+      of_as_is += p->as_is.share, as_is += p->as_is.share * p->as_is.pressure;
+      of_drawn += p->drawn.share, drawn += p->drawn.share * p->drawn.pressure;
+      stronger += p->drawn.share * contact[k].stronger, no_share *= 1 - p->drawn.share;
       of[there++] = k;
     }
-    sum = fmax(sum, 1e-12), mean /= sum;
+    of_as_is = fmax(of_as_is, 1e-12), as_is /= of_as_is;
+    of_drawn = fmax(of_drawn, 1e-12), drawn /= of_drawn, stronger /= of_drawn;
     for (int j = 0; j < there; j++) {
-      const Pressed *p = pressed + j;
-      const Contact *c = contact + of[j];
+      const Press *p = pressed + j;
+      const Contacts *with = contact + of[j];
+      const double *c = each + COLUMNS * of[j];
+      const int64_t *places = index + COLUMNS * of[j];
       double others_wide = 1.0, others_share = 1.0; /* what is pressed twice is pressed once */
       for (int o = 0; o < there; o++)
-        if (o != j) others_wide *= 1 - pressed[o].enclosed, others_share *= 1 - pressed[o].share;
-      double edge = c->each[EDGE], unit = f->unit_kpa;
-      double by_whole = step_slope(p->outline.t / GRADED_WIDTH) / GRADED_WIDTH * p->left;
-      double by_wide = step_slope(p->wide), by_depth = 0.0, by_q = 0.0, away = 0.0;
-      if (c->each[HOLE] != 0) away = c->each[HOLE] * p->whole * step_slope(p->hole.t);
-      if (edge != 0) {
-        by_depth = unit * c->each[PEAK] * edge * p->profile / p->depth;
-        if (p->outline.log_q < 1.0)
-          by_q = by_depth * 0.5 * (1 + p->fall / p->root) * -2 * (1 - p->fall);
-      }
+        if (o != j) others_wide *= 1 - pressed[o].enclosed, others_share *= 1 - pressed[o].drawn.share;
+      double by_wide = step_slope(p->wide), own[2][COLUMNS], share[COLUMNS], kpa[COLUMNS];
+      int is_ring = c[HOLE] != 0 || places[HOLE] >= 0;
+      by_parameters(f, c, &p->as_is, is_ring, own[0], own[1]);
+      by_parameters(f, c, &p->drawn, is_ring, share, kpa);
+      share[EDGE] = with->by_edge * share[SIZE], share[SIZE] += with->by_size * share[SIZE];
+      kpa[EDGE] += with->by_edge * kpa[SIZE], kpa[SIZE] += with->by_size * kpa[SIZE];
       for (int q = 0; q < COLUMNS; q++) {
-        int64_t place = index[COLUMNS * of[j] + q];
-        if (place < 0) continue;
-        double wide = 0.0, share = 0.0, pressure = 0.0;
-        if (q < f->forms) {
-          wide = by_wide * p->outline.by_t[q], share = by_whole * p->outline.by_t[q];
-          if (away != 0) share -= away * p->hole.by_t[q];
-          pressure = by_q * p->outline.by_log_q[q];
-          if (q == SIZE) pressure -= by_depth * 2 * p->rim * p->rim / p->root;
-        } else if (q == HOLE) {
-          share = -p->whole * step(f, p->hole.t);
-        } else if (q == PEAK) {
-          pressure = unit * p->profile;
-        } else if (q == EDGE) {
-          pressure = p->pressure * log(p->depth);
-        }
-        by_enclosed[i * parameters + place] = wide * others_wide;
-        by_share[i * parameters + place] = share * others_share;
-        by_pressure[i * parameters + place] =
-            share * (p->pressure - mean) / sum + pressure * p->share / sum;
+        if (places[q] < 0) continue;
+        int64_t at = i * parameters + places[q];
+        double by = q == SIZE ? with->by_size : q == EDGE ? with->by_edge : 0.0;
+        double strength = share[q] * (with->stronger - stronger) -
+                          2 * by * with->stronger * p->drawn.share;
+        by_enclosed[at] = q < f->forms ? by_wide * p->as_is.outline.by_t[q] * others_wide : 0.0;
+        by_enclosed_kpa[at] =
+            (own[0][q] * (p->as_is.pressure - as_is) + own[1][q] * p->as_is.share) / of_as_is;
+        by_share[at] = share[q] * others_share * stronger + (1 - no_share) * strength / of_drawn;
+        by_pressure[at] =
+            (share[q] * (p->drawn.pressure - drawn) + kpa[q] * p->drawn.share) / of_drawn;
       }
     }
   }

@@ -39,9 +39,9 @@ def _loaded() -> ctypes.CDLL | None:
     library.apply_rim_law.argtypes = [array, array, count, array, array]
     library.solve.argtypes = [array, array, ctypes.c_int, *[array] * 6]
     library.differentiate.argtypes = [*[array] * 5, count, array, array]
-    library.draw.argtypes = [array, count, array, count, *[array] * 6]
+    library.draw.argtypes = [array, count, array, count, *[array] * 7]
     library.draw.restype = count
-    library.draw_slopes.argtypes = [array, count, array, count, *[array] * 3, count, *[array] * 3]
+    library.draw_slopes.argtypes = [array, count, array, count, *[array] * 3, count, *[array] * 4]
     return library
 
 

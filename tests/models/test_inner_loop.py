@@ -80,7 +80,7 @@ def test_contacts_are_drawn_alike(
 
     def drawn() -> tuple[FloatArray | IntArray, ...]:
         made = field.draw(field.join(each))
-        shares = made.enclosed, made.share, made.pressure_kpa
+        shares = made.enclosed, made.enclosed_kpa, made.share, made.pressure_kpa
         return (made.nodes, *shares, *made.slopes(), *field.sampled(each, x_m, y_m, 1e-3))
 
     compiled = drawn()

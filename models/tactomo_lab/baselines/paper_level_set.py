@@ -63,7 +63,7 @@ class PaperLevelSet:
     def jacobian(self, mu: FloatArray) -> FloatArray:
         """Derivative (M, K) of `predict`."""
         drawing = self.family.draw(mu)
-        return np.asarray(self._by_node[drawing.nodes].T @ drawing.slopes()[1])
+        return np.asarray(self._by_node[drawing.nodes].T @ drawing.slopes()[0])
 
     def fit(self, measured: Changes, image: FloatArray | Image) -> FittedField:
         """Minimise equation 9 and judge what comes out by the nonlinear model.

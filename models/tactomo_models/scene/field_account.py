@@ -34,14 +34,11 @@ from tactomo_models.scene.sheet_response import GradedResponse, SaturatingRespon
 
 # Shares within one sigma are of tuning scenes of every kind.
 # Of an outline's radius, over the nodes' distance, that no noise accounts for where a pressure is
-# even: with 0.05, 52 % of the areas at 40 dB are within one sigma, with 0.07, 66 %.
+# even: with 0.05, 59 % of rectangles' and rings' areas are within one sigma, with 0.07, 67 %.
 OUTLINE_ERROR = 0.07
 # Sigmas of size and pressure over the fit's own: a form that is not fitted is no surer for that.
 # With 1, 63 % of the magnitudes at 10 dB are within one sigma, with this 69 %.
 UNFITTED = 1.25
-# Relative error of an area and its magnitude where no sheet saturates: a light rim does not show.
-# With none, 50 % of one graded sheet's areas are within one sigma, with 0.15, 58 %.
-LIGHT_RIM = 0.18
 MAP_OUTLINE = 0.05  # `OUTLINE_ERROR` of a map beside a network's, tuned with `auto.NETWORK_ERROR`
 SAMPLES = 3  # per side of a map cell: what an outline covers of it is right to 3 %
 
@@ -225,7 +222,7 @@ class FieldAccountant:
                     np.concatenate([each.centre_inflation for each in data]),
                 )
             )
-            _, by_share, by_pressure = drawing.slopes()
+            by_share, by_pressure = drawing.slopes()[2:]
         cell = self._areas.node_areas_m2[drawing.nodes]
         share, pressure = drawing.share, drawing.pressure_kpa
 
@@ -250,12 +247,11 @@ class FieldAccountant:
         # leaves no step there.
         of_mesh = 2 * self._cell_m / np.sqrt(areas.areas_m2 / np.pi)
         by_outline = np.where(edges > 0, 0.0, OUTLINE_ERROR * of_mesh)
-        by_rim = np.hypot(by_outline, 0.0 if self._saturating else LIGHT_RIM)
         by_area = weight @ signed
         sigmas = np.column_stack(
             [
                 *(sigma(each_off @ signed / area[:, None], displaced) for each_off in off),
-                np.hypot(sigma(by_area), by_rim * areas.areas_m2),
+                np.hypot(sigma(by_area), by_outline * areas.areas_m2),
             ]
         )
         known["areas"] = replace(areas, sigmas=sigmas)
@@ -265,7 +261,7 @@ class FieldAccountant:
         known["magnitudes"] = (weight @ (share * size)) / area
         by_magnitude = signed * (size[:, None]) + (share * slope)[:, None] * by_pressure
         by_mean = (weight @ by_magnitude - known["magnitudes"][:, None] * by_area) / area[:, None]
-        known["magnitude_sigmas"] = np.hypot(sigma(by_mean), by_rim * known["magnitudes"])
+        known["magnitude_sigmas"] = np.hypot(sigma(by_mean), by_outline * known["magnitudes"])
         of_area = sigma(by_area, together) / areas.areas_m2
         of_size = sigma(by_mean, together) / np.maximum(known["magnitudes"], 1e-12)
         of_map = (MAP_OUTLINE * of_mesh) ** 2

@@ -195,8 +195,7 @@ class FieldFit:
         solutions = dict(solved or {})
         for name in [each for each in measured if each not in solutions]:
             response, forward = self.responses[name], self.sheet(name)
-            share = _seen(name, drawing)
-            ratio = response.conductivity(share, drawing.pressure_kpa, log_ratio)[0]
+            ratio = response.conductivity(*_seen(name, drawing), log_ratio)[0]
             change = np.zeros(len(forward.bare.pressable))
             change[drawing.nodes] = forward.at_rest[drawing.nodes] * (ratio - 1)
             solutions[name] = forward.solve(
@@ -245,15 +244,15 @@ class FieldFit:
             (sum M, N + 1).
         """
         drawing = drawing or fitted.drawing
-        enclosed, share, pressure = drawing.slopes()
+        slopes = drawing.slopes()
         sheets = []
         for name, changes in measured.items():
             _, by_share, by_pressure, by_log_ratio = self.responses[name].conductivity(
-                _seen(name, drawing), drawing.pressure_kpa, fitted.log_ratio
+                *_seen(name, drawing), fitted.log_ratio
             )
-            seen = enclosed if name == Channel.STRUCTURE else share
+            share, pressure = slopes[:2] if name == Channel.STRUCTURE else slopes[2:]
             onto = np.empty((len(drawing.nodes), share.shape[1] + 1))
-            onto[:, :-1] = by_share[:, None] * seen + by_pressure[:, None] * pressure
+            onto[:, :-1] = by_share[:, None] * share + by_pressure[:, None] * pressure
             onto[:, -1] = by_log_ratio
             forward = self.sheet(name)
             onto *= forward.at_rest[drawing.nodes, None]
@@ -330,9 +329,11 @@ class FieldFit:
         return replace(fitted, damping=damping)
 
 
-def _seen(name: Channel, drawing: Drawing) -> FloatArray:
-    """The share (n,) that a sheet shows as pressed."""
-    return drawing.enclosed if name == Channel.STRUCTURE else drawing.share
+def _seen(name: Channel, drawing: Drawing) -> tuple[FloatArray, FloatArray]:
+    """The share (n,) that a sheet shows as pressed, and the pressure (n,) on it."""
+    if name == Channel.STRUCTURE:
+        return drawing.enclosed, drawing.enclosed_kpa
+    return drawing.share, drawing.pressure_kpa
 
 
 def covariance_of(

@@ -21,6 +21,7 @@ from tactomo_models.scene.pressure_field import (
     PRIOR_SIGMA,
     Drawing,
     PressureField,
+    Slopes,
     heaviside,
     heaviside_slope,
 )
@@ -114,16 +115,16 @@ class LevelSet:
             pressure = self._field.unit_kpa * parameters[kernels + self._owner[nodes]]
 
         @cache
-        def slopes() -> tuple[FloatArray, FloatArray, FloatArray]:
+        def slopes() -> Slopes:
             by_share = np.zeros((len(nodes), len(parameters)))
             by_share[:, :kernels] = self._slope(f[nodes])[:, None] * self.kernels[nodes]
             by_pressure = np.zeros_like(by_share)
             if self._field is not None:
                 owner = kernels + self._owner[nodes]
                 by_pressure[np.arange(len(nodes)), owner] = self._field.unit_kpa
-            return by_share, by_share, by_pressure
+            return by_share, by_pressure, by_share, by_pressure
 
-        return Drawing(nodes, share[nodes], share[nodes], pressure, slopes)
+        return Drawing(nodes, share[nodes], pressure, share[nodes], pressure, slopes)
 
     def _step(self, f: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Share pressed, and where it is not 0 or may become so."""

@@ -19,6 +19,7 @@ from tactomo_models.arrays import FloatArray
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.sensor.response import MagnitudeResponse, StructureChannel
 
+LEAST = 0.01  # conductivity ratio: a falling table must not fall through zero
 ROUNDING = 1e-12  # of a change: at the onset it is 0
 
 
@@ -80,16 +81,17 @@ class GradedResponse:
         slope = self._slopes[piece]
         change = self.change[piece] + slope * (pressure_kpa - self.pressure_kpa[piece])
         change = np.where(np.abs(change) < ROUNDING, 0.0, change)
-        # A falling table must not fall through zero.
-        least = -0.99
-        return np.maximum(change, least), np.where(change > least, slope, 0.0)
+        return np.maximum(change, LEAST - 1), np.where(change > LEAST - 1, slope, 0.0)
 
     def conductivity(
         self, share: FloatArray, pressure_kpa: FloatArray, log_ratio: float
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """See `SheetResponse`."""
         change, slope = self.relative_change(pressure_kpa)
-        return 1 + share * change, change, share * slope, np.zeros(len(share))
+        sigma = 1 + share * change
+        there = sigma > LEAST  # a small contact's share may be drawn above 1
+        by_share, by_pressure = np.where(there, change, 0.0), np.where(there, share * slope, 0.0)
+        return np.maximum(sigma, LEAST), by_share, by_pressure, np.zeros(len(share))
 
     def rises(self, log_ratio: float) -> bool:
         """See `SheetResponse`."""

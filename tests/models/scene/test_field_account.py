@@ -13,7 +13,6 @@ from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scene.areas import AreaFinder
 from tactomo_models.scene.field_account import (
-    LIGHT_RIM,
     OUTLINE_ERROR,
     UNFITTED,
     Doubt,
@@ -201,7 +200,6 @@ def test_numbers_scatter_as_their_uncertainties_say(sensor: Sensor, kind: str) -
     The graded sheet keeps magnitude times area, so a force goes with the onset's share of it.
     """
     by_area = {"area": 1, "magnitude": -1, "peak magnitude": -1, "force": force_by_area(sensor)}
-    rim = 0.0 if Channel.STRUCTURE in sensor.fit.responses else LIGHT_RIM
     outline = 0.0 if kind == "soft" else 2 * OUTLINE_ERROR * 0.003 / RADIUS_M
     sigma, rng = 0.02, np.random.default_rng(9)
     accounts, off = accountant(sensor), []
@@ -216,13 +214,12 @@ def test_numbers_scatter_as_their_uncertainties_say(sensor: Sensor, kind: str) -
         found = sensor.settled(sensor.fit.compare(truth, data), data)
         account = accounts.account(found, data)
         assert len(account.areas) == 1
-        of_mesh, of_rim = rng.standard_normal(2) * (outline, rim)
+        of_mesh = outline * rng.standard_normal()
         errors = []
         for name, of in NUMBERS.items():
             (value, said), true_value = of(account), of(exact)[0]
-            off_by = of_mesh + of_rim * (name in ("area", "magnitude"))
             error = (value - true_value) * (1 if name == "x" else UNFITTED)
-            errors.append((error / said + by_area.get(name, 0) * off_by * true_value / said)[0])
+            errors.append((error / said + by_area.get(name, 0) * of_mesh * true_value / said)[0])
         off.append(errors)
     within = dict(zip(NUMBERS, np.mean(np.abs(off) < 1, axis=0), strict=True))
     # Where a peak's range cuts off what noise alone would have it, it is better known than it says.

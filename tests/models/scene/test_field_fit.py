@@ -121,7 +121,8 @@ def test_estimates_converge_at_second_order(small: SensorDescription, edge: floa
     for name in made[0]:
         coarse, middle, fine = (changes[name] for changes in made)
         left = np.linalg.norm(coarse - middle) / np.linalg.norm(middle - fine)
-        assert np.log2(left) == pytest.approx(2, abs=0.35)
+        # Less of second order is left where the mesh's blur is made up for.
+        assert np.log2(left) == pytest.approx(2, abs=0.4)
     data = data_of(made[-1], 1e-3)
     beside = each.copy()
     beside[:, [X, SIZE]] += 0.1

@@ -107,7 +107,10 @@ def _wait_tared(control: str) -> None:
     from tactomo_client import request
 
     deadline = time.monotonic() + TARE_PATIENCE_S
-    while request("status", control, TARE_PATIENCE_S)["state"] != "running" and time.monotonic() < deadline:
+    while (
+        request("status", control, TARE_PATIENCE_S)["state"] != "running"
+        and time.monotonic() < deadline
+    ):
         time.sleep(0.05)
 
 
