@@ -121,9 +121,8 @@ class PressureField:
         """
         offset = 0.05  # see above
         # A triangle has the mean of its corners, which spreads what is on a node over its hexagon;
-        # and then there is the step from 1 to 0. Without noise on one graded sheet, flat presses of
-        # 8 to 15 mm and 80 to 250 kPa err by 5 % in peak and 0 in area; not minding the blur, by 19
-        # and -12 %, and ordinary scenes lose 0.001 (40 dB) to 0.006 (20 dB) of ICC.
+        # and then there is the step from 1 to 0. ICC of tuning scenes without and with it: 0.989,
+        # 0.991 at 40 dB, 0.954, 0.960 at 20 dB, 0.979, 0.981 of one graded sheet.
         of_triangles, of_step = 5 / 18, 1 / 3 - 2 / np.pi**2
         least, beyond = 0.01, 1.3  # of the table's end, that a peak may come to
         x, y = np.ascontiguousarray(forward.bare.points[:, forward.bare.pressable])
