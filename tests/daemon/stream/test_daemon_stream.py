@@ -119,11 +119,13 @@ def test_a_map_is_made_for_subscribers_alone(bench: Start) -> None:
     b.until(lambda: b.ask("status")["subscribers"] == 4)
     counter = b.skin.scan()
     b.listener.wait("contacts", lambda c: c["scan_counter"] == counter)
-    maps = len(b.listener.of("map"))
     b.listener.socket.setsockopt(zmq.SUBSCRIBE, topic("left", "map"))
     b.until(lambda: b.ask("status")["subscribers"] == 5)
     b.step()
-    assert [m["sequence"] for m in b.listener.of("map")] == list(range(1, maps + 2))
+    maps = b.listener.of("map")
+    assert counter not in [m["scan_counter"] for m in maps]
+    # None was numbered that was not sent; a busy computer may make two of a scan.
+    assert [m["sequence"] for m in maps] == list(range(1, len(maps) + 1))
 
 
 def test_a_stalled_subscriber_slows_nobody(bench: Start, connect: Start) -> None:
