@@ -7,12 +7,14 @@ and `stream`, whose they are; `keys`, a folder, for a daemon beyond this compute
 
 from __future__ import annotations
 
+import signal
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from tactomo_client import DEFAULT_STREAM, ClientError, subscribe
 from tactomo_client.placement import Placement
 from tactomo_ros2.live import run
@@ -22,21 +24,23 @@ DEPTH = 10  # messages kept for a slow reader: half a second at 20 frames a seco
 
 
 def main() -> None:
-    """Publish until ROS shuts down."""
-    rclpy.init()
+    """Publish until Ctrl-C, SIGTERM, or ROS shuts down."""
+    # Ours, from the first moment: those of rclpy raise KeyboardInterrupt beside, wherever we are.
+    stops: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: stops.append(number))
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = Node("tactomo")
     try:
-        _publish(node)
+        _publish(node, lambda: bool(stops) or not rclpy.ok())
     except (ClientError, ValueError) as error:
         node.get_logger().fatal(f"{error}")
         raise SystemExit(1) from None
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
     finally:
         rclpy.try_shutdown()
 
 
-def _publish(node: Node) -> None:
+def _publish(node: Node, is_over: Callable[[], bool]) -> None:
     def parameter(name: str, default: Any) -> Any:
         return node.declare_parameter(name, default).value
 
@@ -57,4 +61,4 @@ def _publish(node: Node) -> None:
     placement = Placement.parse(parent, pose) if parent else None
     with subscribe(sensor, address=stream, keys=keys or None) as skin:
         node.get_logger().info(f"publishing {sensor} of {stream}")
-        run(skin, publish, lambda: not rclpy.ok(), placement)
+        run(skin, publish, is_over, placement)
