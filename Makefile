@@ -28,7 +28,7 @@ LOCKED := pyproject.toml --universal --python-version 3.11 --generate-hashes \
 ON_ARM := --python-version 3.11 --python-platform aarch64-manylinux_2_28 --only-binary :all: \
   --no-emit-package tactomo-client --no-emit-package tactomo --no-annotate
 
-.PHONY: help setup run test test-all test-again test-long test-train test-peers faults soak fleet firmware fuzz lint format bench docs wheels deb lock clean
+.PHONY: help setup run test test-all test-long test-train test-peers faults soak fleet firmware fuzz lint format bench docs wheels deb lock clean
 
 help:            ## list these targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -41,12 +41,9 @@ run: $(RUN_READY)  ## twin, daemon and viewer: a skin to press in the browser
 test: $(READY)   ## the default test suite
 	$(BIN)/pytest -n auto --dist loadfile $(ARGS)
 
-EVERY := -m 'not long and not train and not peers and not faults' --hypothesis-profile many
 test-all: $(READY)  ## every test but the long ones, training and faults; more examples in each
-	$(BIN)/pytest -n auto --dist loadfile $(EVERY) $(ARGS)
-
-test-again: $(READY)  ## what failed last, by itself: live programs miss each other on a busy machine
-	$(BIN)/pytest --last-failed --last-failed-no-failures none $(EVERY) $(ARGS)
+	$(BIN)/pytest -n auto --dist loadfile -m 'not long and not train and not peers and not faults' \
+	  --hypothesis-profile many $(ARGS)
 
 test-long: $(READY)  ## statistics, measured sets and days of drift: minutes each
 	$(BIN)/pytest -m long $(ARGS)

@@ -362,12 +362,12 @@ typedef struct {
   double B[2][2], dB[3][2][2];
 } Contact;
 
-/* A contact and its hole as they are, and as they are drawn on a graded sheet: smaller, and stronger,
+/* One contact and its hole as they are, and as they are drawn on a graded sheet: smaller, and stronger,
  * for the mesh's blur; how the logarithm of that size goes by that of its own, over 1, and by gamma. */
 typedef struct {
   Contact as_is, hole, smaller, smaller_hole;
   double stronger, by_size, by_edge;
-} Contacts;
+} Sizes;
 
 /* An outline at a point: t = phi / w, log q, and their derivatives by the form. */
 typedef struct {
@@ -391,11 +391,11 @@ static Contact contact_of(const double *each, double size) {
   return c;
 }
 
-static Contacts contacts_of(const Field *f, const double *each) {
+static Sizes sizes_of(const Field *f, const double *each) {
   double moment = 2 * (each[EDGE] + 2), blur = moment * f->blur_m2 * exp(-2 * each[SIZE]);
   double held = tanh(blur / MOST_BLURRED), left = 1 - MOST_BLURRED * held;
   double size = each[SIZE] + log(left) / 2, by_size = blur * (1 - held * held) / left;
-  return (Contacts){.as_is = contact_of(each, each[SIZE]),
+  return (Sizes){.as_is = contact_of(each, each[SIZE]),
                     .hole = contact_of(each, each[SIZE] - log(2)),
                     .smaller = contact_of(each, size),
                     .smaller_hole = contact_of(each, size - log(2)),
@@ -464,7 +464,7 @@ typedef struct {
   double whole, left, share, fall, root, rim, depth, profile, pressure;
 } Pressed;
 
-/* It as it is and as it is drawn on a graded sheet. */
+/* The same of a contact as it is, and as it is drawn on a graded sheet. */
 typedef struct {
   Pressed as_is, drawn;
   double wide, enclosed;
@@ -487,18 +487,19 @@ static void press_by(const Field *f, const Contact *c, const Contact *hole, doub
 }
 
 /* Whether a contact reaches a point, and what it does there. */
-static int press(const Field *f, const Contacts *c, int is_ring, double x, double y,
+static int press(const Field *f, const Sizes *c, int is_ring, double x, double y,
                  int with_slopes, Press *p) {
   p->as_is.outline = outline_at(f, &c->as_is, x, y, with_slopes);
   p->wide = p->as_is.outline.t + f->offset_m / f->half_width_m;
   if (p->wide <= -1) return 0;
   p->enclosed = step(f, p->wide);
   press_by(f, &c->as_is, is_ring ? &c->hole : NULL, x, y, with_slopes, &p->as_is);
-  p->drawn = p->as_is;
-  if (f->blur_m2 > 0) {
-    p->drawn.outline = outline_at(f, &c->smaller, x, y, with_slopes);
-    press_by(f, &c->smaller, is_ring ? &c->smaller_hole : NULL, x, y, with_slopes, &p->drawn);
+  if (f->is_sharp) { /* no mesh that blurs */
+    p->drawn = p->as_is;
+    return 1;
   }
+  p->drawn.outline = outline_at(f, &c->smaller, x, y, with_slopes);
+  press_by(f, &c->smaller, is_ring ? &c->smaller_hole : NULL, x, y, with_slopes, &p->drawn);
   return 1;
 }
 
@@ -534,7 +535,7 @@ static void by_parameters(const Field *f, const double *c, const Pressed *p, int
 int64_t draw(const Field *f, int64_t count, const double *each, int64_t n, const double *x,
              const double *y, int64_t *points, double *enclosed, double *enclosed_kpa,
              double *share, double *pressure) {
-  Contacts *contact = malloc(sizeof(Contacts) * (count + 1));
+  Sizes *contact = malloc(sizeof(Sizes) * (count + 1));
   double *reach2 = malloc(sizeof(double) * (count + 1));
   if (!contact || !reach2) {
     free(contact), free(reach2);
@@ -542,7 +543,7 @@ int64_t draw(const Field *f, int64_t count, const double *each, int64_t n, const
   }
   for (int64_t k = 0; k < count; k++) {
     const double *c = each + COLUMNS * k;
-    contact[k] = contacts_of(f, c);
+    contact[k] = sizes_of(f, c);
     double longest = c[SIZE] + hypot(c[E1], c[E2]);
     for (int h = HARMONIC; h < PEAK; h++) longest += fabs(c[h]);
     double reach = exp(longest) + 2 * (f->half_width_m + f->offset_m);
@@ -583,14 +584,14 @@ int64_t draw(const Field *f, int64_t count, const double *each, int64_t n, const
 int draw_slopes(const Field *f, int64_t count, const double *each, int64_t n, const double *x,
                 const double *y, const int64_t *index, int64_t parameters, double *by_enclosed,
                 double *by_enclosed_kpa, double *by_share, double *by_pressure) {
-  Contacts *contact = malloc(sizeof(Contacts) * (count + 1));
+  Sizes *contact = malloc(sizeof(Sizes) * (count + 1));
   Press *pressed = malloc(sizeof(Press) * (count + 1));
   int64_t *of = malloc(sizeof(int64_t) * (count + 1));
   if (!contact || !pressed || !of) {
     free(contact), free(pressed), free(of);
     return -1;
   }
-  for (int64_t k = 0; k < count; k++) contact[k] = contacts_of(f, each + COLUMNS * k);
+  for (int64_t k = 0; k < count; k++) contact[k] = sizes_of(f, each + COLUMNS * k);
   size_t size = sizeof(double) * n * parameters;
   memset(by_enclosed, 0, size), memset(by_enclosed_kpa, 0, size);
   memset(by_share, 0, size), memset(by_pressure, 0, size);
@@ -611,7 +612,7 @@ int draw_slopes(const Field *f, int64_t count, const double *each, int64_t n, co
     of_drawn = fmax(of_drawn, 1e-12), drawn /= of_drawn, stronger /= of_drawn;
     for (int j = 0; j < there; j++) {
       const Press *p = pressed + j;
-      const Contacts *with = contact + of[j];
+      const Sizes *sizes = contact + of[j];
       const double *c = each + COLUMNS * of[j];
       const int64_t *places = index + COLUMNS * of[j];
       double others_wide = 1.0, others_share = 1.0; /* what is pressed twice is pressed once */
@@ -621,14 +622,14 @@ int draw_slopes(const Field *f, int64_t count, const double *each, int64_t n, co
       int is_ring = c[HOLE] != 0 || places[HOLE] >= 0;
       by_parameters(f, c, &p->as_is, is_ring, own[0], own[1]);
       by_parameters(f, c, &p->drawn, is_ring, share, kpa);
-      share[EDGE] = with->by_edge * share[SIZE], share[SIZE] += with->by_size * share[SIZE];
-      kpa[EDGE] += with->by_edge * kpa[SIZE], kpa[SIZE] += with->by_size * kpa[SIZE];
+      share[EDGE] = sizes->by_edge * share[SIZE], share[SIZE] += sizes->by_size * share[SIZE];
+      kpa[EDGE] += sizes->by_edge * kpa[SIZE], kpa[SIZE] += sizes->by_size * kpa[SIZE];
       for (int q = 0; q < COLUMNS; q++) {
         if (places[q] < 0) continue;
         int64_t at = i * parameters + places[q];
-        double by = q == SIZE ? with->by_size : q == EDGE ? with->by_edge : 0.0;
-        double strength = share[q] * (with->stronger - stronger) -
-                          2 * by * with->stronger * p->drawn.share;
+        double by = q == SIZE ? sizes->by_size : q == EDGE ? sizes->by_edge : 0.0;
+        double strength = share[q] * (sizes->stronger - stronger) -
+                          2 * by * sizes->stronger * p->drawn.share;
         by_enclosed[at] = q < f->forms ? by_wide * p->as_is.outline.by_t[q] * others_wide : 0.0;
         by_enclosed_kpa[at] =
             (own[0][q] * (p->as_is.pressure - as_is) + own[1][q] * p->as_is.share) / of_as_is;

@@ -31,7 +31,7 @@ NETWORK_ERROR: Final = 0.2
 NEGLIGIBLE: Final = 0.1  # share of a network's map that is not worth asking for
 # Contacts, of more of which a network's map is no help to a field that explains the data: with it
 # ICC of five and six is 0.985 for 0.991, of eight to ten 0.912 for 0.921.
-FEW: Final = 4
+HEDGED: Final = 4
 
 
 class Auto(OutlineFit):
@@ -92,7 +92,7 @@ class Auto(OutlineFit):
         """
         unsure = account.uncertainty**2
         share = unsure / (unsure + NETWORK_ERROR**2)
-        if own.map is None or not share > NEGLIGIBLE or len(account.areas) > FEW:
+        if own.map is None or not share > NEGLIGIBLE or len(account.areas) > HEDGED:
             return own
         if self._hedge is None or self._hedge[0] is not account:
             with measurement.timed("network"):

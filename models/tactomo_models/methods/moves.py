@@ -146,8 +146,7 @@ class Moves:
         inside: list[Move] = [partial(self._with, question) for question in questions]
         crowd = shape.family.count >= CROWD
         # What one sheet takes for one contact of a crowd, both are asked for afterwards.
-        later = crowd and len(frame.measured) < len(self.fit.responses)
-        splits = self._splits(shape, crowd and not later)
+        splits = self._splits(shape, crowd and len(frame.measured) == len(self.fit.responses))
         form = [self._of_higher_order, self._modulate, *inside, *splits]
         if shape.misfit > GOOD_MISFIT or crowd:
             form += [self._birth_anywhere(k) for k in range(ASKED_OF_CROWD if crowd else 1)]

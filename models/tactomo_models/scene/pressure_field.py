@@ -362,7 +362,7 @@ class _Contacts:
         forms = self._of.forms
         as_is, pressures = self._as_is.slopes()
         wide = np.zeros_like(as_is)
-        wide[:, :forms] = heaviside_slope(self.wide)[:, None] * self._as_is.outline.slopes()[0]
+        wide[:, :forms] = heaviside_slope(self.wide)[:, None] * self._as_is.outline.slopes[0]
         enclosed_kpa = self._as_is.slopes_of_mean(as_is, pressures, self._as_is.pressures)
         shares, pressures = self._drawn.slopes()
         for slopes in (shares, pressures):  # so far by the size that is drawn
@@ -424,7 +424,7 @@ class _Pressed:
     def slopes(self) -> tuple[FloatArray, FloatArray]:
         """Derivatives (K, COLUMNS, n) of each contact's share and pressure."""
         of, each, forms = self._of, self._each, self._of.forms
-        by_t, by_log_q = self.outline.slopes()
+        by_t, by_log_q = self.outline.slopes
         shares, pressures = np.zeros((2, len(each), COLUMNS, self.shares.shape[1]))
         shares[:, :forms] = (
             heaviside_slope(self.outline.t / GRADED_WIDTH) / GRADED_WIDTH * self._left
@@ -434,7 +434,7 @@ class _Pressed:
             shares[:, HOLE] = -self.whole * heaviside(inner.t)
             if self._inner is not None:
                 away = self._hole * self.whole * heaviside_slope(inner.t)
-                shares[:, :forms] -= away[:, None] * inner.slopes()[0]
+                shares[:, :forms] -= away[:, None] * inner.slopes[0]
         peak, edge = of.unit_kpa * each[:, PEAK, None], each[:, EDGE, None]
         pressures[:, PEAK] = of.unit_kpa * self._profile
         pressures[:, EDGE] = self.pressures * np.log(self._depth)
@@ -488,6 +488,7 @@ class _Outlines:
         self._depth_slope = -inner
         self.t = self._depth * self._scale / of.half_width_m
 
+    @cached_property
     def slopes(self) -> tuple[FloatArray, FloatArray]:
         """Derivatives (K, forms, n) of t and of log q; each parameter moves u by du and B by dB."""
         B, u, v = self._B, self._u, self._v
