@@ -114,7 +114,8 @@ def train(
         float | None, typer.Option(min=1e-6, max=1.0, help="Learning rate. [the configuration's]")
     ] = None,
     start: Annotated[
-        Path | None, typer.Option(help="Begin with the weights of this checkpoint.")
+        Path | None,
+        typer.Option(help="Begin with the weights of this checkpoint, or of our network, .onnx."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of weights, order, noise and turns.")] = 0,
     device: Annotated[Literal["cpu", "cuda"], typer.Option(help="What computes.")] = "cpu",

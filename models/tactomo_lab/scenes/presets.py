@@ -33,22 +33,26 @@ PAPER_CHANGE = (0.05, 0.25)  # 0.95 to 0.75 S/m in a sheet of 1 S/m
 PAPER_CONTRAST = 100.0
 PAPER_HALF_AXIS_M = (0.007, 0.020)  # the paper leaves sizes open
 
-ROBUST_CONTACTS = (0.03, 0.22, 0.22, 0.22, 0.20, 0.07, 0.04)  # shares of scenes with 0 to 6
+# Shares of scenes with none to ten contacts.
+ROBUST_CONTACTS = (0.03, 0.20, 0.20, 0.18, 0.16, 0.06, 0.06, 0.03, 0.03, 0.03, 0.02)
 ROBUST_HALF_AXIS_M = (0.005, 0.023)
+CROWD = 5  # contacts, from which on they are small, for there is no room for others
+CROWDED_HALF_AXIS_M = (0.005, 0.012)
 MAX_ASPECT = 2.2
 RING_HALF_AXIS_M = 0.010  # least of a ring
 ROBUST_SHAPES: Final[dict[Shape, float]] = {"ellipse": 0.40, "rectangle": 0.35, "ring": 0.25}
 # Shares of contacts by pressure: measurable, too light to be measured, beyond the range.
 ROBUST_PRESSURE_KPA = ((0.70, 140.0, 210.0), (0.15, 20.0, 140.0), (0.15, 200.0, 300.0))
-DOMES = 0.15  # share of contacts, all ellipses, whose pressure falls towards their rim
+SOFT = 0.2  # share of scenes in which all contacts are soft ellipses: pressure falls to their rim
+DOMES = 0.15  # share of soft contacts in the other scenes, likewise ellipses
 DOME_PEAK = 1.3  # of a dome's pressure, over that of a punch
 ROBUST_GAP_M = 0.004
-MAX_UNEVEN = 0.08  # standard deviation of a sheet's smooth conductivity error
+MAX_UNEVEN = 0.12  # standard deviation of a sheet's smooth conductivity error
 IMPEDANCE_DEVIATION = 0.3  # standard deviation of the logarithm of contact impedances
 SAME_SKIN = 4  # scenes in a row that have the same sheets, which saves a third of the time
 WEAK_ELECTRODES = 0.03  # share of scenes with one whose contact impedance is
 WEAK_FACTOR = (5.0, 50.0)  # so many times the others'
-DISPLACED_M = 0.0007  # standard deviation of the electrodes' places along the rim
+MAX_DISPLACED_M = 0.0014  # standard deviation of the electrodes' places along the rim, at most
 
 
 @dataclass(frozen=True)
@@ -122,21 +126,34 @@ def paper_presses(
 
 
 def _robust(description: SensorDescription, seed: int, number: int) -> TrainingScene:
-    """None to six contacts of any form and pressure, on sheets as uneven as real ones."""
+    """None to ten contacts of any form and pressure, on sheets as uneven as real ones."""
     rng = np.random.default_rng(seed_of("training", "robust", seed, number))
     skin = np.random.default_rng(seed_of("training", "robust skin", seed, number // SAME_SKIN))
     opposite = bool(skin.integers(2))
     sheets = (_sheet_errors(description, skin), _sheet_errors(description, skin))
     count = int(rng.choice(len(ROBUST_CONTACTS), p=ROBUST_CONTACTS))
     gap = scale_of(description) * ROBUST_GAP_M
-    presses = placed_apart(description, rng, count, gap, lambda: _any_press(description, rng))
+    half_axis_m = ROBUST_HALF_AXIS_M if count < CROWD else CROWDED_HALF_AXIS_M
+    soft = bool(rng.random() < SOFT)
+
+    def one() -> Press:
+        return _any_press(description, rng, half_axis_m, soft=soft)
+
+    presses = placed_apart(description, rng, count, gap, one)
     contrast = float(np.exp(rng.uniform(*np.log(CONTRAST))))
     return TrainingScene(presses, contrast, opposite, sheets)
 
 
-def _any_press(description: SensorDescription, rng: np.random.Generator) -> Press:
+def _any_press(
+    description: SensorDescription,
+    rng: np.random.Generator,
+    half_axis_m: tuple[float, float],
+    *,
+    soft: bool,
+) -> Press:
     shape = tuple(ROBUST_SHAPES)[rng.choice(len(ROBUST_SHAPES), p=tuple(ROBUST_SHAPES.values()))]
-    least, most = ROBUST_HALF_AXIS_M
+    shape = "ellipse" if soft else shape
+    least, most = half_axis_m
     least = RING_HALF_AXIS_M if shape == "ring" else least
     scale = scale_of(description)
     least, most = scale * least, scale * most
@@ -144,7 +161,7 @@ def _any_press(description: SensorDescription, rng: np.random.Generator) -> Pres
     shares = [share for share, _, _ in ROBUST_PRESSURE_KPA]
     _, *pressures = ROBUST_PRESSURE_KPA[rng.choice(len(shares), p=shares)]
     low, high = (_pressure_scale(description) * pressure for pressure in pressures)
-    domed = shape == "ellipse" and rng.random() < DOMES / ROBUST_SHAPES["ellipse"]
+    domed = soft or (shape == "ellipse" and rng.random() < DOMES / ROBUST_SHAPES["ellipse"])
     profile: Profile = "dome" if domed else "flat"
     return Press(
         *_anywhere(description, rng),
@@ -216,5 +233,6 @@ def _sheet_errors(description: SensorDescription, rng: np.random.Generator) -> S
         seed=int(rng.integers(2**63)),
         unevenness=rng.uniform(0, MAX_UNEVEN),
         impedance=impedance,
-        displaced_m=scale_of(description) * DISPLACED_M * rng.standard_normal(electrodes),
+        displaced_m=rng.uniform(0, scale_of(description) * MAX_DISPLACED_M)
+        * rng.standard_normal(electrodes),
     )

@@ -19,6 +19,7 @@ from torch import nn
 
 from tactomo_lab.scenes.measures import full_range
 from tactomo_lab.scenes.presets import PresetName
+from tactomo_lab.training import exported
 from tactomo_lab.training.batches import SceneBatches
 from tactomo_lab.training.export import export, notes_of
 from tactomo_lab.training.networks import FusionNetwork, PaperNetwork
@@ -26,6 +27,7 @@ from tactomo_lab.training.objectives import FusionObjective, PaperObjective, lin
 from tactomo_lab.training.train import Objective, Settings, Training, load_weights
 from tactomo_lab.training.training_scenes import read_manifest
 
+NORMALISED_BY = 512  # scenes that an exported network's normalisation is put back by
 BOTH: Final[tuple[Channel, ...]] = (Channel.MAGNITUDE, Channel.STRUCTURE)
 
 
@@ -109,11 +111,15 @@ def prepare(
         forward = ForwardModel(description, load_or_build_artifact(description).bare)
         batches = SceneBatches(folder, description, configuration.channels, forward)
         network = FusionNetwork(batches.inputs, batches.nodes, configuration.width, scale)
+        bases = dict(zip(configuration.channels, batches.bases, strict=True))
         if start is None:
             network.start_linear(linear_images(batches, scale))
+        elif start.suffix == exported.SUFFIX:
+            some = torch.arange(min(NORMALISED_BY, len(batches.trained)))
+            inputs = batches.draw(some, torch.Generator().manual_seed(seed)).inputs
+            exported.load_exported(network, start, bases, inputs)
         else:
             load_weights(network, start)
-        bases = dict(zip(configuration.channels, batches.bases, strict=True))
         return Prepared(configuration, description, network, FusionObjective(batches), scale, bases)
     multimodal = len(configuration.channels) == 2
     objective = PaperObjective(folder, description, multimodal=multimodal, scale=scale)

@@ -56,7 +56,7 @@ REFINEMENTS = 2
 PARTS = 3  # that each side of a triangle is divided into, where its conductivity is averaged
 SHARP_M = 1e-9  # width of an outline: a point lies inside or outside
 SCENES = "scenes"  # begins the names of the files that hold them
-FORMAT = 1  # raise it when what is drawn or simulated changes
+FORMAT = 2  # raise it when what is drawn or simulated changes
 MANIFEST = "manifest.json"
 
 

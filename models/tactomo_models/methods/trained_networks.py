@@ -126,9 +126,8 @@ class FusionNetwork:
         magnitude_error = 0.1  # of the range: two in three of our network's err by no more
         self._network = network
         self._sigma = magnitude_error * float(network.notes["scale"])
-        bases = np.load(io.BytesIO(b64decode(network.notes["bases"])), allow_pickle=False)
         #: (M, K) of each channel's prefilter
-        self.bases = {name: bases[name].astype(np.float64) for name in network.channels}
+        self.bases = bases_of(network.notes)
         self._filters: dict[Channel, tuple[bytes, Prefilter]] = {}
         self._mute = {
             name: prefilter(basis, np.zeros(len(basis))) for name, basis in self.bases.items()
@@ -172,6 +171,17 @@ class FusionNetwork:
         if name not in self._filters or self._filters[name][0] != key:
             self._filters[name] = (key, prefilter(self.bases[name], precision))
         return self._filters[name][1]
+
+
+def bases_of(notes: Mapping[str, str]) -> dict[Channel, FloatArray]:
+    """Bases (M, K) of the prefilters that our network's notes on itself have, by channel.
+
+    Raises:
+        KeyError: there are none.
+        ValueError: they are damaged.
+    """
+    bases = np.load(io.BytesIO(b64decode(notes["bases"])), allow_pickle=False)
+    return {name: bases[name].astype(np.float64) for name in Channel if name in bases}
 
 
 class SensorNetworks:
