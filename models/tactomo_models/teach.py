@@ -21,8 +21,9 @@ from tactomo_models.archive import read_arrays
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 from tactomo_models.batch import read_scans
 from tactomo_models.calibration.calibration_file import Subject
+from tactomo_models.calibration.force_regression import ForceRegression
 from tactomo_models.calibration.press_regression import PressRegression
-from tactomo_models.calibration.taught_skin import TaughtSkin, press_changes
+from tactomo_models.calibration.taught_skin import TaughtSkin, load_of, press_changes
 from tactomo_models.errors import CalibrationError, DataError
 from tactomo_models.reconstruct import Reconstructor
 from tactomo_models.scans.reference import Reference
@@ -55,22 +56,29 @@ class KnownPresses:
     scans: dict[str, FloatArray]  # (P, M) volts of each channel
     reference: Reference  # of the unpressed skin
     xy_mm: FloatArray  # (P, 2) where each was, in the description's frame
+    force_n: FloatArray  # (P,) how hard each was, newtons; NaN where that is not known
 
 
 def read_presses(path: Path, description: SensorDescription) -> KnownPresses:
-    """Read what `tactomo reconstruct` reads, and `xy_mm` (P, 2).
+    """Read what `tactomo reconstruct` reads, `xy_mm` (P, 2) and, if there, `force_n` (P,).
 
     Raises DataError where the file cannot be read or does not fit the sensor.
     """
     scans, reference = read_scans(path, description)
     count = len(next(iter(scans.values())))
-    xy_mm = read_arrays(path).get("xy_mm", np.zeros(0))
+    arrays = read_arrays(path)
+    xy_mm, force_n = arrays.get("xy_mm", np.zeros(0)), arrays.get("force_n", np.full(count, np.nan))
     if xy_mm.dtype.kind not in "fiu" or xy_mm.shape != (count, 2):
         raise DataError(
             f"{path}: xy_mm is {xy_mm.dtype} of shape {xy_mm.shape}; where each of the {count} "
             f"presses was is needed, as real numbers of shape {count} x 2, in mm from the middle"
         )
-    return KnownPresses(scans, reference, xy_mm.astype(np.float64))
+    if force_n.dtype.kind not in "fiu" or force_n.shape != (count,):
+        raise DataError(
+            f"{path}: force_n is {force_n.dtype} of shape {force_n.shape}; give the newtons of "
+            f"each of the {count} presses, NaN where they are not known, or leave it out"
+        )
+    return KnownPresses(scans, reference, xy_mm.astype(np.float64), force_n.astype(np.float64))
 
 
 def teach(
@@ -107,6 +115,9 @@ def teach(
                 "0). Correct them, or leave them out, and run this again; or give --keep-odd"
             )
         best, without_mm, with_mm = _best(changes, xy_mm, guess_mm)
+        loads, force_n = seen.loads[one], presses.force_n[one]
+        force_error, note = _judged_forces(loads, xy_mm, force_n, seen.forces_n[one])
+        notes += note
     channels = tuple(name for name in description.channels if name in presses.scans)
     taught = TaughtSkin(
         subject,
@@ -116,9 +127,12 @@ def teach(
         changes,
         xy_mm,
         guess_mm if best == "corrected" else None,
+        loads,
+        force_n,
         seen.tiers,
         without_mm,
         with_mm,
+        force_error,
         np.array([getattr(presses.reference, name) for name in channels]),
     )
     return taught, [*notes, *(f"{each} is kept against the others" for each in odd)]
@@ -138,6 +152,12 @@ def _check_numbers(presses: KnownPresses, description: SensorDescription) -> Non
             f"all places are within {np.abs(xy_mm).max():.2g} mm of the middle: they seem to be "
             "metres; give millimetres"
         )
+    known = presses.force_n[~np.isnan(presses.force_n)]
+    if not ((known > 0) & np.isfinite(known)).all():
+        raise CalibrationError(
+            f"a force of {known.min():g} N presses nothing: give newtons, above 0 where the skin "
+            "is pressed, and NaN where the force is not known"
+        )
     scans = np.hstack(list(presses.scans.values()))
     for k in range(1, len(scans)):
         if np.array_equal(scans[k], scans[k - 1]):
@@ -153,6 +173,8 @@ class _Seen(NamedTuple):
     changes: FloatArray  # (P, V) of all channels, one after the other
     valid: BoolArray  # (P, V) which of them are
     places_mm: FloatArray  # (P, 2) of each one's contact; NaN where there is none, or several
+    loads: FloatArray  # (P,) of each one's contact, see `load_of`; NaN, likewise
+    forces_n: FloatArray  # (P,) by the physics, likewise
     tiers: frozenset[str]  # what made the contacts
 
 
@@ -166,7 +188,7 @@ def _reconstructed(
     width = len(channels) * description.measurements
     count, tiers = len(presses.xy_mm), set()
     changes, valid = np.zeros((count, width)), np.zeros((count, width), bool)
-    places_mm = np.full((count, 2), np.nan)
+    places_mm, (loads, forces_n) = np.full((count, 2), np.nan), np.full((2, count), np.nan)
     for index in range(count):
         scan = {name: volts[index] for name, volts in presses.scans.items()}
         measurement = reconstructor.compare(
@@ -177,11 +199,13 @@ def _reconstructed(
             reconstructor.reset()
             frame = reconstructor.solve(measurement)
             if len(frame.contacts) == 1:
-                places_mm[index] = 1e3 * frame.contacts[0].x_m, 1e3 * frame.contacts[0].y_m
+                (contact,) = frame.contacts
+                places_mm[index] = 1e3 * contact.x_m, 1e3 * contact.y_m
+                loads[index], forces_n[index] = load_of(contact), contact.force_n
                 tiers.add(frame.tier)
         if progress:
             progress(index + 1, count)
-    return _Seen(changes, valid, places_mm, frozenset(tiers))
+    return _Seen(changes, valid, places_mm, loads, forces_n, frozenset(tiers))
 
 
 def _left_out(others: IntArray) -> list[str]:
@@ -286,12 +310,54 @@ def _odd(
     return [odd[number] for number in sorted(odd)]
 
 
+def _parts(count: int) -> list[BoolArray]:
+    """Which presses (P,) are held out each time, in order of time."""
+    part = np.arange(count) * HELD_OUT // count
+    return [part == k for k in range(HELD_OUT)]
+
+
+def _judged_forces(
+    loads: FloatArray, xy_mm: FloatArray, force_n: FloatArray, by_physics_n: FloatArray
+) -> tuple[float, list[str]]:
+    """Median relative error of held-out forces; NaN where they are not learnt, and then why not."""
+    if not np.isfinite(force_n).any():
+        return np.nan, []
+    known = np.flatnonzero(np.isfinite(force_n * loads))
+    if len(known) < MIN_PRESSES:
+        why = f"{len(known)} are known of contacts with a magnitude, and {MIN_PRESSES} are needed"
+        return np.nan, [f"forces are not learnt: {why}"]
+    loads, xy_mm, force_n, by_physics_n = (
+        each[known] for each in (loads, xy_mm, force_n, by_physics_n)
+    )
+    found_n = np.empty(len(known))
+    try:
+        for out in _parts(len(known)):
+            learnt = ForceRegression(loads[~out], xy_mm[~out], force_n[~out])
+            found_n[out], _ = learnt.force(loads[out], xy_mm[out])
+    except DataError as error:
+        return np.nan, [f"forces are not learnt: {error}"]
+
+    def error_of(others_n: FloatArray) -> float:
+        there = np.isfinite(others_n)
+        off = np.abs(others_n[there] / force_n[there] - 1)
+        return float(np.median(off)) if there.any() else np.inf
+
+    taught, physics = error_of(found_n), error_of(by_physics_n)
+    alike = error_of(np.full(len(known), np.median(force_n)))
+    if taught < min(physics, KNOWN * alike):
+        return taught, []
+    others = "" if np.isinf(physics) else f"by the physics alone {physics:.0%}, "
+    return np.nan, [
+        f"forces are not learnt: held-out ones are {taught:.0%} off (median) as taught, {others}"
+        f"and {alike:.0%} if all were alike"
+    ]
+
+
 def _best(changes: FloatArray, xy_mm: FloatArray, guess_mm: FloatArray) -> tuple[str, float, float]:
     """What locates held-out presses best, and the median errors without and with it, mm."""
     places = {"voltages": np.empty_like(xy_mm), "corrected": np.empty_like(xy_mm)}
-    part = np.arange(len(xy_mm)) * HELD_OUT // len(xy_mm)
-    for k in range(HELD_OUT):
-        out, rest = part == k, part != k
+    for out in _parts(len(xy_mm)):
+        rest = ~out
         alone = PressRegression(changes[rest], xy_mm[rest])
         places["voltages"][out] = alone.locate(changes[out]).xy_mm
         corrected = PressRegression(changes[rest], xy_mm[rest], guess_mm[rest])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,42 @@ def test_a_taught_skin_is_located_better(tactomo: Run, tmp_path: Path, good: Arr
     assert np.median(taught) < 0.75 * np.median(untaught)
     sigma = maps["contact_x_sigma_mm"][maps["contact_taught"]]
     assert 0.3 < np.median(taught) / np.median(sigma) < 3
+
+
+def test_forces_are_taught_where_they_are_known(tactomo: Run, tmp_path: Path, good: Arrays) -> None:
+    """Of each second press; a cover makes the physics' a quarter too small."""
+    force_n = np.where(np.arange(60) % 2, np.nan, good["force_n"])
+    made = teach(tactomo, tmp_path, changed(good, force_n=force_n))
+    assert made.returncode == 0, made.stderr
+    assert re.search(r"; forces to \d\.\d%$", made.stdout.splitlines()[0])
+    true_n = presses(20, seed=2)["force_n"]
+
+    def off(*options: Any) -> tuple[np.ndarray, np.ndarray]:
+        _, maps = errors_mm(tactomo, tmp_path, *options)
+        error_n = maps["contact_force_n"] - true_n[maps["contact_frame"]]
+        return error_n / true_n[maps["contact_frame"]], error_n / maps["contact_force_sigma_n"]
+
+    untaught, _ = off()
+    assert np.nanmedian(untaught) < -0.15
+    taught, in_sigmas = off("--taught", taught_path("palm"))
+    assert np.median(np.abs(taught)) < 0.04
+    assert 0.4 < (np.abs(in_sigmas) < 1).mean() < 0.95
+
+
+def test_forces_that_say_nothing_are_not_learnt(tactomo: Run, tmp_path: Path, good: Arrays) -> None:
+    """Places are, all the same; it says why forces are not."""
+    shuffled = np.random.default_rng(0).permutation(good["force_n"])
+    few = np.where(np.arange(60) < 5, good["force_n"], np.nan)
+    for force_n, why in (
+        (shuffled, r"held-out ones are \d+% off"),
+        (few, "5 are known .* 20 are needed"),
+        (np.full(60, 9.81), "held-out .* 0% if all were alike"),
+    ):
+        made = teach(tactomo, tmp_path, changed(good, force_n=force_n))
+        assert made.returncode == 0, made.stderr
+        assert re.search(f"forces are not learnt: {why}", made.stderr)
+        assert "forces to" not in made.stdout
+        assert read_taught(taught_path("palm")).forces is None
 
 
 def test_where_nothing_was_taught_the_frame_says_so(
@@ -133,6 +170,8 @@ def first(arrays: Arrays, count: int) -> Arrays:
         (lambda a: changed(a, xy_mm=a["xy_mm"] + 75), "counted from a corner"),
         (lambda a: changed(a, xy_mm=a["xy_mm"] * [1, np.nan]), "press 0 has no place"),
         (lambda a: changed(a, xy_mm=a["xy_mm"][:-1]), "xy_mm is float64 of shape (59, 2)"),
+        (lambda a: changed(a, force_n=-a["force_n"]), "N presses nothing: give newtons, above 0"),
+        (lambda a: changed(a, force_n=a["force_n"][:-1]), "force_n is float64 of shape (59,)"),
         (swapped_rows, "which x and y swapped explains"),
         (stored_twice, "presses 7 and 8 hold the very same voltages"),
         (lambda a: first(a, 19), "19 presses are too few; give 20 or more"),

@@ -92,7 +92,7 @@ class PressRegression:
             ]
         )
         guess = found if guess_mm is None else guess_mm
-        self._correction = _Correction(
+        self._correction = Correction(
             np.column_stack([unit, log_size, guess]) * self._scale, xy_mm - guess
         )
 
@@ -247,13 +247,13 @@ def _taught_places(xy_mm: FloatArray) -> FloatArray:
     return np.asarray(grid[_squared_distances(grid, xy_mm).min(axis=1) <= reach_mm**2])
 
 
-class _Correction:
-    """What is still wrong, learnt from inputs (N, K) and errors (N, 2) in mm."""
+class Correction:
+    """What is still wrong, learnt from inputs (N, K) and errors (N, D)."""
 
-    def __init__(self, seen: FloatArray, error_mm: FloatArray) -> None:
+    def __init__(self, seen: FloatArray, error: FloatArray) -> None:
         squared = _squared_distances(seen, seen)
         scales = np.median(squared) * np.array(CORRECTION_SCALES)
-        spectra = [_Spectrum(squared / scale, error_mm) for scale in scales]
+        spectra = [_Spectrum(squared / scale, error) for scale in scales]
         which, noise = max(
             ((k, noise) for k in range(len(scales)) for noise in CORRECTION_NOISES),
             key=lambda tried: spectra[tried[0]].log_likelihood(tried[1]),
@@ -265,7 +265,7 @@ class _Correction:
         self._factor = best.vectors[:, top] / np.sqrt(best.values[top] + noise)
 
     def at(self, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The corrections (T, 2) in mm, and the variance (T,) of each coordinate in mm²."""
+        """The corrections (T, D), and the variance (T,) of each."""
         kernel = np.exp(-0.5 * _squared_distances(seen, self._seen) / self._scale)
         known = ((kernel @ self._factor) ** 2).sum(axis=1)
         return kernel @ self._weights, self._variance * (1.0 + self._noise - known)

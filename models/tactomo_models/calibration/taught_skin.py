@@ -25,6 +25,7 @@ from tactomo_models.calibration.calibration_file import (
     reading,
     write_kept,
 )
+from tactomo_models.calibration.force_regression import ForceRegression
 from tactomo_models.calibration.press_regression import PressRegression
 from tactomo_models.errors import CalibrationError, DataError
 from tactomo_models.scans.measurement import Measurement
@@ -53,10 +54,14 @@ class TaughtSkin:
     xy_mm: FloatArray  # (N, 2) where each was
     # (N, 2) where the physics had it; None where the voltages alone tell
     guess_mm: FloatArray | None
+    # loads, force_n: (N,) magnitude times area, m², and newtons of each press; NaN where not known
+    loads: FloatArray
+    force_n: FloatArray
     tiers: frozenset[str]  # what made the contacts that places were corrected of
     # without_mm, with_mm: median errors on presses held out, by the physics and as taught
     without_mm: float
     with_mm: float
+    force_error: float  # likewise of forces, as taught, relative; NaN where they are not learnt
     reference: FloatArray  # (channels, M) volts of the unpressed skin then
 
     @cached_property
@@ -64,9 +69,18 @@ class TaughtSkin:
         """What is learnt: 0.2 s for 200 presses, 4 s for 800."""
         return PressRegression(self.changes, self.xy_mm, self.guess_mm)
 
-    def corrected(self, contact: Contact, measurement: Measurement, tier: str) -> Contact:
-        """A frame's one contact at the place that was taught; as it is where none like it was.
+    @cached_property
+    def forces(self) -> ForceRegression | None:
+        """What is learnt of forces; None where nothing is."""
+        if not np.isfinite(self.force_error):
+            return None
+        known = np.isfinite(self.loads * self.force_n)
+        return ForceRegression(self.loads[known], self.xy_mm[known], self.force_n[known])
 
+    def corrected(self, contact: Contact, measurement: Measurement, tier: str) -> Contact:
+        """A frame's one contact at the place, and with the force, that was taught.
+
+        It is as the physics has it where none like it was taught.
         So it is, too, where voltages are missing, or another method made the contact.
         """
         changes, valid = press_changes(measurement, self.channels)
@@ -78,7 +92,14 @@ class TaughtSkin:
             return contact
         x_m, y_m = (1e-3 * found.xy_mm[0]).tolist()
         sigma_m = 1e-3 * float(found.sigma_mm[0])
-        return replace(contact, x_m=x_m, y_m=y_m, x_sigma_m=sigma_m, y_sigma_m=sigma_m, taught=True)
+        placed = replace(
+            contact, x_m=x_m, y_m=y_m, x_sigma_m=sigma_m, y_sigma_m=sigma_m, taught=True
+        )
+        load = load_of(contact)
+        if self.forces is None or not np.isfinite(load):
+            return placed
+        force_n, force_sigma_n = self.forces.force(np.array([load]), found.xy_mm)
+        return replace(placed, force_n=float(force_n[0]), force_sigma_n=float(force_sigma_n[0]))
 
     def changed(self, reference: Reference) -> str:
         """In words, how the unpressed skin is another one than was taught; empty where it is not.
@@ -102,7 +123,14 @@ class TaughtSkin:
         return (
             f"{len(self.xy_mm)} presses of {self.taken[:10]}; on presses held out "
             f"{self.with_mm:.2f} mm (median), by the physics alone {self.without_mm:.2f} mm"
+            + (f"; forces to {self.force_error:.1%}" if self.forces else "")
         )
+
+
+def load_of(contact: Contact) -> float:
+    """Magnitude times area, m²: what a force is told by; NaN where there is none above 0."""
+    load = contact.magnitude * contact.area_m2
+    return load if load > 0 else float("nan")
 
 
 def press_changes(
@@ -138,6 +166,9 @@ def save_taught(taught: TaughtSkin, path: Path) -> None:
         "changes": taught.changes.astype(np.float32),
         "xy_mm": taught.xy_mm,
         "guess_mm": guess,
+        "loads": taught.loads,
+        "force_n": taught.force_n,
+        "force_error": np.array(taught.force_error),
         "tiers": np.array(sorted(taught.tiers)),
         "held_out_mm": np.array([taught.without_mm, taught.with_mm]),
         "reference": taught.reference,
@@ -162,7 +193,7 @@ def read_taught(path: Path) -> TaughtSkin:
                 f"{FORMAT}; {again}"
             )
         taught = _of_arrays(arrays)
-        _ = taught.regression  # now, not in the first frame
+        _ = taught.regression, taught.forces  # now, not in the first frame
     except (DataError, KeyError, ValueError, ValidationError) as error:
         raise CalibrationError(f"{path} is damaged, or nothing that was taught; {again}") from error
     return taught
@@ -170,6 +201,7 @@ def read_taught(path: Path) -> TaughtSkin:
 
 def _of_arrays(arrays: Mapping[str, Any]) -> TaughtSkin:
     guess = arrays["guess_mm"].astype(np.float64)
+    unknown = np.full(len(arrays["xy_mm"]), np.nan)  # older files have no forces
     without_mm, with_mm = arrays["held_out_mm"].tolist()
     return TaughtSkin(
         Subject.model_validate_json(str(arrays["subject"])),
@@ -179,9 +211,12 @@ def _of_arrays(arrays: Mapping[str, Any]) -> TaughtSkin:
         arrays["changes"].astype(np.float64),
         arrays["xy_mm"].astype(np.float64),
         guess if len(guess) else None,
+        arrays.get("loads", unknown).astype(np.float64),
+        arrays.get("force_n", unknown).astype(np.float64),
         frozenset(arrays["tiers"].tolist()),
         float(without_mm),
         float(with_mm),
+        float(arrays.get("force_error", np.nan)),
         arrays["reference"].astype(np.float64),
     )
 

@@ -32,7 +32,7 @@ class Contact:
     area_sigma_m2: float = float("nan")  #: that of the area; NaN if unknown
     #: standard uncertainty of the pressure; NaN but within the range
     pressure_sigma_kpa: float = float("nan")
-    force_n: float = float("nan")  #: pressure times area; NaN if unknown
+    force_n: float = float("nan")  #: pressure times area, or as was taught; NaN if unknown
     force_sigma_n: float = float("nan")  #: standard uncertainty of the force; NaN if unknown
     #: where the pressure lies, seen from what the magnitude channel answers to
     pressure_range: PressureRange = PressureRange.UNKNOWN
@@ -46,7 +46,8 @@ class Contact:
     #: exponent γ of the pressure (1 - ρ²)^γ from the middle to the edge: 0 flat, 0.5 Hertz; NaN if
     #: unknown
     edge: float = float("nan")
-    #: whether presses at known places say where it is; else the physics alone does
+    #: whether presses at known places say where it is, and ones of known force how hard it presses;
+    #: else the physics alone does
     taught: bool = False
 
 

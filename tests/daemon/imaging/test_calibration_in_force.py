@@ -387,9 +387,12 @@ def taught(**changes: Any) -> TaughtSkin:
         "changes": xy_mm @ rng.standard_normal((2, 2 * MEASUREMENTS)),
         "xy_mm": xy_mm,
         "guess_mm": xy_mm + 1.0,
+        "loads": np.full(40, np.nan),
+        "force_n": np.full(40, np.nan),
         "tiers": frozenset(["fit"]),
         "without_mm": 1.4,
         "with_mm": 0.2,
+        "force_error": np.nan,
         "reference": np.stack([REST, REST]),
     }
     made = TaughtSkin(**{**fields, **changes})

@@ -21,9 +21,9 @@ app = options.typer_app(
         "Learn from presses at known places what the physics gets wrong on this very skin.\n\n"
         "With a robot, a plotter or a template, press 20 to 800 known places, spread over the "
         "skin, one at a time. Each quarter is judged by what the others teach, and that is kept "
-        "only where it locates better than the physics alone. From then on each "
-        "single contact says whether what was taught places it; a press unlike all that were "
-        "taught is flagged `untaught`.\n\n"
+        "only where it locates better than the physics alone; likewise forces, where known. From "
+        "then on each single contact says whether what was taught places it; a press unlike all "
+        "that were taught is flagged `untaught`.\n\n"
         "It is kept by the sensor's name and devices, and used at once by the sensor's daemon if "
         "that runs (at --control), else from its next start. A service keeps its own, see "
         "`tactomo calibrate --help`."
@@ -100,7 +100,8 @@ def fit(
     FILE holds what `tactomo reconstruct` reads, a row for each press in order of time: `magnitude`
     and `structure` (P, M) volts, and `magnitude_reference`, `structure_reference` (M,) of the
     unpressed skin; and `xy_mm` (P, 2), where each press was: x to the right and y up from the
-    middle of the skin, seen from the pressed side. Presses that the others contradict are named,
+    middle of the skin, seen from the pressed side. `force_n` (P,), if it is there, is how hard each
+    press was, newtons; NaN where that is not known. Presses that the others contradict are named,
     and nothing is kept until they are mended (or --keep-odd is given).
     """
     from tactomo_models import load_description

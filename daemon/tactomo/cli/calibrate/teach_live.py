@@ -80,7 +80,8 @@ class _Session:
             self._arrays = {f"{name}_reference": volts for name, volts in rest.items()}
         say(
             "Press one known place at a time and hold still: Enter takes it. Or type another "
-            "place, such as [bold]12.5 -30[/]\n(mm from the middle, x to the right, y up). "
+            "place, such as [bold]12.5 -30[/]\n(mm from the middle, x to the right, y up), and "
+            "behind it the force, if known: [bold]12.5 -30 8.2[/] (N).\n"
             "[bold]undo[/] drops the last one, [bold]done[/] or Ctrl-C ends."
         )
         try:
@@ -120,11 +121,13 @@ class _Session:
         if word == "undo":
             self._keep(slice(0, max(self._count - 1, 0)))
             return True
+        force_n = np.nan
         if word:
             try:
-                x_mm, y_mm = (float(part) for part in word.replace(",", " ").split())
+                x_mm, y_mm, *rest = (float(part) for part in word.replace(",", " ").split())
+                (force_n,) = rest or [np.nan]
             except ValueError:
-                self._console.print("two numbers, such as 12.5 -30, please")
+                self._console.print("two numbers, such as 12.5 -30, or three with newtons, please")
                 return True
         heard = self._heard(HOLD_S)
         if why := self._why_not(heard):
@@ -132,7 +135,8 @@ class _Session:
             return True
         # One scan, not their mean: what is learnt is to hold for scans as noisy as they come.
         last = {name: scans[-1] for name, scans in heard.scans.items()}
-        self._keep(slice(None), {**last, "xy_mm": np.array([x_mm, y_mm])})
+        place = {"xy_mm": np.array([x_mm, y_mm]), "force_n": np.array(force_n)}
+        self._keep(slice(None), {**last, **place})
         return True
 
     def _heard(self, seconds: float) -> Evidence:
@@ -161,7 +165,9 @@ class _Session:
 
     def _keep(self, which: slice, press: dict[str, FloatArray] | None = None) -> None:
         """Keep these of the presses so far, and one more."""
-        for name in ("magnitude", "structure", "xy_mm"):
+        if self._count and "force_n" not in self._arrays:  # a file from before forces were asked
+            self._arrays["force_n"] = np.full(self._count, np.nan)
+        for name in ("magnitude", "structure", "xy_mm", "force_n"):
             rows = self._arrays.get(name)
             rows = None if rows is None else rows[which]
             if press is not None and name in press:
