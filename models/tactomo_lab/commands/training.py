@@ -67,9 +67,10 @@ def simulate(
     one core, and 2 MB for a thousand.
 
     *paper*: one to four ellipses that do not overlap, 0.75 to 0.95 S/m on an even sheet of 1 S/m,
-    100 S/m in the structure channel. *robust*: none to six contacts of several shapes, flat or
-    domed, lighter and heavier than the range as well; both signs; contrast 10 to 100; uneven
-    sheets; uneven, displaced and now and then weak electrodes. Noise is added in training.
+    100 S/m in the structure channel. *robust*: none to ten contacts of several shapes, flat or
+    soft, lighter and heavier than the range as well; both signs; contrast 10 to 100; sheets up to
+    as uneven as hand-made ones; uneven, displaced and now and then weak electrodes. Noise is added
+    in training.
 
     Needs `pip install 'tactomo-lab[train]'`.
     """
@@ -96,6 +97,7 @@ def simulate(
         "tactomo models train scenes/robust",
         "tactomo models train scenes/robust --epochs 5 --output trial.onnx",
         "tactomo models train scenes/robust --start scenes/robust/ours.pt --checkpoint more.pt",
+        "tactomo models train scenes/mine -d my_skin.toml --start trained.onnx --rate 1e-3",
         "tactomo models train scenes/paper --configuration paper-multimodal --device cuda",
     )
 )
@@ -115,7 +117,10 @@ def train(
     ] = None,
     start: Annotated[
         Path | None,
-        typer.Option(help="Begin with the weights of this checkpoint, or of our network, .onnx."),
+        typer.Option(
+            help="Begin with the weights of this checkpoint; or with our network, .onnx, of as "
+            "many voltages and nodes."
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of weights, order, noise and turns.")] = 0,
     device: Annotated[Literal["cpu", "cuda"], typer.Option(help="What computes.")] = "cpu",
