@@ -123,6 +123,7 @@ def part(module: str) -> str:
     return [*module.split("."), ""][1]
 
 
+@pytest.mark.slow
 def test_packages_import_those_that_they_may() -> None:
     wrong = [
         f"{name} imports {other}"

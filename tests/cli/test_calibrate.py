@@ -44,6 +44,7 @@ def _own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("STATE_DIRECTORY", raising=False)
 
 
+@pytest.mark.slow
 def test_a_table_of_magnitudes_is_fitted_kept_and_shown(tactomo: Run, tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text(CSV)
     tried = tactomo(*FIT, "--dry-run")
@@ -83,6 +84,7 @@ def test_a_slip_in_a_table_is_named_by_its_line(
     assert made.stderr.count("disagrees") == 1
 
 
+@pytest.mark.slow
 def test_a_table_with_a_slip_is_kept_on_request_alone(tactomo: Run, tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text(CSV + "220,2.0\n")
     words = (*FIT, "--picture", "curve.png")
@@ -96,6 +98,7 @@ def test_a_table_with_a_slip_is_kept_on_request_alone(tactomo: Run, tmp_path: Pa
     assert read_calibration(calibration_path("palm")).subject.sensor == "palm"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -172,6 +175,7 @@ def test_the_daemon_that_runs_is_asked_to_read_it_again(tactomo: Run) -> None:
         assert "sole, not of palm" in other.stderr
 
 
+@pytest.mark.slow
 def test_without_a_daemon_it_says_when_it_will_be_in_force(tactomo: Run, tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text(CSV)
     command = (*FIT, "--control")
@@ -210,6 +214,7 @@ def test_options_that_do_not_go_together_or_make_no_sense(
     assert tactomo("calibrate", *options).returncode == 2
 
 
+@pytest.mark.slow
 def test_a_recording_tells_what_the_sensor_showed(tactomo: Run, tmp_path: Path) -> None:
     """Six presses of one second each, ten scans a second, and what a load cell said at each."""
     skin = SkinSimulator(SENSOR, unevenness=0.03, seed=4)
@@ -286,6 +291,7 @@ def take(terminal: Terminal, pressed: Pressed, number: int, kpa: float, magnitud
     terminal.wait_for("kPa, taken")
 
 
+@pytest.mark.slow
 def test_a_session_keeps_what_was_taken_and_goes_on(pressed: Pressed) -> None:
     command = ("calibrate", "live", "-s", "palm", "--stream", pressed.address, "--area-mm2", "1000")
     log = calibration_path("palm").with_name("palm.readings.csv")

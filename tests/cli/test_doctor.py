@@ -251,6 +251,7 @@ def test_one_lost_scan_is_no_rate_of_loss(
     assert found["verdict"] == verdict
 
 
+@pytest.mark.slow
 def test_nobody_there(tactomo: Run) -> None:
     outcome = tactomo("doctor", "--stream", "ipc:///nowhere/at/all", "--seconds", "1")
     assert outcome.returncode == 1
@@ -277,6 +278,7 @@ def demo() -> Iterator[Demo]:
         yield running
 
 
+@pytest.mark.slow
 def test_the_description_that_a_daemon_holds_is_found(
     tactomo: Run, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -294,6 +296,7 @@ def wait_for_more(count: str, address: str) -> None:
     wait_until(lambda: request("status", address, PATIENCE_S)[count] >= before + 4)
 
 
+@pytest.mark.slow
 def test_a_healthy_skin_on_a_busy_computer_is_healthy(demo: Demo) -> None:
     """The daemon gets the processor for moments only; its frames are fewer, and none is wrong."""
     request("tare", demo.control, PATIENCE_S)

@@ -238,6 +238,7 @@ def test_what_is_there_is_written_over_only_if_one_says_so(tactomo: Run, grasp: 
         assert grasp.with_name(name).read_text() != "precious"
 
 
+@pytest.mark.slow
 def test_at_a_terminal_it_asks(grasp: Path) -> None:
     target = grasp.with_name("contacts.csv")
     for answer in ("n", "y"):
@@ -268,6 +269,7 @@ def bare_recording(tactomo: Run, tmp_path: Path, scans_pressed: int) -> Path:
     return tmp_path / "bare.mcap"
 
 
+@pytest.mark.slow
 def test_what_holds_no_frames_is_reconstructed_first(tactomo: Run, tmp_path: Path) -> None:
     bare_recording(tactomo, tmp_path, scans_pressed=10)
     result = tactomo("export", "bare.mcap", "made.csv", "--from", 1)

@@ -79,6 +79,7 @@ def test_the_daemon_has_no_more_options_than_a_person_types() -> None:
     assert len(TOP.commands["daemon"].params) <= 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "needed"),
     [
@@ -202,6 +203,7 @@ def test_every_key_of_the_configuration_can_be_set(tactomo: Run, tmp_path: Path)
         assert "command line: recording.maps = 3" in result.stderr, key
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "status", "says"),
     [

@@ -107,6 +107,7 @@ def save_hdf5(path: Path, arrays: dict[str, Any]) -> None:
         whole.write(header)
 
 
+@pytest.mark.slow
 def test_matlab_arrays_of_version_7_3(tactomo: Run, tmp_path: Path) -> None:
     rest, there = tank()
     save_hdf5(tmp_path / "a.mat", {"vh": [rest], "vi": {"meas": there.T}, "note": 208 * "x"})
@@ -141,6 +142,7 @@ def test_a_sign_of_their_own(tactomo: Run, tmp_path: Path) -> None:
     assert "turned round" in said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", [".csv", ".txt", ".tsv", ".dat"])
 @pytest.mark.parametrize("columns", [False, True])
 def test_text(tactomo: Run, tmp_path: Path, ending: str, columns: bool) -> None:
@@ -162,6 +164,7 @@ def test_a_decimal_comma_and_times(tactomo: Run, tmp_path: Path) -> None:
     np.testing.assert_allclose(volts[:FRAMES], rest, rtol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pattern", ["32:adjacent", "16:opposite:adjacent", "16:adjacent:rotated"])
 def test_another_pattern_is_proposed_and_then_read(
     tactomo: Run, tmp_path: Path, pattern: str
@@ -318,6 +321,7 @@ def test_any_bytes_become_scans_or_a_named_error(
     read_damaged(path, data)
 
 
+@pytest.mark.slow
 @settings(max_examples=10, deadline=None, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_any_bytes_of_version_7_3(

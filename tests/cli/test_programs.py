@@ -63,6 +63,7 @@ def announced(stream: IO[str] | None) -> dict[str, Any]:
     raise AssertionError("".join(seen))
 
 
+@pytest.mark.slow
 def test_a_twin_of_the_papers_sensor(start: Run, tmp_path: Path) -> None:
     twin = start(
         *("twin", "--ports", 1, "--link", "dev", "--twin-control", "tcp://127.0.0.1:0"),
@@ -156,6 +157,7 @@ def test_a_speed_that_is_none_is_a_usage_error(tactomo: Run, tmp_path: Path) -> 
         assert tactomo("replay", "none.mcap", "--speed", speed).returncode == 2
 
 
+@pytest.mark.slow
 def test_a_child_that_fails_takes_the_demo_down_and_its_words_are_shown(tactomo: Run) -> None:
     result = tactomo("demo", "--description", "nosuch", "--viewer-port", "0")
     assert result.returncode == 1
@@ -184,6 +186,7 @@ def test_a_demo_leaves_no_process_behind(start: Run, number: signal.Signals) -> 
     wait_until(lambda: not any(is_running(child) for child in children))
 
 
+@pytest.mark.slow
 def test_a_family_notices_whoever_ends_and_tells_its_last_words() -> None:
     with Family() as family:
         viewer = family.start(

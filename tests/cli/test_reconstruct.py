@@ -22,6 +22,7 @@ from typer.testing import CliRunner
 Run = Callable[..., Any]
 
 
+@pytest.mark.slow
 def test_a_press_is_found_in_a_file(tactomo: Run, tmp_path: Path) -> None:
     skin = SkinSimulator(load_description("paper_square"))
     empty = skin.voltages([])
@@ -50,6 +51,7 @@ def test_a_press_is_found_in_a_file(tactomo: Run, tmp_path: Path) -> None:
         assert maps["pressure_kpa"][1].max() == pytest.approx(maps["contact_pressure_kpa"][0])
 
 
+@pytest.mark.slow
 def test_a_calibration_says_how_hard_is_pressed(tactomo: Run, tmp_path: Path) -> None:
     sensor = load_description("paper_square")
     skin = SkinSimulator(sensor)
@@ -106,6 +108,7 @@ def test_an_unknown_method_is_refused(tactomo: Run, tmp_path: Path) -> None:
     assert all(method in result.stderr for method in available_methods())
 
 
+@pytest.mark.slow
 def test_bad_scans_are_flagged_in_the_file(tactomo: Run, tmp_path: Path) -> None:
     description = load_description("paper_square")
     skin = SkinSimulator(description, unevenness=0.03, seed=3)

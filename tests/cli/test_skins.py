@@ -70,6 +70,7 @@ def shared_mb(pid: int) -> float:
     return int(line.split()[1]) / 1024
 
 
+@pytest.mark.slow
 def test_each_skin_is_served_and_found_by_its_name(
     start: Callable[..., Robot], tmp_path: Path
 ) -> None:
@@ -106,6 +107,7 @@ def test_all_of_them_end_with_the_command(start: Callable[..., Robot], number: i
     wait_until(lambda: not any(map(is_running, children)), "the children's end")
 
 
+@pytest.mark.slow
 def test_one_that_dies_is_started_again_and_the_other_goes_on(
     start: Callable[..., Robot],
 ) -> None:
@@ -165,6 +167,7 @@ def test_one_that_hangs_is_killed_and_started_again(start: Callable[..., Robot])
     assert robot.process.told("skin_hangs")[0]["sensor"] == "left"
 
 
+@pytest.mark.slow
 def test_where_none_can_start_the_command_fails_with_the_reasons(
     tmp_path: Path,
 ) -> None:

@@ -167,6 +167,7 @@ def test_status_as_json(tactomo: Run, control: Any) -> None:
     assert json.loads(result.stdout) == STATUS
 
 
+@pytest.mark.slow
 def test_status_of_one_sensor_is_what_its_stream_tells(tactomo: Run) -> None:
     stop = threading.Event()
     with FakeSensor("left_forearm") as fake:
@@ -217,6 +218,7 @@ def test_a_refusal_is_one_line_with_cause_and_next_step(tactomo: Run, control: A
     assert result.stderr == "tactomo: somebody presses; let go and tare again\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [["status", "--control"], ["poke", "clear", "--twin-control"]])
 def test_nobody_there(tactomo: Run, command: list[str]) -> None:
     result = tactomo(*command, "ipc:///nowhere/at/all")

@@ -104,6 +104,7 @@ def test_forces_that_say_nothing_are_not_learnt(tactomo: Run, tmp_path: Path, go
         assert read_taught(taught_path("palm")).forces is None
 
 
+@pytest.mark.slow
 def test_where_nothing_was_taught_the_frame_says_so(
     tactomo: Run, tmp_path: Path, good: Arrays
 ) -> None:
@@ -153,6 +154,7 @@ def first(arrays: Arrays, count: int) -> Arrays:
     return {k: v[:count] if len(v) == len(arrays["xy_mm"]) else v for k, v in arrays.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "told"),
     [
@@ -188,6 +190,7 @@ def test_bad_presses_are_named_and_not_kept(
     assert not taught_path("palm").exists()
 
 
+@pytest.mark.slow
 def test_presses_that_teach_nothing_are_not_kept(
     tactomo: Run, tmp_path: Path, good: Arrays
 ) -> None:
@@ -202,6 +205,7 @@ def test_presses_that_teach_nothing_are_not_kept(
         assert not taught_path("palm").exists()
 
 
+@pytest.mark.slow
 def test_another_skin_is_refused(tactomo: Run, tmp_path: Path, good: Arrays) -> None:
     assert teach(tactomo, tmp_path, good).returncode == 0
     np.savez(tmp_path / "other.npz", **presses(3, seed=3, skin=5))

@@ -148,12 +148,14 @@ def test_it_says_how_well_a_pressure_is_known(fields: dict[str, Any], words: str
         assert frame_line(next(frames)).endswith(f"mm {words}")
 
 
+@pytest.mark.slow
 def test_in_a_pipe_it_says_that_nothing_comes(tactomo: Run) -> None:
     result = tactomo("watch", "--stream", "ipc:///nowhere/at/all", "--seconds", "1.5")
     assert (result.returncode, result.stdout) == (1, "")
     assert "no frame of skin" in result.stderr
 
 
+@pytest.mark.slow
 def test_a_name_that_nobody_publishes_is_told(tactomo: Run, sensor: FakeSensor) -> None:
     result = tactomo("watch", "--sensor", "other", "--stream", sensor.address)
     assert result.returncode == 1

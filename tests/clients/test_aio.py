@@ -157,6 +157,7 @@ def test_closing_ends_the_iteration_of_another_task(run: Run, sensor: FakeSensor
     run(main())
 
 
+@pytest.mark.slow
 def test_what_is_left_open_closes_itself(run: Run, pressed: FakeSensor) -> None:
     left: list[Any] = []
 

@@ -80,6 +80,7 @@ def test_a_daemon_that_starts_a_moment_later_is_reached() -> None:
         later[0].close()
 
 
+@pytest.mark.slow
 def test_a_busy_daemon_is_waited_for_though_it_says_nothing() -> None:
     """The kernel answers for a program that does not come round to its socket."""
     with socket.create_server(("127.0.0.1", 0)) as busy:

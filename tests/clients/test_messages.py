@@ -48,6 +48,7 @@ def arrays() -> st.SearchStrategy[np.ndarray[Any, Any]]:
     )
 
 
+@pytest.mark.slow
 @given(
     sensor=st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", fullmatch=True),
     kind=st.sampled_from(KINDS),

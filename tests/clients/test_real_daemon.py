@@ -100,6 +100,7 @@ def test_both_clients_go_on_by_themselves_after_the_daemon_was_killed(
             process.kill()
 
 
+@pytest.mark.slow
 def test_every_command_on_the_real_thing(tmp_path: Path, config: dict[str, Any]) -> None:
     process = DaemonProcess(tmp_path, **config)
     path = tmp_path / "grasp.mcap"

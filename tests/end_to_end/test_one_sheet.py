@@ -110,6 +110,7 @@ def test_the_twin_has_no_sheet_but_its_own_to_mute(one_sheet: tuple[Demo, str]) 
         request("mute", demo.twin, PATIENCE_S, channel=other, seconds=1.0)
 
 
+@pytest.mark.slow
 def test_what_is_recorded_replays_and_is_plotted(
     one_sheet: tuple[Demo, str], tmp_path: Path
 ) -> None:
@@ -138,6 +139,7 @@ def test_what_is_recorded_replays_and_is_plotted(
         )
 
 
+@pytest.mark.slow
 def test_status_and_doctor_know_of_one_sheet(one_sheet: tuple[Demo, str]) -> None:
     demo, _ = one_sheet
     tactomo("status", "--control", demo.control)

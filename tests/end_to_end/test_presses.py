@@ -78,6 +78,7 @@ def test_every_press_is_found_within_3_mm_with_its_pressure(any_demo: Demo, plac
     assert frame.map.max() > 0.1
 
 
+@pytest.mark.slow
 def test_a_contact_keeps_its_identity_while_it_slides(any_demo: Demo) -> None:
     any_demo.clear()
     settled_frame(any_demo, [])
@@ -95,6 +96,7 @@ def test_a_contact_keeps_its_identity_while_it_slides(any_demo: Demo) -> None:
     assert [contact.id for contact in frame.contacts] == [first.id]
 
 
+@pytest.mark.slow
 def test_a_lost_channel_is_flagged_and_the_other_goes_on(any_demo: Demo) -> None:
     any_demo.clear()
     settled_frame(any_demo, [])
@@ -118,6 +120,7 @@ def test_a_lost_channel_is_flagged_and_the_other_goes_on(any_demo: Demo) -> None
     settled_frame(any_demo, [(10.0, -10.0)])  # and both again once it is back
 
 
+@pytest.mark.slow
 def test_tare_under_load_makes_it_the_new_zero(any_demo: Demo) -> None:
     any_demo.clear()
     settled_frame(any_demo, [])

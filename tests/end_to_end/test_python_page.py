@@ -52,6 +52,7 @@ def test_the_method_is_the_example() -> None:
     assert PAGE.file("own_method.py") == (repository() / "examples/own_method.py").read_text()
 
 
+@pytest.mark.slow
 def test_arrays_become_maps_and_an_own_method_does_the_same(
     newcomer: Newcomer, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -83,6 +84,7 @@ def test_an_own_method_is_charted(newcomer: Newcomer) -> None:
     assert Path("chart.png").exists()
 
 
+@pytest.mark.slow
 def test_an_own_method_is_seen_on_the_live_stream(newcomer: Newcomer) -> None:
     demo, press, watch, other, own = PAGE.commands(METHOD)[3:]
     (live,) = PAGE.blocks("python", "Follow")
@@ -105,6 +107,7 @@ def test_an_own_method_is_seen_on_the_live_stream(newcomer: Newcomer) -> None:
         newcomer.run(own)
 
 
+@pytest.mark.slow
 def test_an_own_protocol_is_read(newcomer: Newcomer) -> None:
     twin, daemon, press, status = PAGE.commands(PROTOCOL)
     with newcomer:

@@ -121,6 +121,7 @@ def array(wire: Any) -> Any:
     return np.frombuffer(wire["data"], wire["dtype"]).reshape(wire["shape"])
 
 
+@pytest.mark.slow
 def test_a_measured_stream_is_imported_replayed_and_located(tmp_path: Path) -> None:
     recording, again = tmp_path / "tank.mcap", tmp_path / "again.mcap"
     tank = measured("tank_sciospec_20fps.npz")

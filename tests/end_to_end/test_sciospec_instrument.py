@@ -88,6 +88,7 @@ def tactomo(*arguments: object) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_an_instrument_is_configured_believed_and_stopped(start: Start, tmp_path: Path) -> None:
     record = {"recording": {"file": str(tmp_path / "a.mcap")}}
     twin, daemon = start(sensor(tmp_path, COARSE), record)

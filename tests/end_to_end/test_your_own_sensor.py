@@ -100,6 +100,7 @@ def test_a_device_of_another_pattern_is_refused_in_the_pages_words(tmp_path: Pat
     assert contradiction(round_, load_description(tmp_path / FILE)) in PAGE.text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("order", "flagged", "place_mm"),
     [

@@ -60,6 +60,7 @@ def test_six_programs_are_listed_where_a_reader_looks() -> None:
         assert set(listed) == names, page
 
 
+@pytest.mark.slow
 def test_presses_are_simulated_found_and_plotted(run: Run, tmp_path: Path) -> None:
     found = re.findall(r"(-?[\d.]+) +(-?[\d.]+) mm +(\d+) kPa", run("simulate_reconstruct_plot.py"))
     places = {(round(float(x)), round(float(y))): float(kpa) for x, y, kpa in found}
@@ -70,6 +71,7 @@ def test_presses_are_simulated_found_and_plotted(run: Run, tmp_path: Path) -> No
     assert (tmp_path / "presses.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_a_simulated_gripper_feels_the_ball_that_it_rolls(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     if find_library("EGL") is None:
@@ -94,6 +96,7 @@ def test_a_simulated_gripper_feels_the_ball_that_it_rolls(tmp_path: Path) -> Non
     assert (tmp_path / "grasp.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_a_sensor_of_ones_own_finds_its_press(run: Run) -> None:
     said = run("own_sensor.py")
     (found,) = re.findall(r"40 voltages: a press at (-?[\d.]+), (-?[\d.]+) mm", said)
@@ -123,6 +126,7 @@ def steady(contacts: list[Contact], *flags: str, frames: int = 25) -> Script:
     return [(contacts, list(flags))] * frames
 
 
+@pytest.mark.slow
 def test_the_robot_stops_once_for_each_cause_and_at_nothing_less() -> None:
     light, hard = steady(touch(None, 134.0)), steady(touch(151.0, 155.0))
     shrug = steady([], "misfit_high", frames=3)  # a short doubt

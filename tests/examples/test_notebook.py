@@ -33,6 +33,7 @@ def test_outputs_are_left_out(cells: list[dict[str, Any]]) -> None:
     assert NOTEBOOK.stat().st_size < 200_000
 
 
+@pytest.mark.slow
 def test_every_cell_runs(cells: list[dict[str, Any]], capsys: pytest.CaptureFixture[str]) -> None:
     names: dict[str, Any] = {"__name__": "__main__"}
     pictures = 0

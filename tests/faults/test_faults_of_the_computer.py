@@ -215,6 +215,7 @@ def test_the_wall_clock_is_set(
     assert duration_s < 60
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("when", ["once", pytest.param("always for 3 s", marks=pytest.mark.faults)])
 @pytest.mark.fault(
     "A reconstruction that raises, {when}",

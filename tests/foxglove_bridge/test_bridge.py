@@ -240,6 +240,7 @@ def test_old_data_are_shown_as_old_until_new_ones_come(
     assert "STALE" not in words_of(scene)
 
 
+@pytest.mark.slow
 def test_it_says_when_no_daemon_answers() -> None:
     with bridged("tcp://127.0.0.1:9") as bridge, FoxgloveClient(bridge.url) as client:
         warning = client.wait_said(lambda said: said["op"] == "status")
@@ -257,6 +258,7 @@ def test_the_daemon_may_be_restarted(sensor: FakeSensor) -> None:
     assert later["missed_frames"] == 0
 
 
+@pytest.mark.slow
 def test_who_does_not_read_holds_up_nobody(sensor: FakeSensor) -> None:
     with (
         bridged(sensor.address) as bridge,
@@ -368,6 +370,7 @@ def test_a_name_that_was_made_to_point_here_is_not_served(
         assert answer_to(bridge.url, Host=host, Origin=APP) == status
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("head", [b"\0" * 20, b"GET / HTTP/1.1\r\n\r\n", b"x" * 100_000])
 def test_what_is_no_request_goes_no_further(source: Publishing, head: bytes) -> None:
     with bridged(source.sensor.address) as bridge, FoxgloveClient(bridge.url) as client:

@@ -121,6 +121,7 @@ def hostile_bodies() -> dict[str, bytes]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", hostile_bodies())
 def test_a_hostile_body_is_refused_in_little_memory(name: str) -> None:
     data = b"left/map\0" + hostile_bodies()[name]

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from tactomo_models.archive import write_whole
 
 KILLED = """
@@ -17,6 +18,7 @@ write_whole(Path(sys.argv[1]), lambda file: os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
+@pytest.mark.slow
 def test_what_a_killed_writer_left_goes_with_the_next_write(tmp_path: Path) -> None:
     path = tmp_path / "left[1].npz"
     subprocess.run([sys.executable, "-c", KILLED, path], check=False)

@@ -52,6 +52,7 @@ def run(
     return out
 
 
+@pytest.mark.slow
 def test_the_arrays_are_those_of_the_contract(
     tmp_path: Path, paper: SensorDescription, arrays: dict[str, Any]
 ) -> None:
@@ -83,6 +84,7 @@ def test_a_single_channel_is_reconstructed_linearly(
     assert out["map"][1].max() > 0.01
 
 
+@pytest.mark.slow
 def test_tikhonov_can_be_asked_for(
     tmp_path: Path, paper: SensorDescription, arrays: dict[str, Any]
 ) -> None:
@@ -147,6 +149,7 @@ def test_a_damaged_archive_is_refused_or_read_as_it_was(
     np.testing.assert_array_equal(reference.structure, volts)
 
 
+@pytest.mark.slow
 def test_progress_is_told_frame_by_frame(
     tmp_path: Path, paper: SensorDescription, arrays: dict[str, Any]
 ) -> None:
@@ -161,6 +164,7 @@ def test_progress_is_told_frame_by_frame(
     assert told == [(1, 3), (2, 3), (3, 3)]
 
 
+@pytest.mark.slow
 def test_a_scan_that_was_not_taken_is_flagged_and_the_others_go_on(
     tmp_path: Path, paper: SensorDescription, arrays: dict[str, Any]
 ) -> None:
@@ -175,6 +179,7 @@ def test_a_scan_that_was_not_taken_is_flagged_and_the_others_go_on(
     assert np.isnan(out["contact_magnitude"][out["contact_frame"] == 2]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("averaged", [1, 20, "without noise"])
 def test_the_noise_is_that_of_the_scans_however_good_the_reference(
     tmp_path: Path, paper: SensorDescription, simulator: SkinSimulator, averaged: int | str

@@ -48,6 +48,7 @@ def test_a_skin_at_rest_is_known_whatever_its_gain(kind: str, gain: float) -> No
     assert found(kind, taken(skin(kind, 0).voltages([]), gain)) is SkinAtStart.KNOWN
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("gain", [1.0, 1.04])
 @pytest.mark.parametrize(
@@ -64,6 +65,7 @@ def test_what_lies_on_it_is_no_other_skin(kind: str, presses: list[Press], gain:
     assert found(kind, taken(skin(kind, 0).voltages(presses), gain), HOUR_S) is SkinAtStart.LOADED
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_another_skin_is_no_load(kind: str, seed: int) -> None:

@@ -70,6 +70,7 @@ def truth_n(touch: Touch) -> float:
     return float(touch.truth_kpa.sum()) * 1e3 * CELL_M2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tilt", [0, 180, 37])
 def test_a_ball_is_found_where_it_presses_and_as_hard(tilt: float) -> None:
     touch = felt(body("ball", BALL, 20, -15, 90), tilt=tilt, method="auto")
@@ -177,6 +178,7 @@ def test_a_light_touch_is_not_known_rather_than_nothing(env: Any) -> None:
     assert env.observation_space.contains(seen)
 
 
+@pytest.mark.slow
 def test_the_pages_code_runs() -> None:
     page = Page("docs/simulation.md")
     (wears,) = page.blocks("xml")

@@ -136,6 +136,7 @@ def test_contacts_land_slide_jump_and_lift(reconstructor: Reconstructor, skin: S
     assert settle(reconstructor, skin, frames=1).tier == "quiet"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["auto", "fit"])
 @pytest.mark.parametrize(("beside_mm", "radius_mm"), [((-16, -20), 11), ((-25, -16), 8)])
 def test_the_identity_stays_with_the_contact_that_never_moved(
@@ -387,6 +388,7 @@ def test_a_reference_of_another_sensor_is_flagged(
     assert Flag.REFERENCE_MISMATCH in frame.flags
 
 
+@pytest.mark.slow
 def test_the_same_frames_give_the_same_maps(
     paper: SensorDescription, artifact: Artifact, skin: Skin
 ) -> None:
@@ -405,6 +407,7 @@ def test_the_same_frames_give_the_same_maps(
         )
 
 
+@pytest.mark.slow
 def test_a_sheet_whose_conductivity_falls_is_no_different(
     paper: SensorDescription, artifact: Artifact
 ) -> None:

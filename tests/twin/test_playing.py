@@ -38,6 +38,7 @@ def test_single_ended_frames_are_played_as_differences_again_and_again(
         assert got == pytest.approx(want[scan.counter % 3], abs=hello.volts_per_count)
 
 
+@pytest.mark.slow
 def test_a_file_played_once_ends_the_twin(bench: Callable[..., Any], tmp_path: Path) -> None:
     path = tmp_path / "in.npz"
     frames = np.arange(1.0, 6.0)[:, None] * np.ones(TANK.measurements)

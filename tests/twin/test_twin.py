@@ -271,6 +271,7 @@ def test_a_live_press_shows_until_it_is_released(bench: Start) -> None:
     assert started.ask("scene")["presses"] == []
 
 
+@pytest.mark.slow
 def test_a_script_starts_with_the_first_scan_that_a_host_receives(bench: Start) -> None:
     script = Scene.model_validate(
         {"press": [{"at_s": 0.5, "duration_s": 1.5, "x_mm": 0, "y_mm": 0, "pressure_kpa": 100}]}
@@ -382,6 +383,7 @@ def test_garbage_costs_no_other_packet(bench: Start) -> None:
     assert host.decoders[1].counts.corrupt == 0
 
 
+@pytest.mark.slow
 def test_a_muted_channel_is_silent_and_comes_back(bench: Start) -> None:
     started = bench(ports=2)
     host = started.host()

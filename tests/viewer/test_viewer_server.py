@@ -187,6 +187,7 @@ async def test_a_newcomer_gets_what_there_is(sensor: FakeSensor) -> None:
             await second.frame(1)
 
 
+@pytest.mark.slow
 @on_loop
 async def test_silence_is_told_from_a_hang(sensor: FakeSensor) -> None:
     async with viewer_of(sensor) as viewer, viewer.page() as page:
@@ -338,6 +339,7 @@ async def test_a_page_that_goes_away_lifts_its_presses_but_not_the_held_ones(
             assert len(set(names.values())) == 3
 
 
+@pytest.mark.slow
 @on_loop
 async def test_the_page_hears_when_the_twin_comes_and_goes(sensor: FakeSensor) -> None:
     twin = FakeControl()

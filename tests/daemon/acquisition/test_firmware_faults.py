@@ -33,6 +33,7 @@ def test_another_version_is_no_bad_cable(bench: Start) -> None:
     assert "version 2" in told(b)["detail"]
 
 
+@pytest.mark.slow
 def test_a_hello_with_a_rate_that_cannot_be_is_told_and_the_port_does_not_run(bench: Start) -> None:
     b = bench()
     content = content_of(HELLO)
@@ -57,6 +58,7 @@ def test_a_hello_with_a_rate_that_cannot_be_is_told_and_the_port_does_not_run(be
         assert "cable" not in issue.next_step
 
 
+@pytest.mark.slow
 def test_scans_of_another_length_are_no_waiting_for_a_trigger(bench: Start) -> None:
     b = bench()
     b.skin.introduce()
@@ -112,6 +114,7 @@ def test_scans_of_a_channel_that_the_hello_does_not_name_are_not_mixed_in(bench:
     assert b.ask("status")["scans"]["magnitude"] == before
 
 
+@pytest.mark.slow
 def test_commands_that_nobody_acknowledges_are_told_once(bench: Start) -> None:
     b = bench()
     b.skin.introduce()
@@ -120,6 +123,7 @@ def test_commands_that_nobody_acknowledges_are_told_once(bench: Start) -> None:
     assert "RX" in b.listener.event(wanted)["next_step"]
 
 
+@pytest.mark.slow
 def test_who_acknowledges_is_not_said_to_be_silent(bench: Start) -> None:
     b = bench()
     line = b.skin.lines[0]
@@ -130,6 +134,7 @@ def test_who_acknowledges_is_not_said_to_be_silent(bench: Start) -> None:
     assert "command_unanswered" not in b.ask("status")["events"]["counts"]
 
 
+@pytest.mark.slow
 def test_infinities_are_no_numbers_and_the_rest_is_used(bench: Start) -> None:
     b = bench(real=True)
     b.tare()

@@ -125,6 +125,7 @@ def test_a_device_that_is_there_already_needs_no_introduction(bench: Start) -> N
     assert b.ask("status")["ports"][0]["corrupt"] == 0
 
 
+@pytest.mark.slow
 def test_a_silent_device_is_asked_again(bench: Start) -> None:
     b = bench()
     codes: list[int] = []

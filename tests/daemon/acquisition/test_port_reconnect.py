@@ -159,6 +159,7 @@ def test_a_pty_of_socat_that_is_killed_is_lost_and_found_again(
 # Coming back
 
 
+@pytest.mark.slow
 def test_unplugged_and_replugged_again_and_again(bench: Start, until: Until) -> None:
     b = bench()
     b.tare()
@@ -176,6 +177,7 @@ def test_unplugged_and_replugged_again_and_again(bench: Start, until: Until) -> 
     assert len(port_threads) == 1
 
 
+@pytest.mark.slow
 def test_what_stands_in_the_way_is_told_and_waited_out(
     bench: Start, tmp_path: Path, hold: Hold
 ) -> None:
@@ -272,6 +274,7 @@ while select.select([port], [], []):
 """
 
 
+@pytest.mark.slow
 def test_one_who_came_later_is_named(bench: Start, hold: Hold, until: Until) -> None:
     b = bench()
     b.tare()
@@ -297,6 +300,7 @@ sys.stdin.read()
 """
 
 
+@pytest.mark.slow
 def test_a_port_is_free_at_once_when_its_daemon_is_killed(line: Any) -> None:
     command = [sys.executable, "-c", HOLDER, str(line.path)]
     other = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
@@ -356,6 +360,7 @@ def test_a_device_that_only_babbles_may_have_another_baud_rate(bench: Start, unt
     assert "baud" in event["next_step"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_short_patience")
 def test_a_device_that_says_hello_and_nothing_else_is_asked_to_start(
     bench: Start, until: Until

@@ -54,6 +54,7 @@ def test_one_channel_missing_is_flagged_and_the_maps_go_on(
     assert b.ask("status")["incomplete_scans"] == 1
 
 
+@pytest.mark.slow
 def test_a_channel_that_stays_out_is_lost_and_comes_back(bench: Start) -> None:
     # A wait that would be noticed if every frame had to pay for it.
     b = bench(ports=2, sync_wait_ms=800)
@@ -165,6 +166,7 @@ def test_voltages_that_are_no_numbers_are_left_to_the_models_and_never_tared(
     assert b.ask("status")["reference"]["scans"] == 3
 
 
+@pytest.mark.slow
 def test_a_channel_that_begins_after_the_other_was_never_missing(bench: Start) -> None:
     b = bench(ports=2, lossless=True)
     b.skin.introduce()

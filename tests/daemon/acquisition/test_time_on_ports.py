@@ -54,6 +54,7 @@ def recorded(
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [0, 60])
 def test_what_waited_in_a_buffer_is_as_old_as_it_is(
     replay: Replay, tmp_path: Path, speed: float
@@ -69,6 +70,7 @@ def test_what_waited_in_a_buffer_is_as_old_as_it_is(
         assert frame["age_ns"] >= frame["delay_ns"]
 
 
+@pytest.mark.slow
 def test_a_dual_scan_is_as_old_as_the_older_of_its_two(replay: Replay, tmp_path: Path) -> None:
     path = recorded(tmp_path / "skew.mcap", structure_after_us=20_000)
     frames = replay(path, lossless=True).of("map")
@@ -77,6 +79,7 @@ def test_a_dual_scan_is_as_old_as_the_older_of_its_two(replay: Replay, tmp_path:
     assert frames[-1]["flags"] == []
 
 
+@pytest.mark.slow
 def test_a_clock_that_stands_still_is_said_to_be_none(
     replay: Replay, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -102,6 +105,7 @@ def test_a_clock_that_jumps_is_said_to_have_jumped(
     assert "device_clock_jumped" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [0, 20])
 @pytest.mark.parametrize("ports", [1, 2])
 def test_an_exact_replay_has_the_dates_and_flags_of_the_live_run(
@@ -127,6 +131,7 @@ def test_an_exact_replay_has_the_dates_and_flags_of_the_live_run(
     assert any(frame["delay_ns"] > 4e6 for frame in live.values())
 
 
+@pytest.mark.slow
 def test_a_recording_of_before_these_dates_replays_with_dates_of_its_own(
     bench: Start, replay: Replay, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -204,6 +209,7 @@ def test_boards_out_of_step_are_flagged_zeroed_and_forgiven(bench: Start) -> Non
     assert "command_refused" not in events(b)
 
 
+@pytest.mark.slow
 def test_an_exact_replay_knows_what_was_known_when_the_recording_began(
     bench: Start, replay: Replay, tmp_path: Path
 ) -> None:

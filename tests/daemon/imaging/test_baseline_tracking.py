@@ -25,6 +25,7 @@ def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(channel_baseline, "GAIN_PER_S", 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("hasty")
 def test_the_baseline_follows_and_a_replay_gives_the_same_maps(
     bench: Start, replay: Start, tmp_path: Path

@@ -119,6 +119,7 @@ def test_it_is_not_in_force_with_another_device(bench: Callable[..., Any]) -> No
     assert daemon.ask("status")["description"]["calibration"] is None
 
 
+@pytest.mark.slow
 def test_with_its_own_device_it_is(bench: Callable[..., Any]) -> None:
     device_id = open_hello(bench())
     kept(device_ids=(device_id,))
@@ -133,6 +134,7 @@ def open_hello(daemon: Any) -> str:
     return str(port["device"]["device_id"])
 
 
+@pytest.mark.slow
 def test_a_recording_takes_it_along(
     bench: Callable[..., Any], replay: Callable[..., Any], tmp_path: Path
 ) -> None:
@@ -275,6 +277,7 @@ def pressures(frames: list[dict[str, Any]]) -> dict[int, list[float]]:
     return {f["scan_counter"]: [c["pressure_kpa"] for c in f["contacts"]] for f in frames}
 
 
+@pytest.mark.slow
 def test_a_replay_goes_by_each_calibration_from_its_frame_on(
     bench: Callable[..., Any], replay: Callable[..., Any], tmp_path: Path
 ) -> None:
@@ -301,6 +304,7 @@ def test_a_replay_goes_by_each_calibration_from_its_frame_on(
     assert min(kpa for (kpa,) in by_one.values()) > 2 * described
 
 
+@pytest.mark.slow
 def test_a_recording_to_come_begins_with_the_new_one(
     bench: Callable[..., Any], replay: Callable[..., Any], tmp_path: Path
 ) -> None:
@@ -400,6 +404,7 @@ def taught(**changes: Any) -> TaughtSkin:
     return made
 
 
+@pytest.mark.slow
 def test_what_was_taught_is_found_by_the_sensors_name_and_told(bench: Callable[..., Any]) -> None:
     made = taught()
     daemon = bench()
@@ -422,6 +427,7 @@ def test_what_was_taught_is_found_by_the_sensors_name_and_told(bench: Callable[.
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "said"),
     [

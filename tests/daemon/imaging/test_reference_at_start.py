@@ -52,6 +52,7 @@ def is_known(frame: Mapping[str, Any]) -> bool:
     return TOUCHES_SEEN.issuperset(frame["flags"])
 
 
+@pytest.mark.slow
 def test_contacts_held_down_through_a_restart_are_still_there(begin: Any) -> None:
     once(begin)
     b = begin(volts(True))
@@ -65,6 +66,7 @@ def test_contacts_held_down_through_a_restart_are_still_there(begin: Any) -> Non
     assert (released["contacts"], released["flags"]) == ([], [])
 
 
+@pytest.mark.slow
 def test_a_tare_on_command_overrides_the_reference_that_was_kept(begin: Any) -> None:
     once(begin)
     b = begin(volts(True))
@@ -81,6 +83,7 @@ def test_a_tare_on_command_overrides_the_reference_that_was_kept(begin: Any) -> 
     again.listener.event("tared")
 
 
+@pytest.mark.slow
 def test_a_skin_that_has_warmed_since_is_tared_anew(begin: Any) -> None:
     once(begin)
     with np.load(reference_path("left")) as kept:
@@ -91,6 +94,7 @@ def test_a_skin_that_has_warmed_since_is_tared_anew(begin: Any) -> None:
     assert b.step(volts={n: 0.96 * each for n, each in volts(False).items()})["tier"] == "quiet"
 
 
+@pytest.mark.slow
 def test_another_skin_is_not_taken_for_a_load(begin: Any) -> None:
     once(begin)
     description = load_description("paper_square")
@@ -102,6 +106,7 @@ def test_another_skin_is_not_taken_for_a_load(begin: Any) -> None:
     assert (frame["contacts"], frame["flags"]) == ([], [])
 
 
+@pytest.mark.slow
 def test_where_somebody_moves_at_the_start_the_reference_that_was_kept_is_used(begin: Any) -> None:
     once(begin)
     b = begin(*[volts(False)] * 10, *[volts(True)] * 10)
@@ -109,6 +114,7 @@ def test_where_somebody_moves_at_the_start_the_reference_that_was_kept_is_used(b
     assert len(b.step(volts=volts(True))["contacts"]) == 4
 
 
+@pytest.mark.slow
 def test_a_damaged_file_is_told_and_does_no_harm(begin: Any) -> None:
     once(begin)
     reference_path("left").write_bytes(b"no archive")
@@ -117,6 +123,7 @@ def test_a_damaged_file_is_told_and_does_no_harm(begin: Any) -> None:
     b.listener.event("tared")
 
 
+@pytest.mark.slow
 def test_where_nobody_can_tell_what_lay_on_the_skin_every_frame_says_so_until_a_tare(
     begin: Any,
 ) -> None:
@@ -138,6 +145,7 @@ def test_where_nobody_can_tell_what_lay_on_the_skin_every_frame_says_so_until_a_
     assert b.step(volts=volts(False))["flags"] == []
 
 
+@pytest.mark.slow
 def test_a_folder_that_cannot_be_written_is_told(begin: Any) -> None:
     reference_path("left").parent.parent.mkdir(parents=True, exist_ok=True)
     reference_path("left").parent.write_text("a file where the folder should be")
@@ -145,6 +153,7 @@ def test_a_folder_that_cannot_be_written_is_told(begin: Any) -> None:
     b.listener.event("reference_not_kept")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [0.0, 2000.0])
 def test_where_nothing_can_be_measured_no_contacts_is_not_known(begin: Any, value: float) -> None:
     b = begin(volts(False))

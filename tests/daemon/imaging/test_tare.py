@@ -16,6 +16,7 @@ def pressed(frame: dict[str, Any]) -> float:
     return float(array_from_wire(frame["map"])[0, 0])
 
 
+@pytest.mark.slow
 def test_frames_go_on_against_the_last_reference_until_the_new_one_is_understood(
     bench: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -104,6 +104,7 @@ def board() -> Iterator[str]:
     os.close(host)
 
 
+@pytest.mark.slow
 def test_the_daemon_reads_a_board_by_a_protocol_that_is_named(folder: Path, board: str) -> None:
     daemon = DaemonProcess(
         folder,
@@ -169,6 +170,7 @@ def test_the_twin_says_what_it_needs_to_speak_it(folder: Path) -> None:
         TwinConfig(SENSOR, protocol="own_board:Floats")
 
 
+@pytest.mark.slow
 def test_ports_knows_it_by_what_it_sends(folder: Path, board: str) -> None:
     from tactomo.cli import app
 

@@ -73,6 +73,7 @@ def tare_and_step(b: Any) -> None:
         b.step(load=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ports", [1, 2])
 @pytest.mark.parametrize("speed", [0, 20])
 def test_a_replay_gives_the_maps_of_the_live_run(
@@ -83,6 +84,7 @@ def test_a_replay_gives_the_maps_of_the_live_run(
     assert_same(live, maps(replay(path, speed=speed).of("map")))
 
 
+@pytest.mark.slow
 def test_a_recording_that_begins_in_the_middle_of_a_packet_has_it_whole(
     bench: Start, replay: Replay, tmp_path: Path
 ) -> None:
@@ -102,6 +104,7 @@ def test_a_recording_that_begins_in_the_middle_of_a_packet_has_it_whole(
     assert_same(maps([live]), maps(replay(path).of("map")))
 
 
+@pytest.mark.slow
 def test_a_replay_leaves_out_what_the_live_run_dropped(
     bench: Start, replay: Replay, tmp_path: Path
 ) -> None:
@@ -119,6 +122,7 @@ def test_a_replay_leaves_out_what_the_live_run_dropped(
     assert_same(live, maps(replay(path).of("map")))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "name"),
     [(frame_marks, "mark_entry"), (daemon, "message_entry")],
@@ -145,6 +149,7 @@ def test_a_frame_that_was_seen_is_in_the_recording(
     assert [frame.scan_counter for frame in open_frames(path)] == [seen["scan_counter"]]
 
 
+@pytest.mark.slow
 def test_a_recording_from_the_start_has_the_first_tare(
     bench: Start, replay: Replay, tmp_path: Path
 ) -> None:
@@ -157,6 +162,7 @@ def test_a_recording_from_the_start_has_the_first_tare(
     assert_same(maps(b.listener.of("map")), maps(replay(path).of("map")))
 
 
+@pytest.mark.slow
 def test_the_tier_that_was_in_force_is_again(bench: Start, replay: Replay, tmp_path: Path) -> None:
     path = tmp_path / "tier.mcap"
     b = bench(recording={"file": path}, method="auto")
@@ -175,6 +181,7 @@ def test_the_tier_that_was_in_force_is_again(bench: Start, replay: Replay, tmp_p
     ]
 
 
+@pytest.mark.slow
 def test_what_a_time_bought_is_given_again_on_any_machine(
     bench: Start, replay: Replay, tmp_path: Path
 ) -> None:
@@ -281,6 +288,7 @@ def test_a_recording_has_the_frames_that_were_published(bench: Start, tmp_path: 
     assert not open_frames(tmp_path / "bytes.mcap").has_frames
 
 
+@pytest.mark.slow
 def test_a_truncated_recording_opens_up_to_where_it_ends(
     bench: Start, replay: Replay, tmp_path: Path
 ) -> None:
@@ -403,6 +411,7 @@ def imported(path: Path, reference: Reference | None = None, **hello: Any) -> li
     return scans
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [0, 30])
 def test_imported_scans_are_tared_and_reconstructed_one_by_one(
     replay: Replay, tmp_path: Path, speed: float
@@ -432,6 +441,7 @@ def test_a_recording_of_another_sensor_is_refused(tmp_path: Path) -> None:
         Daemon(load_config(ports=[f"replay://{path}"]), reconstructor=memory)
 
 
+@pytest.mark.slow
 def test_a_replay_without_pauses_writes_chunks_as_small_as_a_live_one(
     replay: Replay, tmp_path: Path
 ) -> None:
@@ -455,6 +465,7 @@ def scans_in(chunk: list[Any]) -> list[Scan]:
     return [packet for packet in packets if isinstance(packet, Scan)]
 
 
+@pytest.mark.slow
 def test_replay_keeps_the_recordings_time(replay: Replay, tmp_path: Path) -> None:
     path = tmp_path / "tank.mcap"
     imported(path)
@@ -487,6 +498,7 @@ def test_replay_urls_that_cannot_be_are_refused(
         Daemon(load_config(ports=ports), reconstructor=memory)
 
 
+@pytest.mark.slow
 def test_the_summary_is_read_from_a_name_with_blanks(replay: Replay, tmp_path: Path) -> None:
     path = tmp_path / "two words & %.mcap"
     imported(path)

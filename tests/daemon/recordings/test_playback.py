@@ -206,6 +206,7 @@ def test_a_step_gives_one_frame_of_a_read_that_brought_several(play: Any, tmp_pa
     b.until(lambda: b.ask("status")["state"] == "ended")
 
 
+@pytest.mark.slow
 def test_a_move_into_the_middle_of_a_packet_is_no_damage(play: Any, torn: Path) -> None:
     b = play(torn)
     b.ask("replay", paused=False)

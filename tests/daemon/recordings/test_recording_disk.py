@@ -96,6 +96,7 @@ def told(b: Any, name: str) -> list[dict[str, Any]]:
     return [event for event in b.listener.of("event") if event["name"] == name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reserve_mb", [0, 2])
 def test_a_full_disk_is_recorded_to_again_once_it_has_room(
     bench: Start, small_disk: Path, monkeypatch: pytest.MonkeyPatch, reserve_mb: float
@@ -137,6 +138,7 @@ def test_a_full_disk_is_recorded_to_again_once_it_has_room(
     assert open_recording(end["path"]).summary.frames > 0
 
 
+@pytest.mark.slow
 def test_a_recording_to_one_file_ends_with_the_room_and_can_be_recovered(
     bench: Start, small_disk: Path, tmp_path: Path
 ) -> None:
@@ -160,6 +162,7 @@ def test_a_recording_to_one_file_ends_with_the_room_and_can_be_recovered(
         b.ask("record_start", path=str(small_disk / "two.mcap"))
 
 
+@pytest.mark.slow
 def test_a_stuck_disk_holds_up_nothing_and_costs_nothing(
     bench: Start, stuck_disk: tuple[Path, Callable[[str], None]]
 ) -> None:
@@ -184,6 +187,7 @@ def test_a_stuck_disk_holds_up_nothing_and_costs_nothing(
     assert counters(path) == list(range(1, b.skin.counter + 1))
 
 
+@pytest.mark.slow
 def test_a_disk_that_stays_stuck_ends_the_recording_when_enough_waits(
     bench: Start,
     stuck_disk: tuple[Path, Callable[[str], None]],
@@ -211,6 +215,7 @@ def test_a_disk_that_stays_stuck_ends_the_recording_when_enough_waits(
     assert len(told(b, "recording_failed")) == 1
 
 
+@pytest.mark.slow
 def test_the_daemon_stops_although_the_disk_does_not_answer(
     bench: Start, stuck_disk: tuple[Path, Callable[[str], None]]
 ) -> None:
@@ -271,6 +276,7 @@ def test_what_comes_while_the_disk_is_asked_to_keep_it_is_written(
     assert open_recording(path).summary.is_complete
 
 
+@pytest.mark.slow
 def test_a_deleted_file_or_folder_is_noticed(bench: Start, tmp_path: Path) -> None:
     folder, path = tmp_path / "set", tmp_path / "one.mcap"
     b = bench(recording={"folder": folder})
@@ -296,6 +302,7 @@ def test_a_file_that_is_moved_is_written_on(bench: Start, tmp_path: Path) -> Non
     assert open_recording(tmp_path / "b.mcap").summary.frames == 4
 
 
+@pytest.mark.slow
 def test_a_folder_that_takes_no_new_file_leaves_the_present_one_going(
     bench: Start, ext4_disk: Path
 ) -> None:
@@ -317,6 +324,7 @@ def test_a_folder_that_takes_no_new_file_leaves_the_present_one_going(
     assert found == set(range(1, last + 1))
 
 
+@pytest.mark.slow
 def test_a_folder_that_cannot_be_made_does_not_keep_the_daemon_from_starting(
     bench: Start, tmp_path: Path
 ) -> None:

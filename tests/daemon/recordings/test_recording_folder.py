@@ -86,6 +86,7 @@ def test_each_file_replays_alone_and_together_they_have_every_frame_once(
     assert rotated == len(files) - 1 >= 3
 
 
+@pytest.mark.slow
 def test_a_folder_says_every_byte_once_and_in_time(
     bench: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -107,6 +108,7 @@ def test_a_folder_says_every_byte_once_and_in_time(
         assert decoder.counts.corrupt == 0
 
 
+@pytest.mark.slow
 def test_a_night_between_two_files_is_not_waited_for(
     bench: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -155,6 +157,7 @@ def test_numbers_go_on_whatever_the_clock_and_strangers_do(bench: Start, tmp_pat
     assert all((folder / name).read_text() == "precious" for name in strangers)
 
 
+@pytest.mark.slow
 def test_the_oldest_files_of_this_sensor_go_when_there_are_too_many(
     bench: Start, tmp_path: Path
 ) -> None:
@@ -227,6 +230,7 @@ def test_the_file_being_written_stays() -> None:
     assert gone([kept(0, 0, 1, size=10**12)], RecordingConfig(keep_gb=2, keep_days=1)) == []
 
 
+@pytest.mark.slow
 def test_a_file_is_as_old_as_what_is_in_it(
     bench: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -178,6 +178,7 @@ def test_a_whole_recording_is_copied(tmp_path: Path) -> None:
     assert messages(output) == messages(tmp_path / "damaged.mcap")
 
 
+@pytest.mark.slow
 def test_cut_anywhere_in_the_last_chunks(tmp_path: Path) -> None:
     for length in range(chunks()[-2][0], len(whole())):
         if length % 97 and length < len(whole()) - 30:
@@ -367,6 +368,7 @@ def test_nothing_is_written_over(tmp_path: Path) -> None:
     assert (tmp_path / "a.mcap").read_bytes()[:8] == whole()[:8]
 
 
+@pytest.mark.slow
 def test_a_replay_after_recovery_gives_the_live_maps(
     bench: Start, replay: Start, tmp_path: Path
 ) -> None:

@@ -117,6 +117,7 @@ def test_a_signal_stops_it_within_a_second(spawn: Start, tmp_path: Path, number:
     assert open_recording(tmp_path / "skin.mcap").summary.is_complete
 
 
+@pytest.mark.slow
 def test_a_killed_daemons_recording_opens_up_to_its_last_flush(
     spawn: Start, replay: Start, tmp_path: Path
 ) -> None:
@@ -138,6 +139,7 @@ def test_a_killed_daemons_recording_opens_up_to_its_last_flush(
     assert frames == len(replay(path).of("map"))
 
 
+@pytest.mark.slow
 def test_a_full_disk_ends_the_recording_and_nothing_else(spawn: Start, tmp_path: Path) -> None:
     path = tmp_path / "skin.mcap"
     process, skin = spawn()

@@ -113,6 +113,7 @@ def test_elsewhere_it_stays_json(tmp_path: Path) -> None:
     assert "<3>" not in said
 
 
+@pytest.mark.slow
 def test_its_last_words_say_why(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> None:
     skin = make_skin(tmp_path, 1)
     with daemon("--port", str(skin.lines[0].path)) as process:

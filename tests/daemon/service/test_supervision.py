@@ -101,6 +101,7 @@ def supervised(
     process.kill()
 
 
+@pytest.mark.slow
 def test_a_daemon_without_data_is_ready_alive_and_says_when_it_stops(
     supervised: tuple[DaemonProcess, Any], manager: ServiceManager
 ) -> None:
@@ -117,6 +118,7 @@ def test_a_daemon_without_data_is_ready_alive_and_says_when_it_stops(
     assert process.popen.wait(PATIENCE_S) == 0
 
 
+@pytest.mark.slow
 def test_a_pipeline_that_hangs_is_not_hidden_by_the_threads_that_do_not(
     supervised: tuple[DaemonProcess, Any], manager: ServiceManager
 ) -> None:
@@ -136,6 +138,7 @@ def test_a_pipeline_that_hangs_is_not_hidden_by_the_threads_that_do_not(
     assert "in reconstruct" in log, "where it hangs is in the log"
 
 
+@pytest.mark.slow
 def test_control_does_not_feed_the_watchdog(
     supervised: tuple[DaemonProcess, Any], manager: ServiceManager
 ) -> None:

@@ -44,6 +44,7 @@ def test_status_says_how_everything_is(bench: Start) -> None:
     assert set(b.listener.of("status")[-1]) == set(status)
 
 
+@pytest.mark.slow
 def test_rates_are_what_comes_and_nothing_when_nothing_comes(bench: Start) -> None:
     b = bench()
     b.tare()
@@ -59,6 +60,7 @@ def test_rates_are_what_comes_and_nothing_when_nothing_comes(bench: Start) -> No
     b.listener.wait("status", lambda s: s["rates"]["frames_hz"] == 0)
 
 
+@pytest.mark.slow
 def test_tare_is_answered_when_the_new_reference_holds(bench: Start) -> None:
     b = bench(ports=2)
     b.tare()
@@ -113,6 +115,7 @@ def test_the_first_tare_waits_until_nobody_presses(bench: Start) -> None:
     b.listener.event("tared")
 
 
+@pytest.mark.slow
 def test_tare_without_data_says_so(bench: Start) -> None:
     b = bench()
     with pytest.raises(ControlError) as caught:
@@ -120,6 +123,7 @@ def test_tare_without_data_says_so(bench: Start) -> None:
     assert caught.value.name == "no_data"
 
 
+@pytest.mark.slow
 def test_tier_and_budget_are_answered_when_they_are_in_force(
     bench: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -128,6 +128,7 @@ def test_a_map_is_made_for_subscribers_alone(bench: Start) -> None:
     assert [m["sequence"] for m in maps] == list(range(1, len(maps) + 1))
 
 
+@pytest.mark.slow
 def test_a_stalled_subscriber_slows_nobody(bench: Start, connect: Start) -> None:
     b = bench()
     b.tare()
@@ -172,6 +173,7 @@ def test_where_frames_lag_the_state_is_late_and_not_that_no_scans_come(
     b.until(lambda: b.ask("status")["state"] == "stale")  # and nothing comes any more
 
 
+@pytest.mark.slow
 def test_every_scan_is_reconstructed_if_asked_for(bench: Start) -> None:
     b = bench(seconds=0.02, lossless=True)
     b.tare()

@@ -147,6 +147,7 @@ def test_an_allowed_client_does_so_in_an_event_loop(guarded: Any, robot: Robot) 
     asyncio.run(look())
 
 
+@pytest.mark.slow
 def test_a_stranger_is_turned_away_in_an_event_loop_until_allowed(
     guarded: Any, robot: Robot
 ) -> None:
@@ -225,6 +226,7 @@ def test_the_example_of_the_specification_gets_in(
         process.kill()
 
 
+@pytest.mark.slow
 def test_a_client_that_is_not_listed_is_refused_and_told_of(guarded: Any, robot: Robot) -> None:
     stranger = robot.client("stranger")
     address = guarded.daemon.stream_address
@@ -285,6 +287,7 @@ def test_the_wrong_server_key_is_noticed(guarded: Any, robot: Robot) -> None:
     assert caught.value.name == "wrong_server"
 
 
+@pytest.mark.slow
 def test_who_is_revoked_is_cut_off_and_the_others_come_back(guarded: Any, robot: Robot) -> None:
     guarded.tare()
     ros = robot.allow(robot.client("ros"))

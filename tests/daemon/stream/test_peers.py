@@ -51,6 +51,7 @@ def peer(address: str, kind: bytes) -> Iterator[socket.socket]:
         yield line
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parts", [PARTS, 4 * PARTS])
 def test_a_message_of_a_million_parts_holds_up_nobody(daemon: DaemonProcess, parts: int) -> None:
     most_s = 0.0

@@ -49,6 +49,7 @@ def samples(draw: st.DrawFn) -> bytes:
     return framed(content[:16] + b"\3" + content[17:20] + struct.pack("<208I", *bits))
 
 
+@pytest.mark.slow
 def test_no_packet_ends_the_publisher_or_breaks_the_stream(bench: Start) -> None:
     b = bench(real=True, sync_wait_ms=500)
     b.tare()

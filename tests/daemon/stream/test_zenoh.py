@@ -173,6 +173,7 @@ def test_each_kind_has_its_key_and_its_count(
     assert counts == list(range(counts[0], counts[0] + len(counts)))
 
 
+@pytest.mark.slow
 def test_a_skin_at_rest_is_sent_by_a_heartbeat_and_a_touch_at_once(
     left: FakeSensor, start: Callable[..., Running], desk: zenoh.Session
 ) -> None:
@@ -192,6 +193,7 @@ def test_a_skin_at_rest_is_sent_by_a_heartbeat_and_a_touch_at_once(
     assert counts == list(range(counts[0], counts[0] + len(counts)))  # none is missed
 
 
+@pytest.mark.slow
 def test_a_status_is_sent_when_it_says_something_else_and_its_numbers_are_asked_for(
     left: FakeSensor, start: Callable[..., Running], desk: zenoh.Session, reader: Any
 ) -> None:
@@ -275,6 +277,7 @@ def test_a_query_gets_the_newest_contacts_and_status(
     assert len(contacts["contacts"]) == 1
 
 
+@pytest.mark.slow
 def test_a_token_lives_as_long_as_the_daemon(
     left: FakeSensor, start: Callable[..., Running], desk: zenoh.Session
 ) -> None:
@@ -292,6 +295,7 @@ def test_a_token_lives_as_long_as_the_daemon(
     tokens.undeclare()  # type: ignore[no-untyped-call]
 
 
+@pytest.mark.slow
 def test_clients_of_zeromq_find_all_skins_at_one_address(
     left: FakeSensor, right: FakeSensor, start: Callable[..., Running], reader: Any
 ) -> None:
@@ -355,6 +359,7 @@ def test_what_is_lost_is_counted_and_told(
     assert running.said("messages_lost")["detail"].startswith("3 so far")
 
 
+@pytest.mark.slow
 def test_two_robots_skins_of_one_name_are_not_mixed(
     desk: zenoh.Session, start: Callable[..., Running], reader: Any, left: FakeSensor
 ) -> None:
@@ -411,6 +416,7 @@ def test_two_daemons_of_one_name_are_warned_of(
         assert "another name" in warning["next_step"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_it(
     left: FakeSensor, start: Callable[..., Running], number: signal.Signals
@@ -463,6 +469,7 @@ def example(name: str, folder: Path, port: int) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not shutil.which("openssl"), reason="needs openssl to make certificates")
 def test_the_examples_let_a_listed_certificate_read_and_no_more(
     left: FakeSensor, tmp_path: Path
@@ -541,6 +548,7 @@ def test_the_pages_program_prints_touches_and_who_is_there(
     assert said == {"tactomo/arm/left is there", "tactomo/arm/left/contacts 10, 0 mm"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "status", "said"),
     [

@@ -96,6 +96,7 @@ def test_a_sheet_pressed_nearly_everywhere_ends_and_is_flagged(
     assert frame.flags & (Flag.MISFIT_HIGH | Flag.NOT_CONVERGED)
 
 
+@pytest.mark.slow
 def test_what_the_linear_equation_explains_wrongly_is_flagged(
     paper: SensorDescription, artifact: Artifact, simulator: SkinSimulator
 ) -> None:

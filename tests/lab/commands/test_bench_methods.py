@@ -72,6 +72,7 @@ def test_every_method_is_timed_beside_what_it_is_compared_with(sensor: Path) -> 
             assert row["p99_of_product"] == pytest.approx(row["p99_ms"] / product["p50_ms"])
 
 
+@pytest.mark.slow
 def test_methods_of_ones_own_have_rows_and_what_cannot_be_timed_says_why(
     sensor: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -91,6 +92,7 @@ def test_methods_of_ones_own_have_rows_and_what_cannot_be_timed_says_why(
     assert rows[peer]["p50_ms"] is rows[failing]["of_product"] is None
 
 
+@pytest.mark.slow
 def test_an_earlier_run_is_set_beside_this_one(sensor: Path, tmp_path: Path) -> None:
     asked = ("--no-live", "-d", str(sensor), "--method", "tikhonov")
     earlier = CliRunner().invoke(app, ["bench", *asked, "--json"])

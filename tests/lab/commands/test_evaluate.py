@@ -45,6 +45,7 @@ def test_a_picture_that_cannot_be_is_told_before_the_work(
     assert told in result.stderr
 
 
+@pytest.mark.slow
 def test_scenes_in_words(tactomo: Run) -> None:
     result = tactomo(*FEW, "--seeds", "tuning", "--snr-of", "voltage")
     assert result.returncode == 0

@@ -13,6 +13,7 @@ from small_sensor import SMALL
 Run = Callable[..., Any]
 
 
+@pytest.mark.slow
 def test_in_numbers_and_words(tactomo: Run, tmp_path: Path) -> None:
     sensor = tmp_path / "small.toml"
     sensor.write_text(SMALL)

@@ -30,6 +30,7 @@ def tank(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_tanks_in_numbers_and_pictures(tactomo: Run, tank: Path, tmp_path: Path) -> None:
     picture = tmp_path / "tanks.png"
     some = simulated_tanks(load_description(tank), "tuning", 2)
@@ -46,6 +47,7 @@ def test_tanks_in_numbers_and_pictures(tactomo: Run, tank: Path, tmp_path: Path)
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_tanks_in_words(tactomo: Run, tank: Path, tmp_path: Path) -> None:
     rows = np.linspace(1, -1, 32)[:, None]
     np.savez(
@@ -95,6 +97,7 @@ def test_a_file_that_is_none(tactomo: Run, tmp_path: Path, command: str) -> None
     assert "cannot read" in result.stderr
 
 
+@pytest.mark.slow
 def test_a_page_of_the_sets_that_are_there(tactomo: Run, tmp_path: Path) -> None:
     """Of presses on a skin whose voltages are linear in the place; the other sets are missing."""
     rng = np.random.default_rng(0)

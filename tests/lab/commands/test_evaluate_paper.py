@@ -49,6 +49,7 @@ def test_every_figure(tactomo: Run, few: tuple[object, ...], tmp_path: Path) -> 
     assert len(figures["10"]["places"]) == 25
 
 
+@pytest.mark.slow
 def test_in_words(tactomo: Run, few: tuple[object, ...]) -> None:
     result = tactomo(*few, "--figure", "9,12", "--method", "tikhonov")
     assert result.returncode == 0
@@ -58,6 +59,7 @@ def test_in_words(tactomo: Run, few: tuple[object, ...]) -> None:
     assert "Fig. 10" not in result.stdout
 
 
+@pytest.mark.slow
 def test_a_method_that_cannot_be_had_is_said_and_left_out(
     tactomo: Run, few: tuple[object, ...]
 ) -> None:

@@ -20,6 +20,7 @@ def stability(tactomo: Run, tmp_path: Path) -> Callable[..., Any]:
     return lambda *more: tactomo("evaluate", "stability", "--description", sensor, *more)
 
 
+@pytest.mark.slow
 def test_in_numbers_words_and_pictures(stability: Run, tmp_path: Path) -> None:
     picture = tmp_path / "flags.png"
     some = (

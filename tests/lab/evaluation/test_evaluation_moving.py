@@ -96,6 +96,7 @@ def _built(artifact: Artifact, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tactomo_lab.evaluation.moving.load_or_build_artifact", lambda _: artifact)
 
 
+@pytest.mark.slow
 def test_frames_are_scored_one_by_one(paper: SensorDescription, simulator: SkinSimulator) -> None:
     one = {"A": press("A")}
     steps = [
@@ -141,6 +142,7 @@ def test_contacts_that_touch_are_one_and_near_ones_are_not_counted(
     assert (apart.groups, apart.countable) == (2, True)
 
 
+@pytest.mark.slow
 def test_identities_that_are_lost(paper: SensorDescription, simulator: SkinSimulator) -> None:
     """Scans of nothing for longer than a contact is remembered: it gets a new identity."""
     held, gap = Step("hold", {"A": press("A")}), MAX_MISSED + 1
@@ -164,6 +166,7 @@ def test_identities_that_are_lost(paper: SensorDescription, simulator: SkinSimul
     assert [score.switches for score in play(lifted)] == [*none, 0]  # a new one, and told so
 
 
+@pytest.mark.slow
 def test_a_tare_forgets_who_was_who(paper: SensorDescription, simulator: SkinSimulator) -> None:
     held = Step("hold", {"A": press("A")})
     scores = play(sequence(paper, simulator, held, held, replace(held, tare=True)))
@@ -224,6 +227,7 @@ def test_a_sequence_is_drawn_once_and_kept(
     np.testing.assert_array_equal(quiet, ~np.array(loaded))
 
 
+@pytest.mark.slow
 def test_speed_and_accuracy_are_of_all_frames(
     paper: SensorDescription,
     simulator: SkinSimulator,

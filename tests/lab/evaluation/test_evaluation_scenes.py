@@ -203,6 +203,7 @@ def test_noise_is_what_the_ratio_says(paper: SensorDescription, snr_of: SnrOf) -
         assert known == pytest.approx(expected, rel=0.1)
 
 
+@pytest.mark.slow
 def test_the_same_scene_comes_out_of_the_cache(
     paper: SensorDescription, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,6 +18,7 @@ def one_of(small: SensorDescription, row: str) -> dict[str, EvaluationScene]:
     return {line: scene for line, scenes in lines.items() for scene in scenes}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", STILL_ROWS)
 def test_a_scene_of_each_row_is_reconstructed_and_scored(
     small: SensorDescription, row: str
@@ -74,6 +75,7 @@ def test_a_ball_has_its_peak_and_the_mean_over_its_area(small: SensorDescription
     assert contact.magnitude * contact.area_m2 == pytest.approx(in_all, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_an_even_pressure_is_fitted_to_the_middle_press(small: SensorDescription) -> None:
     """By the fit of old, which is sure of it; the field, which may take it for soft, is not."""
     even, field = middle_press(small, (EVEN_FIT, "fit"), "tuning", 4)

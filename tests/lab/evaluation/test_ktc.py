@@ -58,6 +58,7 @@ def simulated(tank_model: TankModel) -> Arrays:
     }
 
 
+@pytest.mark.slow
 def test_simulated_tanks_are_scored(tactomo: Run, simulated: Arrays, tmp_path: Path) -> None:
     np.savez(tmp_path / "six.npz", **simulated)
     asked = ("evaluate", "ktc", tmp_path / "six.npz")
@@ -74,6 +75,7 @@ def test_simulated_tanks_are_scored(tactomo: Run, simulated: Arrays, tmp_path: P
     assert "sum" in tactomo(*asked).stdout
 
 
+@pytest.mark.slow
 def test_the_unit_of_the_voltages_does_not_matter(simulated: Arrays, tmp_path: Path) -> None:
     """What counts is what the empty tank shows."""
     tank = load_description("tank_ktc2023")
@@ -126,6 +128,7 @@ def test_drawn_objects_keep_apart() -> None:
     assert max(beside) == 1  # no two of opposite kinds touch
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("level", "least"), [(1, 0.88), (4, 0.8), (7, 0.7)])
 def test_measured_tanks(level: int, least: float) -> None:
     tank = load_description("tank_ktc2023")

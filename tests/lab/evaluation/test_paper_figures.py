@@ -103,6 +103,7 @@ def test_scenes_of_the_simulation_study(small: SensorDescription) -> None:
     assert other.layout.presses != drawn[0].layout.presses
 
 
+@pytest.mark.slow
 def test_points_of_the_simulation_study(small: SensorDescription) -> None:
     drawn = list(paper_scenes(small, "tuning", 1, contacts=(1, 2)))
     points = cells(reconstruct_scenes(drawn, "tikhonov", "noser"))

@@ -23,6 +23,7 @@ def tanks() -> Tanks:
     return read_tanks(path, load_description("tank_uef2017"))
 
 
+@pytest.mark.slow
 def test_measured_tanks(tanks: Tanks) -> None:
     imager = TankImager(load_description("tank_uef2017"))
     methods = ("tikhonov", "noser", "network")
@@ -73,6 +74,7 @@ def test_turned_tanks_are_not_recognised(tanks: Tanks) -> None:
     assert means[0] > max(means[1:]) + 0.2
 
 
+@pytest.mark.slow
 def test_measured_presses() -> None:
     path = measured("skin_round_presses.npz")
     skin = load_description("skin_round")

@@ -77,6 +77,7 @@ def test_another_pattern_is_refused(skin: SensorDescription, tmp_path: Path) -> 
         read_presses(tmp_path / "absent.npz", skin)
 
 
+@pytest.mark.slow
 def test_presses_are_located_whatever_the_robots_frame(coarse: SensorDescription) -> None:
     """Simulated on a finer, uneven skin; the frame is turned and mirrored, half is not read."""
     rng = np.random.default_rng(5)

@@ -87,6 +87,7 @@ def case_of(small: SensorDescription, regime: str, number: int = 0) -> Case:
     return make_case(small, regime, "tuning", number)
 
 
+@pytest.mark.slow
 def test_a_case_is_measured_as_planned(small: SensorDescription) -> None:
     lost = case_of(small, "lost-scans", 1)
     assert [set(scans) for scans in lost.frames[-3:]] == [
@@ -183,6 +184,7 @@ def by(method: str, case: Case, artifact: Artifact) -> Outcome:
     return outcome
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["tikhonov", "noser"])
 def test_regularisation_is_so_many_times_what_the_rule_chooses(
     small: SensorDescription,
@@ -224,6 +226,7 @@ def test_a_case_is_judged_by_its_last_frame(
     assert outcome.score.contacts == len(case.plan.frames[-1])
 
 
+@pytest.mark.slow
 def test_what_is_right_where_the_magnitude_channel_shows_nothing(
     small: SensorDescription, small_artifact: Artifact
 ) -> None:

@@ -12,6 +12,7 @@ from tactomo_lab.tanks.model import Readings, TankModel
 from tactomo_models import load_description
 
 
+@pytest.mark.slow
 def test_refining_explains_more(monkeypatch: pytest.MonkeyPatch) -> None:
     """A square and a disc, solved on another mesh; without a step it is the network's image."""
     tank = load_description("tank_ktc2023")

@@ -22,6 +22,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mirrored", [0, 1])
 def test_a_turned_scene_has_the_turned_voltages(mirrored: int) -> None:
     """A disc's voltages, dealt out anew, are those of the disc in its new place."""
@@ -43,6 +44,7 @@ def test_a_turned_scene_has_the_turned_voltages(mirrored: int) -> None:
     assert np.linalg.norm(dealt - solved) < 0.03 * np.linalg.norm(solved)
 
 
+@pytest.mark.slow
 def test_batches_are_of_every_view(folder: Path) -> None:
     scenes = TankScenes(folder, seed=0)
     for _ in range(4):
@@ -56,6 +58,7 @@ def test_batches_are_of_every_view(folder: Path) -> None:
     assert not torch.equal(*kept)  # noise and turns are drawn anew
 
 
+@pytest.mark.slow
 def test_what_is_trained_runs(folder: Path, tmp_path: Path) -> None:
     losses = list(train(folder, 3, tmp_path / "tank.onnx"))
     assert losses[-1] < losses[0]

@@ -96,6 +96,7 @@ def count(frames: list[Reconstruction]) -> list[int]:
     return [len(frame.contacts) for frame in frames]
 
 
+@pytest.mark.slow
 def test_a_sheet_that_warms_leaves_no_ghost_and_untracked_it_does(life: Life) -> None:
     tare = life.tracker.reference
     frames = life.lives(1200, gain=0.95)
@@ -141,6 +142,7 @@ def test_a_finger_that_comes_down_within_a_minute_is_reported(life: Life) -> Non
     assert set(count(life.lives(20))) == {0}
 
 
+@pytest.mark.slow
 def test_what_creeps_back_after_a_long_press_is_no_ghost(life: Life) -> None:
     life.lives(1800, PRESS, step_s=20.0)
     # 3 per cent more conductive where it was pressed: 0.15 kPa, as a touch would have it.
@@ -153,6 +155,7 @@ def test_what_creeps_back_after_a_long_press_is_no_ghost(life: Life) -> None:
     assert life.tracker.drift[Channel.STRUCTURE].uneven < 1e-3
 
 
+@pytest.mark.slow
 def test_a_step_that_no_skin_makes_is_refused_and_said(life: Life) -> None:
     frames = life.lives(60, gain=0.7)
     assert frames[-1].flags
@@ -217,6 +220,7 @@ def test_a_contact_that_lasts_is_never_erased_where_a_lead_is_broken(
     assert set(count(broken.lives(20))) == {0}
 
 
+@pytest.mark.slow
 def test_a_lead_that_breaks_after_the_tare_ends_the_following_until_the_next(
     life: Life, paper: SensorDescription
 ) -> None:
@@ -245,6 +249,7 @@ def test_equal_frames_lead_to_equal_references(
     np.testing.assert_array_equal(ends[0].structure_drift, ends[1].structure_drift)
 
 
+@pytest.mark.slow
 def test_a_drifted_reference_says_the_same_again_wherever_it_is_put_in_force(
     life: Life, paper: SensorDescription, artifact: Artifact
 ) -> None:

@@ -133,6 +133,7 @@ def test_a_turned_plug_is_told(patient: Patient) -> None:
     assert "on by 1 of 16" in about(found, "model").detail
 
 
+@pytest.mark.slow
 def test_a_short_is_blamed_on_one_of_its_two(patient: Patient) -> None:
     volts = patient.rest(simulator=shorted(patient.simulator, 5, 6))
     found = patient.examine(patient.scans(volts))

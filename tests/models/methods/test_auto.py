@@ -71,6 +71,7 @@ def test_a_small_contact_beside_a_large_one_is_no_bulge_of_it(
     assert icc(paper, frame, *pair) > 0.97
 
 
+@pytest.mark.slow
 def test_the_hole_of_a_ring_is_seen_where_there_is_little_noise(
     paper: SensorDescription, methods: dict[str, Reconstructor], simulator: SkinSimulator
 ) -> None:

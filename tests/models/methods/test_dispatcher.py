@@ -135,6 +135,7 @@ def test_a_fault_of_ours_is_no_failure_of_the_users(
         reconstructor.reconstruct(**skin.scan(PRESS))
 
 
+@pytest.mark.slow
 def test_a_reference_of_one_scan_is_as_good_as_its_noise(
     paper: SensorDescription, artifact: Artifact, skin: Skin
 ) -> None:

@@ -69,6 +69,7 @@ def test_swapped_channels_are_flagged(reconstructor: Reconstructor, skin: Skin) 
         assert frame.flags & UNTRUSTED
 
 
+@pytest.mark.slow
 def test_channels_swapped_since_the_tare_are_flagged(
     paper: SensorDescription, artifact: Artifact, skin: Skin, rest: Reference
 ) -> None:
@@ -83,6 +84,7 @@ def test_channels_swapped_since_the_tare_are_flagged(
         assert frame.flags & UNTRUSTED
 
 
+@pytest.mark.slow
 def test_a_lift_after_a_tare_under_load_is_flagged(
     paper: SensorDescription, artifact: Artifact, skin: Skin
 ) -> None:
@@ -174,6 +176,7 @@ def test_a_dead_electrode_is_flagged(
         assert frame.flags & UNTRUSTED
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ["reversed", "next drive", "shuffled"])
 def test_another_order_of_voltages_is_flagged(
     paper: SensorDescription, artifact: Artifact, skin: Skin, rest: Reference, order: str
@@ -196,6 +199,7 @@ def test_another_order_of_voltages_is_flagged(
         assert Flag.REFERENCE_MISMATCH in frame.flags
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bad", [math.nan, math.inf, 0.0])
 @pytest.mark.parametrize("noise", ["known", "unknown"])
 def test_a_reference_with_a_bad_voltage_still_serves(
@@ -227,6 +231,7 @@ def test_a_reference_of_nothing_gives_no_map(
         assert Flag.MAGNITUDE_MISSING | Flag.STRUCTURE_MISSING in frame.flags
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scans", [3, 20])
 @pytest.mark.parametrize("noise_share", [1e-3, 1e-2])
 def test_noise_is_not_pressing(
@@ -242,6 +247,7 @@ def test_noise_is_not_pressing(
         assert {frame.tier for frame in frames(reconstructor, skin, count=60)} == {"quiet"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise_share", [1e-4, 1e-3])
 def test_what_is_quiet_has_no_misfit_that_would_be_flagged(
     paper: SensorDescription, artifact: Artifact, simulator: SkinSimulator, noise_share: float

@@ -54,6 +54,7 @@ for _ in range(3):
 """
 
 
+@pytest.mark.slow
 def test_networks_of_one_file_hold_its_weights_once() -> None:
     # In a process of its own: what earlier tests have freed would be taken first.
     out = subprocess.check_output([sys.executable, "-c", HELD_BY_TWO])

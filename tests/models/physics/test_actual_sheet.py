@@ -45,6 +45,7 @@ def test_a_hand_made_sheet_is_found_by_its_reference(
     assert off(voltages, found) < 0.005
 
 
+@pytest.mark.slow
 def test_the_scale_of_the_voltages_is_of_no_matter(
     paper: SensorDescription, estimator: SheetEstimator
 ) -> None:
@@ -89,6 +90,7 @@ def test_voltages_that_no_such_sheet_has_are_left_to_the_even_one(
     assert estimator.estimate(bare, ~EVERY, NOISE) is None
 
 
+@pytest.mark.slow
 def test_what_is_not_usable_does_not_count(
     paper: SensorDescription, estimator: SheetEstimator
 ) -> None:
@@ -120,6 +122,7 @@ def test_the_derivatives_of_a_reference_are_right(
     assert left[1] / left[2] == pytest.approx(4, rel=0.35)
 
 
+@pytest.mark.slow
 def test_a_hand_made_skin_is_reconstructed_as_if_it_were_even(
     paper: SensorDescription, artifact: Artifact
 ) -> None:

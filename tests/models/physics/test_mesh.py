@@ -87,6 +87,7 @@ sizes = st.floats(0.01, 2.0)
 shares = st.one_of(st.floats(0.01, 0.99), st.floats(0.99, 0.999))
 
 
+@pytest.mark.slow
 @settings(max_examples=8)
 @given(sizes, st.floats(0.3, 3), st.integers(2, 8), st.floats(0.3, 1), shares, st.integers(11, 30))
 @example(0.15, 1.0, 4, 1.0, 0.2, 16)  # the outer electrodes end on the corners

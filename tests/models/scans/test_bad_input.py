@@ -116,6 +116,7 @@ def assert_found(frame: Reconstruction, *presses: Press, within_m: float = 0.003
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [*LEADS, "no number"])
 def test_a_bad_lead_is_named_and_the_rest_goes_on(
     paper: SensorDescription, artifact: Artifact, skin: Skin, kind: str
@@ -127,6 +128,7 @@ def test_a_bad_lead_is_named_and_the_rest_goes_on(
     assert_found(frame, PRESS, OTHER)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", LEADS)
 def test_a_lead_that_is_bad_at_the_tare_is_named(
     paper: SensorDescription, artifact: Artifact, skin: Skin, kind: str
@@ -139,6 +141,7 @@ def test_a_lead_that_is_bad_at_the_tare_is_named(
     assert_found(frame, PRESS)
 
 
+@pytest.mark.slow
 def test_two_bad_leads_are_survived(
     paper: SensorDescription, artifact: Artifact, skin: Skin
 ) -> None:
@@ -150,6 +153,7 @@ def test_two_bad_leads_are_survived(
     assert_found(frame, PRESS, OTHER)
 
 
+@pytest.mark.slow
 def test_a_poor_contact_alone_does_no_harm(
     paper: SensorDescription, artifact: Artifact, skin: Skin
 ) -> None:
@@ -190,6 +194,7 @@ def test_a_short_is_flagged(
     assert Flag.ELECTRODE_FAULT in frame.flags
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("order", "shown"),
     [
@@ -214,6 +219,7 @@ def test_an_order_of_electrodes_is_flagged_unless_it_is_a_symmetry_of_the_sheet(
     assert (Flag.REFERENCE_MISMATCH in frame.flags) is shown
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("when", ["at the tare", "later", "said by the device"])
 def test_clipped_voltages_are_left_out(
     paper: SensorDescription, artifact: Artifact, skin: Skin, when: str
@@ -239,6 +245,7 @@ def test_clipped_voltages_are_left_out(
     assert_found(frame, PRESS)
 
 
+@pytest.mark.slow
 def test_a_scan_without_a_number_is_not_called_clipped(
     paper: SensorDescription, artifact: Artifact, skin: Skin
 ) -> None:
@@ -250,6 +257,7 @@ def test_a_scan_without_a_number_is_not_called_clipped(
     assert Flag.NO_USABLE_SCAN in frame.flags
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [0.0, 1e-3, -0.1, 1e300, 1e-310])
 def test_a_scan_of_one_value_gives_no_map(
     paper: SensorDescription, artifact: Artifact, skin: Skin, value: float
@@ -261,6 +269,7 @@ def test_a_scan_of_one_value_gives_no_map(
     assert Flag.INVALID_VOLTAGE in frame.flags
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1.0, 1e300, -1e300])
 def test_a_voltage_that_cannot_be_is_left_out(
     paper: SensorDescription, artifact: Artifact, skin: Skin, size: float
@@ -273,6 +282,7 @@ def test_a_voltage_that_cannot_be_is_left_out(
     assert_found(frame, PRESS)
 
 
+@pytest.mark.slow
 def test_a_tare_under_load_is_flagged_at_once_and_after_the_lift(
     paper: SensorDescription, artifact: Artifact, skin: Skin
 ) -> None:
@@ -308,6 +318,7 @@ def test_a_lift_after_a_tare_under_load_shows_in_either_channel(
     assert Flag.REFERENCE_MISMATCH in lifted.flags
 
 
+@pytest.mark.slow
 def test_swapped_channels_are_told(
     paper: SensorDescription, artifact: Artifact, skin: Skin
 ) -> None:
@@ -319,6 +330,7 @@ def test_swapped_channels_are_told(
     assert Flag.CHANNELS_SWAPPED not in frame_of(paper, artifact, skin, PRESS, frames=1).flags
 
 
+@pytest.mark.slow
 def test_interference_is_flagged_and_widens_the_uncertainty(
     paper: SensorDescription, artifact: Artifact, skin: Skin
 ) -> None:
@@ -339,6 +351,7 @@ def test_interference_is_flagged_and_widens_the_uncertainty(
     assert at_rest.tier == "quiet", "interference is not pressing"
 
 
+@pytest.mark.slow
 def test_a_broken_device_is_flagged(paper: SensorDescription) -> None:
     """Its reciprocity error is 68 %: nothing can be located from it."""
     sensor = variant(paper, electrodes={"per_side": 8, "pitch_m": 0.018}, magnitude=None)
@@ -353,6 +366,7 @@ def test_a_broken_device_is_flagged(paper: SensorDescription) -> None:
         assert Flag.NOISE_HIGH | Flag.REFERENCE_MISMATCH in frame.flags
 
 
+@pytest.mark.slow
 def test_clean_scenes_have_no_flag(
     paper: SensorDescription, artifact: Artifact, simulator: SkinSimulator
 ) -> None:

@@ -100,6 +100,7 @@ def test_the_same_scan_without_noise_is_still(
     assert not is_still(settled, other)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scans", [1, 20])
 def test_a_cup_that_moves_through_a_tank_is_never_still(scans: int) -> None:
     """Its reciprocity error is 75 times its noise; from frame 90 on the cup is on its way."""
@@ -115,6 +116,7 @@ def test_a_cup_that_moves_through_a_tank_is_never_still(scans: int) -> None:
     assert not any(is_still(one, other) for one, other in pairwise(seen[70:]))
 
 
+@pytest.mark.slow
 def test_a_change_below_a_frames_noise_is_followed(
     paper: SensorDescription, artifact: Artifact, simulator: SkinSimulator
 ) -> None:

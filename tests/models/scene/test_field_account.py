@@ -193,6 +193,7 @@ def test_without_noise_a_force_is_as_sure_as_its_outline(sensor: Sensor) -> None
     assert share == pytest.approx([abs(force_by_area(sensor)) * outline], rel=0.05, abs=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["flat", "soft"])
 def test_numbers_scatter_as_their_uncertainties_say(sensor: Sensor, kind: str) -> None:
     """Edges are as wide apart as is likely; a mesh knows a radius no better than it says.

@@ -101,6 +101,7 @@ def test_the_jacobian_passes_a_taylor_test(sensor: Sensor, scene: str) -> None:
     assert orders == pytest.approx(2, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("edge", [0.0, 0.5], ids=["flat", "soft"])
 def test_estimates_converge_at_second_order(small: SensorDescription, edge: float) -> None:
     """Voltages, and what is estimated from those of a finer mesh, as the mesh is refined.
@@ -193,6 +194,7 @@ def on_nodes(fitted: FittedField) -> FloatArray:
     return values
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["circle", "soft"])
 def test_parameters_scatter_as_their_covariance_says(sensor: Sensor, scene: str) -> None:
     """Place, size, and where the sheet is graded peak and edge.
