@@ -68,6 +68,7 @@ def test_a_taught_skin_is_located_better(tactomo: Run, tmp_path: Path, good: Arr
     assert 0.3 < np.median(taught) / np.median(sigma) < 3
 
 
+@pytest.mark.slow
 def test_forces_are_taught_where_they_are_known(tactomo: Run, tmp_path: Path, good: Arrays) -> None:
     """Of each second press; a cover makes the physics' a quarter too small."""
     force_n = np.where(np.arange(60) % 2, np.nan, good["force_n"])
@@ -88,6 +89,7 @@ def test_forces_are_taught_where_they_are_known(tactomo: Run, tmp_path: Path, go
     assert 0.4 < (np.abs(in_sigmas) < 1).mean() < 0.95
 
 
+@pytest.mark.slow
 def test_forces_that_say_nothing_are_not_learnt(tactomo: Run, tmp_path: Path, good: Arrays) -> None:
     """Places are, all the same; it says why forces are not."""
     shuffled = np.random.default_rng(0).permutation(good["force_n"])

@@ -12,18 +12,8 @@ from tactomo_models.inner_loop import LIBRARY, at
 from tactomo_models.physics import forward
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scene import pressure_field
-from tactomo_models.scene.pressure_field import (
-    COLUMNS,
-    EDGE,
-    HARMONIC,
-    HOLE,
-    PEAK,
-    SIZE,
-    UNIT_M,
-    PressureField,
-    X,
-    Y,
-)
+from tactomo_models.scene.parameters import COLUMNS, EDGE, HARMONIC, HOLE, PEAK, SIZE, UNIT_M, X, Y
+from tactomo_models.scene.pressure_field import PressureField
 
 pytestmark = pytest.mark.skipif(LIBRARY is None, reason="no C compiler built the inner loop")
 

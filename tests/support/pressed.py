@@ -12,7 +12,7 @@ from tactomo_models import Channel, SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scene.field_fit import Budget, Family, FieldFit, FittedField, Measured
-from tactomo_models.scene.pressure_field import (
+from tactomo_models.scene.parameters import (
     COLUMNS,
     E1,
     EDGE,
@@ -21,10 +21,10 @@ from tactomo_models.scene.pressure_field import (
     PEAK,
     SIZE,
     UNIT_M,
-    PressureField,
     X,
     Y,
 )
+from tactomo_models.scene.pressure_field import PressureField
 from tactomo_models.scene.sheet_response import GradedResponse
 from variants import variant
 

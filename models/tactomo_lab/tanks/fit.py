@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 from tactomo_models.arrays import FloatArray
-from tactomo_models.scene.pressure_field import heaviside, heaviside_slope
+from tactomo_models.scene.drawing import heaviside, heaviside_slope
 
 from tactomo_lab.tanks.images import (
     PIXELS,

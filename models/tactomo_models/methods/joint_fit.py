@@ -15,18 +15,12 @@ from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
 from tactomo_models.scans.stillness import Since, are_still
+from tactomo_models.scene.drawing import Drawing
 from tactomo_models.scene.field_account import Doubt
 from tactomo_models.scene.field_fit import Budget, Family, FieldFit, FittedField, Measured
 from tactomo_models.scene.level_set import LevelSet
-from tactomo_models.scene.pressure_field import (
-    COLUMNS,
-    EDGE,
-    HERTZ,
-    HOLE,
-    PEAK,
-    Drawing,
-    PressureField,
-)
+from tactomo_models.scene.parameters import COLUMNS, EDGE, HERTZ, HOLE, PEAK
+from tactomo_models.scene.pressure_field import PressureField
 
 
 @dataclass(frozen=True)

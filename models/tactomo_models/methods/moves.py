@@ -28,7 +28,7 @@ from tactomo_models.methods.joint_fit import (
 )
 from tactomo_models.scene.field_fit import Budget, FieldFit, FittedField, Measured
 from tactomo_models.scene.level_set import LevelSet
-from tactomo_models.scene.pressure_field import (
+from tactomo_models.scene.parameters import (
     COLUMNS,
     E1,
     E2,
@@ -39,10 +39,10 @@ from tactomo_models.scene.pressure_field import (
     PRIOR_SIGMA,
     SIZE,
     UNIT_M,
-    PressureField,
     X,
     Y,
 )
+from tactomo_models.scene.pressure_field import PressureField
 from tactomo_models.scene.sheet_response import GradedResponse
 
 GOOD_MISFIT = 1.0  # explained to the noise (discrepancy principle): no further step

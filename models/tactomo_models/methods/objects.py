@@ -18,9 +18,9 @@ from tactomo_protocol import Channel
 
 from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.physics.forward import ForwardModel
+from tactomo_models.scene.drawing import heaviside, heaviside_slope
 from tactomo_models.scene.field_fit import Budget, FieldFit, FittedField, Measured
 from tactomo_models.scene.level_set import HALF_WIDTH, RESTING, LevelSet
-from tactomo_models.scene.pressure_field import heaviside, heaviside_slope
 
 Imager = Callable[[FloatArray], FloatArray]
 

@@ -39,18 +39,11 @@ from tactomo_models.methods.moves import (
     scale_of,
 )
 from tactomo_models.scans.stillness import Since, are_still
+from tactomo_models.scene.drawing import Drawing
 from tactomo_models.scene.field_account import Doubt
 from tactomo_models.scene.field_fit import COLD_S, Budget, FieldFit, FittedField, Measured
-from tactomo_models.scene.pressure_field import (
-    COLUMNS,
-    EDGE,
-    HOLE,
-    PEAK,
-    Drawing,
-    PressureField,
-    X,
-    Y,
-)
+from tactomo_models.scene.parameters import COLUMNS, EDGE, HOLE, PEAK, X, Y
+from tactomo_models.scene.pressure_field import PressureField
 
 STEPS = 4  # of a refinement, before what it leads to is judged
 SLACK = 1.1  # contacts that are explained as well as before are not questioned again

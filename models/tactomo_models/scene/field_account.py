@@ -17,19 +17,11 @@ from tactomo_protocol import Channel
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 from tactomo_models.scans.changes import WRONG_WAY
 from tactomo_models.scene.areas import AreaFinder, Areas
+from tactomo_models.scene.drawing import Drawing
 from tactomo_models.scene.field_fit import FieldFit, FittedField, Measured, covariance_of
+from tactomo_models.scene.parameters import EDGE, HOLE, PEAK, SIZE, UNIT_M, X, Y
 from tactomo_models.scene.pressure import FieldContacts
-from tactomo_models.scene.pressure_field import (
-    EDGE,
-    HOLE,
-    PEAK,
-    SIZE,
-    UNIT_M,
-    Drawing,
-    PressureField,
-    X,
-    Y,
-)
+from tactomo_models.scene.pressure_field import PressureField
 from tactomo_models.scene.sheet_response import GradedResponse, SaturatingResponse
 
 # Shares within one sigma are of tuning scenes of every kind.

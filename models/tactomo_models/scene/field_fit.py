@@ -23,7 +23,7 @@ from tactomo_protocol import Channel
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.forward import ForwardModel, Solution
 from tactomo_models.scans.changes import Changes
-from tactomo_models.scene.pressure_field import Drawing
+from tactomo_models.scene.drawing import Drawing
 from tactomo_models.scene.sheet_response import SheetResponse, responses_of
 from tactomo_models.sensor.description import SensorDescription
 

@@ -16,15 +16,9 @@ import numpy as np
 
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 from tactomo_models.physics.forward import ForwardModel
-from tactomo_models.scene.pressure_field import (
-    PEAK,
-    PRIOR_SIGMA,
-    Drawing,
-    PressureField,
-    Slopes,
-    heaviside,
-    heaviside_slope,
-)
+from tactomo_models.scene.drawing import Drawing, Slopes, heaviside, heaviside_slope
+from tactomo_models.scene.parameters import PEAK, PRIOR_SIGMA
+from tactomo_models.scene.pressure_field import PressureField
 
 KERNEL_SPREAD = 0.7  # standard deviation of a Gaussian over the kernels' distance
 HALF_WIDTH = 0.15  # w of the Heaviside

@@ -13,17 +13,8 @@ from tactomo_models.physics.bare_sheet import solve_bare_sheet
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import mesh_sheet
 from tactomo_models.scene.field_fit import Budget, FittedField, Measured
-from tactomo_models.scene.pressure_field import (
-    E1,
-    E2,
-    EDGE,
-    HOLE,
-    PEAK,
-    UNIT_M,
-    PressureField,
-    X,
-    Y,
-)
+from tactomo_models.scene.parameters import E1, E2, EDGE, HOLE, PEAK, UNIT_M, X, Y
+from tactomo_models.scene.pressure_field import PressureField
 
 NOISE = 1e-3  # of each relative change
 PLENTY_S = 10.0

@@ -21,7 +21,7 @@ from tactomo_models.scene.field_account import (
 )
 from tactomo_models.scene.field_fit import FittedField, Measured
 from tactomo_models.scene.level_set import LevelSet
-from tactomo_models.scene.pressure_field import (
+from tactomo_models.scene.parameters import (
     COLUMNS,
     EDGE,
     EDGE_LIMITS,
@@ -29,8 +29,8 @@ from tactomo_models.scene.pressure_field import (
     PEAK,
     PRIOR_SIGMA,
     SIZE,
-    PressureField,
 )
+from tactomo_models.scene.pressure_field import PressureField
 
 RADIUS_M = 0.012
 AREA_M2 = np.pi * RADIUS_M**2

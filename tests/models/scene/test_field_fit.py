@@ -24,7 +24,7 @@ from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import mesh_sheet
 from tactomo_models.scene.field_fit import Budget, Family, FittedField, covariance_of
 from tactomo_models.scene.level_set import LevelSet
-from tactomo_models.scene.pressure_field import (
+from tactomo_models.scene.parameters import (
     EDGE,
     EDGE_LIMITS,
     HERTZ,
@@ -32,10 +32,10 @@ from tactomo_models.scene.pressure_field import (
     PRIOR_SIGMA,
     SIZE,
     UNIT_M,
-    PressureField,
     X,
     Y,
 )
+from tactomo_models.scene.pressure_field import PressureField
 from taylor import taylor_orders
 from variants import variant
 

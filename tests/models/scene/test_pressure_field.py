@@ -13,24 +13,20 @@ from pressed import contact, contacts
 from tactomo_models import SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.forward import ForwardModel
+from tactomo_models.scene.drawing import MOST_BLURRED, Drawing, heaviside, heaviside_slope
 from tactomo_models.scene.level_set import LevelSet
-from tactomo_models.scene.pressure_field import (
+from tactomo_models.scene.parameters import (
     COLUMNS,
     EDGE,
     HARMONIC,
     HOLE,
-    MOST_BLURRED,
     PEAK,
     SIZE,
     SIZE_LIMITS,
-    Drawing,
-    PressureField,
     X,
     Y,
-    ellipses_of,
-    heaviside,
-    heaviside_slope,
 )
+from tactomo_models.scene.pressure_field import PressureField, ellipses_of
 from tactomo_models.scene.sheet_response import GradedResponse
 from taylor import taylor_orders
 

@@ -1,0 +1,20 @@
+"""Parameters of a contact: the columns that they stand in, and what is likely of them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+UNIT_M = 0.01  # positions are counted in this, so that all parameters are of order 1
+# Columns of a contact's parameters: place, form, peak pressure in units of the field, edge, hole.
+X, Y, SIZE, E1, E2, HARMONIC, PEAK, EDGE, HOLE, COLUMNS = 0, 1, 2, 3, 4, 5, 9, 10, 11, 12
+FORM = {0: 3, 1: 3, 2: 5}  # columns of the form that every contact of an order has
+TYPICAL_SIZE = float(np.log(0.012))  # s is the logarithm of the mean radius in metres
+SIZE_LIMITS = (float(np.log(0.003)), float(np.log(0.06)))
+LARGEST_CIRCLE = float(np.log(0.025))
+MAX_BULGE = 0.25
+# Of an edge that is not flat: what falls less shows nothing but the sheet's errors.
+EDGE_LIMITS = (0.3, 1.0)
+HERTZ = 0.5
+# Place, size, elongation and bulges; the peak as wide as any table; edges as of balls and fingers,
+# holes of what presses with its rim.
+PRIOR_SIGMA = np.array([5.0, 5.0, 0.6, 0.3, 0.3, 0.05, 0.05, 0.07, 0.07, 1.0, 0.12, 0.5])
