@@ -145,15 +145,17 @@ class Moves:
         questions = self._questions if [*shape.residuals] == [Channel.MAGNITUDE] else ()
         inside: list[Move] = [partial(self._with, question) for question in questions]
         crowd = shape.family.count >= CROWD
-        # What one sheet takes for one contact of a crowd, both are asked for afterwards.
-        splits = self._splits(shape, crowd and len(frame.measured) == len(self.fit.responses))
+        # What one sheet takes for one contact of a crowd, or for none, both are asked for afterwards.
+        every = len(frame.measured) == len(self.fit.responses)
+        splits = self._splits(shape, crowd and every)
+        deaths = self._deaths(shape) if every or not crowd else []
         form = [self._of_higher_order, self._modulate, *inside, *splits]
         if shape.misfit > GOOD_MISFIT or crowd:
             form += [self._birth_anywhere(k) for k in range(ASKED_OF_CROWD if crowd else 1)]
         # What pressures leave unexplained in a crowd is a matter of edges and holes first.
         as_needed = self._shape_model == ShapeModel.AS_NEEDED and len(frame.measured) == 1
         free = [self._escalate] if as_needed else []
-        return [self.birth, *form, self._parted, *free, *self._deaths(shape)]
+        return [self.birth, *form, self._parted, *free, *deaths]
 
     def joined(self, shape: FittedField, frame: Frame) -> FittedField:
         """The same contacts and others that landed away from them, before any is let move."""
