@@ -172,8 +172,7 @@ def test_a_scan_that_was_not_taken_is_flagged_and_the_others_go_on(
     arrays["magnitude"][2] = np.nan
     out = run(tmp_path, paper, arrays)
     names = [Flag(int(flags)).names() for flags in out["flags"]]
-    # What the network makes of one channel alone it does not trust itself.
-    assert names == [[], ["structure_missing", "low_confidence"], ["magnitude_missing"]]
+    assert names == [[], ["structure_missing"], ["magnitude_missing"]]
     assert np.isnan(out["structure"][1]).all()
     assert np.isnan(out["map"][2]).all()
     assert np.isnan(out["contact_magnitude"][out["contact_frame"] == 2]).all()

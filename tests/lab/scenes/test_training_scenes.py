@@ -58,7 +58,7 @@ def test_robust_scenes_have_everything_that_makes_a_skin_hard(
     robust_scenes: list[TrainingScene],
 ) -> None:
     presses = [press for scene in robust_scenes for press in scene.presses]
-    assert {len(scene.presses) for scene in robust_scenes} == set(range(7))
+    assert {len(scene.presses) for scene in robust_scenes} == set(range(11))
     assert {press.shape for press in presses} == {"ellipse", "rectangle", "ring"}
     assert {press.profile for press in presses} == {"flat", "dome"}
     assert {scene.opposite for scene in robust_scenes} == {True, False}
@@ -73,7 +73,8 @@ def test_robust_scenes_have_everything_that_makes_a_skin_hard(
     assert max(sheet.unevenness for sheet in sheets) > 0.07
     assert max(sheet.impedance.max() for sheet in sheets) > 5
     displaced_m = np.concatenate([sheet.displaced_m for sheet in sheets])
-    assert displaced_m.std() == pytest.approx(0.0007, rel=0.05)
+    # Each sheet's is uniform up to twice what it is on the mean: a root mean square of 2 / sqrt(3).
+    assert displaced_m.std() == pytest.approx(0.0007 * 2 / np.sqrt(3), rel=0.05)
 
 
 def test_contacts_lie_apart_inside_the_sensing_area(
