@@ -146,7 +146,7 @@ class Moves:
         questions = self._questions if [*shape.residuals] == [Channel.MAGNITUDE] else ()
         inside: list[Move] = [partial(self._with, question) for question in questions]
         crowd = shape.family.count >= CROWD
-        # What one sheet takes for one contact of a crowd, or for none, both are asked for afterwards.
+        # What one sheet takes for one of a crowd, or for none, both are asked for afterwards.
         every = len(frame.measured) == len(self.fit.responses)
         splits = self._splits(shape, crowd and every)
         deaths = self._deaths(shape) if every or not crowd else []
