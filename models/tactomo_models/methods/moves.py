@@ -146,10 +146,10 @@ class Moves:
         questions = self._questions if [*shape.residuals] == [Channel.MAGNITUDE] else ()
         inside: list[Move] = [partial(self._with, question) for question in questions]
         crowd = shape.family.count >= CROWD
-        # What one sheet takes for one of a crowd, or for none, both are asked for afterwards.
+        # What one sheet takes for one of a crowd, or for none of many, both are asked for later.
         every = len(frame.measured) == len(self.fit.responses)
         splits = self._splits(shape, crowd and every)
-        deaths = self._deaths(shape) if every or not crowd else []
+        deaths = self._deaths(shape) if every or shape.family.count <= MANY else []
         form = [self._of_higher_order, self._modulate, *inside, *splits]
         if shape.misfit > GOOD_MISFIT or crowd:
             form += [self._birth_anywhere(k) for k in range(ASKED_OF_CROWD if crowd else 1)]
