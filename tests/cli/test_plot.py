@@ -132,6 +132,7 @@ def test_what_goes_wrong_is_told(
     assert says in result.stderr.replace("\n", " ")
 
 
+@pytest.mark.slow
 def test_a_picture_that_is_there_is_drawn_over_only_if_one_says_so(
     tactomo: Run, grasp: Path
 ) -> None:

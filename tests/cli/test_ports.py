@@ -110,6 +110,7 @@ def test_a_device_is_asked_who_it_is(tactomo: Run, device: Callable[[bytes], str
     assert "skin-7f3a: magnitude; 20 scans/s; firmware 1.2.3" in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("reply", "says"),
     [

@@ -230,6 +230,7 @@ def test_a_child_that_is_ready_ends_with_a_parent_that_is_killed() -> None:
     wait_until(lambda: not is_running(child))
 
 
+@pytest.mark.slow
 def test_a_verbose_family_passes_on_what_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     with Family(verbose=True) as family:
         family.start("list", "models", "list").wait_done()

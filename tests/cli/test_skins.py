@@ -95,7 +95,12 @@ def test_each_skin_is_served_and_found_by_its_name(
 
 
 @pytest.mark.parametrize(
-    "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGKILL]
+    "number",
+    [
+        signal.SIGTERM,
+        pytest.param(signal.SIGINT, marks=pytest.mark.slow),
+        pytest.param(signal.SIGKILL, marks=pytest.mark.slow),
+    ],
 )
 def test_all_of_them_end_with_the_command(start: Callable[..., Robot], number: int) -> None:
     robot = start()

@@ -65,6 +65,7 @@ def test_nothing_listens_is_told_long_before_a_commands_own_time_is_over() -> No
     assert time.monotonic() - begin_s < TARE_TIMEOUT_S / 2
 
 
+@pytest.mark.slow
 def test_a_daemon_that_starts_a_moment_later_is_reached() -> None:
     with FakeControl() as control:
         address = control.address

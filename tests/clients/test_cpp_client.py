@@ -145,6 +145,7 @@ def cpp_view(said: dict[str, Any]) -> dict[str, Any]:
     return view
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [CONTACTS, MAP])
 def test_both_clients_see_the_same_contact_at_the_same_sequence_number(
     probe: Path, start: Callable[..., DaemonProcess], twin: Twin, kind: Any
@@ -173,6 +174,7 @@ def test_both_clients_see_the_same_contact_at_the_same_sequence_number(
         assert theirs[pressed.sequence]["map"]["shape"] == [51, 51]
 
 
+@pytest.mark.slow
 def test_stale_while_the_daemon_is_gone_and_fresh_after_its_restart(
     probe: Path, start: Callable[..., DaemonProcess]
 ) -> None:
@@ -189,6 +191,7 @@ def test_stale_while_the_daemon_is_gone_and_fresh_after_its_restart(
     assert after["frame"]["session"] != before["frame"]["session"]
 
 
+@pytest.mark.slow
 def test_a_loop_of_1_khz_allocates_nothing_once_frames_come(
     probe: Path, start: Callable[..., DaemonProcess], twin: Twin
 ) -> None:
@@ -202,6 +205,7 @@ def test_a_loop_of_1_khz_allocates_nothing_once_frames_come(
         assert did["after_first"] == 0
 
 
+@pytest.mark.slow
 def test_commands(probe: Path, start: Callable[..., DaemonProcess], tmp_path: Path) -> None:
     daemon = start()
 
@@ -245,6 +249,7 @@ def test_commands_to_the_twin(probe: Path, twin: Twin) -> None:
     run(probe, "control", twin.control, "clear")
 
 
+@pytest.mark.slow
 def test_nothing_answers(probe: Path) -> None:
     with FakeSensor("left") as silent:
         free = silent.address
@@ -303,6 +308,7 @@ def test_the_longest_times_serve(checked: Path) -> None:
             assert waiting.result() == (0, "a frame\n")
 
 
+@pytest.mark.slow
 def test_nothing_listens_and_something_busy_does(probe: Path) -> None:
     status, said = give(probe, "connect_timeout", 300, "ipc:///nowhere/at/all")
     assert status == 1
@@ -315,6 +321,7 @@ def test_nothing_listens_and_something_busy_does(probe: Path) -> None:
     assert ", though something listens there; " in said
 
 
+@pytest.mark.slow
 def test_with_keys(probe: Path, start: Callable[..., DaemonProcess], tmp_path: Path) -> None:
     robot = tmp_path / "robot"
     key_files.make_pair(robot, SENSOR, is_server=True)
@@ -452,6 +459,7 @@ def test_an_old_frame_is_stale_and_silence_makes_one_stale(sensor: FakeSensor, p
         skin.wait(lambda said: said["stale"], "silence to make it stale")
 
 
+@pytest.mark.slow
 def test_no_allocation_however_frames_differ(sensor: FakeSensor, probe: Path) -> None:
     """From none to as many contacts as there is room for, long reasons, flags, malformed ones."""
     stop = threading.Event()

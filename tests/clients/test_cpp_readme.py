@@ -78,6 +78,7 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Checkout:
     return Checkout(tmp_path_factory.mktemp("home"))
 
 
+@pytest.mark.slow
 def test_from_nothing_to_a_running_controller(checkout: Checkout, pressed: str) -> None:
     """Every command but `apt`, in order; only the address is another one."""
     (checkout.folder / "robot").mkdir()
@@ -158,6 +159,7 @@ def test_its_version_is_the_python_clients() -> None:
     assert f"project(tactomo VERSION {version[1]} " in (CPP_FOLDER / "CMakeLists.txt").read_text()
 
 
+@pytest.mark.slow
 def test_the_other_examples_compile(tmp_path: Path) -> None:
     """Commands, and keys: not run, for they would be sent to whoever listens."""
     need_headers()

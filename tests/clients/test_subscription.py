@@ -280,6 +280,7 @@ def test_age_from_another_computer_starts_at_the_age_at_publication(sensor: Fake
         assert 0.003 <= new.age_s < STALE_S
 
 
+@pytest.mark.slow
 def test_a_frame_grows_old(sensor: FakeSensor) -> None:
     with subscribe("left", address=sensor.address, timeout_s=10, stale_after_s=STALE_S) as frames:
         sensor.wait_for_subscriber()

@@ -289,6 +289,7 @@ def test_sheets_that_are_lost_by_turns_raise_nothing(
     assert error_mm(nearest(last, press_mm(46, 0)), press_mm(46, 0)) < 2
 
 
+@pytest.mark.slow
 def test_one_graded_sheet_that_is_lost_shows_nothing_and_comes_back() -> None:
     sensor = load_description("graded_square")
     skin = Skin(SkinSimulator(sensor))
@@ -427,6 +428,7 @@ def test_a_sheet_whose_conductivity_falls_is_no_different(
     assert contact.pressure_kpa == pytest.approx(180, abs=15)
 
 
+@pytest.mark.slow
 def test_an_insulating_object_in_a_disc_is_found() -> None:
     tank = load_description("tank_disc")
     skin = Skin(SkinSimulator(tank, spacing_m=0.0045))

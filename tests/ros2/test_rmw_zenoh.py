@@ -148,6 +148,7 @@ def test_the_node_is_in_the_graph_until_it_stops(
     wait_until(lambda: not tokens)
 
 
+@pytest.mark.slow
 def test_silence_is_told(
     graph: zenoh.Session, sensor: FakeSensor, node: subprocess.Popen[str]
 ) -> None:

@@ -53,6 +53,7 @@ def test_identify_is_acknowledged_and_answered_with_a_hello(bench: Start) -> Non
     assert hello.samples_per_scan == 208
 
 
+@pytest.mark.slow
 def test_hello_repeats_unasked(bench: Start) -> None:
     host = bench().host()
     host.wait_for(lambda: len(host.kind(Hello)) >= 2)

@@ -253,6 +253,7 @@ def quiet_console(page: Page) -> Iterator[None]:
 # What it draws
 
 
+@pytest.mark.slow
 def test_the_scale_follows_a_calibration_that_is_put_in_force(page: Page) -> None:
     page.skin.press(36, -48, kpa=200)
     page.open()
@@ -293,6 +294,7 @@ def test_each_node_is_the_middle_of_its_pixel(page: Page, ix: int, iy: int) -> N
         assert sum(page.colour(x_mm + dx, y_mm + dy)) < 60, (dx, dy)
 
 
+@pytest.mark.slow
 def test_the_outline_runs_around_the_press(page: Page) -> None:
     page.skin.press(36, -48)
     page.skin.frame |= {"map": None, "pressure_kpa": None}
@@ -609,6 +611,7 @@ def test_only_a_simulated_skin_can_be_pressed(page: Page, source: str) -> None:
     assert [round(press["x_mm"]) for press in page.presses()] == [30]
 
 
+@pytest.mark.slow
 def test_leaving_the_page_lifts_the_finger_and_coming_back_is_fine(page: Page) -> None:
     page.open()
     page.wait_until_pressable()
@@ -679,6 +682,7 @@ def test_the_strip_shows_each_contacts_pressure_and_force_and_the_events(page: P
     assert np.mean(shares) == pytest.approx(age_ms / 60_000, abs=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quiet_console")
 def test_what_was_is_looked_at_and_left_again(page: Page) -> None:
     page.skin.press(36, -48)
@@ -704,6 +708,7 @@ def test_what_was_is_looked_at_and_left_again(page: Page) -> None:
     wait_until(lambda: page.health == "good")
 
 
+@pytest.mark.slow
 def test_a_pointer_on_the_strip_looks_back(page: Page) -> None:
     page.open()
     wait_until(lambda: page.js("return tactomo.timeline.frames.length") > 5)
@@ -813,6 +818,7 @@ def test_a_refused_tare_says_why(page: Page) -> None:
     wait_until(lambda: "20 scans" in page["message"].text)
 
 
+@pytest.mark.slow
 def test_recording_starts_and_stops(page: Page) -> None:
     page.daemon.answers |= {"record_start": {"path": "/a.mcap"}, "record_stop": {"path": "/a.mcap"}}
     page.open()
@@ -848,6 +854,7 @@ def test_the_method_in_force_is_shown_though_the_daemon_lists_none(page: Page) -
 # When things stop
 
 
+@pytest.mark.slow
 def test_stale_data_are_told_and_come_back(page: Page) -> None:
     page.skin.press(36, -48)
     page.open()
@@ -869,6 +876,7 @@ def test_stale_data_are_told_and_come_back(page: Page) -> None:
     wait_until(lambda: page.map_classes == {"pressable"})
 
 
+@pytest.mark.slow
 def test_a_daemon_that_is_gone_is_told_and_comes_back(page: Page) -> None:
     page.open()
     page.skin.__exit__()
@@ -882,6 +890,7 @@ def test_a_daemon_that_is_gone_is_told_and_comes_back(page: Page) -> None:
         wait_until(page["tare"].is_enabled)
 
 
+@pytest.mark.slow
 def test_a_viewer_that_is_gone_is_told_and_comes_back(page: Page) -> None:
     page.open()
     page.stop_viewer()
@@ -893,6 +902,7 @@ def test_a_viewer_that_is_gone_is_told_and_comes_back(page: Page) -> None:
     wait_until(lambda: sum(page.colour(30, -48)) > 350)
 
 
+@pytest.mark.slow
 def test_a_viewer_that_hangs_is_noticed(page: Page) -> None:
     page.open()
     goes_on = page.served.hang()  # the connection stays, nothing comes
@@ -926,6 +936,7 @@ def test_a_missing_reference_is_told(page: Page) -> None:
     assert page["no-contacts"].text == "Not known."
 
 
+@pytest.mark.slow
 def test_a_daemon_that_never_came_is_waited_for(page: Page) -> None:
     page.skin.__exit__()
     page.stop_viewer()  # it may have heard of the daemon by now

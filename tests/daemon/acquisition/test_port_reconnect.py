@@ -218,6 +218,7 @@ def test_a_permission_that_udev_gives_later_is_waited_for(
     assert connection.try_open()
 
 
+@pytest.mark.slow
 def test_scans_of_a_newcomer_wait_for_its_hello(bench: Start, until: Until) -> None:
     b = bench()
     b.tare()

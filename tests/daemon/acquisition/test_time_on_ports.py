@@ -266,6 +266,7 @@ def test_a_wall_clock_set_back_by_a_day_moves_no_age(
     b.until(lambda: b.step() and b.ask("status")["state"] == "running")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lossless", [True, False])
 def test_every_scan_is_accounted_for(bench: Start, lossless: bool) -> None:
     b = bench(ports=2, seconds=0.02, lossless=lossless)

@@ -69,7 +69,7 @@ class Life(NamedTuple):
     """Counter of the first frame against the second reference."""
 
 
-@pytest.fixture(params=[1, 2])
+@pytest.fixture(params=[pytest.param(1, marks=pytest.mark.slow), 2])
 def life(request: pytest.FixtureRequest, bench: Start, tmp_path: Path) -> Life:
     path = tmp_path / "life.mcap"
     b = bench(ports=request.param)
@@ -160,6 +160,7 @@ def test_a_moved_replay_goes_on_there_against_the_reference_of_then(
     assert tally["received"] == sum(n for name, n in tally.items() if name != "received")
 
 
+@pytest.mark.slow
 def test_what_the_ports_had_read_before_a_move_is_left_out(play: Any, life: Life) -> None:
     b = play(life.path, speed=0, seconds=0.05)  # the ports are far ahead of the frames
     b.ask("replay", paused=False)
@@ -187,6 +188,7 @@ def torn(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_step_gives_one_frame_of_a_read_that_brought_several(play: Any, tmp_path: Path) -> None:
     path = tmp_path / "coarse.mcap"
     writer = RecordingWriter(path, Origin("left", "paper_square", "", ("/dev/x",), "0"))

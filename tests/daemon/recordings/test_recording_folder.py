@@ -38,7 +38,8 @@ def counters(path: Path, channel: Channel) -> list[int]:
     return [scan.counter for scan in found if scan.channel == channel]
 
 
-@pytest.mark.parametrize("ports", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.slow
+@pytest.mark.parametrize("ports", [1, 2])
 def test_each_file_replays_alone_and_together_they_have_every_frame_once(
     bench: Start, replay: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ports: int
 ) -> None:

@@ -61,6 +61,7 @@ def spawn(tmp_path: Path, make_skin: Callable[..., Any]) -> Iterator[Callable[..
         process.kill()
 
 
+@pytest.mark.slow
 def test_nothing_is_left_after_a_stop(bench: Start, tmp_path: Path) -> None:
     bench().daemon.stop()  # what the libraries keep for good is there now
     threads = set(threading.enumerate())

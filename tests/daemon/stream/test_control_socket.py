@@ -141,6 +141,7 @@ def test_tier_and_budget_are_answered_when_they_are_in_force(
         assert status["plan"]["tier"] == tier
 
 
+@pytest.mark.slow
 def test_a_frame_that_takes_long_holds_up_no_command(
     bench: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -76,6 +76,7 @@ def test_the_scan_topic_carries_the_voltages_in_volts(bench: Start) -> None:
     assert (scan["tier"], scan["misfit"]) == (None, None)
 
 
+@pytest.mark.slow
 def test_a_late_joiner_gets_the_status_at_once(bench: Start, connect: Start) -> None:
     b = bench()
     b.tare()
@@ -186,6 +187,7 @@ def test_every_scan_is_reconstructed_if_asked_for(bench: Start) -> None:
     assert b.ask("status")["dropped_scans"] == 0
 
 
+@pytest.mark.slow
 def test_a_reconstruction_that_fails_costs_its_frame_alone(
     bench: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -315,6 +315,7 @@ def test_who_is_revoked_is_cut_off_and_the_others_come_back(guarded: Any, robot:
     assert guarded.ask("status")["state"]
 
 
+@pytest.mark.slow
 def test_a_command_of_one_who_was_revoked_ends(
     guarded: Any, robot: Robot, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -450,6 +451,7 @@ def test_a_list_that_others_can_write_to_is_refused(
     assert "chmod go-w" in caught.value.next_step
 
 
+@pytest.mark.slow
 def test_nobody_new_comes_in_by_a_list_that_was_opened(guarded: Any, robot: Robot) -> None:
     folder = key_files.clients_folder(robot.folder, SERVER)
     folder.chmod(0o777)

@@ -68,7 +68,7 @@ def test_a_message_of_a_million_parts_holds_up_nobody(daemon: DaemonProcess, par
 
 
 @pytest.mark.parametrize(("socket_name", "kind"), [("control", b"DEALER"), ("stream", b"SUB")])
-@pytest.mark.parametrize("size", [1, 1000])
+@pytest.mark.parametrize("size", [1, pytest.param(1000, marks=pytest.mark.slow)])
 def test_a_message_without_an_end_is_cut(
     daemon: DaemonProcess, socket_name: str, kind: bytes, size: int
 ) -> None:
@@ -103,6 +103,7 @@ def test_who_asks_a_lot_and_reads_the_answers_is_not_cut(daemon: DaemonProcess) 
     dealer.close()
 
 
+@pytest.mark.slow
 def test_a_few_parts_more_are_no_reason_to_be_silent(daemon: DaemonProcess) -> None:
     dealer: Any = zmq.Context.instance().socket(zmq.DEALER)
     dealer.setsockopt(zmq.LINGER, 0)

@@ -49,6 +49,7 @@ NAMED_BY_THEMSELVES = ("stage_ms", "scans")
 """Maps whose keys are the names of stages, or of channels."""
 
 
+@pytest.mark.slow
 def test_every_field_is_in_a_table_and_every_row_is_sent(bench: Callable[..., Any]) -> None:
     daemon = bench(ports=1)
     daemon.tare()

@@ -89,6 +89,7 @@ def test_the_largest_clock_goes_through_to_the_subscriber(bench: Start, late_us:
     assert b.step()
 
 
+@pytest.mark.slow
 def test_a_message_that_cannot_be_sent_is_left_out_and_told(
     bench: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:

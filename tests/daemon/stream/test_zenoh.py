@@ -428,6 +428,7 @@ def test_a_signal_ends_it(
         assert "Traceback" not in running.process.stderr.read()
 
 
+@pytest.mark.slow
 def test_without_a_configuration_the_two_meet_on_this_computer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -87,6 +87,7 @@ def test_cases_fit_on_the_sheet_and_lie_apart(paper: SensorDescription) -> None:
     assert places == {(18.0 * i, 18.0 * j) for i in range(-2, 3) for j in range(-2, 3)}
 
 
+@pytest.mark.slow
 def test_scenes_of_the_simulation_study(small: SensorDescription) -> None:
     drawn = list(paper_scenes(small, "tuning", 1, snr_db=np.inf))
     assert [len(scene.layout.presses) for scene in drawn] == [1, 2, 3, 4]
@@ -136,6 +137,7 @@ def test_a_rig_measures_one_uneven_sensor(small: SensorDescription, rig: Rig) ->
 # ------------------------------------------------------------------ how it is measured
 
 
+@pytest.mark.slow
 def test_the_response_rises_where_the_channel_answers(rig: Rig) -> None:
     points = list(measure_response([rig]))
     assert [point.pressure_kpa for point in points] == list(RESPONSE_KPA)

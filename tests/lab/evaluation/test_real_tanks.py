@@ -41,6 +41,7 @@ def test_measured_tanks(tanks: Tanks) -> None:
                 assert sign * np.nanmean(outcome.image[truth == sign]) > 0.3, outcome.name
 
 
+@pytest.mark.slow
 def test_objects_stand_at_the_electrodes_that_their_names_tell() -> None:
     """Another tank, of unknown size: metal and plastic beside electrodes 1, 5, 9, 13."""
     tank = load_description("tank_uef2017")

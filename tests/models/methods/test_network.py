@@ -272,6 +272,7 @@ def test_the_reference_may_change_between_frames(
     assert all(len(frame.contacts) == 1 for frame in shown)
 
 
+@pytest.mark.slow
 def test_nothing_is_reported_to_the_maker_of_the_runtime(tmp_path: Path) -> None:
     """One that reports keeps a number of the computer in its user's home, from its import on."""
     home = {**os.environ, "HOME": str(tmp_path)}

@@ -136,6 +136,7 @@ class Needy:
 """
 
 
+@pytest.mark.slow
 def test_a_module_is_found_in_the_working_folder(tmp_path: Path) -> None:
     (tmp_path / "needy.py").write_text(MODULE)
     program = (

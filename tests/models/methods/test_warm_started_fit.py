@@ -301,6 +301,7 @@ def test_two_in_a_crowd_are_not_taken_for_one(stacked: Skin) -> None:
     assert "still" in how
 
 
+@pytest.mark.slow
 def test_a_crowd_that_moves_shrinks_or_misses_a_sheet_is_followed(stacked: Skin) -> None:
     """What both sheets have found is kept on one, and by the sheets that come back."""
     fit = WarmStartedFit(stacked.sensor.fit)

@@ -179,7 +179,7 @@ def test_a_poor_contact_alone_does_no_harm(
     [(3, 4), *(pytest.param(pair, marks=pytest.mark.slow) for pair in ((5, 6), (2, 4), (1, 9)))],
     ids=str,
 )
-@pytest.mark.parametrize("when", ["at the tare", "later"])
+@pytest.mark.parametrize("when", ["at the tare", pytest.param("later", marks=pytest.mark.slow)])
 def test_a_short_is_flagged(
     paper: SensorDescription,
     artifact: Artifact,
