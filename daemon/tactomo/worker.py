@@ -7,6 +7,8 @@ an event or a future, never by setting an attribute. Where that is not so, a com
 
 from __future__ import annotations
 
+import contextlib
+import socket
 import threading
 
 
@@ -54,3 +56,27 @@ class Worker:
 
     def _close(self) -> None:
         """Give back sockets, ports and files, once the thread has ended."""
+
+
+class Bell:
+    """Wakes a thread that polls, with its `reader` among what it polls."""
+
+    def __init__(self) -> None:
+        self.reader, self._writer = socket.socketpair()
+        self.reader.setblocking(False)
+        self._writer.setblocking(False)
+
+    def ring(self) -> None:
+        """Wake the thread; for any thread."""
+        with contextlib.suppress(OSError):  # full of reasons to wake up already, or closed
+            self._writer.send(b"\0")
+
+    def hear(self) -> None:
+        """Forget that it rang; for the thread that polls."""
+        with contextlib.suppress(BlockingIOError):
+            self.reader.recv(4096)
+
+    def close(self) -> None:
+        """Give back the sockets."""
+        self.reader.close()
+        self._writer.close()

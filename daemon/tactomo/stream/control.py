@@ -27,10 +27,10 @@ from tactomo.events import OnEvent
 from tactomo.stream.access_control import CONTROL
 from tactomo.stream.commands import Arguments, Nothing, obey
 from tactomo.stream.peers import Peers
-from tactomo.worker import Worker
+from tactomo.worker import Bell, Worker
 
 MAX_REQUEST_BYTES: Final = 64 * 1024
-POLL_MS: Final = 250  # how late, at most, a stop or a cut is noticed
+POLL_MS: Final = 250  # between looks at what is idle
 POLL_WHILE_PENDING_MS: Final = 10
 MAX_PENDING: Final = 64
 QUEUED_PER_CLIENT: Final = 64
@@ -134,6 +134,7 @@ class Control(Worker):
         self._pending: list[_Pending] = []
         self._socket: zmq.Socket[bytes]
         self._peers: Peers
+        self._bell: Bell
         self._cut = threading.Event()
 
     def open(
@@ -146,23 +147,32 @@ class Control(Worker):
         self._socket.setsockopt(zmq.SNDHWM, QUEUED_PER_CLIENT)
         self._peers = Peers(self._socket, endpoint, CONTROL, self._on_event, secret)
         self.address = self._peers.address
+        self._bell = Bell()
 
     def cut_connections(self) -> None:
         """Have every client connect anew, those who still may; for any thread."""
         self._cut.set()
+        self._wake()
 
     def _close(self) -> None:
         self._peers.close()
         self._socket.close(LINGER_MS)
+        self._bell.close()
+
+    def _wake(self) -> None:
+        self._bell.ring()
 
     def _run(self) -> None:
         poller = zmq.Poller()
         poller.register(self._socket, zmq.POLLIN)
         poller.register(self._peers.monitor, zmq.POLLIN)
+        poller.register(self._bell.reader, zmq.POLLIN)
         while not self._stopping.is_set():
             self.turns += 1
             longest_ms = POLL_WHILE_PENDING_MS if self._pending else POLL_MS
-            if self._socket in dict(poller.poll(self._peers.wait_ms(longest_ms))):
+            ready = dict(poller.poll(self._peers.wait_ms(longest_ms)))
+            self._bell.hear()
+            if self._socket in ready:
                 self._receive()
             self._answer_pending()
             if self._cut.is_set():

@@ -7,9 +7,7 @@ queue is lost to that one alone.
 
 from __future__ import annotations
 
-import contextlib
 import math
-import os
 import threading
 import time
 from collections import Counter, deque
@@ -24,7 +22,7 @@ from tactomo.events import OnEvent, RateLimit
 from tactomo.stream.access_control import STREAM
 from tactomo.stream.subscriptions import SUBSCRIBERS_CUT, Subscribers
 from tactomo.timing import Durations
-from tactomo.worker import Worker
+from tactomo.worker import Bell, Worker
 
 STATUS_PERIOD_S: Final = 1.0
 LINGER_MS: Final = 200  # how long messages that were sent may take to leave when the daemon stops
@@ -95,7 +93,7 @@ class Publisher(Worker):
         self._cut = threading.Event()
         self._status_asked = threading.Event()
         self._socket: zmq.Socket[bytes]
-        self._wake_reader = self._wake_writer = -1
+        self._bell: Bell | None = None  # until it is open
 
     def open(
         self, context: zmq.Context[zmq.Socket[bytes]], endpoint: str, secret: bytes | None = None
@@ -105,15 +103,13 @@ class Publisher(Worker):
         self._socket.setsockopt(zmq.SNDHWM, QUEUED_PER_SUBSCRIBER)
         self._readers = Subscribers(self._socket, endpoint, STREAM, self._on_event, secret)
         self.address = self._readers.address
-        self._wake_reader, self._wake_writer = os.pipe()
-        os.set_blocking(self._wake_reader, False)
-        os.set_blocking(self._wake_writer, False)
+        self._bell = Bell()
 
     def _close(self) -> None:
         self._readers.close()
         self._socket.close(LINGER_MS)
-        for descriptor in (self._wake_reader, self._wake_writer):
-            os.close(descriptor)
+        if self._bell is not None:
+            self._bell.close()
 
     def cut_connections(self) -> None:
         """Have every subscriber connect anew, those who still may; for any thread."""
@@ -165,7 +161,8 @@ class Publisher(Worker):
     def _run(self) -> None:
         poller = zmq.Poller()
         poller.register(self._socket, zmq.POLLIN)
-        poller.register(self._wake_reader, zmq.POLLIN)
+        assert self._bell is not None
+        poller.register(self._bell.reader, zmq.POLLIN)
         poller.register(self._readers.peers.monitor, zmq.POLLIN)
         status_at_s = time.monotonic()
         while not self._stopping.is_set():
@@ -174,8 +171,8 @@ class Publisher(Worker):
             for ready, _ in poller.poll(self._readers.peers.wait_ms(status_in_ms)):
                 if ready is self._socket:
                     self._read_subscriptions()
-                elif ready == self._wake_reader:
-                    os.read(self._wake_reader, 4096)
+                elif ready == self._bell.reader.fileno():
+                    self._bell.hear()
             self._send_queued()
             if self._cut.is_set():
                 self._cut.clear()
@@ -241,7 +238,5 @@ class Publisher(Worker):
             self._socket.send(self._last_status, zmq.DONTWAIT)
 
     def _wake(self) -> None:
-        if self._wake_writer < 0:  # not open yet
-            return
-        with contextlib.suppress(BlockingIOError):  # full of reasons to wake up already
-            os.write(self._wake_writer, b"\0")
+        if self._bell is not None:
+            self._bell.ring()

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import socket
 import threading
 import time
 from collections.abc import Sequence
@@ -52,6 +51,7 @@ from tactomo.twin.line import SerialLine
 from tactomo.twin.playing import Player
 from tactomo.twin.scene import Scene, SkinDriftSettings
 from tactomo.twin.surface import Surface
+from tactomo.worker import Bell
 
 # How often a line that nobody has open is looked at; its hang-up cannot be waited on.
 HANGUP_CHECK_S = 0.02
@@ -183,8 +183,7 @@ class Twin:
         self._powered_s = time.monotonic()
         self._over_s: float | None = None  # when the last frame of a file was said
         self._firmware = self._make_firmware(ports)
-        self._wake_receiver, self._wake_sender = socket.socketpair()
-        self._wake_receiver.setblocking(False)
+        self._bell = Bell()
         self._solver = ThreadPoolExecutor(max_workers=1, thread_name_prefix="twin-skin")
         self._thread = threading.Thread(target=self._run, name="twin-firmware")
         self._stopping = threading.Event()
@@ -208,7 +207,7 @@ class Twin:
     def stop(self) -> None:
         """Power down, close the lines and the control socket; may be called twice."""
         self._stopping.set()
-        self._wake()
+        self._bell.ring()
         if self._thread.ident is None:  # never started: the closing falls to us
             self._thread.start()
         self._thread.join()
@@ -238,15 +237,14 @@ class Twin:
             for port in self._firmware.ports:
                 port.line.close()
             self._control.close()
-            self._wake_receiver.close()
-            self._wake_sender.close()
+            self._bell.close()
             self._ended.set()
 
     def _rest(self) -> None:
         """Wait until something is due, or the host, a client or the solver has something."""
         poller = zmq.Poller()
         poller.register(self._control.socket, zmq.POLLIN)
-        poller.register(self._wake_receiver, zmq.POLLIN)
+        poller.register(self._bell.reader, zmq.POLLIN)
         timeout_s = self._firmware.due_in_s()
         for port in self._firmware.ports:
             if port.line.is_open:
@@ -254,8 +252,7 @@ class Twin:
             else:
                 timeout_s = min(timeout_s, HANGUP_CHECK_S)
         poller.poll(math.ceil(timeout_s * 1e3))
-        with contextlib.suppress(BlockingIOError):
-            self._wake_receiver.recv(4096)
+        self._bell.hear()
 
     def _stop_at_end(self) -> None:
         """Stop a while after the last frame of a file that is played once."""
@@ -264,10 +261,6 @@ class Twin:
         self._over_s = self._over_s or time.monotonic()
         if time.monotonic() - self._over_s > LINGER_S:
             self._stopping.set()
-
-    def _wake(self) -> None:
-        with contextlib.suppress(OSError):  # closed: the thread has ended
-            self._wake_sender.send(b"\0")
 
     def _clock(self) -> float:
         return time.monotonic() - self._powered_s
@@ -284,7 +277,7 @@ class Twin:
             future = self._solver.submit(self._skin.voltages, presses)
         else:
             future = self._solver.submit(self._drifting.voltages, presses, time_s)
-        future.add_done_callback(lambda _: self._wake())
+        future.add_done_callback(lambda _: self._bell.ring())
         return future
 
     def _play_at(self, time_s: float) -> None:
