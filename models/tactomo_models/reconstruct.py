@@ -265,6 +265,7 @@ class Reconstructor:
             self._failures[name] = ""
             if self._sheets is None and _uses_sheets(method):
                 self._sheets = self._sheets_of(self._skin.channels)
+            self._comparator.meet(self._sheets or {})
             try:
                 method.prepare(replace(self._skin, sheets=self._sheets or {}))
             except (Exception, SystemExit) as error:

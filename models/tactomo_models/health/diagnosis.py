@@ -25,7 +25,11 @@ from tactomo_models.health.findings import (
     snr_found,
     worst,
 )
-from tactomo_models.scans.plausibility import Layout, Wiring
+from tactomo_models.physics.actual_sheet import SheetEstimator, explains
+from tactomo_models.physics.artifact import MODEL_ERROR
+from tactomo_models.physics.bare_sheet import BareSheet
+from tactomo_models.scans.plausibility import Flag, Layout, Wiring
+from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.sensor.pattern import Pairs
 
 
@@ -55,9 +59,8 @@ def diagnose(
     scans: FloatArray,  # (T, M) volts, on any scale
     *,
     times_s: FloatArray | None = None,  # (T,) when each was taken; drift stays unknown without
-    # (L, L) transfer resistances of the sheet's model, see `BareSheet`; without them voltages are
-    # held against their likes further round the rim
-    transfer: FloatArray | None = None,
+    # the even sheet, solved; without it voltages are held against their likes further round the rim
+    even: BareSheet | None = None,
     contrast: float = 100.0,  # factor by which pressing changes conductivity at most
     saturated: int = 0,  # scans of which the device said that it clipped
 ) -> Diagnosis:
@@ -82,13 +85,14 @@ def diagnose(
     wiring = Wiring(layout)
     still = stillest(wiring, scans)
     is_moved = still != slice(0, len(scans)) or moves(wiring, scans)
+    transfer = None if even is None else even.transfer
     examined = Examination(wiring, layout, scans, still, transfer, contrast)
     findings = [
         scans_found(len(scans), int((~whole).sum()), still, is_moved),
         snr_found(examined),
         reciprocity_found(examined),
         *electrodes_found(examined),
-        model_found(examined, transfer is not None, is_moved),
+        model_found(examined, _is_of_sheet(examined, layout, even), is_moved),
         saturation_found(examined, saturated),
         drift_found(scans[still], None if times_s is None else times_s[still]),
     ]
@@ -101,3 +105,18 @@ def diagnose(
         wiring.reciprocal,
         layout.pairs,
     )
+
+
+def _is_of_sheet(examined: Examination, layout: Layout, even: BareSheet | None) -> bool | None:
+    """Whether the voltages are of the sheet that is described, made by hand or not; if known."""
+    if even is None:
+        return None
+    if Flag.REFERENCE_MISMATCH not in examined.verdict.flags:
+        return True
+    if examined.verdict.electrodes or not isinstance(layout, SensorDescription):
+        return False
+    usable, volts = examined.verdict.usable, examined.mean
+    relative = np.divide(examined.noise, np.abs(volts), out=np.ones_like(volts), where=usable)
+    noise = np.where(usable, np.hypot(relative, MODEL_ERROR), 1.0)
+    sheet = SheetEstimator(layout, even).estimate(volts, usable, noise)
+    return sheet is not None and explains(sheet, volts, usable, noise)

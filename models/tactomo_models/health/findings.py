@@ -204,16 +204,16 @@ def electrodes_found(examined: Examination) -> Iterator[Finding]:
         )
 
 
-def model_found(examined: Examination, has_model: bool, is_moved: bool) -> Finding:
-    """Whether the voltages are those of the sensor that is described."""
-    if not has_model:
+def model_found(examined: Examination, is_of_sheet: bool | None, is_moved: bool) -> Finding:
+    """Whether the voltages are those of the sensor that is described, if that is known."""
+    if is_of_sheet is None:
         detail = "no description of the sheet: swapped electrodes cannot be found"
         return Finding("model", Level.UNKNOWN, detail, "give the sensor's description")
     if examined.order.turned:
         detail = f"all leads are on by {examined.order.turned} of {len(examined.states)} electrodes"
         step = "turn the plug, or renumber the electrodes in the description"
         return Finding("model", Level.FAULT, detail, step)
-    if Flag.REFERENCE_MISMATCH not in examined.verdict.flags:
+    if is_of_sheet:
         return Finding("model", Level.OK, "as the description says")
     detail = "the voltages are not those of this sensor unloaded"
     step = "does something press, are leads in another order, or is this another sensor?"

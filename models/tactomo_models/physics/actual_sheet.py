@@ -45,6 +45,9 @@ IMPEDANCE = 0.4  # of the logarithm of a contact impedance
 DISPLACED_M = 1e-3  # of an electrode along the rim
 REACH = 0.4  # radius that an electrode draws along, over their distance: none meets another
 FAR = 1.0  # error of a slope, as a share of what is left to explain; with 0.3 places run away
+EXPLAINED = (
+    1.5  # times its noise, left of a reference: of unloaded skins up to 0.9, of pressed ones 5
+)
 STEPS = 6  # of Gauss-Newton at most: electrodes 1.5 mm off take them all, ordinary ones three
 SETTLED = 1.0  # of the sum of squares, that a last step takes off; with 0.1 nothing gets better
 
@@ -61,6 +64,21 @@ class _Shape:
     contacts: FloatArray
     fields: FloatArray
     voltages: FloatArray
+
+
+def explains(
+    sheet: ForwardModel, voltages: FloatArray, usable: BoolArray, noise: FloatArray
+) -> bool:
+    """Whether these voltages are of this sheet, unloaded, any scale aside.
+
+    A skin made by hand may be far from the even sheet; what presses is no making of any sheet, and
+    leaves more than the noise. Arguments as of `SheetEstimator.estimate`.
+    """
+    if not usable.any():
+        return False
+    ratio = voltages[usable] / sheet.bare_voltages[usable]
+    left = (ratio / np.median(ratio) - 1) / noise[usable]
+    return bool(np.sqrt(np.mean(left**2)) < EXPLAINED)
 
 
 class SheetEstimator:

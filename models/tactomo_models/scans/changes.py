@@ -17,6 +17,7 @@ from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
 from tactomo_models.errors import DataError
+from tactomo_models.physics.actual_sheet import explains
 from tactomo_models.physics.artifact import MODEL_ERROR, Artifact, nominal_noise_v
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.robust import median, robust_sigma
@@ -173,6 +174,12 @@ class MeasuredChannel:
     def error_ratio(self, predicted: FloatArray) -> float:
         """Variance of the errors of a model that predicts this reference (M,), over those told."""
         return (self._error_share_of(predicted) / self._error_share) ** 2
+
+    def meet(self, sheet: ForwardModel) -> None:
+        """Take back that the reference is of no such sheet where it is of this one, as found."""
+        whole = not self._electrodes  # without some leads, the others may fit though misplaced
+        if whole and explains(sheet, self.reference, self.usable, self.relative_noise):
+            self._flags &= ~Flag.REFERENCE_MISMATCH
 
     def follow(self, drift: FloatArray | None) -> None:
         """Measure changes against the tare as it has drifted since: (M,) logarithms of factors.

@@ -12,6 +12,7 @@ import numpy as np
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
+from tactomo_models.physics.actual_sheet import Sheets
 from tactomo_models.physics.artifact import Artifact
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scans.changes import Changes, MeasuredChannel, missing
@@ -64,6 +65,7 @@ class Comparator:
         self._description, self._artifact, self._forward = description, artifact, forward
         self._wiring = Wiring(description)
         self._reference: Reference | None = None
+        self._sheets: Sheets = {}
         self._asks_noise = False
         self._structure_answers_more = len(description.channels) == 2 and bool(
             np.log(description.contrast(Channel.STRUCTURE))
@@ -83,8 +85,16 @@ class Comparator:
         self._follow(reference)
         return is_new
 
+    def meet(self, sheets: Sheets) -> None:
+        """Know the sheets as found: a reference that is of one of them is no other sensor's."""
+        self._sheets = sheets
+        for name, sheet in sheets.items():
+            if name in self.channels:
+                self.channels[name].meet(sheet)
+
     def _tare(self, reference: Reference) -> None:
         self.channels = self.channels_of(reference)
+        self.meet(self._sheets)
 
     def channels_of(self, reference: Reference) -> dict[Channel, MeasuredChannel]:
         """The channels of a reference, with nothing put in force; for any thread.

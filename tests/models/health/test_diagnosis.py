@@ -36,7 +36,7 @@ class Patient:
     ) -> None:
         self.description = description
         self.simulator = simulator
-        self._transfer = artifact.bare.transfer
+        self._even = artifact.bare
 
     def rest(self, *presses: Press, simulator: SkinSimulator | None = None) -> FloatArray:
         return (simulator or self.simulator).voltages(presses)[Channel.STRUCTURE]
@@ -50,7 +50,7 @@ class Patient:
             self.description,
             scans,
             times_s=np.arange(len(scans)) * np.float64(PERIOD_S),
-            transfer=self._transfer if has_model else None,
+            even=self._even if has_model else None,
             contrast=self.description.contrast(Channel.STRUCTURE),
         )
 

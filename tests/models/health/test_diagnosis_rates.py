@@ -52,7 +52,7 @@ class Rates:
     """Counts what was found in all skins of one kind."""
 
     def __init__(self, paper: SensorDescription, artifact: Artifact) -> None:
-        self.paper, self.transfer = paper, artifact.bare.transfer
+        self.paper, self.even = paper, artifact.bare
         self.skins = [
             SkinSimulator(paper, unevenness=0.05, impedance_spread=0.2, seed=seed) for seed in SEEDS
         ]
@@ -73,7 +73,7 @@ class Rates:
                     found = diagnose(
                         self.paper,
                         make(skin, noise, rng, electrode),
-                        transfer=self.transfer,
+                        even=self.even,
                         times_s=np.arange(SCANS) * np.float64(PERIOD_S),
                     )
                     named = {n for n, state in enumerate(found.electrodes) if state != "good"}

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tactomo_models import Press, Reference, SensorDescription, SkinSimulator
+from tactomo_models import Flag, Press, Reference, SensorDescription, SkinSimulator
 from tactomo_models.arrays import FloatArray
+from tactomo_models.health.diagnosis import diagnose
+from tactomo_models.health.findings import Level
 from tactomo_models.physics.actual_sheet import SheetEstimator
 from tactomo_models.physics.artifact import Artifact
 from tactomo_models.physics.forward import ForwardModel
@@ -22,10 +24,10 @@ def estimator(paper: SensorDescription, artifact: Artifact) -> SheetEstimator:
     return SheetEstimator(paper, artifact.bare)
 
 
-def hand_made(paper: SensorDescription, seed: int = 5) -> SkinSimulator:
+def hand_made(paper: SensorDescription, seed: int = 5, unevenness: float = 0.10) -> SkinSimulator:
     """Electrodes up to 1.5 mm off, on a finer mesh than the one that is fitted."""
     made = variant(paper, electrodes={"pitch_m": 0.037})
-    return SkinSimulator(made, unevenness=0.10, impedance_spread=0.30, seed=seed)
+    return SkinSimulator(made, unevenness=unevenness, impedance_spread=0.30, seed=seed)
 
 
 def off(voltages: FloatArray, forward: ForwardModel) -> float:
@@ -135,3 +137,30 @@ def test_a_hand_made_skin_is_reconstructed_as_if_it_were_even(
     (contact,) = reconstructor.reconstruct(**by_name).contacts
     assert np.hypot(contact.x_m - press.x_m, contact.y_m - press.y_m) < 5e-4
     assert contact.pressure_kpa == pytest.approx(190, abs=10)
+
+
+@pytest.mark.parametrize("pressed", [False, True])
+def test_a_skin_far_from_even_is_no_other_sensor_but_one_that_is_pressed_is_flagged(
+    paper: SensorDescription, artifact: Artifact, pressed: bool
+) -> None:
+    skin = hand_made(paper, seed=2, unevenness=0.15)
+    rest = skin.voltages([Press(0.03, -0.02, 200.0, 0.012)] if pressed else [])
+    flags = {}
+    for method in ("tikhonov", "fit"):  # the first knows the even sheet alone
+        reconstructor = Reconstructor(paper, artifact, method=method, budget_s=1.0)
+        reconstructor.set_reference(Reference(rest[Channel.MAGNITUDE], rest[Channel.STRUCTURE]))
+        later = {str(name): volts for name, volts in skin.voltages([]).items()}
+        flags[method] = reconstructor.reconstruct(**later).flags
+    assert Flag.REFERENCE_MISMATCH in flags["tikhonov"]
+    assert (Flag.REFERENCE_MISMATCH in flags["fit"]) == pressed
+
+
+@pytest.mark.parametrize("pressed", [False, True])
+def test_the_doctor_knows_a_skin_made_by_hand(
+    paper: SensorDescription, artifact: Artifact, pressed: bool
+) -> None:
+    skin = hand_made(paper, seed=2, unevenness=0.15)
+    rest = skin.voltages([Press(0.03, -0.02, 200.0, 0.012)] if pressed else [])
+    scans = rest[Channel.STRUCTURE] * np.ones((20, 1))
+    found = {each.about: each.level for each in diagnose(paper, scans, even=artifact.bare).findings}
+    assert found["model"] == (Level.FAULT if pressed else Level.OK)

@@ -171,7 +171,7 @@ def test_a_healthy_device_of_any_kind_is_called_so(kind: str) -> None:
         noise = 1e-3 * scans.max() * np.random.default_rng(0).standard_normal(scans.shape)
         scans = np.where(predicted > 0, scans, np.abs(noise))
     sensor = variant(sensor, instrument={"voltages": kind})
-    found = diagnose(sensor, scans, transfer=BUILT.of(sensor).bare.transfer, contrast=20.0)
+    found = diagnose(sensor, scans, even=BUILT.of(sensor).bare, contrast=20.0)
     assert found.level is Level.OK
     assert set(found.electrodes) == {"good"}
 

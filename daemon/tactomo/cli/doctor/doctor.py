@@ -150,7 +150,7 @@ def _diagnose(evidence: Evidence) -> dict[str, Diagnosis]:
 
     layout = evidence.layout
     known = layout if isinstance(layout, SensorDescription) else None
-    transfer = None if known is None else load_or_build_artifact(known).bare.transfer
+    even = None if known is None else load_or_build_artifact(known).bare
     found = {}
     for name, scans in evidence.scans.items():
         has_channel = known is not None and name in known.channels
@@ -158,7 +158,7 @@ def _diagnose(evidence: Evidence) -> dict[str, Diagnosis]:
             layout,
             scans,
             times_s=evidence.times_s[name],
-            transfer=transfer,
+            even=even,
             saturated=evidence.saturated.get(name, 0),
             **({"contrast": known.contrast(name)} if has_channel else {}),  # type: ignore[arg-type, union-attr]
         )
