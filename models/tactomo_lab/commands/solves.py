@@ -114,7 +114,9 @@ def _budget_law(sensor: SensorDescription, count: int) -> dict[str, float]:
             super().spend(fitted)
 
     class CountedAuto(Auto):
-        def _fitted(self, measurement: Measurement, budget: Budget) -> tuple[FittedField, str]:
+        def _fitted(
+            self, measurement: Measurement, budget: Budget
+        ) -> tuple[FittedField, str, Measurement]:
             return super()._fitted(measurement, Counted(budget.left_s))
 
     terms, seconds = [], []

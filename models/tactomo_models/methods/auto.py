@@ -92,7 +92,7 @@ class Auto(OutlineFit):
         """
         unsure = account.uncertainty**2
         share = unsure / (unsure + NETWORK_ERROR**2)
-        if own.map is None or not share > NEGLIGIBLE or len(account.areas) > HEDGED:
+        if self._drifts or own.map is None or not share > NEGLIGIBLE or len(account.areas) > HEDGED:
             return own
         if self._hedge is None or self._hedge[0] is not account:
             with measurement.timed("network"):

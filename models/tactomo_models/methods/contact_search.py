@@ -87,10 +87,10 @@ class ContactSearch:
         gain, area = np.zeros((2, len(self._nodes)))
         clearest = max(measured, key=lambda name: abs(self._dipoles[name]))
         for name, own in zip(measured, np.split(J, len(measured)), strict=True):
-            scale = self._dipoles[name] * measured[name].weight
             sheet = self._fit.sheet(name)
             by_area = sheet.spot_sensitivity(self._probes, fitted.solutions[name])
-            by_area *= (scale / np.abs(sheet.bare_voltages))[:, None]
+            by_area *= (self._dipoles[name] / np.abs(sheet.bare_voltages))[:, None]
+            by_area = measured[name].weighted(by_area)
             cross = own.T @ by_area
             spanned = (cross * np.linalg.solve(normal, cross)).sum(axis=0)
             power = np.maximum((by_area**2).sum(axis=0) - spanned, 1e-30)

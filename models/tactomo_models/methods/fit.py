@@ -20,12 +20,16 @@ from tactomo_models.methods.method import Estimate, Skin, UnsolvableError
 from tactomo_models.methods.moves import Propose, ShapeModel
 from tactomo_models.methods.objects import ObjectFit
 from tactomo_models.methods.warm_started_fit import WarmStartedFit
+from tactomo_models.physics.actual_sheet import SheetEstimator
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scene.field_account import FieldAccount, FieldAccountant
 from tactomo_models.scene.field_fit import Budget, FieldFit, FittedField, Measured
 from tactomo_models.scene.level_set import LevelSet
 from tactomo_models.scene.pressure_field import PressureField
+
+PATIENCE_S = 1.0  # of work on what no field explains, before it is given up as a drift
+EXPLAINED = 1.4  # misfit of the worst sheet from which a drift explains what no field does
 
 
 class OutlineFit:
@@ -48,10 +52,15 @@ class OutlineFit:
             self._accountant = FieldAccountant(self._field_fit, skin.areas)
             structure = skin.description.structure
             self._fit: WarmStartedFit | ObjectFit
+            self._drifting_fit: WarmStartedFit | None = None
             if structure is not None and structure.either_way:
                 self._fit = ObjectFit(self._field_fit, self._linear_image)
             else:
                 self._fit = WarmStartedFit(self._field_fit, self.shape_model, self.questions)
+                self._drifting_fit = WarmStartedFit(
+                    self._field_fit, self.shape_model, self.questions
+                )
+                self._drift: FloatArray | None = None  # see `SheetEstimator.drift`
                 self._typical_peak = self._fit.typical_peak
         self._field_fit.sheets = dict(skin.sheets)
         self._error_ratios = {
@@ -66,12 +75,14 @@ class OutlineFit:
         measurement = self._as_sheets_are(measurement)
         if previous is None:
             self._forget()
+        if self._drifts:
+            measurement = self._drifting(measurement)
         if Channel.STRUCTURE in self._skin.description.channels:
             if Channel.STRUCTURE not in measurement.changes:
                 return self._held(measurement)
             self._frames_held = 0
         with measurement.timed("shape"):
-            fitted, how = self._fitted(measurement, Budget(budget_s))
+            fitted, how, measurement = self._fitted(measurement, Budget(budget_s))
         with measurement.timed("contacts"):
             account = self._account(fitted, measurement.changes)
         self._made_by = self._name_of(fitted)
@@ -85,15 +96,51 @@ class OutlineFit:
         }
         return replace(measurement, changes=changes)
 
+    def _drifting(self, measurement: Measurement) -> Measurement:
+        """The same, where the sheets may have drifted since the tare."""
+        if self._drift is None:
+            self._drift = SheetEstimator(self._skin.description, self._skin.artifact.bare).drift()
+        changes = {name: c.drifting(self._drift) for name, c in measurement.changes.items()}
+        return replace(measurement, changes=changes)
+
     def _forget(self) -> None:
         self._fit.forget()
+        if self._drifting_fit is not None:
+            self._drifting_fit.forget()
+        self._drifts: bool | None = None  # whether only a drift explains the data; None: not tried
+        self._unexplained_s = 0.0  # of work on data that no field has explained yet
         self._last = None
 
-    def _fitted(self, measurement: Measurement, budget: Budget) -> tuple[FittedField, str]:
-        changes = measurement.changes
-        if isinstance(self._fit, ObjectFit):
-            return self._fit.follow({Channel.STRUCTURE: changes[Channel.STRUCTURE]}, budget)
-        return self._fit.follow(changes, budget, self._proposer(measurement))
+    def _fitted(
+        self, measurement: Measurement, budget: Budget
+    ) -> tuple[FittedField, str, Measurement]:
+        """The field, in words what it came from, and the measurement that it is judged by."""
+        if isinstance(self._fit, ObjectFit) or self._drifting_fit is None:
+            changes = {Channel.STRUCTURE: measurement.changes[Channel.STRUCTURE]}
+            return *self._fit.follow(changes, budget), measurement
+        propose = self._proposer(measurement)
+        if not self._drifts:
+            given_s = budget.left_s
+            fitted, how = self._fit.follow(measurement.changes, budget, propose)
+            self._unexplained_s += given_s - budget.left_s
+            if _worst_misfit(fitted) <= BAD_MISFIT:
+                self._unexplained_s = 0.0
+            at_end = fitted.converged or self._unexplained_s > PATIENCE_S
+            if not (at_end and self._unexplained_s) or self._drifts is not None:
+                return fitted, how, measurement
+            drifting = self._drifting(measurement)
+            if budget.over:  # this once the frame may take as long again
+                budget = Budget(given_s)
+        else:
+            drifting = measurement
+        other, how_other = self._drifting_fit.follow(drifting.changes, budget, propose)
+        if self._drifts is None:
+            if _worst_misfit(other) <= EXPLAINED:
+                self._drifts = True
+            else:
+                self._drifts = False if other.converged else None
+                return fitted, how, measurement
+        return other, f"{how_other}, drifted since the tare", drifting
 
     def _account(self, fitted: FittedField, measured: Measured) -> FieldAccount:
         """The account of a field; that of the frame before while neither field nor doubts moved."""
@@ -140,8 +187,7 @@ class OutlineFit:
 
     def _leaves_unexplained(self, fitted: FittedField, account: FieldAccount) -> bool:
         """Tell whether the data say that something else presses."""
-        worst = max(fitted.misfit_of(name) for name in fitted.residuals)
-        return worst > BAD_MISFIT or account.goes_wrong_way
+        return _worst_misfit(fitted) > BAD_MISFIT or account.goes_wrong_way
 
     def _held(self, measurement: Measurement) -> Estimate:
         """Bridge a lost structure scan with the last field, as long as it explains the other."""
@@ -183,6 +229,10 @@ class OutlineFit:
 
     def _linear_image(self, change: FloatArray) -> FloatArray:
         return self._images.image(Channel.STRUCTURE, change).astype(np.float64)
+
+
+def _worst_misfit(fitted: FittedField) -> float:
+    return max(fitted.misfit_of(name) for name in fitted.residuals)
 
 
 class LevelSetFit(OutlineFit):

@@ -42,6 +42,8 @@ MODES = 6  # cosines along each side: with 8 nothing gets better
 UNEVENNESS = 0.15  # prior standard deviation of the logarithm of conductivity
 SMOOTH = 0.25  # its length over the sheet's width; 0.15 serves as well
 IMPEDANCE = 0.4  # of the logarithm of a contact impedance
+WARMING = 0.1  # of a sheet's conductivity since the tare: 5 K at 2 % per kelvin
+UNEVEN_DRIFT = 0.01  # of that, from place to place
 DISPLACED_M = 1e-3  # of an electrode along the rim
 REACH = 0.4  # radius that an electrode draws along, over their distance: none meets another
 FAR = 1.0  # error of a slope, as a share of what is left to explain; with 0.3 places run away
@@ -159,6 +161,18 @@ class SheetEstimator:
             green_dtype=GREEN_DTYPE,
         )
         return ForwardModel(self._description, bare)
+
+    def drift(self) -> FloatArray:
+        """What the even sheet may do to its voltages by itself: warm, and unevenly so.
+
+        Returns:
+            (M, K) relative changes, each of one standard deviation.
+        """
+        rest = np.zeros(len(self._sigma))
+        shape = self._shape(rest)
+        slopes = self._slopes(rest, shape)[:, : len(self._modes)] / shape.voltages[:, None]
+        uneven = UNEVEN_DRIFT / UNEVENNESS * self._sigma[: len(self._modes)] * slopes
+        return np.column_stack([np.full(len(uneven), WARMING), uneven])
 
     def _left(self, voltages: FloatArray, shape: _Shape, usable: BoolArray) -> FloatArray | None:
         """Logarithms (M,) of what a sheet leaves, any scale aside; None where signs differ."""

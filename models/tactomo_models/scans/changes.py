@@ -67,6 +67,9 @@ class Changes:
     # noise
     modes: FloatArray
     displaced: float = CORRELATED  # the factor of model errors alone, where they displace contacts
+    # (M, K) orthonormal directions of weighted changes that are the sheet's own drift, and the
+    # share (K,) of each that is; None where none is allowed for
+    drift: tuple[FloatArray, FloatArray] | None = None
 
     @property
     def centre_inflation(self) -> FloatArray:
@@ -88,11 +91,29 @@ class Changes:
             displaced=DISPLACING * CORRELATED / error_ratio,
         )
 
+    def drifting(self, directions: FloatArray) -> Changes:
+        """The same, where a drift of the sheet since the tare counts as an error.
+
+        Args:
+            directions: (M, K) relative changes of one standard deviation each.
+        """
+        drift = (self.weight * (1 + self.change))[:, None] * directions
+        along, size, _ = np.linalg.svd(drift, full_matrices=False)
+        return replace(self, drift=(along, 1 - 1 / np.sqrt(1 + size**2)))
+
+    def weighted(self, changes: FloatArray) -> FloatArray:
+        """Relative changes (M,) or (M, N) over their errors, less what may be drift."""
+        over = (self.weight * changes.T).T
+        if self.drift is not None:
+            along, share = self.drift
+            over -= along @ (share * (along.T @ over).T).T
+        return over
+
     @property
     def misfit(self) -> float:
         """Misfit of a model in which nothing is pressed."""
         count = max(int(np.count_nonzero(self.weight)), 1)
-        return float(np.sqrt(((self.weight * self.change) ** 2).sum() / count))
+        return float(np.sqrt((self.weighted(self.change) ** 2).sum() / count))
 
 
 class ChannelResult(NamedTuple):

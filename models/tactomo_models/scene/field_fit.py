@@ -217,7 +217,7 @@ class FieldFit:
         for name, changes in measured.items():
             bare = self.sheet(name).bare_voltages
             change = (solutions[name].voltages - bare) / np.abs(bare)
-            residuals[name] = changes.weight * (change - changes.change)
+            residuals[name] = changes.weighted(change - changes.change)
         off = (log_ratio - self.likely) / (family.ratio_freedom * self._ratio_sigma)
         away = family.prior_precision @ (parameters - family.prior_mean) ** 2
         cost = float(sum(each @ each for each in residuals.values()) + away + off**2)
@@ -258,7 +258,7 @@ class FieldFit:
             onto *= forward.at_rest[drawing.nodes, None]
             by_parameter = forward.jacobian(fitted.solutions[name], drawing.nodes, onto)
             volts = np.abs(forward.bare_voltages)
-            sheets.append(by_parameter * (changes.weight / volts)[:, None])
+            sheets.append(changes.weighted(by_parameter / volts[:, None]))
         return np.concatenate(sheets)
 
     def refine(
