@@ -28,8 +28,8 @@ from tactomo_models.scene.field_fit import Budget, FieldFit, FittedField, Measur
 from tactomo_models.scene.level_set import LevelSet
 from tactomo_models.scene.pressure_field import PressureField
 
-PATIENCE_S = 1.0  # of work on what no field explains, before it is given up as a drift
-EXPLAINED = 1.4  # misfit of the worst sheet from which a drift explains what no field does
+PATIENCE_S = 1.0  # of work on data that no field explains, before a drift is tried
+EXPLAINED = 1.4  # misfit of the worst sheet, below which a drift beside a field is believed
 
 
 class OutlineFit:
@@ -118,9 +118,8 @@ class OutlineFit:
         if isinstance(self._fit, ObjectFit) or self._drifting_fit is None:
             changes = {Channel.STRUCTURE: measurement.changes[Channel.STRUCTURE]}
             return *self._fit.follow(changes, budget), measurement
-        propose = self._proposer(measurement)
         if not self._drifts:
-            given_s = budget.left_s
+            given_s, propose = budget.left_s, self._proposer(measurement)
             fitted, how = self._fit.follow(measurement.changes, budget, propose)
             self._unexplained_s += given_s - budget.left_s
             if _worst_misfit(fitted) <= BAD_MISFIT:
@@ -133,7 +132,8 @@ class OutlineFit:
                 budget = Budget(given_s)
         else:
             drifting = measurement
-        other, how_other = self._drifting_fit.follow(drifting.changes, budget, propose)
+        # Nothing is proposed: who does so takes the drift for specks.
+        other, how_other = self._drifting_fit.follow(drifting.changes, budget)
         if self._drifts is None:
             if _worst_misfit(other) <= EXPLAINED:
                 self._drifts = True
@@ -144,7 +144,8 @@ class OutlineFit:
 
     def _account(self, fitted: FittedField, measured: Measured) -> FieldAccount:
         """The account of a field; that of the frame before while neither field nor doubts moved."""
-        doubts = self._fit.doubts if isinstance(self._fit, WarmStartedFit) else []
+        course = self._drifting_fit if self._drifts else self._fit
+        doubts = course.doubts if isinstance(course, WarmStartedFit) else []
         odds = [doubt.odds for doubt in doubts]
         last = self._last
         if last is not None and last[0].drawing is fitted.drawing and self._odds == odds:

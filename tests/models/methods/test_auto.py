@@ -17,6 +17,7 @@ from tactomo_models import (
     SkinSimulator,
 )
 from tactomo_models.methods.trained_networks import Network
+from tactomo_models.simulation.skin_drift import DriftingSkin, SkinDrift
 
 TWO = (Press(-0.035, 0.03, 180.0), Press(0.03, -0.03, 165.0, radius_m=0.012))
 RING = Press(0.02, 0.015, 185.0, radius_m=0.019, shape="ring")
@@ -161,3 +162,49 @@ def test_a_network_that_says_nonsense_does_no_harm(
     frame = methods["auto"].reconstruct(**skin.scan(*TWO))
     assert len(frame.contacts) == 2
     assert icc(paper, frame, *TWO) > 0.9
+
+
+@pytest.mark.parametrize("step_k", [-1.5, pytest.param(1.5, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("presses", [(), TWO[:1], TWO], ids=len)
+def test_sheets_that_have_drifted_since_the_tare_hide_no_contact_and_make_none(
+    paper: SensorDescription,
+    methods: dict[str, Reconstructor],
+    simulator: SkinSimulator,
+    presses: tuple[Press, ...],
+    step_k: float,
+) -> None:
+    """3 % of warming, 30 times the noise."""
+    warm = DriftingSkin(simulator, SkinDrift(step_k=step_k, uneven=0.2))
+    rng = np.random.default_rng(3)
+    scan = {
+        str(name): volts * (1 + 1e-3 * rng.standard_normal(len(volts)))
+        for name, volts in warm.voltages(presses, 1.0).items()
+    }
+    for method in methods.values():
+        frame = method.reconstruct(**scan)
+        assert frame.misfit < 1.4
+        assert not frame.flags & (Flag.MISFIT_HIGH | Flag.LOW_CONFIDENCE)
+        assert len(frame.contacts) == len(presses)
+        if presses:
+            assert icc(paper, frame, *presses) > 0.9
+        for press in presses:
+            off = [np.hypot(c.x_m - press.x_m, c.y_m - press.y_m) for c in frame.contacts]
+            assert min(off) < 1e-3
+        method.reset()
+
+
+def test_a_drift_is_believed_until_the_scene_is_new(
+    methods: dict[str, Reconstructor], skin: Skin, simulator: SkinSimulator
+) -> None:
+    warm = DriftingSkin(simulator, SkinDrift(step_k=1.5))
+    drifted = {str(name): volts for name, volts in warm.voltages(TWO, 1.0).items()}
+    auto = methods["auto"]
+    assert "drifted" in auto.reconstruct(**drifted).reason
+    moved = {str(name): volts for name, volts in warm.voltages(TWO[:1], 1.5).items()}
+    frame = auto.reconstruct(**moved)
+    assert "drifted" in frame.reason
+    assert len(frame.contacts) == 1
+    auto.set_reference(skin.reference(19))
+    frame = auto.reconstruct(**skin.scan(*TWO))
+    assert "drifted" not in frame.reason
+    assert len(frame.contacts) == 2
