@@ -30,6 +30,9 @@ from tactomo_models.scene.pressure_field import PressureField
 
 PATIENCE_S = 1.0  # of work on data that no field explains, before a drift is tried
 EXPLAINED = 1.4  # misfit of the worst sheet, below which a drift beside a field is believed
+MOST_DRIFT = (
+    0.2  # of a sheet's voltages that a skin comes by, 10 K at 2 % per kelvin: more is a fault
+)
 
 
 class OutlineFit:
@@ -75,11 +78,9 @@ class OutlineFit:
         measurement = self._as_sheets_are(measurement)
         if previous is None:
             self._forget()
-        if self._drifts:
-            measurement = self._drifting(measurement)
         if Channel.STRUCTURE in self._skin.description.channels:
             if Channel.STRUCTURE not in measurement.changes:
-                return self._held(measurement)
+                return self._held(self._drifting(measurement) if self._drifts else measurement)
             self._frames_held = 0
         with measurement.timed("shape"):
             fitted, how, measurement = self._fitted(measurement, Budget(budget_s))
@@ -115,32 +116,48 @@ class OutlineFit:
         self, measurement: Measurement, budget: Budget
     ) -> tuple[FittedField, str, Measurement]:
         """The field, in words what it came from, and the measurement that it is judged by."""
-        if isinstance(self._fit, ObjectFit) or self._drifting_fit is None:
+        if isinstance(self._fit, ObjectFit):
             changes = {Channel.STRUCTURE: measurement.changes[Channel.STRUCTURE]}
             return *self._fit.follow(changes, budget), measurement
-        if not self._drifts:
-            given_s, propose = budget.left_s, self._proposer(measurement)
-            fitted, how = self._fit.follow(measurement.changes, budget, propose)
-            self._unexplained_s += given_s - budget.left_s
-            if _worst_misfit(fitted) <= BAD_MISFIT:
-                self._unexplained_s = 0.0
-            at_end = fitted.converged or self._unexplained_s > PATIENCE_S
-            if not (at_end and self._unexplained_s) or self._drifts is not None:
-                return fitted, how, measurement
-            drifting = self._drifting(measurement)
-            if budget.over:  # this once the frame may take as long again
-                budget = Budget(given_s)
-        else:
-            drifting = measurement
-        # Nothing is proposed: who does so takes the drift for specks.
-        other, how_other = self._drifting_fit.follow(drifting.changes, budget)
-        if self._drifts is None:
-            if _worst_misfit(other) <= EXPLAINED:
-                self._drifts = True
-            else:
-                self._drifts = False if other.converged else None
-                return fitted, how, measurement
-        return other, f"{how_other}, drifted since the tare", drifting
+        given_s = budget.left_s
+        if self._drifts:
+            beside = self._beside_drift(measurement, budget)
+            if self._drifted(beside[0], measurement) < MOST_DRIFT:
+                return beside
+            self._drifts = False
+        fitted, how = self._fit.follow(measurement.changes, budget, self._proposer(measurement))
+        self._unexplained_s += given_s - budget.left_s
+        if _worst_misfit(fitted) <= BAD_MISFIT:
+            self._unexplained_s = 0.0
+        at_end = fitted.converged or self._unexplained_s > PATIENCE_S
+        if not (at_end and self._unexplained_s) or self._drifts is not None:
+            return fitted, how, measurement
+        # This once the frame may take as long again.
+        beside = self._beside_drift(measurement, Budget(given_s) if budget.over else budget)
+        misfit, drifted = _worst_misfit(beside[0]), self._drifted(beside[0], measurement)
+        if misfit <= EXPLAINED and drifted < MOST_DRIFT:
+            self._drifts = True
+            return beside
+        self._drifts = False if beside[0].converged else None
+        return fitted, how, measurement
+
+    def _beside_drift(
+        self, measurement: Measurement, budget: Budget
+    ) -> tuple[FittedField, str, Measurement]:
+        """The field beside a drift; nothing is proposed: who does so takes the drift for specks."""
+        assert self._drifting_fit is not None
+        drifting = self._drifting(measurement)
+        fitted, how = self._drifting_fit.follow(drifting.changes, budget)
+        return fitted, f"{how}, drifted since the tare", drifting
+
+    def _drifted(self, fitted: FittedField, measurement: Measurement) -> float:
+        """By what share a sheet's voltages have drifted at most, beside what presses."""
+        shares = []
+        for name, solution in fitted.solutions.items():
+            changes, bare = measurement.changes[name], self._field_fit.sheet(name).bare_voltages
+            ratio = (1 + np.sign(bare) * changes.change) * bare / solution.voltages
+            shares.append(abs(float(np.median(ratio[changes.weight > 0])) - 1))
+        return max(shares)
 
     def _account(self, fitted: FittedField, measured: Measured) -> FieldAccount:
         """The account of a field; that of the frame before while neither field nor doubts moved."""

@@ -157,8 +157,9 @@ def test_what_creeps_back_after_a_long_press_is_no_ghost(life: Life) -> None:
 
 @pytest.mark.slow
 def test_a_step_that_no_skin_makes_is_refused_and_said(life: Life) -> None:
-    frames = life.lives(60, gain=0.7)
-    assert frames[-1].flags
+    """A fifth less is a drift that the fit allows for, three tenths are not."""
+    assert life.lives(60, gain=0.7)[-1].flags
+    life.lives(30)
     assert life.tracker.state == "refused"
     assert life.tracker.refusal
 
