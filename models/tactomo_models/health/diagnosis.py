@@ -117,6 +117,6 @@ def _is_of_sheet(examined: Examination, layout: Layout, even: BareSheet | None) 
         return False
     usable, volts = examined.verdict.usable, examined.mean
     relative = np.divide(examined.noise, np.abs(volts), out=np.ones_like(volts), where=usable)
-    noise = np.where(usable, np.hypot(relative, MODEL_ERROR), 1.0)
+    noise = np.hypot(relative, MODEL_ERROR)
     sheet = SheetEstimator(layout, even).estimate(volts, usable, noise)
     return sheet is not None and explains(sheet, volts, usable, noise)

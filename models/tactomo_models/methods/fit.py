@@ -21,6 +21,7 @@ from tactomo_models.methods.moves import Propose, ShapeModel
 from tactomo_models.methods.objects import ObjectFit
 from tactomo_models.methods.warm_started_fit import WarmStartedFit
 from tactomo_models.physics.actual_sheet import SheetEstimator
+from tactomo_models.scans.changes import Changes
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scene.field_account import FieldAccount, FieldAccountant
@@ -30,9 +31,7 @@ from tactomo_models.scene.pressure_field import PressureField
 
 PATIENCE_S = 1.0  # of work on data that no field explains, before a drift is tried
 EXPLAINED = 1.4  # misfit of the worst sheet, below which a drift beside a field is believed
-MOST_DRIFT = (
-    0.2  # of a sheet's voltages that a skin comes by, 10 K at 2 % per kelvin: more is a fault
-)
+MOST_DRIFT = 0.2  # of a sheet's voltages, 10 K at 2 % per kelvin: more is a fault
 
 
 class OutlineFit:
@@ -101,8 +100,15 @@ class OutlineFit:
         """The same, where the sheets may have drifted since the tare."""
         if self._drift is None:
             self._drift = SheetEstimator(self._skin.description, self._skin.artifact.bare).drift()
-        changes = {name: c.drifting(self._drift) for name, c in measurement.changes.items()}
+        changes = {
+            name: each.drifting(self._since_tare(name, each)[:, None] * self._drift)
+            for name, each in measurement.changes.items()
+        }
         return replace(measurement, changes=changes)
+
+    def _since_tare(self, name: Channel, changes: Changes) -> FloatArray:
+        """Voltages (M,) of a scan over the amounts that they had at the tare, signs kept."""
+        return np.sign(self._field_fit.sheet(name).bare_voltages) + changes.change
 
     def _forget(self) -> None:
         self._fit.forget()
@@ -155,7 +161,7 @@ class OutlineFit:
         shares = []
         for name, solution in fitted.solutions.items():
             changes, bare = measurement.changes[name], self._field_fit.sheet(name).bare_voltages
-            ratio = (1 + np.sign(bare) * changes.change) * bare / solution.voltages
+            ratio = self._since_tare(name, changes) * np.abs(bare) / solution.voltages
             shares.append(abs(float(np.median(ratio[changes.weight > 0])) - 1))
         return max(shares)
 

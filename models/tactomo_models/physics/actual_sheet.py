@@ -166,7 +166,7 @@ class SheetEstimator:
         """What the even sheet may do to its voltages by itself: warm, and unevenly so.
 
         Returns:
-            (M, K) relative changes, each of one standard deviation.
+            (M, K) changes over the voltages themselves, each of one standard deviation.
         """
         rest = np.zeros(len(self._sigma))
         shape = self._shape(rest)

@@ -95,9 +95,9 @@ class Changes:
         """The same, where a drift of the sheet since the tare counts as an error.
 
         Args:
-            directions: (M, K) relative changes of one standard deviation each.
+            directions: (M, K) changes of one standard deviation each.
         """
-        drift = (self.weight * (1 + self.change))[:, None] * directions
+        drift = self.weight[:, None] * directions
         along, size, _ = np.linalg.svd(drift, full_matrices=False)
         return replace(self, drift=(along, 1 - 1 / np.sqrt(1 + size**2)))
 

@@ -13,8 +13,11 @@ from tactomo_models import (
     Press,
     Reconstruction,
     Reconstructor,
+    Reference,
     SensorDescription,
     SkinSimulator,
+    load_description,
+    load_or_build_artifact,
 )
 from tactomo_models.methods.trained_networks import Network
 from tactomo_models.simulation.skin_drift import DriftingSkin, SkinDrift
@@ -208,3 +211,22 @@ def test_a_drift_is_believed_until_the_scene_is_new(
     frame = auto.reconstruct(**skin.scan(*TWO))
     assert "drifted" not in frame.reason
     assert len(frame.contacts) == 2
+
+
+@pytest.mark.slow
+def test_a_drift_is_told_where_voltages_have_both_signs() -> None:
+    sensor = load_description("openeit_disc")
+    at_rest = SkinSimulator(sensor)
+    reconstructor = Reconstructor(sensor, load_or_build_artifact(sensor), method="fit")
+    (rest,) = at_rest.voltages([]).values()
+    assert (rest < 0).any()
+    assert (rest > 0).any()
+    reconstructor.set_reference(Reference(None, rest))
+    press = Press(0.15 * sensor.width_m, 0.1 * sensor.width_m, 200.0, radius_m=0.1 * sensor.width_m)
+    warm = DriftingSkin(at_rest, SkinDrift(step_k=1.5, uneven=0.2))
+    (volts,) = warm.voltages([press], 1.0).values()
+    noise = 1e-3 * np.random.default_rng(3).standard_normal(len(volts))
+    frame = reconstructor.reconstruct(None, volts * (1 + noise))
+    assert "drifted" in frame.reason
+    (contact,) = frame.contacts
+    assert np.hypot(contact.x_m - press.x_m, contact.y_m - press.y_m) < 1e-3
