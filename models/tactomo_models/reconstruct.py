@@ -205,10 +205,10 @@ class Reconstructor:
         saturated: Collection[Channel] = (),
     ) -> Measurement:
         """The first half of `reconstruct`, which costs little: what has changed."""
-        measurement = self._comparator.compare(magnitude, structure, saturated)
+        self._comparator.ask_noise(magnitude, structure)
         if self._comparator.channels is not self._skin.channels:
             self._prepare()
-        return measurement
+        return self._comparator.compare(magnitude, structure, saturated)
 
     def solve(self, measurement: Measurement) -> Reconstruction:
         """The second half of `reconstruct`: what follows from a measurement."""
@@ -265,9 +265,11 @@ class Reconstructor:
             self._failures[name] = ""
             if self._sheets is None and _uses_sheets(method):
                 self._sheets = self._sheets_of(self._skin.channels)
-            self._comparator.meet(self._sheets or {})
+            sheets = self._sheets or {}
+            for channel in sheets.keys() & self._skin.channels.keys():
+                self._skin.channels[channel].meet(sheets[channel])
             try:
-                method.prepare(replace(self._skin, sheets=self._sheets or {}))
+                method.prepare(replace(self._skin, sheets=sheets))
             except (Exception, SystemExit) as error:
                 if _is_ours(method) or isinstance(error, ModelError):
                     del self._failures[name]

@@ -94,6 +94,7 @@ class _Imager:
     def images(self, volts: dict[Channel, FloatArray]) -> dict[Channel, FloatArray]:
         """Images (nodes_y, nodes_x) of both channels' scans (M,)."""
         scans = (volts[Channel.MAGNITUDE], volts[Channel.STRUCTURE])
+        self._comparator.ask_noise(*scans)
         return self._images.of(self._comparator.compare(*scans).changes, volts.keys())
 
 

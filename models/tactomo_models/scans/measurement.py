@@ -12,7 +12,6 @@ import numpy as np
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
-from tactomo_models.physics.actual_sheet import Sheets
 from tactomo_models.physics.artifact import Artifact
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scans.changes import Changes, MeasuredChannel, missing
@@ -65,7 +64,6 @@ class Comparator:
         self._description, self._artifact, self._forward = description, artifact, forward
         self._wiring = Wiring(description)
         self._reference: Reference | None = None
-        self._sheets: Sheets = {}
         self._asks_noise = False
         self._structure_answers_more = len(description.channels) == 2 and bool(
             np.log(description.contrast(Channel.STRUCTURE))
@@ -85,16 +83,8 @@ class Comparator:
         self._follow(reference)
         return is_new
 
-    def meet(self, sheets: Sheets) -> None:
-        """Know the sheets as found: a reference that is of one of them is no other sensor's."""
-        self._sheets = sheets
-        for name, sheet in sheets.items():
-            if name in self.channels:
-                self.channels[name].meet(sheet)
-
     def _tare(self, reference: Reference) -> None:
         self.channels = self.channels_of(reference)
-        self.meet(self._sheets)
 
     def channels_of(self, reference: Reference) -> dict[Channel, MeasuredChannel]:
         """The channels of a reference, with nothing put in force; for any thread.
@@ -130,12 +120,14 @@ class Comparator:
         for name, channel in self.channels.items():
             channel.follow(drift[name])
 
-    def _ask_noise(self, *scans: FloatArray | None) -> None:
+    def ask_noise(self, *scans: FloatArray | None) -> None:
         """Take the noise of the first frame's scans, where a reference of one scan told none.
 
         A reference is often the mean of many scans, and so much quieter than the scans to come; and
         it breaks reciprocity not by noise alone, but also by what is the same in every scan.
         """
+        if not self._asks_noise:
+            return
         self._asks_noise = False
         if self._reference is None or any(
             scan is not None and scan.shape != (self._description.measurements,) for scan in scans
@@ -154,8 +146,6 @@ class Comparator:
     ) -> Measurement:
         """Relative changes of one frame's scans; see `Reconstructor.reconstruct`."""
         start_s = time.perf_counter()
-        if self._asks_noise:
-            self._ask_noise(magnitude, structure)
         changes: dict[Channel, Changes] = {}
         flags = own_flags = Flag(0)
         faults: list[str] = []

@@ -139,28 +139,46 @@ def test_a_hand_made_skin_is_reconstructed_as_if_it_were_even(
     assert contact.pressure_kpa == pytest.approx(190, abs=10)
 
 
-@pytest.mark.parametrize("pressed", [False, True])
+@pytest.fixture(params=[False, True], ids=["unloaded", "pressed"])
+def pressed(request: pytest.FixtureRequest) -> bool:
+    return bool(request.param)
+
+
+@pytest.fixture
+def far_from_even(paper: SensorDescription) -> SkinSimulator:
+    return hand_made(paper, seed=2, unevenness=0.15)
+
+
+@pytest.fixture
+def at_tare(far_from_even: SkinSimulator, pressed: bool) -> dict[Channel, FloatArray]:
+    return far_from_even.voltages([Press(0.03, -0.02, 200.0, 0.012)] if pressed else [])
+
+
 def test_a_skin_far_from_even_is_no_other_sensor_but_one_that_is_pressed_is_flagged(
-    paper: SensorDescription, artifact: Artifact, pressed: bool
+    paper: SensorDescription,
+    artifact: Artifact,
+    far_from_even: SkinSimulator,
+    at_tare: dict[Channel, FloatArray],
+    pressed: bool,
 ) -> None:
-    skin = hand_made(paper, seed=2, unevenness=0.15)
-    rest = skin.voltages([Press(0.03, -0.02, 200.0, 0.012)] if pressed else [])
     flags = {}
     for method in ("tikhonov", "fit"):  # the first knows the even sheet alone
         reconstructor = Reconstructor(paper, artifact, method=method, budget_s=1.0)
-        reconstructor.set_reference(Reference(rest[Channel.MAGNITUDE], rest[Channel.STRUCTURE]))
-        later = {str(name): volts for name, volts in skin.voltages([]).items()}
+        reconstructor.set_reference(
+            Reference(at_tare[Channel.MAGNITUDE], at_tare[Channel.STRUCTURE])
+        )
+        later = {str(name): volts for name, volts in far_from_even.voltages([]).items()}
         flags[method] = reconstructor.reconstruct(**later).flags
     assert Flag.REFERENCE_MISMATCH in flags["tikhonov"]
     assert (Flag.REFERENCE_MISMATCH in flags["fit"]) == pressed
 
 
-@pytest.mark.parametrize("pressed", [False, True])
 def test_the_doctor_knows_a_skin_made_by_hand(
-    paper: SensorDescription, artifact: Artifact, pressed: bool
+    paper: SensorDescription,
+    artifact: Artifact,
+    at_tare: dict[Channel, FloatArray],
+    pressed: bool,
 ) -> None:
-    skin = hand_made(paper, seed=2, unevenness=0.15)
-    rest = skin.voltages([Press(0.03, -0.02, 200.0, 0.012)] if pressed else [])
-    scans = rest[Channel.STRUCTURE] * np.ones((20, 1))
+    scans = at_tare[Channel.STRUCTURE] * np.ones((20, 1))
     found = {each.about: each.level for each in diagnose(paper, scans, even=artifact.bare).findings}
     assert found["model"] == (Level.FAULT if pressed else Level.OK)
