@@ -136,7 +136,8 @@ class OutlineFit:
         if _worst_misfit(fitted) <= BAD_MISFIT:
             self._unexplained_s = 0.0
         at_end = fitted.converged or self._unexplained_s > PATIENCE_S
-        if not (at_end and self._unexplained_s) or self._drifts is not None:
+        may_drift = measurement.may_drift and self._drifts is None
+        if not (at_end and self._unexplained_s and may_drift):
             return fitted, how, measurement
         # This once the frame may take as long again.
         beside = self._beside_drift(measurement, Budget(given_s) if budget.over else budget)
