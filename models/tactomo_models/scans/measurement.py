@@ -33,9 +33,9 @@ class Measurement:
     #: nothing to add
     standing_flags: Flag = field(default_factory=lambda: Flag(0))
     faults: tuple[str, ...] = ()  #: in words, which electrodes are left out
-    may_drift: bool = True  #: whether a drift since the tare may explain what contacts do not
     #: seconds spent in each stage of this frame so far
     stage_s: dict[str, float] = field(default_factory=dict)
+    may_drift: bool = True  #: whether a drift since the tare may explain what contacts do not
 
     @property
     def is_quiet(self) -> bool:
