@@ -29,7 +29,7 @@ import numpy as np
 from tactomo_models.arrays import BoolArray, FloatArray, Image
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scans.changes import Changes
-from tactomo_models.scene.field_fit import STEP_LIMIT, WORST_DAMPING, FieldFit, FittedField
+from tactomo_models.scene.field_fit import STEP_LIMIT, MAX_DAMPING, FieldFit, FittedField
 from tactomo_models.scene.level_set import LevelSet
 from tactomo_protocol import Channel
 
@@ -102,7 +102,7 @@ class PaperLevelSet:
                 mu, residual, cost, damping = mu + step, trial, trial_cost, damping / 5
             else:
                 damping *= 5
-                settled = damping > WORST_DAMPING
+                settled = damping > MAX_DAMPING
             if settled:
                 return mu, True
         return mu, False

@@ -21,9 +21,14 @@ from dataclasses import dataclass
 import numpy as np
 from tactomo_protocol import Channel
 
-from tactomo_models.scene.field_fit import FieldFit, FittedField, Measured
+from tactomo_models.arrays import FloatArray
+from tactomo_models.methods.account import Account, Frame
+from tactomo_models.scene.field_fit import FieldFit
+from tactomo_models.scene.parameters import SIZE, UNIT_M, X, Y
 
-MOST_MISSING = 8  # places that are told of
+MAX_MISSING = 2  # places that are told of: the third was never the one
+NEAR_M = 0.012  # of two places, or a place and an outline: nearer ones mean the same contact
+RADIUS_M = (0.006, 0.02)  # of a contact to begin with
 
 
 @dataclass(frozen=True)
@@ -65,25 +70,48 @@ class ContactSearch:
         self._x, self._y = x[self._nodes], y[self._nodes]
         self._probes = self._forward.probes(self._x, self._y, reach * spacing)
 
-    def missing(self, fitted: FittedField, measured: Measured) -> list[MissingContact]:
-        """The discs that would explain most of what a field leaves, the best first.
+    def missing(self, account: Account, frame: Frame, *, far: bool) -> list[MissingContact]:
+        """The discs that would explain clearly more than chance, the best first.
 
         What the known contacts would make of a disc by moving aside is allowed for: its
         signature counts as far as theirs do not span it (orthogonal matching pursuit: Pati et
         al., Asilomar 1993).
 
         Args:
-            fitted: what is known to be pressed.
-            measured: what it is fitted to.
+            account: what is known to be pressed, at its minimum.
+            frame: what it is fitted to.
+            far: whether only away from the contacts; nearby, a part of their form may be missing.
         """
-        largest_m = 0.02  # radius of a contact to begin with
-        apart_m = 0.012  # of two places: nearer ones mean the same contact
-        J = self._fit.jacobian(fitted, measured)
-        precision, offset = self._fit.prior(fitted)
-        normal = J.T @ J + np.diag(precision)
-        aside = np.linalg.solve(normal, J.T @ fitted.residual + precision * offset)
+        gain, area = self._gains(account, frame)
+        drawing = account.fitted.drawing
         pressed = np.zeros(self._forward.bare.pressable.shape)
-        pressed[fitted.drawing.nodes] = np.abs(fitted.drawing.enclosed)
+        pressed[drawing.nodes] = np.abs(drawing.enclosed)
+        gain[pressed[self._nodes] >= 0.1] = 0.0
+        if far and account.family.count:
+            gain[self._gaps_m(account.contacts) < NEAR_M] = 0.0
+        # The best of so many places gains this much by noise alone.
+        by_chance = 2 * np.log(len(self._nodes)) / account.unit
+        found: list[MissingContact] = []
+        for spot in np.argsort(-gain):
+            if gain[spot] < by_chance or len(found) == MAX_MISSING:
+                break
+            x, y = float(self._x[spot]), float(self._y[spot])
+            if all(np.hypot(x - other.x_m, y - other.y_m) > NEAR_M for other in found):
+                radius = min(max(float(np.sqrt(area[spot] / np.pi)), RADIUS_M[0]), RADIUS_M[1])
+                found.append(MissingContact(x, y, radius, float(gain[spot])))
+        return found
+
+    def _gaps_m(self, contacts: FloatArray) -> FloatArray:
+        """Distance of each spot from the nearest outline, about."""
+        dx, dy = self._x - UNIT_M * contacts[:, X, None], self._y - UNIT_M * contacts[:, Y, None]
+        return np.asarray((np.hypot(dx, dy) - np.exp(contacts[:, SIZE, None])).min(axis=0))
+
+    def _gains(self, account: Account, frame: Frame) -> tuple[FloatArray, FloatArray]:
+        """By how much a disc at each spot (C,) would lower the cost, and its area, to first order."""
+        fitted, measured = account.fitted, frame.measured
+        J = account.jacobian
+        normal, gradient = self._fit.normal_equations(fitted, J)
+        aside = np.linalg.solve(normal, gradient)
         gain, area = np.zeros((2, len(self._nodes)))
         clearest = max(measured, key=lambda name: abs(self._dipoles[name]))
         for name, own in zip(measured, np.split(J, len(measured)), strict=True):
@@ -98,13 +126,4 @@ class ContactSearch:
             needed = np.maximum(-unexplained / power, 0.0)
             gain += needed**2 * power
             area = needed if name == clearest else area
-        gain[pressed[self._nodes] >= 0.1] = 0.0
-        found: list[MissingContact] = []
-        for spot in np.argsort(-gain):
-            if gain[spot] == 0 or len(found) == MOST_MISSING:
-                break
-            x, y = float(self._x[spot]), float(self._y[spot])
-            if all(np.hypot(x - other.x_m, y - other.y_m) > apart_m for other in found):
-                radius = min(float(np.sqrt(area[spot] / np.pi)), largest_m)
-                found.append(MissingContact(x, y, radius, float(gain[spot])))
-        return found
+        return gain, area

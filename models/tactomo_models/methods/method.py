@@ -100,6 +100,8 @@ class Estimate:
         made_by: what made the estimate, in a word, for the frame's `tier`; the method's name if
             empty.
         reason: why, in words.
+        carried: what the method wants to find in `previous` at the next frame; nobody else reads
+            it.
     """
 
     map: FloatArray | Image | None = None
@@ -114,6 +116,7 @@ class Estimate:
     flags: Flag = field(default_factory=lambda: Flag(0))
     made_by: str = ""
     reason: str = "as requested"
+    carried: object = None
 
 
 class UnsolvableError(Exception):

@@ -27,7 +27,7 @@ _OURS: Final = {
     "auto": "tactomo_models.methods.auto:Auto",
     "tikhonov": "tactomo_models.methods.linear:Tikhonov",
     "noser": "tactomo_models.methods.linear:Noser",
-    "fit": "tactomo_models.methods.fit:OutlineFit",
+    "fit": "tactomo_models.methods.fit:Fit",
     "levelset": "tactomo_models.methods.fit:LevelSetFit",
     "network": "tactomo_models.methods.network:NetworkAlone",
 }

@@ -12,6 +12,7 @@ frame's noise shows in a mean of the frames that came since (`Since`).
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -52,36 +53,47 @@ def are_still(settled: Mapping[Channel, Changes], new: Mapping[Channel, Changes]
     )
 
 
+@dataclass(frozen=True)
 class Since:
     """What has come since a fit: whether its parameters would follow the mean of it.
 
     To first order they would, by what the fit's Jacobian makes of the mean difference. Noise alone
     makes a chi-squared of it, with one degree of freedom for each parameter.
-
-    Args:
-        settled: the frame that was fitted.
-        jacobian: (sum M, N) of its weighted residual.
-        precision: (N,) inverse variances of the prior.
     """
 
-    def __init__(
-        self, settled: Mapping[Channel, Changes], jacobian: FloatArray, precision: FloatArray
-    ) -> None:
-        normal = jacobian.T @ jacobian + np.diag(precision)
-        self._settled = settled
-        self._follow = np.linalg.solve(np.linalg.cholesky(normal), jacobian.T)  # (N, sum M)
-        self._mean, self._count = np.zeros(len(precision)), 0
-        self._limit = float(chdtri(len(precision), FALSE_ALARM))
+    settled: Mapping[Channel, Changes]  # the frame that was fitted
+    follow: FloatArray  # (N, sum M) takes a weighted difference to parameters of unit variance
+    mean: FloatArray  # (N,) what these parameters would follow
+    count: int = 0  # of the frames that it is the mean of
 
-    def shows_change(self, new: Mapping[Channel, Changes]) -> bool:
-        """Take in one frame more of the same channels, and tell whether something has changed."""
+    @classmethod
+    def after(
+        cls,
+        settled: Mapping[Channel, Changes],  # the frame that was fitted
+        jacobian: FloatArray,  # (sum M, N) of its weighted residual
+        precision: FloatArray,  # (N,) inverse variances of the prior
+    ) -> Since:
+        """Nothing has come yet."""
+        normal = jacobian.T @ jacobian + np.diag(precision)
+        follow = np.linalg.solve(np.linalg.cholesky(normal), jacobian.T)
+        return cls(settled, follow, np.zeros(len(precision)))
+
+    def taken(self, new: Mapping[Channel, Changes]) -> tuple[Since, bool]:
+        """With one frame more of the same channels, and whether something has changed."""
         off = [
             old.weight * (new[name].change - old.change) * (new[name].weight > 0)
-            for name, old in self._settled.items()
+            for name, old in self.settled.items()
         ]
-        self._count = min(self._count + 1, MEMORY)
-        self._mean += (self._follow @ np.concatenate(off) - self._mean) / self._count
-        return bool(self._mean @ self._mean > self._limit * (1 + 1 / self._count))
+        count = min(self.count + 1, MEMORY)
+        mean = self.mean + (self.follow @ np.concatenate(off) - self.mean) / count
+        changed = bool(mean @ mean > _mean_limit(len(mean)) * (1 + 1 / count))
+        return replace(self, mean=mean, count=count), changed
+
+
+@cache
+def _mean_limit(parameters: int) -> float:
+    """Sum of squares of so many parameters of unit variance that noise stays below."""
+    return float(chdtri(parameters, FALSE_ALARM))
 
 
 @cache

@@ -7,8 +7,9 @@ uncertainties know how far they are apart.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,20 +19,17 @@ from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 from tactomo_models.scans.changes import WRONG_WAY
 from tactomo_models.scene.areas import AreaFinder, Areas
 from tactomo_models.scene.drawing import Drawing
-from tactomo_models.scene.field_fit import FieldFit, FittedField, Measured, covariance_of
-from tactomo_models.scene.parameters import EDGE, HOLE, PEAK, SIZE, UNIT_M, X, Y
+from tactomo_models.scene.field_fit import FieldFit, FittedField, Measured
+from tactomo_models.scene.evidence import Likelihood
+from tactomo_models.scene.parameters import E1, E2, EDGE, PEAK, SIZE, UNIT_M, X, Y
 from tactomo_models.scene.pressure import FieldContacts
 from tactomo_models.scene.pressure_field import PressureField
 from tactomo_models.scene.sheet_response import GradedResponse, SaturatingResponse
 
-# Shares within one sigma are of tuning scenes of every kind.
 # Of an outline's radius, over the nodes' distance, that no noise accounts for where a pressure is
 # even: with 0.05, 59 % of rectangles' and rings' areas are within one sigma, with 0.07, 67 %.
 OUTLINE_ERROR = 0.07
-# Sigmas of size and pressure over the fit's own: a form that is not fitted is no surer for that.
-# With 1, 63 % of the magnitudes at 10 dB are within one sigma, with this 69 %.
-UNFITTED = 1.25
-MAP_OUTLINE = 0.05  # `OUTLINE_ERROR` of a map beside a network's, tuned with `auto.NETWORK_ERROR`
+NEGLIGIBLE = 0.02  # share of an alternative that need not be drawn
 SAMPLES = 3  # per side of a map cell: what an outline covers of it is right to 3 %
 
 
@@ -47,18 +45,15 @@ class FieldAccount:
     magnitude_sigmas: FloatArray  # (K,) their standard uncertainties
     contacts: FieldContacts | None  # what it says of each area's pressure
     goes_wrong_way: bool  # whether a conductivity goes where no pressure takes it
-    # of areas and magnitudes together, as a share of them, by noise alone and not by other
-    # accounts; NaN where they are not known
-    uncertainty: float = float("nan")
 
 
 @dataclass(frozen=True)
-class Doubt:
-    """Another account of the same contacts that the data leave possible."""
+class Alternative:
+    """What else one contact may be."""
 
-    odds: float  # how likely it is, over the likelier account, 0 to 1
-    # (K, COLUMNS) of its contacts' parameters from those of the likelier account
-    difference: FloatArray
+    odds: float  # how likely, over what it is taken for
+    contact: FloatArray  # (COLUMNS,) its parameters
+    sigmas: FloatArray  # (COLUMNS,) their standard uncertainties
 
 
 class FieldAccountant:
@@ -85,69 +80,181 @@ class FieldAccountant:
         self,
         fitted: FittedField,  # the field
         measured: Measured,  # the data that it explains
-        # other accounts; where they are likely, images are the mean of all
-        doubts: Sequence[Doubt] = (),
+        # of each contact; where they are likely, images and numbers are the mean of all
+        alternatives: Sequence[Sequence[Alternative]] = (),
+        # (N, N) of its parameters; by the data's likelihood alone if None
+        covariance: FloatArray | None = None,
     ) -> FieldAccount:
         """Account for a field."""
-        negligible = 0.02  # odds of what need not be drawn
-        shown, family, weight = self._drawn(fitted, measured, None), fitted.family, 1.0
-        if not isinstance(family, PressureField):
+        if covariance is None:
+            covariance = self._covariance(fitted, measured)
+        shown = self._drawn(fitted, measured, covariance)
+        family = fitted.family
+        if not isinstance(family, PressureField) or not len(shown.areas):
             return shown
         each = family.split(fitted.parameters)
-        for doubt in doubts:
-            if doubt.odds < negligible or doubt.difference.shape != each.shape:
-                continue
-            changed = each.copy()
-            columns = [SIZE, PEAK, EDGE, HOLE]
-            changed[:, columns] += doubt.difference[:, columns]
-            changed[:, PEAK] = np.clip(changed[:, PEAK], *family.peak_limits)
-            changed[:, [EDGE, HOLE]] = np.clip(changed[:, [EDGE, HOLE]], 0.0, 1.0)
-            weight += doubt.odds
-            shown = _mean(shown, self._drawn(fitted, measured, changed), doubt.odds / weight)
+        owner = self._owners_of(shown, each)
+        for k, others in enumerate(alternatives):
+            total = 1 + sum(one.odds for one in others)
+            likely = [one for one in others if one.odds > NEGLIGIBLE * total]
+            if likely:
+                shown = self._mixed(shown, family, each[k], likely, np.flatnonzero(owner == k))
         return shown
 
+    def _covariance(self, fitted: FittedField, measured: Measured) -> FloatArray:
+        """Covariance (N, N) of a field's parameters."""
+        likelihood = Likelihood.of(measured)
+        J = self._fit.jacobian(fitted, measured, fitted.drawing)
+        information = likelihood.information(J, likelihood.chi_squared(fitted.residual))
+        return np.linalg.inv(information + np.diag(self._fit.prior(fitted)[0]))[:-1, :-1]
+
     def _drawn(
-        self, fitted: FittedField, measured: Measured, changed: FloatArray | None
+        self, fitted: FittedField, measured: Measured, covariance: FloatArray
     ) -> FieldAccount:
-        """Account for a field, or for the same with its contacts (K, COLUMNS) changed."""
-        family, needs_sigmas = fitted.family, True
-        if changed is not None:
-            assert isinstance(family, PressureField)
-            # Of another account only what is felt of evener pressures is shown with its own sigma.
-            before = family.split(fitted.parameters)
-            needs_sigmas = bool((changed[:, EDGE] < before[:, EDGE]).any())
-            family = family.of(changed, family.order)
-            parameters = family.join(changed)
-            fitted = replace(
-                fitted, family=family, parameters=parameters, drawing=family.draw(parameters)
-            )
         near, (solid, share, pressure) = self._images(fitted)
-        magnitude, saturation = np.zeros(share.shape), np.ones(share.shape)
-        if isinstance(self._graded, GradedResponse):
-            magnitude = np.abs(self._graded.relative_change(pressure)[0])
-        if isinstance(self._saturating, SaturatingResponse):
-            saturation = self._saturating.saturation(pressure)[0]
-
-        def seen(values: FloatArray) -> FloatArray:
-            image = np.zeros(self._x.shape[0])
-            image[near] = values.sum(axis=1) / values.shape[1]
-            return image.reshape(self._shape)
-
+        image = partial(self._image, near)
         pressed = np.abs(share)
-        covered, whole = seen(pressed), seen(np.abs(solid))
+        covered, whole = image(pressed), image(np.abs(solid))
         drawing = fitted.drawing
         there = np.zeros(len(self._fit.forward.bare.pressable))
         there[drawing.nodes] = 1.0
         areas = self._areas.find(whole, there)
         mine = areas.on_nodes[:, drawing.nodes] > 0
         areas = self._areas.less(areas, covered / np.maximum(whole, 1e-12))
-        known = self._contacts(fitted, measured, areas, mine, needs_sigmas)
+        known = self._contacts(fitted, measured, areas, mine, covariance)
+        magnitude, saturation = self._responses(pressure)
         return FieldAccount(
-            map=seen(pressed * magnitude),
-            structure=seen(share * saturation),
-            pressure_kpa=seen(pressed * pressure),
+            map=image(pressed * magnitude),
+            structure=image(share * saturation),
+            pressure_kpa=image(pressed * pressure),
             **known,
         )
+
+    def _responses(self, pressure: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """|Relative change| of the graded sheet, and share of the saturating one's full change."""
+        magnitude, saturation = np.zeros(pressure.shape), np.ones(pressure.shape)
+        if isinstance(self._graded, GradedResponse):
+            magnitude = np.abs(self._graded.relative_change(pressure)[0])
+        if isinstance(self._saturating, SaturatingResponse):
+            saturation = self._saturating.saturation(pressure)[0]
+        return magnitude, saturation
+
+    def _image(self, near: IntArray, values: FloatArray) -> FloatArray:
+        """Image (nodes_y, nodes_x) of samples in the cells near what is pressed."""
+        image = np.zeros(self._x.shape[0])
+        image[near] = values.sum(axis=1) / values.shape[1]
+        return image.reshape(self._shape)
+
+    def _alone(self, family: PressureField, contact: FloatArray) -> _Alone:
+        """One contact (COLUMNS,) by itself: its images and numbers."""
+        reach = np.exp(contact[SIZE] + np.hypot(contact[E1], contact[E2])) * 1.3 + self._cell_m
+        dx, dy = self._x[:, 0] - UNIT_M * contact[X], self._y[:, 0] - UNIT_M * contact[Y]
+        near = np.flatnonzero((np.abs(dx) < reach) & (np.abs(dy) < reach))
+        x, y = self._x[near], self._y[near]
+        found = family.sampled(contact[None], x.ravel(), y.ravel(), self._step_m)
+        _, share, pressure = np.reshape(found, (3, *x.shape))
+        magnitude, saturation = self._responses(pressure)
+        total = max(float(share.sum()), 1e-12)
+        values = (share * magnitude, share * saturation, share * pressure)
+        peak = np.array(family.unit_kpa * contact[PEAK])
+        size, slope = 0.0, 0.0
+        if isinstance(self._graded, GradedResponse):
+            size, slope = (abs(float(of)) for of in self._graded.relative_change(peak))
+        return _Alone(
+            images=tuple(self._image(near, one) for one in values),
+            area_m2=total * self._step_m**2,
+            magnitude=float(values[0].sum()) / total,
+            mean_kpa=float(values[2].sum()) / total,
+            force_n=1e3 * float(values[2].sum()) * self._step_m**2,
+            peak_kpa=float(peak),
+            peak_magnitude=size,
+            slope=slope,
+        )
+
+    def _mixed(
+        self,
+        shown: FieldAccount,
+        family: PressureField,
+        contact: FloatArray,
+        likely: Sequence[Alternative],
+        own: IntArray,  # the areas that are this contact's
+    ) -> FieldAccount:
+        """The mean over what a contact may be; how far that is apart is part of the uncertainties."""
+        odds = np.array([1.0, *(one.odds for one in likely)])
+        share = odds / odds.sum()
+        alone = [self._alone(family, one) for one in (contact, *(each.contact for each in likely))]
+
+        def mean(of: Callable[[_Alone], Any]) -> Any:
+            return sum(w * (of(one) - of(alone[0])) for w, one in zip(share, alone, strict=True))
+
+        def spread(of: Callable[[_Alone], float]) -> float:
+            values = np.array([of(one) for one in alone])
+            return float(np.sqrt(share @ (values - share @ values) ** 2))
+
+        images = [
+            image + mean(lambda one, at=at: one.images[at])
+            for at, image in enumerate((shown.map, shown.structure, shown.pressure_kpa))
+        ]
+        shown = replace(shown, map=images[0], structure=images[1], pressure_kpa=images[2])
+        if len(own) != 1:
+            return shown
+        at = own[0]
+
+        def moved(values: FloatArray, of: Callable[[_Alone], float]) -> FloatArray:
+            changed = np.array(values, float)
+            changed[at] = max(changed[at] + mean(of), 0.0)
+            return changed
+
+        def wider(sigmas: FloatArray, of: Callable[[_Alone], float], more: float = 0.0) -> FloatArray:
+            changed = np.array(sigmas, float)
+            changed[at] = np.sqrt(changed[at] ** 2 + spread(of) ** 2 + more)
+            return changed
+
+        areas = shown.areas
+        sigmas = areas.sigmas.copy()
+        sigmas[:, 2] = wider(sigmas[:, 2], lambda one: one.area_m2)
+        areas = replace(
+            areas, areas_m2=moved(areas.areas_m2, lambda one: one.area_m2), sigmas=sigmas
+        )
+        contacts = shown.contacts
+        if contacts is not None:
+            of_peaks = family.unit_kpa * np.array([0.0, *(one.sigmas[PEAK] for one in likely)])
+            slopes = np.array([one.slope for one in alone])
+            # Whatever else it may be has a peak of its own uncertainty.
+            more_kpa = float(share @ of_peaks**2)
+            more = float(share @ (slopes * of_peaks) ** 2)
+            evenest = min(
+                zip((contact, *(one.contact for one in likely)), alone, strict=True),
+                key=lambda one: one[0][EDGE],
+            )[1]
+            felt = np.array(contacts.felt, float)
+            felt[at] = evenest.peak_magnitude
+            contacts = replace(
+                contacts,
+                peak_magnitude=moved(contacts.peak_magnitude, lambda one: one.peak_magnitude),
+                peak_magnitude_sigma=wider(
+                    contacts.peak_magnitude_sigma, lambda one: one.peak_magnitude, more
+                ),
+                felt=felt,
+                peak_kpa=moved(contacts.peak_kpa, lambda one: one.peak_kpa),
+                mean_kpa=moved(contacts.mean_kpa, lambda one: one.mean_kpa),
+                mean_sigma_kpa=wider(contacts.mean_sigma_kpa, lambda one: one.mean_kpa),
+                force_n=moved(contacts.force_n, lambda one: one.force_n),
+                force_sigma_n=wider(contacts.force_sigma_n, lambda one: one.force_n),
+            )
+        return replace(
+            shown,
+            areas=areas,
+            magnitudes=moved(shown.magnitudes, lambda one: one.magnitude),
+            magnitude_sigmas=wider(shown.magnitude_sigmas, lambda one: one.magnitude),
+            contacts=contacts,
+        )
+
+    def _owners_of(self, shown: FieldAccount, each: FloatArray) -> IntArray:
+        """The contact (A,) that is nearest to the centre of each area."""
+        x, y = shown.areas.centres_m.T
+        apart = np.hypot(UNIT_M * each[:, X] - x[:, None], UNIT_M * each[:, Y] - y[:, None])
+        return np.asarray((apart / np.exp(each[:, SIZE])).argmin(axis=1))
 
     def _images(self, fitted: FittedField) -> tuple[IntArray, FloatArray]:
         """Cells near what is pressed, and what is enclosed, share and pressure (3, cells, samples).
@@ -186,7 +293,7 @@ class FieldAccountant:
         measured: Measured,
         areas: Areas,
         mine: BoolArray,
-        needs_sigmas: bool,
+        covariance: FloatArray,
     ) -> dict[str, Any]:
         """Numbers of each area's contact, and what they do not know of themselves."""
         count = len(areas)
@@ -201,24 +308,11 @@ class FieldAccountant:
         if count == 0:
             return known
         family, drawing = fitted.family, fitted.drawing
-        by_share = by_pressure = np.zeros((len(drawing.nodes), 0))
-        own = together = displaced = np.zeros((0, 0))  # what is known for sure
-        if needs_sigmas:
-            J = self._fit.jacobian(fitted, measured, drawing)
-            precision, data = self._fit.prior(fitted)[0], measured.values()
-            own, together, displaced = (
-                covariance_of(J, precision, inflation, fitted.misfit)[:-1, :-1]
-                for inflation in (
-                    np.full(len(J), UNFITTED**2),
-                    np.concatenate([each.variance_inflation for each in data]),
-                    np.concatenate([each.centre_inflation for each in data]),
-                )
-            )
-            by_share, by_pressure = drawing.slopes()[2:]
+        by_share, by_pressure = drawing.slopes()[2:]
         cell = self._areas.node_areas_m2[drawing.nodes]
         share, pressure = drawing.share, drawing.pressure_kpa
 
-        def sigma(gradients: FloatArray, covariance: FloatArray = own) -> FloatArray:
+        def sigma(gradients: FloatArray) -> FloatArray:
             return np.asarray(np.sqrt(np.einsum("ki,ij,kj->k", gradients, covariance, gradients)))
 
         weight = mine * cell
@@ -242,7 +336,7 @@ class FieldAccountant:
         by_area = weight @ signed
         sigmas = np.column_stack(
             [
-                *(sigma(each_off @ signed / area[:, None], displaced) for each_off in off),
+                *(sigma(each_off @ signed / area[:, None]) for each_off in off),
                 np.hypot(sigma(by_area), by_outline * areas.areas_m2),
             ]
         )
@@ -254,21 +348,14 @@ class FieldAccountant:
         by_magnitude = signed * (size[:, None]) + (share * slope)[:, None] * by_pressure
         by_mean = (weight @ by_magnitude - known["magnitudes"][:, None] * by_area) / area[:, None]
         known["magnitude_sigmas"] = np.hypot(sigma(by_mean), by_outline * known["magnitudes"])
-        of_area = sigma(by_area, together) / areas.areas_m2
-        of_size = sigma(by_mean, together) / np.maximum(known["magnitudes"], 1e-12)
-        of_map = (MAP_OUTLINE * of_mesh) ** 2
-        unsure = of_area**2 + of_map + np.minimum(of_size**2 + of_map, 1.0)
-        known["uncertainty"] = float(np.sqrt(np.mean(unsure)))
         peaks, by_peak = pressure[highest], by_pressure[highest]
         if isinstance(family, PressureField):
             peaks = family.unit_kpa * each[owner, PEAK]
-            if needs_sigmas:
-                index = family.index[owner, PEAK]
-                by_peak = family.unit_kpa * np.eye(by_share.shape[1])[index]
-                is_least = each[owner, PEAK] <= family.peak_limits[0]
-                known["goes_wrong_way"] = self._goes_wrong_way(
-                    J[:, index], fitted.residual, is_least
-                )
+            index = family.index[owner, PEAK]
+            by_peak = family.unit_kpa * np.eye(by_share.shape[1])[index]
+            is_least = each[owner, PEAK] <= family.peak_limits[0]
+            J = self._fit.jacobian(fitted, measured, drawing)
+            known["goes_wrong_way"] = self._goes_wrong_way(J[:, index], fitted.residual, is_least)
         peak_size, peak_slope = (np.abs(v) for v in self._graded.relative_change(peaks))
         scale = areas.areas_m2 / area  # the map's, over the mesh's
         by_force = signed * pressure[:, None] + share[:, None] * by_pressure
@@ -282,7 +369,7 @@ class FieldAccountant:
             peak_magnitude=peak_size,
             peak_magnitude_sigma=np.hypot(peak_slope * sigma(by_peak), by_outline * peak_size),
             felt=peak_size,
-            felt_sigma=peak_slope * sigma(by_peak, together),
+            felt_sigma=peak_slope * sigma(by_peak),
             peak_kpa=peaks,
             mean_kpa=means,
             mean_sigma_kpa=np.hypot(sigma(by_mean_kpa), by_outline_kpa * means / peaks),
@@ -312,53 +399,15 @@ class FieldAccountant:
         return np.asarray((apart / np.exp(each[:, SIZE])).argmin(axis=1))
 
 
-def _mean(one: FieldAccount, other: FieldAccount, share: float) -> FieldAccount:
-    """Mean of two accounts of the same areas, of which the other has a share.
+@dataclass(frozen=True)
+class _Alone:
+    """One contact by itself."""
 
-    How far they are apart is part of the uncertainties.
-    """
-    if len(one.areas) != len(other.areas):
-        return one
-
-    def mean(first: FloatArray, second: FloatArray) -> FloatArray:
-        return first + share * (second - first)
-
-    def spread(sigma: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
-        return np.asarray(np.hypot(sigma, np.sqrt(share * (1 - share)) * (second - first)))
-
-    contacts = one.contacts
-    if one.contacts is not None and other.contacts is not None:
-        a, b = one.contacts, other.contacts
-        is_evener = b.edge < a.edge
-        contacts = FieldContacts(
-            peak_magnitude=mean(a.peak_magnitude, b.peak_magnitude),
-            peak_magnitude_sigma=spread(a.peak_magnitude_sigma, a.peak_magnitude, b.peak_magnitude),
-            felt=np.where(is_evener, b.felt, a.felt),
-            felt_sigma=np.where(is_evener, b.felt_sigma, a.felt_sigma),
-            peak_kpa=mean(a.peak_kpa, b.peak_kpa),
-            mean_kpa=mean(a.mean_kpa, b.mean_kpa),
-            mean_sigma_kpa=spread(a.mean_sigma_kpa, a.mean_kpa, b.mean_kpa),
-            force_n=mean(a.force_n, b.force_n),
-            force_sigma_n=spread(a.force_sigma_n, a.force_n, b.force_n),
-            edge=a.edge,
-        )
-    areas = replace(
-        one.areas,
-        areas_m2=mean(one.areas.areas_m2, other.areas.areas_m2),
-        sigmas=np.column_stack(
-            [
-                one.areas.sigmas[:, :2],
-                spread(one.areas.sigmas[:, 2], one.areas.areas_m2, other.areas.areas_m2),
-            ]
-        ),
-    )
-    return replace(
-        one,
-        areas=areas,
-        map=mean(one.map, other.map),
-        structure=mean(one.structure, other.structure),
-        pressure_kpa=mean(one.pressure_kpa, other.pressure_kpa),
-        magnitudes=mean(one.magnitudes, other.magnitudes),
-        magnitude_sigmas=spread(one.magnitude_sigmas, one.magnitudes, other.magnitudes),
-        contacts=contacts,
-    )
+    images: tuple[FloatArray, ...]  # of the map, the structure and the pressure in kPa
+    area_m2: float
+    magnitude: float  # |relative conductivity change|, mean over the area
+    mean_kpa: float
+    force_n: float
+    peak_kpa: float
+    peak_magnitude: float  # |relative conductivity change| under the peak
+    slope: float  # of that by the pressure

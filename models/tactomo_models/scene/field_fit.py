@@ -38,7 +38,7 @@ FORESEEN = 1e-3
 COLD_S = 1e-2  # a frame that starts cold, beside its steps: network, account
 SHEET_S = 1.3e-4  # a step on one sheet
 ENTRY_S = 9e-8  # the same, for each node that is pressed and each parameter
-WORST_DAMPING = 1e6  # no step downhill even at this: a minimum
+MAX_DAMPING = 1e6  # no step downhill even at this: a minimum
 STEP_LIMIT = 0.5  # largest change of a parameter in one step
 
 Measured = Mapping[Channel, Changes]
@@ -183,6 +183,7 @@ class FieldFit:
         measured: Measured,
         max_pressed: int = MAX_PRESSED,
         solved: Mapping[Channel, Solution] | None = None,
+        background: object | None = None,
     ) -> FittedField | None:
         """Solve the forward model for given parameters and compare it with the data.
 
@@ -279,7 +280,7 @@ class FieldFit:
             better = self._step(fitted, measured, budget)
             gain = fitted.cost - better.cost
             # No gain because the budget ended says nothing about a minimum.
-            settled = 0 < gain < SETTLED * fitted.cost or better.damping >= WORST_DAMPING
+            settled = 0 < gain < SETTLED * fitted.cost or better.damping >= MAX_DAMPING
             if gain > 0 and not settled:
                 settled = self.foreseen(better) < FORESEEN * better.cost
             fitted = replace(better, converged=settled)
@@ -290,16 +291,25 @@ class FieldFit:
     def foreseen(self, fitted: FittedField) -> float:
         """What further steps would gain in cost, by the Jacobian of the last one: no solve."""
         assert fitted.jacobian is not None
-        normal, gradient = self._normal_equations(fitted, fitted.jacobian)
+        normal, gradient = self.normal_equations(fitted, fitted.jacobian)
         return float(gradient @ np.linalg.solve(normal, gradient))
 
-    def _normal_equations(
+    def normal_equations(
         self, fitted: FittedField, J: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Matrix (N + 1, N + 1) and gradient (N + 1,) of half the linearised cost."""
         precision, offset = self.prior(fitted)
         normal = J.T @ J + np.diag(precision)
         return normal, J.T @ fitted.residual + precision * offset
+
+    def background(
+        self, fitted: FittedField, replaced: list[int], measured: Measured
+    ) -> object | None:
+        return None
+
+    def bounded_ratio(self, log_ratio: float) -> float:
+        """A log ratio brought back to where it means something."""
+        return min(max(log_ratio, self._least_ratio), self._most_ratio)
 
     def prior(self, fitted: FittedField) -> tuple[FloatArray, FloatArray]:
         """Inverse variances (N + 1,) of parameters and log ratio, and their offsets from it."""
@@ -311,12 +321,11 @@ class FieldFit:
     def _step(self, fitted: FittedField, measured: Measured, budget: Budget) -> FittedField:
         """Damp until a step leads downhill: the better estimate, or the old one."""
         J = self.jacobian(fitted, measured)
-        normal, gradient = self._normal_equations(fitted, J)
+        normal, gradient = self.normal_equations(fitted, J)
         damping = fitted.damping
-        while damping < WORST_DAMPING:
-            step = -np.linalg.solve(normal + damping * np.eye(len(normal)), gradient)
-            step *= min(1.0, STEP_LIMIT / max(np.abs(step[:-1]).max(initial=0.0), 1e-12))
-            ratio = float(np.clip(fitted.log_ratio + step[-1], self._least_ratio, self._most_ratio))
+        while damping < MAX_DAMPING:
+            step = bounded_step(normal, gradient, damping)
+            ratio = self.bounded_ratio(fitted.log_ratio + step[-1])
             parameters = fitted.family.bounded(fitted.parameters + step[:-1])
             trial = self.evaluate(fitted.family, parameters, ratio, measured)
             if trial is not None:
@@ -327,6 +336,15 @@ class FieldFit:
             if budget.over:
                 break
         return replace(fitted, damping=damping)
+
+
+def bounded_step(normal: FloatArray, gradient: FloatArray, damping: float) -> FloatArray:
+    """A damped step (N,) of Gauss-Newton, no parameter of which changes by more than the limit."""
+    damped = normal.copy()
+    damped[np.diag_indices(len(damped))] += damping
+    step = -np.linalg.solve(damped, gradient)
+    step *= min(1.0, STEP_LIMIT / max(float(np.abs(step).max(initial=0.0)), 1e-12))
+    return np.asarray(step)
 
 
 def _seen(name: Channel, drawing: Drawing) -> tuple[FloatArray, FloatArray]:

@@ -1,0 +1,144 @@
+"""An account of a frame: contacts fitted to all of its sheets at once, and how likely they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from tactomo_protocol import Channel
+
+from tactomo_models.arrays import FloatArray
+from tactomo_models.scene.evidence import Likelihood, log_occam
+from tactomo_models.scene.field_fit import (
+    MAX_DAMPING,
+    Budget,
+    FieldFit,
+    FittedField,
+    Measured,
+    bounded_step,
+)
+from tactomo_models.scene.pressure_field import PressureField
+
+NEGLIGIBLE = 0.1  # of chi-squared, a third of a standard deviation: what a last step may leave
+
+Propose = Callable[[], FloatArray]  # (K, COLUMNS) contacts, see `pressure_field.ellipses_of`
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What one frame is fitted to, and what the fit may spend."""
+
+    measured: Measured  # the changes of each channel that has a scan
+    budget: Budget  # compute time
+    propose: Propose | None = None  # asked for contacts where a search starts cold
+
+    @cached_property
+    def likelihood(self) -> Likelihood:
+        """The likelihood of what the data leave."""
+        return Likelihood.of(self.measured)
+
+    @property
+    def fits_peaks(self) -> bool:
+        """Whether any sheet tells how hard contacts press."""
+        return Channel.MAGNITUDE in self.measured
+
+
+@dataclass(frozen=True)
+class Account:
+    """A pressure field fitted to a frame."""
+
+    fitted: FittedField
+    jacobian: FloatArray  # (sum M, N + 1) of its weighted residual
+    hessian: FloatArray  # (N + 1, N + 1) inverse covariance of its parameters and the log ratio
+    chi_squared: float  # what it leaves of the data
+    log_evidence: float
+    unit: float  # what one unit of its cost is of chi-squared
+    at_minimum: bool = False
+
+    @property
+    def family(self) -> PressureField:
+        """Its contacts, and which of their parameters are fitted."""
+        assert isinstance(self.fitted.family, PressureField)
+        return self.fitted.family
+
+    @cached_property
+    def contacts(self) -> FloatArray:
+        """(K, COLUMNS) parameters of its contacts."""
+        return self.family.split(self.fitted.parameters)
+
+    @cached_property
+    def sigmas(self) -> FloatArray:
+        """(K, COLUMNS) their standard uncertainties; 0 of what is not fitted."""
+        sigmas = np.zeros(self.family.free.shape)
+        variance = np.diag(np.linalg.inv(self.hessian))[:-1]
+        sigmas[self.family.free] = np.sqrt(variance)
+        return sigmas
+
+
+def account_of(fit: FieldFit, fitted: FittedField, frame: Frame) -> Account:
+    """The account that a fitted field is of a frame."""
+    likelihood = frame.likelihood
+    jacobian = fit.jacobian(fitted, frame.measured)
+    chi_squared = likelihood.chi_squared(fitted.residual)
+    precision, offset = fit.prior(fitted)
+    hessian = likelihood.information(jacobian, chi_squared)
+    hessian[np.diag_indices(len(hessian))] += precision
+    log_evidence = likelihood.log(chi_squared) - float(precision @ offset**2) / 2
+    log_evidence += log_occam(precision, hessian)
+    valid = np.count_nonzero(likelihood.deflation)
+    unit = likelihood.precision(chi_squared) * likelihood.count / max(valid, 1)
+    return Account(fitted, jacobian, hessian, chi_squared, log_evidence, unit)
+
+
+def descended(fit: FieldFit, account: Account, frame: Frame, steps: int) -> Account:
+    """An account nearer to its minimum, by Levenberg-Marquardt on all sheets at once.
+
+    It is there when no more than `NEGLIGIBLE` is left to gain, as its own Jacobian foresees that.
+    One step is always tried.
+    """
+    for _ in range(steps):
+        fitted = account.fitted
+        normal, gradient = fit.normal_equations(fitted, account.jacobian)
+        if foreseen(normal, gradient) * account.unit < NEGLIGIBLE:
+            return replace(account, at_minimum=True)
+        better = _stepped(fit, fitted, normal, gradient, frame)
+        if better is None:
+            return replace(account, at_minimum=not frame.budget.over)
+        frame.budget.spend(better)
+        gain = fitted.cost - better.cost
+        account = account_of(fit, better, frame)
+        if gain * account.unit < NEGLIGIBLE:
+            return replace(account, at_minimum=True)
+        if frame.budget.over:
+            break
+    return account
+
+
+def _stepped(
+    fit: FieldFit, fitted: FittedField, normal: FloatArray, gradient: FloatArray, frame: Frame
+) -> FittedField | None:
+    """Damp until a step leads downhill; None where none does."""
+    damping = fitted.damping
+    while damping < MAX_DAMPING:
+        step = bounded_step(normal, gradient, damping)
+        trial = fit.evaluate(
+            fitted.family,
+            fitted.family.bounded(fitted.parameters + step[:-1]),
+            fit.bounded_ratio(fitted.log_ratio + step[-1]),
+            frame.measured,
+        )
+        if trial is not None:
+            frame.budget.spend(trial)
+            if trial.cost < fitted.cost:
+                return replace(trial, damping=max(damping / 5, 1e-3))
+        damping *= 5
+        if frame.budget.over:
+            break
+    return None
+
+
+def foreseen(normal: FloatArray, gradient: FloatArray) -> float:
+    """What further steps would gain in cost: no solve."""
+    return float(gradient @ np.linalg.solve(normal, gradient))

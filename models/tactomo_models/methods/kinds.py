@@ -1,0 +1,110 @@
+"""The kinds of contact that a search tells apart, and what each kind's fit of a contact starts from.
+
+A kind is one form of one contact: an even press on an ellipse, on an egg or rounded rectangle, or
+by a ring; or a pressure that falls towards the edge. A contact may also be two, or none at all:
+these are asked as the kinds are.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum, auto
+
+import numpy as np
+
+from tactomo_models.arrays import FloatArray
+from tactomo_models.scene.parameters import (
+    COLUMNS,
+    E1,
+    E2,
+    EDGE,
+    HARMONIC,
+    HERTZ,
+    HOLE,
+    PEAK,
+    SIZE,
+    UNIT_M,
+    X,
+    Y,
+)
+
+# Peak over that of an even press of the same force: of Hertz's pressure on the same area, 3 / 2 by
+# its mean; of a ring, 4 / 3 by its area. The fit ends at the same minima from 1.
+FALLING_PEAK, RING_PEAK = 3 / 2, 4 / 3
+TRACE = 1e-3  # of a harmonic: what is modulated is fitted, and a first step finds by how much
+
+
+class Kind(StrEnum):
+    """What a contact may be."""
+
+    EVEN = auto()  # an even pressure on an ellipse
+    ROUNDED = auto()  # an even pressure on a modulated outline
+    RING = auto()  # an even pressure on an ellipse but its inner half
+    FALLING = auto()  # a pressure that falls towards the edge of an ellipse
+    TWO = auto()  # two even presses
+    NONE = auto()  # nothing
+
+
+def kind_of(contact: FloatArray) -> Kind:
+    """Kind of a contact (COLUMNS,)."""
+    if contact[EDGE] > 0:
+        return Kind.FALLING
+    if contact[HOLE] > 0:
+        return Kind.RING
+    return Kind.ROUNDED if contact[HARMONIC:PEAK].any() else Kind.EVEN
+
+
+def as_kind(contact: FloatArray, kind: Kind) -> FloatArray:
+    """What presses (m, COLUMNS) where a contact (COLUMNS,) is of another kind, to start from."""
+    even = contact.copy()
+    even[HARMONIC:PEAK] = even[EDGE:] = 0.0
+    even[PEAK] /= {Kind.FALLING: FALLING_PEAK, Kind.RING: RING_PEAK}.get(kind_of(contact), 1.0)
+    if kind is Kind.NONE:
+        return np.zeros((0, COLUMNS))
+    if kind is Kind.TWO:
+        return _halves(even)
+    if kind is Kind.ROUNDED:
+        even[HARMONIC:PEAK] = TRACE
+    elif kind is Kind.RING:
+        even[HOLE], even[PEAK] = 1.0, RING_PEAK * even[PEAK]
+    elif kind is Kind.FALLING:
+        even[EDGE], even[PEAK] = HERTZ, FALLING_PEAK * even[PEAK]
+    return even[None]
+
+
+def _halves(even: FloatArray) -> FloatArray:
+    """Two circles of half the area, side by side along a contact's longer axis."""
+    elongation = np.hypot(even[E1], even[E2])
+    angle = np.arctan2(even[E2], even[E1]) / 2
+    half = even.copy()
+    half[SIZE] -= np.log(2) / 2
+    half[E1:HARMONIC] = 0.0
+    # They touch where the contact is a circle, and end where a longer one ends.
+    apart = max(np.exp(even[SIZE] + elongation) - np.exp(half[SIZE]), np.exp(half[SIZE]))
+    away = apart / UNIT_M * np.array([np.cos(angle), np.sin(angle)])
+    halves = np.stack([half, half])
+    halves[0, [X, Y]] += away
+    halves[1, [X, Y]] -= away
+    return halves
+
+
+def as_one(contacts: FloatArray) -> FloatArray:
+    """One even ellipse (COLUMNS,) of the centre and moments of contacts (K, COLUMNS) and between.
+
+    Of an even ellipse with half axes a and b the second moments are a^2 / 4 and b^2 / 4.
+    """
+    area = np.exp(2 * contacts[:, SIZE])
+    share = area / area.sum()
+    place = contacts[:, [X, Y]] * UNIT_M
+    centre = share @ place
+    off = place - centre
+    moments = (share * off.T) @ off + np.eye(2) * (share @ area) / 4
+    variance, axes = np.linalg.eigh(moments)
+    short, long = 2 * np.sqrt(variance)
+    one = np.zeros(COLUMNS)
+    angle = np.arctan2(axes[1, 1], axes[0, 1])
+    stretch = np.log(long / short) / 2
+    one[[X, Y]] = centre / UNIT_M
+    one[SIZE] = np.log(long * short) / 2
+    one[[E1, E2]] = stretch * np.cos(2 * angle), stretch * np.sin(2 * angle)
+    one[PEAK] = share @ contacts[:, PEAK]
+    return one

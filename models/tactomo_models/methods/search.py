@@ -1,0 +1,467 @@
+"""One search: from what was believed of the frame before to what is believed of this one.
+
+    advance(belief, frame) -> belief        the frame before is an argument; nothing else is kept
+
+A frame that is of the same scene leaves the belief as it is. Else contacts are moved on as they
+last moved, and fitted to all sheets at once. Where that does not explain the data, what is left of
+the contacts, what is missing beside them and a cold start compete. Then each contact is asked by
+itself what it is, while the others are frozen (`trial`): even, rounded, a ring, falling towards the
+edge, two contacts, or none. The evidence decides, and what it leaves open is kept as rivals, whose
+share is part of what is shown. What one frame's budget does not finish, the next one goes on with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from tactomo_protocol import Channel
+
+from tactomo_models.arrays import FloatArray
+from tactomo_models.methods.account import Account, Frame, account_of, descended
+from tactomo_models.methods.contact_search import ContactSearch
+from tactomo_models.methods.kinds import Kind, as_kind, as_one, kind_of
+from tactomo_models.methods.trial import Rest, Trial
+from tactomo_models.scans.stillness import Since, are_still
+from tactomo_models.scene.field_account import Alternative
+from tactomo_models.scene.field_fit import COLD_S, FieldFit, Measured
+from tactomo_models.scene.parameters import COLUMNS, PEAK, SIZE, UNIT_M, X, Y
+from tactomo_models.scene.pressure_field import PressureField
+from tactomo_models.scene.sheet_response import GradedResponse
+
+MAX_CONTACTS = 12
+# Logarithms of odds. A rival below `HOPELESS` is not asked again: what others become changes its
+# odds by less. One above `OPEN` is asked again once they have become something else.
+HOPELESS, OPEN = -6.0, -3.0
+LIKELIER = 1.0  # from which a rival takes a contact's place; below, the mean of both is shown anyway
+FEW_STEPS = 2  # of starts that are compared: a start's cost says little before
+STEPS = 4  # of a fit in one go, before what is left is looked at
+# Chi-squared over the count of data, from which a contact is missing rather than of another kind.
+SURPRISE = 2.0
+ROUNDS = 4  # of questions, each after what the last one changed
+ANOTHER_PRESS = np.log(1.25)  # change of a peak, from which evidence of a kind is of another press
+
+
+@dataclass(frozen=True)
+class Rival:
+    """What else a contact may be."""
+
+    log_odds: float  # over what it is taken for
+    difference: FloatArray  # (COLUMNS,) of its parameters; empty where it is two, or none
+    sigmas: FloatArray  # (COLUMNS,) their standard uncertainties
+    is_open: bool = False  # whether it is to be asked once more
+
+
+Rivals = Mapping[Kind, Rival]
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What is believed of a scene after a frame."""
+
+    account: Account  # the likeliest account
+    rivals: tuple[Rivals, ...]  # of each contact, what else it may be, as far as it was asked
+    settled_on: Measured  # the frame that it was fitted to last
+    since: Since | None = None  # what has come since
+    moved: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))  # (K, 2) in that frame
+    asked_peaks: FloatArray = field(default_factory=lambda: np.zeros(0))  # (K,) when asked last
+    rounds: int = 0  # of questions in which something has changed
+    frames: int = 0  # in which something moved, with these contacts
+    challenged: float = 0.0  # chi-squared that no start could better
+    lacks_none: bool = False  # whether no contact is missing, as far as was asked
+    done: bool = False  # whether nothing is left to try
+    how: str = ""  # in words, what it came from
+
+    @property
+    def alternatives(self) -> list[list[Alternative]]:
+        """What else each contact may be, where it is one contact."""
+        return [
+            [
+                Alternative(
+                    float(np.exp(rival.log_odds)), contact + rival.difference, rival.sigmas
+                )
+                for rival in mine.values()
+                if len(rival.difference)
+            ]
+            for contact, mine in zip(self.account.contacts, self.rivals, strict=True)
+        ]
+
+
+class Search:
+    """Searches on one sensor.
+
+    Args:
+        fit: what fits fields to the sensor's sheets.
+    """
+
+    def __init__(self, fit: FieldFit) -> None:
+        graded = fit.responses.get(Channel.MAGNITUDE)
+        assert graded is None or isinstance(graded, GradedResponse)
+        self.fit = fit
+        self.field = PressureField.on(fit.forward, graded)
+        typical = {Channel.STRUCTURE: float(np.exp(fit.likely))}
+        if graded is not None:
+            peak_kpa = np.array(self.field.typical_peak * self.field.unit_kpa)
+            typical[Channel.MAGNITUDE] = 1 + float(graded.relative_change(peak_kpa)[0])
+        self._missing = ContactSearch(fit, typical)
+
+    def advance(self, belief: Belief | None, frame: Frame) -> Belief:
+        """What is believed after one frame more."""
+        if belief is None or belief.account.fitted.solutions.keys() != frame.measured.keys():
+            belief = self._cold(frame)
+        else:
+            belief = self._followed(belief, frame)
+        while not belief.done and not frame.budget.over:
+            belief = self._advanced(belief, frame)
+        return belief
+
+    # From frame to frame
+
+    def _followed(self, belief: Belief, frame: Frame) -> Belief:
+        """The same contacts, held against a new frame."""
+        old = belief.account
+        compared = self.fit.compare(old.fitted, frame.measured)
+        since, still = belief.since, are_still(belief.settled_on, frame.measured)
+        if still and since is not None:
+            since, moves = since.taken(frame.measured)
+            still = not moves
+        if still:
+            likelihood = frame.likelihood
+            chi_squared = likelihood.chi_squared(compared.residual)
+            account = replace(old, fitted=compared, chi_squared=chi_squared)
+            return replace(belief, account=account, since=since, how="still")
+        account = account_of(self.fit, compared, frame)
+        ahead = self._moved_on(belief, frame)
+        if ahead is not None and ahead.fitted.cost < compared.cost:
+            account = ahead
+        frames = belief.frames + 1
+        belief = replace(
+            belief,
+            account=self._descended(account, frame, STEPS),
+            settled_on=frame.measured,
+            since=None,
+            frames=frames,
+            done=False,
+            how="warm start",
+        )
+        if not self._is_explained(belief, frame):
+            return self._challenged(belief, account, frame)
+        belief = replace(belief, moved=(belief.account.contacts - old.contacts)[:, [X, Y]])
+        due = frames & (frames - 1) == 0
+        return self._asking_again(belief) if due else belief
+
+    def _moved_on(self, belief: Belief, frame: Frame) -> Account | None:
+        """The contacts where they would be if they went on as they last moved."""
+        account = belief.account
+        if len(belief.moved) != len(account.contacts):
+            return None
+        sigmas = account.sigmas[:, [X, Y]]
+        if not (np.abs(belief.moved) > sigmas).any():
+            return None
+        each = account.contacts.copy()
+        each[:, [X, Y]] += belief.moved
+        return self._account(each, account.fitted.log_ratio, frame)
+
+    def _asking_again(self, belief: Belief) -> Belief:
+        """Ask what is open once more; all of a contact that is pressed quite differently."""
+        peaks = belief.account.contacts[:, PEAK]
+        same = len(belief.asked_peaks) == len(peaks)
+        rivals = tuple(
+            {
+                kind: replace(rival, is_open=rival.log_odds > HOPELESS)
+                for kind, rival in mine.items()
+                if same and abs(np.log(peak / asked)) < ANOTHER_PRESS
+            }
+            for mine, peak, asked in zip(
+                belief.rivals, peaks, belief.asked_peaks if same else peaks, strict=True
+            )
+        )
+        return replace(belief, rivals=rivals, rounds=0, lacks_none=False)
+
+    def _is_explained(self, belief: Belief, frame: Frame) -> bool:
+        chi_squared = belief.account.chi_squared
+        return frame.likelihood.explains(chi_squared - max(0.0, belief.challenged - frame.likelihood.count))
+
+    # Starts
+
+    def _cold(self, frame: Frame) -> Belief:
+        """The best of what is proposed, and of nothing."""
+        frame.budget.left_s -= COLD_S
+        nothing = self._account(np.zeros((0, COLUMNS)), self.fit.likely, frame)
+        assert nothing is not None
+        starts = [nothing, *self._proposed(frame)]
+        best = self._best(starts, frame)
+        return self._begun(best, frame, "cold start" if best.family.count == 0 else "proposed")
+
+    def _proposed(self, frame: Frame) -> Iterator[Account]:
+        """What a network proposes; and the same as one contact, where it fills half of that."""
+        each = frame.propose()[:MAX_CONTACTS] if frame.propose else np.zeros((0, COLUMNS))
+        starts = [each] if len(each) else []
+        if len(each) > 1:
+            one = as_one(each)
+            if np.exp(2 * each[:, SIZE]).sum() > np.exp(2 * one[SIZE]) / 2:
+                starts.append(one[None])
+        for start in starts:
+            account = self._account(start, self.fit.likely, frame)
+            if account is not None:
+                yield account
+
+    def _best(self, starts: list[Account], frame: Frame) -> Account:
+        """The likeliest of starts, after a few steps each; there is at least one."""
+        if len(starts) == 2 and starts[0].family.count == 0:
+            # Any contact at all explains more than none.
+            starts = [min(starts, key=lambda one: one.fitted.cost)]
+        if len(starts) == 1:
+            return starts[0]
+        tried = [self._descended(start, frame, FEW_STEPS) for start in starts]
+        return max(tried, key=lambda one: one.log_evidence)
+
+    def _challenged(self, belief: Belief, before: Account, frame: Frame) -> Belief:
+        """What explains a frame that the known contacts do not: the best of all starts."""
+        left = self._without(before, frame)
+        starts = [belief.account, self._with_missing(belief.account, frame, far=True)]
+        if left is not before:
+            starts.append(self._with_missing(left, frame, far=True))
+        best = self._best([*starts, *self._proposed(frame)], frame)
+        if best is belief.account or best.log_evidence <= belief.account.log_evidence:
+            return replace(belief, challenged=belief.account.chi_squared)
+        return self._begun(best, frame, "warm start")
+
+    def _without(self, account: Account, frame: Frame) -> Account:
+        """The contacts that explain most: one after the other is left out while that helps."""
+        while account.family.count > 0:
+            rests = [
+                self._account(np.delete(account.contacts, k, axis=0), account.fitted.log_ratio, frame)
+                for k in range(account.family.count)
+            ]
+            best = min((rest for rest in rests if rest), key=lambda one: one.fitted.cost)
+            if best.fitted.cost >= account.fitted.cost:
+                break
+            account = best
+        return account
+
+    def _begun(self, account: Account, frame: Frame, how: str) -> Belief:
+        nobody: tuple[Rivals, ...] = ({},) * account.family.count
+        return Belief(account, nobody, frame.measured, how=how)
+
+    # Questions
+
+    def _advanced(self, belief: Belief, frame: Frame) -> Belief:
+        """One thing more: a fit, a contact's kinds, what they lead to, or what is missing."""
+        account = belief.account
+        if not account.at_minimum:
+            return replace(belief, account=self._descended(account, frame, STEPS))
+        missed = not belief.lacks_none and account.chi_squared > SURPRISE * frame.likelihood.count
+        if missed:
+            born = self._with_missing(account, frame, far=True)
+            if born is not account:
+                return self._grown(belief, born)
+        if belief.rounds < ROUNDS:
+            for k, mine in enumerate(belief.rivals):
+                kinds = [kind for kind in self._kinds(account, k) if _is_asked(kind, mine)]
+                if kinds:
+                    return self._asked(belief, k, kinds, frame)
+            better = self._decided(belief, frame)
+            if better is not None:
+                return better
+        if not belief.lacks_none:
+            born = self._with_missing(account, frame, far=False)
+            if born is not account:
+                return self._grown(belief, born)
+            return replace(belief, lacks_none=True)
+        precision = self.fit.prior(account.fitted)[0]
+        return replace(
+            belief,
+            since=Since.after(frame.measured, account.jacobian, precision),
+            asked_peaks=account.contacts[:, PEAK],
+            done=True,
+        )
+
+    def _kinds(self, account: Account, k: int) -> list[Kind]:
+        """What else a contact may be."""
+        own = kind_of(account.contacts[k])
+        pressures = [Kind.FALLING, Kind.RING] if account.family.free[k, PEAK] else []
+        kinds = [Kind.EVEN, *pressures, Kind.ROUNDED, Kind.NONE]
+        if account.family.count < MAX_CONTACTS:
+            kinds.append(Kind.TWO)
+        return [kind for kind in kinds if kind is not own]
+
+    def _asked(self, belief: Belief, k: int, kinds: list[Kind], frame: Frame) -> Belief:
+        """Ask a contact whether it is of other kinds."""
+        account = belief.account
+        rest = Rest(self.fit, self.field, account, [k], frame)
+        mine = dict(belief.rivals[k])
+        for kind in kinds:
+            trial = rest.trial(as_kind(account.contacts[k], kind))
+            mine[kind] = _rival(trial, account.contacts[k], mine.get(kind))
+            if frame.budget.over:
+                break
+        rivals = (*belief.rivals[:k], mine, *belief.rivals[k + 1 :])
+        return replace(belief, rivals=rivals)
+
+    def _decided(self, belief: Belief, frame: Frame) -> Belief | None:
+        """The belief with each contact of its likeliest kind, where that is likelier altogether."""
+        log_evidence = belief.account.log_evidence
+        better = [born] if (born := self._missed(belief, frame)) else []
+        for choice in _choices(belief.rivals):
+            changed = self._changed(belief, choice, frame)
+            if changed is not None and changed.account.log_evidence > log_evidence:
+                better.append(changed)
+                break
+        if better:
+            return max(better, key=lambda one: one.account.log_evidence)
+        rivals = tuple(
+            {kind: replace(one, log_odds=min(one.log_odds, 0.0)) for kind, one in mine.items()}
+            for mine in belief.rivals
+        )
+        return replace(belief, rivals=rivals, rounds=ROUNDS) if rivals != belief.rivals else None
+
+    def _missed(self, belief: Belief, frame: Frame) -> Belief | None:
+        """The belief with a contact more, away from all others, where that is likelier."""
+        account = belief.account
+        if belief.lacks_none or frame.likelihood.explains(account.chi_squared):
+            return None
+        born = self._with_missing(account, frame, far=True)
+        return None if born is account else self._grown(belief, born)
+
+    def _changed(self, belief: Belief, choice: Mapping[int, Kind], frame: Frame) -> Belief | None:
+        """The belief with some contacts of another kind, fitted altogether."""
+        account = belief.account
+        rows, rivals = [], []
+        for k, contact in enumerate(account.contacts):
+            mine = belief.rivals[k]
+            if k not in choice:
+                rows.append(contact[None])
+                rivals.append(mine)
+                continue
+            kind = choice[k]
+            won = mine[kind]
+            start = contact + won.difference if len(won.difference) else as_kind(contact, kind)
+            start = np.atleast_2d(start)
+            rows.append(start)
+            if len(won.difference):
+                turned = _turned(mine, kind, kind_of(contact), account.sigmas[k])
+                rivals.append(turned)
+            else:
+                rivals += [{}] * len(start)
+        start = self._account(np.vstack(rows), account.fitted.log_ratio, frame)
+        if start is None:
+            return None
+        changed = self._descended(start, frame, STEPS)
+        gain = changed.log_evidence - account.log_evidence
+        again = tuple(_opened(mine, gain) for mine in rivals)
+        return replace(
+            belief,
+            account=changed,
+            rivals=again,
+            rounds=belief.rounds + 1,
+            lacks_none=False,
+            moved=np.zeros((0, 2)),
+        )
+
+    # What is missing
+
+    def _with_missing(self, account: Account, frame: Frame, far: bool) -> Account:
+        """The same contacts and another, where that is likelier; the very same account otherwise."""
+        if account.family.count >= MAX_CONTACTS:
+            return account
+        frame.budget.spend(account.fitted)  # about what looking takes, too
+        each = account.contacts
+        for found in self._missing.missing(account, frame, far=far):
+            born = np.zeros((1, COLUMNS))
+            born[0, [X, Y, SIZE, PEAK]] = (
+                found.x_m / UNIT_M,
+                found.y_m / UNIT_M,
+                np.log(found.radius_m),
+                self.field.typical_peak,
+            )
+            start = self._account(np.vstack([each, born]), account.fitted.log_ratio, frame)
+            if start is None:
+                continue
+            grown = self._descended(start, frame, 2 * STEPS)
+            if grown.log_evidence > account.log_evidence:
+                return grown
+        return account
+
+    def _grown(self, belief: Belief, account: Account) -> Belief:
+        """The belief with a further contact."""
+        gain = account.log_evidence - belief.account.log_evidence
+        rivals = (*(_opened(mine, gain) for mine in belief.rivals), {})
+        return replace(
+            belief, account=account, rivals=rivals, rounds=0, frames=0, moved=np.zeros((0, 2))
+        )
+
+    def _account(self, each: FloatArray, log_ratio: float, frame: Frame) -> Account | None:
+        family = self.field.of(each, 2, fits_peaks=frame.fits_peaks)
+        fitted = self.fit.evaluate(
+            family, family.bounded(family.join(each)), log_ratio, frame.measured
+        )
+        if fitted is None:
+            return None
+        frame.budget.spend(fitted)
+        return account_of(self.fit, fitted, frame)
+
+    def _descended(self, account: Account, frame: Frame, steps: int) -> Account:
+        return descended(self.fit, account, frame, steps)
+
+
+def _choices(rivals: tuple[Rivals, ...]) -> list[dict[int, Kind]]:
+    """What contacts may become: those that are about as sure as the surest at once, or it alone."""
+    likeliest = {
+        k: max(mine, key=lambda kind: mine[kind].log_odds) for k, mine in enumerate(rivals) if mine
+    }
+    odds = {k: rivals[k][kind].log_odds for k, kind in likeliest.items()}
+    surest = max(odds, key=lambda k: odds[k], default=None)
+    if surest is None or odds[surest] < LIKELIER:
+        return []
+    many = {k: kind for k, kind in likeliest.items() if odds[k] > odds[surest] / 2}
+    return [many, {surest: likeliest[surest]}][: len(many)]
+
+
+def _is_asked(kind: Kind, rivals: Rivals) -> bool:
+    """Whether a contact is still to be asked for a kind."""
+    return kind not in rivals or rivals[kind].is_open
+
+
+def _rival(trial: Trial | None, contact: FloatArray, before: Rival | None) -> Rival:
+    """What a trial makes of a rival; of one that was asked before, the mean of both.
+
+    A mean and no sum: where a contact stays, errors of the sheet repeat themselves.
+    """
+    if trial is None:
+        return Rival(-np.inf, np.zeros(0), np.zeros(0))
+    odds = trial.log_odds if before is None else (trial.log_odds + before.log_odds) / 2
+    if len(trial.contacts) != 1:
+        return Rival(odds, np.zeros(0), np.zeros(0))
+    return Rival(odds, trial.contacts[0] - contact, trial.sigmas[0])
+
+
+def _turned(rivals: Rivals, kind: Kind, own: Kind, sigmas: FloatArray) -> Rivals:
+    """The rivals of a contact that has become one of them."""
+    won = rivals[kind]
+    others = {
+        other: replace(
+            rival,
+            log_odds=rival.log_odds - won.log_odds,
+            difference=rival.difference - won.difference
+            if len(rival.difference)
+            else rival.difference,
+        )
+        for other, rival in rivals.items()
+        if other is not kind
+    }
+    return others | {own: Rival(-won.log_odds, -won.difference, sigmas)}
+
+
+def _opened(rivals: Rivals, gain: float) -> Rivals:
+    """The same, to be asked again where a change of such a gain elsewhere may matter.
+
+    Whether a contact is there at all costs little to ask.
+    """
+    least = min(OPEN, -gain / 2)
+    return {
+        kind: one
+        for kind, one in rivals.items()
+        if one.log_odds < least and kind is not Kind.NONE
+    }

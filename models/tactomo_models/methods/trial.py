@@ -1,0 +1,193 @@
+"""A trial of some contacts of a field, while the rest is frozen and answers to first order.
+
+What a contact is matters little to the others: they move aside a little. So a trial solves for its
+own contacts alone, and what the others, and the log ratio, would do follows from their Jacobian:
+
+    r(p) = r_s(p) - J_o H_o^-1 J_o^T (r_s(p) - r_0)      H_o = J_o^T J_o + prior precision
+
+with r_s the residual with the others frozen and r_0 that of the minimum to begin with. The same
+Schur complement makes the evidence of a trial comparable with that of the whole field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from tactomo_models.arrays import FloatArray, IntArray
+from tactomo_models.methods.account import NEGLIGIBLE, Account, Frame, foreseen
+from tactomo_models.scene.evidence import log_occam
+from tactomo_models.scene.field_fit import MAX_DAMPING, FieldFit, FittedField, bounded_step
+from tactomo_models.scene.parameters import COLUMNS
+from tactomo_models.scene.pressure_field import PressureField
+
+STEPS = 6  # of a trial, which takes three; 12 change no row
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a trial ended in."""
+
+    log_odds: float  # logarithm of its evidence over that of the field as it was
+    contacts: FloatArray  # (m, COLUMNS) what presses instead
+    sigmas: FloatArray  # (m, COLUMNS) standard uncertainties; 0 of what is not fitted
+    others: FloatArray  # (K - 1, COLUMNS) the frozen ones, moved aside
+    log_ratio: float
+
+
+class Rest:
+    """All of a field but some of its contacts, frozen.
+
+    Args:
+        fit: what fits fields to the sheets.
+        field: a field without contacts.
+        account: the field at its minimum.
+        replaced: which contacts a trial puts something else for.
+        frame: the data.
+    """
+
+    def __init__(
+        self,
+        fit: FieldFit,
+        field: PressureField,
+        account: Account,
+        replaced: Sequence[int],
+        frame: Frame,
+    ) -> None:
+        self._fit, self._field, self._account, self._frame = fit, field, account, frame
+        self._replaced = list(replaced)
+        fitted = account.fitted
+        assert isinstance(fitted.family, PressureField)
+        self._precision, self._offset = fit.prior(fitted)
+        mine = fitted.family.index[self._replaced].ravel()
+        keep = np.ones(len(self._precision), bool)
+        keep[mine[mine >= 0]] = False
+        self._keep: IntArray = np.flatnonzero(keep)
+        self._others = np.delete(account.contacts, self._replaced, axis=0)
+        J = account.jacobian[:, self._keep]
+        normal = J.T @ J
+        normal[np.diag_indices(len(normal))] += self._precision[self._keep]
+        self._root = np.linalg.cholesky(normal)
+        self._aside = np.linalg.solve(self._root, J.T)  # (n, sum M): what of a residual they take
+        self._J = frame.likelihood.deflation[:, None] * J
+        self._background = fit.background(fitted, self._replaced, frame.measured)
+
+    def trial(self, contacts: FloatArray) -> Trial | None:
+        """Fit contacts (m, COLUMNS) in place of those that are replaced, from where they are.
+
+        None where the forward model has no answer.
+        """
+        family = self._family(contacts)
+        best = self._assessed(family, family.bounded(family.join(family.fixed)))
+        if best is None:
+            return None
+        damping = 1.0
+        for _ in range(STEPS if len(contacts) else 0):
+            better, damping = self._step(family, best, damping)
+            if better is None:
+                break
+            gain, best = best.cost - better.cost, better
+            if gain * self._account.unit < NEGLIGIBLE or self._frame.budget.over:
+                break
+        return self._judged(family, best)
+
+    def _family(self, contacts: FloatArray) -> PressureField:
+        field = self._field.of(contacts, 2, fits_peaks=self._frame.fits_peaks)
+        if self._background is not None:
+            return field
+        every = self._field.of(
+            np.vstack([self._others, contacts]), 2, fits_peaks=self._frame.fits_peaks
+        )
+        free = every.free.copy()
+        free[: len(self._others)] = False
+        return replace(every, free=free)
+
+    def _assessed(self, family: PressureField, parameters: FloatArray) -> _Assessed | None:
+        fitted = self._fit.evaluate(
+            family,
+            parameters,
+            self._account.fitted.log_ratio,
+            self._frame.measured,
+            background=self._background,
+        )
+        if fitted is None:
+            return None
+        self._frame.budget.spend(fitted)
+        taken = self._aside @ (fitted.residual - self._account.fitted.residual)
+        away = family.prior_precision @ (parameters - family.prior_mean) ** 2
+        cost = float(fitted.residual @ fitted.residual - taken @ taken + away)
+        return _Assessed(fitted, taken, cost)
+
+    def _step(
+        self, family: PressureField, at: _Assessed, damping: float
+    ) -> tuple[_Assessed | None, float]:
+        """Levenberg-Marquardt, the others answering: what is better, and the damping for next."""
+        J = self._jacobian(at)
+        own = self._aside @ J
+        prior = family.prior_precision
+        normal = J.T @ J - own.T @ own
+        normal[np.diag_indices(len(normal))] += prior
+        parameters = at.fitted.parameters
+        gradient = J.T @ at.fitted.residual - own.T @ at.taken
+        gradient += prior * (parameters - family.prior_mean)
+        if foreseen(normal, gradient) * self._account.unit < NEGLIGIBLE:
+            return None, damping
+        while damping < MAX_DAMPING:
+            step = bounded_step(normal, gradient, damping)
+            trial = self._assessed(family, family.bounded(parameters + step))
+            if trial is not None and trial.cost < at.cost:
+                return trial, max(damping / 5, 1e-3)
+            damping *= 5
+        return None, damping
+
+    def _jacobian(self, at: _Assessed) -> FloatArray:
+        return self._fit.jacobian(at.fitted, self._frame.measured)[:, :-1]
+
+    def _judged(self, family: PressureField, at: _Assessed) -> Trial:
+        account, likelihood = self._account, self._frame.likelihood
+        residual = at.fitted.residual - self._aside.T @ at.taken
+        chi_squared = likelihood.chi_squared(residual)
+        scale = likelihood.precision(chi_squared)
+        response = -np.linalg.solve(self._root.T, at.taken)
+        kept = self._precision[self._keep]
+        own = at.fitted.parameters - family.prior_mean
+        away = kept @ (self._offset[self._keep] + response) ** 2 + family.prior_precision @ own**2
+        hessian = scale * (self._J.T @ self._J) + np.diag(kept)
+        log_evidence = likelihood.log(chi_squared) - away / 2 + log_occam(kept, hessian)
+        sigmas = np.zeros((family.count, COLUMNS))
+        if len(own):
+            J = likelihood.deflation[:, None] * self._jacobian(at)
+            cross = scale * (self._J.T @ J)
+            schur = scale * (J.T @ J) + np.diag(family.prior_precision)
+            schur -= cross.T @ np.linalg.solve(hessian, cross)
+            log_evidence += log_occam(family.prior_precision, schur)
+            sigmas[family.free] = np.sqrt(np.diag(np.linalg.inv(schur)))
+        contacts = family.split(at.fitted.parameters)
+        new = len(contacts) - (0 if self._background is not None else len(self._others))
+        moved = np.append(account.fitted.parameters, account.fitted.log_ratio)
+        moved[self._keep] += response
+        return Trial(
+            log_odds=log_evidence - account.log_evidence,
+            contacts=contacts[len(contacts) - new :],
+            sigmas=sigmas[len(contacts) - new :],
+            others=self._moved_aside(moved[:-1]),
+            log_ratio=self._fit.bounded_ratio(float(moved[-1])),
+        )
+
+    def _moved_aside(self, parameters: FloatArray) -> FloatArray:
+        family = self._account.fitted.family
+        assert isinstance(family, PressureField)
+        each = family.split(family.bounded(parameters))
+        return np.delete(each, self._replaced, axis=0)
+
+
+@dataclass(frozen=True)
+class _Assessed:
+    """A trial on its way."""
+
+    fitted: FittedField
+    taken: FloatArray  # (n,) what the others take of it
+    cost: float
