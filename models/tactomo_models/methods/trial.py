@@ -1,12 +1,13 @@
 """A trial of some contacts of a field, while the rest is frozen and answers to first order.
 
 What a contact is matters little to the others: they move aside a little. So a trial solves for its
-own contacts alone, and what the others, and the log ratio, would do follows from their Jacobian:
+own contacts alone, and what the others would do follows from their Jacobian:
 
     r(p) = r_s(p) - J_o H_o^-1 J_o^T (r_s(p) - r_0)      H_o = J_o^T J_o + prior precision
 
-with r_s the residual with the others frozen and r_0 that of the minimum to begin with. The same
-Schur complement makes the evidence of a trial comparable with that of the whole field.
+with r_s the residual with the others frozen and r_0 that of the minimum to begin with. The log
+ratio belongs to all: a trial varies it, to first order on the frozen contacts. The same Schur
+complement makes the evidence of a trial comparable with that of the whole field.
 """
 
 from __future__ import annotations
@@ -34,7 +35,6 @@ class Trial:
     log_odds: float  # logarithm of its evidence over that of the field as it was
     contacts: FloatArray  # (m, COLUMNS) what presses instead
     sigmas: FloatArray  # (m, COLUMNS) standard uncertainties; 0 of what is not fitted
-    others: FloatArray  # (K - 1, COLUMNS) the frozen ones, moved aside
     log_ratio: float
 
 
@@ -64,6 +64,7 @@ class Rest:
         self._precision, self._offset = fit.prior(fitted)
         mine = fitted.family.index[self._replaced].ravel()
         keep = np.ones(len(self._precision), bool)
+        keep[-1] = False  # the log ratio is the trial's
         keep[mine[mine >= 0]] = False
         self._keep: IntArray = np.flatnonzero(keep)
         self._others = np.delete(account.contacts, self._replaced, axis=0)
@@ -74,6 +75,17 @@ class Rest:
         self._aside = np.linalg.solve(self._root, J.T)  # (n, sum M): what of a residual they take
         self._J = frame.likelihood.deflation[:, None] * J
         self._background = fit.background(fitted, self._replaced, frame.measured)
+        self._by_ratio = self._others_by_ratio()
+
+    def _others_by_ratio(self) -> FloatArray:
+        """Derivative (sum M,) of the residual by the log ratio, of the frozen contacts alone."""
+        by_ratio = self._account.jacobian[:, -1]
+        if self._background is None:  # every evaluation solves for all of them
+            return np.zeros_like(by_ratio)
+        own = self._family(self._account.contacts[self._replaced])
+        fitted = self._evaluated(own, own.join(own.fixed), self._account.fitted.log_ratio)
+        assert fitted is not None
+        return by_ratio - self._fit.jacobian(fitted, self._frame.measured)[:, -1]
 
     def trial(self, contacts: FloatArray) -> Trial | None:
         """Fit contacts (m, COLUMNS) in place of those that are replaced, from where they are.
@@ -81,7 +93,11 @@ class Rest:
         None where the forward model has no answer.
         """
         family = self._family(contacts)
-        best = self._assessed(family, family.bounded(family.join(family.fixed)))
+        best = self._assessed(
+            family,
+            family.bounded(family.join(family.fixed)),
+            self._account.fitted.log_ratio,
+        )
         if best is None:
             return None
         damping = 1.0
@@ -105,21 +121,29 @@ class Rest:
         free[: len(self._others)] = False
         return replace(every, free=free)
 
-    def _assessed(self, family: PressureField, parameters: FloatArray) -> _Assessed | None:
+    def _evaluated(
+        self, family: PressureField, parameters: FloatArray, log_ratio: float
+    ) -> FittedField | None:
         fitted = self._fit.evaluate(
-            family,
-            parameters,
-            self._account.fitted.log_ratio,
-            self._frame.measured,
-            background=self._background,
+            family, parameters, log_ratio, self._frame.measured, background=self._background
         )
+        if fitted is not None:
+            self._frame.budget.spend(fitted)
+        return fitted
+
+    def _assessed(
+        self, family: PressureField, parameters: FloatArray, log_ratio: float
+    ) -> _Assessed | None:
+        fitted = self._evaluated(family, parameters, log_ratio)
         if fitted is None:
             return None
-        self._frame.budget.spend(fitted)
-        taken = self._aside @ (fitted.residual - self._account.fitted.residual)
-        away = family.prior_precision @ (parameters - family.prior_mean) ** 2
-        cost = float(fitted.residual @ fitted.residual - taken @ taken + away)
-        return _Assessed(fitted, taken, cost)
+        before = self._account.fitted
+        residual = fitted.residual + self._by_ratio * (log_ratio - before.log_ratio)
+        taken = self._aside @ (residual - before.residual)
+        offset = self._fit.prior(fitted)[1]
+        away = float(self._fit.prior(fitted)[0] @ offset**2)
+        cost = float(residual @ residual - taken @ taken) + away
+        return _Assessed(fitted, residual, taken, offset, cost)
 
     def _step(
         self, family: PressureField, at: _Assessed, damping: float
@@ -127,61 +151,51 @@ class Rest:
         """Levenberg-Marquardt, the others answering: what is better, and the damping for next."""
         J = self._jacobian(at)
         own = self._aside @ J
-        prior = family.prior_precision
+        prior = self._fit.prior(at.fitted)[0]
         normal = J.T @ J - own.T @ own
         normal[np.diag_indices(len(normal))] += prior
-        parameters = at.fitted.parameters
-        gradient = J.T @ at.fitted.residual - own.T @ at.taken
-        gradient += prior * (parameters - family.prior_mean)
+        gradient = J.T @ at.residual - own.T @ at.taken + prior * at.offset
         if foreseen(normal, gradient) * self._account.unit < NEGLIGIBLE:
             return None, damping
         while damping < MAX_DAMPING:
             step = bounded_step(normal, gradient, damping)
-            trial = self._assessed(family, family.bounded(parameters + step))
+            trial = self._assessed(
+                family,
+                family.bounded(at.fitted.parameters + step[:-1]),
+                self._fit.bounded_ratio(at.fitted.log_ratio + step[-1]),
+            )
             if trial is not None and trial.cost < at.cost:
                 return trial, max(damping / 5, 1e-3)
             damping *= 5
         return None, damping
 
     def _jacobian(self, at: _Assessed) -> FloatArray:
-        return self._fit.jacobian(at.fitted, self._frame.measured)[:, :-1]
+        J = self._fit.jacobian(at.fitted, self._frame.measured)
+        J[:, -1] += self._by_ratio
+        return J
 
     def _judged(self, family: PressureField, at: _Assessed) -> Trial:
         account, likelihood = self._account, self._frame.likelihood
-        residual = at.fitted.residual - self._aside.T @ at.taken
-        chi_squared = likelihood.chi_squared(residual)
+        chi_squared = likelihood.chi_squared(at.residual - self._aside.T @ at.taken)
         scale = likelihood.precision(chi_squared)
         response = -np.linalg.solve(self._root.T, at.taken)
-        kept = self._precision[self._keep]
-        own = at.fitted.parameters - family.prior_mean
-        away = kept @ (self._offset[self._keep] + response) ** 2 + family.prior_precision @ own**2
+        kept, prior = self._precision[self._keep], self._fit.prior(at.fitted)[0]
+        away = kept @ (self._offset[self._keep] + response) ** 2 + prior @ at.offset**2
         hessian = scale * (self._J.T @ self._J) + np.diag(kept)
-        log_evidence = likelihood.log(chi_squared) - away / 2 + log_occam(kept, hessian)
-        sigmas = np.zeros((family.count, COLUMNS))
-        if len(own):
-            J = likelihood.deflation[:, None] * self._jacobian(at)
-            cross = scale * (self._J.T @ J)
-            schur = scale * (J.T @ J) + np.diag(family.prior_precision)
-            schur -= cross.T @ np.linalg.solve(hessian, cross)
-            log_evidence += log_occam(family.prior_precision, schur)
-            sigmas[family.free] = np.sqrt(np.diag(np.linalg.inv(schur)))
-        contacts = family.split(at.fitted.parameters)
-        new = len(contacts) - (0 if self._background is not None else len(self._others))
-        moved = np.append(account.fitted.parameters, account.fitted.log_ratio)
-        moved[self._keep] += response
+        J = likelihood.deflation[:, None] * self._jacobian(at)
+        cross = scale * (self._J.T @ J)
+        schur = scale * (J.T @ J) + np.diag(prior) - cross.T @ np.linalg.solve(hessian, cross)
+        log_evidence = likelihood.log(chi_squared) - away / 2
+        log_evidence += log_occam(kept, hessian) + log_occam(prior, schur)
+        contacts, sigmas = family.split(at.fitted.parameters), np.zeros(family.free.shape)
+        sigmas[family.free] = np.sqrt(np.diag(np.linalg.inv(schur)))[:-1]
+        frozen = 0 if self._background is not None else len(self._others)
         return Trial(
             log_odds=log_evidence - account.log_evidence,
-            contacts=contacts[len(contacts) - new :],
-            sigmas=sigmas[len(contacts) - new :],
-            others=self._moved_aside(moved[:-1]),
-            log_ratio=self._fit.bounded_ratio(float(moved[-1])),
+            contacts=contacts[frozen:],
+            sigmas=sigmas[frozen:],
+            log_ratio=at.fitted.log_ratio,
         )
-
-    def _moved_aside(self, parameters: FloatArray) -> FloatArray:
-        family = self._account.fitted.family
-        assert isinstance(family, PressureField)
-        each = family.split(family.bounded(parameters))
-        return np.delete(each, self._replaced, axis=0)
 
 
 @dataclass(frozen=True)
@@ -189,5 +203,7 @@ class _Assessed:
     """A trial on its way."""
 
     fitted: FittedField
-    taken: FloatArray  # (n,) what the others take of it
+    residual: FloatArray  # (sum M,) with the others frozen
+    taken: FloatArray  # (n,) what they take of it
+    offset: FloatArray  # (N + 1,) of its parameters and the log ratio from what is likely
     cost: float
