@@ -270,10 +270,13 @@ class FieldFit:
         Returns:
             The others; None where they are too near: an area around contact k and two nodes more
             would touch theirs.
+
+        Raises:
+            ValueError: it is no such field.
         """
         family = fitted.family
         if not isinstance(family, PressureField) or fitted.background is not None:
-            raise TypeError("only a whole pressure field has contacts that can be frozen")
+            raise ValueError("only a whole pressure field has contacts that can be frozen")
         (own, alone), (others, frozen) = family.parted(fitted.parameters, k)
         beside, drawing = own.draw(alone).nodes, others.draw(frozen)
         sheets = {}
