@@ -1,10 +1,11 @@
-/* The inner loop of the pressure field's fit: contacts drawn on the mesh, the pressed sheet solved,
- * its voltages differentiated. It does what `scene.pressure_field`, `physics.condensation` and
- * `physics.forward` do in NumPy, array by array, equal to rounding: the theory and its sources stand
- * there. `inner_loop.py` loads it.
+/* The inner loop of the pressure field's fit: contacts drawn on the mesh, what they make each sheet
+ * conduct, the pressed sheet solved, its voltages compared with the data and differentiated. The
+ * theory and its sources stand in `scene.pressure_field`, `scene.sheet_response`,
+ * `physics.condensation` and `physics.forward`. `inner_loop.py` loads it.
  *
  * Matrices are row-major unless their comment says columns: then an (r, c) matrix has its r entries
  * of a column side by side, as BLAS has it. Nothing here reads or writes but the arrays given.
+ * Functions return 0, -1 without memory, and what they say besides.
  */
 #include <math.h>
 #include <stdint.h>
@@ -17,17 +18,21 @@ static void (*dgemm)(char *, char *, int *, int *, int *, double *, double *, in
 static void (*dtrsm)(char *, char *, char *, char *, int *, int *, double *, double *, int *,
                      double *, int *);
 static void (*dpotrf)(char *, int *, double *, int *, int *);
-static void (*dgesv)(int *, int *, double *, int *, int *, double *, int *, int *);
+static void (*dgetrf)(int *, int *, double *, int *, int *, int *);
+static void (*dgetrs)(char *, int *, int *, double *, int *, int *, double *, int *, int *);
 
-void use_blas(void *gemm, void *trsm, void *potrf, void *gesv) {
-  dgemm = gemm, dtrsm = trsm, dpotrf = potrf, dgesv = gesv;
+void use_blas(void *gemm, void *trsm, void *potrf, void *getrf, void *getrs) {
+  dgemm = gemm, dtrsm = trsm, dpotrf = potrf, dgetrf = getrf, dgetrs = getrs;
 }
+
+enum { UNSOLVABLE = 1, TOUCHES = 2 }; /* what else a function may return */
 
 /* C (m, n) = alpha op(A) op(B) + beta C, all columns. */
 static void multiply(char ta, char tb, int m, int n, int k, double alpha, const double *A, int lda,
                      const double *B, int ldb, double beta, double *C, int ldc) {
+  int of_a = lda ? lda : 1, of_b = ldb ? ldb : 1; /* of nothing BLAS asks the same */
   if (m && n)
-    dgemm(&ta, &tb, &m, &n, &k, &alpha, (double *)A, &lda, (double *)B, &ldb, &beta, C, &ldc);
+    dgemm(&ta, &tb, &m, &n, &k, &alpha, (double *)A, &of_a, (double *)B, &of_b, &beta, C, &ldc);
 }
 
 /* What of a sheet stays the same; see `ForwardModel`. */
@@ -37,59 +42,81 @@ typedef struct {
   const int64_t *corner_support;   /* (triangles, 3) */
   const int64_t *corner_pressable; /* (triangles, 3), -1 elsewhere */
   const int64_t *triangles_of;     /* (pressable, most_around), filled up with `triangles` */
-  const int64_t *neighbours;       /* (support, most_near), filled up with `support` */
+  const int64_t *neighbours;       /* (support, most_near), itself too, filled up with `support` */
   const int64_t *triangle_count;   /* (support,) */
   const uint8_t *closed;           /* (support,) */
   const double *gradient;          /* (triangles, 2, 3) */
   const double *stiffness;         /* (triangles, 3, 3) */
   const double *area;              /* (triangles,) */
   const double *conductivity;      /* (triangles,) of the bare sheet */
+  const double *at_rest;           /* (pressable,) of the bare sheet */
+  const double *potentials;        /* (support, fields) of the bare sheet */
   const double *transfer;          /* (fields + 1, fields + 1) of the bare sheet */
+  const double *bare_voltages;     /* (voltages,) */
   const int64_t *electrodes;       /* (voltages, 4): source, sink, v+, v- */
   const int64_t *pair;             /* (pairs, 2): field that counts, field that is taken off */
   const int64_t *product;          /* (products, 2): the pairs of each */
   const int64_t *product_of;       /* (voltages,) */
   const double *sign;              /* (voltages,) */
+  const float *green_single;       /* (support (support + 1) / 2,) lower triangle of the Green's */
+  const double *green_double;      /* function, in the precision that it has; else NULL */
 } Sheet;
+
+/* Other areas that stay as they are: what they answer to the potentials that all else makes there.
+ * Currents -A u at their rims, A (rim, near) columns: see `freeze`. */
+typedef struct {
+  int64_t rim, near;
+  const int64_t *rim_node;  /* (rim,) positions in the support */
+  const int64_t *near_node; /* (near,) */
+  const uint8_t *inside;    /* (support,) whether a node belongs to them */
+  const double *answer;     /* (rim, near) columns: A */
+  const double *injected;   /* (rim, fields) columns, where nothing else is pressed */
+  const double *transfer;   /* (fields + 1, fields + 1) where nothing else is pressed */
+} Frozen;
 
 /* The areas around pressed nodes: a Condensation and where it is; (t,) triangles, (n,) nodes. */
 typedef struct {
   int64_t triangles, nodes, layers, rim, near;
-  int64_t *triangle; /* (t,) */
+  int64_t is_known;  /* whether `both`, `bare` and `taken` are filled */
+  int64_t *triangle; /* (t,) area by area */
   int64_t *corner;   /* (t, 3) places among the nodes */
   int64_t *node;     /* (n,) positions in the support, area by area, layer by layer inwards */
   int64_t *start;    /* (layers + 1,) */
   int64_t *depth;    /* (n,) */
   int64_t *layer;    /* (n,) */
+  double *both;      /* (rim, rim + fields), G and u0 side by side */
+  double *bare;      /* (rim, rim + fields): what the bare areas' stiffness makes of both */
+  double *taken;     /* (frozen rim, rim): A G, what frozen areas answer to currents at the rims */
 } Areas;
 
-/* Find the areas around nodes (count,); buffers of `areas` are large enough for any. */
-int find_areas(const Sheet *s, int64_t count, const int64_t *where, Areas *a) {
-  int64_t S = s->support, t = 0, n = 0;
+/* Find the areas around nodes (count,); buffers of `areas` are large enough for any. Returns
+ * UNSOLVABLE where an area has no rim (on no sheet is there one), TOUCHES where one touches those
+ * that are `frozen` (which may be NULL). */
+int find_areas(const Sheet *s, const Frozen *frozen, int64_t count, const int64_t *where,
+               Areas *a) {
+  int64_t S = s->support, T = s->triangles, n = 0, touches = 0;
   int64_t *place = malloc(sizeof(int64_t) * (5 * S + 2));
-  uint8_t *hit = calloc(s->triangles + 1 + S, 1);
+  uint8_t *hit = calloc(T + 1 + S, 1);
   if (!place || !hit) {
     free(place), free(hit);
     return -1;
   }
   int64_t *here = place + S, *depth = here + S, *part = depth + S, *queue = part + S;
-  uint8_t *there = hit + s->triangles + 1;
-  for (int64_t i = 0; i < count; i++)
-    for (int64_t j = 0; j < s->most_around; j++) hit[s->triangles_of[where[i] * s->most_around + j]] = 1;
-  for (int64_t i = 0; i < s->triangles; i++)
-    if (hit[i]) {
-      a->triangle[t++] = i;
-      for (int c = 0; c < 3; c++) there[s->corner_support[3 * i + c]] = 1;
-    }
+  uint8_t *there = hit + T + 1;
   memset(here, 0, sizeof(int64_t) * S);
-  for (int64_t i = 0; i < t; i++)
-    for (int c = 0; c < 3; c++) here[s->corner_support[3 * a->triangle[i] + c]]++;
+  for (int64_t i = 0; i < count; i++)
+    for (int64_t j = 0; j < s->most_around; j++) {
+      int64_t t = s->triangles_of[where[i] * s->most_around + j];
+      if (t == T || hit[t]) continue;
+      hit[t] = 1;
+      for (int c = 0; c < 3; c++) there[s->corner_support[3 * t + c]] = 1, here[s->corner_support[3 * t + c]]++;
+    }
   /* Depths from all rims at once. */
   int64_t head = 0, tail = 0;
   for (int64_t i = 0; i < S; i++) {
-    depth[i] = part[i] = -1;
     if (!there[i]) continue;
-    n++;
+    depth[i] = part[i] = -1, n++;
+    touches |= frozen && frozen->inside[i];
     if (!s->closed[i] || here[i] < s->triangle_count[i]) depth[i] = 0, queue[tail++] = i;
   }
   for (; head < tail; head++)
@@ -98,17 +125,17 @@ int find_areas(const Sheet *s, int64_t count, const int64_t *where, Areas *a) {
       if (next < S && there[next] && depth[next] < 0)
         depth[next] = depth[queue[head]] + 1, queue[tail++] = next;
     }
-  /* Connected parts, and within each the nodes by depth. */
-  a->triangles = t, a->nodes = n, a->layers = a->rim = a->near = 0;
-  int64_t done = 0;
+  /* Connected parts; within each its triangles, and its nodes by depth. */
+  a->nodes = n, a->triangles = a->layers = a->rim = a->near = a->is_known = 0;
+  int64_t done = 0, areas = 0;
   for (int64_t i = 0; i < S; i++) {
     if (!there[i] || part[i] >= 0) continue;
     int64_t first = 0, last = 0, deepest = 0;
-    queue[last++] = i, part[i] = i;
+    queue[last++] = i, part[i] = areas++;
     for (; first < last; first++)
       for (int64_t j = 0; j < s->most_near; j++) {
         int64_t next = s->neighbours[queue[first] * s->most_near + j];
-        if (next < S && there[next] && part[next] < 0) part[next] = i, queue[last++] = next;
+        if (next < S && there[next] && part[next] < 0) part[next] = part[i], queue[last++] = next;
       }
     for (int64_t j = 0; j < last; j++)
       if (depth[queue[j]] > deepest) deepest = depth[queue[j]];
@@ -124,39 +151,136 @@ int find_areas(const Sheet *s, int64_t count, const int64_t *where, Areas *a) {
     }
   }
   a->start[a->layers] = done;
-  for (int64_t i = 0; i < t && done == n; i++)
-    for (int c = 0; c < 3; c++)
-      a->corner[3 * i + c] = place[s->corner_support[3 * a->triangle[i] + c]];
+  int64_t *next_of = here; /* where each area's next triangle goes */
+  memset(next_of, 0, sizeof(int64_t) * S);
+  for (int64_t t = 0; t < T; t++)
+    if (hit[t]) a->triangles++, next_of[part[s->corner_support[3 * t]]]++;
+  for (int64_t i = areas - 1, end = a->triangles; i >= 0; i--) end -= next_of[i], next_of[i] = end;
+  for (int64_t t = 0; t < T && done == n; t++) {
+    if (!hit[t]) continue;
+    int64_t i = next_of[part[s->corner_support[3 * t]]]++;
+    a->triangle[i] = t;
+    for (int c = 0; c < 3; c++) a->corner[3 * i + c] = place[s->corner_support[3 * t + c]];
+  }
   free(place), free(hit);
-  return done == n ? 0 : 1; /* an area without a rim: on no sheet is there one */
+  return done != n ? UNSOLVABLE : touches ? TOUCHES : 0;
 }
 
-/* What the bare areas' law makes of potentials: `bare` (rim, width), columns, is the law on the rims
- * times `both` (near, width). Returns -1 without memory. */
-int apply_rim_law(const Sheet *s, const Areas *a, int64_t width, const double *both,
-                   double *bare) {
-  int64_t rim = 0, near = 0;
-  int64_t *row = malloc(sizeof(int64_t) * 2 * (a->nodes + 1)), *column = row + a->nodes;
-  double *law = calloc(a->rim * a->near + 1, sizeof(double)); /* columns (near, rim) */
-  if (!row || !law) {
-    free(row), free(law);
-    return -1;
-  }
-  for (int64_t i = 0; i < a->nodes; i++) {
-    row[i] = a->depth[i] == 0 ? rim++ : -1;
-    column[i] = a->depth[i] <= 1 ? near++ : -1;
-  }
+/* Rows (rim, most_near) of the bare areas' stiffness: columns among the near nodes, values. */
+static void rim_law(const Sheet *s, const Areas *a, const int64_t *row, const int64_t *column,
+                    int64_t *entries, int64_t *at, double *value) {
+  memset(entries, 0, sizeof(int64_t) * a->rim);
   for (int64_t i = 0; i < a->triangles; i++) {
     int64_t t = a->triangle[i];
     const int64_t *corner = a->corner + 3 * i;
-    for (int c = 0; c < 3; c++)
-      if (row[corner[c]] >= 0)
-        for (int d = 0; d < 3; d++)
-          law[row[corner[c]] * near + column[corner[d]]] +=
-              s->conductivity[t] * s->stiffness[9 * t + 3 * c + d];
+    for (int c = 0; c < 3; c++) {
+      int64_t r = row[corner[c]];
+      if (r < 0) continue;
+      int64_t *places = at + r * s->most_near;
+      double *values = value + r * s->most_near;
+      for (int d = 0; d < 3; d++) {
+        int64_t e = 0;
+        while (e < entries[r] && places[e] != column[corner[d]]) e++;
+        if (e == entries[r]) places[e] = column[corner[d]], values[e] = 0.0, entries[r]++;
+        values[e] += s->conductivity[t] * s->stiffness[9 * t + 3 * c + d];
+      }
+    }
   }
-  multiply('T', 'T', rim, width, near, 1.0, law, near, both, width, 0.0, bare, rim);
-  free(law), free(row);
+}
+
+/* The near nodes of areas, which rows and columns they are, and the bare law at the rims. */
+typedef struct {
+  int64_t *row, *column;         /* (nodes,), -1 elsewhere */
+  int64_t *rim_node, *near_node; /* (rim,), (near,) positions in the support */
+  int64_t *entries, *at;         /* (rim,), (rim, most_near) */
+  double *value;                 /* (rim, most_near) */
+} Law;
+
+static int find_law(const Sheet *s, const Areas *a, Law *l) {
+  int64_t most = a->rim * s->most_near, rim = 0, near = 0;
+  l->row = malloc(sizeof(int64_t) * (2 * a->nodes + 2 * a->rim + a->near + most + 1));
+  l->value = malloc(sizeof(double) * (most + 1));
+  if (!l->row || !l->value) {
+    free(l->row), free(l->value);
+    return -1;
+  }
+  l->column = l->row + a->nodes, l->rim_node = l->column + a->nodes;
+  l->near_node = l->rim_node + a->rim, l->entries = l->near_node + a->near;
+  l->at = l->entries + a->rim;
+  for (int64_t i = 0; i < a->nodes; i++) {
+    l->row[i] = l->column[i] = -1;
+    if (a->depth[i] == 0) l->row[i] = rim, l->rim_node[rim++] = a->node[i];
+    if (a->depth[i] <= 1) l->column[i] = near, l->near_node[near++] = a->node[i];
+  }
+  rim_law(s, a, l->row, l->column, l->entries, l->at, l->value);
+  return 0;
+}
+
+/* Green's function between nodes (rows,) and (columns,), into rows that are `width` apart. */
+static void look_up(const Sheet *s, int64_t rows, const int64_t *row, int64_t columns,
+                    const int64_t *column, double *green, int64_t width) {
+  for (int64_t i = 0; i < rows; i++)
+    for (int64_t j = 0; j < columns; j++) {
+      int64_t more = row[i] > column[j] ? row[i] : column[j];
+      int64_t place = more * (more + 1) / 2 + row[i] + column[j] - more;
+      green[i * width + j] = s->green_single ? s->green_single[place] : s->green_double[place];
+    }
+}
+
+/* Blocks of the Green's function that Python gives where the sheet has it in pieces. */
+typedef struct {
+  const double *own;     /* (near, rim) */
+  const double *outward; /* (near, frozen rim) */
+  const double *inward;  /* (frozen near, rim) */
+} Green;
+
+static void block(const Sheet *s, const double *given, int64_t rows, const int64_t *row,
+                  int64_t columns, const int64_t *column, double *green, int64_t width) {
+  if (!given) look_up(s, rows, row, columns, column, green, width);
+  for (int64_t i = 0; i < rows && given; i++)
+    memcpy(green + i * width, given + i * columns, sizeof(double) * columns);
+}
+
+/* Fill in what areas know of the bare sheet: G and u0 at their rims, and the law on them.
+ *
+ * Beside frozen areas these take the bare sheet's place: G - G_ko A G_ok, u0 + G_ko i. Either is
+ * balanced at inner nodes, so that the bare law, at rims and by their neighbours, does what the bare
+ * areas' condensed stiffness does.
+ */
+static int know(const Sheet *s, const Frozen *f, const Green *given, Areas *a) {
+  int64_t r = a->rim, F = s->fields, width = r + F, others = f ? f->rim : 0, more = f ? f->near : 0;
+  double *near = malloc(sizeof(double) * (a->near * (width + others) + more * r + 1));
+  Law l;
+  if (!near || find_law(s, a, &l)) {
+    free(near);
+    return -1;
+  }
+  double *outward = near + a->near * width, *inward = outward + a->near * others;
+  block(s, given->own, a->near, l.near_node, r, l.rim_node, near, width);
+  for (int64_t i = 0; i < a->near; i++)
+    memcpy(near + i * width + r, s->potentials + l.near_node[i] * F, sizeof(double) * F);
+  if (f) {
+    block(s, given->outward, a->near, l.near_node, others, f->rim_node, outward, others);
+    block(s, given->inward, more, f->near_node, r, l.rim_node, inward, r);
+    multiply('N', 'T', r, others, more, 1.0, inward, r, f->answer, others, 0.0, a->taken, r);
+    multiply('N', 'N', r, a->near, others, -1.0, a->taken, r, outward, others, 1.0, near, width);
+    multiply('T', 'N', F, a->near, others, 1.0, f->injected, others, outward, others, 1.0,
+             near + r, width);
+  }
+  for (int64_t i = 0; i < a->nodes; i++) {
+    int64_t row = l.row[i];
+    if (row < 0) continue;
+    double *bare = a->bare + row * width;
+    memcpy(a->both + row * width, near + l.column[i] * width, sizeof(double) * width);
+    memset(bare, 0, sizeof(double) * width);
+    for (int64_t e = 0; e < l.entries[row]; e++) {
+      const double *of = near + l.at[row * s->most_near + e] * width;
+      double by = l.value[row * s->most_near + e];
+      for (int64_t j = 0; j < width; j++) bare[j] += by * of[j];
+    }
+  }
+  a->is_known = 1;
+  free(near), free(l.row), free(l.value);
   return 0;
 }
 
@@ -172,176 +296,438 @@ static int at_corners(const Sheet *s, int64_t t, const double *change, double si
   return better;
 }
 
-/* Solve for a pressed sheet; see `ForwardModel.solve`.
- *
- * change: (pressable,). green: (rim, rim). both: (rim, rim + fields), G and u0 side by side.
- * bare: (rim, rim + fields), columns. Out: voltages, potentials (nodes, fields) and injected
- * (rim, fields), columns. Returns 1 where a conductivity is not above 0, -1 without memory.
- */
-int solve(const Sheet *s, const Areas *a, int mixes_resistivities, const double *change,
-          const double *both, const double *bare, double *voltages, double *potentials,
-          double *injected) {
-  int F = s->fields, r = a->rim, width = r + F, failed = 0;
-  int64_t total = 0, i, l;
-  int64_t *offset = malloc(sizeof(int64_t) * (a->layers + 1));
-  for (l = 0; offset && l < a->layers; l++) {
-    int64_t size = a->start[l + 1] - a->start[l];
-    int64_t outer = a->depth[a->start[l]] ? a->start[l] - a->start[l - 1] : 0;
-    offset[l] = total, total += (outer + size) * size;
-  }
-  /* Of each layer its coupling (outer, size) with the next one outwards, and its own block. */
-  double *flat = calloc(total + 1, sizeof(double));
-  double *added = malloc(sizeof(double) * (width * r + F * F + 1));
-  double *moved = added + width * r;
-  int *pivots = malloc(sizeof(int) * (r + 1));
-  if (!offset || !flat || !added || !pivots) {
-    free(offset), free(flat), free(added), free(pivots);
-    return -1;
-  }
-  for (i = 0; i < a->triangles; i++) {
+/* Areas condensed onto their rims. */
+typedef struct {
+  int64_t *offset; /* (layers,) */
+  double *flat;    /* of each layer L^-1 E, E its coupling (outer, size) with the next one outwards,
+                    * and L: on rims the stiffness (size, size) that is left */
+  double *system;  /* (rim, rim + fields): (S - S0) (G, u0); then factors of 1 + (S - S0) G, whose
+                    * transpose has columns, in the first of each row */
+  int *pivots;     /* (rim,) */
+} Condensed;
+
+static void forget(Condensed *c) { free(c->offset), free(c->flat), free(c->system), free(c->pivots); }
+
+static int size_of(const Areas *a, int64_t layer) { return a->start[layer + 1] - a->start[layer]; }
+
+/* How many nodes the next layer outwards has. */
+static int outer_of(const Areas *a, int64_t layer) {
+  return a->depth[a->start[layer]] ? size_of(a, layer - 1) : 0;
+}
+
+/* Sum triangles into layers: see `Condensed.flat`. */
+static void assemble(const Sheet *s, const Areas *a, int mixes, const double *change,
+                     Condensed *c) {
+  for (int64_t i = 0; i < a->triangles; i++) {
     int64_t t = a->triangle[i];
     const int64_t *corner = a->corner + 3 * i;
-    double c[3], sigma;
-    int better = at_corners(s, t, change, c);
-    if (mixes_resistivities && better)
-      sigma = 3 / (1 / c[0] + 1 / c[1] + 1 / c[2]);
+    double each[3], sigma;
+    int better = at_corners(s, t, change, each);
+    if (mixes && better)
+      sigma = 3 / (1 / each[0] + 1 / each[1] + 1 / each[2]);
     else
-      sigma = (c[0] + c[1] + c[2]) / 3;
+      sigma = (each[0] + each[1] + each[2]) / 3;
     for (int m = 0; m < 3; m++)
       for (int n = 0; n < 3; n++) {
         int64_t row = a->layer[corner[m]], col = a->layer[corner[n]];
         if (row > col) continue;
-        int64_t size = a->start[col + 1] - a->start[col];
-        int64_t outer = a->depth[corner[n]] ? a->start[col] - a->start[col - 1] : 0;
-        int64_t place = corner[m] - a->start[row] + (row == col ? outer : 0);
-        flat[offset[col] + place * size + corner[n] - a->start[col]] +=
+        int64_t place = corner[m] - a->start[row] + (row == col ? outer_of(a, col) : 0);
+        c->flat[c->offset[col] + place * size_of(a, col) + corner[n] - a->start[col]] +=
             sigma * s->stiffness[9 * t + 3 * m + n];
       }
   }
-  /* Eliminate layer by layer outwards; W = L^-1 E^T takes the place of the coupling. */
+}
+
+/* Condense areas, and factor what their rims solve: (1 + (S - S0) G) i = -(S - S0) u0. */
+static int condense(const Sheet *s, const Areas *a, int mixes, const double *change,
+                    Condensed *c) {
+  int r = a->rim, width = r + s->fields, failed = 0, first = 0;
+  int64_t total = 0, l;
+  c->offset = malloc(sizeof(int64_t) * (a->layers + 1));
+  c->system = malloc(sizeof(double) * (r * width + 1)), c->pivots = malloc(sizeof(int) * (r + 1));
+  for (l = 0; c->offset && l < a->layers; l++)
+    c->offset[l] = total, total += (outer_of(a, l) + size_of(a, l)) * size_of(a, l);
+  c->flat = calloc(total + 1, sizeof(double));
+  if (!c->offset || !c->flat || !c->system || !c->pivots) {
+    forget(c);
+    return -1;
+  }
+  assemble(s, a, mixes, change, c);
+  /* Eliminate layer by layer outwards. */
   for (l = a->layers - 1; l >= 0 && !failed; l--) {
-    if (a->depth[a->start[l]] == 0) continue;
-    int size = a->start[l + 1] - a->start[l], outer = a->start[l] - a->start[l - 1], above = 0;
-    double *E = flat + offset[l], *own = E + outer * size, one = 1.0;
+    int size = size_of(a, l), outer = outer_of(a, l);
+    if (!outer) continue;
+    double *E = c->flat + c->offset[l], *own = E + outer * size, one = 1.0;
     dpotrf("L", &size, own, &size, &failed);
     if (failed) break;
     dtrsm("L", "L", "N", "N", &size, &outer, &one, own, &size, E, &size);
-    if (a->depth[a->start[l - 1]]) above = a->start[l - 1] - a->start[l - 2];
     multiply('T', 'N', outer, outer, size, -1.0, E, size, E, size, 1.0,
-             flat + offset[l - 1] + above * outer, outer);
+             c->flat + c->offset[l - 1] + outer_of(a, l - 1) * outer, outer);
   }
-  /* The rims: (1 + (S - S0) G) i = -(S - S0) u0. */
-  int first = 0;
   for (l = 0; l < a->layers && !failed; l++) {
     if (a->depth[a->start[l]]) continue;
-    int size = a->start[l + 1] - a->start[l];
-    multiply('N', 'T', size, width, size, 1.0, flat + offset[l], size, both + first * width, width,
-             0.0, added + first, r);
+    int size = size_of(a, l);
+    multiply('N', 'N', width, size, size, 1.0, a->both + first * width, width,
+             c->flat + c->offset[l], size, 0.0, c->system + first * width, width);
     first += size;
   }
-  if (!failed) {
-    for (i = 0; i < r * r; i++) added[i] -= bare[i];
-    for (i = 0; i < r; i++) added[i * r + i] += 1.0;
-    for (i = 0; i < r * F; i++) injected[i] = bare[r * r + i] - added[r * r + i];
-    dgesv(&r, &F, added, &r, pivots, injected, &r, &failed);
-  }
-  if (!failed) {
-    /* moved = u0^T i, by which the electrodes' potentials differ. */
-    multiply('N', 'N', F, F, r, 1.0, both + r, width, injected, r, 0.0, moved, F);
-    for (int64_t v = 0; v < s->voltages; v++) {
-      const int64_t *e = s->electrodes + 4 * v;
-      double each[2];
-      for (int d = 0; d < 2; d++) {
-        double at[2];
-        for (int m = 0; m < 2; m++) {
-          at[m] = s->transfer[e[2 + m] * (F + 1) + e[d]];
-          if (e[2 + m] < F && e[d] < F) at[m] += moved[e[d] * F + e[2 + m]];
-        }
-        each[d] = at[0] - at[1];
+  for (int64_t i = 0; i < (int64_t)r * width && !failed; i++) c->system[i] -= a->bare[i];
+  for (int64_t i = 0; i < r && !failed; i++) c->system[i * width + i] += 1.0;
+  if (!failed && r) dgetrf(&r, &r, c->system, &width, c->pivots, &failed);
+  if (failed) forget(c);
+  return failed ? UNSOLVABLE : 0;
+}
+
+/* What is pressed on a sheet, and what becomes of it. */
+typedef struct {
+  int64_t count, mixes_resistivities;
+  const int64_t *where;    /* (count,) pressable nodes */
+  const double *share;     /* (count,) pressed; NULL where `change` is given */
+  const double *pressure;  /* (count,) kPa */
+  double log_ratio;
+  double *change;     /* (pressable,) conductivity minus the bare sheet's */
+  double *voltages;   /* (voltages,) */
+  double *residual;   /* (voltages,) weighted */
+  double *potentials; /* (nodes, fields) */
+  double *injected;   /* (rim, fields) columns; frozen rims after the areas' own */
+} Pressing;
+
+/* Voltages of transfer resistances to which `moved` (fields, fields), columns, is added. */
+static void scan(const Sheet *s, const double *transfer, const double *moved, double *voltages) {
+  int64_t F = s->fields;
+  for (int64_t v = 0; v < s->voltages; v++) {
+    const int64_t *e = s->electrodes + 4 * v;
+    double each[2];
+    for (int d = 0; d < 2; d++) {
+      double at[2];
+      for (int m = 0; m < 2; m++) {
+        at[m] = transfer[e[2 + m] * (F + 1) + e[d]];
+        if (e[2 + m] < F && e[d] < F) at[m] += moved[e[d] * F + e[2 + m]];
       }
-      voltages[v] = each[0] - each[1];
+      each[d] = at[0] - at[1];
     }
-    /* Potentials on the rims, u0 + G i, and from there inwards. */
-    first = 0;
-    for (l = 0; l < a->layers; l++) {
-      int size = a->start[l + 1] - a->start[l];
-      double *of = potentials + a->start[l] * F;
-      if (a->depth[a->start[l]] == 0) {
-        for (i = 0; i < size; i++) memcpy(of + i * F, both + (first + i) * width + r, 8 * F);
-        multiply('T', 'N', F, size, r, 1.0, injected, r, both + first * width, width, 1.0, of, F);
-        first += size;
-      } else {
-        int outer = a->start[l] - a->start[l - 1];
-        double *W = flat + offset[l], minus = -1.0;
-        multiply('N', 'T', F, size, outer, 1.0, potentials + a->start[l - 1] * F, F, W, size, 0.0,
-                 of, F);
-        dtrsm("R", "L", "N", "N", &F, &size, &minus, W + outer * size, &size, of, &F);
+    voltages[v] = each[0] - each[1];
+  }
+}
+
+/* Potentials on the rims, u0 + G i, and from there inwards. */
+static void spread(const Sheet *s, const Areas *a, const Condensed *c, const double *injected,
+                   int lead, double *potentials) {
+  int F = s->fields, r = a->rim, width = r + F, first = 0;
+  for (int64_t l = 0; l < a->layers; l++) {
+    int size = size_of(a, l), outer = outer_of(a, l);
+    double *of = potentials + a->start[l] * F, minus = -1.0;
+    if (!outer) {
+      for (int64_t i = 0; i < size; i++)
+        memcpy(of + i * F, a->both + (first + i) * width + r, sizeof(double) * F);
+      multiply('T', 'N', F, size, r, 1.0, injected, lead, a->both + first * width, width, 1.0, of,
+               F);
+      first += size;
+    } else {
+      double *W = c->flat + c->offset[l];
+      multiply('N', 'T', F, size, outer, 1.0, potentials + a->start[l - 1] * F, F, W, size, 0.0, of,
+               F);
+      dtrsm("R", "L", "N", "N", &F, &size, &minus, W + outer * size, &size, of, &F);
+    }
+  }
+}
+
+/* Solve for a pressed sheet; see `ForwardModel.solve`. */
+static int solve(const Sheet *s, const Areas *a, const Frozen *f, const Pressing *p) {
+  int F = s->fields, r = a->rim, width = r + F, lead = r + (f ? f->rim : 0), failed = 0;
+  double *moved = malloc(sizeof(double) * F * F);
+  Condensed c;
+  failed = moved ? condense(s, a, p->mixes_resistivities, p->change, &c) : -1;
+  if (failed) {
+    free(moved);
+    return failed;
+  }
+  for (int64_t i = 0; i < r; i++)
+    for (int64_t m = 0; m < F; m++) p->injected[m * lead + i] = -c.system[i * width + r + m];
+  if (r) dgetrs("T", &r, &F, c.system, &width, c.pivots, p->injected, &lead, &failed);
+  /* u0^T i, by which the electrodes' potentials differ. */
+  multiply('N', 'N', F, F, r, 1.0, a->both + r, width, p->injected, lead, 0.0, moved, F);
+  scan(s, f ? f->transfer : s->transfer, moved, p->voltages);
+  spread(s, a, &c, p->injected, lead, p->potentials);
+  if (f) { /* what frozen areas inject, too: i - A G i */
+    for (int64_t m = 0; m < F; m++)
+      memcpy(p->injected + m * lead + r, f->injected + m * f->rim, sizeof(double) * f->rim);
+    multiply('T', 'N', f->rim, F, r, -1.0, a->taken, r, p->injected, lead, 1.0, p->injected + r,
+             lead);
+  }
+  free(moved), forget(&c);
+  return 0;
+}
+
+/* Freeze areas: how they answer, `answer` (rim, near) columns, to what all else makes there.
+ *
+ * Potentials u that are balanced inside them get currents -A u, A = (1 + (S - S0) G)^-1 (S E - L):
+ * E picks the rims' rows, L is the bare law. See `Frozen`.
+ */
+int freeze(const Sheet *s, const Areas *a, int mixes_resistivities, const double *change,
+           double *answer) {
+  int r = a->rim, near = a->near, width = r + s->fields, failed;
+  Condensed c;
+  Law l;
+  if (find_law(s, a, &l)) return -1;
+  failed = condense(s, a, mixes_resistivities, change, &c);
+  if (!failed) {
+    memset(answer, 0, sizeof(double) * r * near);
+    for (int64_t m = 0; m < a->nodes; m++) {
+      int64_t row = l.row[m], layer = a->layer[m], size = size_of(a, layer);
+      if (row < 0) continue;
+      const double *S = c.flat + c.offset[layer] + (m - a->start[layer]) * size;
+      for (int64_t n = 0; n < size; n++) answer[l.column[a->start[layer] + n] * r + row] = S[n];
+      for (int64_t e = 0; e < l.entries[row]; e++)
+        answer[l.at[row * s->most_near + e] * r + row] -= l.value[row * s->most_near + e];
+    }
+    if (r) dgetrs("T", &r, &near, c.system, &width, c.pivots, answer, &r, &failed);
+    forget(&c);
+  }
+  free(l.row), free(l.value);
+  return failed;
+}
+
+/* What a pressure does to a sheet: see `scene.sheet_response`. */
+typedef struct {
+  int64_t saturates, count;
+  const double *pressure; /* (count,) kPa */
+  const double *value;    /* (count,) relative change, or share of the full change's logarithm */
+} Response;
+
+static const double LEAST = 0.01, ROUNDING = 1e-12;
+
+/* A table's value and slope; beyond its end either its last piece or its last value goes on. */
+static double of_table(const Response *r, double pressure, double *slope) {
+  int64_t piece = 0, last = r->count - (r->saturates ? 1 : 2);
+  while (piece < last && r->pressure[piece + 1] <= pressure) piece++;
+  *slope = 0.0;
+  if (piece + 1 < r->count)
+    *slope = (r->value[piece + 1] - r->value[piece]) / (r->pressure[piece + 1] - r->pressure[piece]);
+  if (r->saturates && pressure <= r->pressure[0]) return r->value[0];
+  return r->value[piece] + *slope * (pressure - r->pressure[piece]);
+}
+
+/* Conductivity ratio of a node, and its derivatives by share, pressure and log ratio. */
+static double graded(const Response *r, double share, double pressure, double by[3]) {
+  double slope, change = of_table(r, pressure, &slope);
+  if (fabs(change) < ROUNDING) change = 0.0;
+  if (change <= LEAST - 1) change = LEAST - 1, slope = 0.0;
+  double sigma = 1 + share * change;
+  int there = sigma > LEAST; /* a small contact's share may be drawn above 1 */
+  by[0] = there ? change : 0.0, by[1] = there ? share * slope : 0.0, by[2] = 0.0;
+  return there ? sigma : LEAST;
+}
+
+static double saturating(const Response *r, double share, double pressure, double log_ratio,
+                         double by[3]) {
+  double slope = 0.0, saturation = r->count ? of_table(r, pressure, &slope) : 1.0;
+  double turned = share < 0 ? -1.0 : 1.0, log_full = turned * log_ratio * saturation;
+  double least = exp(-fabs(log_full)), mixed = 1 - fabs(share) * (1 - least);
+  int better = log_full > 0;
+  double sigma = better ? 1 / mixed : mixed, by_mixed = better ? -sigma * sigma : 1.0;
+  double by_log_full = by_mixed * fabs(share) * least * (better ? -1.0 : 1.0);
+  by[0] = by_mixed * (least - 1) * turned;
+  by[1] = by_log_full * turned * log_ratio * slope;
+  by[2] = by_log_full * turned * saturation;
+  return sigma;
+}
+
+/* Conductivity ratios (n,) and their slopes (3, n); see `SheetResponse.conductivity`. */
+void conduct(const Response *r, int64_t n, const double *share, const double *pressure,
+             double log_ratio, double *ratio, double *slopes) {
+  for (int64_t i = 0; i < n; i++) {
+    double by[3];
+    ratio[i] = r->saturates ? saturating(r, share[i], pressure[i], log_ratio, by)
+                            : graded(r, share[i], pressure[i], by);
+    for (int k = 0; k < 3; k++) slopes[k * n + i] = by[k];
+  }
+}
+
+/* Relative changes that were measured, and their weights; see `Changes`. */
+typedef struct {
+  const double *change; /* (voltages,) */
+  const double *weight; /* (voltages,) */
+  int64_t drifts;
+  const double *along; /* (voltages, drifts) */
+  const double *share; /* (drifts,) */
+} Data;
+
+/* Take from weighted changes (voltages, count) what may be drift; `of` (drifts, count) is lost. */
+static void undrift(const Sheet *s, const Data *d, int64_t count, double *changes, double *of) {
+  int M = s->voltages, D = d->drifts, K = count;
+  if (!D) return;
+  multiply('N', 'T', K, D, M, 1.0, changes, K, d->along, D, 0.0, of, K);
+  for (int64_t i = 0; i < D; i++)
+    for (int64_t k = 0; k < K; k++) of[i * K + k] *= d->share[i];
+  multiply('N', 'N', K, M, D, -1.0, of, K, d->along, D, 1.0, changes, K);
+}
+
+/* Evaluate what is pressed on a sheet: see `FieldFit.evaluate`.
+ *
+ * `response` may be NULL: then the conductivities are given. `data` may be: then nothing is
+ * compared. Returns UNSOLVABLE where a conductivity is not above 0.
+ */
+int evaluate(const Sheet *s, Areas *a, const Frozen *f, const Green *green,
+             const Response *response, const Data *data, Pressing *p) {
+  int made = a->is_known ? 0 : know(s, f, green, a);
+  if (made) return made;
+  if (response) {
+    double *ratio = malloc(sizeof(double) * (4 * p->count + 1));
+    if (!ratio) return -1;
+    conduct(response, p->count, p->share, p->pressure, p->log_ratio, ratio, ratio + p->count);
+    memset(p->change, 0, sizeof(double) * s->pressable);
+    for (int64_t i = 0; i < p->count; i++)
+      p->change[p->where[i]] = s->at_rest[p->where[i]] * (ratio[i] - 1);
+    free(ratio);
+  }
+  if ((made = solve(s, a, f, p)) || !data) return made;
+  double *of = malloc(sizeof(double) * (data->drifts + 1));
+  if (!of) return -1;
+  for (int64_t v = 0; v < s->voltages; v++) {
+    double change = (p->voltages[v] - s->bare_voltages[v]) / fabs(s->bare_voltages[v]);
+    p->residual[v] = data->weight[v] * (change - data->change[v]);
+  }
+  undrift(s, data, 1, p->residual, of);
+  free(of);
+  return 0;
+}
+
+enum { STRIP = 64 }; /* triangles at once: what that takes stays in the cache */
+
+/* How the conductivity of a strip's triangles goes by those parameters that move any of them.
+ *
+ * Out: `active` (their count is returned) and weight (STRIP, active). `slot` (count,) is -1 and
+ * left so.
+ */
+static int weigh(const Sheet *s, const Areas *a, int64_t begin, int strip, const double *mixed,
+                 const int64_t *place, int64_t count, const double *onto, int64_t *slot,
+                 int64_t *active, double *weight) {
+  int K = 0;
+  for (int pass = 0; pass < 2; pass++) {
+    for (int i = 0; i < strip; i++) {
+      int64_t t = a->triangle[begin + i];
+      double share[3] = {1.0, 1.0, 1.0}, c[3];
+      if (pass) /* where resistivities were mixed d sigma / d sigma_c = (sigma / sigma_c)^2 / 3 */
+        for (int k = 0; k < K; k++) weight[i * K + k] = 0.0;
+      if (pass && mixed && at_corners(s, t, mixed, c)) {
+        double mean = (1 / c[0] + 1 / c[1] + 1 / c[2]) / 3;
+        for (int k = 0; k < 3; k++) share[k] = 1 / (c[k] * c[k] * mean * mean);
+      }
+      for (int k = 0; k < 3; k++) {
+        int64_t p = s->corner_pressable[3 * t + k];
+        if (p < 0 || place[p] < 0) continue;
+        double by = -share[k] * s->area[t] / 3; /* minus the area that goes with the corner */
+        const double *row = onto ? onto + place[p] * count : NULL;
+        if (pass && !onto) weight[i * K + slot[place[p]]] += by;
+        for (int j = 0; pass && onto && j < K; j++) weight[i * K + j] += by * row[active[j]];
+        if (!pass && !onto && slot[place[p]] < 0) slot[place[p]] = K, active[K++] = place[p];
+        for (int64_t j = 0; !pass && onto && j < count; j++)
+          if (row[j] != 0 && slot[j] < 0) slot[j] = K, active[K++] = j;
       }
     }
   }
-  free(offset), free(flat), free(added), free(pivots);
-  return failed ? 1 : 0;
+  for (int k = 0; k < K; k++) slot[active[k]] = -1;
+  return K;
+}
+
+/* Products (products, STRIP) of the fields (2, pairs, STRIP) of two pairs each in a strip's triangles. */
+static void field_products(const Sheet *s, const Areas *a, int64_t begin, int strip,
+                           const double *potentials, double *fields, double *product) {
+  int P = s->pairs, Q = s->products;
+  double *x = fields, *y = fields + P * STRIP;
+  for (int i = 0; i < strip; i++) {
+    const int64_t *corner = a->corner + 3 * (begin + i);
+    const double *g = s->gradient + 6 * a->triangle[begin + i];
+    const double *u = potentials + corner[0] * P, *v = potentials + corner[1] * P;
+    const double *w = potentials + corner[2] * P;
+    for (int p = 0; p < P; p++) {
+      x[p * STRIP + i] = g[0] * u[p] + g[1] * v[p] + g[2] * w[p];
+      y[p * STRIP + i] = g[3] * u[p] + g[4] * v[p] + g[5] * w[p];
+    }
+  }
+  for (int q = 0; q < Q; q++) { /* of all places, so that it may be vectorised */
+    int64_t one = s->product[2 * q] * STRIP, other = s->product[2 * q + 1] * STRIP;
+    for (int i = 0; i < STRIP; i++)
+      product[q * STRIP + i] = x[one + i] * x[other + i] + y[one + i] * y[other + i];
+  }
 }
 
 /* Derivative of the voltages by parameters; see `ForwardModel.jacobian`.
  *
- * potentials: (nodes, fields). mixed: (pressable,) changes whose resistivities were mixed, or NULL.
- * place: (pressable,) row of each node in `onto` (n, count), -1 elsewhere. Out: (voltages, count).
+ * where: (nodes,) pressable nodes that the areas are around. potentials: (n, fields). mixed:
+ * (pressable,) changes whose resistivities were mixed, or NULL. onto: (nodes, count) derivatives of
+ * these nodes' conductivities by the parameters; NULL where they are the parameters themselves.
+ * scale: (voltages,). Out: (voltages, count).
  */
-int differentiate(const Sheet *s, const Areas *a, const double *potentials, const double *mixed,
-                  const int64_t *place, int64_t count, const double *onto, double *jacobian) {
-  enum { STRIP = 64 }; /* triangles at once: what that takes stays in the cache */
-  int P = s->pairs, Q = s->products, K = count, F = s->fields;
-  double *fields = malloc(sizeof(double) * (a->nodes * P + STRIP * (Q + K) + 2 * P + Q * K));
-  if (!fields) return -1;
-  double *product = fields + a->nodes * P, *weight = product + STRIP * Q;
-  double *x = weight + STRIP * K, *y = x + P, *summed = y + P;
+int differentiate(const Sheet *s, const Areas *a, int64_t nodes, const int64_t *where,
+                  const double *potentials, const double *mixed, int64_t count, const double *onto,
+                  const double *scale, double *jacobian) {
+  int P = s->pairs, Q = s->products, F = s->fields;
+  int64_t most = onto || count < 3 * STRIP ? count : 3 * STRIP; /* that move a strip */
+  size_t reals = a->nodes * P + STRIP * (2 * P + Q + most) + Q * (most + count) + 1;
+  double *by_pair = malloc(sizeof(double) * reals);
+  int64_t *place = malloc(sizeof(int64_t) * (s->pressable + 2 * count + 1));
+  if (!by_pair || !place) {
+    free(by_pair), free(place);
+    return -1;
+  }
+  double *fields = by_pair + a->nodes * P, *product = fields + 2 * P * STRIP;
+  double *weight = product + STRIP * Q;
+  memset(fields, 0, sizeof(double) * 2 * P * STRIP);
+  double *part = weight + STRIP * most, *summed = part + Q * most;
+  int64_t *slot = place + s->pressable, *active = slot + count;
+  for (int64_t i = 0; i < s->pressable; i++) place[i] = -1;
+  for (int64_t i = 0; i < nodes; i++) place[where[i]] = i;
+  for (int64_t k = 0; k < count; k++) slot[k] = -1;
+  memset(summed, 0, sizeof(double) * Q * count);
   for (int64_t i = 0; i < a->nodes; i++)
     for (int p = 0; p < P; p++) {
       int64_t one = s->pair[2 * p], other = s->pair[2 * p + 1]; /* the last electrode is at 0 */
       const double *u = potentials + i * F;
-      fields[i * P + p] = (one < F ? u[one] : 0.0) - (other < F ? u[other] : 0.0);
+      by_pair[i * P + p] = (one < F ? u[one] : 0.0) - (other < F ? u[other] : 0.0);
     }
   for (int64_t begin = 0; begin < a->triangles; begin += STRIP) {
     int strip = a->triangles - begin < STRIP ? a->triangles - begin : STRIP;
-    for (int i = 0; i < strip; i++) {
-      int64_t t = a->triangle[begin + i];
-      const int64_t *corner = a->corner + 3 * (begin + i);
-      const double *g = s->gradient + 6 * t;
-      const double *u = fields + corner[0] * P, *v = fields + corner[1] * P;
-      const double *w = fields + corner[2] * P;
-      for (int p = 0; p < P; p++) {
-        x[p] = g[0] * u[p] + g[1] * v[p] + g[2] * w[p];
-        y[p] = g[3] * u[p] + g[4] * v[p] + g[5] * w[p];
-      }
-      double *of = product + i * Q;
-      for (int q = 0; q < Q; q++) {
-        int64_t one = s->product[2 * q], other = s->product[2 * q + 1];
-        of[q] = x[one] * x[other] + y[one] * y[other];
-      }
-      /* Minus the area that goes with each corner; where resistivities were mixed
-       * d sigma / d sigma_c = (sigma / sigma_c)^2 / 3. */
-      double share[3] = {1.0, 1.0, 1.0}, c[3];
-      if (mixed && at_corners(s, t, mixed, c)) {
-        double mean = (1 / c[0] + 1 / c[1] + 1 / c[2]) / 3;
-        for (int k = 0; k < 3; k++) share[k] = 1 / (c[k] * c[k] * mean * mean);
-      }
-      for (int k = 0; k < K; k++) weight[i * K + k] = 0.0;
-      for (int k = 0; k < 3; k++) {
-        int64_t p = s->corner_pressable[3 * t + k];
-        if (p < 0 || place[p] < 0) continue;
-        double by = -share[k] * s->area[t] / 3;
-        const double *row = onto + place[p] * K;
-        for (int j = 0; j < K; j++) weight[i * K + j] += by * row[j];
-      }
-    }
-    multiply('N', 'T', K, Q, strip, 1.0, weight, K, product, Q, begin ? 1.0 : 0.0, summed, K);
+    int K = weigh(s, a, begin, strip, mixed, place, count, onto, slot, active, weight);
+    field_products(s, a, begin, strip, by_pair, fields, product);
+    multiply('N', 'N', K, Q, strip, 1.0, weight, K, product, STRIP, 0.0, part, K);
+    for (int q = 0; q < Q; q++)
+      for (int k = 0; k < K; k++) summed[q * count + active[k]] += part[q * K + k];
   }
   for (int64_t v = 0; v < s->voltages; v++)
-    for (int k = 0; k < K; k++)
-      jacobian[v * K + k] = a->triangles ? summed[s->product_of[v] * K + k] * s->sign[v] : 0.0;
-  free(fields);
+    for (int64_t k = 0; k < count; k++)
+      jacobian[v * count + k] = summed[s->product_of[v] * count + k] * s->sign[v] * scale[v];
+  free(by_pair), free(place);
   return 0;
+}
+
+/* Derivative (voltages, parameters + 1) of a sheet's weighted residual; see `FieldFit.jacobian`.
+ *
+ * by_share, by_pressure: (count, parameters) of what is pressed; the last column is by the log
+ * ratio. `p` has the pressed nodes and what was solved for them.
+ */
+int evaluate_slopes(const Sheet *s, const Areas *a, const Response *response, const Data *data,
+                    const Pressing *p, int64_t parameters, const double *by_share,
+                    const double *by_pressure, double *jacobian) {
+  int64_t n = p->count, N = parameters + 1, M = s->voltages;
+  double *ratio = malloc(sizeof(double) * (4 * n + n * N + M + data->drifts * N + 1));
+  if (!ratio) return -1;
+  double *slopes = ratio + n, *onto = ratio + 4 * n, *scale = onto + n * N, *of = scale + M;
+  conduct(response, n, p->share, p->pressure, p->log_ratio, ratio, slopes);
+  for (int64_t i = 0; i < n; i++) {
+    double rest = s->at_rest[p->where[i]];
+    const double *share = by_share + i * parameters, *pressure = by_pressure + i * parameters;
+    for (int64_t k = 0; k < parameters; k++)
+      onto[i * N + k] = rest * (slopes[i] * share[k] + slopes[n + i] * pressure[k]);
+    onto[i * N + parameters] = rest * slopes[2 * n + i];
+  }
+  for (int64_t v = 0; v < M; v++) scale[v] = data->weight[v] / fabs(s->bare_voltages[v]);
+  int made = differentiate(s, a, n, p->where, p->potentials,
+                           p->mixes_resistivities ? p->change : NULL, N, onto, scale, jacobian);
+  if (!made) undrift(s, data, N, jacobian, of);
+  free(ratio);
+  return made;
 }
 
 /* Contacts: the columns of their parameters, and constants, as in `scene.pressure_field`. */

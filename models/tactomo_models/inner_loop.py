@@ -1,7 +1,6 @@
-"""The inner loop compiled: `inner_loop.c`, as the installation has built it.
+"""The inner loop compiled: `inner_loop.c`, as the installation has built it (`hatch_build.py`).
 
-Where it could not (no compiler was there), the same is done in NumPy, several times slower: see
-`hatch_build.py`. BLAS and LAPACK are SciPy's own, by the addresses that it gives to Cython.
+BLAS and LAPACK are SciPy's own, by the addresses that it gives to Cython.
 """
 
 from __future__ import annotations
@@ -14,45 +13,95 @@ import scipy.linalg.cython_blas
 import scipy.linalg.cython_lapack
 from numpy.typing import NDArray
 
+from tactomo_models.errors import ModelError
+
+_PATH = Path(__file__).with_name("libinner_loop.so")
 _ROUTINES = {
     scipy.linalg.cython_blas: ("dgemm", "dtrsm"),
-    scipy.linalg.cython_lapack: ("dpotrf", "dgesv"),
+    scipy.linalg.cython_lapack: ("dpotrf", "dgetrf", "dgetrs"),
+}
+_COUNT, _ARRAY = ctypes.c_int64, ctypes.c_void_p
+_ARGUMENTS = {
+    "find_areas": [_ARRAY, _ARRAY, _COUNT, _ARRAY, _ARRAY],
+    "evaluate": [_ARRAY] * 7,
+    "evaluate_slopes": [*[_ARRAY] * 5, _COUNT, *[_ARRAY] * 3],
+    "differentiate": [_ARRAY, _ARRAY, _COUNT, *[_ARRAY] * 3, _COUNT, *[_ARRAY] * 3],
+    "freeze": [_ARRAY, _ARRAY, ctypes.c_int, _ARRAY, _ARRAY],
+    "conduct": [_ARRAY, _COUNT, _ARRAY, _ARRAY, ctypes.c_double, _ARRAY, _ARRAY],
+    "draw": [_ARRAY, _COUNT, _ARRAY, _COUNT, *[_ARRAY] * 7],
+    "draw_slopes": [_ARRAY, _COUNT, _ARRAY, _COUNT, *[_ARRAY] * 3, _COUNT, *[_ARRAY] * 4],
 }
 
 
-def _loaded() -> ctypes.CDLL | None:
-    path = Path(__file__).with_name("libinner_loop.so")
+class _Library:
+    """Functions of the library, which is loaded when the first of them is asked for.
+
+    Raises:
+        ModelError: there is no library, or it is not for this machine.
+    """
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in _ARGUMENTS:
+            raise AttributeError(name)
+        self.__dict__ |= _functions(_PATH)
+        return self.__dict__[name]
+
+
+def _functions(path: Path) -> dict[str, Any]:
     try:
         library = ctypes.CDLL(str(path))
-    except OSError:  # not there, or of another machine
-        return None
+    except OSError as error:
+        state = "was built for another machine" if path.exists() else "is missing"
+        raise ModelError(
+            f"the compiled inner loop {state} ({error}); install a C compiler (or the package "
+            "ziglang) and install tactomo again: pip install --force-reinstall, or make setup in a "
+            "checkout"
+        ) from error
+    library.use_blas(*_routines())
+    functions = {}
+    for name, of_name in _ARGUMENTS.items():
+        functions[name] = getattr(library, name)
+        functions[name].argtypes = of_name
+    functions["draw"].restype, functions["conduct"].restype = _COUNT, None
+    return functions
+
+
+def _routines() -> list[ctypes.c_void_p]:
+    """Addresses of BLAS and LAPACK."""
     name_of, pointer_of = ctypes.pythonapi.PyCapsule_GetName, ctypes.pythonapi.PyCapsule_GetPointer
     name_of.restype, name_of.argtypes = ctypes.c_char_p, [ctypes.py_object]
     pointer_of.restype = ctypes.c_void_p
     pointer_of.argtypes = [ctypes.py_object, ctypes.c_char_p]
     capsules = [module.__pyx_capi__[name] for module, names in _ROUTINES.items() for name in names]
-    if not all(b"int *" in name_of(each) for each in capsules):  # of 64 bits, in some builds
-        return None
-    library.use_blas(*(ctypes.c_void_p(pointer_of(each, name_of(each))) for each in capsules))
-    count, array = ctypes.c_int64, ctypes.c_void_p
-    library.find_areas.argtypes = [array, count, array, array]
-    library.apply_rim_law.argtypes = [array, array, count, array, array]
-    library.solve.argtypes = [array, array, ctypes.c_int, *[array] * 6]
-    library.differentiate.argtypes = [*[array] * 5, count, array, array]
-    library.draw.argtypes = [array, count, array, count, *[array] * 7]
-    library.draw.restype = count
-    library.draw_slopes.argtypes = [array, count, array, count, *[array] * 3, count, *[array] * 4]
-    return library
+    if not all(b"int *" in name_of(each) for each in capsules):
+        raise ModelError(
+            "SciPy's BLAS counts in 64 bits, the compiled inner loop in 32; install SciPy's own "
+            "wheel: pip install --force-reinstall scipy"
+        )
+    return [ctypes.c_void_p(pointer_of(each, name_of(each))) for each in capsules]
 
 
-LIBRARY = _loaded()
+LIBRARY = _Library()
+_START = ctypes.c_char * 0
 
 
-def at(array: NDArray[Any] | None) -> ctypes.c_void_p | None:
+def at(array: NDArray[Any] | None) -> Any:
     """Where a contiguous array's values are, for C; NULL for None.
 
     It holds the array: one that nobody else has, such as a property's, would be freed before C
     reads it.
     """
-    assert array is None or array.flags.c_contiguous
-    return None if array is None else array.ctypes.data_as(ctypes.c_void_p)
+    if array is None:
+        return None
+    assert array.flags.c_contiguous
+    if array.flags.writeable:  # then it takes a seventh of the time
+        return _START.from_buffer(array)  # type: ignore[arg-type]
+    return array.ctypes.data_as(ctypes.c_void_p)
+
+
+def address(array: NDArray[Any]) -> int:
+    """The same as a number, for a structure whose owner keeps the array as long as itself."""
+    assert array.flags.c_contiguous
+    if array.flags.writeable:
+        return ctypes.addressof(_START.from_buffer(array))  # type: ignore[arg-type]
+    return int(array.ctypes.data)

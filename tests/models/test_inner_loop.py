@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import weakref
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy_drawing import Contacts
+from numpy_forward import NumpyForwardModel
 from tactomo_models import Artifact, SensorDescription
 from tactomo_models.arrays import FloatArray, IntArray
-from tactomo_models.inner_loop import LIBRARY, at
-from tactomo_models.physics import forward
+from tactomo_models.inner_loop import at
 from tactomo_models.physics.forward import ForwardModel
-from tactomo_models.scene import pressure_field
 from tactomo_models.scene.parameters import COLUMNS, EDGE, HARMONIC, HOLE, PEAK, SIZE, UNIT_M, X, Y
 from tactomo_models.scene.pressure_field import PressureField
-
-pytestmark = pytest.mark.skipif(LIBRARY is None, reason="no C compiler built the inner loop")
 
 PLACES_MM = {
     "nothing": [],
@@ -35,14 +34,10 @@ def model(paper: SensorDescription, artifact: Artifact) -> ForwardModel:
     return ForwardModel(paper, artifact.bare)
 
 
-@pytest.fixture
-def in_numpy(
-    paper: SensorDescription, artifact: Artifact, monkeypatch: pytest.MonkeyPatch
-) -> ForwardModel:
-    """The same sheet; what is drawn from now on is drawn in NumPy, too."""
-    monkeypatch.setattr(forward, "LIBRARY", None)
-    monkeypatch.setattr(pressure_field, "LIBRARY", None)
-    return ForwardModel(paper, artifact.bare)
+@pytest.fixture(scope="module")
+def in_numpy(model: ForwardModel) -> NumpyForwardModel:
+    """The same sheet."""
+    return NumpyForwardModel(model)
 
 
 def contacts(where: str, kind: str) -> FloatArray:
@@ -60,22 +55,29 @@ def contacts(where: str, kind: str) -> FloatArray:
 
 @pytest.mark.parametrize("kind", ["circles", "ellipses that fall", "rings"])
 @pytest.mark.parametrize("where", PLACES_MM)
-def test_contacts_are_drawn_alike(
-    model: ForwardModel, where: str, kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_contacts_are_drawn_alike(model: ForwardModel, where: str, kind: str) -> None:
     each = contacts(where, kind)
     field = PressureField.on(model, None).of(each, 0 if kind == "circles" else 2)
     field = field.with_free(slice(EDGE, COLUMNS))
     x_m, y_m = field.x_m + 0.4e-3, field.y_m + 0.3e-3
 
-    def drawn() -> tuple[FloatArray | IntArray, ...]:
-        made = field.draw(field.join(each))
-        shares = made.enclosed, made.enclosed_kpa, made.share, made.pressure_kpa
-        return (made.nodes, *shares, *made.slopes(), *field.sampled(each, x_m, y_m, 1e-3))
-
-    compiled = drawn()
-    monkeypatch.setattr(pressure_field, "LIBRARY", None)
-    for one, other in zip(compiled, drawn(), strict=True):
+    made = field.draw(field.join(each))
+    drawn = Contacts(field, each, field.x_m, field.y_m)
+    there = (drawn.wide > -1).any(axis=0)
+    agree(made.nodes, np.flatnonzero(there))
+    shares = made.enclosed, made.enclosed_kpa, made.share, made.pressure_kpa
+    others = drawn.enclosed, drawn.enclosed_kpa, drawn.share, drawn.pressure_kpa
+    for one, other in zip(shares, others, strict=True):
+        agree(one, other[there])
+    for one, other in zip(made.slopes(), drawn.slopes(), strict=True):
+        agree(one, other[field.free][:, there].T)
+    sharp = replace(field, half_width_m=1e-3, blur_m2=0.0)
+    drawn = Contacts(sharp, each, x_m, y_m, is_sharp=True)
+    for one, other in zip(
+        field.sampled(each, x_m, y_m, 1e-3),
+        (drawn.enclosed, drawn.share, drawn.pressure_kpa),
+        strict=True,
+    ):
         agree(one, other)
 
 
@@ -83,16 +85,14 @@ def test_contacts_are_drawn_alike(
 @pytest.mark.parametrize("contrast", [0.2, 100.0])
 @pytest.mark.parametrize("where", PLACES_MM)
 def test_a_sheet_is_solved_and_differentiated_alike(
-    model: ForwardModel, in_numpy: ForwardModel, where: str, contrast: float, mixes: bool
+    model: ForwardModel, in_numpy: NumpyForwardModel, where: str, contrast: float, mixes: bool
 ) -> None:
     field = PressureField.on(model, None).of(each := contacts(where, "circles"), 2)
     drawing = field.draw(field.join(each))
     change = np.zeros(len(model.bare.pressable))
     change[drawing.nodes] = contrast**drawing.enclosed - 1
-    one, other = (
-        each.solve(change, mix_resistivities=mixes, within=drawing.nodes)
-        for each in (model, in_numpy)
-    )
+    one = model.solve(change, mix_resistivities=mixes, within=drawing.nodes)
+    other = in_numpy.solve(change, mix_resistivities=mixes, within=drawing.nodes)
     agree(one.voltages, other.voltages)
     assert set(one.nodes) == set(other.nodes)
     everywhere = np.arange(len(model.bare.support))

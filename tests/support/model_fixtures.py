@@ -19,6 +19,7 @@ from tactomo_models import (
 from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.physics.actual_sheet import SheetEstimator
 from tactomo_models.physics.bare_sheet import BareSheet, solve_bare_sheet
+from tactomo_models.physics.compiled_sheet import CompiledSheet
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import mesh_sheet
 
@@ -106,11 +107,11 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def solves(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Counts forward solves."""
     counted: list[int] = []
-    solve = ForwardModel.solve
+    solve = CompiledSheet.solve
 
-    def counting(self: ForwardModel, *arguments: object, **options: object) -> object:
+    def counting(self: CompiledSheet, *arguments: object, **options: object) -> object:
         counted.append(1)
         return solve(self, *arguments, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(ForwardModel, "solve", counting)
+    monkeypatch.setattr(CompiledSheet, "solve", counting)
     return counted

@@ -47,6 +47,7 @@ class Rest:
         account: the field at its minimum.
         replaced: which contacts a trial puts something else for.
         frame: the data.
+        is_apart: whether no trial comes to touch the others; else each solves for all of them.
     """
 
     def __init__(
@@ -56,6 +57,8 @@ class Rest:
         account: Account,
         replaced: Sequence[int],
         frame: Frame,
+        *,
+        is_apart: bool = True,
     ) -> None:
         self._fit, self._field, self._account, self._frame = fit, field, account, frame
         self._replaced = list(replaced)
@@ -74,7 +77,9 @@ class Rest:
         self._root = np.linalg.cholesky(normal)
         self._aside = np.linalg.solve(self._root, J.T)  # (n, sum M): what of a residual they take
         self._J = frame.likelihood.deflation[:, None] * J
-        self._background = fit.background(fitted, self._replaced, frame.measured)
+        self._background = (
+            fit.background(fitted, self._replaced, frame.measured) if is_apart else None
+        )
         self._by_ratio = self._others_by_ratio()
 
     def _others_by_ratio(self) -> FloatArray:
@@ -98,6 +103,8 @@ class Rest:
             family.bounded(family.join(family.fixed)),
             self._account.fitted.log_ratio,
         )
+        if best is None and self._background is not None:
+            return self._touching.trial(contacts)
         if best is None:
             return None
         damping = 1.0
@@ -109,6 +116,13 @@ class Rest:
             if gain * self._account.unit < NEGLIGIBLE or self._frame.budget.over:
                 break
         return self._judged(family, best)
+
+    @cached_property
+    def _touching(self) -> Rest:
+        """The same for trials that touch the others."""
+        return Rest(
+            self._fit, self._field, self._account, self._replaced, self._frame, is_apart=False
+        )
 
     def _family(self, contacts: FloatArray) -> PressureField:
         field = self._field.of(contacts, 2, fits_peaks=self._frame.fits_peaks)

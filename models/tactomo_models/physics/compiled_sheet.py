@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
-from tactomo_models.inner_loop import LIBRARY, at
+from tactomo_models.inner_loop import LIBRARY, address, at
 from tactomo_models.physics.bare_sheet import BareSheet
+from tactomo_models.physics.greens import PackedGreensFunction
 
 _COUNTS = (
     *("triangles", "support", "pressable", "fields", "pairs", "products", "voltages"),
@@ -17,24 +19,132 @@ _COUNTS = (
 )
 _ARRAYS = (
     *("corner_support", "corner_pressable", "triangles_of", "neighbours", "triangle_count"),
-    *("closed", "gradient", "stiffness", "area", "conductivity", "transfer", "electrodes"),
-    *("pair", "product", "product_of", "sign"),
+    *("closed", "gradient", "stiffness", "area", "conductivity", "at_rest", "potentials"),
+    *("transfer", "bare_voltages", "electrodes", "pair", "product", "product_of", "sign"),
 )
+_TOUCHES = 2  # what `find_areas` returns where areas touch frozen ones
+
+_Fields = tuple[tuple[str, type], ...]
+
+
+def _reals(*names: str) -> _Fields:
+    return tuple((name, ctypes.c_double) for name in names)
+
+
+def _integers(*names: str) -> _Fields:
+    return tuple((name, ctypes.c_int64) for name in names)
+
+
+def _addresses(*names: str) -> _Fields:
+    return tuple((name, ctypes.c_void_p) for name in names)
 
 
 class _Sheet(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int64) for name in _COUNTS),
-        *((name, ctypes.c_void_p) for name in _ARRAYS),
+        *_integers(*_COUNTS),
+        *_addresses(*_ARRAYS, "green_single", "green_double"),
     )
 
 
 class _Areas(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int64) for name in ("triangles", "nodes", "layers", "rim", "near")),
-        *((name, ctypes.c_void_p) for name in ("triangle", "corner", "node", "start", "depth")),
-        ("layer", ctypes.c_void_p),
+        *_integers("triangles", "nodes", "layers", "rim", "near", "is_known"),
+        *_addresses("triangle", "corner", "node", "start", "depth", "layer"),
+        *_addresses("both", "bare", "taken"),
     )
+
+
+class _Frozen(ctypes.Structure):
+    _fields_ = (
+        *_integers("rim", "near"),
+        *_addresses("rim_node", "near_node", "inside", "answer", "injected", "transfer"),
+    )
+
+
+class _Green(ctypes.Structure):
+    _fields_ = _addresses("own", "outward", "inward")
+
+
+class _Pressing(ctypes.Structure):
+    _fields_ = (
+        *_integers("count", "mixes_resistivities"),
+        *_addresses("where", "share", "pressure"),
+        *_reals("log_ratio"),
+        *_addresses("change", "voltages", "residual", "potentials", "injected"),
+    )
+
+
+class _Response(ctypes.Structure):
+    _fields_ = (*_integers("saturates", "count"), *_addresses("pressure", "value"))
+
+
+class _Data(ctypes.Structure):
+    _fields_ = (
+        *_addresses("change", "weight"),
+        *_integers("drifts"),
+        *_addresses("along", "share"),
+    )
+
+
+class CompiledResponse:
+    """What a pressure does to a sheet's conductivity.
+
+    Args:
+        pressure_kpa: (n,) of a table.
+        value: (n,) relative change there; or share of the logarithm of the full change.
+        saturates: which of the two. A table of no rows has all of the full change anywhere.
+    """
+
+    def __init__(self, pressure_kpa: FloatArray, value: FloatArray, *, saturates: bool) -> None:
+        self._kept = [np.ascontiguousarray(each, np.float64) for each in (pressure_kpa, value)]
+        self._response = _Response(saturates, len(value), *map(address, self._kept))
+        self.address = ctypes.byref(self._response)  # for C
+
+    def conductivity(
+        self, share: FloatArray, pressure_kpa: FloatArray, log_ratio: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Conductivity ratio (n,), its derivatives (3, n) by share, pressure and log ratio."""
+        share, pressure_kpa = np.broadcast_arrays(share, pressure_kpa)
+        given = [np.ascontiguousarray(each, np.float64) for each in (share, pressure_kpa)]
+        ratio, slopes = np.empty(len(share)), np.empty((3, len(share)))
+        count, found = len(share), (at(ratio), at(slopes))
+        LIBRARY.conduct(self.address, count, *map(at, given), log_ratio, *found)
+        return ratio, slopes
+
+
+class CompiledData:
+    """Relative changes that were measured, and how they are weighted; see `Changes`.
+
+    Args:
+        change: (M,).
+        weight: (M,) inverse standard deviations.
+        drift: (M, K) directions and (K,) shares that are taken off along them; None without.
+    """
+
+    def __init__(
+        self,
+        change: FloatArray,
+        weight: FloatArray,
+        drift: tuple[FloatArray, FloatArray] | None,
+    ) -> None:
+        along, share = (np.zeros((len(change), 0)), np.zeros(0)) if drift is None else drift
+        kept = [np.ascontiguousarray(each, np.float64) for each in (change, weight, along, share)]
+        self._kept = kept
+        where = list(map(address, kept))
+        self._data = _Data(*where[:2], len(share), *where[2:])
+        self.address = ctypes.byref(self._data)  # for C
+
+
+@dataclass(frozen=True)
+class Pressed:
+    """What presses on a sheet, as that sheet sees it."""
+
+    where: IntArray  # (n,) pressable nodes
+    share: FloatArray  # (n,) of each that is pressed
+    pressure_kpa: FloatArray  # (n,) on that share
+    log_ratio: float  # logarithm of the structure sheet's ratio where it is saturated
+    response: CompiledResponse
+    mixes_resistivities: bool  # see `ForwardModel.solve`
 
 
 class CompiledAreas:
@@ -42,34 +152,78 @@ class CompiledAreas:
 
     Attributes:
         where: (p,) pressable nodes that they are around.
+        frozen: areas beside them that stay as they are.
         found: the same for C.
         nodes: (n,) positions of their nodes in `BareSheet.support`.
-        rim: (r,) positions of those on rims.
-        both: (r, r + L - 1) Green's function and the bare sheet's potentials on the rims.
-        bare_both: (r + L - 1, r) what the bare areas' stiffness makes of both, transposed.
+        rim, near: (r,) positions of those on rims, (m,) of those and of their neighbours.
     """
 
-    def __init__(self, sheet: _Sheet, bare: BareSheet, where: IntArray) -> None:
-        assert LIBRARY is not None
-        self.where = where
+    def __init__(self, sheet: _Sheet, where: IntArray, frozen: FrozenAreas | None) -> None:
+        self.where, self.frozen = where, frozen
         most = min(sheet.triangles, len(where) * sheet.most_around)
         nodes = min(sheet.support, 3 * most)
         sizes = np.array([most, 3 * most, nodes, nodes + 1, nodes, nodes])
         self._kept = np.empty(sizes.sum(), np.int64)
         starts = (sizes.cumsum() - sizes).tolist()
-        address = self._kept.ctypes.data
-        self.found = _Areas(0, 0, 0, 0, 0, *(address + 8 * start for start in starts))
-        of, found = ctypes.byref(sheet), ctypes.byref(self.found)
-        _check(LIBRARY.find_areas(of, len(where), at(where), found))
+        place = address(self._kept)
+        self.found = _Areas(0, 0, 0, 0, 0, 0, *(place + 8 * start for start in starts))
+        of = None if frozen is None else frozen.address
+        made = LIBRARY.find_areas(
+            ctypes.byref(sheet), of, len(where), at(where), ctypes.byref(self.found)
+        )
+        self.touch = made == _TOUCHES  # those that are frozen
+        if self.touch:
+            return
+        _check(made)
+        rim = self.found.rim
         count = self.found.nodes
         self.nodes = self._kept[starts[2] : starts[2] + count]
         depth = self._kept[starts[4] : starts[4] + count]
-        near = self.nodes[depth <= 1]
-        self.rim = self.nodes[depth == 0]
-        both = np.concatenate([bare.green.between(near, self.rim), bare.potentials[near]], axis=1)
-        self.bare_both = np.empty((both.shape[1], len(self.rim)))
-        _check(LIBRARY.apply_rim_law(of, found, both.shape[1], at(both), at(self.bare_both)))
-        self.both = both[depth[depth <= 1] == 0]
+        self.rim, self.near = self.nodes[depth == 0], self.nodes[depth <= 1]
+        width, others = rim + sheet.fields, 0 if frozen is None else len(frozen.rim)
+        self._known = np.empty(2 * rim * width + others * rim)
+        self.found.both = place = address(self._known)
+        self.found.bare = place + 8 * rim * width
+        self.found.taken = place + 16 * rim * width
+
+
+@dataclass(frozen=True, eq=False)
+class FrozenAreas:
+    """Areas that stay as they are while others beside them are pressed: see `inner_loop.c`."""
+
+    rim: IntArray  # (r,) positions in `BareSheet.support` of their rims
+    near: IntArray  # (m,) of those and their neighbours
+    inside: BoolArray  # (S,) which nodes belong to them
+    answer: FloatArray  # (m, r) transposed: minus currents at rims, by the potentials of all else
+    injected: FloatArray  # (L - 1, r) currents where nothing else is pressed
+    transfer: FloatArray  # (L, L) transfer resistances there
+
+    def __post_init__(self) -> None:
+        arrays = (self.rim, self.near, self.inside, self.answer, self.injected, self.transfer)
+        found = _Frozen(len(self.rim), len(self.near), *map(address, arrays))
+        object.__setattr__(self, "_found", found)
+        object.__setattr__(self, "address", ctypes.byref(found))
+
+    address: object = field(init=False, repr=False)  # for C
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Voltages of one pressed sheet, with what its potentials and derivatives follow from."""
+
+    voltages: FloatArray  # (M,) in scan order, relative (multiply by `ForwardModel.volts_per_unit`)
+    # (n,) positions in `BareSheet.support` of the corners of all triangles that changed; not of
+    # those in frozen areas
+    nodes: IntArray
+    potentials: FloatArray  # (n, L - 1) potentials there
+    rim: IntArray  # (r,) positions in `BareSheet.support` of those that other triangles touch, too
+    # (r, L - 1) currents that, injected there into the bare sheet, make the pressed sheet's
+    # potentials on the rims and everywhere outside
+    injected: FloatArray
+    areas: CompiledAreas = field(repr=False)
+    # (P,) changes at the pressable nodes, whose resistivities were mixed where it says so
+    change: FloatArray = field(repr=False)
+    mixes_resistivities: bool
 
 
 class CompiledSheet:
@@ -96,62 +250,189 @@ class CompiledSheet:
             "most_around": arrays["triangles_of"].shape[1],
             "most_near": arrays["neighbours"].shape[1],
         }
-        self._sheet = _Sheet(**counts, **{name: at(self._kept[name]) for name in _ARRAYS})
+        green = {}
+        if isinstance(bare.green, PackedGreensFunction):
+            is_single = bare.green.lower.dtype == np.float32
+            name = "green_single" if is_single else "green_double"
+            self._kept[name] = np.ascontiguousarray(
+                bare.green.lower, np.float32 if is_single else np.float64
+            )
+            green[name] = address(self._kept[name])
+        of_arrays = {name: address(self._kept[name]) for name in _ARRAYS}
+        self._sheet = _Sheet(**counts, **of_arrays, **green)
+        self._address = ctypes.byref(self._sheet)
+        self._even = np.ones(self._sheet.voltages)
         self._last: CompiledAreas | None = None
 
-    def areas(self, where: IntArray) -> CompiledAreas:
-        """Areas around pressable nodes; those of the last call where these are the very same."""
-        if self._last is None or (
-            self._last.where is not where and not np.array_equal(self._last.where, where)
-        ):
-            self._last = CompiledAreas(self._sheet, self._bare, where)
-        return self._last
+    def areas(self, where: IntArray, frozen: FrozenAreas | None = None) -> CompiledAreas:
+        """Areas around pressable nodes; those of the last solve where these are the very same."""
+        last = self._last
+        if last is not None and last.frozen is frozen and np.array_equal(last.where, where):
+            return last
+        return CompiledAreas(self._sheet, np.ascontiguousarray(where, np.int64), frozen)
+
+    def _green(self, areas: CompiledAreas) -> tuple[_Green, list[FloatArray]]:
+        """Blocks of a Green's function that is in pieces, for C; none where C can look them up."""
+        if isinstance(self._bare.green, PackedGreensFunction) or areas.found.is_known:
+            return _Green(), []
+        wanted = [(areas.near, areas.rim)]
+        if areas.frozen is not None:
+            wanted += [(areas.near, areas.frozen.rim), (areas.frozen.near, areas.rim)]
+        blocks = [np.ascontiguousarray(self._bare.green.between(*pair)) for pair in wanted]
+        return _Green(*map(address, blocks)), blocks
 
     def solve(
-        self, areas: CompiledAreas, change: FloatArray, mix_resistivities: bool
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Voltages (M,), potentials (n, L - 1) and injected currents (r, L - 1).
+        self,
+        areas: CompiledAreas,
+        pressed: Pressed | None,
+        data: CompiledData | None,
+        change: FloatArray | None = None,
+        *,
+        mix_resistivities: bool = False,
+    ) -> tuple[Solution, FloatArray]:
+        """Solve for what is pressed, and compare it with data.
+
+        Args:
+            areas: around it.
+            pressed: what presses; None where `change` is given.
+            data: what was measured; None where nothing is compared.
+            change: (P,) conductivity minus the bare sheet's.
+            mix_resistivities: see `ForwardModel.solve`.
+
+        Returns:
+            The solution, and the weighted residual (M,) of the data.
 
         Raises:
             numpy.linalg.LinAlgError: a conductivity is not above 0.
         """
-        assert LIBRARY is not None
-        change = np.ascontiguousarray(change, np.float64)
-        voltages = np.empty(self._sheet.voltages)
-        potentials = np.empty((len(areas.nodes), self._sheet.fields))
-        injected = np.empty((self._sheet.fields, len(areas.rim)))
-        made = LIBRARY.solve(
-            ctypes.byref(self._sheet),
+        found, sheet, frozen = areas.found, self._sheet, areas.frozen
+        lead = found.rim + (0 if frozen is None else len(frozen.rim))
+        sizes = (sheet.pressable, sheet.voltages, sheet.voltages, found.nodes * sheet.fields)
+        kept = np.empty(sum(sizes) + lead * sheet.fields)
+        ends = np.cumsum(sizes).tolist()
+        place = address(kept)
+        if change is not None:
+            kept[: ends[0]] = change
+        pressing = _pressing(pressed, areas.where, mix_resistivities)
+        pressing.change = place
+        pressing.voltages, pressing.residual = place + 8 * ends[0], place + 8 * ends[1]
+        pressing.potentials, pressing.injected = place + 8 * ends[2], place + 8 * ends[3]
+        green, blocks = self._green(areas)
+        made = LIBRARY.evaluate(
+            self._address,
+            ctypes.byref(found),
+            None if frozen is None else frozen.address,
+            ctypes.byref(green),
+            None if pressed is None else pressed.response.address,
+            None if data is None else data.address,
+            ctypes.byref(pressing),
+        )
+        del blocks  # which C has read
+        _check(made)
+        self._last = areas
+        rim = areas.rim if frozen is None else np.concatenate([areas.rim, frozen.rim])
+        solution = Solution(
+            kept[ends[0] : ends[1]],
+            areas.nodes,
+            kept[ends[2] : ends[3]].reshape(-1, sheet.fields),
+            rim,
+            kept[ends[3] :].reshape(sheet.fields, lead).T,
+            areas,
+            kept[: ends[0]],
+            bool(pressing.mixes_resistivities),
+        )
+        return solution, kept[ends[1] : ends[2]]
+
+    def freeze(self, solution: Solution) -> FrozenAreas:
+        """Keep the areas of a solution as they are."""
+        areas, bare = solution.areas, self._bare
+        answer = np.empty((len(areas.near), len(areas.rim)))
+        made = LIBRARY.freeze(
+            self._address,
             ctypes.byref(areas.found),
-            int(mix_resistivities),
-            *(at(each) for each in (change, areas.both, areas.bare_both)),
-            *(at(each) for each in (voltages, potentials, injected)),
+            int(solution.mixes_resistivities),
+            at(solution.change),
+            at(answer),
         )
         _check(made)
-        return voltages, potentials, injected.T
+        inside = np.zeros(len(bare.support), bool)
+        inside[areas.nodes] = True
+        transfer = bare.transfer.copy()
+        transfer[:-1, :-1] += bare.potentials[areas.rim].T @ solution.injected
+        injected = np.ascontiguousarray(solution.injected.T)
+        return FrozenAreas(areas.rim, areas.near, inside, answer, injected, transfer)
+
+    def slopes(
+        self,
+        areas: CompiledAreas,
+        solution: Solution,
+        potentials: FloatArray,
+        pressed: Pressed,
+        data: CompiledData,
+        by_share: FloatArray,
+        by_pressure: FloatArray,
+    ) -> FloatArray:
+        """Derivative (M, N + 1) of the weighted residual by N parameters and the log ratio.
+
+        Args:
+            areas: around what is pressed.
+            solution: its solution.
+            potentials: (n, L - 1) at the areas' nodes.
+            pressed: what presses.
+            data: what was measured.
+            by_share: (p, N) derivatives of the shares by the parameters.
+            by_pressure: (p, N) those of the pressures.
+        """
+        pressing = _pressing(pressed, areas.where, solution.mixes_resistivities)
+        pressing.change, pressing.potentials = address(solution.change), address(potentials)
+        jacobian = np.empty((self._sheet.voltages, by_share.shape[1] + 1))
+        made = LIBRARY.evaluate_slopes(
+            self._address,
+            ctypes.byref(areas.found),
+            pressed.response.address,
+            data.address,
+            ctypes.byref(pressing),
+            by_share.shape[1],
+            *map(at, (by_share, by_pressure, jacobian)),
+        )
+        _check(made)
+        return jacobian
 
     def jacobian(
         self,
         areas: CompiledAreas,
+        solution: Solution,
         potentials: FloatArray,
-        mixed: FloatArray | None,
-        onto: FloatArray,
+        onto: FloatArray | None,
     ) -> FloatArray:
         """Derivative (M, K) of the voltages by parameters; see `ForwardModel.jacobian`."""
-        assert LIBRARY is not None
-        onto = np.ascontiguousarray(onto, np.float64)
-        place = np.full(self._sheet.pressable, -1)
-        place[areas.where] = np.arange(len(areas.where))
-        jacobian = np.empty((self._sheet.voltages, onto.shape[1]))
+        onto = None if onto is None else np.ascontiguousarray(onto, np.float64)
+        count = len(areas.where) if onto is None else onto.shape[1]
+        jacobian = np.empty((self._sheet.voltages, count))
+        mixed = solution.change if solution.mixes_resistivities else None
         made = LIBRARY.differentiate(
-            ctypes.byref(self._sheet),
+            self._address,
             ctypes.byref(areas.found),
-            *(at(each) for each in (potentials, mixed, place)),
-            onto.shape[1],
-            *(at(each) for each in (onto, jacobian)),
+            len(areas.where),
+            *(at(each) for each in (areas.where, potentials, mixed)),
+            count,
+            *(at(each) for each in (onto, self._even, jacobian)),
         )
         _check(made)
         return jacobian
+
+
+def _pressing(pressed: Pressed | None, where: IntArray, mix_resistivities: bool) -> _Pressing:
+    if pressed is None:
+        return _Pressing(len(where), mix_resistivities, address(where))
+    return _Pressing(
+        len(where),
+        pressed.mixes_resistivities,
+        address(where),
+        address(pressed.share),
+        address(pressed.pressure_kpa),
+        pressed.log_ratio,
+    )
 
 
 def _check(made: int) -> None:

@@ -21,13 +21,18 @@ import numpy as np
 import scipy.sparse as sp
 
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
-from tactomo_models.inner_loop import LIBRARY
 from tactomo_models.physics.bare_sheet import BareSheet, scan_voltages, volts_per_unit
-from tactomo_models.physics.compiled_sheet import CompiledSheet
-from tactomo_models.physics.condensation import Condensation
+from tactomo_models.physics.compiled_sheet import (
+    CompiledAreas,
+    CompiledData,
+    CompiledSheet,
+    FrozenAreas,
+    Pressed,
+    Solution,
+)
 from tactomo_models.sensor.description import SensorDescription
 
-_STRIP = 256  # triangles, or spots, at once: what that takes stays in the cache
+_STRIP = 256  # spots at once: what that takes stays in the cache
 
 
 @dataclass(frozen=True)
@@ -36,42 +41,6 @@ class Probes:
 
     bare: FloatArray  # (2 C, L - 1) field of the bare sheet there, x components first
     gradient: sp.csr_matrix  # (2 C, S) of potentials at the support nodes, averaged
-
-
-@dataclass(frozen=True)
-class Solution:
-    """Voltages of one pressed sheet, with what its potentials and derivatives follow from."""
-
-    voltages: FloatArray  # (M,) in scan order, relative (multiply by `ForwardModel.volts_per_unit`)
-    # (n,) positions in `BareSheet.support` of the corners of all triangles that changed
-    nodes: IntArray
-    potentials: FloatArray  # (n, L - 1) potentials there
-    rim: IntArray  # (r,) positions in `BareSheet.support` of those that other triangles touch, too
-    # (r, L - 1) currents that, injected there into the bare sheet, make the pressed sheet's
-    # potentials on the rims and everywhere outside
-    injected: FloatArray
-    # (P,) changes at the pressable nodes whose resistivities were mixed; None where conductivities
-    # were
-    mixed: FloatArray | None = None
-
-
-@dataclass(frozen=True)
-class _PressedAreas:
-    """What a solve needs to know of the areas that are pressed, however strongly they are.
-
-    With S and S0 the areas' stiffness on their rims, pressed and bare, the potentials there are
-    u = u0 + G i, and the currents injected there i = -(S - S0) u.
-    """
-
-    triangles: IntArray  # (t,) indexed triangles that change
-    condensation: Condensation  # of their corners onto the rims
-    # (n,) positions of the corners in `BareSheet.support`, in the condensation's order
-    nodes: IntArray
-    rim: IntArray  # (r,) positions of those on rims
-    potentials: FloatArray  # (r, L - 1) u0
-    green: FloatArray  # (r, r) G
-    both: FloatArray  # (r, r + L - 1) G and u0 side by side
-    bare_both: FloatArray  # (r, r + L - 1) S0 G and S0 u0
 
 
 class ForwardModel:
@@ -94,7 +63,7 @@ class ForwardModel:
         self._index_pairs()
         self._index_triangles()
         self._index_nodes()
-        self._compiled = self._compile() if LIBRARY is not None else None
+        self._compiled = self._compile()
 
     def _compile(self) -> CompiledSheet:
         pairs = self.description.pairs
@@ -109,7 +78,10 @@ class ForwardModel:
             "stiffness": self._stiffness,
             "area": self._area,
             "conductivity": self._bare_conductivity,
+            "at_rest": self.at_rest,
+            "potentials": self.bare.potentials,
             "transfer": self.bare.transfer,
+            "bare_voltages": self.bare_voltages,
             "electrodes": np.concatenate([pairs.drive, pairs.measure], axis=1),
             "pair": self._different_pairs,
             "product": self._products.T,
@@ -172,8 +144,6 @@ class ForwardModel:
         # Nodes where the bare sheet's currents balance among these triangles. Elsewhere an
         # electrode, or a triangle that cannot be pressed, is part of the balance.
         left = np.abs(law @ self.bare.potentials).max(axis=1)
-        self._last_areas: _PressedAreas | None = None
-        self._last_touched: tuple[IntArray, tuple[IntArray, IntArray, IntArray]] | None = None
         self._closed = left < 1e-9 * (abs(law) @ np.abs(self.bare.potentials)).max(axis=1)
 
     def solve(
@@ -195,97 +165,93 @@ class ForwardModel:
             numpy.linalg.LinAlgError: a conductivity is not above 0.
         """
         where = np.flatnonzero(change) if within is None else within
-        if len(where) == 0:
-            nowhere = np.zeros(0, np.intp)
-            none = self.bare.potentials[nowhere]
-            return Solution(self.bare_voltages, nowhere, none, nowhere, none)
-        mixed = change if mix_resistivities else None
-        if self._compiled is not None:
-            found = self._compiled.areas(where)
-            voltages, potentials, injected = self._compiled.solve(found, change, mix_resistivities)
-            return Solution(voltages, found.nodes, potentials, found.rim, injected, mixed)
-        triangles = self._around(where)
-        areas = self._areas(triangles)
-        at_corners = self._at_corners(triangles, change)
-        conductivity = at_corners.sum(axis=1) / 3
-        if mix_resistivities:
-            better = self._better(triangles, at_corners)
-            conductivity[better] = 3 / (1 / at_corners[better]).sum(axis=1)
-        condensed = areas.condensation.condense(
-            conductivity[:, None, None] * self._stiffness[triangles]
-        )
-        added = condensed.times(areas.both) - areas.bare_both  # (S - S0) (G, u0)
-        rim = len(areas.rim)
-        system = added[:, :rim]
-        system[np.diag_indices(rim)] += 1.0
-        injected = np.asarray(np.linalg.solve(system, -added[:, rim:]), np.float64)
-        transfer = self.bare.transfer.copy()
-        transfer[:-1, :-1] += areas.potentials.T @ injected
-        return Solution(
-            voltages=scan_voltages(self.description, transfer),
-            nodes=areas.nodes,
-            potentials=condensed.inwards(areas.potentials + areas.green @ injected),
-            rim=areas.rim,
-            injected=injected,
-            mixed=mixed,
-        )
+        areas = self._compiled.areas(where)
+        return self._compiled.solve(areas, None, None, change, mix_resistivities=mix_resistivities)[
+            0
+        ]
 
-    def _at_corners(self, triangles: IntArray, change: FloatArray) -> FloatArray:
-        """Conductivity (t, 3) of triangles as their corners have it."""
-        bare = self._bare_conductivity[triangles, None]
-        return np.asarray(bare + np.append(change, 0.0)[self._corner_pressable[triangles]])
+    def evaluate(
+        self, pressed: Pressed, data: CompiledData, frozen: FrozenAreas | None = None
+    ) -> tuple[Solution, FloatArray] | None:
+        """Solve for what is pressed and compare its relative voltage changes with data.
 
-    def _better(self, triangles: IntArray, at_corners: FloatArray) -> BoolArray:
-        """Tell which triangles (t,) conduct nowhere worse than the bare sheet."""
-        return np.asarray((at_corners >= self._bare_conductivity[triangles, None]).all(axis=1))
+        Args:
+            pressed: what presses, and what that does to the sheet.
+            data: what was measured.
+            frozen: areas beside it that are pressed, too, and stay as they are; see `freeze`.
 
-    def _areas(self, triangles: IntArray) -> _PressedAreas:
-        """What was found out for the last solve, where the same triangles change again."""
-        last = self._last_areas
-        if last is None or not np.array_equal(last.triangles, triangles):
-            self._last_areas = last = self._explored(triangles)
-        return last
+        Returns:
+            The solution, and the weighted residual (M,) of the data; None where what is pressed
+            touches frozen areas.
 
-    def _explored(self, triangles: IntArray) -> _PressedAreas:
-        count = len(self.bare.support)
-        nodes, corners = _renumbered(self._corner_support[triangles], count)
-        here = np.bincount(corners.ravel())
-        rim = ~self._closed[nodes] | (here < self._triangle_count[nodes])
-        neighbours = _positions(nodes, count + 1)[self._neighbours[nodes]]
-        condensation = Condensation(neighbours, rim, corners)
-        nodes, depth = nodes[condensation.order], condensation.depth
-        near, on_rim = nodes[depth <= 1], depth[depth <= 1] == 0
-        # S0 needs no condensation: the bare sheet's u0 and G balance at inner nodes already, so
-        # that the law itself, at rims and by their neighbours, does what S0 does.
-        law = _rim_law(
-            self._bare_conductivity[triangles, None, None] * self._stiffness[triangles],
-            condensation.corners,
-            depth,
-        )
-        potentials = self.bare.potentials[near]
-        both = np.concatenate([self.bare.green.between(near, near[on_rim]), potentials], axis=1)
-        rim = np.count_nonzero(on_rim)
-        return _PressedAreas(
-            triangles=triangles,
-            condensation=condensation,
-            nodes=nodes,
-            rim=near[on_rim],
-            potentials=potentials[on_rim],
-            green=both[on_rim, :rim],
-            both=both[on_rim],
-            bare_both=law @ both,
+        Raises:
+            numpy.linalg.LinAlgError: a conductivity is not above 0.
+        """
+        areas = self._compiled.areas(pressed.where, frozen)
+        return None if areas.touch else self._compiled.solve(areas, pressed, data)
+
+    def freeze(self, solution: Solution, beside: IntArray, margin: int) -> FrozenAreas | None:
+        """Keep the areas of a solution as they are, for solves of others beside them.
+
+        Args:
+            solution: the areas' own, with nothing else pressed.
+            beside: (p,) pressable nodes that will be pressed.
+            margin: so many nodes more than the area around these must be free.
+
+        Returns:
+            The areas; None where these nodes are too near.
+        """
+        frozen = self._compiled.freeze(solution)
+        grown = self._compiled.areas(beside).nodes
+        for _ in range(margin):
+            grown = np.unique(self._neighbours[grown])
+            grown = grown[grown < len(self.bare.support)]
+        return None if frozen.inside[grown].any() else frozen
+
+    def slopes(
+        self,
+        solution: Solution,
+        pressed: Pressed,
+        data: CompiledData,
+        by_share: FloatArray,
+        by_pressure: FloatArray,
+    ) -> FloatArray:
+        """Derivative of the weighted residual of what is pressed.
+
+        Args:
+            solution: that of `evaluate`.
+            pressed: what presses on p nodes.
+            data: what was measured.
+            by_share: (p, N) derivatives of the shares by N parameters.
+            by_pressure: (p, N) those of the pressures.
+
+        Returns:
+            (M, N + 1), by the parameters and the log ratio.
+        """
+        areas, potentials = self._around(solution, pressed.where)
+        return self._compiled.slopes(
+            areas, solution, potentials, pressed, data, by_share, by_pressure
         )
 
-    def _around(self, nodes: IntArray) -> IntArray:
-        """Indexed triangles with any of these pressable nodes as a corner."""
-        found = np.zeros(len(self._area) + 1, bool)
-        found[self._triangles_of[nodes]] = True
-        return np.flatnonzero(found[:-1])
+    def _around(self, solution: Solution, where: IntArray) -> tuple[CompiledAreas, FloatArray]:
+        """Areas around pressable nodes, and a solution's potentials (n, L - 1) there."""
+        areas = solution.areas
+        if areas.where is where or np.array_equal(areas.where, where):
+            return areas, solution.potentials
+        areas = self._compiled.areas(where)
+        return areas, self.potentials(solution, areas.nodes)
 
     def potentials(self, solution: Solution, nodes: IntArray) -> FloatArray:
-        """Potentials (n, L - 1) of a pressed sheet at n positions in `BareSheet.support`."""
+        """Potentials (n, L - 1) of a pressed sheet at n positions in `BareSheet.support`.
+
+        Raises:
+            ValueError: some are inside frozen areas.
+        """
         position = _positions(solution.nodes, len(self.bare.support))[nodes]
         outside = position < 0
+        frozen = solution.areas.frozen
+        if frozen is not None and (frozen.inside & ~_there(solution.rim, frozen))[nodes].any():
+            raise ValueError("potentials inside frozen areas are not known: solve all together")
         potentials = np.empty((len(nodes), self.bare.potentials.shape[1]))
         potentials[~outside] = solution.potentials[position[~outside]]
         others = nodes[outside]
@@ -306,71 +272,8 @@ class ForwardModel:
         Returns:
             (M, K), or (M, n) by the nodes' relative conductivity (the paper's equation 2).
         """
-        if self._compiled is not None and onto is not None:
-            areas = self._compiled.areas(where)
-            inside = solution.nodes is areas.nodes
-            found = solution.potentials if inside else self.potentials(solution, areas.nodes)
-            return self._compiled.jacobian(areas, found, solution.mixed, onto)
-        triangles, nodes, corners = self._touched(where)
-        fields = self.potentials(solution, nodes) @ self._pair_matrix.T  # (nodes, pairs)
-        gradient = self._gradient[triangles] @ fields[corners]  # (t, 2, pairs)
-        node, share = self._shares(where, triangles, solution.mixed)
-        if onto is None:
-            pressable = node < len(where)
-            places = node[pressable], pressable.nonzero()[0]
-            by_triangle = sp.csr_matrix((share[pressable], places), (len(where), len(triangles)))
-            summed = (by_triangle @ self._field_products(gradient).T).T
-        else:
-            onto = np.append(onto, np.zeros((1, onto.shape[1])), axis=0)
-            weight = (share[:, :, None] * onto[node]).sum(axis=1)  # (t, K)
-            summed = np.zeros((self._products.shape[1], onto.shape[1]))
-            for start in range(0, len(triangles), _STRIP):
-                strip = slice(start, start + _STRIP)
-                summed += self._field_products(gradient[strip]) @ weight[strip]
-        return np.asarray(summed[self._product_of] * self._sign[:, None])
-
-    def _touched(self, where: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-        """Indexed triangles around pressable nodes, the different ones of their corners, and which.
-
-        Sheets that are differentiated at the very same nodes share what was found.
-        """
-        if self._last_touched is None or self._last_touched[0] is not where:
-            triangles = self._around(where)
-            corners = _renumbered(self._corner_support[triangles], len(self.bare.support))
-            self._last_touched = where, (triangles, *corners)
-        return self._last_touched[1]
-
-    def _shares(
-        self, where: IntArray, triangles: IntArray, mixed: FloatArray | None
-    ) -> tuple[IntArray, FloatArray]:
-        """Where triangles' corners stand among nodes, and minus the area that goes with each.
-
-        Returns:
-            (t, 3) places in `where`, its length for other nodes; (t, 3) areas by which the
-            conductivities of triangles go with those of their corners.
-        """
-        position = np.full(len(self.bare.pressable) + 1, len(where))  # the last: not pressable
-        position[where] = np.arange(len(where))
-        node = position[self._corner_pressable[triangles]]
-        share = np.repeat(-self._area[triangles, None] / 3, 3, axis=1)
-        if mixed is not None:  # d sigma / d sigma_i = (sigma / sigma_i)^2 / 3
-            at_corners = self._at_corners(triangles, mixed)
-            inverse = 1 / at_corners
-            weighted = inverse / inverse.mean(axis=1)[:, None]
-            weighted[~self._better(triangles, at_corners)] = 1.0
-            share *= weighted**2
-        return node, share
-
-    def _field_products(self, gradient: FloatArray) -> FloatArray:
-        """Products (q, t) of the fields (t, 2, pairs) of two pairs each."""
-        x, y = np.ascontiguousarray(gradient.transpose(1, 2, 0))
-        one, other = self._products
-        product = x[one]
-        product *= x[other]
-        across = y[one]
-        across *= y[other]
-        product += across
-        return np.asarray(product)
+        areas, potentials = self._around(solution, where)
+        return self._compiled.jacobian(areas, solution, potentials, onto)
 
     @property
     def node_areas_m2(self) -> FloatArray:
@@ -419,18 +322,11 @@ class ForwardModel:
         return self.jacobian(unpressed, np.arange(len(self.bare.pressable)))
 
 
-def _rim_law(stiffness: FloatArray, corners: IntArray, depth: IntArray) -> FloatArray:
-    """Rows of the rims' nodes, by them and their neighbours inside, of triangles assembled."""
-    # Full, although most are zero: a sparse matrix takes longer to make than this to multiply.
-    rim, near = depth == 0, depth <= 1
-    triangle, corner = np.nonzero(rim[corners])
-    rows = (rim.cumsum() - 1)[corners[triangle, corner]]
-    columns = (near.cumsum() - 1)[corners[triangle]]
-    shape = np.count_nonzero(rim), np.count_nonzero(near)
-    place = (rows[:, None] * shape[1] + columns).ravel()
-    values = stiffness[triangle, corner].ravel()
-    law = np.bincount(place, values, shape[0] * shape[1]).reshape(shape)
-    return np.asarray(law, np.float64)
+def _there(members: IntArray, frozen: FrozenAreas) -> BoolArray:
+    """Tell which nodes (S,) are among some."""
+    there = np.zeros_like(frozen.inside)
+    there[members] = True
+    return there
 
 
 def _assembled(stiffness: FloatArray, corners: IntArray, nodes: int) -> sp.csr_matrix:
@@ -444,14 +340,6 @@ def _positions(members: IntArray, count: int) -> IntArray:
     position = np.full(count, -1)
     position[members] = np.arange(len(members))
     return position
-
-
-def _renumbered(numbers: IntArray, count: int) -> tuple[IntArray, IntArray]:
-    """The different ones of numbers below `count`, ascending, and each one's place there."""
-    there = np.zeros(count, bool)
-    there[numbers] = True
-    different = np.flatnonzero(there)
-    return different, _positions(different, count)[numbers]
 
 
 def _lists(owner: IntArray, member: IntArray, owners: int, fill: int) -> IntArray:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +19,7 @@ from tactomo_models.arrays import FloatArray
 from tactomo_models.errors import DataError
 from tactomo_models.physics.actual_sheet import explains
 from tactomo_models.physics.artifact import MODEL_ERROR, Artifact, nominal_noise_v
+from tactomo_models.physics.compiled_sheet import CompiledData
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.robust import median, robust_sigma
 from tactomo_models.scans.plausibility import (
@@ -100,6 +101,11 @@ class Changes:
         drift = self.weight[:, None] * directions
         along, size, _ = np.linalg.svd(drift, full_matrices=False)
         return replace(self, drift=(along, 1 - 1 / np.sqrt(1 + size**2)))
+
+    @cached_property
+    def compiled(self) -> CompiledData:
+        """What C knows of them."""
+        return CompiledData(self.change, self.weight, self.drift)
 
     def weighted(self, changes: FloatArray) -> FloatArray:
         """Relative changes (M,) or (M, N) over their errors, less what may be drift."""

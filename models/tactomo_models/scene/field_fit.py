@@ -13,17 +13,20 @@ Jacobian go by the pressed area.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
-from tactomo_models.physics.forward import ForwardModel, Solution
+from tactomo_models.physics.compiled_sheet import FrozenAreas, Pressed, Solution
+from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scans.changes import Changes
 from tactomo_models.scene.drawing import Drawing
+from tactomo_models.scene.pressure_field import PressureField
 from tactomo_models.scene.sheet_response import SheetResponse, responses_of
 from tactomo_models.sensor.description import SensorDescription
 
@@ -40,6 +43,7 @@ SHEET_S = 1.3e-4  # a step on one sheet
 ENTRY_S = 9e-8  # the same, for each node that is pressed and each parameter
 MAX_DAMPING = 1e6  # no step downhill even at this: a minimum
 STEP_LIMIT = 0.5  # largest change of a parameter in one step
+APART = 2  # nodes that a contact must have to move in before it would touch those that are frozen
 
 Measured = Mapping[Channel, Changes]
 
@@ -67,6 +71,16 @@ class Family(Protocol):
 
 
 @dataclass(frozen=True)
+class Background:
+    """Contacts of a pressure field that stay as they are while another one is fitted."""
+
+    family: PressureField  # what their parameters mean
+    parameters: FloatArray  # (N,) of the family
+    sheets: Mapping[Channel, FrozenAreas] = field(repr=False)
+    away: float  # what they add to the cost: by what is likely of them
+
+
+@dataclass(frozen=True)
 class FittedField:
     """An estimate of what presses."""
 
@@ -78,17 +92,18 @@ class FittedField:
     # each sheet's (M,) noise-weighted misfit of the data
     residuals: Mapping[Channel, FloatArray] = field(repr=False)
     cost: float  # what is minimised, the prior included
+    background: Background | None = field(default=None, repr=False)  # contacts beside it
     damping: float = 1.0  # Levenberg-Marquardt damping that its last step got through with
     # (sum M, N + 1) that its last step was made with; None before any
     jacobian: FloatArray | None = field(default=None, repr=False)
     converged: bool = False  # whether the last step changed next to nothing
 
-    @property
+    @cached_property
     def residual(self) -> FloatArray:
         """(sum M,) noise-weighted misfit of all sheets' data."""
         return np.concatenate(list(self.residuals.values()))
 
-    @property
+    @cached_property
     def misfit(self) -> float:
         """Root mean square of the noise-weighted residual; about 1 where the model explains all."""
         return float(np.sqrt(np.mean(self.residual**2)))
@@ -162,6 +177,7 @@ class FieldFit:
                 fitted.log_ratio,
                 measured,
                 solved=fitted.solutions,
+                background=fitted.background,
             )
             assert again is not None
             return again
@@ -170,8 +186,8 @@ class FieldFit:
             fitted.parameters,
             fitted.log_ratio,
             fitted.drawing,
-            {name: fitted.solutions[name] for name in measured},
-            measured,
+            *self._compared(fitted, measured),
+            fitted.background,
         )
         return replace(judged, damping=1.0 if fitted.converged else fitted.damping)
 
@@ -183,27 +199,48 @@ class FieldFit:
         measured: Measured,
         max_pressed: int = MAX_PRESSED,
         solved: Mapping[Channel, Solution] | None = None,
-        background: object | None = None,
+        background: Background | None = None,
     ) -> FittedField | None:
         """Solve the forward model for given parameters and compare it with the data.
 
-        None where so much would be pressed that no deadline could be kept. Sheets that are `solved`
-        for these very contacts and ratio are not solved again.
+        None where so much would be pressed that no deadline could be kept, or where it would touch
+        the background's contacts. Sheets that are `solved` for these very contacts and ratio are
+        not solved again. With a background the voltages, residuals and cost are those of all
+        contacts together; parameters are those of the one that is not frozen.
         """
         drawing = family.draw(parameters)
         if len(drawing.nodes) > max_pressed:
             return None
-        solutions = dict(solved or {})
-        for name in [each for each in measured if each not in solutions]:
-            response, forward = self.responses[name], self.sheet(name)
-            ratio = response.conductivity(*_seen(name, drawing), log_ratio)[0]
-            change = np.zeros(len(forward.bare.pressable))
-            change[drawing.nodes] = forward.at_rest[drawing.nodes] * (ratio - 1)
-            solutions[name] = forward.solve(
-                change, mix_resistivities=response.rises(log_ratio), within=drawing.nodes
-            )
-        solutions = {name: solutions[name] for name in measured}
-        return self._judged(family, parameters, log_ratio, drawing, solutions, measured)
+        solutions: dict[Channel, Solution] = {}
+        residuals: dict[Channel, FloatArray] = {}
+        for name, changes in measured.items():
+            if solved and name in solved:
+                solutions[name] = solved[name]
+                residuals[name] = self._residual(name, solved[name], changes)
+                continue
+            frozen = None if background is None else background.sheets[name]
+            pressed = self._pressed(name, drawing, log_ratio)
+            made = self.sheet(name).evaluate(pressed, changes.compiled, frozen)
+            if made is None:
+                return None
+            solutions[name], residuals[name] = made
+        return self._judged(
+            family, parameters, log_ratio, drawing, solutions, residuals, background
+        )
+
+    def _pressed(self, name: Channel, drawing: Drawing, log_ratio: float) -> Pressed:
+        """What presses on a sheet, as the sheet sees it."""
+        response = self.responses[name]
+        share, pressure = drawing.share, drawing.pressure_kpa
+        if name == Channel.STRUCTURE:
+            share, pressure = drawing.enclosed, drawing.enclosed_kpa
+        rises = response.rises(log_ratio)
+        return Pressed(drawing.nodes, share, pressure, log_ratio, response.compiled, rises)
+
+    def _residual(self, name: Channel, solution: Solution, changes: Changes) -> FloatArray:
+        bare = self.sheet(name).bare_voltages
+        change = (solution.voltages - bare) / np.abs(bare)
+        return changes.weighted(change - changes.change)
 
     def _judged(
         self,
@@ -212,25 +249,70 @@ class FieldFit:
         log_ratio: float,
         drawing: Drawing,
         solutions: Mapping[Channel, Solution],
-        measured: Measured,
+        residuals: Mapping[Channel, FloatArray],
+        background: Background | None,
     ) -> FittedField:
-        residuals = {}
-        for name, changes in measured.items():
-            bare = self.sheet(name).bare_voltages
-            change = (solutions[name].voltages - bare) / np.abs(bare)
-            residuals[name] = changes.weighted(change - changes.change)
         off = (log_ratio - self.likely) / (family.ratio_freedom * self._ratio_sigma)
-        away = family.prior_precision @ (parameters - family.prior_mean) ** 2
+        away = _away(family, parameters) + (0.0 if background is None else background.away)
         cost = float(sum(each @ each for each in residuals.values()) + away + off**2)
-        return FittedField(family, parameters, log_ratio, drawing, solutions, residuals, cost)
+        return FittedField(
+            family, parameters, log_ratio, drawing, solutions, residuals, cost, background
+        )
+
+    def background(
+        self, fitted: FittedField, free: Sequence[int], measured: Measured
+    ) -> Background | None:
+        """Freeze all contacts of a pressure field but some, so that trials of those cost little.
+
+        Args:
+            fitted: the field, with `PressureField` as its family and no background of its own.
+            free: the contacts that are not frozen.
+            measured: the sheets whose data trials will be compared with.
+
+        Returns:
+            The others; None where there are none, or where they are too near: an area around the
+            free contacts and two nodes more would touch theirs.
+
+        Raises:
+            ValueError: it is no such field.
+        """
+        family = fitted.family
+        if not isinstance(family, PressureField) or fitted.background is not None:
+            raise ValueError("only a whole pressure field has contacts that can be frozen")
+        (own, alone), (others, frozen) = family.parted(fitted.parameters, free)
+        if others.count == 0:
+            return None
+        beside, drawing = own.draw(alone).nodes, others.draw(frozen)
+        sheets = {}
+        for name, changes in measured.items():
+            sheet, pressed = self.sheet(name), self._pressed(name, drawing, fitted.log_ratio)
+            solved = sheet.evaluate(pressed, changes.compiled)
+            assert solved is not None  # nothing is frozen yet
+            areas = sheet.freeze(solved[0], beside, APART)
+            if areas is None:
+                return None
+            sheets[name] = areas
+        return Background(others, frozen, sheets, _away(others, frozen))
 
     def restricted(
         self, fitted: FittedField, family: Family, parameters: FloatArray, measured: Measured
     ) -> FittedField:
         """The same field on fewer sheets, with fewer parameters fitted: no solve."""
-        solutions = {name: fitted.solutions[name] for name in measured}
         drawing = family.draw(parameters)
-        return self._judged(family, parameters, fitted.log_ratio, drawing, solutions, measured)
+        compared = self._compared(fitted, measured)
+        return self._judged(
+            family, parameters, fitted.log_ratio, drawing, *compared, fitted.background
+        )
+
+    def _compared(
+        self, fitted: FittedField, measured: Measured
+    ) -> tuple[dict[Channel, Solution], dict[Channel, FloatArray]]:
+        """Solutions and residuals (M,) of the sheets that were measured."""
+        solutions = {name: fitted.solutions[name] for name in measured}
+        return solutions, {
+            name: self._residual(name, solutions[name], changes)
+            for name, changes in measured.items()
+        }
 
     def jacobian(
         self,
@@ -248,18 +330,15 @@ class FieldFit:
         slopes = drawing.slopes()
         sheets = []
         for name, changes in measured.items():
-            _, by_share, by_pressure, by_log_ratio = self.responses[name].conductivity(
-                *_seen(name, drawing), fitted.log_ratio
+            by_share, by_pressure = slopes[:2] if name == Channel.STRUCTURE else slopes[2:]
+            by_parameter = self.sheet(name).slopes(
+                fitted.solutions[name],
+                self._pressed(name, drawing, fitted.log_ratio),
+                changes.compiled,
+                by_share,
+                by_pressure,
             )
-            share, pressure = slopes[:2] if name == Channel.STRUCTURE else slopes[2:]
-            onto = np.empty((len(drawing.nodes), share.shape[1] + 1))
-            onto[:, :-1] = by_share[:, None] * share + by_pressure[:, None] * pressure
-            onto[:, -1] = by_log_ratio
-            forward = self.sheet(name)
-            onto *= forward.at_rest[drawing.nodes, None]
-            by_parameter = forward.jacobian(fitted.solutions[name], drawing.nodes, onto)
-            volts = np.abs(forward.bare_voltages)
-            sheets.append(changes.weighted(by_parameter / volts[:, None]))
+            sheets.append(by_parameter)
         return np.concatenate(sheets)
 
     def refine(
@@ -302,11 +381,6 @@ class FieldFit:
         normal = J.T @ J + np.diag(precision)
         return normal, J.T @ fitted.residual + precision * offset
 
-    def background(
-        self, fitted: FittedField, replaced: list[int], measured: Measured
-    ) -> object | None:
-        return None
-
     def bounded_ratio(self, log_ratio: float) -> float:
         """A log ratio brought back to where it means something."""
         return min(max(log_ratio, self._least_ratio), self._most_ratio)
@@ -327,7 +401,9 @@ class FieldFit:
             step = bounded_step(normal, gradient, damping)
             ratio = self.bounded_ratio(fitted.log_ratio + step[-1])
             parameters = fitted.family.bounded(fitted.parameters + step[:-1])
-            trial = self.evaluate(fitted.family, parameters, ratio, measured)
+            trial = self.evaluate(
+                fitted.family, parameters, ratio, measured, background=fitted.background
+            )
             if trial is not None:
                 budget.spend(trial)
                 if trial.cost < fitted.cost:
@@ -347,11 +423,9 @@ def bounded_step(normal: FloatArray, gradient: FloatArray, damping: float) -> Fl
     return np.asarray(step)
 
 
-def _seen(name: Channel, drawing: Drawing) -> tuple[FloatArray, FloatArray]:
-    """The share (n,) that a sheet shows as pressed, and the pressure (n,) on it."""
-    if name == Channel.STRUCTURE:
-        return drawing.enclosed, drawing.enclosed_kpa
-    return drawing.share, drawing.pressure_kpa
+def _away(family: Family, parameters: FloatArray) -> float:
+    """Cost of parameters (N,) by what is likely of them."""
+    return float(family.prior_precision @ (parameters - family.prior_mean) ** 2)
 
 
 def covariance_of(

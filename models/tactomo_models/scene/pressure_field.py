@@ -24,6 +24,7 @@ of h / k^2, so that both are those of the contact:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from ctypes import Structure, byref, c_double, c_int64
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
@@ -31,9 +32,9 @@ from functools import cache, cached_property
 import numpy as np
 
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
-from tactomo_models.inner_loop import LIBRARY, at
+from tactomo_models.inner_loop import LIBRARY, address, at
 from tactomo_models.physics.forward import ForwardModel
-from tactomo_models.scene.drawing import GRADED_WIDTH, Contacts, Drawing, Slopes
+from tactomo_models.scene.drawing import GRADED_WIDTH, Drawing, Slopes
 from tactomo_models.scene.parameters import (
     COLUMNS,
     E1,
@@ -151,14 +152,24 @@ class PressureField:
         free[:, PEAK] = True
         return replace(self, fixed=self.split(parameters), free=free)
 
-    @property
+    def parted(
+        self, parameters: FloatArray, some: Sequence[int]
+    ) -> tuple[tuple[PressureField, FloatArray], tuple[PressureField, FloatArray]]:
+        """Some contacts alone, and all others: their fields and their parameters."""
+        each, is_own = self.split(parameters), np.isin(np.arange(self.count), some)
+        own, others = (
+            replace(self, fixed=each[those], free=self.free[those]) for those in (is_own, ~is_own)
+        )
+        return (own, own.join(own.fixed)), (others, others.join(others.fixed))
+
+    @cached_property
     def index(self) -> IntArray:
         """(K, COLUMNS) where each parameter stands in the vector of all; -1 where it is fixed."""
         index = np.full(self.free.shape, -1)
         index[self.free] = np.arange(self.free.sum())
         return index
 
-    @property
+    @cached_property
     def forms(self) -> int:
         """Columns of the form that any contact has."""
         waves = slice(HARMONIC, PEAK)
@@ -214,51 +225,29 @@ class PressureField:
     def draw(self, parameters: FloatArray) -> Drawing:
         """Draw the field on the nodes."""
         each = self.split(parameters)
-        if LIBRARY is not None:
-            return self._compiled(each)
-        near = self._near(each)
-        drawn = Contacts(self, each, self.x_m[near], self.y_m[near])
-        there = np.flatnonzero((drawn.wide > -1).any(axis=0))
-
-        @cache
-        def slopes() -> Slopes:
-            one, two, three, four = (of[self.free][:, there].T for of in drawn.slopes())
-            return one, two, three, four
-
-        return Drawing(
-            nodes=near[there],
-            enclosed=drawn.enclosed[there],
-            enclosed_kpa=drawn.enclosed_kpa[there],
-            share=drawn.share[there],
-            pressure_kpa=drawn.pressure_kpa[there],
-            slopes=slopes,
-        )
-
-    def _for_c(self, is_sharp: bool) -> _Field:
-        of = self.half_width_m, self.offset_m, self.unit_kpa, self.blur_m2
-        return _Field(*of, self.forms, is_sharp)
-
-    def _compiled(self, each: FloatArray) -> Drawing:
-        """The same as `draw`, by `inner_loop.c`."""
-        assert LIBRARY is not None
         of = byref(self._for_c(False))
-        nodes, found = np.empty(len(self.x_m), np.intp), np.empty((4, len(self.x_m)))
-        points = len(self.x_m), at(self.x_m), at(self.y_m)
-        count = LIBRARY.draw(of, len(each), at(each), *points, at(nodes), *map(at, found))
+        points = len(self.x_m)
+        nodes, found = np.empty(points, np.intp), np.empty((4, points))
+        places = at(self.x_m), at(self.y_m)
+        count = LIBRARY.draw(of, len(each), at(each), points, *places, at(nodes), *_rows(found))
         nodes = nodes[:count].copy()
 
         @cache
         def slopes() -> Slopes:
             x_m, y_m = self.x_m[nodes], self.y_m[nodes]
-            by = np.empty((4, count, int(self.free.sum())))
+            by = np.empty((4, count, self.index.max(initial=-1) + 1))
             points = count, at(x_m), at(y_m)
             LIBRARY.draw_slopes(
-                of, len(each), at(each), *points, at(self.index), by.shape[2], *map(at, by)
+                of, len(each), at(each), *points, at(self.index), by.shape[2], *_rows(by)
             )
             return by[0], by[1], by[2], by[3]
 
         enclosed, enclosed_kpa, share, pressure = found[:, :count].copy()
         return Drawing(nodes, enclosed, enclosed_kpa, share, pressure, slopes)
+
+    def _for_c(self, is_sharp: bool) -> _Field:
+        of = self.half_width_m, self.offset_m, self.unit_kpa, self.blur_m2
+        return _Field(*of, self.forms, is_sharp)
 
     def sampled(
         self, each: FloatArray, x_m: FloatArray, y_m: FloatArray, step_m: float
@@ -268,32 +257,16 @@ class PressureField:
         Outlines are as sharp as the points can show them.
         """
         sharp = replace(self, half_width_m=step_m, blur_m2=0.0)
-        if LIBRARY is not None:
-            found = np.empty((4, len(x_m)))
-            LIBRARY.draw(
-                byref(sharp._for_c(True)),
-                len(each),
-                at(each),
-                len(x_m),
-                at(x_m),
-                at(y_m),
-                None,
-                *map(at, found),
-            )
-            return found[0], found[2], found[3]
-        drawn = Contacts(sharp, each, x_m, y_m, is_sharp=True)
-        return drawn.enclosed, drawn.share, drawn.pressure_kpa
+        found = np.empty((4, len(x_m)))
+        places = len(x_m), at(x_m), at(y_m)
+        of = byref(sharp._for_c(True))
+        LIBRARY.draw(of, len(each), at(each), *places, None, *_rows(found))
+        return found[0], found[2], found[3]
 
-    def _near(self, each: FloatArray) -> IntArray:
-        """Nodes that any contact can reach: what is farther away need not be drawn."""
-        longest = np.exp(
-            each[:, SIZE]
-            + np.hypot(each[:, E1], each[:, E2])
-            + np.abs(each[:, HARMONIC:PEAK]).sum(axis=1)
-        )
-        reach = longest + 2 * (self.half_width_m + self.offset_m)
-        dx, dy = self.x_m - UNIT_M * each[:, X, None], self.y_m - UNIT_M * each[:, Y, None]
-        return np.flatnonzero((dx * dx + dy * dy < reach[:, None] ** 2).any(axis=0))
+
+def _rows(array: FloatArray) -> list[int]:
+    """Where each row (of one or more dimensions) of an array that outlives its use begins."""
+    return [address(array) + array.strides[0] * row for row in range(len(array))]
 
 
 def _limit(values: FloatArray, least: float, most: float) -> None:

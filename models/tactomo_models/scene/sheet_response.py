@@ -16,6 +16,7 @@ import numpy as np
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
+from tactomo_models.physics.compiled_sheet import CompiledResponse
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.sensor.response import MagnitudeResponse, StructureChannel
 
@@ -42,6 +43,10 @@ class SheetResponse(Protocol):
 
     def rises(self, log_ratio: float) -> bool:
         """Whether pressing makes the sheet conduct better."""
+
+    @property
+    def compiled(self) -> CompiledResponse:
+        """The same for C."""
 
 
 @dataclass(frozen=True)
@@ -87,11 +92,13 @@ class GradedResponse:
         self, share: FloatArray, pressure_kpa: FloatArray, log_ratio: float
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """See `SheetResponse`."""
-        change, slope = self.relative_change(pressure_kpa)
-        sigma = 1 + share * change
-        there = sigma > LEAST  # a small contact's share may be drawn above 1
-        by_share, by_pressure = np.where(there, change, 0.0), np.where(there, share * slope, 0.0)
-        return np.maximum(sigma, LEAST), by_share, by_pressure, np.zeros(len(share))
+        ratio, slopes = self.compiled.conductivity(share, pressure_kpa, log_ratio)
+        return ratio, *slopes
+
+    @cached_property
+    def compiled(self) -> CompiledResponse:
+        """See `SheetResponse`."""
+        return CompiledResponse(self.pressure_kpa, self.change, saturates=False)
 
     def rises(self, log_ratio: float) -> bool:
         """See `SheetResponse`."""
@@ -133,24 +140,17 @@ class SaturatingResponse:
         self, share: FloatArray, pressure_kpa: FloatArray, log_ratio: float
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """See `SheetResponse`."""
-        saturation, slope = self.saturation(pressure_kpa)
-        turned = np.where(share < 0, -1.0, 1.0)
-        log_full = turned * log_ratio * saturation  # of the whole node
-        least, better = np.exp(-np.abs(log_full)), log_full > 0
-        mixed = 1 - np.abs(share) * (1 - least)
-        sigma = np.where(better, 1 / mixed, mixed)
-        by_mixed = np.where(better, -(sigma**2), 1.0)
-        by_log_full = by_mixed * np.abs(share) * least * np.where(better, -1.0, 1.0)
-        return (
-            sigma,
-            by_mixed * (least - 1) * turned,
-            by_log_full * turned * log_ratio * slope,
-            by_log_full * turned * saturation,
-        )
+        ratio, slopes = self.compiled.conductivity(share, pressure_kpa, log_ratio)
+        return ratio, *slopes
+
+    @cached_property
+    def compiled(self) -> CompiledResponse:
+        """See `SheetResponse`."""
+        return CompiledResponse(self.pressure_kpa, self.share, saturates=True)
 
     def rises(self, log_ratio: float) -> bool:
         """See `SheetResponse`."""
-        return log_ratio > 0
+        return bool(log_ratio > 0)
 
 
 def responses_of(description: SensorDescription) -> dict[Channel, SheetResponse]:

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy_drawing import MOST_BLURRED
 from pressed import contact, contacts
 from tactomo_models import SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.forward import ForwardModel
-from tactomo_models.scene.drawing import MOST_BLURRED, Drawing, heaviside, heaviside_slope
+from tactomo_models.scene.drawing import Drawing, heaviside, heaviside_slope
 from tactomo_models.scene.level_set import LevelSet
 from tactomo_models.scene.parameters import (
     COLUMNS,

@@ -384,12 +384,9 @@ def _stage_table(phases: list[Phase]) -> Table:
 def machine() -> str:
     """Return the processor, its cores that we may use, and the versions that matter."""
     import numpy as np
-    from tactomo_models.inner_loop import LIBRARY
     from tactomo_models.machine_speed import processor
 
-    compiled = "" if LIBRARY is not None else ", nothing compiled"
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return (
-        f"{processor()}, {cores} cores, Python {platform.python_version()}, "
-        f"NumPy {np.__version__}{compiled}"
+        f"{processor()}, {cores} cores, Python {platform.python_version()}, NumPy {np.__version__}"
     )

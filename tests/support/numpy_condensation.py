@@ -18,7 +18,6 @@ import scipy.sparse as sp
 from scipy.linalg.blas import dtrsm
 from scipy.linalg.lapack import dpotrf
 from scipy.sparse.csgraph import connected_components
-
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 
 
