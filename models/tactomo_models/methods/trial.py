@@ -22,9 +22,12 @@ from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.methods.account import NEGLIGIBLE, Account, Frame, foreseen
 from tactomo_models.scene.evidence import log_occam
 from tactomo_models.scene.field_fit import MAX_DAMPING, FieldFit, FittedField, bounded_step
-from tactomo_models.scene.parameters import COLUMNS
+from tactomo_models.scene.parameters import E1, E2, SIZE, UNIT_M, X, Y
 from tactomo_models.scene.pressure_field import PressureField
 
+# Nodes between outlines, below which a neighbour is solved with a trial: each outline is a node wide,
+# a triangle lies around it, and the trial may move by a node.
+NEAR_NODES = 5
 STEPS = 6  # of a trial, which takes three; 12 change no row
 
 
@@ -70,16 +73,22 @@ class Rest:
         keep[-1] = False  # the log ratio is the trial's
         keep[mine[mine >= 0]] = False
         self._keep: IntArray = np.flatnonzero(keep)
-        self._others = np.delete(account.contacts, self._replaced, axis=0)
         J = account.jacobian[:, self._keep]
         normal = J.T @ J
         normal[np.diag_indices(len(normal))] += self._precision[self._keep]
         self._root = np.linalg.cholesky(normal)
         self._aside = np.linalg.solve(self._root, J.T)  # (n, sum M): what of a residual they take
         self._J = frame.likelihood.deflation[:, None] * J
-        self._background = (
-            fit.background(fitted, self._replaced, frame.measured) if is_apart else None
-        )
+        others = [k for k in range(len(account.contacts)) if k not in self._replaced]
+        gaps = self._gaps(others)
+        nearest = [others[at] for at in np.argsort(gaps)]
+        near = np.count_nonzero(gaps < NEAR_NODES * field.half_width_m) if is_apart else len(others)
+        self._background = None
+        while near < len(others) and self._background is None:
+            free = [*self._replaced, *nearest[:near]]
+            self._background = fit.background(fitted, free, frame.measured)
+            near += self._background is None
+        self._near = account.contacts[nearest[:near]]
         self._by_ratio = self._others_by_ratio()
 
     def _others_by_ratio(self) -> FloatArray:
@@ -90,7 +99,7 @@ class Rest:
         own = self._family(self._account.contacts[self._replaced])
         fitted = self._evaluated(own, own.join(own.fixed), self._account.fitted.log_ratio)
         assert fitted is not None
-        return by_ratio - self._fit.jacobian(fitted, self._frame.measured)[:, -1]
+        return np.asarray(by_ratio - self._fit.jacobian(fitted, self._frame.measured)[:, -1])
 
     def trial(self, contacts: FloatArray) -> Trial | None:
         """Fit contacts (m, COLUMNS) in place of those that are replaced, from where they are.
@@ -125,15 +134,20 @@ class Rest:
         )
 
     def _family(self, contacts: FloatArray) -> PressureField:
-        field = self._field.of(contacts, 2, fits_peaks=self._frame.fits_peaks)
-        if self._background is not None:
-            return field
-        every = self._field.of(
-            np.vstack([self._others, contacts]), 2, fits_peaks=self._frame.fits_peaks
-        )
-        free = every.free.copy()
-        free[: len(self._others)] = False
-        return replace(every, free=free)
+        every = np.vstack([self._near, contacts])
+        field = self._field.of(every, 2, fits_peaks=self._frame.fits_peaks)
+        free = field.free.copy()
+        free[: len(self._near)] = False
+        return replace(field, free=free)
+
+    def _gaps(self, others: Sequence[int]) -> FloatArray:
+        """Distances of other contacts' outlines from those that are replaced, about."""
+        each = self._account.contacts
+        place, reach = each[:, [X, Y]] * UNIT_M, np.exp(each[:, SIZE] + np.hypot(*each[:, [E1, E2]].T))
+        own = self._replaced
+        apart = np.linalg.norm(place[others][:, None] - place[own], axis=2)
+        gaps = apart - reach[others][:, None] - reach[own]
+        return np.asarray(gaps.min(axis=1, initial=np.inf))
 
     def _evaluated(
         self, family: PressureField, parameters: FloatArray, log_ratio: float
@@ -203,11 +217,11 @@ class Rest:
         log_evidence += log_occam(kept, hessian) + log_occam(prior, schur)
         contacts, sigmas = family.split(at.fitted.parameters), np.zeros(family.free.shape)
         sigmas[family.free] = np.sqrt(np.diag(np.linalg.inv(schur)))[:-1]
-        frozen = 0 if self._background is not None else len(self._others)
+        near = len(self._near)
         return Trial(
             log_odds=log_evidence - account.log_evidence,
-            contacts=contacts[frozen:],
-            sigmas=sigmas[frozen:],
+            contacts=contacts[near:],
+            sigmas=sigmas[near:],
             log_ratio=at.fitted.log_ratio,
         )
 

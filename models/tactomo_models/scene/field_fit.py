@@ -43,7 +43,7 @@ SHEET_S = 1.3e-4  # a step on one sheet
 ENTRY_S = 9e-8  # the same, for each node that is pressed and each parameter
 MAX_DAMPING = 1e6  # no step downhill even at this: a minimum
 STEP_LIMIT = 0.5  # largest change of a parameter in one step
-APART = 2  # nodes that a contact must have to move in before it would touch those that are frozen
+APART = 1  # nodes that a free contact must have to move in before it would touch those that are frozen
 
 Measured = Mapping[Channel, Changes]
 

@@ -149,7 +149,7 @@ def test_a_contact_is_refined_before_its_background(fit: FieldFit, data: Measure
     }
     start = at(fit, SCENES["beside each other"], exact)
     assert start is not None
-    background = fit.background(start, 1, exact)
+    background = fit.background(start, [1], exact)
     alone = at(fit, moved(SCENES["beside each other"], 1)[1:2], exact, background)
     assert alone is not None
     found = fit.refine(alone, exact, Budget(30.0), good_enough=0.1)
@@ -162,13 +162,13 @@ def test_contacts_are_frozen_only_where_they_are_apart(fit: FieldFit, data: Meas
     each = contacts(contact(0.0, 0.0, RADIUS_M), contact(BESIDE_M, 0.0, RADIUS_M))
     far = at(fit, each, data)
     assert far is not None
-    background = fit.background(far, 0, data)
+    background = fit.background(far, [0], data)
     assert background is not None
     nearer = each.copy()
     nearer[1, X] -= 0.7  # then areas do not touch, but soon would
     near = at(fit, nearer, data)
     assert near is not None
-    assert fit.background(near, 0, data) is None
+    assert fit.background(near, [0], data) is None
     each[0, X] += 0.7
     assert at(fit, each[:1], data, background) is not None
     each[0, X] += 0.7
@@ -183,4 +183,4 @@ def test_what_is_not_known_of_frozen_areas_is_not_told(fit: FieldFit, data: Meas
     with pytest.raises(ValueError, match="inside frozen areas"):
         fit.forward.potentials(solution, inner[:1])
     with pytest.raises(ValueError, match="whole pressure field"):
-        fit.background(alone, 0, data)
+        fit.background(alone, [0], data)
