@@ -1,7 +1,7 @@
 """Compile the inner loop of the fit (`inner_loop.c`) into the wheel, or in place for a checkout.
 
 By $CC or the system's compiler; where there is none, by the one that the package `ziglang` brings.
-Without any the wheel is whole all the same: NumPy then does the same, several times slower.
+Without any the build fails, and says what to do.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 SOURCE = "models/tactomo_models/inner_loop.c"
 LIBRARY = "models/tactomo_models/libinner_loop.so"
+NEXT_STEP = "install gcc or clang, name one in $CC, or pip install ziglang; then install again"
 
 
 class CompileInnerLoop(BuildHookInterface):  # type: ignore[type-arg]
@@ -30,15 +31,16 @@ class CompileInnerLoop(BuildHookInterface):  # type: ignore[type-arg]
         return [] if _compiler() else ["ziglang"]
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Compile; say so where nothing can."""
+        """Compile; end the build where nothing can."""
         compiler, root = _compiler(), Path(self.root)
         if not compiler:
-            self.app.display_warning(
-                "no C compiler: tactomo will run in NumPy, several times slower"
-            )
-            return
+            self.app.abort(f"tactomo needs a C compiler to be built: {NEXT_STEP}")
         flags = ("-O3", "-std=c11", "-Wall", "-Wextra", "-fPIC", "-shared")
-        subprocess.run([*compiler, *flags, SOURCE, "-o", LIBRARY, "-lm"], cwd=root, check=True)
+        command = [*compiler, *flags, SOURCE, "-o", LIBRARY, "-lm"]
+        try:
+            subprocess.run(command, cwd=root, check=True)
+        except (OSError, subprocess.CalledProcessError) as error:
+            self.app.abort(f"{shlex.join(command)} failed ({error}): {NEXT_STEP}")
         platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")
         build_data["artifacts"].append(f"/{LIBRARY}")
         build_data["pure_python"], build_data["tag"] = False, f"py3-none-{platform}"

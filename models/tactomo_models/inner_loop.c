@@ -192,13 +192,14 @@ static void rim_law(const Sheet *s, const Areas *a, const int64_t *row, const in
 typedef struct {
   int64_t *row, *column;         /* (nodes,), -1 elsewhere */
   int64_t *rim_node, *near_node; /* (rim,), (near,) positions in the support */
+  int64_t *rim_column;           /* (rim,) */
   int64_t *entries, *at;         /* (rim,), (rim, most_near) */
   double *value;                 /* (rim, most_near) */
 } Law;
 
 static int find_law(const Sheet *s, const Areas *a, Law *l) {
   int64_t most = a->rim * s->most_near, rim = 0, near = 0;
-  l->row = malloc(sizeof(int64_t) * (2 * a->nodes + 2 * a->rim + a->near + most + 1));
+  l->row = malloc(sizeof(int64_t) * (2 * a->nodes + 3 * a->rim + a->near + most + 1));
   l->value = malloc(sizeof(double) * (most + 1));
   if (!l->row || !l->value) {
     free(l->row), free(l->value);
@@ -206,25 +207,43 @@ static int find_law(const Sheet *s, const Areas *a, Law *l) {
   }
   l->column = l->row + a->nodes, l->rim_node = l->column + a->nodes;
   l->near_node = l->rim_node + a->rim, l->entries = l->near_node + a->near;
-  l->at = l->entries + a->rim;
+  l->at = l->entries + a->rim, l->rim_column = l->at + most;
   for (int64_t i = 0; i < a->nodes; i++) {
     l->row[i] = l->column[i] = -1;
-    if (a->depth[i] == 0) l->row[i] = rim, l->rim_node[rim++] = a->node[i];
+    if (a->depth[i] == 0)
+      l->row[i] = rim, l->rim_column[rim] = near, l->rim_node[rim++] = a->node[i];
     if (a->depth[i] <= 1) l->column[i] = near, l->near_node[near++] = a->node[i];
   }
   rim_law(s, a, l->row, l->column, l->entries, l->at, l->value);
   return 0;
 }
 
+static double green_at(const Sheet *s, int64_t row, int64_t column) {
+  int64_t more = row > column ? row : column, place = more * (more + 1) / 2 + row + column - more;
+  return s->green_single ? s->green_single[place] : s->green_double[place];
+}
+
 /* Green's function between nodes (rows,) and (columns,), into rows that are `width` apart. */
 static void look_up(const Sheet *s, int64_t rows, const int64_t *row, int64_t columns,
                     const int64_t *column, double *green, int64_t width) {
   for (int64_t i = 0; i < rows; i++)
-    for (int64_t j = 0; j < columns; j++) {
-      int64_t more = row[i] > column[j] ? row[i] : column[j];
-      int64_t place = more * (more + 1) / 2 + row[i] + column[j] - more;
-      green[i * width + j] = s->green_single ? s->green_single[place] : s->green_double[place];
-    }
+    for (int64_t j = 0; j < columns; j++) green[i * width + j] = green_at(s, row[i], column[j]);
+}
+
+/* The same between near nodes and rims: what is symmetric is looked up once, along its rows. */
+static void look_up_own(const Sheet *s, const Areas *a, const Law *l, double *green,
+                        int64_t width) {
+  for (int64_t i = 0; i < a->nodes; i++) {
+    if (l->column[i] < 0) continue;
+    int64_t row = a->node[i], is_rim = l->row[i] >= 0;
+    double *into = green + l->column[i] * width;
+    for (int64_t j = 0; j < a->rim; j++)
+      if (!is_rim || l->rim_node[j] <= row) into[j] = green_at(s, row, l->rim_node[j]);
+  }
+  for (int64_t i = 0; i < a->rim; i++)
+    for (int64_t j = 0; j < a->rim; j++)
+      if (l->rim_node[j] > l->rim_node[i])
+        green[l->rim_column[i] * width + j] = green[l->rim_column[j] * width + i];
 }
 
 /* Blocks of the Green's function that Python gives where the sheet has it in pieces. */
@@ -256,7 +275,10 @@ static int know(const Sheet *s, const Frozen *f, const Green *given, Areas *a) {
     return -1;
   }
   double *outward = near + a->near * width, *inward = outward + a->near * others;
-  block(s, given->own, a->near, l.near_node, r, l.rim_node, near, width);
+  if (given->own)
+    block(s, given->own, a->near, l.near_node, r, l.rim_node, near, width);
+  else
+    look_up_own(s, a, &l, near, width);
   for (int64_t i = 0; i < a->near; i++)
     memcpy(near + i * width + r, s->potentials + l.near_node[i] * F, sizeof(double) * F);
   if (f) {
@@ -595,40 +617,51 @@ int evaluate(const Sheet *s, Areas *a, const Frozen *f, const Green *green,
 
 enum { STRIP = 64 }; /* triangles at once: what that takes stays in the cache */
 
-/* How the conductivity of a strip's triangles goes by those parameters that move any of them.
+/* Which parameters (count,) move any of a strip's triangles: how many; `active` says which ones.
  *
- * Out: `active` (their count is returned) and weight (STRIP, active). `slot` (count,) is -1 and
- * left so.
+ * seen: (nodes,) strips in which nodes were looked at last. slot: (count,) is -1 and left so.
  */
-static int weigh(const Sheet *s, const Areas *a, int64_t begin, int strip, const double *mixed,
-                 const int64_t *place, int64_t count, const double *onto, int64_t *slot,
-                 int64_t *active, double *weight) {
+static int find_active(const Sheet *s, const Areas *a, int64_t begin, int strip,
+                       const int64_t *place, int64_t count, const double *onto, int64_t *seen,
+                       int64_t *slot, int64_t *active) {
   int K = 0;
-  for (int pass = 0; pass < 2; pass++) {
-    for (int i = 0; i < strip; i++) {
-      int64_t t = a->triangle[begin + i];
-      double share[3] = {1.0, 1.0, 1.0}, c[3];
-      if (pass) /* where resistivities were mixed d sigma / d sigma_c = (sigma / sigma_c)^2 / 3 */
-        for (int k = 0; k < K; k++) weight[i * K + k] = 0.0;
-      if (pass && mixed && at_corners(s, t, mixed, c)) {
-        double mean = (1 / c[0] + 1 / c[1] + 1 / c[2]) / 3;
-        for (int k = 0; k < 3; k++) share[k] = 1 / (c[k] * c[k] * mean * mean);
-      }
-      for (int k = 0; k < 3; k++) {
-        int64_t p = s->corner_pressable[3 * t + k];
-        if (p < 0 || place[p] < 0) continue;
-        double by = -share[k] * s->area[t] / 3; /* minus the area that goes with the corner */
-        const double *row = onto ? onto + place[p] * count : NULL;
-        if (pass && !onto) weight[i * K + slot[place[p]]] += by;
-        for (int j = 0; pass && onto && j < K; j++) weight[i * K + j] += by * row[active[j]];
-        if (!pass && !onto && slot[place[p]] < 0) slot[place[p]] = K, active[K++] = place[p];
-        for (int64_t j = 0; !pass && onto && j < count; j++)
-          if (row[j] != 0 && slot[j] < 0) slot[j] = K, active[K++] = j;
-      }
-    }
+  for (int64_t i = 3 * begin; i < 3 * (begin + strip); i++) {
+    int64_t p = s->corner_pressable[3 * a->triangle[i / 3] + i % 3];
+    if (p < 0 || place[p] < 0 || seen[place[p]] == begin) continue;
+    seen[place[p]] = begin;
+    if (!onto) active[K++] = place[p];
+    for (int64_t j = 0; onto && j < count; j++)
+      if (onto[place[p] * count + j] != 0 && slot[j] < 0) slot[j] = K, active[K++] = j;
   }
   for (int k = 0; k < K; k++) slot[active[k]] = -1;
   return K;
+}
+
+/* How the conductivity of a strip's triangles goes by the parameters (K,) that move any of them.
+ *
+ * Out: weight (strip, K). slot: (count,) scratch that is -1 and left so.
+ */
+static void weigh(const Sheet *s, const Areas *a, int64_t begin, int strip, const double *mixed,
+                  const int64_t *place, int64_t count, const double *onto, int K,
+                  const int64_t *active, int64_t *slot, double *weight) {
+  for (int k = 0; k < K; k++) slot[active[k]] = k;
+  memset(weight, 0, sizeof(double) * strip * K);
+  for (int i = 0; i < strip; i++) {
+    int64_t t = a->triangle[begin + i];
+    double share[3] = {1.0, 1.0, 1.0}, c[3], *into = weight + i * K;
+    if (mixed && at_corners(s, t, mixed, c)) { /* d sigma / d sigma_c = (sigma / sigma_c)^2 / 3 */
+      double mean = (1 / c[0] + 1 / c[1] + 1 / c[2]) / 3;
+      for (int k = 0; k < 3; k++) share[k] = 1 / (c[k] * c[k] * mean * mean);
+    }
+    for (int k = 0; k < 3; k++) {
+      int64_t p = s->corner_pressable[3 * t + k];
+      if (p < 0 || place[p] < 0) continue;
+      double by = -share[k] * s->area[t] / 3; /* minus the area that goes with the corner */
+      if (!onto) into[slot[place[p]]] += by;
+      for (int j = 0; onto && j < K; j++) into[j] += by * onto[place[p] * count + active[j]];
+    }
+  }
+  for (int k = 0; k < K; k++) slot[active[k]] = -1;
 }
 
 /* Products (products, STRIP) of the fields (2, pairs, STRIP) of two pairs each in a strip's triangles. */
@@ -667,7 +700,7 @@ int differentiate(const Sheet *s, const Areas *a, int64_t nodes, const int64_t *
   int64_t most = onto || count < 3 * STRIP ? count : 3 * STRIP; /* that move a strip */
   size_t reals = a->nodes * P + STRIP * (2 * P + Q + most) + Q * (most + count) + 1;
   double *by_pair = malloc(sizeof(double) * reals);
-  int64_t *place = malloc(sizeof(int64_t) * (s->pressable + 2 * count + 1));
+  int64_t *place = malloc(sizeof(int64_t) * (s->pressable + 2 * count + nodes + 1));
   if (!by_pair || !place) {
     free(by_pair), free(place);
     return -1;
@@ -676,9 +709,9 @@ int differentiate(const Sheet *s, const Areas *a, int64_t nodes, const int64_t *
   double *weight = product + STRIP * Q;
   memset(fields, 0, sizeof(double) * 2 * P * STRIP);
   double *part = weight + STRIP * most, *summed = part + Q * most;
-  int64_t *slot = place + s->pressable, *active = slot + count;
+  int64_t *slot = place + s->pressable, *active = slot + count, *seen = active + count;
   for (int64_t i = 0; i < s->pressable; i++) place[i] = -1;
-  for (int64_t i = 0; i < nodes; i++) place[where[i]] = i;
+  for (int64_t i = 0; i < nodes; i++) place[where[i]] = i, seen[i] = -1;
   for (int64_t k = 0; k < count; k++) slot[k] = -1;
   memset(summed, 0, sizeof(double) * Q * count);
   for (int64_t i = 0; i < a->nodes; i++)
@@ -689,7 +722,8 @@ int differentiate(const Sheet *s, const Areas *a, int64_t nodes, const int64_t *
     }
   for (int64_t begin = 0; begin < a->triangles; begin += STRIP) {
     int strip = a->triangles - begin < STRIP ? a->triangles - begin : STRIP;
-    int K = weigh(s, a, begin, strip, mixed, place, count, onto, slot, active, weight);
+    int K = find_active(s, a, begin, strip, place, count, onto, seen, slot, active);
+    weigh(s, a, begin, strip, mixed, place, count, onto, K, active, slot, weight);
     field_products(s, a, begin, strip, by_pair, fields, product);
     multiply('N', 'N', K, Q, strip, 1.0, weight, K, product, STRIP, 0.0, part, K);
     for (int q = 0; q < Q; q++)

@@ -50,18 +50,16 @@ class _Library:
 def _functions(path: Path) -> dict[str, Any]:
     try:
         library = ctypes.CDLL(str(path))
-    except OSError as error:
-        state = "was built for another machine" if path.exists() else "is missing"
+        functions = {name: getattr(library, name) for name in _ARGUMENTS}
+    except (OSError, AttributeError) as error:
+        state = "is not of this machine and version" if path.exists() else "is missing"
         raise ModelError(
-            f"the compiled inner loop {state} ({error}); install a C compiler (or the package "
-            "ziglang) and install tactomo again: pip install --force-reinstall, or make setup in a "
-            "checkout"
+            f"the compiled inner loop {state} ({error}); install tactomo again, with a C compiler "
+            "at hand: pip install --force-reinstall tactomo, or make clean setup in a checkout"
         ) from error
     library.use_blas(*_routines())
-    functions = {}
-    for name, of_name in _ARGUMENTS.items():
-        functions[name] = getattr(library, name)
-        functions[name].argtypes = of_name
+    for name, function in functions.items():
+        function.argtypes = _ARGUMENTS[name]
     functions["draw"].restype, functions["conduct"].restype = _COUNT, None
     return functions
 

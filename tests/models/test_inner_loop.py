@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import weakref
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from measured import measured
 from numpy_drawing import Contacts
 from numpy_forward import NumpyForwardModel
-from tactomo_models import Artifact, SensorDescription
+from tactomo_models import Artifact, Channel, SensorDescription, inner_loop
 from tactomo_models.arrays import FloatArray, IntArray
-from tactomo_models.inner_loop import at
+from tactomo_models.errors import ModelError
+from tactomo_models.inner_loop import LIBRARY, at
 from tactomo_models.physics.forward import ForwardModel
+from tactomo_models.scene.field_fit import FieldFit
 from tactomo_models.scene.parameters import COLUMNS, EDGE, HARMONIC, HOLE, PEAK, SIZE, UNIT_M, X, Y
 from tactomo_models.scene.pressure_field import PressureField
 
@@ -106,6 +110,46 @@ def test_a_sheet_is_solved_and_differentiated_alike(
     )
 
 
+def test_a_sequence_of_evaluations_is_as_in_numpy(
+    model: ForwardModel, in_numpy: NumpyForwardModel, paper: SensorDescription
+) -> None:
+    """Of contacts that come, move, stay and go, with data that may have drifted."""
+    rng, fit = np.random.default_rng(7), FieldFit(model, paper)
+    bare, empty = model.bare_voltages, PressureField.on(model, None)
+    data = {
+        name: measured(0.1 * rng.normal(size=len(bare)), 1 + rng.random(len(bare)))
+        for name in fit.responses
+    }
+    data[Channel.STRUCTURE] = data[Channel.STRUCTURE].drifting(rng.normal(size=(len(bare), 3)))
+    for where in ("two in one", "two in one", "one", "nothing", "two apart", "beside electrodes"):
+        field = empty.of(each := contacts(where, "ellipses that fall"), 2)
+        fitted = fit.evaluate(field, field.join(each), fit.likely, data)
+        assert fitted is not None
+        drawing, slopes = fitted.drawing, fitted.drawing.slopes()
+        jacobians = []
+        for name, changes in data.items():
+            saturates = name == Channel.STRUCTURE
+            share, pressure = (
+                (drawing.enclosed, drawing.enclosed_kpa)
+                if saturates
+                else (drawing.share, drawing.pressure_kpa)
+            )
+            response = fit.responses[name]
+            ratio, *by = response.conductivity(share, pressure, fit.likely)
+            change = np.zeros(len(model.bare.pressable))
+            change[drawing.nodes] = model.at_rest[drawing.nodes] * (ratio - 1)
+            mixes = response.rises(fit.likely)
+            solved = in_numpy.solve(change, mix_resistivities=mixes, within=drawing.nodes)
+            relative = (solved.voltages - bare) / np.abs(bare)
+            agree(fitted.residuals[name], changes.weighted(relative - changes.change))
+            by_share, by_pressure = slopes[:2] if saturates else slopes[2:]
+            onto = by[0][:, None] * by_share + by[1][:, None] * by_pressure
+            onto = np.append(onto, by[2][:, None], axis=1) * model.at_rest[drawing.nodes, None]
+            by_parameter = in_numpy.jacobian(solved, drawing.nodes, onto)
+            jacobians.append(changes.weighted(by_parameter / np.abs(bare)[:, None]))
+        agree(fit.jacobian(fitted, data), np.concatenate(jacobians))
+
+
 def test_what_c_is_given_lives_as_long_as_its_address() -> None:
     """A property's array has nobody else: C once read what was freed."""
     array = np.arange(3)
@@ -115,3 +159,17 @@ def test_what_c_is_given_lives_as_long_as_its_address() -> None:
     assert alive() is not None
     del address
     assert alive() is None
+
+
+@pytest.mark.parametrize("state", ["is missing", "is not of this machine and version"])
+def test_a_library_that_cannot_be_used_says_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, forward: ForwardModel, state: str
+) -> None:
+    library = tmp_path / "libinner_loop.so"
+    if state != "is missing":
+        library.write_bytes(b"not of this machine")
+    monkeypatch.setattr(inner_loop, "_PATH", library)
+    for name in [*vars(LIBRARY)]:
+        monkeypatch.delattr(LIBRARY, name)  # as in a process that has not used it yet
+    with pytest.raises(ModelError, match=f"{state}.*install tactomo again"):
+        forward.solve(np.ones(len(forward.bare.pressable)))
