@@ -305,11 +305,21 @@ def play(
 
 
 def _reference(sequence: Sequence, rng: np.random.Generator) -> Reference:
-    """Mean of `REFERENCE_SCANS` scans; of one where scans at rest are without noise."""
-    count = REFERENCE_SCANS if any(sequence.rest_noise.values()) else 1
+    """Mean of `REFERENCE_SCANS` scans; where those have no noise, one, as `batch` takes it.
+
+    A file's single reference does not tell how noisy the scans are: they tell it themselves.
+    """
+    volts = sequence.volts
+    if not any(sequence.rest_noise.values()):
+        seen = [
+            volts.pressed[name] + std[:, None] * rng.standard_normal(volts.pressed[name].shape)
+            for name, std in sequence.noise.items()
+        ]
+        rest = [volts.rest[name] for name in sequence.noise]
+        return Reference(*rest).with_noise_of(sequence.description, *seen)
     scans = [
-        rest + sequence.rest_noise[name] * rng.standard_normal((count, len(rest)))
-        for name, rest in sequence.volts.rest.items()
+        rest + sequence.rest_noise[name] * rng.standard_normal((REFERENCE_SCANS, len(rest)))
+        for name, rest in volts.rest.items()
     ]
     return Reference.from_scans(*scans)
 

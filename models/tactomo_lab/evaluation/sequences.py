@@ -64,7 +64,7 @@ def mixed_sequence(
     require_both_channels(description)
     rng = np.random.default_rng(seed_of(seed_set, "mixed-moving", number))
     draw = Draw(description, rng, number)
-    steps = _draw_steps(draw)
+    steps = mixed_steps(draw)
     plan = by_hand_as_told(draw, *(tuple(step.presses.values()) for step in steps))
     planned = simulate_plan(description, plan, "mixed-moving", seed_set, number)
     at_rest = dict.fromkeys(BOTH_CHANNELS, 0.0)
@@ -91,7 +91,7 @@ def _noise_of_each(volts: SimulatedVolts, name: Channel) -> FloatArray:
     return np.asarray(np.sqrt(np.mean(change**2, axis=1)) * 10 ** (-NOISE_DB["each change"] / 20))
 
 
-def _draw_steps(draw: Draw) -> tuple[Step, ...]:
+def mixed_steps(draw: Draw) -> tuple[Step, ...]:
     lanes = draw.apart(MAX_CONTACTS - draw.number % MAX_CONTACTS, lambda: _draw_lane(draw))
     frames = int(draw.rng.integers(FRAMES[0], FRAMES[1] + 1))
     courses = dict(zip(INDENTERS, (_course(draw, lane, frames) for lane in lanes), strict=False))
