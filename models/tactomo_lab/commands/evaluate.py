@@ -259,7 +259,7 @@ def _print_scenes(settings: dict[str, Any], outcomes: Sequence[Outcome]) -> None
         groups,
         {"maps, cold start": MAPS, "contacts": CONTACTS},
         "worst: ICC that 95 % exceed; shape: ICC of the pressed shape; wrong: ICC below 0.8 "
-        "or another count, and no flag that says so. count: right; missed: of the true contacts; "
+        "or another count, and no flag that says so. counted: right; missed: of the true contacts; "
         "false: a scene; mm: centre error, median; Δσ: error of the magnitude, mean, share of the "
         "range; spread: largest minus smallest at one pressure; in σ: within one reported "
         "standard uncertainty, 68 % where that is right.",
@@ -279,12 +279,13 @@ FIGURES: dict[str, Callable[[Any], str]] = {
     "wrong": lambda s: f"{s.confidently_wrong:.0%}",
     "ms": lambda s: f"{s.seconds * 1e3:.0f}",
     "p99": lambda s: f"{s.seconds_99 * 1e3:.0f}",
-    "count": lambda s: f"{s.count_right:.0%}",
+    "counted": lambda s: f"{s.count_right:.0%}",
     "missed": lambda s: f"{s.missed:.0%}",
     "false": lambda s: f"{s.false:.2f}",
     "mm": lambda s: f"{s.centre_mm:.2f}",
     "p95": lambda s: f"{s.centre_mm_95:.1f}",
-    "peak": lambda s: f"{s.peak_right:.0%}",
+    "right to 10 %": lambda s: f"{s.peak_right:.0%}",
+    "surely wrong": lambda s: f"{s.peak_surely_wrong:.0%}",
     "area": lambda s: f"{s.area_error:.0%}",
     "Δσ": lambda s: f"{s.magnitude_error:.1%}",
     "spread": lambda s: f"{s.magnitude_spread:.0%}",
@@ -298,8 +299,8 @@ FIGURES: dict[str, Callable[[Any], str]] = {
     "ids": lambda s: str(s.switches),
 }
 MAPS = ("frames", "ICC", "worst", "shape", "RIE", "flagged", "wrong", "ms", "p99")
-CONTACTS = (*("count", "missed", "false", "mm", "p95", "area"), *("Δσ", "spread", "kPa", "in σ"))
+CONTACTS = (*("counted", "missed", "false", "mm", "p95", "area"), *("Δσ", "spread", "kPa", "in σ"))
 PHASES = (
-    *("frames", "ICC", "worst", "shape", "count", "lost", "most", "ids"),
+    *("frames", "ICC", "worst", "shape", "counted", "lost", "most", "ids"),
     *("flagged", "wrong", "ms", "p99"),
 )

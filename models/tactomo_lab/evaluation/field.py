@@ -1,4 +1,4 @@
-"""The scenes that a pressure field has to explain, in rows: soft, graded, made by hand, crowded.
+"""The scenes that a pressure field has to explain, in rows: soft, graded, mixed, crowded, moving.
 
 Still scenes, each reconstructed from a cold start and run to its end, and moving ones. The rows of
 ordinary scenes, rectangles and rings are `still_scenes`'; each of the others is the regime of that
@@ -16,7 +16,9 @@ from typing import Final
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_protocol import Channel
 
+from tactomo_lab.evaluation.moving import Sequence as MovingScene
 from tactomo_lab.evaluation.moving import draw_sequence, play
+from tactomo_lab.evaluation.sequences import NOISE_DB, NoiseOf, mixed_sequence
 from tactomo_lab.evaluation.stability import make_case
 from tactomo_lab.evaluation.still import Outcome, reconstruct_scenes
 from tactomo_lab.scenes.measures import FrameScore
@@ -35,10 +37,11 @@ from tactomo_lab.scenes.still_scenes import (
 MAX_CONTACTS = 4  # of a scene that is not crowded
 ORDINARY_DB = (40.0, 20.0, 10.0)  # of the change, as the paper tests
 SHAPES_DB = 40.0
-REGIME_ROWS: Final = ("hand-made", "soft", "soft-hand-made", "graded", "crowded", "many")
+REGIME_ROWS: Final = ("hand-made", "soft", "soft-hand-made", "graded", "crowded", "many", "mixed")
 STILL_ROWS: Final = ("ordinary", "rectangles-rings", *REGIME_ROWS)
-ROWS: Final = (*STILL_ROWS, "moving")
-SCENES_A_SEQUENCE = 10  # a moving scene has 146 frames and takes a minute to simulate
+MOVING_ROWS: Final = ("moving", "mixed-moving")
+ROWS: Final = (*STILL_ROWS, *MOVING_ROWS)
+SCENES_A_SEQUENCE = 10  # a moving scene has some 100 frames and takes a minute to simulate
 
 
 def scores_of_row(
@@ -52,8 +55,9 @@ def scores_of_row(
         DataError: the sensor has a single channel, or no room for what presses.
         ModelError: the method is not to be had for this sensor, or is the user's own and failed.
     """
-    if row == "moving":
-        return {row: _moving(description, method, seed_set, count)}
+    if row in MOVING_ROWS:
+        sequences = sequences_of_row(description, row, seed_set, count)
+        return {line: _played(scenes, method) for line, scenes in sequences.items()}
     lines = scenes_of_row(description, row, seed_set, count)
     return {
         line: (outcome.score for outcome in reconstruct_scenes(scenes, method))
@@ -61,12 +65,27 @@ def scores_of_row(
     }
 
 
-def _moving(
-    description: SensorDescription, method: str, seed_set: SeedSet, count: int
-) -> Iterator[FrameScore]:
+def sequences_of_row(
+    description: SensorDescription, row: str, seed_set: SeedSet, count: int
+) -> dict[str, Iterator[MovingScene]]:
+    """Moving scenes of one of `MOVING_ROWS`, by the line's name; the same ones every time.
+
+    Arguments and errors are those of `scores_of_row`.
+    """
+    numbers = range(ceil(count / SCENES_A_SEQUENCE))
+    if row == "moving":
+        return {row: (draw_sequence(description, seed_set, number) for number in numbers)}
+
+    def mixed(noise_of: NoiseOf) -> Iterator[MovingScene]:
+        for number in numbers:
+            yield mixed_sequence(description, seed_set, number, noise_of)
+
+    return {f"{row}, noise of {noise_of}": mixed(noise_of) for noise_of in NOISE_DB}
+
+
+def _played(sequences: Iterator[MovingScene], method: str) -> Iterator[FrameScore]:
     """Frames in which no scan is lost: a map of half a measurement is another question."""
-    for number in range(ceil(count / SCENES_A_SEQUENCE)):
-        sequence = draw_sequence(description, seed_set, number)
+    for sequence in sequences:
         for step, score in zip(sequence.steps, play(sequence, method), strict=True):
             if not step.lost:
                 yield score
@@ -124,8 +143,10 @@ def _of_regime(
     case = make_case(description, regime, seed_set, number)
     plan, (scans,) = case.plan, case.frames
     (presses,) = plan.frames
+    shapes = {press.shape for press in presses}
+    shape: SceneShape = "mixed" if len(shapes) > 1 else shapes.pop()
     return EvaluationScene(
-        layout=Layout(seed_set, number, presses, "ellipse", plan.contrast, plan.opposite),
+        layout=Layout(seed_set, number, presses, shape, plan.contrast, plan.opposite),
         description=case.description,
         snr_db=plan.snr_db,
         snr_of=plan.snr_of,

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
+from tactomo_models.arrays import FloatArray
 from tactomo_models.errors import MethodError
 from tactomo_models.physics.artifact import load_or_build_artifact
 from tactomo_models.reconstruct import Reconstructor
@@ -153,8 +154,9 @@ class Sequence:
     true_description: SensorDescription  # the sensor as it is, with its true contrast
     steps: tuple[Step, ...]  # the frames
     volts: SimulatedVolts  # noise-free voltages, pressed (T, M)
-    snr_db: float  # signal-to-noise ratio, over all frames in which something presses
-    noise: dict[Channel, float]  # standard deviation of the noise of each channel, volts
+    snr_db: float  # signal-to-noise ratio
+    noise: dict[Channel, FloatArray]  # (T,) standard deviation of each channel's noise, volts
+    rest_noise: dict[Channel, float]  # likewise of the unpressed scans
     seed: np.random.SeedSequence  # of the noise
 
 
@@ -192,6 +194,7 @@ def draw_sequence(
     volts = kept_volts(what, lambda: _simulate(true_sensor, steps, sheet_seed))
     under_load = np.array([bool(step.presses) for step in steps])
     loaded = replace(volts, pressed={n: scans[under_load] for n, scans in volts.pressed.items()})
+    noise = {name: noise_std(loaded, name, snr_db, snr_of) for name in BOTH_CHANNELS}
     return Sequence(
         name=f"{seed_set} {number}",
         description=sensor,
@@ -199,7 +202,8 @@ def draw_sequence(
         steps=steps,
         volts=volts,
         snr_db=snr_db,
-        noise={name: noise_std(loaded, name, snr_db, snr_of) for name in BOTH_CHANNELS},
+        noise={name: np.full(len(steps), std) for name, std in noise.items()},
+        rest_noise=noise,
         seed=seed_of(seed_set, "moving noise", number),
     )
 
@@ -283,7 +287,7 @@ def play(
             reconstructor.set_reference(_reference(sequence, rng))
         scans = {
             name: sequence.volts.pressed[name][index]
-            + sequence.noise[name] * rng.standard_normal(len(sequence.volts.rest[name]))
+            + sequence.noise[name][index] * rng.standard_normal(len(sequence.volts.rest[name]))
             for name in BOTH_CHANNELS
         }
         for name in step.lost:
@@ -301,9 +305,21 @@ def play(
 
 
 def _reference(sequence: Sequence, rng: np.random.Generator) -> Reference:
+    """Mean of `REFERENCE_SCANS` scans; where those have no noise, one, as `batch` takes it.
+
+    A file's single reference does not tell how noisy the scans are: they tell it themselves.
+    """
+    volts = sequence.volts
+    if not any(sequence.rest_noise.values()):
+        seen = [
+            volts.pressed[name] + std[:, None] * rng.standard_normal(volts.pressed[name].shape)
+            for name, std in sequence.noise.items()
+        ]
+        rest = [volts.rest[name] for name in sequence.noise]
+        return Reference(*rest).with_noise_of(sequence.description, *seen)
     scans = [
-        rest + sequence.noise[name] * rng.standard_normal((REFERENCE_SCANS, len(rest)))
-        for name, rest in sequence.volts.rest.items()
+        rest + sequence.rest_noise[name] * rng.standard_normal((REFERENCE_SCANS, len(rest)))
+        for name, rest in volts.rest.items()
     ]
     return Reference.from_scans(*scans)
 

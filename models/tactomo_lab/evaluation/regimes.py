@@ -13,11 +13,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
+from tactomo_models.arrays import FloatArray
 from tactomo_models.errors import DataError
-from tactomo_models.scene.press import Press, Profile
+from tactomo_models.scene.press import Press, Profile, Shape
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.sensor.description_file import load_description
 from tactomo_protocol import Channel
@@ -30,18 +31,25 @@ from tactomo_lab.scenes.still_scenes import (
     PRESSURE_KPA,
     SeedSet,
     SnrOf,
+    draw_indenter,
     gap_m,
     outline_of,
     seed_of,
 )
 
 Range = tuple[float, float]
+Placed = TypeVar("Placed", bound=Press)
 SensorOf = Callable[[SensorDescription], SensorDescription]
 
 SETTLED_FRAMES = 6  # of a scene that stays, before something happens
 SLIDE_FRAMES = 4
 CONVERTER_DB = 60.0  # of the voltage: a good converter's, where changes are small or none
 SOFT_KPA = (180.0, 300.0)  # peak under a ball: well above where the magnitude channel answers
+FLAT_KPA = (145.0, 230.0)  # under a flat indenter beside balls
+KINDS: Final[tuple[tuple[Shape, Profile], ...]] = (
+    *(("ellipse", "flat"), ("rectangle", "flat"), ("ring", "flat")),
+    ("ellipse", "dome"),
+)
 
 
 @dataclass(frozen=True)
@@ -123,7 +131,26 @@ class Draw:
             profile=profile,
         )
 
-    def apart(self, count: int, press: Callable[[], Press], gap_mm: float = 9) -> tuple[Press, ...]:
+    def any_kind(self) -> Press:
+        """An indenter of one of `KINDS`, of the evaluation's sizes."""
+        shape, profile = KINDS[self.rng.integers(len(KINDS))]
+        return draw_indenter(
+            self.description,
+            self.rng,
+            shape,
+            profile=profile,
+            pressure_kpa=self.kpa_of(profile),
+            scale=scale_of(self.description),
+        )
+
+    @staticmethod
+    def kpa_of(profile: Profile) -> Range:
+        """Peak pressures of indenters of `KINDS`."""
+        return SOFT_KPA if profile == "dome" else FLAT_KPA
+
+    def apart(
+        self, count: int, press: Callable[[], Placed], gap_mm: float = 9
+    ) -> tuple[Placed, ...]:
         """So many inside the sensing area, outlines at least so far from each other."""
         return placed_apart(self.description, self.rng, count, gap_mm * self.mm, press)
 
@@ -312,19 +339,37 @@ def _soft(draw: Draw) -> Plan:
 
 @regime("hand-made", "Electrodes 1 mm off, contact impedances by 30 %, sheets uneven by 10 %.")
 def _hand_made(draw: Draw) -> Plan:
-    return _by_hand(draw, draw.plan(draw.scene()))
+    return _by_hand(draw.plan(draw.scene()), _displaced_m(draw))
 
 
 @regime("soft-hand-made", "Balls on a skin made by hand.")
 def _soft_hand_made(draw: Draw) -> Plan:
-    return _by_hand(draw, _soft(draw))
+    return _by_hand(_soft(draw), _displaced_m(draw))
 
 
-def _by_hand(draw: Draw, plan: Plan) -> Plan:
-    off_m = draw.mm * draw.rng.standard_normal(draw.description.electrode_count)
+def _displaced_m(draw: Draw) -> FloatArray:
+    return np.asarray(draw.mm * draw.rng.standard_normal(draw.description.electrode_count))
+
+
+def _by_hand(plan: Plan, displaced_m: FloatArray) -> Plan:
     return replace(
-        plan, unevenness=0.10, impedance_deviation=0.30, displaced_m=tuple(off_m.tolist())
+        plan, unevenness=0.10, impedance_deviation=0.30, displaced_m=tuple(displaced_m.tolist())
     )
+
+
+@regime("mixed", "Flat ellipses, rectangles, rings and balls side by side, on a skin made by hand.")
+def _mixed(draw: Draw) -> Plan:
+    return by_hand_as_told(draw, draw.apart(1 + draw.number % 4, draw.any_kind))
+
+
+def by_hand_as_told(draw: Draw, *frames: Sequence[Press]) -> Plan:
+    """A plan on a skin made by hand, electrodes off by up to 1 mm, that answers as described."""
+    structure = draw.description.structure
+    assert structure is not None
+    ratio = structure.saturated_ratio
+    off_m = draw.mm * draw.rng.uniform(-1, 1, draw.description.electrode_count)
+    plan = replace(draw.plan(*frames), contrast=max(ratio, 1 / ratio), opposite=False)
+    return replace(_by_hand(plan, off_m), snr_db=CONVERTER_DB, snr_of="voltage")
 
 
 def one_graded_sheet(description: SensorDescription) -> SensorDescription:

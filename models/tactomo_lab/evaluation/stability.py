@@ -76,6 +76,33 @@ def make_case(description: SensorDescription, regime: str, seed_set: SeedSet, nu
     require_both_channels(description)
     description = REGIMES[regime].sensor_of(description)
     plan = draw_plan(description, regime, seed_set, number)
+    planned = simulate_plan(description, plan, regime, seed_set, number)
+    rng = np.random.default_rng(seed_of(seed_set, f"stability {regime} noise", number))
+    reference, frames = _measure(plan, planned.volts, description, rng)
+    return Case(
+        regime=regime,
+        name=f"{seed_set} {number}",
+        plan=plan,
+        description=planned.told,
+        reference=reference,
+        frames=frames,
+        truth=truth_of(planned.true, plan.frames[-1]),
+    )
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A plan on its skin, without noise."""
+
+    told: SensorDescription  # the sensor as the reconstructor is told
+    true: SensorDescription  # the sensor as it is
+    volts: SimulatedVolts  # at the tare (M,) and in every frame (T, M)
+
+
+def simulate_plan(
+    description: SensorDescription, plan: Plan, regime: str, seed_set: SeedSet, number: int
+) -> Planned:
+    """Simulate a plan of a regime's case on that case's sheets, or read it from the cache."""
     true = with_opposite_magnitude(description) if plan.opposite else description
     told = true if plan.sign_told else with_opposite_magnitude(true)
     if true.structure is not None:
@@ -83,17 +110,7 @@ def make_case(description: SensorDescription, regime: str, seed_set: SeedSet, nu
     seed = seed_of(seed_set, f"stability {regime} sheet", number)
     what = f"{SIMULATION} {seed_set} {regime} {number} {plan!r} {true.model_dump_json()}"
     volts = kept_volts(what, lambda: _simulate(plan, true, _fine_mesh(description), seed))
-    rng = np.random.default_rng(seed_of(seed_set, f"stability {regime} noise", number))
-    reference, frames = _measure(plan, volts, description, rng)
-    return Case(
-        regime=regime,
-        name=f"{seed_set} {number}",
-        plan=plan,
-        description=told,
-        reference=reference,
-        frames=frames,
-        truth=truth_of(true, plan.frames[-1]),
-    )
+    return Planned(told, true, volts)
 
 
 @lru_cache(maxsize=1)

@@ -19,6 +19,7 @@ from scipy.spatial.distance import cdist
 from tactomo_models.arrays import FloatArray
 from tactomo_models.scans.plausibility import DISTRUST
 from tactomo_models.scene.contacts import Contact
+from tactomo_models.scene.pressure import PressureRange
 from tactomo_models.scene.reconstruction import Reconstruction
 from tactomo_models.sensor.description import SensorDescription
 
@@ -29,6 +30,7 @@ MATCH_M = 0.012  # centres farther apart belong to different contacts
 WRONG_ICC = 0.8  # a map that correlates less shows something else than what presses
 BAD_ICC = 0.7  # one that correlates less should have been flagged
 RIGHT_PEAK = 0.10  # largest relative error of a peak pressure that is right
+SURE_SIGMAS = 3.0  # standard uncertainties that an error exceeds in one of 370 honest reports
 FULL_RANGE_KPA = PRESSURE_KPA[1]
 BAND_KPA = 10.0  # pressures that count as one where errors at one pressure are compared
 
@@ -83,6 +85,7 @@ class ContactScore:
     y_error_sigmas: float = float("nan")
     area_error_sigmas: float = float("nan")
     peak_error_sigmas: float = float("nan")
+    above: bool = False  #: whether its pressure was reported as above the range
 
     @property
     def missed(self) -> bool:
@@ -93,6 +96,20 @@ class ContactScore:
     def peak_right(self) -> bool:
         """Whether it was found with its peak pressure, or nearly."""
         return abs(self.peak_error) <= RIGHT_PEAK
+
+    @property
+    def surely_wrong(self) -> bool | None:
+        """Whether its peak is off by more than it may be, and by more than was said.
+
+        That is by more than `RIGHT_PEAK` and `SURE_SIGMAS` standard uncertainties; or it is
+        reported above the range's top and lies below that by more than `RIGHT_PEAK`. None where
+        nothing was claimed: missed, below the range or unknown, or without an uncertainty.
+        """
+        if self.above:
+            return self.peak_error > RIGHT_PEAK
+        if not np.isfinite(self.peak_error_sigmas):
+            return None
+        return not self.peak_right and abs(self.peak_error_sigmas) > SURE_SIGMAS
 
 
 @dataclass(frozen=True)
@@ -196,6 +213,7 @@ def score_contact(
         y_error_sigmas=_sigmas(found.y_m - true.y_m, found.y_sigma_m),
         area_error_sigmas=_sigmas(found.area_m2 - true.area_m2, found.area_sigma_m2),
         peak_error_sigmas=_sigmas(found.peak_kpa - true.pressure_kpa, found.peak_sigma_kpa),
+        above=found.pressure_range is PressureRange.ABOVE,
     )
 
 
@@ -245,6 +263,9 @@ class Summary:
     #: share of the true contacts whose peak pressure is right to `RIGHT_PEAK`, of those that the
     #: magnitude channel answers to
     peak_right: float
+    #: share of the peaks told with an uncertainty, or as above the range, that are surely wrong;
+    #: see `ContactScore.surely_wrong`
+    peak_surely_wrong: float
     distrusted: float  #: share of scenes flagged as not to be trusted
     bad_unflagged: float  #: share of scenes with an ICC below `BAD_ICC` and not flagged so
     good_flagged: float  #: share of the other scenes that are flagged so
@@ -284,6 +305,9 @@ def summarise(scores: Sequence[FrameScore]) -> Summary:
         area_within_sigma=_share_within_one([contact.area_error_sigmas for contact in matched]),
         peak_within_sigma=_share_within_one([contact.peak_error_sigmas for contact in matched]),
         peak_right=mean(contact.peak_right for contact in contacts if contact.magnitude > 0),
+        peak_surely_wrong=mean(
+            wrong for contact in matched if (wrong := contact.surely_wrong) is not None
+        ),
         distrusted=mean(one.distrusted for one in scores),
         bad_unflagged=mean(one.bad and not one.distrusted for one in scores),
         good_flagged=mean(one.distrusted for one in scores if not one.bad),

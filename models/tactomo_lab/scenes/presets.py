@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Final, Literal, TypeVar
 
 import numpy as np
 from tactomo_models.arrays import FloatArray
@@ -23,6 +23,7 @@ from tactomo_models.sensor.description import SensorDescription
 from tactomo_lab.scenes.still_scenes import CONTRAST, gap_m, outline_of, seed_of
 
 PresetName = Literal["paper", "robust"]
+Placed = TypeVar("Placed", bound=Press)
 SCENES: Final[dict[PresetName, int]] = {"paper": 12_000, "robust": 24_000}  # of a whole set
 
 SIDE_M = 0.150  # of the sheet that the lengths below are for
@@ -194,8 +195,8 @@ def placed_apart(
     rng: np.random.Generator,
     count: int,
     least_gap_m: float,
-    draw: Callable[[], Press],
-) -> tuple[Press, ...]:
+    draw: Callable[[], Placed],
+) -> tuple[Placed, ...]:
     """Draw contacts inside the sensing area that lie apart; anew from the first if one has no room.
 
     Those that have no room for long are drawn smaller.
@@ -203,7 +204,7 @@ def placed_apart(
     frame_m = description.sheet.frame_width_m
     for trial in range(300):
         shrink = min(1.0, 60 / (trial + 1))
-        placed: list[Press] = []
+        placed: list[Placed] = []
         for _ in range(40 * count):
             if len(placed) == count:
                 break

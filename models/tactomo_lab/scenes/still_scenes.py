@@ -23,7 +23,7 @@ from tactomo_models.arrays import FloatArray
 from tactomo_models.errors import DataError
 from tactomo_models.physics.mesh import SheetMesh
 from tactomo_models.scans.reference import Reference
-from tactomo_models.scene.press import Press, Shape
+from tactomo_models.scene.press import Press, Profile, Shape
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_protocol import Channel
 
@@ -181,17 +181,31 @@ def _draw_press(
     description: SensorDescription, shape: SceneShape, rng: np.random.Generator
 ) -> Press:
     own: Shape = SHAPES[rng.integers(3)] if shape == "mixed" else shape
+    return draw_indenter(description, rng, own)
+
+
+def draw_indenter(
+    description: SensorDescription,
+    rng: np.random.Generator,
+    shape: Shape,
+    *,
+    profile: Profile = "flat",
+    pressure_kpa: tuple[float, float] = PRESSURE_KPA,  # of its peak
+    scale: float = 1.0,  # on `HALF_AXIS_M`
+) -> Press:
+    """Draw an indenter of a shape anywhere on the sheet, turned any way."""
     least, most = HALF_AXIS_M
-    least = RING_HALF_AXIS_M if own == "ring" else least
+    least = RING_HALF_AXIS_M if shape == "ring" else least
     long = rng.uniform(least, most)
     return Press(
         x_m=rng.uniform(-0.5, 0.5) * description.width_m,
         y_m=rng.uniform(-0.5, 0.5) * description.height_m,
-        pressure_kpa=rng.uniform(*PRESSURE_KPA),
-        radius_m=long,
-        radius_y_m=rng.uniform(max(least, long / MAX_ASPECT), long),
+        pressure_kpa=rng.uniform(*pressure_kpa),
+        radius_m=scale * long,
+        radius_y_m=scale * rng.uniform(max(least, long / MAX_ASPECT), long),
         angle_rad=rng.uniform(0, np.pi),
-        shape=own,
+        shape=shape,
+        profile=profile,
     )
 
 

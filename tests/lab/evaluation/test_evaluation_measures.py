@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tactomo_lab.scenes.measures import (
     MATCH_M,
+    ContactScore,
     SceneScore,
     correlation,
     full_range,
@@ -21,6 +23,7 @@ from tactomo_lab.scenes.measures import (
 )
 from tactomo_lab.scenes.simulation import TrueContact
 from tactomo_models import Contact, SensorDescription
+from tactomo_models.scene.pressure import PressureRange
 
 TRUE = TrueContact(0.01, -0.02, 400e-6, 180.0, 0.15, "ellipse")
 FOUND = Contact(7, 0.01, -0.02, 400e-6, 0.15, 0.01, 180.0)
@@ -64,6 +67,7 @@ def test_a_contact_is_scored_in_the_units_it_says(paper: SensorDescription) -> N
     )
     of_peak = replace(FOUND, peak_kpa=190.0, peak_sigma_kpa=4.0)
     assert score_contact(paper, TRUE, of_peak).peak_error_sigmas == pytest.approx(2.5)
+    assert not score_contact(paper, TRUE, of_peak).above
     one = score_contact(paper, TRUE, off)
     assert one.centre_error_mm == pytest.approx(5)
     assert one.area_error == pytest.approx(0.25)
@@ -126,6 +130,44 @@ def test_a_summary_by_hand(paper: SensorDescription) -> None:
     assert all_of.distrusted == pytest.approx(1 / 3)
     assert all_of.confidently_wrong == pytest.approx(1 / 3)
     assert all_of.seconds == 0.2
+
+
+def told(paper: SensorDescription, peak_kpa: float, sigma_kpa: float, **other: Any) -> ContactScore:
+    found = replace(FOUND, peak_kpa=peak_kpa, peak_sigma_kpa=sigma_kpa, **other)
+    return score_contact(paper, replace(TRUE, pressure_kpa=200.0), found)
+
+
+def test_a_peak_is_surely_wrong_by_three_sigmas_and_ten_percent(paper: SensorDescription) -> None:
+    assert told(paper, 170.0, 9.0).surely_wrong is True
+    assert told(paper, 170.0, 11.0).surely_wrong is False
+    assert told(paper, 181.0, 1.0).surely_wrong is False
+    assert told(paper, 230.0, 9.0).surely_wrong is True
+    assert told(paper, 150.0, float("nan")).surely_wrong is None
+
+
+def test_a_peak_told_above_a_range_that_it_lies_in_is_surely_wrong(
+    paper: SensorDescription,
+) -> None:
+    above = {"pressure_range": PressureRange.ABOVE}
+    assert told(paper, 225.0, float("nan"), **above).surely_wrong is True
+    assert told(paper, 215.0, float("nan"), **above).surely_wrong is False
+    assert told(paper, 150.0, float("nan"), **above).surely_wrong is False  # it is above
+
+
+def test_shares_of_peaks(paper: SensorDescription) -> None:
+    """Of the true contacts, of those with a sigma, and of those with that or told above."""
+    unknown = float("nan")
+    frames = [
+        *(told(paper, 170.0, 9.0), told(paper, 199.0, 2.0), told(paper, 204.0, 2.0)),
+        *(told(paper, 215.0, unknown, pressure_range=PressureRange.ABOVE),),
+        *(told(paper, 150.0, unknown), score_contact(paper, TRUE, None)),
+    ]
+    all_of = summarise([replace(scene(paper, FOUND), contacts=(one,)) for one in frames])
+    assert all_of.peak_right == pytest.approx(3 / 6)
+    assert all_of.peak_within_sigma == pytest.approx(1 / 3)
+    assert all_of.peak_surely_wrong == pytest.approx(1 / 4)
+    nothing = summarise([scene(paper, None)])
+    assert np.isnan(nothing.peak_surely_wrong)
 
 
 def test_what_was_never_measured_is_nan(paper: SensorDescription) -> None:

@@ -33,6 +33,7 @@ from tactomo_models import Artifact, Press, SensorDescription, SkinSimulator
 from tactomo_models.scene.tracking import MAX_MISSED
 from tactomo_protocol import Channel
 
+NOISE = {Channel.MAGNITUDE: 2e-6, Channel.STRUCTURE: 2e-5}
 PLACES_MM = {"A": (-38, -38), "B": (35, 10)}
 
 
@@ -86,7 +87,8 @@ def sequence(paper: SensorDescription, simulator: SkinSimulator, *steps: Step) -
             rest, {name: np.array([scan[name] for scan in scans]) for name in BOTH_CHANNELS}
         ),
         snr_db=40.0,
-        noise={Channel.MAGNITUDE: 2e-6, Channel.STRUCTURE: 2e-5},
+        noise={name: np.full(len(steps), std) for name, std in NOISE.items()},
+        rest_noise=NOISE,
         seed=np.random.SeedSequence(0),
     )
 
@@ -220,9 +222,9 @@ def test_a_sequence_is_drawn_once_and_kept(
     assert len(first.volts.pressed[Channel.MAGNITUDE]) == len(first.steps)
     loaded = [bool(step.presses) for step in first.steps]
     change = first.volts.pressed[Channel.STRUCTURE] - first.volts.rest[Channel.STRUCTURE]
-    assert first.noise[Channel.STRUCTURE] == pytest.approx(
-        0.01 * np.sqrt(np.mean(change[loaded] ** 2))
-    )
+    std = 0.01 * np.sqrt(np.mean(change[loaded] ** 2))
+    assert first.rest_noise[Channel.STRUCTURE] == pytest.approx(std)
+    np.testing.assert_allclose(first.noise[Channel.STRUCTURE], std)
     quiet = np.abs(change).max(axis=1) == 0
     np.testing.assert_array_equal(quiet, ~np.array(loaded))
 

@@ -7,6 +7,7 @@ import pytest
 from tactomo_lab.commands.evaluate_field import EVEN_FIT
 from tactomo_lab.evaluation.field import STILL_ROWS, middle_press, scenes_of_row, scores_of_row
 from tactomo_lab.evaluation.moving import draw_sequence
+from tactomo_lab.evaluation.sequences import NOISE_DB, mixed_sequence
 from tactomo_lab.scenes.measures import summarise
 from tactomo_lab.scenes.still_scenes import EvaluationScene
 from tactomo_models import DataError, SensorDescription
@@ -84,6 +85,15 @@ def test_an_even_pressure_is_fitted_to_the_middle_press(small: SensorDescription
     (sure,), (unsure,) = even.frame.contacts, field.frame.contacts
     assert sure.edge == 0
     assert sure.peak_sigma_kpa < unsure.peak_sigma_kpa
+
+
+@pytest.mark.slow
+def test_mixed_moving_presses_are_scored_at_both_noises(small: SensorDescription) -> None:
+    lines = scores_of_row(small, "mixed-moving", "tikhonov", "tuning", 1)
+    assert list(lines) == [f"mixed-moving, noise of {of}" for of in ("each change", "voltage")]
+    for noise_of, scores in zip(NOISE_DB, lines.values(), strict=True):
+        frames = len(mixed_sequence(small, "tuning", 0, noise_of).steps)
+        assert summarise(list(scores)).frames == frames
 
 
 def test_a_sensor_of_one_channel_has_no_rows(small: SensorDescription) -> None:

@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from tactomo_lab.evaluation.regimes import REGIMES, Plan, draw_plan
+from tactomo_lab.evaluation.regimes import KINDS, REGIMES, Plan, draw_plan
 from tactomo_lab.evaluation.stability import (
     Case,
     CaseScore,
@@ -31,6 +31,7 @@ from tactomo_models import Artifact, DataError, Reconstructor, SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics import tikhonov as linear
 from tactomo_models.physics.bare_sheet import exchanged
+from tactomo_models.scene.press import Press, Profile, Shape
 from tactomo_protocol import Channel
 from variants import variant
 
@@ -61,6 +62,15 @@ def test_regimes_are_what_they_are_called(paper: SensorDescription) -> None:
     assert 1 <= min(gaps) < 2
     assert 5 <= max(gaps) < 6.1
     assert {len(plan.frames[0]) for plan in plans(paper, "many")} == {8, 9, 10}
+    mixed = [plan.frames[0] for plan in plans(paper, "mixed")]
+    assert [len(presses) for presses in mixed] == [1, 2, 3, 4] * 2
+    assert {kind(press) for presses in mixed for press in presses} == set(KINDS)
+    assert max(len({kind(press) for press in presses}) for presses in mixed) >= 3
+    for press in (press for presses in mixed for press in presses):
+        least, most = (180, 300) if press.profile == "dome" else (145, 230)
+        assert least <= press.pressure_kpa <= most
+        assert press.radius_y_m is not None
+        assert 0.007 <= press.radius_y_m <= press.radius_m <= 0.020
     for plan in plans(paper, "many"):
         assert all(gap_m(a, b) > 0.005 for a, b in combinations(plan.frames[0], 2))
     for plan in plans(paper, "edges"):
@@ -76,6 +86,20 @@ def test_regimes_are_what_they_are_called(paper: SensorDescription) -> None:
         for plan in plans(paper, regime):
             (a,), (b,) = plan.frames[-2:]
             assert 3 <= 1e3 * np.hypot(b.x_m - a.x_m, b.y_m - a.y_m) <= 10
+
+
+def test_mixed_presses_are_on_skins_made_by_hand(paper: SensorDescription) -> None:
+    for plan in plans(paper, "mixed"):
+        assert (plan.unevenness, plan.impedance_deviation) == (0.10, 0.30)
+        off_mm = 1e3 * np.abs(plan.displaced_m)
+        assert len(off_mm) == 16
+        assert 0.5 < off_mm.max() <= 1
+        assert (plan.snr_db, plan.snr_of) == (60, "voltage")
+        assert (plan.contrast, plan.opposite) == (100, False)  # as described
+
+
+def kind(press: Press) -> tuple[Shape, Profile]:
+    return press.shape, press.profile
 
 
 def centre(plan: Plan) -> tuple[float, float]:
