@@ -289,6 +289,15 @@ class FieldAccountant:
             force_n=1e3 * total * scale,
             force_sigma_n=1e3 * scale * np.hypot(sigma(weight @ by_force), total * by_edge),
             edge=edges,
+            total_force_n=float(1e3 * total @ scale),
+            # Errors of contacts that touch go against each other; those of their outlines do not.
+            total_force_sigma_n=1e3
+            * float(
+                np.hypot(
+                    sigma((scale @ (weight @ by_force))[None])[0],
+                    np.linalg.norm(scale * total * by_edge),
+                )
+            ),
         )
         return known
 
@@ -330,6 +339,7 @@ def _mean(one: FieldAccount, other: FieldAccount, share: float) -> FieldAccount:
     if one.contacts is not None and other.contacts is not None:
         a, b = one.contacts, other.contacts
         is_evener = b.edge < a.edge
+        totals = np.asarray(a.total_force_n), np.asarray(b.total_force_n)
         contacts = FieldContacts(
             peak_magnitude=mean(a.peak_magnitude, b.peak_magnitude),
             peak_magnitude_sigma=spread(a.peak_magnitude_sigma, a.peak_magnitude, b.peak_magnitude),
@@ -341,6 +351,8 @@ def _mean(one: FieldAccount, other: FieldAccount, share: float) -> FieldAccount:
             force_n=mean(a.force_n, b.force_n),
             force_sigma_n=spread(a.force_sigma_n, a.force_n, b.force_n),
             edge=a.edge,
+            total_force_n=float(mean(*totals)),
+            total_force_sigma_n=float(spread(np.asarray(a.total_force_sigma_n), *totals)),
         )
     areas = replace(
         one.areas,
