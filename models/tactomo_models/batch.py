@@ -215,6 +215,8 @@ def frame_arrays(
         "structure": np.array([absent if f.structure is None else f.structure for f in frames]),
         "misfit": column([f.misfit for f in frames]),
         "confidence": column([f.confidence for f in frames]),
+        "force_n": column([f.force_n for f in frames]),
+        "force_sigma_n": column([f.force_sigma_n for f in frames]),
         "flags": np.array([int(f.flags) for f in frames], dtype=np.uint32),
         "contact_frame": np.array([i for i, _ in contacts], dtype=np.int64),
         "contact_x_mm": column([c.x_m * 1e3 for _, c in contacts]),

@@ -31,7 +31,7 @@ from tactomo_models.scans.measurement import Comparator, Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scans.reference import Reference
 from tactomo_models.scene.areas import Areas
-from tactomo_models.scene.contacts import contacts_of, pressure_map
+from tactomo_models.scene.contacts import contacts_of, pressure_map, total_force
 from tactomo_models.scene.pressure import PressureCurve, PressureRange, described_curve
 from tactomo_models.scene.reconstruction import Reconstruction
 from tactomo_models.scene.tracking import ContactTracker
@@ -327,6 +327,7 @@ class Reconstructor:
             misfit=misfit,
             flags=flags,
             stage_s=measurement.stage_s,
+            force_n=0.0 if changes else float("nan"),
         )
 
     def _frame(self, estimate: Estimate, measurement: Measurement) -> Reconstruction:
@@ -357,6 +358,7 @@ class Reconstructor:
                 contacts = (self.taught.corrected(contacts[0], measurement, tier),)
             if not contacts[0].taught:
                 flags |= Flag.UNTAUGHT
+        force_n, force_sigma_n = total_force(contacts, self.curve, field)
         pressure = None
         if estimate.tells_pressure and has_magnitude:
             pressure = pressure_map(areas, contacts, account.pressure_kpa if account else None)
@@ -371,6 +373,8 @@ class Reconstructor:
             flags=flags,
             stage_s=measurement.stage_s,
             confidence=estimate.confidence,
+            force_n=force_n,
+            force_sigma_n=force_sigma_n,
         )
 
     def _areas_of(self, estimate: Estimate) -> tuple[Areas, FloatArray, FloatArray]:

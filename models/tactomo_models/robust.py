@@ -6,6 +6,8 @@ import numpy as np
 
 from tactomo_models.arrays import FloatArray
 
+HUBER_EFFICIENCY = 0.73  # degrees of freedom of `huber_sigma` for each value of normal noise
+
 
 def robust_sigma(deviations: FloatArray) -> float:
     """Return the standard deviation of normal noise whose deviations (any shape) these are.
@@ -14,6 +16,21 @@ def robust_sigma(deviations: FloatArray) -> float:
     deviations (Rousseeuw & Croux, "Alternatives to the median absolute deviation", 1993).
     """
     return float(np.median(np.abs(deviations))) / 0.6745
+
+
+def huber_sigma(deviations: FloatArray) -> float:
+    """Return the standard deviation of normal noise whose deviations (n,) these are, n > 0.
+
+    It is their root mean square, sizes cut off at 1.5 of it, so that a third of them may be
+    outliers (Huber, "Robust estimation of a location parameter", 1964, proposal 2; 1.5 is his and
+    the usual cut). Less noisy than `robust_sigma`, which it starts from.
+    """
+    cut, kept = 1.5, 0.7785  # mean square of unit normal noise cut off there
+    rounds = 5  # to 1 % where half as many are outliers
+    squares, variance = deviations**2, robust_sigma(deviations) ** 2
+    for _ in range(rounds):
+        variance = float(np.minimum(squares, cut**2 * variance).mean()) / kept
+    return float(np.sqrt(variance))
 
 
 def median(values: FloatArray) -> float:

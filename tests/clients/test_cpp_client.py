@@ -495,7 +495,8 @@ def examples() -> dict[str, dict[str, Any]]:
     contact = {**CONTACT, "magnitude_sigma": 0.5, "force_n": 2, "pressure_range": "below"}
     soft = {**CONTACT, "pressure_kpa": 120.0, "peak_kpa": 160, "peak_sigma_kpa": 3.0, "edge": 0.5}
     contacts = [contact | {"max_kpa": 134.0}, soft, dict(CONTACT)]
-    fields = {**HEADER, "contacts": contacts, "clock_id": "a", "dated_by": "device"}
+    total = {"force_n": 41.5, "force_sigma_n": 2}
+    fields = {**HEADER, **total, "contacts": contacts, "clock_id": "a", "dated_by": "device"}
     array = {"shape": [3, 4], "dtype": "<f4", "data": image.tobytes()}
     images = {"map": array, "pressure_kpa": None, "structure": dict(array)}
     extent = {"x_mm": [-75.0, 75.0], "y_mm": [-75, 75]}

@@ -66,6 +66,11 @@ def test_the_arrays_are_those_of_the_contract(
         assert out[f"contact_{name}"].shape == (3,)
     assert (out["contact_x_mm"][0], out["contact_y_mm"][0]) == pytest.approx((20, 10), abs=2)
     assert out["contact_magnitude"][0] == pytest.approx(0.177, abs=0.03)
+    by_frame = np.bincount(out["contact_frame"], out["contact_force_n"])
+    assert out["force_n"] == pytest.approx(by_frame)
+    assert out["force_n"][0] == 0
+    assert out["force_sigma_n"][1] == out["contact_force_sigma_n"][0]
+    assert 0 < out["force_sigma_n"][2] < out["contact_force_sigma_n"][1:].sum()
     assert not out["map"][0].any()
     assert 0.1 < out["map"][1].max() < 0.25
     assert 0 <= out["structure"].min() < out["structure"].max() <= 1

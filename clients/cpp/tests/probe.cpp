@@ -174,6 +174,8 @@ void print_frame(const tactomo::Frame& frame) {
     print_member("tier_reason", frame.tier_reason.view());
     print_member("misfit", frame.misfit);
     print_member("confidence", frame.confidence);
+    print_member("force_n", frame.force_n);
+    print_member("force_sigma_n", frame.force_sigma_n);
     print_member("exceeds_150", name_of(frame.exceeds(150)));
     std::printf(", \"is_known\": %s", frame.is_known() ? "true" : "false");
     print_member("age_ns", std::int64_t{frame.age().count()});

@@ -137,6 +137,10 @@ class Frame:
     #: asked
     confidence: float | None
     contacts: tuple[Contact, ...]
+    #: Of all contacts together, N; 0 where nothing presses, None where that of one is not known, a
+    #: lower bound where one is ``above``
+    force_n: float | None
+    force_sigma_n: float | None  #: standard uncertainty of `force_n`; None where unknown
     map: Image | None  #: |Δσ|/σ₀ of the magnitude channel, a ratio
     pressure_kpa: Image | None
     structure: Image | None  #: pressed (1) or not (0), with everything between for in between
@@ -215,6 +219,8 @@ def frame_from_message(message: Message, received_ns: int | None, stale_after_s:
         misfit=None if misfit is None else float(misfit),
         confidence=None if confidence is None else float(confidence),
         contacts=tuple(_contact(contact) for contact in contacts),
+        force_n=_number_or_none(fields, "force_n"),
+        force_sigma_n=_number_or_none(fields, "force_sigma_n"),
         map=_image(fields, "map") if has_images else None,
         pressure_kpa=_image(fields, "pressure_kpa") if has_images else None,
         structure=_image(fields, "structure") if has_images else None,

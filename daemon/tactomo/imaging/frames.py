@@ -62,7 +62,12 @@ def scan_fields(counter: int, volts: dict[Channel, FloatArray]) -> dict[str, Any
 
 def contacts_fields(counter: int, frame: Reconstruction) -> dict[str, Any]:
     """Return the fields of a `contacts` message."""
-    return {"scan_counter": counter, "contacts": [_contact(c) for c in frame.contacts]}
+    return {
+        "scan_counter": counter,
+        "contacts": [_contact(c) for c in frame.contacts],
+        "force_n": _finite(frame.force_n),
+        "force_sigma_n": _finite(frame.force_sigma_n),
+    }
 
 
 def map_fields(

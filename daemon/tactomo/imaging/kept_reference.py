@@ -121,7 +121,7 @@ class KeptReference:
         if not any(name in volts for name in self._description.channels):
             raise ValueError("it holds no channel of this sensor")
         both = {name: volts.get(name) for name in REFERENCE_ARRAYS}
-        return Reference(scans=max(1, int(arrays["scans"])), **both)
+        return Reference(scans=max(1, int(arrays["scans"])), is_noise_measured=True, **both)
 
     def _write(self, arrays: dict[str, Any]) -> None:
         try:

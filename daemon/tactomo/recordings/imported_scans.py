@@ -100,8 +100,8 @@ class Scans:
             return Reference.from_scans(**chosen)
         if not self.reference:
             return None
-        own = {channel: self.reference.get(channel) for channel in Channel}
-        return Reference(**own, magnitude_noise=None, structure_noise=None, scans=1)
+        magnitude, structure = map(self.reference.get, (Channel.MAGNITUDE, Channel.STRUCTURE))
+        return Reference(magnitude, structure)
 
     def _chosen(self, channel: Channel, frames: slice) -> FloatArray | None:
         volts = self.volts.get(channel)

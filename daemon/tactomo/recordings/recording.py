@@ -363,7 +363,7 @@ def _read_reference(data: bytes) -> Reference:
         }
     except MessageError as error:
         raise _malformed() from error
-    return Reference(scans=_integer(fields["scans"]), **arrays)
+    return Reference(scans=_integer(fields["scans"]), is_noise_measured=True, **arrays)
 
 
 def read_reference_number(data: bytes) -> int | None:

@@ -19,7 +19,7 @@ from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.physics.artifact import Artifact
 from tactomo_models.physics.bare_sheet import scan_voltages, transfer_slopes
 from tactomo_models.physics.mesh import SheetMesh, mesh_sheet
-from tactomo_models.scans.changes import noise_limit
+from tactomo_models.scans.frame_noise import noise_limit
 from tactomo_models.sensor.description import SensorDescription
 
 SMOOTH_SHARE: Final = 0.25  # of the sheet's width: how far conductivity wanders together

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtri  # scipy.stats takes half a second to import
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
@@ -22,6 +21,7 @@ from tactomo_models.physics.artifact import MODEL_ERROR, Artifact, nominal_noise
 from tactomo_models.physics.compiled_sheet import CompiledData
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.robust import median, robust_sigma
+from tactomo_models.scans.frame_noise import FrameNoiseEstimator, noise_limit
 from tactomo_models.scans.plausibility import (
     Flag,
     ScanCheck,
@@ -40,6 +40,7 @@ CORRELATED = 10.0
 # sheet's own errors. On tuning scenes 64 % of hand-made skins' places are then within one sigma and
 # 76 % of crowds'; with half as much more 75 and 81 %.
 DISPLACING = 0.13
+NOISELESS = 1e-9  # of the largest voltage: the noise of data that have none
 UNUSABLE = 1e3  # relative error of a voltage whose reference is zero or no number
 WRONG_WAY = 5.0  # standard uncertainties by which a conductivity may change against its sign
 
@@ -59,8 +60,7 @@ class Changes:
     # is below the root of `noise_limit` over the count (1.24 of 208)
     signal: float
     precision: FloatArray  # (M,) inverse variances of the changes by noise; 0 where invalid
-    # (M,) that of the changes by noise, as the tare knows it: where it was of a single scan, no
-    # more than an upper bound
+    # (M,) variances of the changes by noise: the tare's, and the scan's own where it has more
     noise_variance: FloatArray
     # (M,) square of a change too far below the model's error to be worth a solve
     tolerance: FloatArray
@@ -153,11 +153,13 @@ class MeasuredChannel:
         # (M,) standard deviation of one scan in volts; None where it is not known
         noise: FloatArray | None,
         scans: int,  # how many `volts` is the mean of
+        # whether scans at rest tell `noise`; else it is no more than an upper bound
+        is_noise_measured: bool,
     ) -> None:
-        trace = 1e-9  # relative noise of data that have none
         max_invalid = 0.5  # share of voltages that may be invalid before the channel is given up
         self._description, self._name = description, name
         self._check_length(volts, f"the {name} reference")
+        is_bound = noise is None or not is_noise_measured
         if noise is None:
             noise = noise_of_reciprocity(description, volts)
         if noise is None:
@@ -173,18 +175,20 @@ class MeasuredChannel:
         self.usable = valid = verdict.usable
         reference = np.where(valid, volts, 0.0)
         noise = np.where(valid, noise, 0.0)
+        noiseless = NOISELESS * float(np.abs(reference).max(initial=0.0))
+        of_change = np.maximum(noise * np.sqrt(1 + 1 / scans), noiseless)
         self.reference = self._reference = reference
         self._tare_per_volt = self._per_volt = np.divide(
             1, np.abs(reference), out=np.zeros_like(reference), where=valid
         )
-        relative = np.hypot(noise * self._per_volt * np.sqrt(1 + 1 / scans), MODEL_ERROR)
-        self.relative_noise = np.where(valid, relative, UNUSABLE)
-        self._noise = np.maximum(self.relative_noise**2 - MODEL_ERROR**2, trace**2)
+        self._least_noise = (noiseless * self._per_volt) ** 2
+        self._noise = np.where(valid, (of_change * self._per_volt) ** 2, UNUSABLE**2)
+        self.relative_noise = np.sqrt(self._noise + MODEL_ERROR**2)
         self._modes = _leading_modes(artifact.jacobian, np.where(valid, self._noise, np.inf))
-        self._variance = self.relative_noise**2  # of a change where nothing presses, drift included
         self._error_share = self._error_share_of(predicted)
         asymmetry = asymmetry_of(wiring, reference)
         self._check = ScanCheck(wiring, reference, noise, valid, contrast, asymmetry)
+        self._frame_noise = FrameNoiseEstimator(wiring, reference, of_change, is_bound=is_bound)
         # Weights of the changes whose sum is the whole sheet's, in the direction of pressing.
         direction = 0.0 if description.either_way(name) else description.sign(name)
         self._total = direction * artifact.tikhonov.sum(axis=0)
@@ -235,13 +239,14 @@ class MeasuredChannel:
             return ChannelResult(None, flags | gone, electrodes, verdict.flags | gone)
         change = np.where(valid, scan - self._reference, 0.0) * self._per_volt
         square = change * change
-        grown = verdict.noise**2
-        variance = self._variance * grown
+        ratio, pairs = self._frame_noise.estimate(scan, valid)
+        noise = np.maximum(self._noise * ratio, self._least_noise)
+        variance = noise + MODEL_ERROR**2  # of a change where nothing presses, drift included
         # Small changes share in the error of the large ones beside them.
         typical = median(square[valid]) / median_square
-        noise, error = self._noise * grown, self._error_share**2 * (square + typical)
+        error = self._error_share**2 * (square + typical)
         statistic = float((square / variance).sum())
-        quiet = statistic < noise_limit(count)
+        quiet = statistic < noise_limit(count, pairs)
         total = self._total
         if not (quiet or electrodes) and _fell(total * change, total**2 * variance):
             flags |= Flag.REFERENCE_MISMATCH
@@ -288,13 +293,6 @@ def _leading_modes(
     whitened = jacobian / np.sqrt(variance)[:, None]
     squares, vectors = np.linalg.eigh(whitened @ whitened.T)
     return np.ascontiguousarray(vectors[:, squares > least**2 * squares[-1]])
-
-
-@cache
-def noise_limit(count: int) -> float:
-    """Sum of squares that noise alone in so many voltages stays below, but for false alarms."""
-    false_alarm = 1e-6  # chance that an unpressed frame of pure noise is taken for a pressed one
-    return float(chdtri(count, false_alarm))
 
 
 def _fell(total: FloatArray, variance: FloatArray) -> bool:

@@ -108,6 +108,7 @@ class Comparator:
                 scan,
                 noise[name],
                 reference.scans,
+                reference.is_noise_measured,
             )
             for name in self._description.channels
             if (scan := volts[name]) is not None

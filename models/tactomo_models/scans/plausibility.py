@@ -84,7 +84,6 @@ class Verdict:
     usable: BoolArray  # (M,) voltages that may be believed
     flags: Flag  # what is wrong
     electrodes: tuple[int, ...] = ()  # those whose voltages were left out
-    noise: float = 1.0  # how many times noisier than expected; 1 where that may be chance
 
 
 class Layout(Protocol):
@@ -206,8 +205,8 @@ class ScanCheck:
             flags |= Flag.SATURATED
             usable &= ~clipped
             wrong |= clipped
-        noise, unequal = self._reciprocity(scan, usable)
-        if noise > high_noise:
+        noise, interference, unequal = self._reciprocity(scan, usable)
+        if interference > high_noise:
             flags |= Flag.NOISE_HIGH
         along = scan * self._sign
         outlier = unequal | (along < self._wrong_way * noise)
@@ -221,7 +220,7 @@ class ScanCheck:
         if suspect is not None:
             wrong |= suspect
         if not wrong.any():
-            return Verdict(usable, flags, (), noise)
+            return Verdict(usable, flags)
         electrodes = self._wiring.faulty_electrodes(wrong)
         if electrodes:
             flags |= Flag.ELECTRODE_FAULT
@@ -230,7 +229,7 @@ class ScanCheck:
             outlier &= ~left_out
         if outlier.any():
             flags |= Flag.INVALID_VOLTAGE
-        return Verdict(usable & ~outlier, flags, electrodes, noise)
+        return Verdict(usable & ~outlier, flags, electrodes)
 
     def _clipped(self, size: FloatArray, *, saturated: bool) -> BoolArray | None:
         """Voltages at the converter's limit: many of the same size that should not be alike."""
@@ -247,29 +246,34 @@ class ScanCheck:
             return None
         return np.asarray(top)
 
-    def _reciprocity(self, scan: FloatArray, usable: BoolArray) -> tuple[float, BoolArray]:
-        """How many times noisier than expected, and voltages that differ from their reciprocals."""
-        quartile = 0.3186  # standard deviations that hold a quarter of a normal distribution
-        risen_noise = 2.0  # times what the tare saw: below, it is chance
+    def _reciprocity(self, scan: FloatArray, usable: BoolArray) -> tuple[float, float, BoolArray]:
+        """Noise over the tare's, the same but for gains, and voltages unlike their reciprocals."""
         unequal = np.zeros(len(scan), dtype=bool)
         i, j = self._first, self._second
         one, other = scan[i], scan[j]
         total = one + other
         allowed = self._tolerance * total
-        error = np.abs(one - other - self._asymmetry * total)
-        error /= np.sqrt(self._pair_variance + allowed * allowed)
+        square = (one - other - self._asymmetry * total) ** 2
         both = usable[i] & usable[j]
-        compared = error if both.all() else error[both]
-        if len(compared) < 4:
-            return 1.0, unequal
-        # A quartile, not a median: some dead electrodes must not pass for noise.
-        quarter = len(compared) // 4
-        typical = float(np.partition(compared, quarter)[quarter]) / quartile
-        noise = typical if typical > risen_noise else 1.0
-        bad = np.flatnonzero((error > OUTLIER * noise) & both)
+        if np.count_nonzero(both) < 4:
+            return 1.0, 1.0, unequal
+        ratio = max(1.0, _typical(square[both] / self._pair_variance[both]))
+        gains = allowed * allowed
+        interference = np.sqrt(_typical((square / (self._pair_variance + gains))[both]))
+        bad = np.flatnonzero((square > OUTLIER**2 * (ratio * self._pair_variance + gains)) & both)
         unequal[i[bad]] = True
         unequal[j[bad]] = True
-        return noise, unequal
+        return ratio**0.5, float(interference), unequal
+
+
+def _typical(squares: FloatArray) -> float:
+    """Variance of normal noise whose squares (n,) these are, though two thirds may be outliers.
+
+    It goes by a quartile, not by the median: some dead electrodes must not pass for noise.
+    """
+    quartile = 0.3186  # standard deviations that hold a quarter of a normal distribution
+    quarter = len(squares) // 4
+    return float(np.partition(squares, quarter)[quarter]) / quartile**2
 
 
 def examine_reference(
@@ -317,7 +321,7 @@ def examine_reference(
         flags |= Flag.REFERENCE_MISMATCH
     if _asymmetry(wiring, volts) > max_asymmetry:
         flags |= Flag.NOISE_HIGH
-    return Verdict(verdict.usable, flags, verdict.electrodes, verdict.noise)
+    return Verdict(verdict.usable, flags, verdict.electrodes)
 
 
 def _rewired(wiring: Wiring, along: FloatArray, noise: FloatArray) -> bool:

@@ -31,6 +31,9 @@ class Reference:
     magnitude_drift: FloatArray | None = None
     structure_drift: FloatArray | None = None  #: (M,) likewise
 
+    #: whether scans at rest told the noise; else reciprocity did, and it is an upper bound
+    is_noise_measured: bool = True
+
     @property
     def lacks_noise(self) -> bool:
         """Whether no channel's noise is known: the reference is a single scan, for all it says."""
@@ -56,6 +59,7 @@ class Reference:
             magnitude_noise=seen[0][0] if seen[0] else None,
             structure_noise=seen[1][0] if seen[1] else None,
             scans=min((each[1] for each in seen if each), default=1),
+            is_noise_measured=False,
         )
 
     def is_followed_from(self, other: Reference) -> bool:

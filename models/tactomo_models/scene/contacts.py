@@ -94,6 +94,28 @@ def contacts_of(
     )
 
 
+def total_force(
+    contacts: Sequence[Contact],
+    curve: PressureCurve | None,  # the sensor's; None where it has none
+    field: FieldContacts | None = None,  # what a fitted field says of them; None where none is
+) -> tuple[float, float]:
+    """Force of all contacts together in N, and its standard uncertainty; each NaN where unknown.
+
+    Both are unknown where one contact's is. A fitted field knows how its contacts' errors go
+    together; without one they are taken as independent. The curve's own error is in all alike.
+    """
+    if not contacts:
+        return 0.0, float("nan")
+    force = np.array([contact.force_n for contact in contacts])
+    sigma = np.array([contact.force_sigma_n for contact in contacts])
+    total = float(force.sum())
+    if field is None or curve is None or len(contacts) == 1 or not np.isfinite(sigma).all():
+        return total, float(np.sqrt(sigma @ sigma))
+    by_fit = field.total_force_sigma_n * total / max(field.total_force_n, 1e-12)
+    by_curve = force @ (curve.sigma(field.peak_magnitude) / curve.pressure(field.peak_magnitude))
+    return total, float(np.hypot(by_fit, by_curve))
+
+
 def map_of(areas: Areas, values: FloatArray) -> Image:
     """Map on which each area carries its own value; areas of unknown value stay 0."""
     fused = np.einsum("k,kyx->yx", np.nan_to_num(values), areas.on_map)

@@ -241,6 +241,10 @@ class FieldAccountant:
                 mean_sigma_kpa=wider(contacts.mean_sigma_kpa, lambda one: one.mean_kpa),
                 force_n=moved(contacts.force_n, lambda one: one.force_n),
                 force_sigma_n=wider(contacts.force_sigma_n, lambda one: one.force_n),
+                total_force_n=contacts.total_force_n + mean(lambda one: one.force_n),
+                total_force_sigma_n=float(
+                    np.hypot(contacts.total_force_sigma_n, spread(lambda one: one.force_n))
+                ),
             )
         return replace(
             shown,
@@ -376,6 +380,15 @@ class FieldAccountant:
             force_n=1e3 * total * scale,
             force_sigma_n=1e3 * scale * np.hypot(sigma(weight @ by_force), total * by_edge),
             edge=edges,
+            total_force_n=float(1e3 * total @ scale),
+            # Errors of contacts that touch go against each other; those of their outlines do not.
+            total_force_sigma_n=1e3
+            * float(
+                np.hypot(
+                    sigma((scale @ (weight @ by_force))[None])[0],
+                    np.linalg.norm(scale * total * by_edge),
+                )
+            ),
         )
         return known
 

@@ -65,6 +65,9 @@ class FieldContacts:
     force_n: FloatArray  # (K,) forces
     force_sigma_n: FloatArray  # (K,) standard uncertainties
     edge: FloatArray  # (K,) gamma; 0 flat, 1/2 Hertz
+    total_force_n: float  # of all contacts together
+    # its standard uncertainty: less than that of its parts where they touch
+    total_force_sigma_n: float
 
 
 @dataclass(frozen=True)

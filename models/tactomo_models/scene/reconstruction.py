@@ -33,4 +33,9 @@ class Reconstruction:
     #: expected correlation of the map with the truth, 0 to 1, as a network judges it; NaN where
     #: none did
     confidence: float = float("nan")
+    #: of all contacts together, N; NaN where that of one is not known, a lower bound where one is
+    #: `above`
+    force_n: float = float("nan")
+    #: standard uncertainty of `force_n`; NaN where unknown, and where nothing presses
+    force_sigma_n: float = float("nan")
     failure: str = ""  #: what a method of the user's own failed of; empty where none did

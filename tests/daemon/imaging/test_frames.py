@@ -62,6 +62,13 @@ def test_a_contact_is_in_millimetres_and_kilopascals() -> None:
     assert {name: contact[name] for name in expected} == pytest.approx(expected)
 
 
+def test_all_contacts_together_have_a_force() -> None:
+    fields = contacts_fields(3, frame(force_n=12.5, force_sigma_n=0.5))
+    assert (fields["force_n"], fields["force_sigma_n"]) == (12.5, 0.5)
+    unknown = contacts_fields(3, frame())
+    assert unknown["force_n"] is unknown["force_sigma_n"] is None
+
+
 def test_what_is_not_known_is_nil() -> None:
     contact = Contact(1, 0.0, 0.0, 1e-4, float("nan"), float("inf"), max_kpa=float("inf"))
     [said] = contacts_fields(0, frame(contacts=(contact,)))["contacts"]

@@ -24,7 +24,7 @@ from tactomo_models import (
 )
 from tactomo_models.arrays import FloatArray
 from tactomo_models.methods.magnitudes import BAD_MISFIT
-from tactomo_models.scans.changes import noise_limit
+from tactomo_models.scans.frame_noise import noise_limit
 from variants import variant
 
 Scans = dict[str, FloatArray]

@@ -168,12 +168,19 @@ def test_a_level_set_has_its_account(sensor: Sensor) -> None:
         assert (np.isfinite(sigma) & (sigma > 0)).all()
 
 
+def total_of(account: FieldAccount) -> tuple[FloatArray, FloatArray]:
+    assert account.contacts is not None
+    said = account.contacts
+    return np.array([said.total_force_n]), np.array([said.total_force_sigma_n])
+
+
 NUMBERS: dict[str, Callable[[FieldAccount], tuple[FloatArray, FloatArray]]] = {
     "x": lambda a: (a.areas.centres_m[:, 0], a.areas.sigmas[:, 0]),
     "area": lambda a: (a.areas.areas_m2, a.areas.sigmas[:, 2]),
     "magnitude": lambda a: (a.magnitudes, a.magnitude_sigmas),
     "peak magnitude": lambda a: (a.contacts.peak_magnitude, a.contacts.peak_magnitude_sigma),  # type: ignore[union-attr]
     "force": lambda a: (a.contacts.force_n, a.contacts.force_sigma_n),  # type: ignore[union-attr]
+    "total": total_of,
 }
 
 
@@ -193,6 +200,29 @@ def test_without_noise_a_force_is_as_sure_as_its_outline(sensor: Sensor) -> None
     assert share == pytest.approx([abs(force_by_area(sensor)) * outline], rel=0.05, abs=1e-4)
 
 
+def test_the_force_of_two_that_nearly_touch_is_surer_than_theirs(sensor: Sensor) -> None:
+    """Their errors go against each other, so the sum scatters as it says, and less than theirs."""
+    two = [contact(side * 0.012, 0.0, 0.008, peak=PEAK_SHARE, edge=0.5) for side in (-1, 1)]
+    truth, data = explained(sensor, *two)
+    account = accountant(sensor).account(truth, data)
+    known = account.contacts
+    assert known is not None
+    assert known.total_force_n == pytest.approx(known.force_n.sum())
+    apart = float(np.linalg.norm(known.force_sigma_n))
+    assert known.total_force_sigma_n < apart
+    sigma, rng = 0.003, np.random.default_rng(4)
+    totals, parts = [], []
+    for _ in range(30):
+        data = data_of(sensor.changes(truth), sigma, rng)
+        found = sensor.settled(sensor.fit.compare(truth, data), data)
+        contacts_found = accountant(sensor).account(found, data).contacts
+        assert contacts_found is not None
+        totals.append(contacts_found.total_force_n)
+        parts.append(contacts_found.force_n)
+    assert np.std(totals) < np.linalg.norm(np.std(parts, axis=0))
+    assert np.std(totals) < known.total_force_sigma_n  # which knows that edges may differ, too
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["flat", "soft"])
 def test_numbers_scatter_as_their_uncertainties_say(sensor: Sensor, kind: str) -> None:
@@ -200,7 +230,8 @@ def test_numbers_scatter_as_their_uncertainties_say(sensor: Sensor, kind: str) -
 
     The graded sheet keeps magnitude times area, so a force goes with the onset's share of it.
     """
-    by_area = {"area": 1, "magnitude": -1, "peak magnitude": -1, "force": force_by_area(sensor)}
+    by_area = {"area": 1.0, "magnitude": -1.0, "peak magnitude": -1.0}
+    by_area |= dict.fromkeys(("force", "total"), force_by_area(sensor))
     outline = 0.0 if kind == "soft" else 2 * OUTLINE_ERROR * 0.003 / RADIUS_M
     sigma, rng = 0.02, np.random.default_rng(9)
     accounts, off = accountant(sensor), []

@@ -142,6 +142,8 @@ struct Frame {
     std::optional<double> misfit;  ///< what the model left unexplained, in units of the noise
     std::optional<double> confidence;
     std::vector<Contact> contacts;
+    std::optional<double> force_n;  ///< of all contacts together; at least that where one is above
+    std::optional<double> force_sigma_n;
     Image map;  ///< |Δσ|/σ₀ of the magnitude channel; the images are only in Kind::map
     Image pressure_kpa;
     Image structure;               ///< how surely each node is pressed, 0 to 1

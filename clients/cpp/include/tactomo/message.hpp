@@ -436,6 +436,8 @@ public:
         read_envelope(fields, received, frame);
         read_flags(*tape, fields, frame);
         read_contacts(*tape, fields, problem, frame);
+        frame.force_n = fields.number("force_n", Allow::both);
+        frame.force_sigma_n = fields.number("force_sigma_n", Allow::both);
         if (kind_ == Kind::map) read_images(fields, frame);
         return problem;
     }

@@ -21,6 +21,8 @@ FRAME_COLUMNS: Final = (
     "tier",
     "misfit",
     "confidence",
+    "total_force_n",
+    "total_force_sigma_n",
     "flags",
     "age_s",
 )
@@ -39,7 +41,7 @@ def write_contacts(moments: Iterable[Moment], output: IO[bytes]) -> int:
         count += 1
         start = [
             f"{time_s:.9f}",
-            *(getattr(frame, name) for name in FRAME_COLUMNS[1:-2]),
+            *(getattr(frame, name.removeprefix("total_")) for name in FRAME_COLUMNS[1:-2]),
             " ".join(sorted(frame.flags)),
             age_s,
         ]

@@ -33,6 +33,8 @@ FRAME_TYPES: Final[Mapping[str, str]] = {
     "tier": "<U16",
     "misfit": "<f8",
     "confidence": "<f8",
+    "force_n": "<f8",
+    "force_sigma_n": "<f8",
     "flags": "<u4",
 }
 CONTACT_TYPES: Final[Mapping[str, str]] = {

@@ -72,10 +72,10 @@ def reconstruct(
     `--pattern 32:adjacent`, `16:opposite:adjacent` or `16:adjacent:rotated` says which electrodes
     the numbers are of, where the description says otherwise; it gets as many electrodes.
 
-    OUT gets `map` (T, ny, nx), the relative
-    conductivity change; `pressure_kpa` (T, ny, nx), NaN where unknown; `structure` (T, ny, nx) from
-    0 to 1; `misfit`, `confidence` (the correlation with the truth that the network expects, where a
-    network made the map), `flags` and `seconds` (T,); and the contacts as flat arrays
+    OUT gets `map` (T, ny, nx), the relative conductivity change; `pressure_kpa` (T, ny, nx), NaN
+    where unknown; `structure` (T, ny, nx) from 0 to 1; `misfit`, `confidence` (the correlation with
+    the truth that the network expects, where a network made the map), `force_n` (of all contacts
+    together), `force_sigma_n`, `flags` and `seconds` (T,); and the contacts as flat arrays
     `contact_frame`, `contact_x_mm`, `contact_y_mm`, `contact_area_mm2`, `contact_magnitude`,
     `contact_sigma` (of the magnitude), and the standard uncertainties `contact_x_sigma_mm`,
     `contact_y_sigma_mm`, `contact_area_sigma_mm2`; and how hard is pressed, `contact_pressure_kpa`,
@@ -83,9 +83,9 @@ def reconstruct(
     and `contact_pressure_range` (*within*, *below*, *above* or *unknown*); the highest pressure
     under each, `contact_peak_kpa`, `contact_peak_sigma_kpa`, what it cannot exceed,
     `contact_max_kpa` (95 %), and how the pressure falls to the edge, `contact_edge` (0 flat, 0.5
-    Hertz), and `contact_taught`, whether --taught
-    says where it is. Where the sensor's objects conduct `either_way`, such as metal and plastic in
-    a tank, `structure` is -1 in those that conduct worse.
+    Hertz), and `contact_taught`, whether --taught says where it is. Where the sensor's objects
+    conduct `either_way`, such as metal and plastic in a tank, `structure` is -1 in those that
+    conduct worse.
 
     Frames follow one another, as in a stream: each one starts from what the last one found. Give
     scenes that have nothing to do with each other in files of their own.
