@@ -1,8 +1,7 @@
 """A pressure field fitted to all sheets that have a scan.
 
-`fit` describes what presses by a few contacts, `levelset` by shapes of any form; see
-`warm_started_fit`. Where a sensor's objects conduct better or worse than what surrounds them,
-either one is the fit of both kinds (`objects`).
+What presses is described by a few contacts; see `warm_started_fit`. Where a sensor's objects
+conduct better or worse than what surrounds them, there is a linear image alone.
 """
 
 from __future__ import annotations
@@ -14,11 +13,10 @@ from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
 from tactomo_models.methods.joint_fit import QUESTIONS, Question
-from tactomo_models.methods.linear import LinearImages
+from tactomo_models.methods.linear import EitherWay
 from tactomo_models.methods.magnitudes import BAD_MISFIT
 from tactomo_models.methods.method import Estimate, Skin, UnsolvableError
 from tactomo_models.methods.moves import Propose, ShapeModel
-from tactomo_models.methods.objects import ObjectFit
 from tactomo_models.methods.warm_started_fit import WarmStartedFit
 from tactomo_models.physics.actual_sheet import SheetEstimator
 from tactomo_models.scans.changes import Changes
@@ -45,25 +43,21 @@ class OutlineFit:
         """Make the fit of this sensor, unless the last tare was of the same."""
         before = getattr(self, "_skin", None)
         self._skin = skin
-        self._images = LinearImages(skin, "noser")
+        self._either_way: EitherWay | None = None
+        if skin.description.either_way(Channel.STRUCTURE):
+            self._either_way = EitherWay()
+            self._either_way.prepare(skin)
+            return
         self._frames_held = 0  # since the last structure scan
         self._last: tuple[FittedField, FieldAccount] | None = None
         self._odds: list[float] = []  # of what the last account was made with
         if before is None or before.forward is not skin.forward:
             self._field_fit = FieldFit(skin.forward, skin.description)
             self._accountant = FieldAccountant(self._field_fit, skin.areas)
-            structure = skin.description.structure
-            self._fit: WarmStartedFit | ObjectFit
-            self._drifting_fit: WarmStartedFit | None = None
-            if structure is not None and structure.either_way:
-                self._fit = ObjectFit(self._field_fit, self._linear_image)
-            else:
-                self._fit = WarmStartedFit(self._field_fit, self.shape_model, self.questions)
-                self._drifting_fit = WarmStartedFit(
-                    self._field_fit, self.shape_model, self.questions
-                )
-                self._drift: FloatArray | None = None  # see `SheetEstimator.drift`
-                self._typical_peak = self._fit.typical_peak
+            self._fit = WarmStartedFit(self._field_fit, self.shape_model, self.questions)
+            self._drifting_fit = WarmStartedFit(self._field_fit, self.shape_model, self.questions)
+            self._drift: FloatArray | None = None  # see `SheetEstimator.drift`
+            self._typical_peak = self._fit.typical_peak
         self._field_fit.sheets = dict(skin.sheets)
         self._error_ratios = {
             name: skin.channels[name].error_ratio(sheet.bare_voltages)
@@ -74,6 +68,8 @@ class OutlineFit:
         self, measurement: Measurement, previous: Estimate | None, budget_s: float
     ) -> Estimate:
         """Fit a field, from where the frame before ended."""
+        if self._either_way is not None:
+            return self._either_way.solve(measurement, previous, budget_s)
         measurement = self._as_sheets_are(measurement)
         if previous is None:
             self._forget()
@@ -112,8 +108,7 @@ class OutlineFit:
 
     def _forget(self) -> None:
         self._fit.forget()
-        if self._drifting_fit is not None:
-            self._drifting_fit.forget()
+        self._drifting_fit.forget()
         self._drifts: bool | None = None  # whether only a drift explains the data; None: not tried
         self._unexplained_s = 0.0  # of work on data that no field has explained yet
         self._last = None
@@ -122,9 +117,6 @@ class OutlineFit:
         self, measurement: Measurement, budget: Budget
     ) -> tuple[FittedField, str, Measurement]:
         """The field, in words what it came from, and the measurement that it is judged by."""
-        if isinstance(self._fit, ObjectFit):
-            changes = {Channel.STRUCTURE: measurement.changes[Channel.STRUCTURE]}
-            return *self._fit.follow(changes, budget), measurement
         given_s = budget.left_s
         if self._drifts:
             beside = self._beside_drift(measurement, budget)
@@ -152,7 +144,6 @@ class OutlineFit:
         self, measurement: Measurement, budget: Budget
     ) -> tuple[FittedField, str, Measurement]:
         """The field beside a drift; nothing is proposed: who does so takes the drift for specks."""
-        assert self._drifting_fit is not None
         drifting = self._drifting(measurement)
         fitted, how = self._drifting_fit.follow(drifting.changes, budget)
         return fitted, f"{how}, drifted since the tare", drifting
@@ -169,7 +160,7 @@ class OutlineFit:
     def _account(self, fitted: FittedField, measured: Measured) -> FieldAccount:
         """The account of a field; that of the frame before while neither field nor doubts moved."""
         course = self._drifting_fit if self._drifts else self._fit
-        doubts = course.doubts if isinstance(course, WarmStartedFit) else []
+        doubts = course.doubts
         odds = [doubt.odds for doubt in doubts]
         last = self._last
         if last is not None and last[0].drawing is fitted.drawing and self._odds == odds:
@@ -252,16 +243,6 @@ class OutlineFit:
         steps = 3  # pressures alone are nearly linear
         return self._field_fit.refine(held, measured, Budget(1.0), 0.0, steps)
 
-    def _linear_image(self, change: FloatArray) -> FloatArray:
-        return self._images.image(Channel.STRUCTURE, change).astype(np.float64)
-
 
 def _worst_misfit(fitted: FittedField) -> float:
     return max(fitted.misfit_of(name) for name in fitted.residuals)
-
-
-class LevelSetFit(OutlineFit):
-    """Shapes of any form, and how hard each area is pressed."""
-
-    shape_model = ShapeModel.LEVEL_SET
-    needs = (Channel.STRUCTURE,)
