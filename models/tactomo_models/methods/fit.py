@@ -2,12 +2,12 @@
 
 How contacts are found from frame to frame: `search`. Here the sheets are taken as the tare knows
 them, a drift of theirs is allowed for where nothing else explains the data, and a lost structure
-scan is bridged.
+scan is bridged. Where a sensor's objects conduct better or worse than what surrounds them, there is
+a linear image alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
 from tactomo_models.methods.account import Frame, Propose
+from tactomo_models.methods.linear import EitherWay
 from tactomo_models.methods.magnitudes import BAD_MISFIT
 from tactomo_models.methods.method import Estimate, Skin, UnsolvableError
 from tactomo_models.methods.search import Belief, Search
@@ -51,24 +52,27 @@ class Fit:
         """Make the fit of this sensor, unless the last tare was of the same."""
         before = getattr(self, "_skin", None)
         self._skin = skin
+        self._either_way: EitherWay | None = None
+        if skin.description.either_way(Channel.STRUCTURE):
+            self._either_way = EitherWay()
+            self._either_way.prepare(skin)
+            return
         if before is None or before.forward is not skin.forward:
             self._field_fit = FieldFit(skin.forward, skin.description)
             self._search = Search(self._field_fit)
             self._accountant = FieldAccountant(self._field_fit, skin.areas)
             self._drift: FloatArray | None = None  # see `SheetEstimator.drift`
         self._field_fit.sheets = dict(skin.sheets)
-        self._error_ratios = {
-            name: skin.channels[name].error_ratio(sheet.bare_voltages)
-            for name, sheet in skin.sheets.items()
-        }
 
     def solve(
         self, measurement: Measurement, previous: Estimate | None, budget_s: float
     ) -> Estimate:
         """Fit a field, from where the frame before ended."""
+        if self._either_way is not None:
+            return self._either_way.solve(measurement, previous, budget_s)
         carried = previous.carried if previous is not None else None
         course = carried if isinstance(carried, Course) else Course()
-        measurement = self._as_sheets_are(measurement)
+        measurement = self._skin.with_model_error(measurement)
         if Channel.STRUCTURE in self._skin.description.channels:
             if Channel.STRUCTURE not in measurement.changes:
                 judged = self._drifting(measurement) if course.drifts else measurement
@@ -78,17 +82,8 @@ class Fit:
         with measurement.timed("contacts"):
             account = self._account(course, measurement)
         assert course.belief is not None
-        before = carried.belief if isinstance(carried, Course) else None
         course = replace(course, frames_held=0, account=account)
         return self._concluded(course, measurement)
-
-    def _as_sheets_are(self, measurement: Measurement) -> Measurement:
-        """The same, with the model-error variance of the fitted sheets."""
-        changes = {
-            name: each.judged_by(self._error_ratios[name]) if name in self._error_ratios else each
-            for name, each in measurement.changes.items()
-        }
-        return replace(measurement, changes=changes)
 
     def _drifting(self, measurement: Measurement) -> Measurement:
         """The same, where the sheets may have drifted since the tare."""

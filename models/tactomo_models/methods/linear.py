@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -85,6 +86,9 @@ class Tikhonov:
     """One linear step, every node alike."""
 
     prior: Prior = "tikhonov"
+    # Share of the clearest area's peak. The rest of the image is blur: a contact there would be as
+    # large as the sheet.
+    area_cut = 0.5
 
     def prepare(self, skin: Skin) -> None:
         """Make each channel's matrix."""
@@ -109,8 +113,7 @@ class Tikhonov:
         with measurement.timed("contacts"):
             shown = images[Channel.STRUCTURE if Channel.STRUCTURE in images else Channel.MAGNITUDE]
             peak = max(float(np.abs(shown).max()), 1e-12)
-            # The rest of the image is blur: a contact there would be as large as the sheet.
-            inside = np.where(np.abs(shown) > 0.5 * peak, 1.0, 0.0)
+            inside = np.where(np.abs(shown) > self.area_cut * peak, 1.0, 0.0)
             found = areas.find(areas.on_map(inside), inside)
             fitted, unexplained = None, False
             if Channel.MAGNITUDE in changes:
@@ -171,3 +174,18 @@ class Noser(Tikhonov):
     """One linear step, nodes weighted by how well they are seen."""
 
     prior = "noser"
+
+
+class EitherWay(Noser):
+    """What `auto` and `fit` do where objects conduct better or worse than what surrounds them."""
+
+    # Objects differ more in size than contacts do. Of 67 in measured and simulated tanks 61 are
+    # found and none made up; with 0.5, 54 and none; with 0.25, 64 and 2.
+    area_cut = 0.35
+
+    def solve(
+        self, measurement: Measurement, previous: Estimate | None, budget_s: float
+    ) -> Estimate:
+        """The linear images of both kinds, and why there is no more."""
+        estimate = super().solve(measurement, previous, budget_s)
+        return replace(estimate, reason="objects conduct better or worse: one linear step")

@@ -19,7 +19,8 @@ A method of one's own is a class with these two functions. This one is complete:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Protocol
 
 from tactomo_protocol import Channel
@@ -67,6 +68,22 @@ class Skin:
         """Of the magnitude channel's change under pressure; 1 where there is no such channel."""
         has_magnitude = Channel.MAGNITUDE in self.description.channels
         return self.description.sign(Channel.MAGNITUDE) if has_magnitude else 1.0
+
+    @cached_property
+    def _error_ratios(self) -> dict[Channel, float]:
+        """Variance of each found sheet's model errors, over that of an even one."""
+        return {
+            name: self.channels[name].error_ratio(sheet.bare_voltages)
+            for name, sheet in self.sheets.items()
+        }
+
+    def with_model_error(self, measurement: Measurement) -> Measurement:
+        """The same, with each weight from the model error of the sheet as it was found."""
+        changes = {
+            name: each.judged_by(self._error_ratios[name]) if name in self.sheets else each
+            for name, each in measurement.changes.items()
+        }
+        return replace(measurement, changes=changes)
 
     @classmethod
     def of(cls, description: SensorDescription, artifact: Artifact | None = None) -> Skin:

@@ -28,7 +28,7 @@ _OURS: Final = {
     "tikhonov": "tactomo_models.methods.linear:Tikhonov",
     "noser": "tactomo_models.methods.linear:Noser",
     "fit": "tactomo_models.methods.fit:Fit",
-    "levelset": "tactomo_models.methods.fit:LevelSetFit",
+    "levelset": "tactomo_models.methods.level_set:LevelSetFit",
     "network": "tactomo_models.methods.network:NetworkAlone",
 }
 METHODS: Final = tuple(_OURS)

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from measured import measured
 from scipy.stats import spearmanr
 from simulated_tanks import simulated_tanks
 from tactomo_lab.evaluation.tanks import (
@@ -24,21 +20,16 @@ from tactomo_lab.evaluation.tanks import (
 )
 from tactomo_models import (
     Artifact,
-    Channel,
     DataError,
+    MethodError,
     Reconstructor,
-    Reference,
     SensorDescription,
     build_artifact,
     load_description,
 )
-from tactomo_models.arrays import FloatArray
 from tactomo_models.batch import reconstruct_file
-from tactomo_models.methods.objects import SignedLevelSet
 from tactomo_models.physics.bare_sheet import volts_per_unit
 from tactomo_models.physics.forward import ForwardModel
-from tactomo_models.scene.field_fit import FieldFit, FittedField
-from taylor import taylor_orders
 
 
 @pytest.fixture(scope="module")
@@ -67,18 +58,31 @@ def drawn(tank: SensorDescription) -> Tanks:
 
 
 def test_both_kinds_are_found_with_the_right_sign(imager: TankImager, drawn: Tanks) -> None:
-    methods = ("tikhonov", "noser", "levelset")
+    methods = ("tikhonov", "noser", "network")
     outcomes = {o.method: o for o in evaluate_tanks(imager, drawn, methods, 1.0)}
-    found, truth = outcomes["levelset"], drawn.truth[0]
-    assert found.correlation > 0.85
-    assert found.image[truth > 0].mean() > 0.6
-    assert found.image[truth < 0].mean() < -0.6
-    assert np.nanmean(np.abs(found.image[truth == 0])) < 0.03
-    assert found.misfit < 1.3
-    for method in ("tikhonov", "noser"):
-        assert 0.4 < outcomes[method].correlation < found.correlation - 0.05
-        assert outcomes[method].image[truth > 0].mean() > 0.2
-        assert outcomes[method].image[truth < 0].mean() < -0.2
+    truth = drawn.truth[0]
+    for outcome in outcomes.values():
+        assert outcome.correlation > 0.4
+        assert outcome.image[truth > 0].mean() > 0.2
+        assert outcome.image[truth < 0].mean() < -0.2
+    for linear in ("tikhonov", "noser"):
+        assert outcomes[linear].correlation < outcomes["network"].correlation - 0.05
+
+
+@pytest.mark.parametrize("method", ["auto", "fit"])
+def test_live_there_is_a_linear_image_and_the_frame_says_so(
+    imager: TankImager, drawn: Tanks, method: str
+) -> None:
+    frame, noser = (imager.reconstruct(drawn.changes[0], name) for name in (method, "noser"))
+    assert frame.tier == "noser"
+    assert "better or worse" in frame.reason
+    np.testing.assert_array_equal(frame.structure, noser.structure)
+    assert len(frame.contacts) >= 2
+
+
+def test_a_level_set_knows_one_kind_and_is_refused(tank: SensorDescription) -> None:
+    with pytest.raises(MethodError, match=r"levelset.*tank_uef2017.*better or worse; use auto"):
+        Reconstructor(tank, method="levelset")
 
 
 def test_turned_over_the_kinds_change_places(imager: TankImager, drawn: Tanks) -> None:
@@ -111,9 +115,9 @@ def test_a_file_of_scans_of_such_a_tank(
     assert len(reconstruct_file(tmp_path / "in.npz", tmp_path / "out.npz", description=tank)) == 3
     with np.load(tmp_path / "out.npz") as out:
         maps = out["structure"]
-        assert -1 <= maps.min() < -0.9
-        assert 0.9 < maps.max() <= 1
-        assert correlation(on_pixels(tank, maps[0], (128, 128)), drawn.truth[0]) > 0.85
+        assert -1 <= maps.min() < -0.5
+        assert 0.3 < maps.max() <= 1
+        assert correlation(on_pixels(tank, maps[0], (128, 128)), drawn.truth[0]) > 0.6
         np.testing.assert_array_equal(maps[1], maps[0])  # a still scene stays as it is
         assert not maps[2].any()
         at = out["contact_frame"] == 0
@@ -121,74 +125,6 @@ def test_a_file_of_scans_of_such_a_tank(
     rows = np.round((1 - where[:, 0] / 0.14) * 64 - 0.5).astype(int)
     columns = np.round((1 + where[:, 1] / 0.14) * 64 - 0.5).astype(int)
     assert set(drawn.truth[0][rows, columns]) == {-1.0, 1.0}
-
-
-def test_a_small_budget_is_kept_and_the_next_frames_go_on(
-    tank: SensorDescription, tank_artifact: Artifact, drawn: Tanks
-) -> None:
-    empty = ForwardModel(tank, tank_artifact.bare).bare_voltages
-    scan = empty + np.sign(empty) * drawn.changes[0]
-    live = Reconstructor(tank, tank_artifact, budget_s=0.01)
-    noise = np.full(len(empty), 0.03 * np.sqrt(np.mean(drawn.changes**2)))
-    live.set_reference(Reference(None, empty, structure_noise=noise, scans=100))
-    frames = [live.reconstruct(None, scan) for _ in range(40)]
-    assert frames[0].tier == "levelset"
-    assert frames[-1].misfit < frames[0].misfit
-    assert all(b.misfit <= a.misfit * 1.05 for a, b in pairwise(frames))
-    live.reset()
-    again = live.reconstruct(None, scan)
-    assert again.misfit == frames[0].misfit
-
-
-@pytest.fixture(scope="module")
-def signed(tank: SensorDescription, tank_artifact: Artifact) -> tuple[FieldFit, SignedLevelSet]:
-    forward = ForwardModel(tank, tank_artifact.bare)
-    return FieldFit(forward), SignedLevelSet(forward)
-
-
-def _one_of_each(fit: FieldFit) -> FloatArray:
-    x, y = fit.forward.bare.points[:, fit.forward.bare.pressable]
-    better = np.clip(1.5 - np.hypot(x + 0.06, y) / 0.03, 0, 1)
-    worse = np.clip(1.5 - np.hypot(x - 0.05, y - 0.03) / 0.03, 0, 1)
-    return np.asarray(better - worse)
-
-
-def test_taylor_of_both_kinds(signed: tuple[FieldFit, SignedLevelSet]) -> None:
-    """|F(x + t v) - F(x) - t J v| falls with t squared."""
-    fit, level_set = signed
-    data = {Channel.STRUCTURE: measured(np.zeros(len(fit.forward.bare_voltages)))}
-
-    def at(parameters: FloatArray) -> FittedField:
-        fitted = fit.evaluate(level_set, parameters[:-1], float(parameters[-1]), data)
-        assert fitted is not None
-        return fitted
-
-    start = np.append(level_set.parameters_of(_one_of_each(fit)), 3.0)
-    share = at(start).drawing.share
-    assert share.min() < -0.9
-    assert share.max() > 0.9
-    direction = np.random.default_rng(0).standard_normal(len(start))
-    orders = taylor_orders(
-        lambda parameters: at(parameters).residual,
-        start,
-        fit.jacobian(at(start), data) @ direction,
-        direction,
-        np.array([1e-3, 5e-4, 2.5e-4]),
-    )
-    assert orders == pytest.approx(2, abs=0.2)
-
-
-@settings(max_examples=25)
-@given(st.lists(st.floats(-3, 3), min_size=81, max_size=81))
-def test_no_node_is_both(signed: tuple[FieldFit, SignedLevelSet], parameters: list[float]) -> None:
-    """Turned over, each object becomes one of the other kind in the same place."""
-    level_set = signed[1]
-    shares = np.zeros((2, len(signed[0].forward.bare.pressable)))
-    for share, sign in zip(shares, (1, -1), strict=True):
-        drawing = level_set.draw(sign * np.array(parameters))
-        share[drawing.nodes] = drawing.share
-    np.testing.assert_allclose(shares[1], -shares[0], atol=1e-12)
-    assert np.abs(shares).max() <= 1
 
 
 @pytest.mark.slow
@@ -224,14 +160,6 @@ def test_what_is_expected_of_a_certain_image() -> None:
     certain[0] = 1 - certain[1] - certain[2]
     assert expected_correlation(certain) == pytest.approx(1)
     assert expected_correlation(0.5 * certain + 0.5 * certain[[1, 0, 2]]) < 0.75
-
-
-@pytest.mark.long
-def test_the_level_set_on_simulated_tanks(tank: SensorDescription, imager: TankImager) -> None:
-    some = simulated_tanks(tank, "reporting", 16)
-    scale = 1 / volts_per_unit(tank)
-    outcomes = evaluate_tanks(imager, some, ["levelset"], scale)
-    assert np.mean([outcome.correlation for outcome in outcomes]) > 0.9
 
 
 @pytest.mark.slow
