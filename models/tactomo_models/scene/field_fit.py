@@ -374,15 +374,21 @@ class FieldFit:
     ) -> tuple[FloatArray, FloatArray]:
         """Matrix (N + 1, N + 1) and gradient (N + 1,) of half the linearised cost."""
         precision, offset = self.prior(fitted)
-        normal = J.T @ J + np.diag(precision)
+        normal = J.T @ J
+        _diagonal(normal)[:] += precision
         return normal, J.T @ fitted.residual + precision * offset
 
     def prior(self, fitted: FittedField) -> tuple[FloatArray, FloatArray]:
         """Inverse variances (N + 1,) of parameters and log ratio, and their offsets from it."""
-        ratio_sigma = fitted.family.ratio_freedom * self._ratio_sigma
-        precision = np.append(fitted.family.prior_precision, ratio_sigma**-2)
-        mean = np.append(fitted.family.prior_mean, self.likely)
-        return precision, np.append(fitted.parameters, fitted.log_ratio) - mean
+        family, count = fitted.family, len(fitted.parameters)
+        precision, offset = np.empty((2, count + 1))
+        precision[:count], offset[:count] = (
+            family.prior_precision,
+            fitted.parameters - family.prior_mean,
+        )
+        precision[count] = (family.ratio_freedom * self._ratio_sigma) ** -2
+        offset[count] = fitted.log_ratio - self.likely
+        return precision, offset
 
     def _step(self, fitted: FittedField, measured: Measured, budget: Budget) -> FittedField:
         """Damp until a step leads downhill: the better estimate, or the old one."""
@@ -390,7 +396,9 @@ class FieldFit:
         normal, gradient = self._normal_equations(fitted, J)
         damping = fitted.damping
         while damping < WORST_DAMPING:
-            step = -np.linalg.solve(normal + damping * np.eye(len(normal)), gradient)
+            damped = normal.copy()
+            _diagonal(damped)[:] += damping
+            step = -np.linalg.solve(damped, gradient)
             step *= min(1.0, STEP_LIMIT / max(np.abs(step[:-1]).max(initial=0.0), 1e-12))
             ratio = float(np.clip(fitted.log_ratio + step[-1], self._least_ratio, self._most_ratio))
             parameters = fitted.family.bounded(fitted.parameters + step[:-1])
@@ -405,6 +413,11 @@ class FieldFit:
             if budget.over:
                 break
         return replace(fitted, damping=damping)
+
+
+def _diagonal(matrix: FloatArray) -> FloatArray:
+    """A view of the diagonal (n,) of a matrix (n, n)."""
+    return matrix.reshape(-1)[:: len(matrix) + 1]
 
 
 def _away(family: Family, parameters: FloatArray) -> float:
