@@ -26,7 +26,7 @@ _ARGUMENTS = {
     "evaluate": [_ARRAY] * 7,
     "evaluate_slopes": [*[_ARRAY] * 5, _COUNT, *[_ARRAY] * 3],
     "differentiate": [_ARRAY, _ARRAY, _COUNT, *[_ARRAY] * 3, _COUNT, *[_ARRAY] * 3],
-    "freeze": [_ARRAY, _ARRAY, ctypes.c_int, _ARRAY, _ARRAY],
+    "freeze": [_ARRAY] * 6,
     "conduct": [_ARRAY, _COUNT, _ARRAY, _ARRAY, ctypes.c_double, _ARRAY, _ARRAY],
     "draw": [_ARRAY, _COUNT, _ARRAY, _COUNT, *[_ARRAY] * 7],
     "draw_slopes": [_ARRAY, _COUNT, _ARRAY, _COUNT, *[_ARRAY] * 3, _COUNT, *[_ARRAY] * 4],

@@ -190,23 +190,27 @@ class ForwardModel:
         areas = self._compiled.areas(pressed.where, frozen)
         return None if areas.touch else self._compiled.solve(areas, pressed, data)
 
-    def freeze(self, solution: Solution, beside: IntArray, margin: int) -> FrozenAreas | None:
-        """Keep the areas of a solution as they are, for solves of others beside them.
+    def freeze(self, pressed: Pressed, beside: IntArray, margin: int) -> FrozenAreas | None:
+        """Keep what is pressed as it is, for solves of what presses beside it.
 
         Args:
-            solution: the areas' own, with nothing else pressed.
+            pressed: what presses, and what that does to the sheet.
             beside: (p,) pressable nodes that will be pressed.
             margin: so many nodes more than the area around these must be free.
 
         Returns:
             The areas; None where these nodes are too near.
+
+        Raises:
+            numpy.linalg.LinAlgError: a conductivity is not above 0.
         """
-        frozen = self._compiled.freeze(solution)
-        grown = self._compiled.areas(beside).nodes
+        areas, grown = self._compiled.areas(pressed.where), self._compiled.areas(beside).nodes
         for _ in range(margin):
             grown = np.unique(self._neighbours[grown])
             grown = grown[grown < len(self.bare.support)]
-        return None if frozen.inside[grown].any() else frozen
+        if np.isin(grown, areas.nodes).any():
+            return None
+        return self._compiled.freeze(areas, pressed)
 
     def slopes(
         self,

@@ -280,11 +280,9 @@ class FieldFit:
         (own, alone), (others, frozen) = family.parted(fitted.parameters, k)
         beside, drawing = own.draw(alone).nodes, others.draw(frozen)
         sheets = {}
-        for name, changes in measured.items():
-            sheet, pressed = self.sheet(name), self._pressed(name, drawing, fitted.log_ratio)
-            solved = sheet.evaluate(pressed, changes.compiled)
-            assert solved is not None  # nothing is frozen yet
-            areas = sheet.freeze(solved[0], beside, APART)
+        for name in measured:
+            pressed = self._pressed(name, drawing, fitted.log_ratio)
+            areas = self.sheet(name).freeze(pressed, beside, APART)
             if areas is None:
                 return None
             sheets[name] = areas
