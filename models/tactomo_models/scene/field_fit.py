@@ -235,6 +235,7 @@ class FieldFit:
         if name == Channel.STRUCTURE:
             share, pressure = drawing.enclosed, drawing.enclosed_kpa
         rises = response.rises(log_ratio)
+        share, pressure = _for_c(share), _for_c(pressure)
         return Pressed(drawing.nodes, share, pressure, log_ratio, response.compiled, rises)
 
     def _residual(self, name: Channel, solution: Solution, changes: Changes) -> FloatArray:
@@ -329,8 +330,8 @@ class FieldFit:
                 fitted.solutions[name],
                 self._pressed(name, drawing, fitted.log_ratio),
                 changes.compiled,
-                by_share,
-                by_pressure,
+                _for_c(by_share),
+                _for_c(by_pressure),
             )
             sheets.append(by_parameter)
         return np.concatenate(sheets)
@@ -411,6 +412,11 @@ class FieldFit:
             if budget.over:
                 break
         return replace(fitted, damping=damping)
+
+
+def _for_c(array: FloatArray) -> FloatArray:
+    """The same numbers as C reads them, whatever a family has them in."""
+    return np.ascontiguousarray(array, np.float64)
 
 
 def _diagonal(matrix: FloatArray) -> FloatArray:
