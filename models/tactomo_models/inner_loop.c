@@ -1,7 +1,7 @@
 /* The inner loop of the pressure field's fit: contacts drawn on the mesh, what they make each sheet
  * conduct, the pressed sheet solved, its voltages compared with the data and differentiated. The
- * theory and its sources stand in `scene.pressure_field`, `scene.sheet_response`,
- * `physics.condensation` and `physics.forward`. `inner_loop.py` loads it.
+ * theory and its sources stand in `scene.pressure_field`, `scene.sheet_response` and
+ * `physics.forward`. `inner_loop.py` loads it.
  *
  * Matrices are row-major unless their comment says columns: then an (r, c) matrix has its r entries
  * of a column side by side, as BLAS has it. Nothing here reads or writes but the arrays given.
@@ -62,9 +62,8 @@ typedef struct {
   const double *green_double;      /* function, in the precision that it has; else NULL */
 } Sheet;
 
-/* Other areas that stay as they are, and what they answer to potentials u that all else makes there
- * and that are balanced inside them: currents -A u at their rims, A = (1 + (S - S0) G)^-1 (S E - L).
- * E picks the rims' rows, L is the bare law: S E - L goes from area to area. */
+/* Other areas that stay as they are, and A: how they answer what all else makes there; the theory
+ * stands in `forward`. S E - L goes area by area. */
 typedef struct {
   int64_t rim, near, areas;
   const int64_t *rim_node;  /* (rim,) positions in the support */
@@ -79,7 +78,7 @@ typedef struct {
   const double *transfer;   /* (fields + 1, fields + 1) where nothing else is pressed */
 } Frozen;
 
-/* The areas around pressed nodes: a Condensation and where it is; (t,) triangles, (n,) nodes. */
+/* The areas around pressed nodes; (t,) triangles, (n,) nodes. */
 typedef struct {
   int64_t triangles, nodes, layers, rim, near;
   int64_t is_known;  /* whether `both`, `bare` and `taken` are filled */
@@ -91,7 +90,7 @@ typedef struct {
   int64_t *layer;    /* (n,) */
   double *both;      /* (rim, rim + fields), G and u0 side by side */
   double *bare;      /* (rim, rim + fields): what the bare areas' stiffness makes of both */
-  double *taken;     /* (frozen rim, rim) columns: A G, what frozen areas answer to currents there */
+  double *taken;     /* (frozen rim, rim) columns: A G, frozen areas' answer to currents there */
 } Areas;
 
 /* Find the areas around nodes (count,); buffers of `areas` are large enough for any. Returns
@@ -114,7 +113,10 @@ int find_areas(const Sheet *s, const Frozen *frozen, int64_t count, const int64_
       int64_t t = s->triangles_of[where[i] * s->most_around + j];
       if (t == T || hit[t]) continue;
       hit[t] = 1;
-      for (int c = 0; c < 3; c++) there[s->corner_support[3 * t + c]] = 1, here[s->corner_support[3 * t + c]]++;
+      for (int c = 0; c < 3; c++) {
+        int64_t node = s->corner_support[3 * t + c];
+        there[node] = 1, here[node]++;
+      }
     }
   /* Depths from all rims at once. */
   int64_t head = 0, tail = 0;
@@ -282,8 +284,8 @@ static void answer(const Frozen *f, int width, const double *near, double *curre
 /* Fill in what areas know of the bare sheet: G and u0 at their rims, and the law on them.
  *
  * Beside frozen areas these take the bare sheet's place: G - G_ko A G_ok, u0 + G_ko i. Either is
- * balanced at inner nodes, so that the bare law, at rims and by their neighbours, does what the bare
- * areas' condensed stiffness does.
+ * balanced at inner nodes, so that the bare law, at rims and by their neighbours, does what the
+ * bare areas' condensed stiffness does.
  */
 static int know(const Sheet *s, const Frozen *f, const Green *given, Areas *a) {
   int64_t r = a->rim, F = s->fields, width = r + F, others = f ? f->rim : 0, more = f ? f->near : 0;
@@ -304,7 +306,8 @@ static int know(const Sheet *s, const Frozen *f, const Green *given, Areas *a) {
     block(s, given->outward, a->near, l.near_node, others, f->rim_node, outward, others);
     block(s, given->inward, more, f->near_node, r, l.rim_node, inward, r);
     answer(f, r, inward, a->taken);
-    multiply('T', 'N', r, a->near, others, -1.0, a->taken, others, outward, others, 1.0, near, width);
+    multiply('T', 'N', r, a->near, others, -1.0, a->taken, others, outward, others, 1.0, near,
+             width);
     multiply('T', 'N', F, a->near, others, 1.0, f->injected, others, outward, others, 1.0,
              near + r, width);
   }
@@ -347,7 +350,9 @@ typedef struct {
   int *pivots;     /* (rim,) */
 } Condensed;
 
-static void forget(Condensed *c) { free(c->offset), free(c->flat), free(c->system), free(c->pivots); }
+static void forget(Condensed *c) {
+  free(c->offset), free(c->flat), free(c->system), free(c->pivots);
+}
 
 static int size_of(const Areas *a, int64_t layer) { return a->start[layer + 1] - a->start[layer]; }
 
@@ -518,13 +523,12 @@ static const double LEAST = 0.01, ROUNDING = 1e-12;
 
 /* A table's value and slope; beyond its end either its last piece or its last value goes on. */
 static double of_table(const Response *r, double pressure, double *slope) {
-  int64_t piece = 0, last = r->count - (r->saturates ? 1 : 2);
-  while (piece < last && r->pressure[piece + 1] <= pressure) piece++;
-  *slope = 0.0;
-  if (piece + 1 < r->count)
-    *slope = (r->value[piece + 1] - r->value[piece]) / (r->pressure[piece + 1] - r->pressure[piece]);
-  if (r->saturates && pressure <= r->pressure[0]) return r->value[0];
-  return r->value[piece] + *slope * (pressure - r->pressure[piece]);
+  int64_t i = 0, last = r->count - (r->saturates ? 1 : 2);
+  const double *at = r->pressure, *value = r->value;
+  while (i < last && at[i + 1] <= pressure) i++;
+  *slope = i + 1 < r->count ? (value[i + 1] - value[i]) / (at[i + 1] - at[i]) : 0.0;
+  if (r->saturates && pressure <= at[0]) return value[0];
+  return value[i] + *slope * (pressure - at[i]);
 }
 
 /* Conductivity ratio of a node, and its derivatives by share, pressure and log ratio. */
@@ -712,7 +716,7 @@ static void weigh(const Sheet *s, const Areas *a, int64_t begin, int strip, cons
   for (int k = 0; k < K; k++) slot[active[k]] = -1;
 }
 
-/* Products (products, STRIP) of the fields (2, pairs, STRIP) of two pairs each in a strip's triangles. */
+/* Products (products, STRIP) of two pairs' fields (2, pairs, STRIP) in a strip's triangles. */
 static void field_products(const Sheet *s, const Areas *a, int64_t begin, int strip,
                            const double *potentials, double *fields, double *product) {
   int P = s->pairs, Q = s->products;

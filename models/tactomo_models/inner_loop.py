@@ -34,16 +34,21 @@ _ARGUMENTS = {
 
 
 class _Library:
-    """Functions of the library, which is loaded when the first of them is asked for.
+    """Functions of the library, which is loaded when the first of them is asked for."""
 
-    Raises:
-        ModelError: there is no library, or it is not for this machine.
-    """
+    def load(self) -> None:
+        """Load the library.
+
+        Raises:
+            ModelError: there is none, or it is not of this machine and version.
+        """
+        if "evaluate" not in self.__dict__:
+            self.__dict__ |= _functions(_PATH)
 
     def __getattr__(self, name: str) -> Any:
         if name not in _ARGUMENTS:
             raise AttributeError(name)
-        self.__dict__ |= _functions(_PATH)
+        self.load()
         return self.__dict__[name]
 
 

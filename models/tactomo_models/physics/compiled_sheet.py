@@ -1,4 +1,4 @@
-"""A sheet as `inner_loop.c` solves and differentiates it; the theory: `forward`, `condensation`."""
+"""A sheet as `inner_loop.c` solves and differentiates it; the theory stands in `forward`."""
 
 from __future__ import annotations
 
@@ -239,11 +239,15 @@ class CompiledSheet:
     Args:
         bare: the sheet.
         arrays: what is known of its triangles, nodes and electrode pairs, as in `inner_loop.c`.
+
+    Raises:
+        ModelError: the compiled library is not there, or not of this machine.
     """
 
     def __init__(
         self, bare: BareSheet, arrays: Mapping[str, FloatArray | IntArray | BoolArray]
     ) -> None:
+        LIBRARY.load()  # where it is not there, nobody should wait for the first press to know
         self._bare = bare
         self._kept = {name: np.ascontiguousarray(arrays[name]) for name in _ARRAYS}
         counts = {
