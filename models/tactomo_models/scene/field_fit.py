@@ -44,8 +44,8 @@ ENTRY_S = 9e-8  # the same, for each node that is pressed and each parameter
 WORST_DAMPING = 1e6  # no step downhill even at this: a minimum
 STEP_LIMIT = 0.5  # largest change of a parameter in one step
 # Nodes that a contact must have to move in before it would touch those that are frozen: on the
-# paper's sensor (3 mm each) outlines 15 mm apart may be frozen, 12 with one node, 21 with four. What
-# a trial says does not depend on it.
+# paper's sensor (3 mm each) outlines 15 mm apart may be frozen, 12 with one node, 21 with four.
+# What a trial says does not depend on it.
 APART = 2
 
 Measured = Mapping[Channel, Changes]
