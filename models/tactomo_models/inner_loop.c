@@ -1,7 +1,7 @@
 /* The inner loop of the pressure field's fit: contacts drawn on the mesh, what they make each sheet
  * conduct, the pressed sheet solved, its voltages compared with the data and differentiated. The
- * theory and its sources stand in `scene.pressure_field`, `scene.sheet_response`,
- * `physics.condensation` and `physics.forward`. `inner_loop.py` loads it.
+ * theory and its sources stand in `scene.pressure_field`, `scene.sheet_response` and
+ * `physics.forward`. `inner_loop.py` loads it.
  *
  * Matrices are row-major unless their comment says columns: then an (r, c) matrix has its r entries
  * of a column side by side, as BLAS has it. Nothing here reads or writes but the arrays given.
@@ -62,19 +62,23 @@ typedef struct {
   const double *green_double;      /* function, in the precision that it has; else NULL */
 } Sheet;
 
-/* Other areas that stay as they are: what they answer to the potentials that all else makes there.
- * Currents -A u at their rims, A (rim, near) columns: see `freeze`. */
+/* Other areas that stay as they are, and A: how they answer what all else makes there; the theory
+ * stands in `forward`. S E - L goes area by area. */
 typedef struct {
-  int64_t rim, near;
+  int64_t rim, near, areas;
   const int64_t *rim_node;  /* (rim,) positions in the support */
   const int64_t *near_node; /* (near,) */
   const uint8_t *inside;    /* (support,) whether a node belongs to them */
-  const double *answer;     /* (rim, near) columns: A */
-  const double *injected;   /* (rim, fields) columns, where nothing else is pressed */
+  int64_t *rim_start;       /* (areas + 1,) */
+  int64_t *near_start;      /* (areas + 1,) */
+  double *law;              /* (near, rim) of each area: S E - L, transposed */
+  double *factors;          /* (rim, rim) of 1 + (S - S0) G, whose transpose has columns */
+  int *pivots;              /* (rim,) */
+  double *injected;         /* (rim, fields) columns, where nothing else is pressed */
   const double *transfer;   /* (fields + 1, fields + 1) where nothing else is pressed */
 } Frozen;
 
-/* The areas around pressed nodes: a Condensation and where it is; (t,) triangles, (n,) nodes. */
+/* The areas around pressed nodes; (t,) triangles, (n,) nodes. */
 typedef struct {
   int64_t triangles, nodes, layers, rim, near;
   int64_t is_known;  /* whether `both`, `bare` and `taken` are filled */
@@ -86,7 +90,7 @@ typedef struct {
   int64_t *layer;    /* (n,) */
   double *both;      /* (rim, rim + fields), G and u0 side by side */
   double *bare;      /* (rim, rim + fields): what the bare areas' stiffness makes of both */
-  double *taken;     /* (frozen rim, rim): A G, what frozen areas answer to currents at the rims */
+  double *taken;     /* (frozen rim, rim) columns: A G, frozen areas' answer to currents there */
 } Areas;
 
 /* Find the areas around nodes (count,); buffers of `areas` are large enough for any. Returns
@@ -109,7 +113,10 @@ int find_areas(const Sheet *s, const Frozen *frozen, int64_t count, const int64_
       int64_t t = s->triangles_of[where[i] * s->most_around + j];
       if (t == T || hit[t]) continue;
       hit[t] = 1;
-      for (int c = 0; c < 3; c++) there[s->corner_support[3 * t + c]] = 1, here[s->corner_support[3 * t + c]]++;
+      for (int c = 0; c < 3; c++) {
+        int64_t node = s->corner_support[3 * t + c];
+        there[node] = 1, here[node]++;
+      }
     }
   /* Depths from all rims at once. */
   int64_t head = 0, tail = 0;
@@ -260,11 +267,25 @@ static void block(const Sheet *s, const double *given, int64_t rows, const int64
     memcpy(green + i * width, given + i * columns, sizeof(double) * columns);
 }
 
+/* A u (rim, width), columns, of potentials u (near, width) in frozen areas. */
+static void answer(const Frozen *f, int width, const double *near, double *currents) {
+  int rim = f->rim, failed;
+  const double *law = f->law;
+  for (int64_t i = 0; i < f->areas; i++) {
+    int rows = f->rim_start[i + 1] - f->rim_start[i];
+    int columns = f->near_start[i + 1] - f->near_start[i];
+    multiply('N', 'T', rows, width, columns, 1.0, law, rows, near + f->near_start[i] * width, width,
+             0.0, currents + f->rim_start[i], rim);
+    law += rows * columns;
+  }
+  if (rim) dgetrs("T", &rim, &width, f->factors, &rim, f->pivots, currents, &rim, &failed);
+}
+
 /* Fill in what areas know of the bare sheet: G and u0 at their rims, and the law on them.
  *
  * Beside frozen areas these take the bare sheet's place: G - G_ko A G_ok, u0 + G_ko i. Either is
- * balanced at inner nodes, so that the bare law, at rims and by their neighbours, does what the bare
- * areas' condensed stiffness does.
+ * balanced at inner nodes, so that the bare law, at rims and by their neighbours, does what the
+ * bare areas' condensed stiffness does.
  */
 static int know(const Sheet *s, const Frozen *f, const Green *given, Areas *a) {
   int64_t r = a->rim, F = s->fields, width = r + F, others = f ? f->rim : 0, more = f ? f->near : 0;
@@ -284,8 +305,9 @@ static int know(const Sheet *s, const Frozen *f, const Green *given, Areas *a) {
   if (f) {
     block(s, given->outward, a->near, l.near_node, others, f->rim_node, outward, others);
     block(s, given->inward, more, f->near_node, r, l.rim_node, inward, r);
-    multiply('N', 'T', r, others, more, 1.0, inward, r, f->answer, others, 0.0, a->taken, r);
-    multiply('N', 'N', r, a->near, others, -1.0, a->taken, r, outward, others, 1.0, near, width);
+    answer(f, r, inward, a->taken);
+    multiply('T', 'N', r, a->near, others, -1.0, a->taken, others, outward, others, 1.0, near,
+             width);
     multiply('T', 'N', F, a->near, others, 1.0, f->injected, others, outward, others, 1.0,
              near + r, width);
   }
@@ -328,7 +350,9 @@ typedef struct {
   int *pivots;     /* (rim,) */
 } Condensed;
 
-static void forget(Condensed *c) { free(c->offset), free(c->flat), free(c->system), free(c->pivots); }
+static void forget(Condensed *c) {
+  free(c->offset), free(c->flat), free(c->system), free(c->pivots);
+}
 
 static int size_of(const Areas *a, int64_t layer) { return a->start[layer + 1] - a->start[layer]; }
 
@@ -454,9 +478,18 @@ static void spread(const Sheet *s, const Areas *a, const Condensed *c, const dou
   }
 }
 
+/* Currents (rim, fields), columns that are `lead` apart, that rims inject. */
+static void inject(const Sheet *s, const Areas *a, const Condensed *c, int lead,
+                   double *injected) {
+  int F = s->fields, r = a->rim, width = r + F, failed;
+  for (int64_t i = 0; i < r; i++)
+    for (int64_t m = 0; m < F; m++) injected[m * lead + i] = -c->system[i * width + r + m];
+  if (r) dgetrs("T", &r, &F, c->system, &width, c->pivots, injected, &lead, &failed);
+}
+
 /* Solve for a pressed sheet; see `ForwardModel.solve`. */
 static int solve(const Sheet *s, const Areas *a, const Frozen *f, const Pressing *p) {
-  int F = s->fields, r = a->rim, width = r + F, lead = r + (f ? f->rim : 0), failed = 0;
+  int F = s->fields, r = a->rim, width = r + F, lead = r + (f ? f->rim : 0), failed;
   double *moved = malloc(sizeof(double) * F * F);
   Condensed c;
   failed = moved ? condense(s, a, p->mixes_resistivities, p->change, &c) : -1;
@@ -464,9 +497,7 @@ static int solve(const Sheet *s, const Areas *a, const Frozen *f, const Pressing
     free(moved);
     return failed;
   }
-  for (int64_t i = 0; i < r; i++)
-    for (int64_t m = 0; m < F; m++) p->injected[m * lead + i] = -c.system[i * width + r + m];
-  if (r) dgetrs("T", &r, &F, c.system, &width, c.pivots, p->injected, &lead, &failed);
+  inject(s, a, &c, lead, p->injected);
   /* u0^T i, by which the electrodes' potentials differ. */
   multiply('N', 'N', F, F, r, 1.0, a->both + r, width, p->injected, lead, 0.0, moved, F);
   scan(s, f ? f->transfer : s->transfer, moved, p->voltages);
@@ -474,40 +505,11 @@ static int solve(const Sheet *s, const Areas *a, const Frozen *f, const Pressing
   if (f) { /* what frozen areas inject, too: i - A G i */
     for (int64_t m = 0; m < F; m++)
       memcpy(p->injected + m * lead + r, f->injected + m * f->rim, sizeof(double) * f->rim);
-    multiply('T', 'N', f->rim, F, r, -1.0, a->taken, r, p->injected, lead, 1.0, p->injected + r,
-             lead);
+    multiply('N', 'N', f->rim, F, r, -1.0, a->taken, f->rim, p->injected, lead, 1.0,
+             p->injected + r, lead);
   }
   free(moved), forget(&c);
   return 0;
-}
-
-/* Freeze areas: how they answer, `answer` (rim, near) columns, to what all else makes there.
- *
- * Potentials u that are balanced inside them get currents -A u, A = (1 + (S - S0) G)^-1 (S E - L):
- * E picks the rims' rows, L is the bare law. See `Frozen`.
- */
-int freeze(const Sheet *s, const Areas *a, int mixes_resistivities, const double *change,
-           double *answer) {
-  int r = a->rim, near = a->near, width = r + s->fields, failed;
-  Condensed c;
-  Law l;
-  if (find_law(s, a, &l)) return -1;
-  failed = condense(s, a, mixes_resistivities, change, &c);
-  if (!failed) {
-    memset(answer, 0, sizeof(double) * r * near);
-    for (int64_t m = 0; m < a->nodes; m++) {
-      int64_t row = l.row[m], layer = a->layer[m], size = size_of(a, layer);
-      if (row < 0) continue;
-      const double *S = c.flat + c.offset[layer] + (m - a->start[layer]) * size;
-      for (int64_t n = 0; n < size; n++) answer[l.column[a->start[layer] + n] * r + row] = S[n];
-      for (int64_t e = 0; e < l.entries[row]; e++)
-        answer[l.at[row * s->most_near + e] * r + row] -= l.value[row * s->most_near + e];
-    }
-    if (r) dgetrs("T", &r, &near, c.system, &width, c.pivots, answer, &r, &failed);
-    forget(&c);
-  }
-  free(l.row), free(l.value);
-  return failed;
 }
 
 /* What a pressure does to a sheet: see `scene.sheet_response`. */
@@ -521,13 +523,12 @@ static const double LEAST = 0.01, ROUNDING = 1e-12;
 
 /* A table's value and slope; beyond its end either its last piece or its last value goes on. */
 static double of_table(const Response *r, double pressure, double *slope) {
-  int64_t piece = 0, last = r->count - (r->saturates ? 1 : 2);
-  while (piece < last && r->pressure[piece + 1] <= pressure) piece++;
-  *slope = 0.0;
-  if (piece + 1 < r->count)
-    *slope = (r->value[piece + 1] - r->value[piece]) / (r->pressure[piece + 1] - r->pressure[piece]);
-  if (r->saturates && pressure <= r->pressure[0]) return r->value[0];
-  return r->value[piece] + *slope * (pressure - r->pressure[piece]);
+  int64_t i = 0, last = r->count - (r->saturates ? 1 : 2);
+  const double *at = r->pressure, *value = r->value;
+  while (i < last && at[i + 1] <= pressure) i++;
+  *slope = i + 1 < r->count ? (value[i + 1] - value[i]) / (at[i + 1] - at[i]) : 0.0;
+  if (r->saturates && pressure <= at[0]) return value[0];
+  return value[i] + *slope * (pressure - at[i]);
 }
 
 /* Conductivity ratio of a node, and its derivatives by share, pressure and log ratio. */
@@ -585,6 +586,18 @@ static void undrift(const Sheet *s, const Data *d, int64_t count, double *change
   multiply('N', 'N', K, M, D, -1.0, of, K, d->along, D, 1.0, changes, K);
 }
 
+/* Changes of conductivity that a response makes of what is pressed. */
+static int change_by(const Sheet *s, const Response *response, Pressing *p) {
+  double *ratio = malloc(sizeof(double) * (4 * p->count + 1));
+  if (!ratio) return -1;
+  conduct(response, p->count, p->share, p->pressure, p->log_ratio, ratio, ratio + p->count);
+  memset(p->change, 0, sizeof(double) * s->pressable);
+  for (int64_t i = 0; i < p->count; i++)
+    p->change[p->where[i]] = s->at_rest[p->where[i]] * (ratio[i] - 1);
+  free(ratio);
+  return 0;
+}
+
 /* Evaluate what is pressed on a sheet: see `FieldFit.evaluate`.
  *
  * `response` may be NULL: then the conductivities are given. `data` may be: then nothing is
@@ -593,17 +606,9 @@ static void undrift(const Sheet *s, const Data *d, int64_t count, double *change
 int evaluate(const Sheet *s, Areas *a, const Frozen *f, const Green *green,
              const Response *response, const Data *data, Pressing *p) {
   int made = a->is_known ? 0 : know(s, f, green, a);
-  if (made) return made;
-  if (response) {
-    double *ratio = malloc(sizeof(double) * (4 * p->count + 1));
-    if (!ratio) return -1;
-    conduct(response, p->count, p->share, p->pressure, p->log_ratio, ratio, ratio + p->count);
-    memset(p->change, 0, sizeof(double) * s->pressable);
-    for (int64_t i = 0; i < p->count; i++)
-      p->change[p->where[i]] = s->at_rest[p->where[i]] * (ratio[i] - 1);
-    free(ratio);
-  }
-  if ((made = solve(s, a, f, p)) || !data) return made;
+  if (!made && response) made = change_by(s, response, p);
+  if (!made) made = solve(s, a, f, p);
+  if (made || !data) return made;
   double *of = malloc(sizeof(double) * (data->drifts + 1));
   if (!of) return -1;
   for (int64_t v = 0; v < s->voltages; v++) {
@@ -613,6 +618,53 @@ int evaluate(const Sheet *s, Areas *a, const Frozen *f, const Green *green,
   undrift(s, data, 1, p->residual, of);
   free(of);
   return 0;
+}
+
+/* The rims' stiffness less the bare law, area by area: see `Frozen.law`. */
+static void freeze_law(const Sheet *s, const Areas *a, const Condensed *c, const Law *l,
+                       Frozen *f) {
+  double *law = f->law;
+  int64_t rim = 0, near = 0, area = 0;
+  for (int64_t layer = 0; layer < a->layers; layer++) {
+    if (outer_of(a, layer)) continue;
+    int64_t size = size_of(a, layer), first = a->start[layer], columns = size;
+    if (layer + 1 < a->layers && outer_of(a, layer + 1)) columns += size_of(a, layer + 1);
+    memset(law, 0, sizeof(double) * size * columns);
+    memcpy(law, c->flat + c->offset[layer], sizeof(double) * size * size);
+    for (int64_t i = 0; i < size; i++) {
+      int64_t row = l->row[first + i];
+      for (int64_t e = 0; e < l->entries[row]; e++) {
+        int64_t place = row * s->most_near + e;
+        law[(l->at[place] - near) * size + i] -= l->value[place];
+      }
+    }
+    f->rim_start[area] = rim, f->near_start[area++] = near;
+    rim += size, near += columns, law += size * columns;
+  }
+  f->rim_start[area] = rim, f->near_start[area] = near, f->areas = area;
+}
+
+/* Freeze areas in what is pressed: fill in how they answer; see `Frozen`. */
+int freeze(const Sheet *s, Areas *a, const Green *green, const Response *response, Pressing *p,
+           Frozen *f) {
+  int64_t r = a->rim, width = r + s->fields;
+  int made = a->is_known ? 0 : know(s, NULL, green, a);
+  if (!made) made = change_by(s, response, p);
+  Condensed c;
+  Law l;
+  if (made || (made = find_law(s, a, &l))) return made;
+  made = condense(s, a, p->mixes_resistivities, p->change, &c);
+  if (!made) {
+    freeze_law(s, a, &c, &l, f);
+    inject(s, a, &c, r, f->injected);
+    for (int64_t i = 0; i < r; i++) {
+      memcpy(f->factors + i * r, c.system + i * width, sizeof(double) * r);
+      f->pivots[i] = c.pivots[i];
+    }
+    forget(&c);
+  }
+  free(l.row), free(l.value);
+  return made;
 }
 
 enum { STRIP = 64 }; /* triangles at once: what that takes stays in the cache */
@@ -664,7 +716,7 @@ static void weigh(const Sheet *s, const Areas *a, int64_t begin, int strip, cons
   for (int k = 0; k < K; k++) slot[active[k]] = -1;
 }
 
-/* Products (products, STRIP) of the fields (2, pairs, STRIP) of two pairs each in a strip's triangles. */
+/* Products (products, STRIP) of two pairs' fields (2, pairs, STRIP) in a strip's triangles. */
 static void field_products(const Sheet *s, const Areas *a, int64_t begin, int strip,
                            const double *potentials, double *fields, double *product) {
   int P = s->pairs, Q = s->products;

@@ -26,7 +26,7 @@ _ARGUMENTS = {
     "evaluate": [_ARRAY] * 7,
     "evaluate_slopes": [*[_ARRAY] * 5, _COUNT, *[_ARRAY] * 3],
     "differentiate": [_ARRAY, _ARRAY, _COUNT, *[_ARRAY] * 3, _COUNT, *[_ARRAY] * 3],
-    "freeze": [_ARRAY, _ARRAY, ctypes.c_int, _ARRAY, _ARRAY],
+    "freeze": [_ARRAY] * 6,
     "conduct": [_ARRAY, _COUNT, _ARRAY, _ARRAY, ctypes.c_double, _ARRAY, _ARRAY],
     "draw": [_ARRAY, _COUNT, _ARRAY, _COUNT, *[_ARRAY] * 7],
     "draw_slopes": [_ARRAY, _COUNT, _ARRAY, _COUNT, *[_ARRAY] * 3, _COUNT, *[_ARRAY] * 4],
@@ -34,16 +34,21 @@ _ARGUMENTS = {
 
 
 class _Library:
-    """Functions of the library, which is loaded when the first of them is asked for.
+    """Functions of the library, which is loaded when the first of them is asked for."""
 
-    Raises:
-        ModelError: there is no library, or it is not for this machine.
-    """
+    def load(self) -> None:
+        """Load the library.
+
+        Raises:
+            ModelError: there is none, or it is not of this machine and version.
+        """
+        if "evaluate" not in self.__dict__:
+            self.__dict__ |= _functions(_PATH)
 
     def __getattr__(self, name: str) -> Any:
         if name not in _ARGUMENTS:
             raise AttributeError(name)
-        self.__dict__ |= _functions(_PATH)
+        self.load()
         return self.__dict__[name]
 
 

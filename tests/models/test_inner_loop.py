@@ -172,4 +172,4 @@ def test_a_library_that_cannot_be_used_says_what_to_do(
     for name in [*vars(LIBRARY)]:
         monkeypatch.delattr(LIBRARY, name)  # as in a process that has not used it yet
     with pytest.raises(ModelError, match=f"{state}.*install tactomo again"):
-        forward.solve(np.ones(len(forward.bare.pressable)))
+        ForwardModel(forward.description, forward.bare)

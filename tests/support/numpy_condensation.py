@@ -1,4 +1,4 @@
-"""Static condensation: pressed areas as seen from their rims.
+"""Static condensation in NumPy: pressed areas as seen from their rims.
 
 Inside a pressed area no current enters or leaves, so its inner nodes can be eliminated, whatever
 their conductivity: what is left is a dense matrix on the nodes of its rim. They are eliminated

@@ -1,4 +1,4 @@
-"""A sheet as `inner_loop.c` solves and differentiates it; the theory: `forward`, `condensation`."""
+"""A sheet as `inner_loop.c` solves and differentiates it; the theory stands in `forward`."""
 
 from __future__ import annotations
 
@@ -56,8 +56,9 @@ class _Areas(ctypes.Structure):
 
 class _Frozen(ctypes.Structure):
     _fields_ = (
-        *_integers("rim", "near"),
-        *_addresses("rim_node", "near_node", "inside", "answer", "injected", "transfer"),
+        *_integers("rim", "near", "areas"),
+        *_addresses("rim_node", "near_node", "inside", "rim_start", "near_start", "law"),
+        *_addresses("factors", "pivots", "injected", "transfer"),
     )
 
 
@@ -187,24 +188,30 @@ class CompiledAreas:
         self.found.taken = place + 16 * rim * width
 
 
-@dataclass(frozen=True, eq=False)
 class FrozenAreas:
-    """Areas that stay as they are while others beside them are pressed: see `inner_loop.c`."""
+    """Areas that stay as they are while others beside them are pressed: see `inner_loop.c`.
 
-    rim: IntArray  # (r,) positions in `BareSheet.support` of their rims
-    near: IntArray  # (m,) of those and their neighbours
-    inside: BoolArray  # (S,) which nodes belong to them
-    answer: FloatArray  # (m, r) transposed: minus currents at rims, by the potentials of all else
-    injected: FloatArray  # (L - 1, r) currents where nothing else is pressed
-    transfer: FloatArray  # (L, L) transfer resistances there
+    Attributes:
+        rim, near: (r,) positions in `BareSheet.support` of their rims, (m,) of those and of their
+            neighbours.
+        inside: (S,) which nodes belong to them.
+        found: the same for C, still to be filled in.
+    """
 
-    def __post_init__(self) -> None:
-        arrays = (self.rim, self.near, self.inside, self.answer, self.injected, self.transfer)
-        found = _Frozen(len(self.rim), len(self.near), *map(address, arrays))
-        object.__setattr__(self, "_found", found)
-        object.__setattr__(self, "address", ctypes.byref(found))
-
-    address: object = field(init=False, repr=False)  # for C
+    def __init__(self, sheet: _Sheet, areas: CompiledAreas) -> None:
+        rim, most = len(areas.rim), areas.found.layers + 1
+        self.rim: IntArray = areas.rim
+        self.near: IntArray = areas.near
+        self.inside = np.zeros(sheet.support, bool)
+        self.inside[areas.nodes] = True
+        self.injected = np.empty((sheet.fields, rim))
+        self.transfer = np.zeros((sheet.fields + 1, sheet.fields + 1))
+        self._starts, self._pivots = np.empty((2, most), np.int64), np.empty(rim, np.intc)
+        self._law, self._factors = np.empty(rim * len(areas.near)), np.empty((rim, rim))
+        arrays = (self.rim, self.near, self.inside, *self._starts)
+        more = (self._law, self._factors, self._pivots, self.injected, self.transfer)
+        self.found = _Frozen(rim, len(self.near), 0, *map(address, (*arrays, *more)))
+        self.address: object = ctypes.byref(self.found)  # for C
 
 
 @dataclass(frozen=True)
@@ -232,11 +239,15 @@ class CompiledSheet:
     Args:
         bare: the sheet.
         arrays: what is known of its triangles, nodes and electrode pairs, as in `inner_loop.c`.
+
+    Raises:
+        ModelError: the compiled library is not there, or not of this machine.
     """
 
     def __init__(
         self, bare: BareSheet, arrays: Mapping[str, FloatArray | IntArray | BoolArray]
     ) -> None:
+        LIBRARY.load()  # where it is not there, nobody should wait for the first press to know
         self._bare = bare
         self._kept = {name: np.ascontiguousarray(arrays[name]) for name in _ARRAYS}
         counts = {
@@ -343,24 +354,34 @@ class CompiledSheet:
         )
         return solution, kept[ends[1] : ends[2]]
 
-    def freeze(self, solution: Solution) -> FrozenAreas:
-        """Keep the areas of a solution as they are."""
-        areas, bare = solution.areas, self._bare
-        answer = np.empty((len(areas.near), len(areas.rim)))
+    def freeze(self, areas: CompiledAreas, pressed: Pressed) -> FrozenAreas:
+        """Keep what is pressed as it is.
+
+        Args:
+            areas: around it.
+            pressed: what presses.
+
+        Raises:
+            numpy.linalg.LinAlgError: a conductivity is not above 0.
+        """
+        frozen, change = FrozenAreas(self._sheet, areas), np.empty(self._sheet.pressable)
+        pressing = _pressing(pressed, areas.where, False)
+        pressing.change = address(change)
+        green, blocks = self._green(areas)
         made = LIBRARY.freeze(
             self._address,
             ctypes.byref(areas.found),
-            int(solution.mixes_resistivities),
-            at(solution.change),
-            at(answer),
+            ctypes.byref(green),
+            pressed.response.address,
+            ctypes.byref(pressing),
+            frozen.address,
         )
+        del blocks  # which C has read
         _check(made)
-        inside = np.zeros(len(bare.support), bool)
-        inside[areas.nodes] = True
-        transfer = bare.transfer.copy()
-        transfer[:-1, :-1] += bare.potentials[areas.rim].T @ solution.injected
-        injected = np.ascontiguousarray(solution.injected.T)
-        return FrozenAreas(areas.rim, areas.near, inside, answer, injected, transfer)
+        self._last, bare = areas, self._bare
+        frozen.transfer[:] = bare.transfer
+        frozen.transfer[:-1, :-1] += bare.potentials[frozen.rim].T @ frozen.injected.T
+        return frozen
 
     def slopes(
         self,

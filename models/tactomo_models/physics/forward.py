@@ -1,16 +1,30 @@
 """The forward model: voltages of a pressed sheet by the complete electrode model.
 
 The problem is solved once for the bare sheet, keeping the Green's function between the nodes that
-can be pressed. To all that lies outside, a pressed area is what it does on its rim: its inner
-nodes are condensed onto it (see `condensation`), and the currents that the rims then inject into
-the bare sheet follow from a dense system on their nodes (Woodbury identity). The cost goes by the
-pressed area, not by the size of the sheet.
+can be pressed. To all that lies outside, a pressed area is what it does on its rim. Inside it no
+current enters or leaves, so its inner nodes are eliminated: layer by layer from the middle
+outwards, since a layer couples with its two neighbours alone. With S and S0 the areas' stiffness on
+their rims, pressed and bare, G and u0 the bare sheet's Green's function and potentials there, the
+rims inject currents i into the bare sheet (Woodbury identity):
+
+    (1 + (S - S0) G) i = -(S - S0) u0        u = u0 + G i
+
+The cost goes by the pressed area, not by the size of the sheet.
+
+Areas o may be frozen while another, k, changes. They answer potentials u, which all else makes
+there, with currents -A u, where E picks the rows of rims and L is the law of the bare triangles:
+
+    A = (1 + (S_o - S0_o) G_oo)^-1 (S_o E - L)
+
+To k the sheet with them is a bare one of G_kk - G_ko A G_ok and u0_k - G_ko A u0_o.
 
 Everything is relative to a sheet of unit conductance: conductivities are ratios to the bare
 sheet's, transfer resistances are in units of the bare sheet's resistance per square.
 
 Source: Somersalo, Cheney & Isaacson, "Existence and uniqueness for electrode models for electric
-current computed tomography", SIAM J. Appl. Math. 52 (1992); Jacobian: the paper, equation 2.
+current computed tomography", SIAM J. Appl. Math. 52 (1992); Jacobian: the paper, equation 2;
+elimination by layers: George, "Nested dissection of a regular finite element mesh", SIAM J. Numer.
+Anal. 10 (1973).
 """
 
 from __future__ import annotations
@@ -190,23 +204,27 @@ class ForwardModel:
         areas = self._compiled.areas(pressed.where, frozen)
         return None if areas.touch else self._compiled.solve(areas, pressed, data)
 
-    def freeze(self, solution: Solution, beside: IntArray, margin: int) -> FrozenAreas | None:
-        """Keep the areas of a solution as they are, for solves of others beside them.
+    def freeze(self, pressed: Pressed, beside: IntArray, margin: int) -> FrozenAreas | None:
+        """Keep what is pressed as it is, for solves of what presses beside it.
 
         Args:
-            solution: the areas' own, with nothing else pressed.
+            pressed: what presses, and what that does to the sheet.
             beside: (p,) pressable nodes that will be pressed.
             margin: so many nodes more than the area around these must be free.
 
         Returns:
             The areas; None where these nodes are too near.
+
+        Raises:
+            numpy.linalg.LinAlgError: a conductivity is not above 0.
         """
-        frozen = self._compiled.freeze(solution)
-        grown = self._compiled.areas(beside).nodes
+        areas, grown = self._compiled.areas(pressed.where), self._compiled.areas(beside).nodes
         for _ in range(margin):
             grown = np.unique(self._neighbours[grown])
             grown = grown[grown < len(self.bare.support)]
-        return None if frozen.inside[grown].any() else frozen
+        if np.isin(grown, areas.nodes).any():
+            return None
+        return self._compiled.freeze(areas, pressed)
 
     def slopes(
         self,

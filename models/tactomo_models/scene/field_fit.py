@@ -43,7 +43,10 @@ SHEET_S = 1.3e-4  # a step on one sheet
 ENTRY_S = 9e-8  # the same, for each node that is pressed and each parameter
 MAX_DAMPING = 1e6  # no step downhill even at this: a minimum
 STEP_LIMIT = 0.5  # largest change of a parameter in one step
-APART = 1  # nodes that a free contact must have to move in before it would touch those that are frozen
+# Nodes that a contact must have to move in before it would touch those that are frozen: on the
+# paper's sensor (3 mm each) outlines 15 mm apart may be frozen, 12 with one node, 21 with four.
+# What a trial says does not depend on it.
+APART = 1
 
 Measured = Mapping[Channel, Changes]
 
@@ -235,6 +238,7 @@ class FieldFit:
         if name == Channel.STRUCTURE:
             share, pressure = drawing.enclosed, drawing.enclosed_kpa
         rises = response.rises(log_ratio)
+        share, pressure = _for_c(share), _for_c(pressure)
         return Pressed(drawing.nodes, share, pressure, log_ratio, response.compiled, rises)
 
     def _residual(self, name: Channel, solution: Solution, changes: Changes) -> FloatArray:
@@ -284,11 +288,9 @@ class FieldFit:
             return None
         beside, drawing = own.draw(alone).nodes, others.draw(frozen)
         sheets = {}
-        for name, changes in measured.items():
-            sheet, pressed = self.sheet(name), self._pressed(name, drawing, fitted.log_ratio)
-            solved = sheet.evaluate(pressed, changes.compiled)
-            assert solved is not None  # nothing is frozen yet
-            areas = sheet.freeze(solved[0], beside, APART)
+        for name in measured:
+            pressed = self._pressed(name, drawing, fitted.log_ratio)
+            areas = self.sheet(name).freeze(pressed, beside, APART)
             if areas is None:
                 return None
             sheets[name] = areas
@@ -335,8 +337,8 @@ class FieldFit:
                 fitted.solutions[name],
                 self._pressed(name, drawing, fitted.log_ratio),
                 changes.compiled,
-                by_share,
-                by_pressure,
+                _for_c(by_share),
+                _for_c(by_pressure),
             )
             sheets.append(by_parameter)
         return np.concatenate(sheets)
@@ -378,7 +380,8 @@ class FieldFit:
     ) -> tuple[FloatArray, FloatArray]:
         """Matrix (N + 1, N + 1) and gradient (N + 1,) of half the linearised cost."""
         precision, offset = self.prior(fitted)
-        normal = J.T @ J + np.diag(precision)
+        normal = J.T @ J
+        _diagonal(normal)[:] += precision
         return normal, J.T @ fitted.residual + precision * offset
 
     def bounded_ratio(self, log_ratio: float) -> float:
@@ -387,10 +390,15 @@ class FieldFit:
 
     def prior(self, fitted: FittedField) -> tuple[FloatArray, FloatArray]:
         """Inverse variances (N + 1,) of parameters and log ratio, and their offsets from it."""
-        ratio_sigma = fitted.family.ratio_freedom * self._ratio_sigma
-        precision = np.append(fitted.family.prior_precision, ratio_sigma**-2)
-        mean = np.append(fitted.family.prior_mean, self.likely)
-        return precision, np.append(fitted.parameters, fitted.log_ratio) - mean
+        family, count = fitted.family, len(fitted.parameters)
+        precision, offset = np.empty((2, count + 1))
+        precision[:count], offset[:count] = (
+            family.prior_precision,
+            fitted.parameters - family.prior_mean,
+        )
+        precision[count] = (family.ratio_freedom * self._ratio_sigma) ** -2
+        offset[count] = fitted.log_ratio - self.likely
+        return precision, offset
 
     def _step(self, fitted: FittedField, measured: Measured, budget: Budget) -> FittedField:
         """Damp until a step leads downhill: the better estimate, or the old one."""
@@ -417,10 +425,20 @@ class FieldFit:
 def bounded_step(normal: FloatArray, gradient: FloatArray, damping: float) -> FloatArray:
     """A damped step (N,) of Gauss-Newton, no parameter of which changes by more than the limit."""
     damped = normal.copy()
-    damped[np.diag_indices(len(damped))] += damping
+    _diagonal(damped)[:] += damping
     step = -np.linalg.solve(damped, gradient)
     step *= min(1.0, STEP_LIMIT / max(float(np.abs(step).max(initial=0.0)), 1e-12))
     return np.asarray(step)
+
+
+def _for_c(array: FloatArray) -> FloatArray:
+    """The same numbers as C reads them, whatever a family has them in."""
+    return np.ascontiguousarray(array, np.float64)
+
+
+def _diagonal(matrix: FloatArray) -> FloatArray:
+    """A view of the diagonal (n,) of a matrix (n, n)."""
+    return matrix.reshape(-1)[:: len(matrix) + 1]
 
 
 def _away(family: Family, parameters: FloatArray) -> float:

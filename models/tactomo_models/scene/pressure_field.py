@@ -198,7 +198,7 @@ class PressureField:
     @cached_property
     def prior_precision(self) -> FloatArray:
         """Inverse variances (N,) of that."""
-        return self.join(np.tile(PRIOR_SIGMA**-2.0, (self.count, 1)))
+        return self.join(np.broadcast_to(PRIOR_SIGMA**-2.0, self.free.shape))
 
     @property
     def ratio_freedom(self) -> float:
@@ -206,12 +206,18 @@ class PressureField:
         firm_ratio = 0.02  # share of the log ratio's uncertainty that circles of order 0 have
         return firm_ratio if self.order == 0 else 1.0
 
+    @cached_property
+    def _sheet_limits(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Least and largest x and y of the nodes, as parameters count them."""
+        x, y = self.x_m / UNIT_M, self.y_m / UNIT_M
+        return (float(x.min()), float(x.max())), (float(y.min()), float(y.max()))
+
     def bounded(self, parameters: FloatArray) -> FloatArray:
         """Keep centres on the sheet, and sizes, forms and pressures to those of contacts."""
         max_elongated = 0.9  # half the logarithm of the ratio of an ellipse's axes
         each = self.split(parameters)
-        for column, nodes in ((X, self.x_m), (Y, self.y_m)):
-            _limit(each[:, column], nodes.min() / UNIT_M, nodes.max() / UNIT_M)
+        for column, limits in zip((X, Y), self._sheet_limits, strict=True):
+            _limit(each[:, column], *limits)
         _limit(each[:, SIZE], SIZE_LIMITS[0], LARGEST_CIRCLE if self.order < 2 else SIZE_LIMITS[1])
         elongation = np.maximum(np.hypot(each[:, E1], each[:, E2]), 1e-12)
         each[:, E1:HARMONIC] *= np.minimum(1, max_elongated / elongation)[:, None]

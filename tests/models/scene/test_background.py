@@ -90,14 +90,19 @@ def joint_and_alone(
     return joint, alone
 
 
+def rounding_of(fit: FieldFit) -> float:
+    """Share to which numbers are the same: fields balance at inner nodes but for rounding."""
+    green = fit.forward.bare.green
+    single = isinstance(green, PackedGreensFunction) and green.lower.dtype == np.float32
+    return 1e-4 if single else 1e-8
+
+
 @pytest.mark.parametrize("k", [0, -1])
 @pytest.mark.parametrize("scene", SCENES)
 def test_a_trial_is_that_of_all_together(fit: FieldFit, data: Measured, scene: str, k: int) -> None:
     k %= len(SCENES[scene])
     joint, alone = joint_and_alone(fit, data, scene, k)
-    green = fit.forward.bare.green
-    single = isinstance(green, PackedGreensFunction) and green.lower.dtype == np.float32
-    rounding = 1e-4 if single else 1e-8  # fields that balance at inner nodes but for rounding
+    rounding = rounding_of(fit)
 
     def agree(one: FloatArray, other: FloatArray, to: float = rounding) -> None:
         np.testing.assert_allclose(one, other, rtol=0, atol=to * np.abs(other).max())
@@ -169,10 +174,28 @@ def test_contacts_are_frozen_only_where_they_are_apart(fit: FieldFit, data: Meas
     near = at(fit, nearer, data)
     assert near is not None
     assert fit.background(near, [0], data) is None
-    each[0, X] += 0.7
-    assert at(fit, each[:1], data, background) is not None
-    each[0, X] += 0.7
+    each[0, X] += 1.4
     assert at(fit, each[:1], data, background) is None
+
+
+def test_a_trial_is_right_until_it_touches_what_is_frozen(fit: FieldFit, data: Measured) -> None:
+    """Down to areas that are one node apart."""
+    each = contacts(contact(0.0, 0.0, RADIUS_M), contact(BESIDE_M, 0.0, RADIUS_M))
+    start = at(fit, each, data)
+    assert start is not None
+    background = fit.background(start, 0, data)
+    steps = 0
+    while True:
+        each[0, X] += 0.05
+        alone, joint = at(fit, each[:1], data, background), at(fit, each, data)
+        if alone is None:
+            break
+        assert joint is not None
+        to = rounding_of(fit) * np.abs(joint.residual).max()
+        np.testing.assert_allclose(alone.residual, joint.residual, rtol=0, atol=to)
+        steps += 1
+    gap_mm = 18 - 0.5 * steps  # between outlines, which reach two nodes and a half outwards
+    assert gap_mm < 13
 
 
 def test_what_is_not_known_of_frozen_areas_is_not_told(fit: FieldFit, data: Measured) -> None:

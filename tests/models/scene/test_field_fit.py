@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -22,6 +22,7 @@ from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.bare_sheet import solve_bare_sheet
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import mesh_sheet
+from tactomo_models.scene.drawing import Drawing
 from tactomo_models.scene.field_fit import Budget, Family, FittedField, covariance_of
 from tactomo_models.scene.level_set import LevelSet
 from tactomo_models.scene.parameters import (
@@ -99,6 +100,31 @@ def test_the_jacobian_passes_a_taylor_test(sensor: Sensor, scene: str) -> None:
         direction,
     )
     assert orders == pytest.approx(2, abs=0.1)
+
+
+def test_a_family_may_lay_out_what_it_draws_as_it_likes(sensor: Sensor) -> None:
+    """Families are open: one that draws in strides, by columns, is evaluated as any other."""
+    fit, (order, each) = sensor.fit, SCENES["soft"]
+    family, data = sensor.family(each, order), sensor.no_data()
+
+    class Strided(PressureField):
+        def draw(self, parameters: FloatArray) -> Drawing:
+            drawn = super().draw(parameters)
+            one, two, three, four = (np.asfortranarray(each) for each in drawn.slopes())
+            return Drawing(
+                np.repeat(drawn.nodes, 2)[::2],
+                np.repeat(drawn.enclosed, 2)[::2],
+                np.repeat(drawn.enclosed_kpa, 2)[::2],
+                np.repeat(drawn.share, 2)[::2],
+                np.repeat(drawn.pressure_kpa, 2)[::2],
+                lambda: (one, two, three, four),
+            )
+
+    strided = Strided(**{each.name: getattr(family, each.name) for each in fields(family)})
+    one = evaluated(fit, family, family.join(each), data)
+    other = evaluated(fit, strided, family.join(each), data)
+    np.testing.assert_array_equal(one.residual, other.residual)
+    np.testing.assert_array_equal(fit.jacobian(one, data), fit.jacobian(other, data))
 
 
 @pytest.mark.slow
