@@ -25,7 +25,7 @@ from tactomo_lab.evaluation.sequences import (
     mixed_sequence,
     palm_sequence,
 )
-from tactomo_lab.evaluation.stability import make_case
+from tactomo_lab.evaluation.stability import Case, make_case
 from tactomo_lab.evaluation.still import Outcome, reconstruct_scenes
 from tactomo_lab.scenes.measures import FrameScore
 from tactomo_lab.scenes.still_scenes import (
@@ -122,8 +122,7 @@ def scenes_of_row(
     """
     require_both_channels(description)
     if row in REGIME_ROWS:
-        cases = (_of_regime(description, row, seed_set, number) for number in range(count))
-        return {row: cases}
+        return {row: scenes_of_regime(description, row, seed_set, count)}
     simulation = Simulation(description)
 
     def still(shapes: tuple[SceneShape, ...], snr_db: float) -> Iterator[EvaluationScene]:
@@ -158,11 +157,25 @@ def _layouts(
                 yield layout
 
 
-def _of_regime(
-    description: SensorDescription, regime: str, seed_set: SeedSet, number: int
-) -> EvaluationScene:
-    """A case of a regime of single frames."""
-    case = make_case(description, regime, seed_set, number)
+def scenes_of_regime(
+    description: SensorDescription,
+    regime: str,
+    seed_set: SeedSet,
+    count: int,
+    *,
+    snr_db: float | None = None,
+) -> Iterator[EvaluationScene]:
+    """Cases of a regime of single frames, with its own noise or of so many dB of the change.
+
+    Raises DataError where the sensor has a single channel, or no room for what presses.
+    """
+    for number in range(count):
+        yield _of_case(
+            make_case(description, regime, seed_set, number, snr_db=snr_db), seed_set, number
+        )
+
+
+def _of_case(case: Case, seed_set: SeedSet, number: int) -> EvaluationScene:
     plan, (scans,) = case.plan, case.frames
     (presses,) = plan.frames
     shapes = {press.shape for press in presses}
