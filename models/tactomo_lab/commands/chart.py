@@ -1,7 +1,8 @@
 """The chart of `tactomo bench`: every method's speed against its accuracy, on simulated scenes.
 
-Still scenes at three signal-to-noise ratios and moving ones, all with reporting seeds. The points
-go into a table of comma-separated values beside the picture (`bench_chart_picture`).
+Presses of mixed kinds on skins made by hand: still scenes at three signal-to-noise ratios and
+moving ones, all with reporting seeds. The points go into a table of comma-separated values beside
+the picture (`bench_chart_picture`).
 """
 
 from __future__ import annotations
@@ -23,16 +24,16 @@ from tactomo.errors import TactomoError
 from tactomo_models import SensorDescription, available_methods, load_description
 
 from tactomo_lab.evaluation import moving, trade_off
+from tactomo_lab.evaluation.field import scenes_of_regime
+from tactomo_lab.evaluation.sequences import mixed_sequence
 from tactomo_lab.evaluation.still import Variant
-from tactomo_lab.scenes.still_scenes import scenes as draw_scenes
 
 if TYPE_CHECKING:
     from rich.table import Table
 
 STILL_SNR_DB: Final = (40.0, 20.0, 10.0)
-MOVING_SNR_DB: Final = 40.0
-CONTACTS: Final = (1, 2, 3, 4)
-SCENES_A_SEQUENCE: Final = 5  # a sequence has 146 frames
+CONTACTS: Final = 4  # mixed scenes have one to so many, in turns
+SCENES_A_SEQUENCE: Final = 5  # a sequence has some 100 frames
 SEEDS: Final = "reporting"
 
 
@@ -57,10 +58,10 @@ def chart(
     write_table(rows, machine, table_path(picture))
     moving_scenes = sequences(count)
     title = (
-        f"Simulated, not measured on hardware: sensor {name}, reporting seeds; "
-        f"{count} still scenes each of 1 to 4 contacts, {moving_scenes} moving "
-        f"scene{'s' * (moving_scenes > 1)}\none thread of {machine}; figures at points: "
-        "budget of modelled work; pale: something else is both faster and better"
+        f"Simulated, not measured on hardware: sensor {name}, reporting seeds; presses of mixed "
+        f"kinds on skins made by hand\n{count} still scenes each of 1 to 4 contacts, "
+        f"{moving_scenes} moving scene{'s' * (moving_scenes > 1)}; one thread of {machine}\n"
+        "figures at points: budget of modelled work; pale: something else is both faster and better"
     )
     save_figure(draw_chart(points, title), picture)
     typer.echo(f"wrote {picture} and {table_path(picture)}", err=True)
@@ -85,26 +86,27 @@ def measure_chart(name: str, count: int, methods: Sequence[str] = ()) -> list[tr
     """
     sensor = load_description(name)
     methods = usable(sensor, methods or available_methods())
+    scenes = count * CONTACTS
     with Progress(console=Console(stderr=True), transient=True) as progress:
         still = [
             list(
                 progress.track(
-                    draw_scenes(sensor, SEEDS, count, contacts=CONTACTS, snr_db=snr_db),
-                    total=count * len(CONTACTS),
+                    scenes_of_regime(sensor, "mixed", SEEDS, scenes, snr_db=snr_db),
+                    total=scenes,
                     description=f"simulating still scenes, {snr_db:g} dB",
                 )
             )
             for snr_db in STILL_SNR_DB
         ]
         numbers = progress.track(range(sequences(count)), description="simulating moving scenes")
-        played = [moving.draw_sequence(sensor, SEEDS, n, snr_db=MOVING_SNR_DB) for n in numbers]
+        played = [mixed_sequence(sensor, SEEDS, number, "each change") for number in numbers]
         points: list[trade_off.Point] = []
         with warned_if_busy():
-            for scenes in still:
+            for drawn in still:
                 asked = trade_off.variants(methods, trade_off.STILL_BUDGETS_S)
-                what = f"measuring on still scenes, {scenes[0].snr_db:g} dB"
-                task = progress.add_task(what, total=len(scenes) * len(asked))
-                points += trade_off.measure_still(scenes, asked, partial(progress.advance, task))
+                what = f"measuring on still scenes, {drawn[0].snr_db:g} dB"
+                task = progress.add_task(what, total=len(drawn) * len(asked))
+                points += trade_off.measure_still(drawn, asked, partial(progress.advance, task))
             points += follow(played, trade_off.variants(methods), progress)
     return points
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import cycle
+from itertools import cycle, groupby
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -130,17 +130,25 @@ def _draw_method(
             alpha=1.0 if best else PALE,
             zorder=4 if best else 3,
         )
-        if len(series) > 1:
-            axes.annotate(
-                point.variant.budget_name,
-                (point.p50_s * 1e3, _shown(point.icc)),
-                xytext=(0, -MARKER),
-                textcoords="offset points",
-                ha="center",
-                va="top",
-                fontsize=6,
-                color=colour,
-            )
+    if len(series) > 1:
+        _name_budgets(axes, series, colour)
+
+
+def _name_budgets(axes: Any, series: Sequence[Point], colour: str) -> None:
+    """Write budgets below points: one range for budgets in a row whose ICC prints alike."""
+    for _, alike in groupby(series, key=lambda point: f"{point.icc:.3f}"):
+        first, *others = alike
+        names = [first.variant.budget_name, *(p.variant.budget_name for p in others[-1:])]
+        axes.annotate(
+            " to ".join(names),
+            (first.p50_s * 1e3, _shown(first.icc)),
+            xytext=(0, -MARKER),
+            textcoords="offset points",
+            ha="center",
+            va="top",
+            fontsize=6,
+            color=colour,
+        )
 
 
 def _styles(points: Sequence[Point]) -> dict[str, Style]:

@@ -285,6 +285,8 @@ FIGURES: dict[str, Callable[[Any], str]] = {
     "mm": lambda s: f"{s.centre_mm:.2f}",
     "p95": lambda s: f"{s.centre_mm_95:.1f}",
     "right to 10 %": lambda s: f"{s.peak_right:.0%}",
+    "overload right": lambda s: f"{s.overload_right:.0%}",
+    "overload wrong": lambda s: f"{s.overload_wrong:.0%}",
     "surely wrong": lambda s: f"{s.peak_surely_wrong:.0%}",
     "area": lambda s: f"{s.area_error:.0%}",
     "Δσ": lambda s: f"{s.magnitude_error:.1%}",

@@ -17,10 +17,22 @@ if TYPE_CHECKING:
     from tactomo_lab.scenes.measures import FrameScore
 
 EVEN_FIT = "tactomo_lab.baselines.even_fit:EvenFit"
-MAPS = ("frames", "ICC", "RIE", "worst", "flagged", "silent", "alarms", "ms", "p99")
+MAPS = (
+    "frames",
+    "ICC",
+    "RIE",
+    "worst",
+    "shape",
+    "flagged",
+    "silent",
+    "wrong",
+    "alarms",
+    "ms",
+    "p99",
+)
 CONTACTS = (
     *("counted", "right to 10 %", "peak in σ", "surely wrong"),
-    *("mm", "in σ", "place in σ", "area in σ"),
+    *("mm", "in σ", "place in σ", "area in σ", "overload right", "overload wrong"),
 )
 
 app = options.typer_app()
@@ -59,9 +71,12 @@ def field(
     skins made by hand, at 60 dB of the voltages. *moving*: a sequence of `tactomo evaluate moving`
     for every ten scenes, without the frames whose scans are lost. *mixed-moving*: such a sequence
     of mixed presses that land, glide, change pressure and lift, with noise 40 dB under each
-    frame's change and with noise 60 dB under the voltages. All are simulated as in `tactomo
-    evaluate scenes`, still ones reconstructed from a cold start. The first run simulates (a second
-    a scene, a minute a sequence) and keeps the voltages in the cache.
+    frame's change and with noise 60 dB under the voltages. *palm*: one contact of 60 mm or more
+    across and 2 to 200 kPa, which comes in a second to ten minutes while the reference follows.
+    *overload*: one to three presses, the first or all beyond the response table's end. All are
+    simulated as in `tactomo evaluate scenes`, still ones reconstructed from a cold start. The
+    first run simulates (a second a scene, a minute a sequence, 10 s a palm) and keeps the voltages
+    in the cache.
     """
     from tactomo_models import ModelError, load_description
 
@@ -90,10 +105,13 @@ def field(
             {line: summarise(own) for line, own in scores.items()},
             {"maps": MAPS, "contacts": CONTACTS},
             "worst: ICC that 95 % exceed; silent: maps with an ICC below 0.7 and no flag that "
-            "tells to distrust, of all; alarms: good maps with one, of the good ones. counted: "
+            "tells to distrust, of all; shape: ICC of the pressed shape; wrong: ICC below 0.8 or "
+            "another count, and no flag; alarms: good maps with one, of the good ones. counted: "
             "frames with the right number of contacts; right to 10 %: peaks, of the true contacts; "
             "surely wrong: peaks more than 3 reported sigmas and 10 % off, or told above a range "
             "that they lie in, of those told with a sigma or as above; mm: centre error, median; "
+            "overload: of the contacts beyond the response table, those told without a bound, and "
+            "those whose 95 % interval ends below them; "
             "in σ: peaks, magnitudes, places and areas within one reported sigma, 68 % where that "
             "is right.",
         )

@@ -18,8 +18,14 @@ from tactomo_protocol import Channel
 
 from tactomo_lab.evaluation.moving import Sequence as MovingScene
 from tactomo_lab.evaluation.moving import draw_sequence, play
-from tactomo_lab.evaluation.sequences import NOISE_DB, NoiseOf, mixed_sequence
-from tactomo_lab.evaluation.stability import make_case
+from tactomo_lab.evaluation.sequences import (
+    COMING,
+    NOISE_DB,
+    NoiseOf,
+    mixed_sequence,
+    palm_sequence,
+)
+from tactomo_lab.evaluation.stability import Case, make_case
 from tactomo_lab.evaluation.still import Outcome, reconstruct_scenes
 from tactomo_lab.scenes.measures import FrameScore
 from tactomo_lab.scenes.still_scenes import (
@@ -37,9 +43,18 @@ from tactomo_lab.scenes.still_scenes import (
 MAX_CONTACTS = 4  # of a scene that is not crowded
 ORDINARY_DB = (40.0, 20.0, 10.0)  # of the change, as the paper tests
 SHAPES_DB = 40.0
-REGIME_ROWS: Final = ("hand-made", "soft", "soft-hand-made", "graded", "crowded", "many", "mixed")
+REGIME_ROWS: Final = (
+    "hand-made",
+    "soft",
+    "soft-hand-made",
+    "graded",
+    "crowded",
+    "many",
+    "mixed",
+    "overload",
+)
 STILL_ROWS: Final = ("ordinary", "rectangles-rings", *REGIME_ROWS)
-MOVING_ROWS: Final = ("moving", "mixed-moving")
+MOVING_ROWS: Final = ("moving", "mixed-moving", "palm")
 ROWS: Final = (*STILL_ROWS, *MOVING_ROWS)
 SCENES_A_SEQUENCE = 10  # a moving scene has some 100 frames and takes a minute to simulate
 
@@ -49,7 +64,8 @@ def scores_of_row(
 ) -> dict[str, Iterator[FrameScore]]:
     """Frames of one of `ROWS` as a method reconstructs them, by the name of their line.
 
-    `count` is of the scenes of each line; of moving ones there is one for `SCENES_A_SEQUENCE`.
+    `count` is of the scenes of each line, palms too; of other moving ones there is one for
+    `SCENES_A_SEQUENCE`.
 
     Raises:
         DataError: the sensor has a single channel, or no room for what presses.
@@ -72,6 +88,9 @@ def sequences_of_row(
 
     Arguments and errors are those of `scores_of_row`.
     """
+    require_both_channels(description)
+    if row == "palm":
+        return {row: (palm_sequence(description, seed_set, number) for number in range(count))}
     numbers = range(ceil(count / SCENES_A_SEQUENCE))
     if row == "moving":
         return {row: (draw_sequence(description, seed_set, number) for number in numbers)}
@@ -84,10 +103,13 @@ def sequences_of_row(
 
 
 def _played(sequences: Iterator[MovingScene], method: str) -> Iterator[FrameScore]:
-    """Frames in which no scan is lost: a map of half a measurement is another question."""
+    """Frames in which no scan is lost, for a map of half a measurement is another question.
+
+    Without those in which a palm is still to come.
+    """
     for sequence in sequences:
         for step, score in zip(sequence.steps, play(sequence, method), strict=True):
-            if not step.lost:
+            if not step.lost and step.phase != COMING:
                 yield score
 
 
@@ -100,8 +122,7 @@ def scenes_of_row(
     """
     require_both_channels(description)
     if row in REGIME_ROWS:
-        cases = (_of_regime(description, row, seed_set, number) for number in range(count))
-        return {row: cases}
+        return {row: scenes_of_regime(description, row, seed_set, count)}
     simulation = Simulation(description)
 
     def still(shapes: tuple[SceneShape, ...], snr_db: float) -> Iterator[EvaluationScene]:
@@ -136,11 +157,25 @@ def _layouts(
                 yield layout
 
 
-def _of_regime(
-    description: SensorDescription, regime: str, seed_set: SeedSet, number: int
-) -> EvaluationScene:
-    """A case of a regime of single frames."""
-    case = make_case(description, regime, seed_set, number)
+def scenes_of_regime(
+    description: SensorDescription,
+    regime: str,
+    seed_set: SeedSet,
+    count: int,
+    *,
+    snr_db: float | None = None,
+) -> Iterator[EvaluationScene]:
+    """Cases of a regime of single frames, with its own noise or of so many dB of the change.
+
+    Raises DataError where the sensor has a single channel, or no room for what presses.
+    """
+    for number in range(count):
+        yield _of_case(
+            make_case(description, regime, seed_set, number, snr_db=snr_db), seed_set, number
+        )
+
+
+def _of_case(case: Case, seed_set: SeedSet, number: int) -> EvaluationScene:
     plan, (scans,) = case.plan, case.frames
     (presses,) = plan.frames
     shapes = {press.shape for press in presses}

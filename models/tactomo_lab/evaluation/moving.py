@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 from tactomo_models.arrays import FloatArray
+from tactomo_models.drift.baseline import BaselineTracker
 from tactomo_models.errors import MethodError
 from tactomo_models.physics.artifact import load_or_build_artifact
 from tactomo_models.reconstruct import Reconstructor
@@ -158,6 +159,8 @@ class Sequence:
     noise: dict[Channel, FloatArray]  # (T,) standard deviation of each channel's noise, volts
     rest_noise: dict[Channel, float]  # likewise of the unpressed scans
     seed: np.random.SeedSequence  # of the noise
+    # seconds between frames, in which the daemon's reference follows the skin; it stays if None
+    period_s: float | None = None
 
 
 def draw_sequence(
@@ -281,10 +284,12 @@ def play(
         sensor, load_or_build_artifact(sensor), method=method, budget_s=budget_s
     )
     identities = _Identities()
-    reconstructor.set_reference(_reference(sequence, rng))
+    tracker = None if sequence.period_s is None else BaselineTracker(reconstructor)
+    begin = reconstructor.set_reference if tracker is None else tracker.begin
+    begin(_reference(sequence, rng))
     for index, step in enumerate(sequence.steps):
         if step.tare:
-            reconstructor.set_reference(_reference(sequence, rng))
+            begin(_reference(sequence, rng))
         scans = {
             name: sequence.volts.pressed[name][index]
             + sequence.noise[name][index] * rng.standard_normal(len(sequence.volts.rest[name]))
@@ -294,9 +299,11 @@ def play(
             del scans[name]
         with threadpool_limits(1):
             begin_s = time.thread_time()
-            frame = reconstructor.reconstruct(
-                scans.get(Channel.MAGNITUDE), scans.get(Channel.STRUCTURE)
-            )
+            volts = scans.get(Channel.MAGNITUDE), scans.get(Channel.STRUCTURE)
+            if tracker is None or sequence.period_s is None:
+                frame = reconstructor.reconstruct(*volts)
+            else:
+                frame = tracker.reconstruct(index * sequence.period_s, *volts)
             seconds = time.thread_time() - begin_s
         if frame.failure:  # the frame is another method's
             raise MethodError(frame.failure)
@@ -312,11 +319,12 @@ def _reference(sequence: Sequence, rng: np.random.Generator) -> Reference:
     volts = sequence.volts
     if not any(sequence.rest_noise.values()):
         seen = [
-            volts.pressed[name] + std[:, None] * rng.standard_normal(volts.pressed[name].shape)
-            for name, std in sequence.noise.items()
+            volts.pressed[name]
+            + sequence.noise[name][:, None] * rng.standard_normal(volts.pressed[name].shape)
+            for name in BOTH_CHANNELS
         ]
-        rest = [volts.rest[name] for name in sequence.noise]
-        return Reference(*rest).with_noise_of(sequence.description, *seen)
+        rest = Reference(volts.rest[Channel.MAGNITUDE], volts.rest[Channel.STRUCTURE])
+        return rest.with_noise_of(sequence.description, *seen)
     scans = [
         rest + sequence.rest_noise[name] * rng.standard_normal((REFERENCE_SCANS, len(rest)))
         for name, rest in volts.rest.items()

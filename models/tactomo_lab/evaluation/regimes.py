@@ -45,6 +45,11 @@ SETTLED_FRAMES = 6  # of a scene that stays, before something happens
 SLIDE_FRAMES = 4
 CONVERTER_DB = 60.0  # of the voltage: a good converter's, where changes are small or none
 SOFT_KPA = (180.0, 300.0)  # peak under a ball: well above where the magnitude channel answers
+PALM_M = (0.030, 0.069)  # half axes of a palm: 60 mm across to what fits on the paper's sensor
+PALM_KPA = (2.0, 200.0)
+PALM_FRAMES = 16  # in which a palm comes
+PALM_REST_FRAMES = 2  # before, and after, while it stays
+OVERLOAD = (1.0, 2.0)  # pressure over the response table's end
 FLAT_KPA = (145.0, 230.0)  # under a flat indenter beside balls
 KINDS: Final[tuple[tuple[Shape, Profile], ...]] = (
     *(("ellipse", "flat"), ("rectangle", "flat"), ("ring", "flat")),
@@ -370,6 +375,47 @@ def by_hand_as_told(draw: Draw, *frames: Sequence[Press]) -> Plan:
     off_m = draw.mm * draw.rng.uniform(-1, 1, draw.description.electrode_count)
     plan = replace(draw.plan(*frames), contrast=max(ratio, 1 / ratio), opposite=False)
     return replace(_by_hand(plan, off_m), snr_db=CONVERTER_DB, snr_of="voltage")
+
+
+@regime("overload", "One to three presses, the first or all beyond the response table's end.")
+def _overload(draw: Draw) -> Plan:
+    assert draw.description.magnitude is not None
+    end_kpa = draw.description.magnitude.response.pressure_kpa[-1]
+    first, *others = draw.scene()
+
+    def beyond(press: Press) -> Press:
+        return replace(press, pressure_kpa=end_kpa * draw.rng.uniform(*OVERLOAD))
+
+    rest = others if draw.number % 2 else map(beyond, others)
+    plan = draw.plan((beyond(first), *rest))
+    return replace(plan, snr_db=CONVERTER_DB, snr_of="voltage")
+
+
+@regime("palm", "A pad or a palm, 60 mm across or more, that comes slowly.")
+def _palm(draw: Draw) -> Plan:
+    (palm,) = draw.apart(1, lambda: _draw_palm(draw))
+    shares = np.linspace(0, 1, PALM_FRAMES + 1)[1:].tolist()
+    comes = [(replace(palm, pressure_kpa=share * palm.pressure_kpa),) for share in shares]
+    frames = [*[()] * PALM_REST_FRAMES, *comes, *[comes[-1]] * PALM_REST_FRAMES]
+    return replace(draw.plan(*frames), snr_db=CONVERTER_DB, snr_of="voltage")
+
+
+def _draw_palm(draw: Draw) -> Press:
+    least, most = PALM_M
+    long = draw.rng.uniform(least, most)
+    x, y = draw.rng.uniform(-1, 1, 2) * (most - long)
+    shape: Shape = "rectangle" if draw.rng.integers(2) else "ellipse"
+    profile: Profile = "dome" if draw.rng.integers(2) else "flat"
+    return Press(
+        x_m=x * scale_of(draw.description),
+        y_m=y * scale_of(draw.description),
+        pressure_kpa=draw.rng.uniform(*PALM_KPA),
+        radius_m=long * scale_of(draw.description),
+        radius_y_m=draw.rng.uniform(least, long) * scale_of(draw.description),
+        angle_rad=draw.rng.uniform(0, np.pi),
+        shape=shape,
+        profile=profile,
+    )
 
 
 def one_graded_sheet(description: SensorDescription) -> SensorDescription:

@@ -1,7 +1,9 @@
-"""Presses of mixed kinds that move, frame by frame at 20 a second, on skins made by hand.
+"""Moving scenes beside the choreography: presses of mixed kinds that move, a palm that comes.
 
-Each indenter has a lane of its own, clear of the others: it lands, glides along it, changes its
-pressure, and lifts. `moving.play` reconstructs and scores the frames.
+Mixed presses are on skins made by hand, frame by frame at 20 a second. Each indenter has a lane of
+its own, clear of the others: it lands, glides along it, changes its pressure, and lifts. A palm
+comes in one second to ten minutes, while the daemon's reference follows the skin.
+`moving.play` reconstructs and scores the frames.
 """
 
 from __future__ import annotations
@@ -16,7 +18,14 @@ from tactomo_models.sensor.description import SensorDescription
 from tactomo_protocol import Channel
 
 from tactomo_lab.evaluation.moving import INDENTERS, Sequence, Step
-from tactomo_lab.evaluation.regimes import CONVERTER_DB, Draw, by_hand_as_told
+from tactomo_lab.evaluation.regimes import (
+    CONVERTER_DB,
+    PALM_FRAMES,
+    PALM_KPA,
+    Draw,
+    by_hand_as_told,
+    draw_plan,
+)
 from tactomo_lab.evaluation.stability import simulate_plan
 from tactomo_lab.scenes.still_scenes import (
     BOTH_CHANNELS,
@@ -27,6 +36,8 @@ from tactomo_lab.scenes.still_scenes import (
     seed_of,
 )
 
+COMING: Final = "coming"  # phase in which a palm is lighter than any
+PALM_S = (1.0, 600.0)  # in which a palm comes
 NoiseOf = Literal["each change", "voltage"]
 
 NOISE_DB: Final[dict[NoiseOf, float]] = {"each change": 40.0, "voltage": CONVERTER_DB}
@@ -86,12 +97,45 @@ def mixed_sequence(
     )
 
 
+def palm_sequence(description: SensorDescription, seed_set: SeedSet, number: int) -> Sequence:
+    """Draw and simulate a palm that comes, a case of that regime: 7 s, or read from the cache.
+
+    Raises:
+        DataError: the sensor has a single channel.
+    """
+    require_both_channels(description)
+    plan = draw_plan(description, "palm", seed_set, number)
+    planned = simulate_plan(description, plan, "palm", seed_set, number)
+    steps = tuple(_palm_step(presses) for presses in plan.frames)
+    rng = np.random.default_rng(seed_of(seed_set, "palm seconds", number))
+    period_s = float(np.exp(rng.uniform(*np.log(PALM_S)))) / PALM_FRAMES
+    at_rest = {n: noise_std(planned.volts, n, plan.snr_db, plan.snr_of) for n in BOTH_CHANNELS}
+    return Sequence(
+        name=f"{seed_set} {number}",
+        description=planned.told,
+        true_description=planned.true,
+        steps=steps,
+        volts=planned.volts,
+        snr_db=plan.snr_db,
+        noise={name: np.full(len(steps), std) for name, std in at_rest.items()},
+        rest_noise=at_rest,
+        seed=seed_of(seed_set, "palm noise", number),
+        period_s=period_s,
+    )
+
+
+def _palm_step(presses: tuple[Press, ...]) -> Step:
+    is_there = any(press.pressure_kpa >= PALM_KPA[0] for press in presses)
+    return Step("palm" if is_there else COMING, dict(zip(INDENTERS, presses, strict=False)))
+
+
 def _noise_of_each(volts: SimulatedVolts, name: Channel) -> FloatArray:
     change = volts.pressed[name] - volts.rest[name]
     return np.asarray(np.sqrt(np.mean(change**2, axis=1)) * 10 ** (-NOISE_DB["each change"] / 20))
 
 
 def mixed_steps(draw: Draw) -> tuple[Step, ...]:
+    """Draw the frames of a sequence: presses of mixed kinds, each in a lane of its own."""
     lanes = draw.apart(MAX_CONTACTS - draw.number % MAX_CONTACTS, lambda: _draw_lane(draw))
     frames = int(draw.rng.integers(FRAMES[0], FRAMES[1] + 1))
     courses = dict(zip(INDENTERS, (_course(draw, lane, frames) for lane in lanes), strict=False))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -68,8 +68,17 @@ class Case:
     truth: Truth  # of the last frame
 
 
-def make_case(description: SensorDescription, regime: str, seed_set: SeedSet, number: int) -> Case:
+def make_case(
+    description: SensorDescription,
+    regime: str,
+    seed_set: SeedSet,
+    number: int,
+    *,
+    snr_db: float | None = None,
+) -> Case:
     """Draw, simulate and measure a case; the same one every time.
+
+    Its noise is the plan's, or that of a ratio of the change.
 
     Raises DataError where the sensor has a single channel, or no room for what presses.
     """
@@ -77,6 +86,8 @@ def make_case(description: SensorDescription, regime: str, seed_set: SeedSet, nu
     description = REGIMES[regime].sensor_of(description)
     plan = draw_plan(description, regime, seed_set, number)
     planned = simulate_plan(description, plan, regime, seed_set, number)
+    if snr_db is not None:
+        plan = replace(plan, snr_db=snr_db, snr_of="change")
     rng = np.random.default_rng(seed_of(seed_set, f"stability {regime} noise", number))
     reference, frames = _measure(plan, planned.volts, description, rng)
     return Case(

@@ -29,8 +29,8 @@ Done = Callable[[], None]
 
 # Methods that a budget bounds, and that go on in a frame from what the one before it came to. The
 # others take what they take, and start anew in each frame.
-RUNGS: Final = ("fit", "levelset")  # of auto, whose budgets stand for theirs
-BUDGETS_S: Final = (0.005, 0.01, 0.02, DEFAULT_BUDGET_S)
+RUNGS: Final = ("levelset",)  # of auto, whose budgets stand for theirs
+BUDGETS_S: Final = (0.001, 0.002, 0.005, 0.01, 0.02, DEFAULT_BUDGET_S)
 STILL_BUDGETS_S: Final = (*BUDGETS_S, BUDGET_S)  # the last one: as much as a scene needs
 
 

@@ -9,7 +9,7 @@ change at `FULL_RANGE_KPA`, as the paper's are, which normalises by it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from scipy.spatial.distance import cdist
 from tactomo_models.arrays import FloatArray
 from tactomo_models.scans.plausibility import DISTRUST
 from tactomo_models.scene.contacts import Contact
-from tactomo_models.scene.pressure import PressureRange
+from tactomo_models.scene.pressure import PressureRange, described_curve
 from tactomo_models.scene.reconstruction import Reconstruction
 from tactomo_models.sensor.description import SensorDescription
 
@@ -31,6 +31,7 @@ WRONG_ICC = 0.8  # a map that correlates less shows something else than what pre
 BAD_ICC = 0.7  # one that correlates less should have been flagged
 RIGHT_PEAK = 0.10  # largest relative error of a peak pressure that is right
 SURE_SIGMAS = 3.0  # standard uncertainties that an error exceeds in one of 370 honest reports
+TWO_SIDED_95 = 1.96  # standard uncertainties that 95 % of a normal distribution lie within
 FULL_RANGE_KPA = PRESSURE_KPA[1]
 BAND_KPA = 10.0  # pressures that count as one where errors at one pressure are compared
 
@@ -85,7 +86,11 @@ class ContactScore:
     y_error_sigmas: float = float("nan")
     area_error_sigmas: float = float("nan")
     peak_error_sigmas: float = float("nan")
+    beyond: bool = False  #: whether its true peak lies above the response table's end
     above: bool = False  #: whether its pressure was reported as above the range
+    #: whether nothing finite was claimed of its peak: above the range or without an upper bound,
+    #: and without an uncertainty
+    unbounded: bool = False
 
     @property
     def missed(self) -> bool:
@@ -94,8 +99,13 @@ class ContactScore:
 
     @property
     def peak_right(self) -> bool:
-        """Whether it was found with its peak pressure, or nearly."""
-        return abs(self.peak_error) <= RIGHT_PEAK
+        """Whether it was found with its peak pressure to `RIGHT_PEAK`; unbounded, if beyond."""
+        return self.unbounded if self.beyond else abs(self.peak_error) <= RIGHT_PEAK
+
+    @property
+    def denied(self) -> bool:
+        """Whether it lies beyond the table and the 95 % interval of its peak does not reach it."""
+        return self.beyond and self.peak_error_sigmas < -TWO_SIDED_95
 
     @property
     def surely_wrong(self) -> bool | None:
@@ -109,7 +119,7 @@ class ContactScore:
             return self.peak_error > RIGHT_PEAK
         if not np.isfinite(self.peak_error_sigmas):
             return None
-        return not self.peak_right and abs(self.peak_error_sigmas) > SURE_SIGMAS
+        return abs(self.peak_error) > RIGHT_PEAK and abs(self.peak_error_sigmas) > SURE_SIGMAS
 
 
 @dataclass(frozen=True)
@@ -197,12 +207,22 @@ def score_contact(
     description: SensorDescription, true: TrueContact, found: Contact | None
 ) -> ContactScore:
     """Compare a contact with the true one that it is taken for; None where there is none."""
-    known = (true.shape, true.area_m2 * 1e6, true.pressure_kpa, true.magnitude)
+    curve = described_curve(description)
+    assert curve is not None
+    known = ContactScore(
+        shape=true.shape,
+        area_mm2=true.area_m2 * 1e6,
+        pressure_kpa=true.pressure_kpa,
+        magnitude=true.magnitude,
+        beyond=true.pressure_kpa > curve.range_kpa[1],
+    )
     if found is None:
-        return ContactScore(*known)
+        return known
     full = full_range(description)
-    return ContactScore(
-        *known,
+    is_above = found.pressure_range is PressureRange.ABOVE
+    is_bare = not np.isfinite(found.peak_sigma_kpa)
+    return replace(
+        known,
         centre_error_mm=1e3 * float(np.hypot(found.x_m - true.x_m, found.y_m - true.y_m)),
         area_error=found.area_m2 / true.area_m2 - 1,
         magnitude_error=(found.magnitude - true.magnitude) / full,
@@ -213,7 +233,8 @@ def score_contact(
         y_error_sigmas=_sigmas(found.y_m - true.y_m, found.y_sigma_m),
         area_error_sigmas=_sigmas(found.area_m2 - true.area_m2, found.area_sigma_m2),
         peak_error_sigmas=_sigmas(found.peak_kpa - true.pressure_kpa, found.peak_sigma_kpa),
-        above=found.pressure_range is PressureRange.ABOVE,
+        above=is_above,
+        unbounded=is_bare and (is_above or bool(np.isposinf(found.max_kpa))),
     )
 
 
@@ -260,12 +281,16 @@ class Summary:
     place_within_sigma: float
     area_within_sigma: float
     peak_within_sigma: float
-    #: share of the true contacts whose peak pressure is right to `RIGHT_PEAK`, of those that the
-    #: magnitude channel answers to
+    #: share of the true contacts whose peak pressure is right (`ContactScore.peak_right`), of those
+    #: that the magnitude channel answers to
     peak_right: float
     #: share of the peaks told with an uncertainty, or as above the range, that are surely wrong;
     #: see `ContactScore.surely_wrong`
     peak_surely_wrong: float
+    #: overload_right, overload_wrong: shares of the true contacts beyond the response table's end:
+    #: reported without a bound, and denied by a 95 % interval; NaN where none is beyond
+    overload_right: float
+    overload_wrong: float
     distrusted: float  #: share of scenes flagged as not to be trusted
     bad_unflagged: float  #: share of scenes with an ICC below `BAD_ICC` and not flagged so
     good_flagged: float  #: share of the other scenes that are flagged so
@@ -308,6 +333,8 @@ def summarise(scores: Sequence[FrameScore]) -> Summary:
         peak_surely_wrong=mean(
             wrong for contact in matched if (wrong := contact.surely_wrong) is not None
         ),
+        overload_right=mean(contact.unbounded for contact in contacts if contact.beyond),
+        overload_wrong=mean(contact.denied for contact in contacts if contact.beyond),
         distrusted=mean(one.distrusted for one in scores),
         bad_unflagged=mean(one.bad and not one.distrusted for one in scores),
         good_flagged=mean(one.distrusted for one in scores if not one.bad),

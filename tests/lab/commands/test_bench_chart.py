@@ -57,6 +57,16 @@ def test_the_picture_names_every_method_and_budget() -> None:
     assert figure.get_suptitle() == "a title"
 
 
+def test_budgets_that_change_nothing_share_a_name() -> None:
+    points = [
+        point("auto", 0.01, icc, budget_s=ms / 1e3)
+        for ms, icc in ((1, 0.9), (2, 0.9), (5, 0.9), (10, 0.8))
+    ]
+    (axes,) = draw_chart(points, "a title").axes
+    named = {text.get_text() for text in axes.texts if "ms" in text.get_text()}
+    assert named == {"1 ms to 5 ms", "10 ms"}
+
+
 def test_no_two_methods_look_alike() -> None:
     figure = draw_chart([point(method, 0.02, 0.9) for method in available_methods()], "a title")
     (axes,) = figure.axes

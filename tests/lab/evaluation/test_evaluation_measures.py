@@ -154,6 +154,35 @@ def test_a_peak_told_above_a_range_that_it_lies_in_is_surely_wrong(
     assert told(paper, 150.0, float("nan"), **above).surely_wrong is False  # it is above
 
 
+def test_beyond_the_table_nothing_finite_is_right(paper: SensorDescription) -> None:
+    true = replace(TRUE, pressure_kpa=400.0)  # of a table that ends at 300
+    unknown, above = float("nan"), PressureRange.ABOVE
+
+    def overload(peak_kpa: float, sigma_kpa: float, **other: Any) -> ContactScore:
+        found = replace(FOUND, peak_kpa=peak_kpa, peak_sigma_kpa=sigma_kpa, **other)
+        return score_contact(paper, true, found)
+
+    right = [
+        overload(300.0, unknown, pressure_range=above),
+        overload(280.0, unknown, max_kpa=float("inf")),
+    ]
+    wide = overload(290.0, 100.0, max_kpa=float("inf"))
+    wrong = overload(298.0, 7.0, max_kpa=310.0)
+    silent = score_contact(paper, true, None)
+    all_of = [*right, wide, wrong, silent]
+    assert all(one.beyond for one in all_of)
+    assert [one.unbounded for one in all_of] == [True, True, False, False, False]
+    assert [one.denied for one in all_of] == [False, False, False, True, False]
+    assert [one.peak_right for one in all_of] == [one.unbounded for one in all_of]
+    assert wrong.surely_wrong
+    assert not right[0].surely_wrong
+    frames = [replace(scene(paper, FOUND), contacts=(one,)) for one in all_of]
+    counted = summarise([*frames, scene(paper, FOUND)])  # one in range is not counted
+    assert counted.overload_right == pytest.approx(2 / 5)
+    assert counted.overload_wrong == pytest.approx(1 / 5)
+    assert np.isnan(summarise([scene(paper, FOUND)]).overload_right)
+
+
 def test_shares_of_peaks(paper: SensorDescription) -> None:
     """Of the true contacts, of those with a sigma, and of those with that or told above."""
     unknown = float("nan")

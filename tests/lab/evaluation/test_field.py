@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from tactomo_lab.commands.evaluate_field import EVEN_FIT
-from tactomo_lab.evaluation.field import STILL_ROWS, middle_press, scenes_of_row, scores_of_row
+from tactomo_lab.evaluation.field import (
+    STILL_ROWS,
+    middle_press,
+    scenes_of_regime,
+    scenes_of_row,
+    scores_of_row,
+)
 from tactomo_lab.evaluation.moving import draw_sequence
 from tactomo_lab.evaluation.sequences import NOISE_DB, mixed_sequence
 from tactomo_lab.scenes.measures import summarise
@@ -47,6 +53,21 @@ def test_ordinary_scenes_are_the_same_ones_at_each_noise(small: SensorDescriptio
     quiet, noisy, noisiest = one_of(small, "ordinary").values()
     assert quiet.layout == noisy.layout == noisiest.layout
     assert [scene.snr_db for scene in (quiet, noisy, noisiest)] == [40, 20, 10]
+    assert quiet.reference.magnitude_noise is not None
+    assert noisy.reference.magnitude_noise is not None
+    np.testing.assert_allclose(
+        noisy.reference.magnitude_noise / quiet.reference.magnitude_noise, 10, rtol=1e-6
+    )
+
+
+def test_a_regime_is_measured_at_its_own_noise_or_of_the_change(small: SensorDescription) -> None:
+    own, quiet, noisy = (
+        next(scenes_of_regime(small, "mixed", "tuning", 1, snr_db=snr_db))
+        for snr_db in (None, 40.0, 20.0)
+    )
+    assert own.layout == quiet.layout == noisy.layout
+    told = [(scene.snr_db, scene.snr_of) for scene in (own, quiet, noisy)]
+    assert told == [(60, "voltage"), (40, "change"), (20, "change")]
     assert quiet.reference.magnitude_noise is not None
     assert noisy.reference.magnitude_noise is not None
     np.testing.assert_allclose(

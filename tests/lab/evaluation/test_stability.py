@@ -88,6 +88,32 @@ def test_regimes_are_what_they_are_called(paper: SensorDescription) -> None:
             assert 3 <= 1e3 * np.hypot(b.x_m - a.x_m, b.y_m - a.y_m) <= 10
 
 
+def test_a_palm_comes_from_nothing_to_its_pressure(paper: SensorDescription) -> None:
+    for plan in plans(paper, "palm"):
+        assert len(plan.frames) <= 40
+        assert not plan.frames[0]
+        kpa = [press.pressure_kpa for frame in plan.frames for press in frame]
+        assert kpa == sorted(kpa)
+        assert kpa[0] < 0.1 * kpa[-1]
+        assert 2 <= kpa[-1] == kpa[-2] <= 200
+        (palm,) = plan.frames[-1]
+        assert palm.radius_y_m is not None
+        assert 0.030 <= palm.radius_y_m <= palm.radius_m <= 0.069
+    last = [plan.frames[-1][0] for plan in plans(paper, "palm")]
+    assert {press.shape for press in last} == {"ellipse", "rectangle"}
+    assert {press.profile for press in last} == {"flat", "dome"}
+    assert max(press.radius_m for press in last) > 0.050
+
+
+def test_presses_overload_the_table_with_others_in_range(paper: SensorDescription) -> None:
+    scenes = [plan.frames[0] for plan in plans(paper, "overload")]
+    assert {len(presses) for presses in scenes} == {1, 2, 3}
+    assert all(300 <= presses[0].pressure_kpa <= 600 for presses in scenes)
+    others = [press.pressure_kpa for presses in scenes for press in presses[1:]]
+    assert min(others) <= 200
+    assert max(others) > 300
+
+
 def test_mixed_presses_are_on_skins_made_by_hand(paper: SensorDescription) -> None:
     for plan in plans(paper, "mixed"):
         assert (plan.unevenness, plan.impedance_deviation) == (0.10, 0.30)

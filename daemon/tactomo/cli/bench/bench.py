@@ -150,9 +150,10 @@ def bench(
     pressed, cold, still and moving; in ms, and in such products, and what memory it takes. Takes
     another one or two minutes. `--compare` sets all that beside an earlier run.
 
-    With `--chart`, every method reconstructs simulated scenes of the reporting seeds: still ones
-    at 40, 20 and 10 dB, each from a cold start, and moving ones under a daemon's budgets. Takes
-    about ten minutes, the first time some more to simulate them.
+    With `--chart`, every method reconstructs simulated presses of mixed kinds on skins made by
+    hand, of the reporting seeds: still ones at 40, 20 and 10 dB, each from a cold start, and
+    moving ones, under budgets of 1 to 50 ms. Takes about a quarter of an hour, the first time some
+    more to simulate them.
 
     With `--machine-speed`, methods follow one moving scene and what they took is kept in the
     cache, beside the sensor's models: daemons then keep to a budget of time as this machine does,
