@@ -40,9 +40,9 @@ def reconstruct_file(
     """Reconstruct every frame of `source` into `target`, and return the frames.
 
     Args:
-        source: .npz with `magnitude` (T, M), `structure` (T, M), `magnitude_reference` (M,) and
-            `structure_reference` (M,), volts on any common scale. A channel that is missing or
-            all NaN is taken as absent.
+        source: .npz with `magnitude` (T, M), `structure` (T, M), `magnitude_reference` (M,) or
+            (n, M) and `structure_reference` likewise, volts on any common scale. A channel that is
+            missing or all NaN is taken as absent.
         target: .npz that is written; docs/files.md says what is in it.
         description: the sensor.
         method: its name, see `methods.registry`.
@@ -123,7 +123,9 @@ def reference_at_rest(
     references: Mapping[str, FloatArray],
     description: SensorDescription,
 ) -> Reference:
-    """Return the reference of scans (T, M) whose noise nobody has told.
+    """Return the reference of scans (T, M).
+
+    Several scans at rest (n, M) tell the noise; of a single one, or a mean (M,), the scans do.
 
     Raises:
         DataError: a channel has none, or one without a voltage.
@@ -138,15 +140,19 @@ def reference_at_rest(
             raise DataError(
                 f"{source}: {name}_reference holds no voltage; take the unpressed scan again"
             )
+    rest = Reference.at_rest(references.get("magnitude"), references.get("structure"))
+    if not rest.lacks_noise:
+        return rest
     # The file does not say how noisy the scans are, nor of how many the reference is the mean.
-    rest = Reference(references.get("magnitude"), references.get("structure"))
     return rest.with_noise_of(description, scans.get("magnitude"), scans.get("structure"))
 
 
 def scans_of(
     source: Path, arrays: Mapping[str, Any], description: SensorDescription
 ) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
-    """Return the scans (T, M) of each channel that a file holds, and the references (M,) there are.
+    """Return the scans (T, M) of each channel of a file, and what references there are.
+
+    A reference is one scan (M,), or several (n, M) at rest.
 
     Args:
         source: where they are from, for errors.
@@ -163,7 +169,7 @@ def scans_of(
             scans[name] = checked(source, name, arrays[name], (None, description.measurements))
             key = f"{name}_reference"
             if key in arrays:
-                references[name] = checked(source, key, arrays[key], (description.measurements,))
+                references[name] = _at_rest(source, key, arrays[key], description.measurements)
     if not scans:
         raise DataError(
             f"{source} holds none of the channels of {description.name!r} "
@@ -173,6 +179,17 @@ def scans_of(
     if len(set(lengths.values())) > 1:
         raise DataError(f"{source}: channels differ in length: {lengths}")
     return scans, references
+
+
+def _at_rest(source: Path, name: str, array: Any, count: int) -> FloatArray:
+    """One scan (M,) or several (n, M) of `count` voltages; DataError where they are neither.
+
+    A scan that is NaN throughout was not taken.
+    """
+    if array.ndim != 2 or 1 in array.shape or array.shape[1] != count:
+        return checked(source, name, array, (count,))
+    scans = checked(source, name, array, (None, count))
+    return scans[~np.isnan(scans).all(axis=1)]
 
 
 def all_nan(array: Any) -> bool:
@@ -189,9 +206,10 @@ def checked(source: Path, name: str, array: Any, shape: tuple[int | None, ...]) 
     )
     if array.dtype.kind not in "fiu" or not fits:
         wanted = " x ".join("T" if n is None else str(n) for n in shape)
+        several = f", or n x {wanted}," if name.endswith("_reference") else ""
         raise DataError(
             f"{source}: {name} is {array.dtype} of shape {array.shape}; real numbers of shape "
-            f"{wanted} are needed"
+            f"{wanted}{several} are needed"
         )
     return np.asarray(array, dtype=np.float64)
 

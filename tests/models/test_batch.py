@@ -12,7 +12,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from noisy_skin import Skin
-from tactomo_models import DataError, Flag, MethodError, Press, SensorDescription, SkinSimulator
+from tactomo_models import (
+    DataError,
+    Flag,
+    MethodError,
+    Press,
+    Reference,
+    SensorDescription,
+    SkinSimulator,
+)
 from tactomo_models.batch import read_scans, reconstruct_file
 
 PRESSES = [(), (Press(0.02, 0.01, 180.0),), (Press(-0.03, 0.0, 160.0), Press(0.035, 0.03, 190.0))]
@@ -106,6 +114,8 @@ def test_bad_input_is_refused_with_what_is_needed(
         ({**arrays, "magnitude": np.zeros((2, 208))}, "differ in length"),
         ({**arrays, "magnitude": np.array(["a"] * 208)}, "real numbers"),
         ({"magnitude": arrays["magnitude"]}, "magnitude_reference"),
+        ({**arrays, "structure_reference": np.ones((20, 192))}, "shape 208, or n x 208, are"),
+        ({**arrays, "structure_reference": np.full((20, 208), np.nan)}, "holds no voltage"),
     ]
     for content, said in bad:
         with pytest.raises(DataError, match=said):
@@ -181,6 +191,37 @@ def test_a_scan_that_was_not_taken_is_flagged_and_the_others_go_on(
     assert np.isnan(out["structure"][1]).all()
     assert np.isnan(out["map"][2]).all()
     assert np.isnan(out["contact_magnitude"][out["contact_frame"] == 2]).all()
+
+
+def test_scans_at_rest_tell_their_noise(
+    tmp_path: Path, paper: SensorDescription, skin: Skin, arrays: dict[str, Any]
+) -> None:
+    taken = [skin.scan() for _ in range(21)]
+    rest = {name: np.array([scan[name] for scan in taken]) for name in taken[0]}
+    for volts in rest.values():
+        volts[7] = np.nan  # a scan that was not taken
+    arrays |= {f"{name}_reference": volts for name, volts in rest.items()}
+    np.savez(tmp_path / "in.npz", **arrays)
+    _, reference = read_scans(tmp_path / "in.npz", paper)
+    known = {name: np.delete(volts, 7, axis=0) for name, volts in rest.items()}
+    expected = Reference.from_scans(known["magnitude"], known["structure"])
+    assert reference.scans == 20
+    assert reference.is_noise_measured
+    for name in ("magnitude", "structure", "magnitude_noise", "structure_noise"):
+        np.testing.assert_array_equal(getattr(reference, name), getattr(expected, name))
+    out = run(tmp_path, paper, arrays)
+    assert out["contact_frame"].tolist() == [1, 2, 2]
+
+
+def test_a_voltage_that_no_scan_at_rest_has_is_left_out(
+    tmp_path: Path, paper: SensorDescription, skin: Skin, arrays: dict[str, Any]
+) -> None:
+    rest = np.array([skin.scan()["magnitude"] for _ in range(5)])
+    rest[:, 3] = np.nan
+    np.savez(tmp_path / "in.npz", **{**arrays, "magnitude_reference": rest})
+    _, reference = read_scans(tmp_path / "in.npz", paper)
+    assert reference.magnitude is not None
+    assert np.flatnonzero(np.isnan(reference.magnitude)).tolist() == [3]
 
 
 @pytest.mark.slow

@@ -72,10 +72,11 @@ class Contact:
     area_sigma_mm2: float | None = None  #: standard uncertainty of `area_mm2`
     #: Standard uncertainty of `pressure_kpa`, the sensor's calibration included
     pressure_sigma_kpa: float | None = None
-    force_n: float | None = None  #: pressure times area
+    #: Pressure times area; a lower bound where ``above``
+    force_n: float | None = None
     force_sigma_n: float | None = None  #: standard uncertainty of `force_n`
     #: ``within``; ``below``: touched, too lightly to be measured, `pressure_kpa` is None;
-    #: ``above``: `pressure_kpa` is the least that it can be; ``unknown``
+    #: ``above``: may be beyond the range, `pressure_kpa` is a lower bound, 95 %; ``unknown``
     pressure_range: str = "unknown"
     #: Highest pressure under it; `pressure_kpa` is a mean over its area
     peak_kpa: float | None = None
@@ -91,8 +92,9 @@ class Contact:
     def exceeds(self, limit_kpa: float) -> Answer:
         """Return whether it presses with `limit_kpa` or more.
 
-        YES goes by the best estimate of its highest pressure, NO by the upper bound of 95 %. So
-        noise moves the answer near the limit to and fro: stop at one, go on below a lower one.
+        YES goes by the best estimate of its highest pressure (the lower bound of 95 % of one that
+        is ``above``), NO by the upper bound of 95 %. So noise moves the answer near the limit to
+        and fro: stop at one, go on below a lower one.
         """
         least_kpa = self.pressure_kpa if self.peak_kpa is None else self.peak_kpa
         if least_kpa is not None and least_kpa >= limit_kpa:

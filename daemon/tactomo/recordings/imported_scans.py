@@ -5,8 +5,8 @@ Three layouts are read, told apart by their arrays; Sciospec's .eit files are of
 
 batch
     what `tactomo reconstruct` takes: `magnitude` and/or `structure` (T, M) volts in the
-    description's order; optionally `magnitude_reference`, `structure_reference` (M,) and `t` (T,)
-    seconds. A frame that is all NaN is a scan that did not arrive.
+    description's order; optionally `magnitude_reference`, `structure_reference` (M,) or (n, M) and
+    `t` (T,) seconds. A frame that is all NaN is a scan that did not arrive.
 
 single-ended
     what impedance tomography instruments save: `volts` (T, injections, electrodes), complex or
@@ -65,7 +65,7 @@ class Scans:
     Attributes:
         volts: (T, M) volts of each channel there is, in the description's order.
         time_s: (T,) seconds, rising, from 0; None where the file does not say.
-        reference: (M,) volts of each channel whose unloaded scan the file holds.
+        reference: (M,) or (n, M) volts of each channel whose unloaded scans the file holds.
         notes: what a user should know about how the file was read.
         turned_rad: the angle that complex volts were turned by.
     """
@@ -101,7 +101,7 @@ class Scans:
         if not self.reference:
             return None
         magnitude, structure = map(self.reference.get, (Channel.MAGNITUDE, Channel.STRUCTURE))
-        return Reference(magnitude, structure)
+        return Reference.at_rest(magnitude, structure)
 
     def _chosen(self, channel: Channel, frames: slice) -> FloatArray | None:
         volts = self.volts.get(channel)

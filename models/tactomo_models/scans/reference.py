@@ -98,6 +98,18 @@ class Reference:
             scans=min(len(scans) for scans in present),
         )
 
+    @classmethod
+    def at_rest(cls, magnitude: FloatArray | None, structure: FloatArray | None) -> Reference:
+        """The reference of scans (M,) or (n, M) of each channel; several tell their noise.
+
+        Where a voltage is no number, that voltage has no reference, and nothing tells the noise.
+        """
+        scans = [None if each is None else np.atleast_2d(each) for each in (magnitude, structure)]
+        if all(each is None or np.isfinite(each).all() for each in scans):
+            return cls.from_scans(*scans)
+        one, other = (None if each is None else each.mean(axis=0) for each in scans)
+        return cls(one, other)
+
 
 _TAKEN = ("magnitude", "structure", "magnitude_noise", "structure_noise")
 

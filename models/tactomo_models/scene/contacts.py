@@ -24,7 +24,7 @@ class Contact:
     #: relative conductivity change of the magnitude channel, without its sign; NaN if unknown
     magnitude: float = float("nan")
     magnitude_sigma: float = float("nan")  #: standard uncertainty of the magnitude
-    #: see `pressure_range`; NaN if unknown, the range's top if above
+    #: see `pressure_range`; NaN if unknown, a lower bound of 95 % if above
     pressure_kpa: float = float("nan")
     #: x_sigma_m, y_sigma_m: standard uncertainties of the centroid; NaN if unknown
     x_sigma_m: float = float("nan")
@@ -32,11 +32,13 @@ class Contact:
     area_sigma_m2: float = float("nan")  #: that of the area; NaN if unknown
     #: standard uncertainty of the pressure; NaN but within the range
     pressure_sigma_kpa: float = float("nan")
-    force_n: float = float("nan")  #: pressure times area, or as was taught; NaN if unknown
-    force_sigma_n: float = float("nan")  #: standard uncertainty of the force; NaN if unknown
+    #: pressure times area, or as was taught; NaN if unknown, a lower bound of 95 % if above
+    force_n: float = float("nan")
+    #: standard uncertainty of the force; NaN if that is unknown or a lower bound
+    force_sigma_n: float = float("nan")
     #: where the pressure lies, seen from what the magnitude channel answers to
     pressure_range: PressureRange = PressureRange.UNKNOWN
-    #: highest pressure under it; NaN if unknown, the range's top if above
+    #: highest pressure under it; NaN if unknown, a lower bound of 95 % if above
     peak_kpa: float = float("nan")
     #: standard uncertainty of the peak; NaN but within the range
     peak_sigma_kpa: float = float("nan")

@@ -1,8 +1,9 @@
 """From the magnitude channel's conductivity change to pressure and force, with uncertainty.
 
 A sensor's curve answers within a range. Below its onset a contact is felt by the structure channel
-alone: that it is touched is known, how hard is not. Beyond its last reading all that is known is
-that the pressure is at least that one's. Neither is given a number that looks measured.
+alone: that it is touched is known, how hard is not. Where the pressure may lie beyond its last
+reading, nothing bounds it from above, and what is told is a lower bound. Neither is given a number
+that looks measured.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from enum import StrEnum, auto
 
 import numpy as np
 
-from tactomo_models.arrays import FloatArray
+from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.sensor.response import MagnitudeResponse
 
@@ -23,6 +24,7 @@ CLEARLY = 2.0  # standard uncertainties above zero from which a magnitude is one
 # without it in half of them, and in 2 %. Less than CLEARLY: a contact that lightens is let go.
 HYSTERESIS = 1.75
 ONE_SIDED_95 = 1.645  # standard uncertainties below which 95 % of a normal distribution lie
+ONE_SIDED_99 = 2.326  # likewise: only if this bound is on the curve is a pressure `within` again
 
 
 class PressureRange(StrEnum):
@@ -30,7 +32,7 @@ class PressureRange(StrEnum):
 
     WITHIN = auto()
     BELOW = auto()  # touched, but too lightly to be measured
-    ABOVE = auto()  # at least the range's top
+    ABOVE = auto()  # its upper bound, 95 %, lies beyond the range's top: a lower bound is told
     UNKNOWN = auto()  # no magnitude channel, no curve, or too uncertain to tell
 
 
@@ -38,12 +40,14 @@ class PressureRange(StrEnum):
 class Pressures:
     """Pressures of K contacts; NaN where unknown."""
 
-    kpa: FloatArray  # (K,) the range's top where it is `above`
+    kpa: FloatArray  # (K,) a lower bound, 95 %, where it is `above`; at most the range's top
     sigma_kpa: FloatArray  # (K,) standard uncertainties; known `within` alone
-    force_n: FloatArray  # (K,) pressure times area
-    force_sigma_n: FloatArray  # (K,) standard uncertainties; NaN where the area's is
+    # (K,) pressures times areas; a lower bound where one is `above`
+    force_n: FloatArray
+    # (K,) standard uncertainties; NaN where `above`, and where the force or the area's is
+    force_sigma_n: FloatArray
     ranges: tuple[PressureRange, ...]  # K of them
-    peak_kpa: FloatArray  # (K,) highest pressures; the range's top where one is `above`
+    peak_kpa: FloatArray  # (K,) highest pressures; lower bounds, as `kpa`, where `above`
     peak_sigma_kpa: FloatArray  # (K,) standard uncertainties; known `within` alone
     max_kpa: FloatArray  # (K,) upper bounds, 95 %, in every range; +inf where the curve ends below
 
@@ -114,23 +118,54 @@ class PressureCurve:
         kpa = reported + np.hypot(self.pressure(most) - reported, ONE_SIDED_95 * self.sigma(most))
         return np.where(most > self.magnitude[-1], np.inf, kpa)
 
+    def least(self, magnitude: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Pressure in kPa, same shape, that the true one exceeds with 95 %; at most the top."""
+        least = np.maximum(magnitude - ONE_SIDED_95 * sigma, 0.0)
+        reported = self.pressure(magnitude)
+        by_both = np.hypot(reported - self.pressure(least), ONE_SIDED_95 * self.sigma(least))
+        return np.maximum(reported - by_both, 0.0)
+
     def range_of(
-        self, magnitude: float, sigma: float, last: PressureRange = PressureRange.UNKNOWN
+        self,
+        magnitude: float,
+        sigma: float,
+        last: PressureRange = PressureRange.UNKNOWN,
+        *,
+        highest: tuple[float, float] | None = None,
     ) -> PressureRange:
-        """Where a magnitude with its standard uncertainty lies, of a contact that was in `last`."""
+        """Where a magnitude with its standard uncertainty lies, of a contact that was in `last`.
+
+        Args:
+            magnitude: tells whether anything is felt.
+            sigma: its standard uncertainty.
+            last: the range a frame ago.
+            highest: magnitude under the highest pressure and its standard uncertainty, which tell
+                whether it may lie beyond the curve; the same ones if None.
+        """
         # Of the curve's top: a magnitude that is clearly below that, and may be 0, is below.
         little = 0.25
-        if not np.isfinite(magnitude + sigma):
+        peak, peak_sigma = highest or (magnitude, sigma)
+        if not np.isfinite(magnitude + sigma + peak + peak_sigma):
             return PressureRange.UNKNOWN
         was_measured = last in (PressureRange.WITHIN, PressureRange.ABOVE)
         was_below = last is PressureRange.BELOW
         favour = HYSTERESIS * sigma * (was_below - was_measured)
         if magnitude > CLEARLY * sigma + favour and magnitude >= self.magnitude[0] + favour:
-            above = magnitude > self.magnitude[-1]
+            sure = ONE_SIDED_99 if last is PressureRange.ABOVE else ONE_SIDED_95
+            above = peak + sure * peak_sigma > self.magnitude[-1]
             return PressureRange.ABOVE if above else PressureRange.WITHIN
         most = max(little * self.magnitude[-1], self.magnitude[0])
         light = magnitude + CLEARLY * sigma - HYSTERESIS * sigma * was_below < most
         return PressureRange.BELOW if light else PressureRange.UNKNOWN
+
+    def covers(self, magnitude: FloatArray, sigma: FloatArray) -> BoolArray:
+        """Whether magnitudes (any shape) are between the curve's ends, as far as is known.
+
+        A curve that begins at no pressure covers all that is light.
+        """
+        from_onset = magnitude - ONE_SIDED_95 * sigma >= self.magnitude[0]
+        is_bounded = magnitude + ONE_SIDED_95 * sigma <= self.magnitude[-1]
+        return np.asarray(is_bounded & (from_onset | (self.pressure_kpa[0] <= 0)))
 
     def _beyond(self, magnitude: FloatArray) -> FloatArray:
         """Pressure with the end pieces prolonged, so that a spread does not shrink at the ends."""
@@ -163,31 +198,34 @@ def pressures_of(
     An area taken too large makes the magnitude too small, and the magnitude's uncertainty says so
     already: in the force the two errors partly cancel.
     """
+    nothing = np.full(len(magnitude), np.nan)
     if curve is None:
-        nothing = np.full(len(magnitude), np.nan)
         unknown = (PressureRange.UNKNOWN,) * len(magnitude)
         return Pressures(nothing, nothing, nothing, nothing, unknown, nothing, nothing, nothing)
     highest, highest_sigma = felt, felt_sigma = magnitude, magnitude_sigma
     if field is not None:
         highest, highest_sigma = field.peak_magnitude, field.peak_magnitude_sigma
         felt, felt_sigma = field.felt, field.felt_sigma
-    ago = [PressureRange.UNKNOWN] * len(magnitude) if last is None else last
-    each = zip(felt.tolist(), felt_sigma.tolist(), ago, strict=True)
-    ranges = tuple(curve.range_of(*one) for one in each)
+    lasts = [PressureRange.UNKNOWN] * len(magnitude) if last is None else last
+    columns = (felt, felt_sigma, highest, highest_sigma)
+    ranges = tuple(
+        curve.range_of(size, error, was, highest=(peak_size, peak_error))
+        for (size, error, peak_size, peak_error), was in zip(
+            np.column_stack(columns).tolist(), lasts, strict=True
+        )
+    )
     within = np.array([r is PressureRange.WITHIN for r in ranges], bool)
     above = np.array([r is PressureRange.ABOVE for r in ranges], bool)
-    peak = np.where(within | above, curve.pressure(highest), np.nan)
+    peak = curve.pressure(highest)
     spread, own = curve.spread(highest, highest_sigma), curve.sigma(highest)
-    peak_sigma = np.where(within, np.hypot(spread, own), np.nan)
-    bound = curve.bound(highest, highest_sigma)
+    peak_sigma = np.hypot(spread, own)
     if field is not None:
         # The curve in force may be another than the description's table, as after a calibration.
         by_curve = peak / np.maximum(field.peak_kpa, 1e-12)
         force = field.force_n * by_curve
         force_sigma = np.hypot(field.force_sigma_n * by_curve, force * own / peak)
         kpa = np.minimum(field.mean_kpa * by_curve, peak)  # but for rounding it is
-        kpa = np.where(above, peak, kpa)  # at least that, somewhere
-        sigma = np.where(within, np.hypot(field.mean_sigma_kpa * by_curve, own), np.nan)
+        sigma = np.hypot(field.mean_sigma_kpa * by_curve, own)
     else:
         kpa, sigma, force = peak, peak_sigma, 1e3 * peak * areas_m2
         by_area = magnitude * area_sigmas_m2 / areas_m2
@@ -196,5 +234,20 @@ def pressures_of(
         of_area = (kpa - slope * magnitude) * area_sigmas_m2
         of_pressure = np.hypot(curve.spread(magnitude, apart), own) * areas_m2
         force_sigma = 1e3 * np.hypot(of_pressure, of_area)
-    force_sigma = np.where(within, force_sigma, np.nan)
-    return Pressures(kpa, sigma, force, force_sigma, ranges, peak, peak_sigma, bound)
+    least = curve.least(highest, highest_sigma)
+    is_force = within | (~above & curve.covers(highest, highest_sigma))
+    at_least = np.maximum(force - ONE_SIDED_95 * np.nan_to_num(force_sigma), 0.0)
+
+    def told(value: FloatArray, bound: FloatArray, known: BoolArray = within) -> FloatArray:
+        return np.where(known, value, np.where(above, bound, np.nan))
+
+    return Pressures(
+        kpa=told(kpa, np.minimum(least, np.maximum(kpa - ONE_SIDED_95 * sigma, 0.0))),
+        sigma_kpa=told(sigma, nothing),
+        force_n=told(force, at_least, is_force),
+        force_sigma_n=told(force_sigma, nothing, is_force),
+        ranges=ranges,
+        peak_kpa=told(peak, least),
+        peak_sigma_kpa=told(peak_sigma, nothing),
+        max_kpa=np.where(above, np.inf, curve.bound(highest, highest_sigma)),
+    )

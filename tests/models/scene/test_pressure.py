@@ -117,10 +117,64 @@ def test_the_bound_holds_in_95_of_100() -> None:
     assert held.mean() == pytest.approx(0.95, abs=0.01)
 
 
-def test_beyond_the_range_its_top_is_a_lower_bound() -> None:
-    pressures = one(0.4, 0.01)
-    assert pressures.kpa[0] == 200
-    assert pressures.force_n[0] == pytest.approx(200e3 * AREA_M2)
+@pytest.mark.parametrize(
+    ("magnitude", "sigma", "kpa"),
+    [
+        (0.4, 0.01, 200 - 1.645 * 4),  # the curve's own uncertainty is all there is
+        (0.195, 0.01, 198.3 - 1.645 * np.hypot(3.33, 3.8)),  # may be beyond, and need not be
+    ],
+)
+def test_what_may_lie_beyond_the_range_has_a_lower_bound(
+    magnitude: float, sigma: float, kpa: float
+) -> None:
+    pressures = one(magnitude, sigma, 1e-5)
+    assert pressures.ranges == (PressureRange.ABOVE,)
+    assert pressures.kpa[0] <= pressures.peak_kpa[0] == pytest.approx(kpa, abs=0.5)
+    assert pressures.max_kpa[0] == np.inf
+    assert np.isnan([pressures.sigma_kpa, pressures.peak_sigma_kpa, pressures.force_sigma_n]).all()
+    assert 0.9 * kpa * 1e3 * AREA_M2 < pressures.force_n[0] < kpa * 1e3 * AREA_M2
+
+
+def test_a_lower_bound_holds_in_95_of_100() -> None:
+    rng = np.random.default_rng(6)
+    truth, count = 0.19, 100_000
+    magnitude = truth + 0.01 * rng.standard_normal(count)
+    true_kpa = CURVE.pressure(np.array([truth])) + rng.standard_normal(count) * CURVE.sigma(
+        np.array([truth])
+    )
+    held = true_kpa >= CURVE.least(magnitude, np.full(count, 0.01))
+    assert held.mean() == pytest.approx(0.95, abs=0.01)
+
+
+def test_near_the_top_a_contact_stays_above_until_it_is_clearly_not() -> None:
+    ranges = [
+        [CURVE.range_of(magnitude, 0.01, last) for magnitude in (0.176, 0.18, 0.185)]
+        for last in (PressureRange.WITHIN, PressureRange.ABOVE)
+    ]
+    assert ranges == [["within", "within", "above"], ["within", "above", "above"]]
+
+
+FROM_ZERO = PressureCurve(np.array([0.0, 2.0]), np.array([0.0, 300.0]), np.zeros(2))
+
+
+@pytest.mark.parametrize(
+    ("curve", "magnitude", "sigma", "found", "is_known"),
+    [
+        (FROM_ZERO, 0.1, 0.15, "below", True),  # the sheet answers from the lightest touch on
+        (FROM_ZERO, 0.5, 0.4, "unknown", True),
+        (FROM_ZERO, 1.4, 1.0, "unknown", False),  # may be beyond the curve
+        (CURVE, 0.02, 0.012, "below", False),  # may be less than what it answers to
+        (CURVE, 0.07, 0.036, "unknown", False),
+    ],
+)
+def test_a_force_is_known_where_the_curve_covers_the_contact(
+    curve: PressureCurve, magnitude: float, sigma: float, found: str, is_known: bool
+) -> None:
+    pressures = one(magnitude, sigma, 1e-5, curve)
+    assert pressures.ranges == (PressureRange(found),)
+    assert np.isnan(pressures.kpa[0])
+    assert np.isfinite(pressures.force_n[0]) == is_known
+    assert np.isfinite(pressures.force_sigma_n[0]) == is_known
 
 
 def test_without_a_curve_nothing_is_known() -> None:
@@ -132,14 +186,16 @@ def test_without_a_curve_nothing_is_known() -> None:
 @pytest.mark.parametrize("area_share", [0.0, 0.02, 0.1])
 def test_uncertainties_are_what_happens(area_share: float) -> None:
     """The area's error is in the magnitude, too: an area too large makes it too small."""
+    # Goes on far enough for none to be `above`, where lower bounds are told.
+    curve = PressureCurve(np.array([0.02, 0.38]), np.array([140.0, 260.0]), np.array([2.0, 6.0]))
     rng = np.random.default_rng(5)
     truth, noise, count = 0.1, 0.004, 100_000
     areas = AREA_M2 * (1 + area_share * rng.standard_normal(count))
     magnitude = truth * AREA_M2 / areas + noise * rng.standard_normal(count)
     off = rng.standard_normal(count)  # of the curve, in its own uncertainties
-    true_kpa = CURVE.pressure(np.array([truth])) + off * CURVE.sigma(np.array([truth]))
+    true_kpa = curve.pressure(np.array([truth])) + off * curve.sigma(np.array([truth]))
     sigma = np.full(count, np.hypot(noise, truth * area_share))
-    found = pressures_of(CURVE, magnitude, sigma, areas, np.full(count, area_share * AREA_M2))
+    found = pressures_of(curve, magnitude, sigma, areas, np.full(count, area_share * AREA_M2))
     pressure_error = (found.kpa - true_kpa).std()
     assert pressure_error == pytest.approx(found.sigma_kpa.mean(), rel=0.03)
     force_error = (found.force_n - 1e3 * true_kpa * AREA_M2).std()

@@ -76,8 +76,8 @@ struct Contact {
     std::optional<double> edge;     ///< γ of its pressure (1 - ρ²)^γ: 0 flat, 0.5 Hertz
     bool taught = false;  ///< presses at known places say where it is; else the physics alone does
 
-    /// Whether it presses with limit_kpa or more: yes by the best estimate of its highest pressure,
-    /// no by the upper bound of 95 %. So noise moves the answer near the limit to and fro: stop at
+    /// Whether it presses with limit_kpa or more: yes by the best estimate of its highest pressure
+    /// (the lower bound of 95 % of one that is above), no by the upper bound of 95 %. So noise moves the answer near the limit to and fro: stop at
     /// one, go on below a lower one.
     Answer exceeds(double limit_kpa) const noexcept {
         const std::optional<double>& estimate = peak_kpa ? peak_kpa : pressure_kpa;

@@ -259,5 +259,5 @@ def _beyond(made: PressureCalibration) -> str:
     low, high = made.curve.range_kpa
     return (
         f"Below {low:.0f} kPa contacts are `below` (touched, pressure unknown); beyond {high:.0f} "
-        f"kPa they are `above` (at least {high:.0f} kPa)."
+        "kPa they are `above` (at least what is told)."
     )

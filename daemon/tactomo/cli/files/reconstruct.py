@@ -65,12 +65,13 @@ def reconstruct(
     OUT may be an earlier one of this command; anything else is written over with `--force` only.
 
     IN holds `magnitude` and `structure` (T, M) volts and `magnitude_reference`,
-    `structure_reference` (M,); structure may be missing. Or it is what `tactomo import` reads, or
-    frames of one channel, one a row or a column: an array of a .mat (up to version 7), numbers in
-    text (.csv, .txt), or a .get of 16 electrodes. Then the reference is an array called reference,
-    baseline, rest, empty or vh, `--reference-frames` of IN, or the mean of the file `--reference`.
-    `--pattern 32:adjacent`, `16:opposite:adjacent` or `16:adjacent:rotated` says which electrodes
-    the numbers are of, where the description says otherwise; it gets as many electrodes.
+    `structure_reference` (M,), or (n, M) scans at rest; structure may be missing. Or it is what
+    `tactomo import` reads, or frames of one channel, one a row or a column: an array of a .mat (up
+    to version 7), numbers in text (.csv, .txt), or a .get of 16 electrodes. Then the reference is
+    an array called reference, baseline, rest, empty or vh, `--reference-frames` of IN, or the mean
+    of the file `--reference`. `--pattern 32:adjacent`, `16:opposite:adjacent` or
+    `16:adjacent:rotated` says which electrodes the numbers are of, where the description says
+    otherwise; it gets as many electrodes.
 
     OUT gets `map` (T, ny, nx), the relative conductivity change; `pressure_kpa` (T, ny, nx), NaN
     where unknown; `structure` (T, ny, nx) from 0 to 1; `misfit`, `confidence` (the correlation with
