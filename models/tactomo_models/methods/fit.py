@@ -12,7 +12,6 @@ import numpy as np
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
-from tactomo_models.methods.joint_fit import QUESTIONS, Question
 from tactomo_models.methods.linear import EitherWay
 from tactomo_models.methods.magnitudes import BAD_MISFIT
 from tactomo_models.methods.method import Estimate, Skin, UnsolvableError
@@ -36,7 +35,6 @@ class OutlineFit:
     """A few contacts: their outlines, and how hard each presses."""
 
     shape_model = ShapeModel.OUTLINES
-    questions: tuple[Question, ...] = QUESTIONS
     uses_sheets = True
 
     def prepare(self, skin: Skin) -> None:
@@ -54,8 +52,8 @@ class OutlineFit:
         if before is None or before.forward is not skin.forward:
             self._field_fit = FieldFit(skin.forward, skin.description)
             self._accountant = FieldAccountant(self._field_fit, skin.areas)
-            self._fit = WarmStartedFit(self._field_fit, self.shape_model, self.questions)
-            self._drifting_fit = WarmStartedFit(self._field_fit, self.shape_model, self.questions)
+            self._fit = WarmStartedFit(self._field_fit, self.shape_model)
+            self._drifting_fit = WarmStartedFit(self._field_fit, self.shape_model)
             self._drift: FloatArray | None = None  # see `SheetEstimator.drift`
             self._typical_peak = self._fit.typical_peak
         self._field_fit.sheets = dict(skin.sheets)
