@@ -29,19 +29,19 @@ Done = Callable[[], None]
 
 # Methods that a budget bounds, and that go on in a frame from what the one before it came to. The
 # others take what they take, and start anew in each frame.
-RUNGS: Final = ("fit", "levelset")  # of auto, whose budgets stand for theirs
+LAST_BUDGET_ALONE: Final = ("fit", "levelset")  # auto's budgets stand for theirs
 BUDGETS_S: Final = (0.005, 0.01, 0.02, DEFAULT_BUDGET_S)
 STILL_BUDGETS_S: Final = (*BUDGETS_S, BUDGET_S)  # the last one: as much as a scene needs
 
 
 def variants(methods: Iterable[str], budgets_s: Sequence[float] = BUDGETS_S) -> list[Variant]:
-    """Every method: those that a budget bounds under each of some, auto's rungs under the last."""
+    """Every method: `auto` under each of some budgets, others that one bounds under the last."""
     chosen = []
     for method in methods:
         if method not in BUDGETED:
             chosen.append(Variant(method))
         else:
-            budgets = budgets_s[-1:] if method in RUNGS else budgets_s
+            budgets = budgets_s[-1:] if method in LAST_BUDGET_ALONE else budgets_s
             chosen += [Variant(method, budget_s) for budget_s in budgets]
     return chosen
 
