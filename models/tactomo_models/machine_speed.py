@@ -1,4 +1,4 @@
-"""What a budget of time buys on the machine at hand: how much work, and which method.
+"""What a budget of time buys on the machine at hand: how much modelled work.
 
 A reconstructor's budget counts modelled work, so that a recording reconstructs exactly as the live
 stream did (`field_fit.Budget`). The machine's speed turns time into such a budget, once, before the
@@ -11,58 +11,34 @@ there is none, one that comes with tactomo stands in.
 
 from __future__ import annotations
 
+import json
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from functools import cache
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Final, Literal, NamedTuple
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from tactomo_models.archive import write_whole
-from tactomo_models.errors import ArtifactError, ModelError, explain
-from tactomo_models.methods.registry import check_method
+from tactomo_models.errors import ArtifactError, explain
 from tactomo_models.physics.artifact import default_path
 from tactomo_models.sensor.description import SensorDescription
 
 SHIPPED: Final = "shipped_machine_speed.json"
 AGAIN: Final = "run: tactomo bench --machine-speed"
-CLEARLY: Final = 0.02  # of ICC: by more than this another method must be better than auto's own
 MIN_BUDGET_S: Final = 0.001  # a frame does one thing at least, whatever it may take
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class Row(_Table):
-    """How fast and how right a method is on moving scenes, frame after frame."""
-
-    method: str  # its name
-    # modelled work that a frame might take; None where a method takes what it takes
-    budget_s: Annotated[float, Field(gt=0)] | None
-    # p50_s, p99_s: time of a frame
-    p50_s: Annotated[float, Field(gt=0)]
-    p99_s: Annotated[float, Field(gt=0)]
-    # of the magnitude map, mean, on the laboratory's moving scenes of the shipped sensor: no matter
-    # of the machine, and the order of methods on other sensors, too
-    icc: Annotated[float, Field(ge=-1, le=1)]
-
-
-class Plan(NamedTuple):
-    """What a reconstructor is given for the method and the time that were asked for."""
-
-    method: str
-    budget_s: float | None
-
-
-class MachineSpeed(_Table):
+class MachineSpeed(BaseModel):
     """What was measured for one sensor on one machine."""
 
-    format: Literal[1] = 1  # of the file
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    format: Literal[2] = 2  # of the file
     tactomo: str  # the version that measured
     machine: str  # its processor
     taken: str  # the day, as YYYY-MM-DD
@@ -72,18 +48,17 @@ class MachineSpeed(_Table):
     overhead_s: Annotated[float, Field(ge=0)]
     # seconds that a frame takes for each second of modelled work, there
     speed: Annotated[float, Field(gt=0)]
-    rows: tuple[Row, ...]  # the methods that `auto` may choose from
     shipped: Annotated[bool, Field(exclude=True)] = False  # whether it came with tactomo
 
     @classmethod
-    def of_rows(
+    def of_times(
         cls,
         description: SensorDescription,  # the sensor
         taken: str,  # the day
-        rows: Sequence[Row],  # some of them of `auto`, under different budgets
+        p99_s: Mapping[float, float],  # time of a frame, at its 99th percentile, by its budget
     ) -> MachineSpeed:
         """Make one of what was measured just now on this machine."""
-        overhead_s, speed = _law([row for row in rows if row.method == "auto"])
+        overhead_s, speed = _law(p99_s)
         return cls(
             tactomo=version("tactomo"),
             machine=processor(),
@@ -92,33 +67,11 @@ class MachineSpeed(_Table):
             sha256=description.sha256,
             overhead_s=overhead_s,
             speed=speed,
-            rows=tuple(rows),
         )
 
-    def plan(self, method: str, time_s: float | None) -> Plan:
-        """Return what to give a reconstructor, so that 99 frames of 100 keep to a time.
-
-        Args:
-            method: that is asked for. `auto` becomes another method where that one is more right
-                within so little time.
-            time_s: that a frame may take; None leaves it to the method.
-        """
-        if time_s is None:
-            return Plan(method, None)
-        best = self.best_within(time_s) if method == "auto" else None
-        budget_s = max(MIN_BUDGET_S, (time_s - self.overhead_s) / self.speed)
-        return Plan(method if best is None else best.method, budget_s)
-
-    def best_within(self, time_s: float) -> Row | None:
-        """Return the most accurate row that keeps to a time, or else the fastest one.
-
-        What `auto` does by itself is judged by the physics and flagged where that finds fault, so
-        that another method has to be clearly more accurate.
-        """
-        fitting = [row for row in self.rows if row.p99_s <= time_s]
-        if fitting:
-            return max(fitting, key=lambda row: row.icc + CLEARLY * (row.method == "auto"))
-        return min(self.rows, key=lambda row: row.p99_s, default=None)
+    def budget_s(self, time_s: float) -> float:
+        """Modelled work (s) by which 99 frames of 100 keep to a time (s)."""
+        return max(MIN_BUDGET_S, (time_s - self.overhead_s) / self.speed)
 
     @property
     def source(self) -> str:
@@ -128,14 +81,13 @@ class MachineSpeed(_Table):
         return f"measured here on {self.taken}"
 
 
-def _law(rows: Sequence[Row]) -> tuple[float, float]:
+def _law(p99_by_budget: Mapping[float, float]) -> tuple[float, float]:
     """Overhead and slope of the frames' time over their budget, by least relative squares."""
-    budget_s = np.array([row.budget_s or 0.0 for row in rows])
-    p99_s = np.array([row.p99_s for row in rows])
-    terms = np.stack([np.ones(len(rows)), budget_s], axis=1)
+    budget_s, p99_s = np.array([*p99_by_budget]), np.array([*p99_by_budget.values()])
+    terms = np.stack([np.ones(len(budget_s)), budget_s], axis=1)
     from scipy.optimize import nnls  # 10 MB, which a daemon need not hold
 
-    (overhead_s, speed), _ = nnls(terms / p99_s[:, None], np.ones(len(rows)))
+    (overhead_s, speed), _ = nnls(terms / p99_s[:, None], np.ones(len(budget_s)))
     return float(overhead_s), max(float(speed), 1e-3)
 
 
@@ -164,12 +116,15 @@ def load_machine_speed(path: Path, description: SensorDescription) -> MachineSpe
         FileNotFoundError: there is none.
     """
     try:
-        found = MachineSpeed.model_validate_json(path.read_bytes())
+        content = path.read_bytes()
+        found = MachineSpeed.model_validate_json(content)
     except FileNotFoundError:
         raise
     except OSError as error:
         raise ArtifactError(f"cannot read {path}: {error.strerror}; {AGAIN}") from error
     except ValidationError as error:
+        if _is_earlier(content):
+            raise ArtifactError(f"{path} was measured by an earlier tactomo; {AGAIN}") from error
         complaint = " ".join(explain(error.errors()[0]).split())[:200]
         raise ArtifactError(f"{path} is damaged ({complaint}); {AGAIN}") from error
     for what, of, here in (
@@ -196,23 +151,15 @@ def machine_speed_for(
     except ArtifactError as error:
         warn(f"{error}; until then: the one that comes with tactomo")
         found = _shipped()
-    # Which method is best is another sensor's, and a network may be gone that was there.
-    of_this = (found.sensor, found.sha256) == (description.name, description.sha256)
-    rows = [row for row in found.rows if of_this and _is_available(description, row.method)]
-    return found.model_copy(update={"rows": tuple(rows)})
+    return found
 
 
-def shipped_rows(description: SensorDescription) -> list[Row]:
-    """Rows of the shipped table whose methods a sensor can be reconstructed by."""
-    return [row for row in _shipped().rows if _is_available(description, row.method)]
-
-
-def _is_available(description: SensorDescription, method: str) -> bool:
+def _is_earlier(content: bytes) -> bool:
+    """Whether a file is of format 1, which rated methods beside the machine's speed."""
     try:
-        check_method(method, description)
-    except ModelError:
+        return dict(json.loads(content)).get("format") == 1
+    except (ValueError, TypeError):
         return False
-    return True
 
 
 def _shipped() -> MachineSpeed:

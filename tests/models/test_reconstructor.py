@@ -246,7 +246,7 @@ def test_the_last_shape_is_not_held_for_ever(reconstructor: Reconstructor, skin:
     assert tiers[-1] == "network"
 
 
-@pytest.mark.parametrize("method", ["auto", "fit", "levelset"])
+@pytest.mark.parametrize("method", ["auto", "fit"])
 @pytest.mark.parametrize("lost", [1, 10, 11])
 def test_a_sheet_lost_in_mid_press_is_held_or_flagged_and_comes_back(
     reconstructor: Reconstructor, skin: Skin, method: str, lost: int
@@ -269,6 +269,34 @@ def test_a_sheet_lost_in_mid_press_is_held_or_flagged_and_comes_back(
         (after,) = settle(reconstructor, skin, CENTRE, frames=4).contacts
         assert after.id == before.id
         assert after.pressure_kpa == pytest.approx(180, abs=12)
+
+
+def test_a_level_set_has_no_shapes_without_its_sheet_and_starts_again_with_it(
+    reconstructor: Reconstructor, skin: Skin
+) -> None:
+    reconstructor.method = "levelset"
+    (before,) = settle(reconstructor, skin, CENTRE).contacts
+    held = reconstructor.reconstruct(skin.scan(CENTRE)["magnitude"], None)
+    assert held.tier == "tikhonov"
+    assert held.reason.startswith("the structure channel is missing")
+    blind = reconstructor.reconstruct(None, skin.scan(CENTRE)["structure"])
+    assert blind.tier == "levelset"
+    assert blind.map is None
+    assert [math.isnan(contact.pressure_kpa) for contact in blind.contacts] == [True]
+    frame = settle(reconstructor, skin, CENTRE, frames=4)
+    assert [contact.id for contact in frame.contacts] == [before.id]
+    assert frame.flags == Flag(0)
+
+
+def test_a_still_level_set_takes_no_further_solve(
+    reconstructor: Reconstructor, skin: Skin, solves: list[int]
+) -> None:
+    reconstructor.method = "levelset"
+    settle(reconstructor, skin, CENTRE, frames=20)
+    before = len(solves)
+    frame = settle(reconstructor, skin, CENTRE, frames=10)
+    assert frame.reason == "still"
+    assert len(solves) == before
 
 
 def test_sheets_that_are_lost_by_turns_raise_nothing(

@@ -244,18 +244,18 @@ class Imaging:
         if not processor.note(*self._took_s, dropped, time.monotonic()):
             return
         self.method.give_share(processor.of_time)
-        method, share = self.method.effective.method, processor.of_time
+        share = processor.of_time
         if share < before:
             self._on_event(
                 "processor_shared",
                 "warning",
                 f"others take the processor: this skin got {processor.of_core:.0%} of a core while "
-                f"it computed, and frames get {share:.0%} of their time, by {method}",
+                f"it computed, and frames get {share:.0%} of their time",
                 "give the daemon more of the processor, or fewer skins; it takes more by itself "
                 "once it can",
             )
         elif share == 1:
-            self._on_event("processor_free", "info", f"frames get all of their time, by {method}")
+            self._on_event("processor_free", "info", "frames get all of their time")
 
     def _judge_dispute(self, frame: Reconstruction) -> Reconstruction:
         """Flag a frame, unless it settles the dispute: the skin is again as it was known."""

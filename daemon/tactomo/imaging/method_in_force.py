@@ -1,9 +1,8 @@
 """The method and the budget that were requested, and those that frames get.
 
 A budget is milliseconds of this machine; the machine's speed turns it into milliseconds of modelled
-work, and may choose another method than `auto` where there is little time, or where others take the
-processor. Recordings hold what was effective, so that a replay gives the same on any machine. For
-use by the pipeline thread; others may read.
+work, less of it where others take the processor. Recordings hold what was effective, so that a
+replay gives the same on any machine. For use by the pipeline thread; others may read.
 """
 
 from __future__ import annotations
@@ -76,9 +75,8 @@ class MethodInForce:
         time_s = None if requested.budget_ms is None else requested.budget_ms * 1e-3
         if self.share < 1:
             time_s = self.share * (time_s or DEFAULT_BUDGET_S)
-        plan = self._machine_speed.plan(requested.method, time_s)
-        modelled_ms = None if plan.budget_s is None else plan.budget_s * 1e3
-        self._put_in_force(Effort(plan.method, modelled_ms))
+        modelled_ms = None if time_s is None else self._machine_speed.budget_s(time_s) * 1e3
+        self._put_in_force(Effort(requested.method, modelled_ms))
         self.requested = requested
 
     def _put_in_force(self, effective: Effort) -> None:

@@ -16,7 +16,6 @@ from tactomo_lab.commands import evaluate
 if TYPE_CHECKING:
     from tactomo_lab.scenes.measures import FrameScore
 
-EVEN_FIT = "tactomo_lab.baselines.even_fit:EvenFit"
 MAPS = (
     "frames",
     "ICC",
@@ -54,10 +53,7 @@ def field(
     sensor: options.Description = options.DEFAULT_DESCRIPTION,
     picture: Annotated[
         Path | None,
-        picture_option(
-            "Draw one soft contact, the middle one by correlation: truth, an even pressure fitted, "
-            "the method"
-        ),
+        picture_option("Draw one soft contact, the middle one by correlation: truth and method"),
     ] = None,
     as_json: options.JsonOutput = False,
 ) -> None:
@@ -118,5 +114,5 @@ def field(
     if picture is not None:
         from tactomo_lab.commands.pictures import draw_press
 
-        draw_press(middle_press(description, (EVEN_FIT, method), seeds, count), picture)
+        draw_press(middle_press(description, method, seeds, count), picture)
         typer.echo(f"wrote {picture}", err=True)

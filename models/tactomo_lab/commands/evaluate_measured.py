@@ -25,7 +25,7 @@ app = typer_app()
 @app.command(
     epilog=examples(
         "tactomo evaluate tanks tank_uef2017.npz --picture tanks.png",
-        "tactomo evaluate tanks tank_uef2017.npz --method levelset --scale 0.78",
+        "tactomo evaluate tanks tank_uef2017.npz --method network --scale 0.78",
     )
 )
 def tanks(

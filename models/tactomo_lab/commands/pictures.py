@@ -60,61 +60,57 @@ def _draw_outcome(axes: Any, outcome: Outcome) -> None:
     for panel, (image, highest, title) in zip(axes, images, strict=True):
         panel.set_title(title, fontsize=8)
         drawn = _show(panel, image, sensor, highest)
-        if panel in (axes[1], axes[3]):  # of the truth beside it, too
+        if panel in (axes[1], axes[2]):  # of the truth beside it, too
             bar = axes[0].figure.colorbar(drawn, ax=panel, shrink=0.8, pad=0.02)
             bar.ax.tick_params(labelsize=6)
             bar.set_label(CHANGE if panel is axes[1] else "share pressed", fontsize=7)
     for contact in frame.contacts:
         axes[1].plot(contact.x_m * 1e3, contact.y_m * 1e3, "r+", markersize=6)
-    axes[3].set_xlabel("\n".join(score.flags), fontsize=6, color="tab:red")
+    axes[2].set_xlabel("\n".join(score.flags), fontsize=6, color="tab:red")
 
 
 def draw_press(
-    outcomes: Sequence[Outcome],  # of one scene, the even pressure first
+    outcome: Outcome,  # of a scene of one contact
     output: Path,  # the picture
 ) -> None:
-    """Draw one contact: the truth, an even pressure fitted, the field; and a cut through it, kPa.
+    """Draw one contact: the truth, what a method found, and a cut through both in kPa.
 
     Raises TactomoError where the picture cannot be written.
     """
     from matplotlib.figure import Figure
 
-    scene = outcomes[0].scene
+    scene, frame = outcome.scene, outcome.frame
     (press,) = scene.layout.presses
     sensor, truth = scene.description, scene.truth
-    figure = Figure(figsize=(15, 4), layout="constrained")
-    axes: Any = figure.subplots(1, 4)
-    maps = [truth.map] + [outcome.frame.map for outcome in outcomes]
+    figure = Figure(figsize=(11.5, 4), layout="constrained")
+    axes: Any = figure.subplots(1, 3)
+    maps = (truth.map, frame.map)
     highest = max(float(image.max()) for image in maps if image is not None)
-    names = ("an even pressure fitted", f"the field fitted ({outcomes[-1].method})")
-    titles = [f"truth, {scene.layout}, {_size_mm(sensor)}\npeak {press.pressure_kpa:.0f} kPa"]
-    titles += [_told(name, outcome) for name, outcome in zip(names, outcomes, strict=True)]
+    peaks = [f"{c.peak_kpa:.0f} ± {c.peak_sigma_kpa:.0f} kPa" for c in frame.contacts]
+    titles = (
+        f"truth, {scene.layout}, {_size_mm(sensor)}\npeak {press.pressure_kpa:.0f} kPa",
+        f"{outcome.method}, correlation {outcome.score.icc:.3f}\npeak {', '.join(peaks) or 'none'}",
+    )
     for panel, image, title in zip(axes, maps, titles, strict=False):
         panel.set_title(title, fontsize=10)
         drawn = _show(panel, image, sensor, highest)
         panel.axhline(press.y_m * 1e3, color="white", linestyle=":", linewidth=1)
-    figure.colorbar(drawn, ax=axes[:3], shrink=0.8, pad=0.01, label=CHANGE)
+    figure.colorbar(drawn, ax=axes[:2], shrink=0.8, pad=0.01, label=CHANGE)
     x = np.linspace(press.x_m - 0.03, press.x_m + 0.03, 301)
     pressure, coverage = strongest([press], x, np.full_like(x, press.y_m), edge_m=1e-9)
-    axes[3].plot(x * 1e3, pressure * coverage, "k", label="truth")
+    axes[2].plot(x * 1e3, pressure * coverage, "k", label="truth")
     row = int(np.argmin(np.abs(sensor.map_y_m - press.y_m)))
-    for name, outcome in zip(names, outcomes, strict=True):
-        if outcome.frame.pressure_kpa is not None:
-            axes[3].plot(sensor.map_x_m * 1e3, outcome.frame.pressure_kpa[row], label=name)
-    axes[3].set(xlim=(x[0] * 1e3, x[-1] * 1e3), ylim=(0, None), xlabel="x (mm)")
-    axes[3].set_ylim(top=1.3 * axes[3].get_ylim()[1])  # the legend above the curves
-    axes[3].set_title("pressure along the dotted line (kPa)", fontsize=10)
-    axes[3].legend(fontsize=8, loc="upper center")
+    if frame.pressure_kpa is not None:
+        axes[2].plot(sensor.map_x_m * 1e3, frame.pressure_kpa[row], label=outcome.method)
+    axes[2].set(xlim=(x[0] * 1e3, x[-1] * 1e3), ylim=(0, None), xlabel="x (mm)")
+    axes[2].set_ylim(top=1.3 * axes[2].get_ylim()[1])  # the legend above the curves
+    axes[2].set_title("pressure along the dotted line (kPa)", fontsize=10)
+    axes[2].legend(fontsize=8, loc="upper center")
     save_figure(figure, output)
 
 
 def _size_mm(sensor: SensorDescription) -> str:
     return f"{np.ptp(sensor.map_x_m) * 1e3:.0f} × {np.ptp(sensor.map_y_m) * 1e3:.0f} mm"
-
-
-def _told(name: str, outcome: Outcome) -> str:
-    peaks = [f"{c.peak_kpa:.0f} ± {c.peak_sigma_kpa:.0f} kPa" for c in outcome.frame.contacts]
-    return f"{name}\ncorrelation {outcome.score.icc:.3f}, peak {', '.join(peaks) or 'none'}"
 
 
 def _show(panel: Any, image: NDArray[Any] | None, sensor: SensorDescription, highest: float) -> Any:

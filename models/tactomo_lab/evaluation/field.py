@@ -7,7 +7,7 @@ name.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import count as count_from
 from itertools import islice
 from math import ceil
@@ -135,15 +135,13 @@ def scenes_of_row(
 
 
 def middle_press(
-    description: SensorDescription, methods: Sequence[str], seed_set: SeedSet, count: int
-) -> list[Outcome]:
-    """One soft contact as each method has it: the scene whose ICC by the last one is the middle."""
+    description: SensorDescription, method: str, seed_set: SeedSet, count: int
+) -> Outcome:
+    """One soft contact as a method has it: the scene whose ICC is the middle."""
     soft = scenes_of_row(description, "soft", seed_set, count)["soft"]
     single = (scene for scene in soft if len(scene.layout.presses) == 1)
-    outcomes = list(reconstruct_scenes(single, *methods))
-    by_scene = [outcomes[at : at + len(methods)] for at in range(0, len(outcomes), len(methods))]
-    by_scene.sort(key=lambda same: same[-1].score.icc)
-    return by_scene[len(by_scene) // 2]
+    outcomes = sorted(reconstruct_scenes(single, method), key=lambda outcome: outcome.score.icc)
+    return outcomes[len(outcomes) // 2]
 
 
 def _layouts(

@@ -35,13 +35,13 @@ STILL_BUDGETS_S: Final = (*BUDGETS_S, BUDGET_S)  # the last one: as much as a sc
 
 
 def variants(methods: Iterable[str], budgets_s: Sequence[float] = BUDGETS_S) -> list[Variant]:
-    """Every method: those that a budget bounds under each of some, auto's rungs under the last."""
+    """Every method: `auto` under each of some budgets, others that one bounds under the last."""
     chosen = []
     for method in methods:
         if method not in BUDGETED:
             chosen.append(Variant(method))
         else:
-            budgets = budgets_s[-1:] if method in RUNGS else budgets_s
+            budgets = budgets_s[-1:] if method in LAST_BUDGET_ALONE else budgets_s
             chosen += [Variant(method, budget_s) for budget_s in budgets]
     return chosen
 

@@ -1,9 +1,9 @@
 """`levelset`: shapes of any form on the structure sheet, and a pressure for each separate area.
 
-The shapes are refined frame by frame from where the last frame ended. A level set has no derivative
-where nothing presses, so that it cannot find what lands by itself. Each frame therefore compares
-three kinds of start: the last shapes, the last shapes together with the linear image of what they
-leave unexplained, and the linear image alone. The start of the lowest cost is refined.
+A frame's shapes are refined from where the last frame ended, or from the linear image where that
+explains more. A level set has no derivative where nothing presses, so that it cannot find what
+lands by itself: the linear image of what the shapes leave unexplained is added to them and refined,
+as long as that explains more. Outlines and pressures are then fitted to all sheets together.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ from tactomo_models.scene.sheet_response import GradedResponse
 from tactomo_models.sensor.description import SensorDescription
 
 GOOD_MISFIT = 1.0  # explained to the noise (discrepancy principle): no further step, no other start
-CUT_HEIGHTS = (0.35, 0.6)  # of the linear image's peak, where outlines may start
+# Of the linear image's peak, where outlines may start. With half of the first as well, ICC stays
+# (crowds 0.895, ordinary scenes 0.891); with 0.85 as well, 0.883 and 0.889.
+CUT_HEIGHTS = (0.35, 0.6)
 
 
 @dataclass(frozen=True)

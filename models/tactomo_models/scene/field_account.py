@@ -113,8 +113,7 @@ class FieldAccountant:
     ) -> FieldAccount:
         near, (solid, share, pressure) = self._images(fitted)
         image = partial(self._image, near)
-        pressed = np.abs(share)
-        covered, whole = image(pressed), image(np.abs(solid))
+        covered, whole = image(share), image(solid)
         drawing = fitted.drawing
         there = np.zeros(len(self._fit.forward.bare.pressable))
         there[drawing.nodes] = 1.0
@@ -124,9 +123,9 @@ class FieldAccountant:
         known = self._contacts(fitted, measured, areas, mine, covariance)
         magnitude, saturation = self._responses(pressure)
         return FieldAccount(
-            map=image(pressed * magnitude),
+            map=image(share * magnitude),
             structure=image(share * saturation),
-            pressure_kpa=image(pressed * pressure),
+            pressure_kpa=image(share * pressure),
             **known,
         )
 
@@ -268,9 +267,9 @@ class FieldAccountant:
         family, drawing = fitted.family, fitted.drawing
         if not isinstance(family, PressureField):
             on_nodes = np.zeros((2, len(self._fit.forward.bare.pressable)))
-            on_nodes[:, drawing.nodes] = drawing.share, np.abs(drawing.share) * drawing.pressure_kpa
+            on_nodes[:, drawing.nodes] = drawing.share, drawing.share * drawing.pressure_kpa
             share, pressed = (self._areas.on_map(each).reshape(-1, 1) for each in on_nodes)
-            pressure = pressed / np.maximum(np.abs(share), 1e-12)
+            pressure = pressed / np.maximum(share, 1e-12)
             return np.arange(len(share)), np.stack([share, share, pressure])
         near = self._near(drawing)
         x, y = self._x[near], self._y[near]
@@ -320,13 +319,12 @@ class FieldAccountant:
             return np.asarray(np.sqrt(np.einsum("ki,ij,kj->k", gradients, covariance, gradients)))
 
         weight = mine * cell
-        area = np.maximum(weight @ np.abs(share), 1e-12)
+        area = np.maximum(weight @ share, 1e-12)
         places = self._areas.places[:, drawing.nodes]
         off = [
             mine * cell * (axis - centre[:, None])
             for axis, centre in zip(places, areas.centres_m.T, strict=True)
         ]
-        signed = np.sign(share)[:, None] * by_share
         highest = np.where(mine, share * pressure, -1.0).argmax(axis=1)  # a node of each area
         each, owner, edges = np.zeros((0, 0)), np.zeros(0, int), nothing
         if isinstance(family, PressureField):
@@ -337,10 +335,10 @@ class FieldAccountant:
         # leaves no step there.
         of_mesh = 2 * self._cell_m / np.sqrt(areas.areas_m2 / np.pi)
         by_outline = np.where(edges > 0, 0.0, OUTLINE_ERROR * of_mesh)
-        by_area = weight @ signed
+        by_area = weight @ by_share
         sigmas = np.column_stack(
             [
-                *(sigma(each_off @ signed / area[:, None]) for each_off in off),
+                *(sigma(each_off @ by_share / area[:, None]) for each_off in off),
                 np.hypot(sigma(by_area), by_outline * areas.areas_m2),
             ]
         )
@@ -349,7 +347,7 @@ class FieldAccountant:
             return known
         size, slope = (np.abs(v) for v in self._graded.relative_change(pressure))
         known["magnitudes"] = (weight @ (share * size)) / area
-        by_magnitude = signed * (size[:, None]) + (share * slope)[:, None] * by_pressure
+        by_magnitude = by_share * size[:, None] + (share * slope)[:, None] * by_pressure
         by_mean = (weight @ by_magnitude - known["magnitudes"][:, None] * by_area) / area[:, None]
         known["magnitude_sigmas"] = np.hypot(sigma(by_mean), by_outline * known["magnitudes"])
         peaks, by_peak = pressure[highest], by_pressure[highest]
@@ -362,7 +360,7 @@ class FieldAccountant:
             known["goes_wrong_way"] = self._goes_wrong_way(J[:, index], fitted.residual, is_least)
         peak_size, peak_slope = (np.abs(v) for v in self._graded.relative_change(peaks))
         scale = areas.areas_m2 / area  # the map's, over the mesh's
-        by_force = signed * pressure[:, None] + share[:, None] * by_pressure
+        by_force = by_share * pressure[:, None] + share[:, None] * by_pressure
         total = weight @ (share * pressure)
         means = total / area
         by_mean_kpa = (weight @ by_force - means[:, None] * by_area) / area[:, None]

@@ -14,7 +14,7 @@ from functools import cache
 
 import numpy as np
 
-from tactomo_models.arrays import BoolArray, FloatArray, IntArray
+from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scene.drawing import Drawing, Slopes, heaviside, heaviside_slope
 from tactomo_models.scene.parameters import PEAK, PRIOR_SIGMA
@@ -101,8 +101,8 @@ class LevelSet:
         """Draw what is pressed on the nodes."""
         kernels = self.kernels.shape[1]
         f = self.kernels @ parameters[:kernels] + RESTING
-        share, there = self._step(f)
-        nodes = np.flatnonzero(there)
+        share = heaviside(f / HALF_WIDTH)
+        nodes = np.flatnonzero(f > -HALF_WIDTH)
         if self._field is None:
             pressure = np.full(len(nodes), SATURATING_KPA)
         else:
@@ -111,7 +111,8 @@ class LevelSet:
         @cache
         def slopes() -> Slopes:
             by_share = np.zeros((len(nodes), len(parameters)))
-            by_share[:, :kernels] = self._slope(f[nodes])[:, None] * self.kernels[nodes]
+            by_f = heaviside_slope(f[nodes] / HALF_WIDTH) / HALF_WIDTH
+            by_share[:, :kernels] = by_f[:, None] * self.kernels[nodes]
             by_pressure = np.zeros_like(by_share)
             if self._field is not None:
                 owner = kernels + self._owner[nodes]
@@ -119,14 +120,6 @@ class LevelSet:
             return by_share, by_pressure, by_share, by_pressure
 
         return Drawing(nodes, share[nodes], pressure, share[nodes], pressure, slopes)
-
-    def _step(self, f: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Share pressed, and where it is not 0 or may become so."""
-        return heaviside(f / HALF_WIDTH), f > -HALF_WIDTH
-
-    def _slope(self, f: FloatArray) -> FloatArray:
-        """Derivative of the share by f."""
-        return heaviside_slope(f / HALF_WIDTH) / HALF_WIDTH
 
 
 def _kernel_centres(half_side_m: float) -> tuple[FloatArray, float]:

@@ -24,7 +24,7 @@ from tactomo_client.intact_chunks import intact_chunks
 from tactomo_client.messages import array_from_wire
 from tactomo_client.recording import open_recording as open_frames
 from tactomo_models import Reference
-from tactomo_models.machine_speed import MachineSpeed, Row
+from tactomo_models.machine_speed import MachineSpeed
 from tactomo_protocol import Channel, Decoder, Scan, ScanFlag, encode
 
 Start = Callable[..., Any]
@@ -186,10 +186,6 @@ def test_what_a_time_bought_is_given_again_on_any_machine(
     bench: Start, replay: Replay, tmp_path: Path
 ) -> None:
     path = tmp_path / "budget.mcap"
-    rows = (
-        Row(method="auto", budget_s=0.001, p50_s=0.003, p99_s=0.004, icc=0.9),
-        Row(method="noser", budget_s=None, p50_s=0.001, p99_s=0.002, icc=0.6),
-    )
     here = MachineSpeed(
         tactomo="1",
         machine="of the test",
@@ -198,26 +194,21 @@ def test_what_a_time_bought_is_given_again_on_any_machine(
         sha256="",
         overhead_s=0.002,
         speed=2.0,
-        rows=rows,
     )
     b = bench(recording={"file": path}, machine_speed=here)
     b.tare()
-    for budget_ms, tier, modelled_ms in (
-        (12, "auto", 5.0),
-        (3, "noser", 1.0),
-        (None, "auto", None),
-    ):
+    for budget_ms, modelled_ms in ((12, 5.0), (3, 1.0), (None, None)):
         b.ask("set_budget", budget_ms=budget_ms)
-        given = {"source": here.source, "tier": tier, "modelled_ms": modelled_ms, "share": 1}
+        given = {"source": here.source, "tier": "auto", "modelled_ms": modelled_ms, "share": 1}
         b.until(lambda given=given: {**b.ask("status")["plan"], "share": 1} == pytest.approx(given))
         status = b.ask("status")
         assert (status["tier_requested"], status["budget_ms"]) == ("auto", budget_ms)
         b.step(load=0.1)
     b.daemon.stop()
     marks = [(mark.tier, mark.budget_ms) for mark in open_recording(path).marks()]
-    assert [tier for tier, _ in marks] == ["auto"] * 4 + ["noser", "auto"]
+    assert [tier for tier, _ in marks] == ["auto"] * 6
     assert [budget_ms for _, budget_ms in marks[3:]] == [pytest.approx(5), 1, None]
-    elsewhere = here.model_copy(update={"overhead_s": 0.0, "speed": 0.1, "rows": rows[1:]})
+    elsewhere = here.model_copy(update={"overhead_s": 0.0, "speed": 0.1})
     again = replay(path, machine_speed=elsewhere)
     assert [(mark.tier, mark.budget_ms) for mark in open_recording(again.path).marks()] == marks
 

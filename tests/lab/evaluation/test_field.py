@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
-from tactomo_lab.commands.evaluate_field import EVEN_FIT
+from tactomo_lab.commands.pictures import draw_press
 from tactomo_lab.evaluation.field import (
     STILL_ROWS,
     middle_press,
@@ -98,14 +100,14 @@ def test_a_ball_has_its_peak_and_the_mean_over_its_area(small: SensorDescription
 
 
 @pytest.mark.slow
-def test_an_even_pressure_is_fitted_to_the_middle_press(small: SensorDescription) -> None:
-    """By the fit of old, which is sure of it; the field, which may take it for soft, is not."""
-    even, field = middle_press(small, (EVEN_FIT, "fit"), "tuning", 4)
-    assert even.scene is field.scene
-    assert len(even.scene.layout.presses) == 1
-    (sure,), (unsure,) = even.frame.contacts, field.frame.contacts
-    assert sure.edge == 0
-    assert sure.peak_sigma_kpa < unsure.peak_sigma_kpa
+def test_one_soft_contact_is_drawn_the_middle_one(small: SensorDescription, tmp_path: Path) -> None:
+    middle = middle_press(small, "tikhonov", "tuning", 6)
+    assert len(middle.scene.layout.presses) == 1
+    scores = scores_of_row(small, "soft", "tikhonov", "tuning", 6)["soft"]
+    single = sorted(score.icc for score in scores if len(score.contacts) == 1)
+    assert middle.score.icc == single[len(single) // 2]
+    draw_press(middle, tmp_path / "press.png")
+    assert (tmp_path / "press.png").stat().st_size > 10_000
 
 
 @pytest.mark.slow

@@ -155,18 +155,17 @@ def bench(
     moving ones, under budgets of 1 to 50 ms. Takes about a quarter of an hour, the first time some
     more to simulate them.
 
-    With `--machine-speed`, methods follow one moving scene and what they took is kept in the
-    cache, beside the sensor's models: daemons then keep to a budget of time as this machine does,
-    and `auto` takes the method that is most accurate within it; how accurate each is was measured
-    on the shipped sensor. Takes about half a minute; leave the machine alone meanwhile. A service
-    has a cache of its own: set CACHE_DIRECTORY to it.
+    With `--machine-speed`, `auto` follows one moving scene under several budgets and what they took
+    is kept in the cache, beside the sensor's models: daemons then keep to a budget of time as this
+    machine does. Takes about half a minute; leave the machine alone meanwhile. A service has a
+    cache of its own: set CACHE_DIRECTORY to it.
     """
     if show and not machine_speed:
         raise typer.BadParameter("--show goes with --machine-speed")
     if machine_speed and chart is not None:
         raise typer.BadParameter("--machine-speed and --chart are two runs")
     if machine_speed and method:
-        raise typer.BadParameter("--machine-speed measures every method, without --method")
+        raise typer.BadParameter("--machine-speed measures auto, without --method")
     if compare is not None and (machine_speed or chart is not None):
         raise typer.BadParameter("--compare goes with latencies and methods alone")
     earlier = None if compare is None else read_results(compare)
@@ -218,8 +217,7 @@ def _machine_speed(results: Results, show: bool, as_json: bool) -> None:
         typer.echo(made.model_dump_json(indent=2))
         return
     console = _console(results)
-    for each in bench_machine_speed.tables_of(made):
-        console.print(each)
+    console.print(bench_machine_speed.table_of(made))
     console.print(
         f"This machine's speed: {made.source}. A frame takes {made.overhead_s * 1e3:.1f} ms and "
         f"{made.speed:.2f} times its modelled budget (p99)."

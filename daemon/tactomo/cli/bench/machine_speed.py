@@ -1,12 +1,9 @@
-"""`tactomo bench --machine-speed`: how much work, and which method, a time buys on this machine.
-
-How right a method is does not depend on the machine: that is the shipped table's.
-"""
+"""`tactomo bench --machine-speed`: how much modelled work a time buys on this machine."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
@@ -30,9 +27,7 @@ from tactomo_models.machine_speed import (
     machine_speed_for,
     machine_speed_path,
     save_machine_speed,
-    shipped_rows,
 )
-from tactomo_models.methods.registry import BUDGETED
 from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
 
@@ -41,6 +36,7 @@ from tactomo.cli.output import table
 if TYPE_CHECKING:
     from rich.table import Table
 
+BUDGETS_S: Final = (0.002, 0.005, 0.01, 0.02, 0.05)  # of modelled work, that are timed
 TIMES_MS: Final = (1, 2, 5, 10, 20, 50, 100)  # for which the table shows what they buy
 Scan = tuple[FloatArray | None, ...]  # volts (M,) of each channel, or None
 FRAMES: Final = 120
@@ -52,7 +48,7 @@ BUSY: Final = 0.8  # share of a core below which times are those of whatever els
 
 
 def measure(name: str) -> MachineSpeed:
-    """Time a sensor's methods on this machine and keep what came out, with a progress bar.
+    """Time a sensor's frames on this machine and keep what came out, with a progress bar.
 
     Raises ModelError where the models cannot be built, or the file cannot be written.
     """
@@ -60,17 +56,14 @@ def measure(name: str) -> MachineSpeed:
     artifact = load_or_build_artifact(sensor)
     with Progress(console=Console(stderr=True), transient=True) as progress:
         reference, scans = _moving_scene(sensor, progress)
-        rows = []
+        p99_s = {}
         with warned_if_busy(), threadpool_limits(1):
-            for row in shipped_rows(sensor):
-                reconstructor = Reconstructor(
-                    sensor, artifact, method=row.method, budget_s=row.budget_s
-                )
+            for budget_s in BUDGETS_S:
+                reconstructor = Reconstructor(sensor, artifact, budget_s=budget_s)
                 reconstructor.set_reference(reference)
-                frames = progress.track(scans, description=f"measuring {row.method}")
-                p50_s, p99_s = np.percentile(_seconds(reconstructor, frames), (50, 99)).tolist()
-                rows.append(row.model_copy(update={"p50_s": p50_s, "p99_s": p99_s}))
-    speed = MachineSpeed.of_rows(sensor, datetime.now(UTC).date().isoformat(), rows)
+                frames = progress.track(scans, description=f"measuring {budget_s * 1e3:g} ms")
+                p99_s[budget_s] = float(np.percentile(_seconds(reconstructor, frames), 99))
+    speed = MachineSpeed.of_times(sensor, datetime.now(UTC).date().isoformat(), p99_s)
     save_machine_speed(speed, machine_speed_path(sensor))
     return speed
 
@@ -126,25 +119,9 @@ def in_force(name: str) -> MachineSpeed:
     return machine_speed_for(load_description(name), lambda why: console.print(why, soft_wrap=True))
 
 
-def tables_of(speed: MachineSpeed) -> Sequence[Table]:
-    """Lay out what was measured, and what each time buys."""
-    columns = ("method", "modelled budget ms", "p50 ms", "p99 ms", "ICC, as shipped")
-    measured = table(*columns, title="one frame of a moving scene (simulated), one thread")
-    for row in speed.rows:
-        measured.add_row(
-            row.method,
-            "" if row.budget_s is None else f"{row.budget_s * 1e3:g}",
-            f"{row.p50_s * 1e3:.1f}",
-            f"{row.p99_s * 1e3:.1f}",
-            f"{row.icc:.3f}",
-        )
-    bought = table(
-        *("within ms", "method", "modelled budget ms"),
-        left=("method",),
-        title="what auto does within a time",
-    )
+def table_of(speed: MachineSpeed) -> Table:
+    """Lay out what each time buys."""
+    bought = table("within ms", "modelled budget ms", title="what a time buys")
     for time_ms in TIMES_MS:
-        plan = speed.plan("auto", time_ms * 1e-3)
-        budget = f"{plan.budget_s * 1e3:.1f}" if plan.method in BUDGETED and plan.budget_s else ""
-        bought.add_row(str(time_ms), str(plan.method), budget)
-    return [measured, bought] if speed.rows else [bought]
+        bought.add_row(str(time_ms), f"{speed.budget_s(time_ms * 1e-3) * 1e3:.1f}")
+    return bought

@@ -103,9 +103,9 @@ def reconstruct(
     Methods: *tikhonov* and *noser* are one linear step, regularised so that the image is as noisy,
     relative to its signal, as the scans are (noise figure 1); *fit* models a few outlines,
     *levelset* shapes of any form, both nonlinear and down to the scans' noise; *network* is our
-    fusion network alone. *auto* takes what a frame needs: *fit* or, where a few outlines explain
-    too little, *levelset*; where the sensor has a network, the network proposes what they start
-    from, and stands in where nothing that is fitted explains the scans. The laboratory adds
+    fusion network alone. *auto* is *fit*, and where the sensor has a network, the network proposes
+    what the fit starts from, and stands in where the fit does not explain the scans. Where objects
+    conduct `either_way`, *fit* and *auto* are *noser*. The laboratory adds
     *pls-paper*, the level set of the paper that tactomo is compared with, and the paper's networks,
     *cnn-single* and *cnn-multimodal*.
     """
