@@ -60,7 +60,7 @@ def run(fit: FieldFit) -> None:
         assert np.isfinite(fit.jacobian(fitted, data)).all()
         field.sampled(each, field.x_m, field.y_m, 1e-3)
         for k in range(len(each)):
-            background = fit.background(fitted, k, data)
+            background = fit.background(fitted, [k], data)
             own = empty.of(each[k : k + 1], 2)
             if background is None:
                 continue

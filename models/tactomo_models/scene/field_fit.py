@@ -13,7 +13,7 @@ Jacobian go by the pressed area.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol
@@ -46,7 +46,7 @@ STEP_LIMIT = 0.5  # largest change of a parameter in one step
 # Nodes that a contact must have to move in before it would touch those that are frozen: on the
 # paper's sensor (3 mm each) outlines 15 mm apart may be frozen, 12 with one node, 21 with four.
 # What a trial says does not depend on it.
-APART = 2
+APART = 1
 
 Measured = Mapping[Channel, Changes]
 
@@ -263,17 +263,19 @@ class FieldFit:
             family, parameters, log_ratio, drawing, solutions, residuals, cost, background
         )
 
-    def background(self, fitted: FittedField, k: int, measured: Measured) -> Background | None:
-        """Freeze all contacts of a pressure field but one, so that trials of that one cost little.
+    def background(
+        self, fitted: FittedField, free: Sequence[int], measured: Measured
+    ) -> Background | None:
+        """Freeze all contacts of a pressure field but some, so that trials of those cost little.
 
         Args:
             fitted: the field, with `PressureField` as its family and no background of its own.
-            k: the contact that is not frozen.
+            free: the contacts that are not frozen.
             measured: the sheets whose data trials will be compared with.
 
         Returns:
-            The others; None where they are too near: an area around contact k and two nodes more
-            would touch theirs.
+            The others; None where there are none, or where they are too near: an area around the
+            free contacts and two nodes more would touch theirs.
 
         Raises:
             ValueError: it is no such field.
@@ -281,7 +283,9 @@ class FieldFit:
         family = fitted.family
         if not isinstance(family, PressureField) or fitted.background is not None:
             raise ValueError("only a whole pressure field has contacts that can be frozen")
-        (own, alone), (others, frozen) = family.parted(fitted.parameters, k)
+        (own, alone), (others, frozen) = family.parted(fitted.parameters, free)
+        if others.count == 0:
+            return None
         beside, drawing = own.draw(alone).nodes, others.draw(frozen)
         sheets = {}
         for name in measured:

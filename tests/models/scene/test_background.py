@@ -81,7 +81,7 @@ def joint_and_alone(
     """A contact moved: solved with all others, and before them as a background."""
     before = at(fit, SCENES[scene], data)
     assert before is not None
-    background = fit.background(before, k, data)
+    background = fit.background(before, [k], data)
     after = moved(SCENES[scene], k)
     alone = at(fit, after[k : k + 1], data, background)
     joint = at(fit, after, data)
@@ -127,6 +127,21 @@ def test_a_trial_is_that_of_all_together(fit: FieldFit, data: Measured, scene: s
     assert fewer.background is alone.background
 
 
+def test_several_contacts_may_be_free(fit: FieldFit, data: Measured) -> None:
+    before = at(fit, SCENES["beside each other"], data)
+    assert before is not None
+    background = fit.background(before, [2, 0], data)
+    after = moved(moved(SCENES["beside each other"], 0), 2)
+    free, joint = at(fit, after[[0, 2]], data, background), at(fit, after, data)
+    assert background is not None
+    assert free is not None
+    assert joint is not None
+    assert background.family.count == 2
+    to = rounding_of(fit) * np.abs(joint.residual).max()
+    np.testing.assert_allclose(free.residual, joint.residual, rtol=0, atol=to)
+    assert fit.background(before, range(4), data) is None  # nothing is left to be frozen
+
+
 def test_its_jacobian_passes_a_taylor_test(fit: FieldFit, data: Measured) -> None:
     """By the parameters of the contact that is not frozen, and the log ratio of it alone."""
     _, alone = joint_and_alone(fit, data, "beside each other", 0)
@@ -154,7 +169,7 @@ def test_a_contact_is_refined_before_its_background(fit: FieldFit, data: Measure
     }
     start = at(fit, SCENES["beside each other"], exact)
     assert start is not None
-    background = fit.background(start, 1, exact)
+    background = fit.background(start, [1], exact)
     alone = at(fit, moved(SCENES["beside each other"], 1)[1:2], exact, background)
     assert alone is not None
     found = fit.refine(alone, exact, Budget(30.0), good_enough=0.1)
@@ -167,13 +182,13 @@ def test_contacts_are_frozen_only_where_they_are_apart(fit: FieldFit, data: Meas
     each = contacts(contact(0.0, 0.0, RADIUS_M), contact(BESIDE_M, 0.0, RADIUS_M))
     far = at(fit, each, data)
     assert far is not None
-    background = fit.background(far, 0, data)
+    background = fit.background(far, [0], data)
     assert background is not None
     nearer = each.copy()
     nearer[1, X] -= 0.7  # then areas do not touch, but soon would
     near = at(fit, nearer, data)
     assert near is not None
-    assert fit.background(near, 0, data) is None
+    assert fit.background(near, [0], data) is None
     each[0, X] += 1.4
     assert at(fit, each[:1], data, background) is None
 
@@ -183,7 +198,7 @@ def test_a_trial_is_right_until_it_touches_what_is_frozen(fit: FieldFit, data: M
     each = contacts(contact(0.0, 0.0, RADIUS_M), contact(BESIDE_M, 0.0, RADIUS_M))
     start = at(fit, each, data)
     assert start is not None
-    background = fit.background(start, 0, data)
+    background = fit.background(start, [0], data)
     steps = 0
     while True:
         each[0, X] += 0.05
@@ -206,4 +221,4 @@ def test_what_is_not_known_of_frozen_areas_is_not_told(fit: FieldFit, data: Meas
     with pytest.raises(ValueError, match="inside frozen areas"):
         fit.forward.potentials(solution, inner[:1])
     with pytest.raises(ValueError, match="whole pressure field"):
-        fit.background(alone, 0, data)
+        fit.background(alone, [0], data)
