@@ -127,6 +127,21 @@ def test_a_trial_is_that_of_all_together(fit: FieldFit, data: Measured, scene: s
     assert fewer.background is alone.background
 
 
+def test_several_contacts_may_be_free(fit: FieldFit, data: Measured) -> None:
+    before = at(fit, SCENES["beside each other"], data)
+    assert before is not None
+    background = fit.background(before, [2, 0], data)
+    after = moved(moved(SCENES["beside each other"], 0), 2)
+    free, joint = at(fit, after[[0, 2]], data, background), at(fit, after, data)
+    assert background is not None
+    assert free is not None
+    assert joint is not None
+    assert background.family.count == 2
+    to = rounding_of(fit) * np.abs(joint.residual).max()
+    np.testing.assert_allclose(free.residual, joint.residual, rtol=0, atol=to)
+    assert fit.background(before, range(4), data) is None  # nothing is left to be frozen
+
+
 def test_its_jacobian_passes_a_taylor_test(fit: FieldFit, data: Measured) -> None:
     """By the parameters of the contact that is not frozen, and the log ratio of it alone."""
     _, alone = joint_and_alone(fit, data, "beside each other", 0)
@@ -183,7 +198,7 @@ def test_a_trial_is_right_until_it_touches_what_is_frozen(fit: FieldFit, data: M
     each = contacts(contact(0.0, 0.0, RADIUS_M), contact(BESIDE_M, 0.0, RADIUS_M))
     start = at(fit, each, data)
     assert start is not None
-    background = fit.background(start, 0, data)
+    background = fit.background(start, [0], data)
     steps = 0
     while True:
         each[0, X] += 0.05
