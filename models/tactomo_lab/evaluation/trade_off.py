@@ -41,7 +41,7 @@ def variants(methods: Iterable[str], budgets_s: Sequence[float] = BUDGETS_S) -> 
         if method not in BUDGETED:
             chosen.append(Variant(method))
         else:
-            budgets = budgets_s[-1:] if method in LAST_BUDGET_ALONE else budgets_s
+            budgets = budgets_s[-1:] if method in RUNGS else budgets_s
             chosen += [Variant(method, budget_s) for budget_s in budgets]
     return chosen
 

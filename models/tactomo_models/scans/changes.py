@@ -35,7 +35,7 @@ from tactomo_models.sensor.description import SensorDescription
 
 # An uneven sheet has few degrees of freedom: errors of the model go together, about as many
 # voltages at a time, and average out so much less than noise does.
-CORRELATED = 5.0
+CORRELATED = 4.0
 # Share of that variance which displaces contacts once the sheet is found as it is, over the even
 # sheet's own errors. On tuning scenes 64 % of hand-made skins' places are then within one sigma and
 # 76 % of crowds'; with half as much more 75 and 81 %.
