@@ -56,7 +56,7 @@ def test_the_first_sequences_have_most_presses_which_glide_change_and_lift(
     assert kinds == set(KINDS)
     moving = [turn for steps in drawn for turn in turns(steps)]
     assert any(way_m(turn) > 0.001 for turn in moving)
-    assert any(abs(a.pressure_kpa - b.pressure_kpa) > 1 for a, b in moving)
+    assert any(0 < abs(a.pressure_kpa - b.pressure_kpa) < 40 for a, b in moving)  # no landing
     lifted = [names(steps) - steps[-1].presses.keys() for steps in drawn]
     assert 0 < sum(map(len, lifted)) < 20
 
