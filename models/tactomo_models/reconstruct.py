@@ -58,11 +58,11 @@ class Reconstructor:
     Raises:
         ArtifactError: the artifact or the method's network cannot be used.
         MethodError: there is no such method, or the sensor lacks a channel that it needs.
+        ModelError: the budget is no time.
 
     Attributes:
         description: the sensor.
         artifact: what is precomputed for it.
-        budget_s: compute time a frame may take; None for `DEFAULT_BUDGET_S`.
         curve: the one in force; it may be set at any time.
         taught: what presses at known places have taught; likewise. None where nothing.
 
@@ -99,6 +99,24 @@ class Reconstructor:
         if isinstance(method, str):
             check_method(method, description)
         self._methods[self._name] = make_method(method) if isinstance(method, str) else method
+
+    @property
+    def budget_s(self) -> float | None:
+        """Compute time a frame may take, s; None for `DEFAULT_BUDGET_S`.
+
+        Setting it raises ModelError for what is no finite time above 0.
+        """
+        return self._budget_s
+
+    @budget_s.setter
+    def budget_s(self, budget_s: float | None) -> None:
+        is_number = isinstance(budget_s, (float, int)) and not isinstance(budget_s, bool)
+        if budget_s is not None and not (is_number and 0 < budget_s < np.inf):
+            raise ModelError(
+                f"budget_s = {budget_s!r} is no time that a frame may take: give seconds above 0, "
+                f"such as {DEFAULT_BUDGET_S}, or None for the usual one"
+            )
+        self._budget_s = budget_s
 
     @property
     def method(self) -> str:

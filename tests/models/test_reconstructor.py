@@ -15,6 +15,7 @@ from tactomo_models import (
     Contact,
     DataError,
     Flag,
+    ModelError,
     Press,
     Reconstruction,
     Reconstructor,
@@ -368,6 +369,30 @@ def test_where_no_voltage_can_be_right_no_contacts_says_nothing(
         frame = reconstructor.reconstruct(**absurd)
         assert not frame.contacts
         assert Flag.NO_USABLE_SCAN in frame.flags
+
+
+@pytest.mark.parametrize("budget_s", [0.0, -1.0, math.inf, math.nan, "1", True])
+def test_a_budget_that_is_no_time_is_refused(
+    paper: SensorDescription, artifact: Artifact, reconstructor: Reconstructor, budget_s: float
+) -> None:
+    with pytest.raises(ModelError, match=r"budget_s = .* seconds above 0"):
+        Reconstructor(paper, artifact, budget_s=budget_s)
+    before = reconstructor.budget_s
+    with pytest.raises(ModelError, match="budget_s"):
+        reconstructor.budget_s = budget_s
+    assert reconstructor.budget_s == before
+
+
+@pytest.mark.parametrize("method", ["auto", "fit"])
+@pytest.mark.parametrize("budget_s", [1e-3, 1e-300])
+def test_a_budget_that_is_too_short_leaves_no_bad_map_unflagged(
+    paper: SensorDescription, artifact: Artifact, skin: Skin, method: str, budget_s: float
+) -> None:
+    reconstructor = Reconstructor(paper, artifact, method=method, budget_s=budget_s)
+    reconstructor.set_reference(skin.reference())
+    presses = (press_mm(20, -10, 170, 10), press_mm(-30, 30, 180, 10))
+    frame = reconstructor.reconstruct(**skin.scan(*presses))
+    assert frame.flags or len(frame.contacts) == 2
 
 
 def test_without_a_reference_there_is_no_map(

@@ -12,7 +12,6 @@ import numpy as np
 
 from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.drift.drift_model import OUT_OF_BOUNDS, DriftSubspace, Explained
-from tactomo_models.physics.artifact import MODEL_ERROR
 from tactomo_models.robust import robust_sigma
 from tactomo_models.scans.changes import Changes
 
@@ -52,7 +51,7 @@ class ChannelBaseline:
         self.has_moved = False
         self._amounts = np.zeros(subspace.modes.shape[1])
         self._residual = np.zeros(len(tare))
-        self._precision = np.zeros(len(tare))
+        self._precision = self._noise_variance = np.zeros(len(tare))
         self._seen_s = self._gain_seen_s = self._jumped_s = 0.0
         self._begun_s: float | None = None
         self.drop_block()
@@ -75,7 +74,7 @@ class ChannelBaseline:
             self._begun_s = time_s
         self._sum += scan
         self._frames += 1
-        self._precision = measured.precision
+        self._precision, self._noise_variance = measured.precision, measured.noise_variance
         return abs(time_s - self._begun_s) >= BLOCK_S
 
     def _take_block(self, time_s: float) -> FloatArray:
@@ -162,7 +161,7 @@ class ChannelBaseline:
         each = np.log(mean[sure] / anchor[sure])
         gain = float(np.median(each))
         sigma = robust_sigma(each - gain)
-        noise = np.sqrt(np.maximum(1 / self._precision[sure] - MODEL_ERROR**2, 0)) / mean[sure]
+        noise = np.sqrt(self._noise_variance[sure]) / mean[sure]
         doubt = float(np.median(noise)) * np.sqrt(2 / frames)
         return gain, sigma < max(uneven_share * abs(gain), 3 * doubt, still)
 

@@ -59,7 +59,9 @@ class Changes:
     # root mean square of the changes over their noise and what no noise accounts for; what is quiet
     # is below the root of `noise_limit` over the count (1.24 of 208)
     signal: float
-    precision: FloatArray  # (M,) inverse variances of the changes by noise; 0 where invalid
+    # (M,) inverse variances of the changes where nothing presses, by noise and by what a skin at
+    # rest does by itself; 0 where invalid
+    precision: FloatArray
     # (M,) variances of the changes by noise: the tare's, and the scan's own where it has more
     noise_variance: FloatArray
     # (M,) square of a change too far below the model's error to be worth a solve
@@ -239,14 +241,15 @@ class MeasuredChannel:
             return ChannelResult(None, flags | gone, electrodes, verdict.flags | gone)
         change = np.where(valid, scan - self._reference, 0.0) * self._per_volt
         square = change * change
-        ratio, pairs = self._frame_noise.estimate(scan, valid)
+        ratio, freedom = self._frame_noise.estimate(scan, valid)
         noise = np.maximum(self._noise * ratio, self._least_noise)
-        variance = noise + MODEL_ERROR**2  # of a change where nothing presses, drift included
+        # Of a change where nothing presses, drift included.
+        variance = noise + self._description.instrument.stability**2
         # Small changes share in the error of the large ones beside them.
         typical = median(square[valid]) / median_square
         error = self._error_share**2 * (square + typical)
         statistic = float((square / variance).sum())
-        quiet = statistic < noise_limit(count, pairs)
+        quiet = statistic < noise_limit(count, freedom)
         total = self._total
         if not (quiet or electrodes) and _fell(total * change, total**2 * variance):
             flags |= Flag.REFERENCE_MISMATCH

@@ -24,10 +24,10 @@ class FrameNoise(NamedTuple):
     """Noise of one scan's changes."""
 
     variance_ratio: float  # over the variance that the tare tells
-    pairs: int  # reciprocal ones that tell the ratio; 0 where the tare does
+    freedom: float  # degrees of freedom that the ratio is known with; inf where the tare tells it
 
 
-AS_TARED = FrameNoise(1.0, 0)
+AS_TARED = FrameNoise(1.0, np.inf)
 
 
 class FrameNoiseEstimator:
@@ -59,19 +59,17 @@ class FrameNoiseEstimator:
         error = one - other - self._asymmetry[both] * (one + other)
         ratio = huber_sigma(error / self._sigma[both]) ** 2
         is_chance = ratio * freedom < noise_limit(freedom)
-        return AS_TARED if is_chance and not self._is_bound else FrameNoise(ratio, len(one))
+        return AS_TARED if is_chance and not self._is_bound else FrameNoise(ratio, freedom)
 
 
 @cache
-def noise_limit(count: float, pairs: int = 0) -> float:
+def noise_limit(count: float, freedom: float = np.inf) -> float:
     """Sum of squares over their variance that noise alone stays below, but for false alarms.
 
     Args:
         count: voltages, or degrees of freedom that they have.
-        pairs: reciprocal ones among them whose differences tell the variance; 0 where it is known.
-            Their sums, and what has no reciprocal, are independent of it.
+        freedom: degrees of freedom that their variance is known with.
     """
-    if not pairs:
+    if np.isinf(freedom):
         return float(chdtri(count, FALSE_ALARM))
-    others = count - pairs
-    return pairs + others * float(fdtri(others, HUBER_EFFICIENCY * pairs, 1 - FALSE_ALARM))
+    return count * float(fdtri(count, freedom, 1 - FALSE_ALARM))

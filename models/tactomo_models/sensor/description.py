@@ -75,13 +75,15 @@ class Instrument(Section):
     nothing of voltages below zero has `positive` ones, or `negative` ones where it is connected the
     other way round. `single_ended` readings, of each electrode against the one that the current
     leaves by, are the `matrix` protocol's. `regularisation` is a factor on what the linear methods
-    choose by the noise: above 1 where a device has larger errors than noise.
+    choose by the noise: above 1 where a device has larger errors than noise. By `stability`, a
+    share, voltages at rest change since the tare beyond noise: no more than that is no press.
     """
 
     voltages: Literal["signed", "unsigned", "positive", "negative"] = "signed"
     referenced: Literal["pairs", "single_ended"] = "pairs"
     volts_per_unit: Annotated[float, Field(gt=0, le=1e6)] = 1.0
     regularisation: Annotated[float, Field(ge=1e-3, le=1e6)] = 1.0
+    stability: Annotated[float, Field(ge=0, le=0.1)] = 0.003
     start: Annotated[str, Field(max_length=16, pattern=r"^[ -~\r\n]*$")] = ""
     scan_rate_hz: Annotated[float, Field(ge=0.1, le=1000)] = 20.0
     frequency_hz: Annotated[float, Field(ge=100, le=1e7)] = 10_000.0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from noisy_skin import Skin, rms
@@ -147,3 +149,28 @@ def test_channels_of_one_frame_differ_in_noise(
     }
     assert grown[Channel.STRUCTURE] == 1
     assert grown[Channel.MAGNITUDE] == pytest.approx(26, rel=0.3)
+
+
+def test_a_stable_instrument_feels_less(
+    paper: SensorDescription, artifact: Artifact, simulator: SkinSimulator
+) -> None:
+    """What voltages do by themselves is no press, and the description says how much that is."""
+    skin = Skin(simulator, 1e-4)
+    reference, light = skin.reference(), Press(0.02, -0.01, 170.0, 0.008)
+    pressed = {}
+    for stability in (0.003, 3e-4):
+        instrument = paper.instrument.model_copy(update={"stability": stability})
+        sensor = paper.model_copy(update={"instrument": instrument})
+        reconstructor = Reconstructor(sensor, artifact, method="noser")
+        reconstructor.set_reference(replace(reference, structure=None))
+
+        def is_pressed(volts: FloatArray, by: Reconstructor = reconstructor) -> bool:
+            return not by.compare(volts, None).is_quiet
+
+        rest = [skin.scan()["magnitude"] for _ in range(50)]
+        pressed[stability] = (
+            any(is_pressed(volts) for volts in rest),
+            any(is_pressed(1.001 * volts) for volts in rest),
+            is_pressed(skin.scan(light)["magnitude"]),
+        )
+    assert pressed == {0.003: (False, False, False), 3e-4: (False, True, True)}
