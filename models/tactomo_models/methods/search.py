@@ -393,7 +393,7 @@ class Search:
         )
 
     def _account(self, each: FloatArray, log_ratio: float, frame: Frame) -> Account | None:
-        family = self.field.of(each, 2, fits_peaks=frame.fits_peaks)
+        family = self.field.of(each, fits_peaks=frame.fits_peaks)
         fitted = self.fit.evaluate(
             family, family.bounded(family.join(each)), log_ratio, frame.measured
         )

@@ -135,7 +135,7 @@ class Rest:
 
     def _family(self, contacts: FloatArray) -> PressureField:
         every = np.vstack([self._near, contacts])
-        field = self._field.of(every, 2, fits_peaks=self._frame.fits_peaks)
+        field = self._field.of(every, fits_peaks=self._frame.fits_peaks)
         free = field.free.copy()
         free[: len(self._near)] = False
         return replace(field, free=free)

@@ -30,7 +30,6 @@ from tactomo_models.scene.pressure_field import PressureField
 from tactomo_models.scene.sheet_response import SheetResponse, responses_of
 from tactomo_models.sensor.description import SensorDescription
 
-MAX_PRESSED = 1000  # nodes that one solve may change: some 5 ms, two fifths of a sheet
 SETTLED = 5e-3  # share of the cost below which another gain is not worth a step
 # The same as the last step's Jacobian foresees it. With 5e-3 another 5 % of the work is saved, but
 # one of 36 scenes then goes another way, at a correlation lower by 0.13.
@@ -61,10 +60,6 @@ class Family(Protocol):
     @property
     def prior_precision(self) -> FloatArray:
         """(N,) inverse variances of that."""
-
-    @property
-    def ratio_freedom(self) -> float:
-        """How far the log ratio may stray from what is likely: 1 as far as is known of it."""
 
     def bounded(self, parameters: FloatArray) -> FloatArray:
         """Bring parameters (N,) back to where they mean something."""
@@ -200,20 +195,16 @@ class FieldFit:
         parameters: FloatArray,
         log_ratio: float,
         measured: Measured,
-        max_pressed: int = MAX_PRESSED,
         solved: Mapping[Channel, Solution] | None = None,
         background: Background | None = None,
     ) -> FittedField | None:
         """Solve the forward model for given parameters and compare it with the data.
 
-        None where so much would be pressed that no deadline could be kept, or where it would touch
-        the background's contacts. Sheets that are `solved` for these very contacts and ratio are
+        None where it would touch the background's contacts. Sheets that are `solved` for these very contacts and ratio are
         not solved again. With a background the voltages, residuals and cost are those of all
         contacts together; parameters are those of the one that is not frozen.
         """
         drawing = family.draw(parameters)
-        if len(drawing.nodes) > max_pressed:
-            return None
         solutions: dict[Channel, Solution] = {}
         residuals: dict[Channel, FloatArray] = {}
         for name, changes in measured.items():
@@ -256,7 +247,7 @@ class FieldFit:
         residuals: Mapping[Channel, FloatArray],
         background: Background | None,
     ) -> FittedField:
-        off = (log_ratio - self.likely) / (family.ratio_freedom * self._ratio_sigma)
+        off = (log_ratio - self.likely) / self._ratio_sigma
         away = _away(family, parameters) + (0.0 if background is None else background.away)
         cost = float(sum(each @ each for each in residuals.values()) + away + off**2)
         return FittedField(
@@ -396,7 +387,7 @@ class FieldFit:
             family.prior_precision,
             fitted.parameters - family.prior_mean,
         )
-        precision[count] = (family.ratio_freedom * self._ratio_sigma) ** -2
+        precision[count] = self._ratio_sigma**-2
         offset[count] = fitted.log_ratio - self.likely
         return precision, offset
 

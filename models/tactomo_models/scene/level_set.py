@@ -42,7 +42,6 @@ class LevelSet:
         self._projection = np.linalg.solve(
             self.kernels.T @ self.kernels + 1e-3 * np.eye(self.kernels.shape[1]), self.kernels.T
         )
-        self.ratio_freedom = 1.0
         self.prior_mean = np.zeros(self.kernels.shape[1])
         self.prior_precision = np.full(self.kernels.shape[1], prior)
         self._places = np.stack([x, y])

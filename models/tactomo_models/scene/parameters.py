@@ -7,10 +7,8 @@ import numpy as np
 UNIT_M = 0.01  # positions are counted in this, so that all parameters are of order 1
 # Columns of a contact's parameters: place, form, peak pressure in units of the field, edge, hole.
 X, Y, SIZE, E1, E2, HARMONIC, PEAK, EDGE, HOLE, COLUMNS = 0, 1, 2, 3, 4, 5, 9, 10, 11, 12
-FORM = {0: 3, 1: 3, 2: 5}  # columns of the form that every contact of an order has
 TYPICAL_SIZE = float(np.log(0.012))  # s is the logarithm of the mean radius in metres
-SIZE_LIMITS = (float(np.log(0.003)), float(np.log(0.06)))
-LARGEST_CIRCLE = float(np.log(0.025))
+SMALLEST_SIZE = float(np.log(0.003))  # of a mean radius: the distance of two nodes
 MAX_BULGE = 0.25
 # Of an edge that is not flat: what falls less shows nothing but the sheet's errors.
 EDGE_LIMITS = (0.3, 1.0)

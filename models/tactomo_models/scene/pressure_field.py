@@ -1,8 +1,7 @@
 """The pressure field: contacts that press on all sheets alike, each of few parameters.
 
-A contact is a closed outline and the pressure inside it. Of order 0 and 1 the outline is a circle
-(3 parameters), of order 2 an ellipse (5); an ellipse's radius may be modulated around its edge,
-which makes it an egg or a rounded rectangle (9). The pressure is even, or falls towards the edge;
+A contact is a closed outline and the pressure inside it. The outline is an ellipse (5 parameters),
+whose radius may be modulated around its edge, which makes it an egg or a rounded rectangle (9). The pressure is even, or falls towards the edge;
 a ring presses with its rim alone.
 
     u = B (x - x0),  B = exp(-s) expm(-E),  E = [[e1, e2], [e2, -e1]]     the unit circle of u
@@ -41,16 +40,14 @@ from tactomo_models.scene.parameters import (
     E2,
     EDGE,
     EDGE_LIMITS,
-    FORM,
     HARMONIC,
     HERTZ,
     HOLE,
-    LARGEST_CIRCLE,
     MAX_BULGE,
     PEAK,
     PRIOR_SIGMA,
     SIZE,
-    SIZE_LIMITS,
+    SMALLEST_SIZE,
     TYPICAL_SIZE,
     UNIT_M,
     X,
@@ -79,7 +76,9 @@ class PressureField:
     blur_m2: float  # variance of each axis by which the mesh blurs what is drawn; see above
     unit_kpa: float  # pressure that peaks are counted in: the end of the table
     peak_limits: tuple[float, float]  # least and largest peak, in that unit
-    order: int = 0  # 0, 1 or 2
+    # peak that a contact starts with, in that unit: the middle of what the table answers to
+    typical_peak: float
+    size_limits: tuple[float, float]  # least and largest logarithm of the mean radius in metres
     # (K, COLUMNS) parameters of each contact, as far as they are not fitted
     fixed: FloatArray = field(default_factory=lambda: np.zeros((0, COLUMNS)))
     # (K, COLUMNS) which are fitted
@@ -104,41 +103,47 @@ class PressureField:
         # and then there is the step from 1 to 0. ICC of tuning scenes without and with it: 0.989,
         # 0.991 at 40 dB, 0.954, 0.960 at 20 dB, 0.979, 0.981 of one graded sheet.
         of_triangles, of_step = 5 / 18, 1 / 3 - 2 / np.pi**2
-        least, beyond = 0.01, 1.3  # of the table's end, that a peak may come to
+        # Of the table's end, that a peak may come to. A tenth of what saturates a sheet is less than
+        # any noise leaves of it; beyond the table all that is told is a lower bound.
+        least, beyond = 0.01, 3.0
         x, y = np.ascontiguousarray(forward.bare.points[:, forward.bare.pressable])
         description = forward.description
         spacing = description.width_m / (description.map.nodes_x - 1)
         end_kpa = graded.end_kpa if graded else 300.0
         onset_kpa = graded.onset_kpa if graded else 0.0
-        limits = (max(onset_kpa / end_kpa, least), beyond)
         node_m2 = float(forward.node_areas_m2.mean())
         blur_m2 = of_triangles * node_m2 + of_step * (GRADED_WIDTH * spacing) ** 2
-        return cls(x, y, spacing, offset * spacing, blur_m2, end_kpa, limits)
+        largest = float(np.log(np.hypot(description.width_m, description.height_m) / 2))
+        return cls(
+            x,
+            y,
+            half_width_m=spacing,
+            offset_m=offset * spacing,
+            blur_m2=blur_m2,
+            unit_kpa=end_kpa,
+            peak_limits=(least, beyond),
+            typical_peak=(onset_kpa / end_kpa + 1) / 2,
+            size_limits=(SMALLEST_SIZE, largest),
+        )
 
     @property
     def count(self) -> int:
         """Number of contacts, K."""
         return len(self.fixed)
 
-    @property
-    def typical_peak(self) -> float:
-        """Peak that a contact starts with, in the field's unit: the middle of the table."""
-        return (self.peak_limits[0] + 1.0) / 2
-
-    def of(self, each: FloatArray, order: int, *, fits_peaks: bool = True) -> PressureField:
-        """A field of contacts (K, COLUMNS) whose form has an order.
+    def of(self, each: FloatArray, *, fits_peaks: bool = True) -> PressureField:
+        """A field of contacts (K, COLUMNS).
 
         A contact whose outline is modulated has that fitted, one whose edge is above 0 its edge.
         """
         free = np.zeros(each.shape, bool)
-        free[:, : FORM[order]] = True
+        free[:, :HARMONIC] = True
         free[:, PEAK] = fits_peaks
         free[:, EDGE] = fits_peaks & (each[:, EDGE] > 0)
         fixed = each.copy()
-        fixed[:, FORM[order] : HARMONIC] = 0.0
         modulated = np.asarray(fixed[:, HARMONIC:PEAK].any(axis=1))
         free[:, HARMONIC:PEAK] = modulated[:, None]
-        return replace(self, order=order, fixed=fixed, free=free)
+        return replace(self, fixed=fixed, free=free)
 
     def with_free(self, columns: slice) -> PressureField:
         """The same contacts with some parameters of each free as well."""
@@ -174,7 +179,7 @@ class PressureField:
         """Columns of the form that any contact has."""
         waves = slice(HARMONIC, PEAK)
         modulated = bool(self.free[:, waves].any() or self.fixed[:, waves].any())
-        return PEAK if modulated else FORM[self.order]
+        return PEAK if modulated else HARMONIC
 
     def split(self, parameters: FloatArray) -> FloatArray:
         """(K, COLUMNS) parameters of each contact."""
@@ -200,12 +205,6 @@ class PressureField:
         """Inverse variances (N,) of that."""
         return self.join(np.broadcast_to(PRIOR_SIGMA**-2.0, self.free.shape))
 
-    @property
-    def ratio_freedom(self) -> float:
-        """Order 0 keeps to the likely ratio: else the first of several grows over them all."""
-        firm_ratio = 0.02  # share of the log ratio's uncertainty that circles of order 0 have
-        return firm_ratio if self.order == 0 else 1.0
-
     @cached_property
     def _sheet_limits(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Least and largest x and y of the nodes, as parameters count them."""
@@ -218,7 +217,7 @@ class PressureField:
         each = self.split(parameters)
         for column, limits in zip((X, Y), self._sheet_limits, strict=True):
             _limit(each[:, column], *limits)
-        _limit(each[:, SIZE], SIZE_LIMITS[0], LARGEST_CIRCLE if self.order < 2 else SIZE_LIMITS[1])
+        _limit(each[:, SIZE], *self.size_limits)
         elongation = np.maximum(np.hypot(each[:, E1], each[:, E2]), 1e-12)
         each[:, E1:HARMONIC] *= np.minimum(1, max_elongated / elongation)[:, None]
         _limit(each[:, HARMONIC:PEAK], -MAX_BULGE, MAX_BULGE)
