@@ -37,7 +37,7 @@ def is_settled(frame: Frame, places: Places) -> bool:
 def settled_frame(demo: Demo, places: Places, tier: str | None = None) -> Frame:
     """First unflagged frame with as many contacts as there are presses, of a tier if one is given.
 
-    Where others take the processor, frames are made by the network until it is free again.
+    Where others take the processor, frames get less time until it is free again.
     """
     deadline = time.monotonic() + (PATIENCE_S if tier is None else FREE_AGAIN_S)
     with subscribe(SENSOR, address=demo.stream, timeout_s=PATIENCE_S) as frames:

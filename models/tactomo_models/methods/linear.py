@@ -34,6 +34,7 @@ from tactomo_models.physics.tikhonov import (
 from tactomo_models.scans.changes import Changes
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
+from tactomo_models.scene.areas import Areas
 
 Prior = Literal["tikhonov", "noser"]
 
@@ -113,8 +114,7 @@ class Tikhonov:
         with measurement.timed("contacts"):
             shown = images[Channel.STRUCTURE if Channel.STRUCTURE in images else Channel.MAGNITUDE]
             peak = max(float(np.abs(shown).max()), 1e-12)
-            inside = np.where(np.abs(shown) > self.area_cut * peak, 1.0, 0.0)
-            found = areas.find(areas.on_map(inside), inside)
+            found = self._areas(shown, self.area_cut * peak)
             fitted, unexplained = None, False
             if Channel.MAGNITUDE in changes:
                 magnitude = changes[Channel.MAGNITUDE]
@@ -136,6 +136,18 @@ class Tikhonov:
             flags=Flag.MISFIT_HIGH if unexplained else Flag(0),
             made_by=self.prior,
         )
+
+    def _areas(self, shown: Image, cut: float) -> Areas:
+        """Areas where an image (P,) is above a cut, and those where it is as far below zero.
+
+        One that conducts better and one that conducts worse may touch, and remain two.
+        """
+        finder = self._skin.areas
+        better, worse = (np.where(side > cut, 1.0, 0.0) for side in (shown, -shown))
+        found = finder.find(finder.on_map(better), better)
+        if worse.any():
+            found = found.joined(finder.find(finder.on_map(worse), worse))
+        return found
 
     def _leaves_unexplained(
         self, image: Image, fitted: Magnitudes | None, magnitude: Changes

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy import ndimage
@@ -23,6 +23,12 @@ class Areas:
 
     def __len__(self) -> int:
         return len(self.areas_m2)
+
+    def joined(self, other: Areas) -> Areas:
+        """These areas, then others of the same map."""
+        names = [each.name for each in fields(Areas)]
+        pairs = ([getattr(self, name), getattr(other, name)] for name in names)
+        return Areas(*(np.concatenate(pair) for pair in pairs))
 
 
 class AreaFinder:

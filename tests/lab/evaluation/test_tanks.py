@@ -80,6 +80,20 @@ def test_live_there_is_a_linear_image_and_the_frame_says_so(
     assert len(frame.contacts) >= 2
 
 
+def test_objects_of_two_kinds_that_touch_are_two_contacts(
+    tank: SensorDescription, tank_artifact: Artifact, imager: TankImager
+) -> None:
+    """Two discs side by side, of voltages that are linear in the conductivity."""
+    forward = ForwardModel(tank, tank_artifact.bare)
+    x, y = forward.bare.points[:, forward.bare.pressable]
+    better, worse = (np.hypot(x - side * 0.04, y) < 0.04 for side in (1, -1))
+    relative = tank_artifact.jacobian @ (0.1 * better - 0.1 * worse)
+    frame = imager.reconstruct(relative * np.abs(forward.bare_voltages), "auto")
+    left, right = sorted(frame.contacts, key=lambda contact: contact.x_m)
+    assert (left.x_m, left.y_m) == pytest.approx((-0.04, 0), abs=0.015)
+    assert (right.x_m, right.y_m) == pytest.approx((0.04, 0), abs=0.015)
+
+
 def test_a_level_set_knows_one_kind_and_is_refused(tank: SensorDescription) -> None:
     with pytest.raises(MethodError, match=r"levelset.*tank_uef2017.*better or worse; use auto"):
         Reconstructor(tank, method="levelset")
