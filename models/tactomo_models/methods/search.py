@@ -48,9 +48,15 @@ class Rival:
     """What else a contact may be."""
 
     log_odds: float  # over what it is taken for
-    difference: FloatArray  # (COLUMNS,) of its parameters; empty where it is two, or none
+    # (COLUMNS,) of its parameters; the two contacts (2, COLUMNS) that it is, or none (0, COLUMNS)
+    difference: FloatArray
     sigmas: FloatArray  # (COLUMNS,) their standard uncertainties
     is_open: bool = False  # whether it is to be asked once more
+
+    @property
+    def is_one(self) -> bool:
+        """Whether it is one contact of another kind."""
+        return self.difference.ndim == 1
 
 
 Rivals = Mapping[Kind, Rival]
@@ -82,7 +88,7 @@ class Belief:
                     float(np.exp(rival.log_odds)), contact + rival.difference, rival.sigmas
                 )
                 for rival in mine.values()
-                if len(rival.difference)
+                if rival.is_one
             ]
             for contact, mine in zip(self.account.contacts, self.rivals, strict=True)
         ]
@@ -337,10 +343,9 @@ class Search:
                 continue
             kind = choice[k]
             won = mine[kind]
-            start = contact + won.difference if len(won.difference) else as_kind(contact, kind)
-            start = np.atleast_2d(start)
+            start = (contact + won.difference)[None] if won.is_one else won.difference
             rows.append(start)
-            if len(won.difference):
+            if won.is_one:
                 turned = _turned(mine, kind, kind_of(contact), account.sigmas[k])
                 rivals.append(turned)
             else:
@@ -430,10 +435,10 @@ def _rival(trial: Trial | None, contact: FloatArray, before: Rival | None) -> Ri
     A mean and no sum: where a contact stays, errors of the sheet repeat themselves.
     """
     if trial is None:
-        return Rival(-np.inf, np.zeros(0), np.zeros(0))
+        return Rival(-np.inf, np.zeros((0, COLUMNS)), np.zeros((0, COLUMNS)))
     odds = trial.log_odds if before is None else (trial.log_odds + before.log_odds) / 2
     if len(trial.contacts) != 1:
-        return Rival(odds, np.zeros(0), np.zeros(0))
+        return Rival(odds, trial.contacts, trial.sigmas)
     return Rival(odds, trial.contacts[0] - contact, trial.sigmas[0])
 
 
@@ -444,9 +449,7 @@ def _turned(rivals: Rivals, kind: Kind, own: Kind, sigmas: FloatArray) -> Rivals
         other: replace(
             rival,
             log_odds=rival.log_odds - won.log_odds,
-            difference=rival.difference - won.difference
-            if len(rival.difference)
-            else rival.difference,
+            difference=rival.difference - won.difference * rival.is_one,
         )
         for other, rival in rivals.items()
         if other is not kind
