@@ -186,7 +186,7 @@ class Search:
                 belief.rivals, peaks, belief.asked_peaks if same else peaks, strict=True
             )
         )
-        return replace(belief, rivals=rivals, rounds=0, lacks_none=False)
+        return replace(belief, rivals=rivals, rounds=0, lacks_none=False, is_parted=False)
 
     @staticmethod
     def _is_explained(belief: Belief, frame: Frame, *, anew: bool) -> bool:
@@ -393,12 +393,14 @@ class Search:
         for touching in _touching(account.contacts, self.field.half_width_m):
             rest = np.delete(account.contacts, touching, axis=0)
             one = as_one(account.contacts[touching])
-            start = self._account(np.vstack([rest, one]), account.fitted.log_ratio, frame)
-            if start is None:
-                continue
-            joined = self._descended(start, frame, 2 * STEPS)
-            if joined.log_evidence > account.log_evidence:
-                return self._begun(joined, frame, belief.how)
+            for kind in (Kind.EVEN, Kind.FALLING):
+                each = np.vstack([rest, as_kind(one, kind)])
+                start = self._account(each, account.fitted.log_ratio, frame)
+                if start is None:
+                    continue
+                joined = self._descended(start, frame, 2 * STEPS)
+                if joined.log_evidence > account.log_evidence:
+                    return self._begun(joined, frame, belief.how)
         return replace(belief, is_parted=True)
 
     # What is missing
