@@ -166,7 +166,6 @@ class Fit:
             belief.account.fitted,
             measurement.changes,
             belief.alternatives,
-            np.linalg.inv(belief.account.hessian)[:-1, :-1],
         )
 
     def _concluded(self, course: Course, measurement: Measurement) -> Estimate:
