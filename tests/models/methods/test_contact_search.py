@@ -28,7 +28,7 @@ def test_the_search_finds_the_contact_that_is_missing(
     bare = forward.bare_voltages
 
     def fitted(*each: FloatArray) -> FittedField:
-        family = field.of(contacts(*each), 1, fits_peaks=False)
+        family = field.of(contacts(*each), fits_peaks=False)
         data = {Channel.STRUCTURE: measured(np.zeros(len(bare)))}
         field_ = fit.evaluate(family, family.join(contacts(*each)), fit.likely, data)
         assert field_ is not None
