@@ -107,6 +107,9 @@ class Fit:
         if course.drifts:
             drifting = self._drifting(measurement)
             belief = self._search.advance(course.belief, Frame(drifting.changes, budget))
+            plain = self._without_drift(belief, measurement, given_s)
+            if plain is not None:
+                return plain, measurement
             if self._drifted(belief.account.fitted, measurement) < MAX_DRIFT:
                 return replace(course, belief=belief), drifting
             course = Course(drifts=False)
@@ -129,6 +132,16 @@ class Fit:
         if _worst_misfit(field) <= EXPLAINED and self._drifted(field, measurement) < MAX_DRIFT:
             return replace(course, belief=beside, drifts=True), drifting
         return replace(course, drifts=False if beside.done else None), measurement
+
+    def _without_drift(
+        self, belief: Belief, measurement: Measurement, given_s: float
+    ) -> Course | None:
+        """A course without a drift where contacts alone explain the data, asked ever more seldom."""
+        if belief.how == "still" or belief.frames & (belief.frames - 1):
+            return None
+        propose = self._proposer(measurement)
+        plain = self._search.advance(None, Frame(measurement.changes, Budget(given_s), propose))
+        return Course(plain) if _worst_misfit(plain.account.fitted) <= EXPLAINED else None
 
     def _drifted(self, fitted: FittedField, measurement: Measurement) -> float:
         """By what share a sheet's voltages have drifted at most, beside what presses."""

@@ -16,6 +16,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
@@ -26,7 +27,7 @@ from tactomo_models.methods.trial import Rest, Trial
 from tactomo_models.scans.stillness import Since, are_still
 from tactomo_models.scene.field_account import Alternative
 from tactomo_models.scene.field_fit import COLD_S, FieldFit, Measured
-from tactomo_models.scene.parameters import COLUMNS, PEAK, SIZE, UNIT_M, X, Y
+from tactomo_models.scene.parameters import COLUMNS, E1, E2, PEAK, SIZE, UNIT_M, X, Y
 from tactomo_models.scene.pressure_field import PressureField
 from tactomo_models.scene.sheet_response import GradedResponse
 
@@ -35,7 +36,7 @@ MAX_CONTACTS = 12
 # odds by less. One above `OPEN` is asked again once they have become something else.
 HOPELESS, OPEN = -6.0, -3.0
 LIKELIER = 1.0  # from which a rival takes a contact's place; below, the mean of both is shown anyway
-FEW_STEPS = 2  # of starts that are compared: a start's cost says little before
+FEW_STEPS = 4  # of starts that are compared: a start's cost says little before
 STEPS = 4  # of a fit in one go, before what is left is looked at
 # Chi-squared over the count of data, from which a contact is missing rather than of another kind.
 SURPRISE = 2.0
@@ -76,6 +77,7 @@ class Belief:
     frames: int = 0  # in which something moved, with these contacts
     challenged: float = 0.0  # chi-squared that no start could better
     lacks_none: bool = False  # whether no contact is missing, as far as was asked
+    is_parted: bool = False  # whether no contacts that touch are one, as far as was asked
     done: bool = False  # whether nothing is left to try
     how: str = ""  # in words, what it came from
 
@@ -106,6 +108,7 @@ class Search:
         assert graded is None or isinstance(graded, GradedResponse)
         self.fit = fit
         self.field = PressureField.on(fit.forward, graded)
+        self._onset = graded.onset_kpa / graded.end_kpa if graded else 0.0
         typical = {Channel.STRUCTURE: float(np.exp(fit.likely))}
         if graded is not None:
             peak_kpa = np.array(self.field.typical_peak * self.field.unit_kpa)
@@ -151,10 +154,10 @@ class Search:
             done=False,
             how="warm start",
         )
-        if not self._is_explained(belief, frame):
+        due = frames & (frames - 1) == 0
+        if not self._is_explained(belief, frame, anew=due):
             return self._challenged(belief, account, frame)
         belief = replace(belief, moved=(belief.account.contacts - old.contacts)[:, [X, Y]])
-        due = frames & (frames - 1) == 0
         return self._asking_again(belief) if due else belief
 
     def _moved_on(self, belief: Belief, frame: Frame) -> Account | None:
@@ -185,9 +188,12 @@ class Search:
         )
         return replace(belief, rivals=rivals, rounds=0, lacks_none=False)
 
-    def _is_explained(self, belief: Belief, frame: Frame) -> bool:
-        chi_squared = belief.account.chi_squared
-        return frame.likelihood.explains(chi_squared - max(0.0, belief.challenged - frame.likelihood.count))
+    @staticmethod
+    def _is_explained(belief: Belief, frame: Frame, *, anew: bool) -> bool:
+        """Whether the data are explained, or at least as well as they were when all was tried."""
+        likelihood, chi_squared = frame.likelihood, belief.account.chi_squared
+        tried = 0.0 if anew else belief.challenged - likelihood.count
+        return likelihood.explains(chi_squared - max(tried, 0.0))
 
     # Starts
 
@@ -203,6 +209,7 @@ class Search:
     def _proposed(self, frame: Frame) -> Iterator[Account]:
         """What a network proposes; and the same as one contact, where it fills half of that."""
         each = frame.propose()[:MAX_CONTACTS] if frame.propose else np.zeros((0, COLUMNS))
+        each[:, PEAK] = self._start_peak(frame)
         starts = [each] if len(each) else []
         if len(each) > 1:
             one = as_one(each)
@@ -276,6 +283,8 @@ class Search:
             if born is not account:
                 return self._grown(belief, born)
             return replace(belief, lacks_none=True)
+        if not belief.is_parted:
+            return self._joined(belief, frame)
         precision = self.fit.prior(account.fitted)[0]
         return replace(
             belief,
@@ -362,8 +371,23 @@ class Search:
             rivals=again,
             rounds=belief.rounds + 1,
             lacks_none=False,
+            is_parted=False,
             moved=np.zeros((0, 2)),
         )
+
+    def _joined(self, belief: Belief, frame: Frame) -> Belief:
+        """The belief with contacts that touch as one, where that is likelier."""
+        account = belief.account
+        for touching in _touching(account.contacts, self.field.half_width_m):
+            rest = np.delete(account.contacts, touching, axis=0)
+            one = as_one(account.contacts[touching])
+            start = self._account(np.vstack([rest, one]), account.fitted.log_ratio, frame)
+            if start is None:
+                continue
+            joined = self._descended(start, frame, 2 * STEPS)
+            if joined.log_evidence > account.log_evidence:
+                return self._begun(joined, frame, belief.how)
+        return replace(belief, is_parted=True)
 
     # What is missing
 
@@ -379,7 +403,7 @@ class Search:
                 found.x_m / UNIT_M,
                 found.y_m / UNIT_M,
                 np.log(found.radius_m),
-                self.field.typical_peak,
+                self._start_peak(frame),
             )
             start = self._account(np.vstack([each, born]), account.fitted.log_ratio, frame)
             if start is None:
@@ -394,8 +418,20 @@ class Search:
         gain = account.log_evidence - belief.account.log_evidence
         rivals = (*(_opened(mine, gain) for mine in belief.rivals), {})
         return replace(
-            belief, account=account, rivals=rivals, rounds=0, frames=0, moved=np.zeros((0, 2))
+            belief,
+            account=account,
+            rivals=rivals,
+            rounds=0,
+            frames=0,
+            is_parted=False,
+            moved=np.zeros((0, 2)),
         )
+
+    def _start_peak(self, frame: Frame) -> float:
+        """Peak that a contact starts with: below the graded sheet's onset where that sheet rests."""
+        if frame.fits_peaks and frame.measured[Channel.MAGNITUDE].quiet:
+            return max(self._onset / 2, self.field.peak_limits[0])
+        return self.field.typical_peak
 
     def _account(self, each: FloatArray, log_ratio: float, frame: Frame) -> Account | None:
         family = self.field.of(each, fits_peaks=frame.fits_peaks)
@@ -409,6 +445,16 @@ class Search:
 
     def _descended(self, account: Account, frame: Frame, steps: int) -> Account:
         return descended(self.fit, account, frame, steps)
+
+
+def _touching(contacts: FloatArray, near_m: float) -> Iterator[list[int]]:
+    """Groups of contacts whose outlines are so near to each other, the largest group first."""
+    place = contacts[:, [X, Y]] * UNIT_M
+    reach = np.exp(contacts[:, SIZE] + np.hypot(*contacts[:, [E1, E2]].T))
+    apart = np.linalg.norm(place[:, None] - place, axis=2)
+    count, group = connected_components(apart < reach[:, None] + reach + near_m)
+    groups = [np.flatnonzero(group == number).tolist() for number in range(count)]
+    yield from sorted((one for one in groups if len(one) > 1), key=len, reverse=True)
 
 
 def _choices(rivals: tuple[Rivals, ...]) -> list[dict[int, Kind]]:
