@@ -96,7 +96,7 @@ def descended(fit: FieldFit, account: Account, frame: Frame, steps: int) -> Acco
     """An account nearer to its minimum, by Levenberg-Marquardt on all sheets at once.
 
     It is there when no more than `NEGLIGIBLE` is left to gain, as its own Jacobian foresees that.
-    One step is always tried.
+    What was begun is finished: a budget is looked at between fits, never within one.
     """
     for _ in range(steps):
         fitted = account.fitted
@@ -105,14 +105,12 @@ def descended(fit: FieldFit, account: Account, frame: Frame, steps: int) -> Acco
             return replace(account, at_minimum=True)
         better = _stepped(fit, fitted, normal, gradient, frame)
         if better is None:
-            return replace(account, at_minimum=not frame.budget.over)
+            return replace(account, at_minimum=True)
         frame.budget.spend(better)
         gain = fitted.cost - better.cost
         account = account_of(fit, better, frame)
         if gain * account.unit < NEGLIGIBLE:
             return replace(account, at_minimum=True)
-        if frame.budget.over:
-            break
     return account
 
 
@@ -134,8 +132,6 @@ def _stepped(
             if trial.cost < fitted.cost:
                 return replace(trial, damping=max(damping / 5, 1e-3))
         damping *= 5
-        if frame.budget.over:
-            break
     return None
 
 

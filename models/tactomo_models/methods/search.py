@@ -186,7 +186,7 @@ class Search:
                 belief.rivals, peaks, belief.asked_peaks if same else peaks, strict=True
             )
         )
-        return replace(belief, rivals=rivals, rounds=0, lacks_none=False)
+        return replace(belief, rivals=rivals, rounds=0, lacks_none=False, is_parted=False)
 
     @staticmethod
     def _is_explained(belief: Belief, frame: Frame, *, anew: bool) -> bool:
@@ -234,12 +234,24 @@ class Search:
         """What explains a frame that the known contacts do not: the best of all starts."""
         left = self._without(before, frame)
         starts = [belief.account, self._with_missing(belief.account, frame, far=True)]
+        starts += self._pressed_harder(before, frame)
         if left is not before:
             starts.append(self._with_missing(left, frame, far=True))
         best = self._best([*starts, *self._proposed(frame)], frame)
         if best is belief.account or best.log_evidence <= belief.account.log_evidence:
             return replace(belief, challenged=belief.account.chi_squared)
         return self._begun(best, frame, "warm start")
+
+    def _pressed_harder(self, account: Account, frame: Frame) -> list[Account]:
+        """The same contacts, none of them below the graded sheet's onset, if any was.
+
+        Down there that sheet answers to nothing, so that no fit finds the way up.
+        """
+        each = account.contacts.copy()
+        light = account.family.free[:, PEAK] & (each[:, PEAK] < self._onset)
+        each[light, PEAK] = self.field.typical_peak
+        harder = self._account(each, account.fitted.log_ratio, frame) if light.any() else None
+        return [harder] if harder else []
 
     def _without(self, account: Account, frame: Frame) -> Account:
         """The contacts that explain most: one after the other is left out while that helps."""
@@ -381,12 +393,14 @@ class Search:
         for touching in _touching(account.contacts, self.field.half_width_m):
             rest = np.delete(account.contacts, touching, axis=0)
             one = as_one(account.contacts[touching])
-            start = self._account(np.vstack([rest, one]), account.fitted.log_ratio, frame)
-            if start is None:
-                continue
-            joined = self._descended(start, frame, 2 * STEPS)
-            if joined.log_evidence > account.log_evidence:
-                return self._begun(joined, frame, belief.how)
+            for kind in (Kind.EVEN, Kind.FALLING):
+                each = np.vstack([rest, as_kind(one, kind)])
+                start = self._account(each, account.fitted.log_ratio, frame)
+                if start is None:
+                    continue
+                joined = self._descended(start, frame, 2 * STEPS)
+                if joined.log_evidence > account.log_evidence:
+                    return self._begun(joined, frame, belief.how)
         return replace(belief, is_parted=True)
 
     # What is missing

@@ -122,7 +122,7 @@ class Rest:
             if better is None:
                 break
             gain, best = best.cost - better.cost, better
-            if gain * self._account.unit < NEGLIGIBLE or self._frame.budget.over:
+            if gain * self._account.unit < NEGLIGIBLE:
                 break
         return self._judged(family, best)
 
