@@ -61,7 +61,7 @@ def contacts(where: str, kind: str) -> FloatArray:
 @pytest.mark.parametrize("where", PLACES_MM)
 def test_contacts_are_drawn_alike(model: ForwardModel, where: str, kind: str) -> None:
     each = contacts(where, kind)
-    field = PressureField.on(model, None).of(each, 0 if kind == "circles" else 2)
+    field = PressureField.on(model, None).of(each)
     field = field.with_free(slice(EDGE, COLUMNS))
     x_m, y_m = field.x_m + 0.4e-3, field.y_m + 0.3e-3
 
@@ -91,7 +91,7 @@ def test_contacts_are_drawn_alike(model: ForwardModel, where: str, kind: str) ->
 def test_a_sheet_is_solved_and_differentiated_alike(
     model: ForwardModel, in_numpy: NumpyForwardModel, where: str, contrast: float, mixes: bool
 ) -> None:
-    field = PressureField.on(model, None).of(each := contacts(where, "circles"), 2)
+    field = PressureField.on(model, None).of(each := contacts(where, "circles"))
     drawing = field.draw(field.join(each))
     change = np.zeros(len(model.bare.pressable))
     change[drawing.nodes] = contrast**drawing.enclosed - 1
@@ -122,7 +122,7 @@ def test_a_sequence_of_evaluations_is_as_in_numpy(
     }
     data[Channel.STRUCTURE] = data[Channel.STRUCTURE].drifting(rng.normal(size=(len(bare), 3)))
     for where in ("two in one", "two in one", "one", "nothing", "two apart", "beside electrodes"):
-        field = empty.of(each := contacts(where, "ellipses that fall"), 2)
+        field = empty.of(each := contacts(where, "ellipses that fall"))
         fitted = fit.evaluate(field, field.join(each), fit.likely, data)
         assert fitted is not None
         drawing, slopes = fitted.drawing, fitted.drawing.slopes()

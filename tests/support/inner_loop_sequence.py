@@ -54,14 +54,14 @@ def run(fit: FieldFit) -> None:
     for each in (one for one in SCENES for _ in range(3)):
         each = each.copy()
         each[:, [X, Y, SIZE]] += 0.05 * rng.normal(size=(len(each), 3))
-        field = empty.of(each, 2).with_free(slice(HARMONIC, HOLE + 1))
+        field = empty.of(each).with_free(slice(HARMONIC, HOLE + 1))
         fitted = fit.evaluate(field, field.join(each), fit.likely, data, 10**6)
         assert fitted is not None
         assert np.isfinite(fit.jacobian(fitted, data)).all()
         field.sampled(each, field.x_m, field.y_m, 1e-3)
         for k in range(len(each)):
             background = fit.background(fitted, [k], data)
-            own = empty.of(each[k : k + 1], 2)
+            own = empty.of(each[k : k + 1])
             if background is None:
                 continue
             alone = fit.evaluate(own, own.join(own.fixed), fit.likely, data, background=background)

@@ -83,15 +83,15 @@ class Sensor:
         graded = GradedResponse.of(magnitude.response) if magnitude else None
         return cls(FieldFit(forward, description), PressureField.on(forward, graded))
 
-    def family(self, each: FloatArray, order: int) -> PressureField:
-        return self.field.of(each, order, fits_peaks=Channel.MAGNITUDE in self.fit.responses)
+    def family(self, each: FloatArray) -> PressureField:
+        return self.field.of(each, fits_peaks=Channel.MAGNITUDE in self.fit.responses)
 
     def no_data(self) -> Measured:
         none = np.zeros(len(self.fit.forward.bare_voltages))
         return {name: measured(none) for name in self.fit.responses}
 
-    def at(self, each: FloatArray, order: int, data: Measured) -> FittedField:
-        family = self.family(each, order)
+    def at(self, each: FloatArray, data: Measured) -> FittedField:
+        family = self.family(each)
         return evaluated(self.fit, family, family.join(each), data)
 
     def changes(self, fitted: FittedField) -> dict[Channel, FloatArray]:
@@ -120,7 +120,7 @@ def evaluated(
     log_ratio: float | None = None,
 ) -> FittedField:
     ratio = fit.likely if log_ratio is None else log_ratio
-    fitted = fit.evaluate(family, parameters, ratio, data, len(fit.forward.bare.pressable))
+    fitted = fit.evaluate(family, parameters, ratio, data)
     assert fitted is not None
     return fitted
 

@@ -58,7 +58,7 @@ def data(fit: FieldFit) -> Measured:
 def field_of(fit: FieldFit, each: FloatArray) -> PressureField:
     graded = fit.responses[Channel.MAGNITUDE]
     assert isinstance(graded, GradedResponse)
-    return PressureField.on(fit.forward, graded).of(each, 2)
+    return PressureField.on(fit.forward, graded).of(each)
 
 
 def at(

@@ -42,17 +42,14 @@ from variants import variant
 
 EGG = (0.03, -0.02, 0.04, 0.05)
 SCENES = {
-    "circle": (1, contacts(contact())),
-    "ellipse": (2, contacts(contact(e=(0.2, -0.1)))),
-    "rounded": (2, contacts(contact(e=(0.2, -0.1), waves=EGG))),
-    "soft": (2, contacts(contact(e=(0.2, -0.1), edge=0.5))),
-    "soft ring": (2, contacts(contact(waves=EGG, edge=0.4, hole=0.6))),
-    "overlapping": (
-        2,
-        contacts(
-            contact(-0.004, 0.001, 0.009, peak=0.9, edge=0.5),
-            contact(0.005, -0.002, 0.007, peak=0.6),
-        ),
+    "circle": contacts(contact()),
+    "ellipse": contacts(contact(e=(0.2, -0.1))),
+    "rounded": contacts(contact(e=(0.2, -0.1), waves=EGG)),
+    "soft": contacts(contact(e=(0.2, -0.1), edge=0.5)),
+    "soft ring": contacts(contact(waves=EGG, edge=0.4, hole=0.6)),
+    "overlapping": contacts(
+        contact(-0.004, 0.001, 0.009, peak=0.9, edge=0.5),
+        contact(0.005, -0.002, 0.007, peak=0.6),
     ),
 }
 
@@ -87,8 +84,8 @@ def test_the_jacobian_passes_a_taylor_test(sensor: Sensor, scene: str) -> None:
         family: Family
         family, parameters = level_set_at(sensor)
     else:
-        order, each = SCENES[scene]
-        family = sensor.family(each, order)
+        each = SCENES[scene]
+        family = sensor.family(each)
         parameters = family.join(each)
     at = np.append(parameters, fit.likely)
     here = evaluated(fit, family, parameters, data)
@@ -104,8 +101,8 @@ def test_the_jacobian_passes_a_taylor_test(sensor: Sensor, scene: str) -> None:
 
 def test_a_family_may_lay_out_what_it_draws_as_it_likes(sensor: Sensor) -> None:
     """Families are open: one that draws in strides, by columns, is evaluated as any other."""
-    fit, (order, each) = sensor.fit, SCENES["soft"]
-    family, data = sensor.family(each, order), sensor.no_data()
+    fit, each = sensor.fit, SCENES["soft"]
+    family, data = sensor.family(each), sensor.no_data()
 
     class Strided(PressureField):
         def draw(self, parameters: FloatArray) -> Drawing:
@@ -146,19 +143,19 @@ def test_estimates_converge_at_second_order(small: SensorDescription, edge: floa
     ]
     # The same is drawn on every mesh: none is made up for its own blur.
     drawn = [replace(sensor, field=replace(sensor.field, blur_m2=0.0)) for sensor in sensors]
-    made = [sensor.changes(sensor.at(each, 1, sensor.no_data())) for sensor in drawn]
+    made = [sensor.changes(sensor.at(each, sensor.no_data())) for sensor in drawn]
     for name in made[0]:
         coarse, middle, fine = (changes[name] for changes in made)
         left = np.linalg.norm(coarse - middle) / np.linalg.norm(middle - fine)
         assert np.log2(left) == pytest.approx(2, abs=0.35)
     finest = sensors[-1]
-    data = data_of(finest.changes(finest.at(each, 1, finest.no_data())), 1e-3)
+    data = data_of(finest.changes(finest.at(each, finest.no_data())), 1e-3)
     beside = each.copy()
     beside[:, [X, SIZE]] += 0.1
     off = []
     for sensor in sensors[:-1]:
-        found = sensor.settled(sensor.at(beside, 1, data), data)
-        (one,) = sensor.family(each, 1).split(found.parameters)
+        found = sensor.settled(sensor.at(beside, data), data)
+        (one,) = sensor.family(each).split(found.parameters)
         off.append(np.abs(one - each[0])[[SIZE, PEAK]])
     assert (off[1] < [0.01, 0.02]).all()  # of the radius, and of the table's end
     assert (off[1] < 0.4 * off[0]).all()
@@ -167,15 +164,15 @@ def test_estimates_converge_at_second_order(small: SensorDescription, edge: floa
 @pytest.mark.parametrize("scene", SCENES)
 def test_the_fit_explains_what_its_own_model_made(sensor: Sensor, scene: str) -> None:
     """Without noise or model error a field comes back from a start beside it."""
-    order, each = SCENES[scene]
-    truth = sensor.at(each, order, sensor.no_data())
+    each = SCENES[scene]
+    truth = sensor.at(each, sensor.no_data())
     data = data_of(sensor.changes(truth), 0.001)
     beside = each.copy()
     beside[:, X] -= 0.2
     beside[:, Y] += 0.15
     beside[:, SIZE] += 0.1
     beside[:, PEAK] -= 0.07
-    start = sensor.at(beside, order, data)
+    start = sensor.at(beside, data)
     found = sensor.fit.refine(start, data, Budget(PLENTY_S), good_enough=0.2)
     assert start.misfit > 3
     # Where outlines overlap the field has a kink, at which steps become short.
@@ -192,8 +189,8 @@ def test_the_fit_explains_what_its_own_model_made(sensor: Sensor, scene: str) ->
 
 def test_no_step_is_taken_that_would_gain_nothing(sensor: Sensor) -> None:
     """From next to the minimum one step is enough, and the last Jacobian tells so."""
-    order, each = SCENES["circle"]
-    truth = sensor.at(each, order, sensor.no_data())
+    each = SCENES["circle"]
+    truth = sensor.at(each, sensor.no_data())
     data = data_of(sensor.changes(truth), 0.003, np.random.default_rng(4))
     best = sensor.settled(sensor.fit.compare(truth, data), data)
     beside = best.parameters + 0.01 * (np.arange(len(best.parameters)) == X)
@@ -227,9 +224,9 @@ def test_parameters_scatter_as_their_covariance_says(sensor: Sensor, scene: str)
 
     What voltages hardly tell is known from before: edges are as wide apart as the prior says.
     """
-    order, each = SCENES[scene]
+    each = SCENES[scene]
     sigma, rng = 0.003, np.random.default_rng(8)
-    index = sensor.family(each, order).index[0, [X, Y, SIZE, PEAK, EDGE]]
+    index = sensor.family(each).index[0, [X, Y, SIZE, PEAK, EDGE]]
     index = index[index >= 0]
     off = []
     for _ in range(80):
@@ -237,7 +234,7 @@ def test_parameters_scatter_as_their_covariance_says(sensor: Sensor, scene: str)
         if each[0, EDGE]:
             drawn = HERTZ + PRIOR_SIGMA[EDGE] * rng.standard_normal()
             true[0, EDGE] = np.clip(drawn, *EDGE_LIMITS)
-        truth = sensor.at(true, order, sensor.no_data())
+        truth = sensor.at(true, sensor.no_data())
         data = data_of(sensor.changes(truth), sigma, rng)
         found = sensor.settled(sensor.fit.compare(truth, data), data)
         J, (precision, _) = sensor.fit.jacobian(found, data), sensor.fit.prior(found)
@@ -250,8 +247,8 @@ def test_parameters_scatter_as_their_covariance_says(sensor: Sensor, scene: str)
 
 
 def test_what_the_data_leave_unexplained_widens_the_covariance(sensor: Sensor) -> None:
-    order, each = SCENES["circle"]
-    truth = sensor.at(each, order, sensor.no_data())
+    each = SCENES["circle"]
+    truth = sensor.at(each, sensor.no_data())
     data = data_of(sensor.changes(truth), 0.003)
     J = sensor.fit.jacobian(sensor.fit.compare(truth, data), data)
     precision, _ = sensor.fit.prior(truth)
@@ -262,9 +259,9 @@ def test_what_the_data_leave_unexplained_widens_the_covariance(sensor: Sensor) -
 def test_a_budget_that_is_used_up_leaves_a_better_field_that_has_not_converged(
     sensor: Sensor,
 ) -> None:
-    order, each = SCENES["ellipse"]
-    data = data_of(sensor.changes(sensor.at(each, order, sensor.no_data())), 0.002)
-    field = sensor.at(contacts(contact(-0.01, 0.003, 0.009)), order, data)
+    each = SCENES["ellipse"]
+    data = data_of(sensor.changes(sensor.at(each, sensor.no_data())), 0.002)
+    field = sensor.at(contacts(contact(-0.01, 0.003, 0.009)), data)
     for _ in range(3):
         better = sensor.fit.refine(field, data, Budget(0.0), good_enough=0.0)
         assert better.cost <= field.cost
@@ -272,25 +269,17 @@ def test_a_budget_that_is_used_up_leaves_a_better_field_that_has_not_converged(
         field = better
 
 
-def test_more_than_a_deadline_allows_is_not_solved(sensor: Sensor, solves: list[int]) -> None:
-    order, each = SCENES["circle"]
-    family = sensor.family(each, order)
-    none = sensor.fit.evaluate(family, family.join(each), 1.0, sensor.no_data(), max_pressed=5)
-    assert none is None
-    assert not solves
-
-
 def test_holding_a_field_against_other_data_is_what_solving_it_would_say(
     sensor: Sensor, solves: list[int]
 ) -> None:
-    order, each = SCENES["soft"]
-    field = sensor.at(each, order, sensor.no_data())
+    each = SCENES["soft"]
+    field = sensor.at(each, sensor.no_data())
     change = np.linspace(-1, 1, len(sensor.fit.forward.bare_voltages))
     data = {name: measured(change, np.linspace(1, 2, len(change))) for name in sensor.fit.responses}
     solves.clear()
     compared = sensor.fit.compare(field, data)
     assert not solves
-    solved = sensor.at(each, order, data)
+    solved = sensor.at(each, data)
     np.testing.assert_array_equal(compared.residual, solved.residual)
     assert compared.cost == solved.cost
     assert compared.misfit == pytest.approx(
@@ -302,8 +291,8 @@ def test_a_sheet_that_is_lost_and_comes_back_is_left_out_and_solved(
     forward: ForwardModel, small: SensorDescription, solves: list[int]
 ) -> None:
     sensor = Sensor.of(forward, described(small, "both"))
-    order, each = SCENES["circle"]
-    both = sensor.at(each, order, sensor.no_data())
+    each = SCENES["circle"]
+    both = sensor.at(each, sensor.no_data())
     exact = data_of(sensor.changes(both), 0.002)
     alone = {Channel.STRUCTURE: exact[Channel.STRUCTURE]}
     solves.clear()
@@ -320,9 +309,9 @@ def test_a_field_pushed_off_the_sheet_stays_on_it(sensor: Sensor) -> None:
     """Data of a contact half beyond the rim, and a start in the corner."""
     width, height = 0.06, 0.05
     beyond = contacts(contact(width / 2, 0.005, 0.009))
-    made = sensor.changes(sensor.at(beyond, 1, sensor.no_data()))
+    made = sensor.changes(sensor.at(beyond, sensor.no_data()))
     data = data_of(made, 0.01, np.random.default_rng(2))
-    start = sensor.at(contacts(contact(width / 2 - 0.002, height / 2, 0.006)), 2, data)
+    start = sensor.at(contacts(contact(width / 2 - 0.002, height / 2, 0.006)), data)
     found = sensor.fit.refine(start, data, Budget(PLENTY_S), 1.0)
     assert isinstance(found.family, PressureField)
     (one,) = found.family.split(found.parameters)

@@ -23,7 +23,6 @@ from tactomo_models.scene.parameters import (
     HOLE,
     PEAK,
     SIZE,
-    SIZE_LIMITS,
     X,
     Y,
 )
@@ -33,21 +32,18 @@ from taylor import taylor_orders
 
 EGG = (0.03, -0.02, 0.04, 0.05)
 SCENES = {
-    "circle": (1, contacts(contact())),
-    "ellipse": (2, contacts(contact(e=(0.2, -0.1)))),
-    "round ellipse": (2, contacts(contact())),
-    "rounded": (2, contacts(contact(e=(0.2, -0.1), waves=EGG))),
-    "soft circle": (1, contacts(contact(edge=0.5))),
-    "soft and rounded": (2, contacts(contact(e=(0.2, -0.1), waves=EGG, edge=0.7))),
-    "ring": (2, contacts(contact(e=(0.2, -0.1), hole=0.8))),
-    "soft ring": (2, contacts(contact(waves=EGG, edge=0.4, hole=0.6))),
-    "overlapping": (
-        2,
-        contacts(
-            contact(-0.004, 0.001, 0.009, peak=0.9, edge=0.5),
-            contact(0.005, -0.002, 0.007, peak=0.6),
-            contact(0.001, 0.007, 0.006, peak=0.7, hole=0.5),
-        ),
+    "circle": contacts(contact()),
+    "ellipse": contacts(contact(e=(0.2, -0.1))),
+    "round ellipse": contacts(contact()),
+    "rounded": contacts(contact(e=(0.2, -0.1), waves=EGG)),
+    "soft circle": contacts(contact(edge=0.5)),
+    "soft and rounded": contacts(contact(e=(0.2, -0.1), waves=EGG, edge=0.7)),
+    "ring": contacts(contact(e=(0.2, -0.1), hole=0.8)),
+    "soft ring": contacts(contact(waves=EGG, edge=0.4, hole=0.6)),
+    "overlapping": contacts(
+        contact(-0.004, 0.001, 0.009, peak=0.9, edge=0.5),
+        contact(0.005, -0.002, 0.007, peak=0.6),
+        contact(0.001, 0.007, 0.006, peak=0.7, hole=0.5),
     ),
 }
 FURTHER = {
@@ -95,8 +91,8 @@ def orders_of(field: PressureField, parameters: FloatArray, direction: FloatArra
 @pytest.mark.parametrize("name", SCENES)
 def test_what_is_drawn_passes_a_taylor_test(field: PressureField, name: str) -> None:
     """Every parameter of every contact at once, those of edge and peak too."""
-    order, each = SCENES[name]
-    drawn = field.of(each, order)
+    each = SCENES[name]
+    drawn = field.of(each)
     parameters = drawn.join(each)
     direction = np.random.default_rng(3).standard_normal(len(parameters))
     assert orders_of(drawn, parameters, direction) == pytest.approx(2, abs=0.1)
@@ -108,8 +104,8 @@ def test_what_is_not_fitted_yet_passes_it_too(
     field: PressureField, name: str, further: str
 ) -> None:
     """The data are asked for an edge, a hole or bulges by these slopes, before any is fitted."""
-    order, each = SCENES[name]
-    drawn = field.of(each, order).with_free(FURTHER[further])
+    each = SCENES[name]
+    drawn = field.of(each).with_free(FURTHER[further])
     parameters = drawn.join(each)
     direction = np.random.default_rng(4).standard_normal(len(parameters))
     assert orders_of(drawn, parameters, direction) == pytest.approx(2, abs=0.1)
@@ -135,8 +131,8 @@ def test_a_level_set_passes_a_taylor_test(
 
 @pytest.mark.parametrize("name", SCENES)
 def test_shares_and_pressures_stay_what_they_are(field: PressureField, name: str) -> None:
-    order, each = SCENES[name]
-    drawing = field.of(each, order).draw(field.of(each, order).join(each))
+    each = SCENES[name]
+    drawing = field.of(each).draw(field.of(each).join(each))
     assert drawing.enclosed.max() <= 1
     assert drawing.share.min() >= 0
     assert drawing.share.max() <= 1 / (1 - MOST_BLURRED)
@@ -148,10 +144,10 @@ def test_shares_and_pressures_stay_what_they_are(field: PressureField, name: str
 
 def test_far_from_contacts_nothing_is_drawn(field: PressureField) -> None:
     each = contacts(contact())
-    drawn = field.of(each, 1)
+    drawn = field.of(each)
     nodes = drawn.draw(drawn.join(each)).nodes
     assert np.hypot(field.x_m[nodes] - 0.004, field.y_m[nodes]).max() < 0.02
-    empty = field.of(np.zeros((0, COLUMNS)), 0)
+    empty = field.of(np.zeros((0, COLUMNS)))
     assert len(empty.draw(np.zeros(0)).nodes) == 0
 
 
@@ -159,7 +155,7 @@ def test_what_is_pressed_twice_is_pressed_once(field: PressureField) -> None:
     """Two contacts in one place are one of their mean pressure."""
     one = contacts(contact(peak=0.7))
     two = contacts(contact(peak=0.9), contact(peak=0.5))
-    single, both = (field.of(each, 1).draw(field.of(each, 1).join(each)) for each in (one, two))
+    single, both = (field.of(each).draw(field.of(each).join(each)) for each in (one, two))
     inside = single.share > 0.999 * single.share.max()
     np.testing.assert_allclose(both.pressure_kpa[inside], single.pressure_kpa[inside])
     np.testing.assert_allclose(both.share[inside], single.share[inside], rtol=1e-3)
@@ -171,7 +167,7 @@ def test_a_field_has_its_force(field: PressureField, edge: float) -> None:
     each = contacts(contact(0.001, -0.002, 0.012, peak=0.8, edge=edge))
     axis, step = np.linspace(-0.02, 0.02, 401, retstep=True)
     x, y = (places.ravel() for places in np.meshgrid(axis, axis))
-    _, share, pressure = field.of(each, 1).sampled(each, x, y, float(step))
+    _, share, pressure = field.of(each).sampled(each, x, y, float(step))
     force = 1e3 * (share * pressure).sum() * step**2
     # The rim's width, over which a falling pressure is averaged, is that of the samples.
     assert force == pytest.approx(1e3 * np.pi * 0.012**2 * 0.8 * 200 / (1 + edge), rel=5e-3)
@@ -193,7 +189,7 @@ def test_a_mesh_shows_area_and_moments_of_what_is_drawn(
         for place in product(offsets, offsets):
             moved = each.copy()
             moved[0, [X, Y]] = place
-            drawing = of.of(moved, 1).draw(of.of(moved, 1).join(moved))
+            drawing = of.of(moved).draw(of.of(moved).join(moved))
             pressed = np.zeros(points.shape[1])
             pressed[forward.bare.pressable[drawing.nodes]] = drawing.share * drawing.pressure_kpa
             corners = points[:, triangles] - 0.01 * moved[0, [X, Y], None, None]
@@ -213,7 +209,7 @@ def test_a_mesh_shows_area_and_moments_of_what_is_drawn(
 def test_a_ring_presses_with_its_rim(field: PressureField) -> None:
     each = contacts(contact(0.0, 0.0, 0.012, hole=1.0))
     x, y = np.array([0.0, 0.009, 0.013]), np.zeros(3)
-    enclosed, share, _ = field.of(each, 1).sampled(each, x, y, 1e-4)
+    enclosed, share, _ = field.of(each).sampled(each, x, y, 1e-4)
     np.testing.assert_array_equal(enclosed, [1, 1, 0])
     np.testing.assert_array_equal(share, [0, 1, 0])
 
@@ -224,13 +220,14 @@ def test_contacts_stay_on_the_sheet_and_of_a_contacts_size(
 ) -> None:
     each = np.array(parameters).reshape(2, COLUMNS)
     each[:, EDGE], each[:, HOLE] = np.abs(each[:, EDGE]), 0.0
-    family = field.of(each, 2)
+    family = field.of(each)
     bounded = family.bounded(family.join(each))
     inside = family.split(bounded)
     assert np.abs(inside[:, X] * 0.01).max() <= np.abs(field.x_m).max() + 1e-12
     assert np.abs(inside[:, Y] * 0.01).max() <= np.abs(field.y_m).max() + 1e-12
-    assert (inside[:, SIZE] >= SIZE_LIMITS[0]).all()
-    assert (inside[:, SIZE] <= SIZE_LIMITS[1]).all()
+    least_size, most_size = field.size_limits
+    assert (inside[:, SIZE] >= least_size).all()
+    assert (inside[:, SIZE] <= most_size).all()
     least, most = field.peak_limits
     assert (inside[:, PEAK] >= least).all()
     assert (inside[:, PEAK] <= most).all()
@@ -254,7 +251,7 @@ def test_an_image_becomes_the_ellipse_that_it_shows(
     each = contacts(contact(x, y, radius, e=e))
     axis, step = np.linspace(-0.03, 0.03, 61, retstep=True)
     x_m, y_m = np.meshgrid(axis, axis)
-    _, share, _ = field.of(each, 2).sampled(each, x_m.ravel(), y_m.ravel(), float(step))
+    _, share, _ = field.of(each).sampled(each, x_m.ravel(), y_m.ravel(), float(step))
     (found,) = ellipses_of(share.reshape(1, 61, 61), x_m, y_m, typical_peak=0.5)
     assert found[[X, Y]] * 0.01 == pytest.approx([x, y], abs=2e-4)
     assert np.exp(found[SIZE]) == pytest.approx(radius, rel=0.02)
@@ -275,6 +272,5 @@ def test_the_heaviside_is_smooth_and_of_compact_support(t: float) -> None:
 def test_a_sheet_without_a_table_has_a_field_too(forward: ForwardModel) -> None:
     field = PressureField.on(forward, None)
     each = contacts(contact())
-    family = field.of(each, 1, fits_peaks=False)
-    assert len(family.join(each)) == 3
-    assert field.of(each, 0).ratio_freedom < 0.1 < family.ratio_freedom
+    family = field.of(each, fits_peaks=False)
+    assert len(family.join(each)) == 5
