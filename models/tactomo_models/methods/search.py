@@ -76,6 +76,7 @@ class Belief:
     rounds: int = 0  # of questions in which something has changed
     frames: int = 0  # in which something moved, with these contacts
     challenged: float = 0.0  # chi-squared that no start could better
+    is_explained: bool = True  # whether it explains its own frame
     lacks_none: bool = False  # whether no contact is missing, as far as was asked
     is_parted: bool = False  # whether no contacts that touch are one, as far as was asked
     done: bool = False  # whether nothing is left to try
@@ -123,7 +124,8 @@ class Search:
             belief = self._followed(belief, frame)
         while not belief.done and not frame.budget.over:
             belief = self._advanced(belief, frame)
-        return belief
+        explained = frame.likelihood.explains(belief.account.chi_squared)
+        return replace(belief, is_explained=explained)
 
     # From frame to frame
 
@@ -155,10 +157,12 @@ class Search:
             how="warm start",
         )
         due = frames & (frames - 1) == 0
-        if not self._is_explained(belief, frame, anew=due):
+        # What did not explain its own frame has no claim on the next one.
+        suspect = not belief.is_explained and (due or not belief.challenged)
+        if suspect or not self._is_explained(belief, frame, anew=due):
             return self._challenged(belief, account, frame)
-        belief = replace(belief, moved=(belief.account.contacts - old.contacts)[:, [X, Y]])
-        return self._asking_again(belief) if due else belief
+        moved = (belief.account.contacts - old.contacts)[:, [X, Y]]
+        return self._asking_again(replace(belief, moved=moved), due=due)
 
     def _moved_on(self, belief: Belief, frame: Frame) -> Account | None:
         """The contacts where they would be if they went on as they last moved."""
@@ -172,21 +176,23 @@ class Search:
         each[:, [X, Y]] += belief.moved
         return self._account(each, account.fitted.log_ratio, frame)
 
-    def _asking_again(self, belief: Belief) -> Belief:
-        """Ask what is open once more; all of a contact that is pressed quite differently."""
+    def _asking_again(self, belief: Belief, *, due: bool) -> Belief:
+        """Ask a contact that is pressed quite differently; where it is due, what is open, too."""
         peaks = belief.account.contacts[:, PEAK]
-        same = len(belief.asked_peaks) == len(peaks)
+        asked = belief.asked_peaks if len(belief.asked_peaks) == len(peaks) else peaks
+        same = np.abs(np.log(peaks / asked)) < ANOTHER_PRESS
+        if same.all() and not due:
+            return belief
         rivals = tuple(
             {
-                kind: replace(rival, is_open=rival.log_odds > HOPELESS)
+                kind: replace(rival, is_open=due and rival.log_odds > HOPELESS)
                 for kind, rival in mine.items()
-                if same and abs(np.log(peak / asked)) < ANOTHER_PRESS
+                if is_same
             }
-            for mine, peak, asked in zip(
-                belief.rivals, peaks, belief.asked_peaks if same else peaks, strict=True
-            )
+            for mine, is_same in zip(belief.rivals, same, strict=True)
         )
-        return replace(belief, rivals=rivals, rounds=0, lacks_none=False, is_parted=False)
+        again = replace(belief, rivals=rivals, asked_peaks=np.where(same, asked, peaks), rounds=0)
+        return replace(again, lacks_none=False, is_parted=False) if due else again
 
     @staticmethod
     def _is_explained(belief: Belief, frame: Frame, *, anew: bool) -> bool:
@@ -238,9 +244,8 @@ class Search:
         if left is not before:
             starts.append(self._with_missing(left, frame, far=True))
         best = self._best([*starts, *self._proposed(frame)], frame)
-        if best is belief.account or best.log_evidence <= belief.account.log_evidence:
-            return replace(belief, challenged=belief.account.chi_squared)
-        return self._begun(best, frame, "warm start")
+        begun = self._begun(best, frame, "warm start")
+        return replace(begun, challenged=best.chi_squared)
 
     def _pressed_harder(self, account: Account, frame: Frame) -> list[Account]:
         """The same contacts, none of them below the graded sheet's onset, if any was.
@@ -345,11 +350,11 @@ class Search:
         return replace(belief, rivals=rivals, rounds=ROUNDS) if rivals != belief.rivals else None
 
     def _missed(self, belief: Belief, frame: Frame) -> Belief | None:
-        """The belief with a contact more, away from all others, where that is likelier."""
+        """The belief with a contact more, where that is likelier than data left unexplained."""
         account = belief.account
         if belief.lacks_none or frame.likelihood.explains(account.chi_squared):
             return None
-        born = self._with_missing(account, frame, far=True)
+        born = self._with_missing(account, frame, far=False)
         return None if born is account else self._grown(belief, born)
 
     def _changed(self, belief: Belief, choice: Mapping[int, Kind], frame: Frame) -> Belief | None:

@@ -29,6 +29,9 @@ from tactomo_models.scene.sheet_response import GradedResponse, SaturatingRespon
 # Of an outline's radius, over the nodes' distance, that no noise accounts for where a pressure is
 # even: with 0.05, 59 % of rectangles' and rings' areas are within one sigma, with 0.07, 67 %.
 OUTLINE_ERROR = 0.07
+# Of a place, likewise: what is left of electrodes' places once the sheet is found. With half, 48 %
+# of the places on hand-made skins are within one sigma, with twice 75 %.
+PLACE_ERROR = 0.03
 NEGLIGIBLE = 0.02  # share of an alternative that need not be drawn
 SAMPLES = 3  # per side of a map cell: what an outline covers of it is right to 3 %
 
@@ -82,13 +85,9 @@ class FieldAccountant:
         measured: Measured,  # the data that it explains
         # of each contact; where they are likely, images and numbers are the mean of all
         alternatives: Sequence[Sequence[Alternative]] = (),
-        # (N, N) of its parameters; by the data's likelihood alone if None
-        covariance: FloatArray | None = None,
     ) -> FieldAccount:
         """Account for a field."""
-        if covariance is None:
-            covariance = self._covariance(fitted, measured)
-        shown = self._drawn(fitted, measured, covariance)
+        shown = self._drawn(fitted, measured)
         family = fitted.family
         if not isinstance(family, PressureField) or not len(shown.areas):
             return shown
@@ -101,16 +100,35 @@ class FieldAccountant:
                 shown = self._mixed(shown, family, each[k], likely, np.flatnonzero(owner == k))
         return shown
 
-    def _covariance(self, fitted: FittedField, measured: Measured) -> FloatArray:
+    def _sensed(self, fitted: FittedField, measured: Measured) -> FloatArray:
+        """Derivative (sum M, N) of the weighted residual by the parameters.
+
+        Below its onset a graded sheet answers to nothing. What it would answer to is what bounds a
+        light contact's pressure, so that there it is differentiated at its onset.
+        """
+        drawing = fitted.drawing
+        J = self._fit.jacobian(fitted, measured)
+        if isinstance(self._graded, GradedResponse) and Channel.MAGNITUDE in measured:
+            light = drawing.pressure_kpa < self._graded.onset_kpa
+            if light.any():
+                onset_kpa = np.maximum(drawing.pressure_kpa, self._graded.onset_kpa)
+                at_onset = replace(drawing, pressure_kpa=onset_kpa)
+                graded = {Channel.MAGNITUDE: measured[Channel.MAGNITUDE]}
+                start = [*measured].index(Channel.MAGNITUDE) * len(J) // len(measured)
+                sensed = self._fit.jacobian(fitted, graded, at_onset)
+                J[start : start + len(sensed)] = sensed
+        return J[:, :-1]
+
+    def _covariance(
+        self, fitted: FittedField, measured: Measured, J: FloatArray
+    ) -> FloatArray:
         """Covariance (N, N) of a field's parameters."""
         likelihood = Likelihood.of(measured)
-        J = self._fit.jacobian(fitted, measured, fitted.drawing)
         information = likelihood.information(J, likelihood.chi_squared(fitted.residual))
-        return np.linalg.inv(information + np.diag(self._fit.prior(fitted)[0]))[:-1, :-1]
+        precision = self._fit.prior(fitted)[0][:-1]
+        return np.asarray(np.linalg.inv(information + np.diag(precision)), np.float64)
 
-    def _drawn(
-        self, fitted: FittedField, measured: Measured, covariance: FloatArray
-    ) -> FieldAccount:
+    def _drawn(self, fitted: FittedField, measured: Measured) -> FieldAccount:
         near, (solid, share, pressure) = self._images(fitted)
         image = partial(self._image, near)
         covered, whole = image(share), image(solid)
@@ -120,7 +138,7 @@ class FieldAccountant:
         areas = self._areas.find(whole, there)
         mine = areas.on_nodes[:, drawing.nodes] > 0
         areas = self._areas.less(areas, covered / np.maximum(whole, 1e-12))
-        known = self._contacts(fitted, measured, areas, mine, covariance)
+        known = self._contacts(fitted, measured, areas, mine)
         magnitude, saturation = self._responses(pressure)
         return FieldAccount(
             map=image(share * magnitude),
@@ -296,7 +314,6 @@ class FieldAccountant:
         measured: Measured,
         areas: Areas,
         mine: BoolArray,
-        covariance: FloatArray,
     ) -> dict[str, Any]:
         """Numbers of each area's contact, and what they do not know of themselves."""
         count = len(areas)
@@ -311,6 +328,8 @@ class FieldAccountant:
         if count == 0:
             return known
         family, drawing = fitted.family, fitted.drawing
+        J = self._sensed(fitted, measured)
+        covariance = self._covariance(fitted, measured, J)
         by_share, by_pressure = drawing.slopes()[2:]
         cell = self._areas.node_areas_m2[drawing.nodes]
         share, pressure = drawing.share, drawing.pressure_kpa
@@ -338,14 +357,17 @@ class FieldAccountant:
         by_area = weight @ by_share
         sigmas = np.column_stack(
             [
-                *(sigma(each_off @ by_share / area[:, None]) for each_off in off),
-                np.hypot(sigma(by_area), by_outline * areas.areas_m2),
+                *(
+                    np.hypot(sigma(each_off @ by_share / area[:, None]), PLACE_ERROR * self._cell_m)
+                    for each_off in off
+                ),
+                np.hypot(sigma(by_area), OUTLINE_ERROR * of_mesh * areas.areas_m2),
             ]
         )
         known["areas"] = replace(areas, sigmas=sigmas)
         if Channel.MAGNITUDE not in measured or not isinstance(self._graded, GradedResponse):
             return known
-        size, slope = (np.abs(v) for v in self._graded.relative_change(pressure))
+        size, slope = self._felt(pressure)
         known["magnitudes"] = (weight @ (share * size)) / area
         by_magnitude = by_share * size[:, None] + (share * slope)[:, None] * by_pressure
         by_mean = (weight @ by_magnitude - known["magnitudes"][:, None] * by_area) / area[:, None]
@@ -355,10 +377,9 @@ class FieldAccountant:
             peaks = family.unit_kpa * each[owner, PEAK]
             index = family.index[owner, PEAK]
             by_peak = family.unit_kpa * np.eye(by_share.shape[1])[index]
-            is_least = each[owner, PEAK] <= family.peak_limits[0]
-            J = self._fit.jacobian(fitted, measured, drawing)
-            known["goes_wrong_way"] = self._goes_wrong_way(J[:, index], fitted.residual, is_least)
-        peak_size, peak_slope = (np.abs(v) for v in self._graded.relative_change(peaks))
+            rests = peaks <= max(self._graded.onset_kpa, family.unit_kpa * family.peak_limits[0])
+            known["goes_wrong_way"] = self._goes_wrong_way(J[:, index], fitted.residual, rests)
+        peak_size, peak_slope = self._felt(peaks)
         scale = areas.areas_m2 / area  # the map's, over the mesh's
         by_force = by_share * pressure[:, None] + share[:, None] * by_pressure
         total = weight @ (share * pressure)
@@ -390,16 +411,23 @@ class FieldAccountant:
         )
         return known
 
+    def _felt(self, pressure_kpa: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """|Relative change| of the graded sheet and its slope; below its onset, the slope there."""
+        assert isinstance(self._graded, GradedResponse)
+        size, _ = self._graded.relative_change(pressure_kpa)
+        _, slope = self._graded.relative_change(np.maximum(pressure_kpa, self._graded.onset_kpa))
+        return np.abs(size), np.abs(slope)
+
     @staticmethod
     def _goes_wrong_way(
         # (sum M, K) derivative of the weighted residual by each contact's peak
         by_peak: FloatArray,
         residual: FloatArray,  # (sum M,) weighted
-        is_least: BoolArray,  # (K,) whether a peak is as small as it may be
+        rests: BoolArray,  # (K,) whether the graded sheet answers to none of it
     ) -> bool:
         """Tell whether a contact that hardly presses would have to press less than nothing."""
         power = np.maximum((by_peak**2).sum(axis=0), 1e-12)
-        return bool((is_least & (by_peak.T @ residual > WRONG_WAY * np.sqrt(power))).any())
+        return bool((rests & (by_peak.T @ residual > WRONG_WAY * np.sqrt(power))).any())
 
     @staticmethod
     def _owners(each: FloatArray, highest_m: FloatArray) -> IntArray:
