@@ -10,6 +10,7 @@ import numpy as np
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
+from tactomo_models.methods.kinds import log_prior
 from tactomo_models.scene.evidence import Likelihood, log_occam
 from tactomo_models.scene.field_fit import (
     MAX_DAMPING,
@@ -87,6 +88,8 @@ def account_of(fit: FieldFit, fitted: FittedField, frame: Frame) -> Account:
     hessian[np.diag_indices(len(hessian))] += precision
     log_evidence = likelihood.log(chi_squared) - float(precision @ offset**2) / 2
     log_evidence += log_occam(precision, hessian)
+    assert isinstance(fitted.family, PressureField)
+    log_evidence += log_prior(fitted.family.split(fitted.parameters))
     valid = np.count_nonzero(likelihood.deflation)
     unit = likelihood.precision(chi_squared) * likelihood.count / max(valid, 1)
     return Account(fitted, jacobian, hessian, chi_squared, log_evidence, unit)

@@ -44,6 +44,16 @@ class Kind(StrEnum):
     NONE = auto()  # nothing
 
 
+# How likely each kind is before any data: tools and pads press evenly, fingers and balls fall off,
+# few things have corners that a skin can tell, fewer a hole. @SENS@
+SHARES = {Kind.EVEN: 0.4, Kind.FALLING: 0.3, Kind.ROUNDED: 0.2, Kind.RING: 0.1}
+
+
+def log_prior(contacts: FloatArray) -> float:
+    """Logarithm of how likely the kinds of contacts (K, COLUMNS) are before any data."""
+    return float(sum(np.log(SHARES[kind_of(contact)]) for contact in contacts))
+
+
 def kind_of(contact: FloatArray) -> Kind:
     """Kind of a contact (COLUMNS,)."""
     if contact[EDGE] > 0:

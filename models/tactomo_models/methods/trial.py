@@ -20,6 +20,7 @@ import numpy as np
 
 from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.methods.account import NEGLIGIBLE, Account, Frame, foreseen
+from tactomo_models.methods.kinds import log_prior
 from tactomo_models.scene.evidence import log_occam
 from tactomo_models.scene.field_fit import MAX_DAMPING, FieldFit, FittedField, bounded_step
 from tactomo_models.scene.parameters import E1, E2, SIZE, UNIT_M, X, Y
@@ -216,8 +217,10 @@ class Rest:
         log_evidence = likelihood.log(chi_squared) - away / 2
         log_evidence += log_occam(kept, hessian) + log_occam(prior, schur)
         contacts, sigmas = family.split(at.fitted.parameters), np.zeros(family.free.shape)
+        kept_contacts = np.delete(account.contacts, self._replaced, axis=0)
         sigmas[family.free] = np.sqrt(np.diag(np.linalg.inv(schur)))[:-1]
         near = len(self._near)
+        log_evidence += log_prior(kept_contacts) + log_prior(contacts[near:])
         return Trial(
             log_odds=log_evidence - account.log_evidence,
             contacts=contacts[near:],
