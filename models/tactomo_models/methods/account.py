@@ -20,6 +20,8 @@ from tactomo_models.scene.field_fit import (
     Measured,
     bounded_step,
 )
+from tactomo_models.scene.parameters import PEAK
+from tactomo_models.scene.pressure import CLEARLY
 from tactomo_models.scene.pressure_field import PressureField
 
 NEGLIGIBLE = 0.1  # of chi-squared, a third of a standard deviation: what a last step may leave
@@ -84,7 +86,8 @@ def account_of(fit: FieldFit, fitted: FittedField, frame: Frame) -> Account:
     jacobian = fit.jacobian(fitted, frame.measured)
     chi_squared = likelihood.chi_squared(fitted.residual)
     precision, offset = fit.prior(fitted)
-    hessian = likelihood.information(jacobian, chi_squared)
+    told = without_light_peaks(fitted, jacobian)
+    hessian = likelihood.information(told, chi_squared)
     hessian[np.diag_indices(len(hessian))] += precision
     log_evidence = likelihood.log(chi_squared) - float(precision @ offset**2) / 2
     log_evidence += log_occam(precision, hessian)
@@ -93,6 +96,24 @@ def account_of(fit: FieldFit, fitted: FittedField, frame: Frame) -> Account:
     valid = np.count_nonzero(likelihood.deflation)
     unit = likelihood.precision(chi_squared) * likelihood.count / max(valid, 1)
     return Account(fitted, jacobian, hessian, chi_squared, log_evidence, unit)
+
+
+def without_light_peaks(fitted: FittedField, jacobian: FloatArray) -> FloatArray:
+    """The derivative (sum M, N + 1) where light contacts' pressures leave no trace.
+
+    Below its onset a graded sheet answers to nothing: any pressure down there is as likely as it was
+    before. Laplace's method does not see that from a peak at the onset.
+    """
+    family = fitted.family
+    assert isinstance(family, PressureField)
+    free = family.free[:, PEAK]
+    peaks = family.index[free, PEAK]
+    above = family.split(fitted.parameters)[free, PEAK] - family.onset
+    light = peaks[above * np.sqrt((jacobian[:, peaks] ** 2).sum(axis=0)) < CLEARLY]
+    if len(light):
+        jacobian = jacobian.copy()
+        jacobian[:, light] = 0.0
+    return jacobian
 
 
 def descended(fit: FieldFit, account: Account, frame: Frame, steps: int) -> Account:

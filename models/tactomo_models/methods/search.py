@@ -109,7 +109,6 @@ class Search:
         assert graded is None or isinstance(graded, GradedResponse)
         self.fit = fit
         self.field = PressureField.on(fit.forward, graded)
-        self._onset = graded.onset_kpa / graded.end_kpa if graded else 0.0
         typical = {Channel.STRUCTURE: float(np.exp(fit.likely))}
         if graded is not None:
             peak_kpa = np.array(self.field.typical_peak * self.field.unit_kpa)
@@ -253,7 +252,7 @@ class Search:
         Down there that sheet answers to nothing, so that no fit finds the way up.
         """
         each = account.contacts.copy()
-        light = account.family.free[:, PEAK] & (each[:, PEAK] < self._onset)
+        light = account.family.free[:, PEAK] & (each[:, PEAK] < self.field.onset)
         each[light, PEAK] = self.field.typical_peak
         harder = self._account(each, account.fitted.log_ratio, frame) if light.any() else None
         return [harder] if harder else []
@@ -449,7 +448,7 @@ class Search:
     def _start_peak(self, frame: Frame) -> float:
         """Peak that a contact starts with: below the graded sheet's onset where that sheet rests."""
         if frame.fits_peaks and frame.measured[Channel.MAGNITUDE].quiet:
-            return max(self._onset / 2, self.field.peak_limits[0])
+            return max(self.field.onset / 2, self.field.peak_limits[0])
         return self.field.typical_peak
 
     def _account(self, each: FloatArray, log_ratio: float, frame: Frame) -> Account | None:

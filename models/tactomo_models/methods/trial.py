@@ -21,7 +21,13 @@ from functools import cached_property
 import numpy as np
 
 from tactomo_models.arrays import FloatArray, IntArray
-from tactomo_models.methods.account import NEGLIGIBLE, Account, Frame, foreseen
+from tactomo_models.methods.account import (
+    NEGLIGIBLE,
+    Account,
+    Frame,
+    foreseen,
+    without_light_peaks,
+)
 from tactomo_models.methods.kinds import log_prior
 from tactomo_models.scene.evidence import log_occam
 from tactomo_models.scene.field_fit import MAX_DAMPING, FieldFit, FittedField, bounded_step
@@ -93,7 +99,8 @@ class Rest:
         normal[np.diag_indices(len(normal))] += self._precision[self._keep]
         self._root = np.linalg.cholesky(normal)
         self._aside = np.linalg.solve(self._root, J.T)  # (n, sum M): what of a residual they take
-        self._J = frame.likelihood.deflation[:, None] * J
+        told = without_light_peaks(fitted, account.jacobian)[:, self._keep]
+        self._J = frame.likelihood.deflation[:, None] * told
 
     def trial(self, contacts: FloatArray) -> Trial | None:
         """Fit contacts (m, COLUMNS) in place of those that are replaced, from where they are.
@@ -198,7 +205,8 @@ class Rest:
         kept, prior = self._precision[self._keep], at.prior
         away = kept @ (self._offset[self._keep] + response) ** 2 + prior @ at.offset**2
         hessian = scale * (self._J.T @ self._J) + np.diag(kept)
-        J = likelihood.deflation[:, None] * self._jacobian(at)
+        told = without_light_peaks(at.fitted, self._jacobian(at))
+        J = likelihood.deflation[:, None] * told
         cross = scale * (self._J.T @ J)
         schur = scale * (J.T @ J) + np.diag(prior) - cross.T @ np.linalg.solve(hessian, cross)
         log_evidence = likelihood.log(chi_squared) - away / 2

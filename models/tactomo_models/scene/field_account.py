@@ -106,16 +106,15 @@ class FieldAccountant:
         Below its onset a graded sheet answers to nothing. What it would answer to is what bounds a
         light contact's pressure, so that there it is differentiated at its onset.
         """
-        drawing = fitted.drawing
-        J = self._fit.jacobian(fitted, measured)
-        if isinstance(self._graded, GradedResponse) and Channel.MAGNITUDE in measured:
-            light = drawing.pressure_kpa < self._graded.onset_kpa
+        J, family = self._fit.jacobian(fitted, measured), fitted.family
+        if isinstance(family, PressureField) and Channel.MAGNITUDE in measured:
+            each = family.split(fitted.parameters)
+            light = family.free[:, PEAK] & (each[:, PEAK] < family.onset)
             if light.any():
-                onset_kpa = np.maximum(drawing.pressure_kpa, self._graded.onset_kpa)
-                at_onset = replace(drawing, pressure_kpa=onset_kpa)
+                each[light, PEAK] = family.onset
                 graded = {Channel.MAGNITUDE: measured[Channel.MAGNITUDE]}
+                sensed = self._fit.jacobian(fitted, graded, family.draw(family.join(each)))
                 start = [*measured].index(Channel.MAGNITUDE) * len(J) // len(measured)
-                sensed = self._fit.jacobian(fitted, graded, at_onset)
                 J[start : start + len(sensed)] = sensed
         return J[:, :-1]
 

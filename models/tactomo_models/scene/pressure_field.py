@@ -76,6 +76,7 @@ class PressureField:
     blur_m2: float  # variance of each axis by which the mesh blurs what is drawn; see above
     unit_kpa: float  # pressure that peaks are counted in: the end of the table
     peak_limits: tuple[float, float]  # least and largest peak, in that unit
+    onset: float  # pressure from which the graded sheet answers, in that unit
     # peak that a contact starts with, in that unit: the middle of what the table answers to
     typical_peak: float
     size_limits: tuple[float, float]  # least and largest logarithm of the mean radius in metres
@@ -110,7 +111,7 @@ class PressureField:
         description = forward.description
         spacing = description.width_m / (description.map.nodes_x - 1)
         end_kpa = graded.end_kpa if graded else 300.0
-        onset_kpa = graded.onset_kpa if graded else 0.0
+        onset = graded.onset_kpa / end_kpa if graded else 0.0
         node_m2 = float(forward.node_areas_m2.mean())
         blur_m2 = of_triangles * node_m2 + of_step * (GRADED_WIDTH * spacing) ** 2
         largest = float(np.log(np.hypot(description.width_m, description.height_m) / 2))
@@ -122,7 +123,8 @@ class PressureField:
             blur_m2=blur_m2,
             unit_kpa=end_kpa,
             peak_limits=(least, beyond),
-            typical_peak=(onset_kpa / end_kpa + 1) / 2,
+            onset=onset,
+            typical_peak=(onset + 1) / 2,
             size_limits=(SMALLEST_SIZE, largest),
         )
 
