@@ -100,14 +100,15 @@ def _halves(even: FloatArray) -> FloatArray:
 def as_one(contacts: FloatArray) -> FloatArray:
     """One even ellipse (COLUMNS,) of the centre and moments of contacts (K, COLUMNS) and between.
 
-    Of an even ellipse with half axes a and b the second moments are a^2 / 4 and b^2 / 4.
+    Of an even ellipse with half axes a and b the second moments are a^2 / 4 and b^2 / 4, altogether
+    exp(2 s) expm(2 E) / 4 with s and E of `pressure_field`.
     """
     area = np.exp(2 * contacts[:, SIZE])
     share = area / area.sum()
     place = contacts[:, [X, Y]] * UNIT_M
     centre = share @ place
     off = place - centre
-    moments = (share * off.T) @ off + np.eye(2) * (share @ area) / 4
+    moments = (share * off.T) @ off + np.einsum("k,kij->ij", share * area, _stretches(contacts)) / 4
     variance, axes = np.linalg.eigh(moments)
     short, long = 2 * np.sqrt(variance)
     one = np.zeros(COLUMNS)
@@ -118,3 +119,12 @@ def as_one(contacts: FloatArray) -> FloatArray:
     one[[E1, E2]] = stretch * np.cos(2 * angle), stretch * np.sin(2 * angle)
     one[PEAK] = contacts[:, PEAK].max()
     return one
+
+
+def _stretches(contacts: FloatArray) -> FloatArray:
+    """expm(2 E) (K, 2, 2) of each contact's elongation: cosh(2 e) + sinh(2 e) E / e."""
+    elongation = np.hypot(contacts[:, E1], contacts[:, E2])
+    along = np.sinh(2 * elongation) / np.maximum(elongation, 1e-12)
+    e1, e2 = along * contacts[:, E1], along * contacts[:, E2]
+    round_ = np.cosh(2 * elongation)
+    return np.moveaxis(np.array([[round_ + e1, e2], [e2, round_ - e1]]), 2, 0)

@@ -6,14 +6,16 @@ own contacts alone, and what the others would do follows from their Jacobian:
     r(p) = r_s(p) - J_o H_o^-1 J_o^T (r_s(p) - r_0)      H_o = J_o^T J_o + prior precision
 
 with r_s the residual with the others frozen and r_0 that of the minimum to begin with. The log
-ratio belongs to all: a trial varies it, to first order on the frozen contacts. The same Schur
-complement makes the evidence of a trial comparable with that of the whole field.
+ratio belongs to all: it answers as the others do, unless there are none. (Stepped by a trial, it
+leads where the others do not follow to first order: a trial of the very same contact then ended
+up to 13 nats away.) The same Schur complement makes the evidence of a trial comparable with that
+of the whole field.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -32,8 +34,9 @@ from tactomo_models.scene.field_fit import MAX_DAMPING, FieldFit, FittedField, b
 from tactomo_models.scene.parameters import E1, E2, SIZE, UNIT_M, X, Y
 from tactomo_models.scene.pressure_field import PressureField
 
-# Nodes between outlines, below which a neighbour is solved with a trial: each outline is a node wide,
-# a triangle lies around it, and the trial may move by a node.
+# Nodes between outlines, below which a neighbour is fitted with a trial: each outline is a node wide,
+# a triangle lies around it, and the trial may move by a node. Neighbours at 10 mm that answer to
+# first order alone make a trial of the very same contact err by up to 13 nats.
 NEAR_NODES = 5
 STEPS = 6  # of a trial, which takes three; 12 change no row
 
@@ -45,7 +48,6 @@ class Trial:
     log_odds: float  # logarithm of its evidence over that of the field as it was
     contacts: FloatArray  # (m, COLUMNS) what presses instead
     sigmas: FloatArray  # (m, COLUMNS) standard uncertainties; 0 of what is not fitted
-    log_ratio: float
 
 
 class Rest:
@@ -75,18 +77,6 @@ class Rest:
         fitted = account.fitted
         assert isinstance(fitted.family, PressureField)
         self._precision, self._offset = fit.prior(fitted)
-        mine = fitted.family.index[self._replaced].ravel()
-        keep = np.ones(len(self._precision), bool)
-        keep[-1] = False  # the log ratio is the trial's
-        keep[mine[mine >= 0]] = False
-        self._keep: IntArray = np.flatnonzero(keep)
-        J = account.jacobian[:, self._keep]
-        normal = J.T @ J
-        normal[np.diag_indices(len(normal))] += self._precision[self._keep]
-        self._root = np.linalg.cholesky(normal)
-        self._aside = np.linalg.solve(self._root, J.T)  # (n, sum M): what of a residual they take
-        told = without_light_peaks(fitted, account.jacobian)[:, self._keep]
-        self._J = frame.likelihood.deflation[:, None] * told
         others = [k for k in range(len(account.contacts)) if k not in self._replaced]
         gaps = self._gaps(others)
         nearest = [others[at] for at in np.argsort(gaps)]
@@ -97,17 +87,20 @@ class Rest:
             self._background = fit.background(fitted, free, frame.measured)
             near += self._background is None
         self._near = account.contacts[nearest[:near]]
-        self._by_ratio = self._others_by_ratio()
-
-    def _others_by_ratio(self) -> FloatArray:
-        """Derivative (sum M,) of the residual by the log ratio, of the frozen contacts alone."""
-        by_ratio = self._account.jacobian[:, -1]
-        if self._background is None:  # every evaluation solves for all of them
-            return np.zeros_like(by_ratio)
-        own = self._family(self._account.contacts[self._replaced])
-        fitted = self._evaluated(own, own.join(own.fixed), self._account.fitted.log_ratio)
-        assert fitted is not None
-        return np.asarray(by_ratio - self._fit.jacobian(fitted, self._frame.measured)[:, -1])
+        frozen = nearest[near:]
+        self._frozen = account.contacts[frozen]
+        index = fitted.family.index[frozen].ravel()
+        self._keep: IntArray = np.sort(index[index >= 0])
+        if frozen:  # the log ratio answers, too
+            self._keep = np.append(self._keep, len(self._precision) - 1)
+        self._own = slice(-1 if frozen else None)  # of a trial's parameters and the log ratio
+        J = account.jacobian[:, self._keep]
+        normal = J.T @ J
+        normal[np.diag_indices(len(normal))] += self._precision[self._keep]
+        self._root = np.linalg.cholesky(normal)
+        self._aside = np.linalg.solve(self._root, J.T)  # (n, sum M): what of a residual they take
+        told = without_light_peaks(fitted, account.jacobian)[:, self._keep]
+        self._J = frame.likelihood.deflation[:, None] * told
 
     def trial(self, contacts: FloatArray) -> Trial | None:
         """Fit contacts (m, COLUMNS) in place of those that are replaced, from where they are.
@@ -125,7 +118,7 @@ class Rest:
         if best is None:
             return None
         damping = 1.0
-        for _ in range(STEPS if len(contacts) else 0):
+        for _ in range(STEPS if len(best.fitted.parameters) else 0):
             better, damping = self._step(family, best, damping)
             if better is None:
                 break
@@ -143,10 +136,7 @@ class Rest:
 
     def _family(self, contacts: FloatArray) -> PressureField:
         every = np.vstack([self._near, contacts])
-        field = self._field.of(every, fits_peaks=self._frame.fits_peaks)
-        free = field.free.copy()
-        free[: len(self._near)] = False
-        return replace(field, free=free)
+        return self._field.of(every, fits_peaks=self._frame.fits_peaks)
 
     def _gaps(self, others: Sequence[int]) -> FloatArray:
         """Distances of other contacts' outlines from those that are replaced, about."""
@@ -174,12 +164,11 @@ class Rest:
         if fitted is None:
             return None
         before = self._account.fitted
-        residual = fitted.residual + self._by_ratio * (log_ratio - before.log_ratio)
+        residual = fitted.residual
         taken = self._aside @ (residual - before.residual)
-        offset = self._fit.prior(fitted)[1]
-        away = float(self._fit.prior(fitted)[0] @ offset**2)
-        cost = float(residual @ residual - taken @ taken) + away
-        return _Assessed(fitted, residual, taken, offset, cost)
+        prior, offset = (each[self._own] for each in self._fit.prior(fitted))
+        cost = float(residual @ residual - taken @ taken + prior @ offset**2)
+        return _Assessed(fitted, taken, prior, offset, cost)
 
     def _step(
         self, family: PressureField, at: _Assessed, damping: float
@@ -187,18 +176,18 @@ class Rest:
         """Levenberg-Marquardt, the others answering: what is better, and the damping for next."""
         J = self._jacobian(at)
         own = self._aside @ J
-        prior = self._fit.prior(at.fitted)[0]
         normal = J.T @ J - own.T @ own
-        normal[np.diag_indices(len(normal))] += prior
-        gradient = J.T @ at.residual - own.T @ at.taken + prior * at.offset
+        normal[np.diag_indices(len(normal))] += at.prior
+        gradient = J.T @ at.fitted.residual - own.T @ at.taken + at.prior * at.offset
         if foreseen(normal, gradient) * self._account.unit < NEGLIGIBLE:
             return None, damping
         while damping < MAX_DAMPING:
             step = bounded_step(normal, gradient, damping)
+            count = len(at.fitted.parameters)
             trial = self._assessed(
                 family,
-                family.bounded(at.fitted.parameters + step[:-1]),
-                self._fit.bounded_ratio(at.fitted.log_ratio + step[-1]),
+                family.bounded(at.fitted.parameters + step[:count]),
+                self._fit.bounded_ratio(at.fitted.log_ratio + step[count:].sum()),
             )
             if trial is not None and trial.cost < at.cost:
                 return trial, max(damping / 5, 1e-3)
@@ -206,16 +195,14 @@ class Rest:
         return None, damping
 
     def _jacobian(self, at: _Assessed) -> FloatArray:
-        J = self._fit.jacobian(at.fitted, self._frame.measured)
-        J[:, -1] += self._by_ratio
-        return J
+        return self._fit.jacobian(at.fitted, self._frame.measured)[:, self._own]
 
     def _judged(self, family: PressureField, at: _Assessed) -> Trial:
         account, likelihood = self._account, self._frame.likelihood
-        chi_squared = likelihood.chi_squared(at.residual - self._aside.T @ at.taken)
+        chi_squared = likelihood.chi_squared(at.fitted.residual - self._aside.T @ at.taken)
         scale = likelihood.precision(chi_squared)
         response = -np.linalg.solve(self._root.T, at.taken)
-        kept, prior = self._precision[self._keep], self._fit.prior(at.fitted)[0]
+        kept, prior = self._precision[self._keep], at.prior
         away = kept @ (self._offset[self._keep] + response) ** 2 + prior @ at.offset**2
         hessian = scale * (self._J.T @ self._J) + np.diag(kept)
         told = without_light_peaks(at.fitted, self._jacobian(at))
@@ -225,15 +212,13 @@ class Rest:
         log_evidence = likelihood.log(chi_squared) - away / 2
         log_evidence += log_occam(kept, hessian) + log_occam(prior, schur)
         contacts, sigmas = family.split(at.fitted.parameters), np.zeros(family.free.shape)
-        kept_contacts = np.delete(account.contacts, self._replaced, axis=0)
-        sigmas[family.free] = np.sqrt(np.diag(np.linalg.inv(schur)))[:-1]
+        sigmas[family.free] = np.sqrt(np.diag(np.linalg.inv(schur)))[: len(at.fitted.parameters)]
         near = len(self._near)
-        log_evidence += log_prior(kept_contacts) + log_prior(contacts[near:])
+        log_evidence += log_prior(self._frozen) + log_prior(contacts)
         return Trial(
             log_odds=log_evidence - account.log_evidence,
             contacts=contacts[near:],
             sigmas=sigmas[near:],
-            log_ratio=at.fitted.log_ratio,
         )
 
 
@@ -242,7 +227,7 @@ class _Assessed:
     """A trial on its way."""
 
     fitted: FittedField
-    residual: FloatArray  # (sum M,) with the others frozen
-    taken: FloatArray  # (n,) what they take of it
-    offset: FloatArray  # (N + 1,) of its parameters and the log ratio from what is likely
+    taken: FloatArray  # (n,) what the others take of its residual
+    prior: FloatArray  # (N,) inverse variances of its parameters, and of the log ratio where it steps
+    offset: FloatArray  # (N,) of the same from what is likely
     cost: float

@@ -102,9 +102,10 @@ def test_a_still_frame_is_held(skin: Skin, solves: list[int]) -> None:
     """Noise of one sigma keeps the belief, and costs no solve."""
     search = Search(skin.sensor.fit)
     belief = search.advance(None, skin.frame(LEFT, RIGHT))
+    frames = [skin.frame(LEFT, RIGHT) for _ in range(20)]
     solves.clear()
-    for _ in range(20):
-        again = search.advance(belief, skin.frame(LEFT, RIGHT))
+    for frame in frames:
+        again = search.advance(belief, frame)
         assert again.how == "still"
         np.testing.assert_array_equal(again.account.contacts, belief.account.contacts)
         belief = again
@@ -126,8 +127,9 @@ def test_a_contact_that_slides_is_followed(skin: Skin, solves: list[int]) -> Non
     for k in range(16):
         x_m += 0.002
         pressed = contact(x_m, 0.002, 0.007)
+        frame = skin.frame(pressed)
         solves.clear()
-        belief = search.advance(belief, skin.frame(pressed))
+        belief = search.advance(belief, frame)
         spent.append(len(solves) / len(skin.sensor.fit.responses))
         assert_at(belief, pressed)
     # Two solves are those that start: where the contact was, and where it would be.

@@ -1,0 +1,102 @@
+"""Kinds of contacts: what a fit of another kind starts from presses in the same place."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pressed import contact, contacts
+from tactomo_models.arrays import FloatArray
+from tactomo_models.methods.kinds import Kind, as_kind, as_one, kind_of
+from tactomo_models.scene.parameters import COLUMNS, E1, E2, PEAK, SIZE, UNIT_M, X, Y
+
+ONE = [Kind.EVEN, Kind.ROUNDED, Kind.RING, Kind.FALLING]
+places = st.floats(-0.05, 0.05)
+radii = st.floats(0.004, 0.03)
+elongations = st.floats(0.0, 0.8)
+angles = st.floats(-np.pi, np.pi)
+
+
+def drawn(x: float, y: float, radius: float, elongation: float, angle: float) -> FloatArray:
+    e = elongation * np.cos(angle), elongation * np.sin(angle)
+    return contact(x, y, radius, peak=0.7, e=e)
+
+
+def moments_of(each: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+    """Area, centre and second moments of what even ellipses (K, COLUMNS) press together."""
+    area = np.pi * np.exp(2 * each[:, SIZE])
+    place, share = each[:, [X, Y]] * UNIT_M, area / area.sum()
+    centre = share @ place
+    second = np.zeros((2, 2))
+    for one, weight, away in zip(each, share, place - centre, strict=True):
+        # (B^T B)^-1 of `pressure_field`, over 4: half axes exp(s +- e)
+        e = np.array([[one[E1], one[E2]], [one[E2], -one[E1]]])
+        size, axes = np.linalg.eigh(e)
+        half = np.exp(2 * (one[SIZE] + size))
+        second += weight * ((axes * half) @ axes.T / 4 + np.outer(away, away))
+    return float(area.sum()), centre, second
+
+
+@given(places, places, radii, elongations, angles, st.sampled_from(ONE))
+def test_another_kind_starts_in_the_same_place(
+    x: float, y: float, radius: float, elongation: float, angle: float, kind: Kind
+) -> None:
+    """With the same area and form; and is of that kind."""
+    own = drawn(x, y, radius, elongation, angle)
+    (other,) = as_kind(own, kind)
+    assert kind_of(other) is kind
+    np.testing.assert_array_equal(other[: E2 + 1], own[: E2 + 1])
+
+
+@given(places, places, radii, elongations, angles, st.sampled_from(ONE))
+def test_what_is_even_again_is_what_it_was(
+    x: float, y: float, radius: float, elongation: float, angle: float, kind: Kind
+) -> None:
+    own = drawn(x, y, radius, elongation, angle)
+    (other,) = as_kind(own, kind)
+    (again,) = as_kind(other, Kind.EVEN)
+    assert again == pytest.approx(own)
+
+
+@given(places, places, radii, elongations, angles)
+def test_halves_keep_area_and_centre(
+    x: float, y: float, radius: float, elongation: float, angle: float
+) -> None:
+    """And lie along the longer axis, where they do not overlap."""
+    own = drawn(x, y, radius, elongation, angle)
+    halves = as_kind(own, Kind.TWO)
+    (area, centre, _), (own_area, own_centre, _) = moments_of(halves), moments_of(own[None])
+    assert area == pytest.approx(own_area)
+    assert centre == pytest.approx(own_centre, abs=1e-9)
+    assert (halves[:, PEAK] == own[PEAK]).all()
+    away = (halves[0] - halves[1])[[X, Y]] * UNIT_M
+    assert np.linalg.norm(away) >= 2 * np.exp(halves[0, SIZE]) * (1 - 1e-9)
+    if elongation > 1e-6:
+        along = np.array([np.cos(angle / 2), np.sin(angle / 2)])
+        assert abs(along @ away) == pytest.approx(np.linalg.norm(away))
+
+
+def test_nothing_is_no_contact() -> None:
+    assert as_kind(contact(), Kind.NONE).shape == (0, COLUMNS)
+
+
+@given(st.lists(st.tuples(places, places, radii, elongations, angles), min_size=1, max_size=5))
+def test_several_as_one_keep_centre_and_moments(
+    each: list[tuple[float, float, float, float, float]],
+) -> None:
+    several = contacts(*(drawn(*one) for one in each))
+    one = as_one(several)
+    assert kind_of(one) is Kind.EVEN
+    (_, centre, second), (_, own_centre, own) = moments_of(several), moments_of(one[None])
+    assert own_centre == pytest.approx(centre, abs=1e-9)
+    np.testing.assert_allclose(own, second, rtol=1e-6, atol=1e-12)
+    assert one[PEAK] == pytest.approx(0.7)
+
+
+@given(places, places, radii, elongations, angles)
+def test_one_as_one_is_itself(
+    x: float, y: float, radius: float, elongation: float, angle: float
+) -> None:
+    own = drawn(x, y, radius, elongation, angle)
+    assert as_one(own[None]) == pytest.approx(own, abs=1e-6)
