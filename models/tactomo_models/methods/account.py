@@ -116,7 +116,9 @@ def without_light_peaks(fitted: FittedField, jacobian: FloatArray) -> FloatArray
     return jacobian
 
 
-def descended(fit: FieldFit, account: Account, frame: Frame, steps: int) -> Account:
+def descended(
+    fit: FieldFit, account: Account, frame: Frame, steps: int, *, holds_ratio: bool = False
+) -> Account:
     """An account nearer to its minimum, by Levenberg-Marquardt on all sheets at once.
 
     It is there when no more than `NEGLIGIBLE` is left to gain, as its own Jacobian foresees that.
@@ -125,6 +127,9 @@ def descended(fit: FieldFit, account: Account, frame: Frame, steps: int) -> Acco
     for _ in range(steps):
         fitted = account.fitted
         normal, gradient = fit.normal_equations(fitted, account.jacobian)
+        if holds_ratio:
+            normal[-1], normal[:, -1], gradient[-1] = 0.0, 0.0, 0.0
+            normal[-1, -1] = 1.0
         if foreseen(normal, gradient) * account.unit < NEGLIGIBLE:
             return replace(account, at_minimum=True)
         better = _stepped(fit, fitted, normal, gradient, frame)

@@ -423,10 +423,13 @@ class Search:
                 np.log(found.radius_m),
                 self._start_peak(frame),
             )
+            # With a free ratio the first of several contacts would grow over them all.
+            holds = account.chi_squared > SURPRISE * frame.likelihood.count
             start = self._account(np.vstack([each, born]), account.fitted.log_ratio, frame)
             if start is None:
                 continue
-            grown = self._descended(start, frame, 2 * STEPS)
+            grown = self._descended(start, frame, 2 * STEPS, holds_ratio=holds)
+            grown = replace(grown, at_minimum=grown.at_minimum and not holds)
             if grown.log_evidence > account.log_evidence:
                 return grown
         return account
@@ -461,8 +464,10 @@ class Search:
         frame.budget.spend(fitted)
         return account_of(self.fit, fitted, frame)
 
-    def _descended(self, account: Account, frame: Frame, steps: int) -> Account:
-        return descended(self.fit, account, frame, steps)
+    def _descended(
+        self, account: Account, frame: Frame, steps: int, *, holds_ratio: bool = False
+    ) -> Account:
+        return descended(self.fit, account, frame, steps, holds_ratio=holds_ratio)
 
 
 def _touching(contacts: FloatArray, near_m: float) -> Iterator[list[int]]:
