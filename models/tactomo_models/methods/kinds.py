@@ -46,7 +46,7 @@ class Kind(StrEnum):
 
 # How likely each kind is before any data: tools and pads press evenly, fingers and balls fall off,
 # few things have corners that a skin can tell, fewer a hole. @SENS@
-SHARES = {Kind.EVEN: 0.4, Kind.FALLING: 0.3, Kind.ROUNDED: 0.2, Kind.RING: 0.1}
+SHARES = {Kind.EVEN: 0.35, Kind.FALLING: 0.3, Kind.ROUNDED: 0.2, Kind.RING: 0.15}
 
 
 def log_prior(contacts: FloatArray) -> float:

@@ -118,9 +118,14 @@ class Search:
     def advance(self, belief: Belief | None, frame: Frame) -> Belief:
         """What is believed after one frame more."""
         if belief is None or belief.account.fitted.solutions.keys() != frame.measured.keys():
-            belief = self._cold(frame)
-        else:
-            belief = self._followed(belief, frame)
+            return self._tried(self._cold(frame), frame)
+        still, since = self._is_still(belief, frame)
+        if still:
+            return self._held(replace(belief, since=since, how="still"), frame)
+        return self._tried(self._followed(belief, frame), frame)
+
+    def _tried(self, belief: Belief, frame: Frame) -> Belief:
+        """What is left to try, one thing after the other, as long as the budget lasts."""
         while not belief.done and not frame.budget.over:
             belief = self._advanced(belief, frame)
         explained = frame.likelihood.explains(belief.account.chi_squared)
@@ -128,19 +133,33 @@ class Search:
 
     # From frame to frame
 
+    @staticmethod
+    def _is_still(belief: Belief, frame: Frame) -> tuple[bool, Since | None]:
+        """Whether a frame is of the scene that was fitted last, and what has come since then."""
+        if not are_still(belief.settled_on, frame.measured):
+            return False, None
+        if belief.since is None:
+            return True, None
+        since, moves = belief.since.taken(frame.measured)
+        return not moves, since
+
+    def _held(self, belief: Belief, frame: Frame) -> Belief:
+        """The belief held against a frame of the same scene, which tells nothing new.
+
+        What is left to try is tried on the frame that was fitted.
+        """
+        if not belief.done:
+            fitted = self.fit.compare(belief.account.fitted, belief.settled_on)
+            account = replace(belief.account, fitted=fitted)
+            settled = replace(frame, measured=belief.settled_on)
+            belief = self._tried(replace(belief, account=account), settled)
+        shown = self.fit.compare(belief.account.fitted, frame.measured)
+        return replace(belief, account=replace(belief.account, fitted=shown))
+
     def _followed(self, belief: Belief, frame: Frame) -> Belief:
-        """The same contacts, held against a new frame."""
+        """The same contacts, fitted to a frame in which something has changed."""
         old = belief.account
         compared = self.fit.compare(old.fitted, frame.measured)
-        since, still = belief.since, are_still(belief.settled_on, frame.measured)
-        if still and since is not None:
-            since, moves = since.taken(frame.measured)
-            still = not moves
-        if still:
-            likelihood = frame.likelihood
-            chi_squared = likelihood.chi_squared(compared.residual)
-            account = replace(old, fitted=compared, chi_squared=chi_squared)
-            return replace(belief, account=account, since=since, how="still")
         account = account_of(self.fit, compared, frame)
         ahead = self._moved_on(belief, frame)
         if ahead is not None and ahead.fitted.cost < compared.cost:
