@@ -75,9 +75,8 @@ class PaperLevelSet:
         likeness = image.astype(np.float64) / max(float(image.max()), 1e-12)
         start = self.family.parameters_of(0.5 + 0.5 * (likeness - CUT) / (1 - CUT))
         mu, converged = self._minimise(start, measured.change * self._volts, measured.weight > 0)
-        shape = self._judge.evaluate(
-            self.family, mu, self._judge.likely, {Channel.STRUCTURE: measured}, len(image)
-        )
+        data = {Channel.STRUCTURE: measured}
+        shape = self._judge.evaluate(self.family, mu, self._judge.likely, data)
         assert shape is not None
         return replace(shape, converged=converged)
 

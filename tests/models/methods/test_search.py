@@ -319,12 +319,8 @@ def test_what_a_small_contact_at_little_signal_is_stays_open(stacked: Skin) -> N
     likely = [one for one in alternatives if one.odds > 0.05]
     assert likely
     accountant = FieldAccountant(stacked.sensor.fit, AreaFinder(stacked.sensor.fit.forward))
-    told = accountant.account(
-        belief.account.fitted,
-        frame.measured,
-        belief.alternatives,
-        np.linalg.inv(belief.account.hessian)[:-1, :-1],
-    ).contacts
+    fitted = belief.account.fitted
+    told = accountant.account(fitted, frame.measured, belief.alternatives).contacts
     assert told is not None
     own = belief.account.contacts[0]
     apart = [abs(told.peak_magnitude[0] - magnitude_of(search, one)) for one in
