@@ -302,13 +302,13 @@ class Search:
     def _advanced(self, belief: Belief, frame: Frame) -> Belief:
         """One thing more: a fit, a contact's kinds, what they lead to, or what is missing."""
         account = belief.account
-        if not account.at_minimum:
-            return replace(belief, account=self._descended(account, frame, STEPS))
-        missed = not belief.lacks_none and account.chi_squared > SURPRISE * frame.likelihood.count
-        if missed:
+        # Fitted to its end by itself, the first of several contacts would grow over them all.
+        if not belief.lacks_none and account.chi_squared > SURPRISE * frame.likelihood.count:
             born = self._with_missing(account, frame, far=True)
             if born is not account:
                 return self._grown(belief, born)
+        if not account.at_minimum:
+            return replace(belief, account=self._descended(account, frame, STEPS))
         if belief.rounds < ROUNDS:
             for k, mine in enumerate(belief.rivals):
                 kinds = [kind for kind in self._kinds(account, k, frame) if _is_asked(kind, mine)]
@@ -456,7 +456,7 @@ class Search:
             start = self._account(np.vstack([each, born]), account.fitted.log_ratio, frame)
             if start is None:
                 continue
-            steps = self._steps(account, frame)
+            steps = STEPS if holds else self._steps(account, frame)
             grown = self._descended(start, frame, steps, holds_ratio=holds)
             grown = replace(grown, at_minimum=grown.at_minimum and not holds)
             if grown.log_evidence > account.log_evidence:
