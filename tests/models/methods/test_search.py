@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
 
 import numpy as np
@@ -11,7 +10,7 @@ from pressed import PLENTY_S, Sensor, contact, contacts, data_of, described
 from tactomo_models import Channel, SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_models.methods.account import Frame
-from tactomo_models.methods.kinds import Kind, as_kind, kind_of
+from tactomo_models.methods.kinds import Kind, kind_of
 from tactomo_models.methods.search import Belief, Search
 from tactomo_models.physics.bare_sheet import solve_bare_sheet
 from tactomo_models.physics.forward import ForwardModel
