@@ -141,7 +141,10 @@ class Rest:
     def _gaps(self, others: Sequence[int]) -> FloatArray:
         """Distances of other contacts' outlines from those that are replaced, about."""
         each = self._account.contacts
-        place, reach = each[:, [X, Y]] * UNIT_M, np.exp(each[:, SIZE] + np.hypot(*each[:, [E1, E2]].T))
+        place, reach = (
+            each[:, [X, Y]] * UNIT_M,
+            np.exp(each[:, SIZE] + np.hypot(*each[:, [E1, E2]].T)),
+        )
         own = self._replaced
         apart = np.linalg.norm(place[others][:, None] - place[own], axis=2)
         gaps = apart - reach[others][:, None] - reach[own]
@@ -228,6 +231,8 @@ class _Assessed:
 
     fitted: FittedField
     taken: FloatArray  # (n,) what the others take of its residual
-    prior: FloatArray  # (N,) inverse variances of its parameters, and of the log ratio where it steps
+    prior: (
+        FloatArray  # (N,) inverse variances of its parameters, and of the log ratio where it steps
+    )
     offset: FloatArray  # (N,) of the same from what is likely
     cost: float

@@ -29,7 +29,6 @@ from tactomo_models.scene.parameters import (
     PRIOR_SIGMA,
     SIZE,
 )
-from tactomo_models.scene.pressure_field import PressureField
 
 RADIUS_M = 0.012
 AREA_M2 = np.pi * RADIUS_M**2
