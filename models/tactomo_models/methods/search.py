@@ -23,7 +23,7 @@ from tactomo_models.arrays import FloatArray
 from tactomo_models.methods.account import Account, Frame, account_of, descended
 from tactomo_models.methods.contact_search import ContactSearch
 from tactomo_models.methods.kinds import Kind, as_kind, as_one, kind_of
-from tactomo_models.methods.trial import Rest, Trial
+from tactomo_models.methods.trial import FAR_STEPS, Rest, Trial
 from tactomo_models.scans.stillness import Since, are_still
 from tactomo_models.scene.field_account import Alternative
 from tactomo_models.scene.field_fit import COLD_S, FieldFit, Measured
@@ -36,6 +36,10 @@ MAX_CONTACTS = 12
 # odds by less. One above `OPEN` is asked again once they have become something else.
 HOPELESS, OPEN = -6.0, -3.0
 LIKELIER = 1.0  # from which a rival takes a contact's place; below, the mean of both is shown anyway
+# Of a contact that data explain: half the logarithm of its axes' ratio, from which it may be two (two
+# circles 8 mm apart have 0.2), and the uncertainty of a logarithm of its size, from which it may be
+# none. With every contact asked for both, odds are the same and cold frames take a third longer.
+LONG, KNOWN_SIZE = 0.1, 0.25
 FEW_STEPS = 4  # of starts that are compared: a start's cost says little before
 STEPS = 4  # of a fit in one go, before what is left is looked at
 # Chi-squared over the count of data, from which a contact is missing rather than of another kind.
@@ -307,7 +311,7 @@ class Search:
                 return self._grown(belief, born)
         if belief.rounds < ROUNDS:
             for k, mine in enumerate(belief.rivals):
-                kinds = [kind for kind in self._kinds(account, k) if _is_asked(kind, mine)]
+                kinds = [kind for kind in self._kinds(account, k, frame) if _is_asked(kind, mine)]
                 if kinds:
                     return self._asked(belief, k, kinds, frame)
             better = self._decided(belief, frame)
@@ -328,12 +332,17 @@ class Search:
             done=True,
         )
 
-    def _kinds(self, account: Account, k: int) -> list[Kind]:
-        """What else a contact may be."""
-        own = kind_of(account.contacts[k])
-        pressures = [Kind.FALLING, Kind.RING] if account.family.free[k, PEAK] else []
-        kinds = [Kind.EVEN, *pressures, Kind.ROUNDED, Kind.NONE]
-        if account.family.count < MAX_CONTACTS:
+    def _kinds(self, account: Account, k: int, frame: Frame) -> list[Kind]:
+        """What else a contact may be, as far as that is worth a trial."""
+        contact, own = account.contacts[k], kind_of(account.contacts[k])
+        kinds = [Kind.EVEN, Kind.ROUNDED]
+        if account.family.free[k, PEAK]:
+            kinds += [Kind.FALLING, Kind.RING]
+        unexplained = not frame.likelihood.explains(account.chi_squared)
+        if account.sigmas[k, SIZE] > KNOWN_SIZE or unexplained:
+            kinds.append(Kind.NONE)
+        is_long = float(np.hypot(*contact[[E1, E2]])) > LONG or own is Kind.ROUNDED
+        if (is_long or unexplained) and account.family.count < MAX_CONTACTS:
             kinds.append(Kind.TWO)
         return [kind for kind in kinds if kind is not own]
 
@@ -397,7 +406,7 @@ class Search:
         start = self._account(np.vstack(rows), account.fitted.log_ratio, frame)
         if start is None:
             return None
-        changed = self._descended(start, frame, STEPS)
+        changed = self._descended(start, frame, self._steps(account, frame))
         gain = changed.log_evidence - account.log_evidence
         again = tuple(_opened(mine, gain) for mine in rivals)
         return replace(
@@ -421,7 +430,7 @@ class Search:
                 start = self._account(each, account.fitted.log_ratio, frame)
                 if start is None:
                     continue
-                joined = self._descended(start, frame, 2 * STEPS)
+                joined = self._descended(start, frame, self._steps(account, frame))
                 if joined.log_evidence > account.log_evidence:
                     return self._begun(joined, frame, belief.how)
         return replace(belief, is_parted=True)
@@ -447,7 +456,8 @@ class Search:
             start = self._account(np.vstack([each, born]), account.fitted.log_ratio, frame)
             if start is None:
                 continue
-            grown = self._descended(start, frame, 2 * STEPS, holds_ratio=holds)
+            steps = self._steps(account, frame)
+            grown = self._descended(start, frame, steps, holds_ratio=holds)
             grown = replace(grown, at_minimum=grown.at_minimum and not holds)
             if grown.log_evidence > account.log_evidence:
                 return grown
@@ -472,6 +482,11 @@ class Search:
         if frame.fits_peaks and frame.measured[Channel.MAGNITUDE].quiet:
             return max(self.field.onset / 2, self.field.peak_limits[0])
         return self.field.typical_peak
+
+    @staticmethod
+    def _steps(account: Account, frame: Frame) -> int:
+        """Steps of a fit of something else: where the data are unexplained, it may have far to go."""
+        return 2 * STEPS if frame.likelihood.explains(account.chi_squared) else FAR_STEPS
 
     def _account(self, each: FloatArray, log_ratio: float, frame: Frame) -> Account | None:
         family = self.field.of(each, fits_peaks=frame.fits_peaks)

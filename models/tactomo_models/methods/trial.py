@@ -38,7 +38,8 @@ from tactomo_models.scene.pressure_field import PressureField
 # a triangle lies around it, and the trial may move by a node. Neighbours at 10 mm that answer to
 # first order alone make a trial of the very same contact err by up to 13 nats.
 NEAR_NODES = 5
-STEPS = 6  # of a trial, which takes three; 12 change no row
+# Of a trial, which takes three where the data are explained; elsewhere it may have far to go.
+STEPS, FAR_STEPS = 6, 20
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,9 @@ class Rest:
         if best is None:
             return None
         damping = 1.0
-        for _ in range(STEPS if len(best.fitted.parameters) else 0):
+        explained = self._frame.likelihood.explains(self._account.chi_squared)
+        steps = STEPS if explained else FAR_STEPS
+        for _ in range(steps if len(best.fitted.parameters) else 0):
             better, damping = self._step(family, best, damping)
             if better is None:
                 break

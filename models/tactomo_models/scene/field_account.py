@@ -101,7 +101,7 @@ class FieldAccountant:
         return shown
 
     def _sensed(self, fitted: FittedField, measured: Measured) -> FloatArray:
-        """Derivative (sum M, N) of the weighted residual by the parameters.
+        """Derivative (sum M, N + 1) of the weighted residual by the parameters and the log ratio.
 
         Below its onset a graded sheet answers to nothing. What it would answer to is what bounds a
         light contact's pressure, so that there it is differentiated at its onset.
@@ -116,7 +116,7 @@ class FieldAccountant:
                 sensed = self._fit.jacobian(fitted, graded, family.draw(family.join(each)))
                 start = [*measured].index(Channel.MAGNITUDE) * len(J) // len(measured)
                 J[start : start + len(sensed)] = sensed
-        return J[:, :-1]
+        return J
 
     def _covariance(
         self, fitted: FittedField, measured: Measured, J: FloatArray
@@ -124,8 +124,8 @@ class FieldAccountant:
         """Covariance (N, N) of a field's parameters."""
         likelihood = Likelihood.of(measured)
         information = likelihood.information(J, likelihood.chi_squared(fitted.residual))
-        precision = self._fit.prior(fitted)[0][:-1]
-        return np.asarray(np.linalg.inv(information + np.diag(precision)), np.float64)
+        precision = self._fit.prior(fitted)[0]
+        return np.asarray(np.linalg.inv(information + np.diag(precision)), np.float64)[:-1, :-1]
 
     def _drawn(self, fitted: FittedField, measured: Measured) -> FieldAccount:
         near, (solid, share, pressure) = self._images(fitted)
