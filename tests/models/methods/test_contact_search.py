@@ -49,9 +49,7 @@ def test_the_search_finds_the_contact_that_is_missing(sensor: Sensor, ratio: flo
     assert first.gain > 10
 
 
-def test_far_from_all_contacts_is_nothing_that_is_next_to_one(
-    sensor: Sensor, ratio: float
-) -> None:
+def test_far_from_all_contacts_is_nothing_that_is_next_to_one(sensor: Sensor, ratio: float) -> None:
     """What is missing there may be a part of its form."""
     account, frame = fitted_without(sensor, BESIDE)
     search = ContactSearch(sensor.fit, {Channel.STRUCTURE: ratio})

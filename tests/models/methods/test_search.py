@@ -123,7 +123,7 @@ def test_what_is_held_is_judged_by_the_new_frame(skin: Skin) -> None:
 def test_a_contact_that_slides_is_followed(skin: Skin, solves: list[int]) -> None:
     """With one to three solves of each sheet a frame, once its pace is known."""
     search, belief, x_m, spent = Search(skin.sensor.fit), None, -0.016, []
-    for k in range(16):
+    for _ in range(16):
         x_m += 0.002
         pressed = contact(x_m, 0.002, 0.007)
         frame = skin.frame(pressed)
@@ -263,9 +263,7 @@ def test_pressures_follow_what_moves_also_when_time_is_short(skin: Skin) -> None
 def test_what_is_proposed_is_judged_by_the_data(
     skin: Skin, proposed: tuple[FloatArray, ...]
 ) -> None:
-    frame = Frame(
-        skin.measured(LEFT, RIGHT), Budget(PLENTY_S), lambda: contacts(*proposed)
-    )
+    frame = Frame(skin.measured(LEFT, RIGHT), Budget(PLENTY_S), lambda: contacts(*proposed))
     belief = Search(skin.sensor.fit).advance(None, frame)
     assert_at(belief, LEFT, RIGHT)
     assert len(proposed) != 2 or belief.how == "proposed"
@@ -322,8 +320,10 @@ def test_what_a_small_contact_at_little_signal_is_stays_open(stacked: Skin) -> N
     told = accountant.account(fitted, frame.measured, belief.alternatives).contacts
     assert told is not None
     own = belief.account.contacts[0]
-    apart = [abs(told.peak_magnitude[0] - magnitude_of(search, one)) for one in
-             (own, *(each.contact for each in likely))]
+    apart = [
+        abs(told.peak_magnitude[0] - magnitude_of(search, one))
+        for one in (own, *(each.contact for each in likely))
+    ]
     odds = np.array([1.0, *(one.odds for one in likely)])
     assert told.peak_magnitude_sigma[0] >= np.sqrt(odds / odds.sum() @ np.square(apart)) * 0.99
 
@@ -350,9 +350,7 @@ def test_edges_and_holes_are_what_the_data_say(skin: Skin, edge: float, hole: fl
 
 
 @pytest.mark.parametrize("budget_s", [0.005, 0.02, PLENTY_S])
-def test_an_even_press_that_lands_is_not_soft_for_want_of_time(
-    skin: Skin, budget_s: float
-) -> None:
+def test_an_even_press_that_lands_is_not_soft_for_want_of_time(skin: Skin, budget_s: float) -> None:
     """A fit that was cut short says nothing about edges."""
     pressed = contact(-0.004, 0.002, 0.012, peak=0.85)
     search, belief = Search(skin.sensor.fit), None

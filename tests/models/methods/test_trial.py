@@ -89,9 +89,7 @@ def test_nothing_in_place_of_a_contact_is_hardly_likely(sensor: Sensor, gap_m: f
     assert len(trial.contacts) == 0
 
 
-def test_a_trial_costs_the_solves_of_its_own_contact(
-    sensor: Sensor, solves: list[int]
-) -> None:
+def test_a_trial_costs_the_solves_of_its_own_contact(sensor: Sensor, solves: list[int]) -> None:
     """Far from the others; and what it spends is taken off the frame's budget."""
     account, frame = even_fit(sensor, 0.040, "soft")
     rest = Rest(sensor.fit, sensor.field, account, [0], frame)
