@@ -154,7 +154,9 @@ def _stepped(
         ratio = fit.bounded_ratio(fitted.log_ratio + float(step[-1]))
         return np.append(parameters - fitted.parameters, ratio - fitted.log_ratio)
 
-    for step, damping in damped_steps(normal, gradient, fitted.damping, limited, account.unit):
+    scale = fit.prior(fitted)[0]
+    steps = damped_steps(normal, gradient, scale, fitted.damping, limited, account.unit)
+    for step, damping in steps:
         parameters, ratio = fitted.parameters + step[:-1], fitted.log_ratio + float(step[-1])
         trial = fit.evaluate(fitted.family, parameters, ratio, frame.measured)
         if trial is not None:
@@ -167,13 +169,14 @@ def _stepped(
 def damped_steps(
     normal: FloatArray,  # (N, N) half of the cost's curvature
     gradient: FloatArray,  # (N,) half of its slope
-    damping: float,  # to begin with
+    scale: FloatArray,  # (N,) inverse variances of what is likely: what a step is measured by
+    damping: float,  # to begin with, in these
     limited: Callable[[FloatArray], FloatArray],  # cuts a step where a parameter has its limit
     unit: float,  # what one unit of cost is of chi-squared
 ) -> Iterator[tuple[FloatArray, float]]:
     """Steps (N,) of Levenberg and Marquardt, shorter and shorter, as long as one would gain."""
     while damping < MAX_DAMPING:
-        step = limited(bounded_step(normal, gradient, damping))
+        step = limited(bounded_step(normal, gradient, damping * scale))
         if -(2 * gradient + normal @ step) @ step * unit < NEGLIGIBLE:
             return
         yield step, damping

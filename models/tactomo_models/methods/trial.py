@@ -196,7 +196,7 @@ class Rest:
             off = np.append(parameters - fitted.parameters, ratio - fitted.log_ratio)
             return off[: len(step)]
 
-        steps = damped_steps(normal, gradient, damping, limited, self._account.unit)
+        steps = damped_steps(normal, gradient, at.prior, damping, limited, self._account.unit)
         for step, damped in steps:
             trial = self._assessed(
                 family,
