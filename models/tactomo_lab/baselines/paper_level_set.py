@@ -29,7 +29,7 @@ import numpy as np
 from tactomo_models.arrays import BoolArray, FloatArray, Image
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scans.changes import Changes
-from tactomo_models.scene.field_fit import STEP_LIMIT, MAX_DAMPING, FieldFit, FittedField
+from tactomo_models.scene.field_fit import MAX_DAMPING, STEP_LIMIT, FieldFit, FittedField
 from tactomo_models.scene.level_set import LevelSet
 from tactomo_protocol import Channel
 
