@@ -102,6 +102,7 @@ def _budget_law(sensor: SensorDescription, count: int) -> dict[str, float]:
     from scipy.optimize import nnls
     from tactomo_models import Reconstructor
     from tactomo_models.methods.auto import Auto
+    from tactomo_models.methods.fit import Course
     from tactomo_models.scans.measurement import Measurement
     from tactomo_models.scene.field_fit import Budget, FittedField
 
@@ -114,10 +115,10 @@ def _budget_law(sensor: SensorDescription, count: int) -> dict[str, float]:
             super().spend(fitted)
 
     class CountedAuto(Auto):
-        def _fitted(
-            self, measurement: Measurement, budget: Budget
-        ) -> tuple[FittedField, str, Measurement]:
-            return super()._fitted(measurement, Counted(budget.left_s))
+        def _followed(
+            self, course: Course, measurement: Measurement, budget: Budget
+        ) -> tuple[Course, Measurement]:
+            return super()._followed(course, measurement, Counted(budget.left_s))
 
     terms, seconds = [], []
     lines = (scenes_of_row(sensor, row, "tuning", count) for row in STILL_ROWS)

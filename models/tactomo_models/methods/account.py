@@ -93,7 +93,7 @@ def account_of(fit: FieldFit, fitted: FittedField, frame: Frame) -> Account:
     log_evidence += log_occam(precision, hessian)
     assert isinstance(fitted.family, PressureField)
     log_evidence += log_prior(fitted.family.split(fitted.parameters))
-    valid = np.count_nonzero(likelihood.deflation)
+    valid = int(np.count_nonzero(likelihood.deflation))
     unit = likelihood.precision(chi_squared) * likelihood.count / max(valid, 1)
     return Account(fitted, jacobian, hessian, chi_squared, log_evidence, unit)
 
@@ -101,8 +101,8 @@ def account_of(fit: FieldFit, fitted: FittedField, frame: Frame) -> Account:
 def without_light_peaks(fitted: FittedField, jacobian: FloatArray) -> FloatArray:
     """The derivative (sum M, N + 1) where light contacts' pressures leave no trace.
 
-    Below its onset a graded sheet answers to nothing: any pressure down there is as likely as it was
-    before. Laplace's method does not see that from a peak at the onset.
+    Below its onset a graded sheet answers to nothing: any pressure down there is as likely as it
+    was before. Laplace's method does not see that from a peak at the onset.
     """
     family = fitted.family
     assert isinstance(family, PressureField)

@@ -107,7 +107,7 @@ class ContactSearch:
         return np.asarray((np.hypot(dx, dy) - np.exp(contacts[:, SIZE, None])).min(axis=0))
 
     def _gains(self, account: Account, frame: Frame) -> tuple[FloatArray, FloatArray]:
-        """By how much a disc at each spot (C,) would lower the cost, and its area, to first order."""
+        """What a disc at each spot (C,) would take off the cost, and its area, to first order."""
         fitted, measured = account.fitted, frame.measured
         J = account.jacobian
         normal, gradient = self._fit.normal_equations(fitted, J)

@@ -25,12 +25,13 @@ from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scene.field_account import FieldAccount, FieldAccountant
 from tactomo_models.scene.field_fit import Budget, FieldFit, FittedField
+from tactomo_models.scene.pressure_field import PressureField
 
 PATIENCE_S = 1.0  # of work on data that no field explains, before a drift is tried
 EXPLAINED = 1.4  # misfit of the worst sheet, below which a drift beside a field is believed
 MAX_DRIFT = 0.2  # of a sheet's voltages, 10 K at 2 % per kelvin: more is a fault
-# Standard deviations of the log ratio's prior: of contrasts from a tenth of saturation to all of it,
-# which ordinary skins have, none comes to two.
+# Standard deviations of the log ratio's prior: of contrasts from a tenth of saturation to all of
+# it, which ordinary skins have, none comes to two.
 FAR_RATIO = 3.0
 MAX_HELD = 10  # frames without a structure scan that the last field stands in for: 0.5 s
 
@@ -76,10 +77,9 @@ class Fit:
         carried = previous.carried if previous is not None else None
         course = carried if isinstance(carried, Course) else Course()
         measurement = self._skin.with_model_error(measurement)
-        if Channel.STRUCTURE in self._skin.description.channels:
-            if Channel.STRUCTURE not in measurement.changes:
-                judged = self._drifting(measurement) if course.drifts else measurement
-                return self._held(course, judged)
+        if Channel.STRUCTURE in self._skin.description.channels - measurement.changes.keys():
+            judged = self._drifting(measurement) if course.drifts else measurement
+            return self._held(course, judged)
         with measurement.timed("shape"):
             course, measurement = self._followed(course, measurement, Budget(budget_s))
         with measurement.timed("contacts"):
@@ -139,7 +139,7 @@ class Fit:
     def _without_drift(
         self, belief: Belief, measurement: Measurement, given_s: float
     ) -> Course | None:
-        """A course without a drift where contacts alone explain the data, asked ever more seldom."""
+        """A course without a drift, where contacts alone explain the data; asked rarely."""
         if belief.how == "still" or belief.frames & (belief.frames - 1):
             return None
         propose = self._proposer(measurement)
@@ -174,7 +174,8 @@ class Fit:
     def _concluded(self, course: Course, measurement: Measurement) -> Estimate:
         """The estimate that a belief and the account of it come to."""
         belief, account = course.belief, course.account
-        assert belief is not None and account is not None
+        assert belief is not None
+        assert account is not None
         fitted = belief.account.fitted
         unfinished = 1.2  # misfit below which what is still being refined explains the data already
         flags = Flag(0)
@@ -233,6 +234,7 @@ class Fit:
 
     def _with_outlines_of(self, last: FittedField, measurement: Measurement) -> FittedField:
         """Contacts as they were, with pressures as they are now."""
+        assert isinstance(last.family, PressureField)
         family = last.family.with_peaks_alone(last.parameters)
         parameters = family.join(family.fixed)
         held = self._field_fit.evaluate(family, parameters, last.log_ratio, measurement.changes)

@@ -1,4 +1,4 @@
-"""The kinds of contact that a search tells apart, and what each kind's fit of a contact starts from.
+"""The kinds of contact that a search tells apart, and where the fit of each starts.
 
 A kind is one form of one contact: an even press on an ellipse, on an egg or rounded rectangle, or
 by a ring; or a pressure that falls towards the edge. A contact may also be two, or none at all:

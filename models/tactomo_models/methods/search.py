@@ -35,10 +35,12 @@ MAX_CONTACTS = 12
 # Logarithms of odds. A rival below `HOPELESS` is not asked again: what others become changes its
 # odds by less. One above `OPEN` is asked again once they have become something else.
 HOPELESS, OPEN = -6.0, -3.0
-LIKELIER = 1.0  # from which a rival takes a contact's place; below, the mean of both is shown anyway
-# Of a contact that data explain: half the logarithm of its axes' ratio, from which it may be two (two
-# circles 8 mm apart have 0.2), and the uncertainty of a logarithm of its size, from which it may be
-# none. With every contact asked for both, odds are the same and cold frames take a third longer.
+LIKELIER = (
+    1.0  # from which a rival takes a contact's place; below, the mean of both is shown anyway
+)
+# Of a contact that data explain: half the logarithm of its axes' ratio, from which it may be two
+# (two circles 8 mm apart have 0.2), and the uncertainty of a logarithm of its size, from which it
+# may be none. With every contact asked for both, cold frames take a third longer.
 LONG, KNOWN_SIZE = 0.1, 0.25
 FEW_STEPS = 4  # of starts that are compared: a start's cost says little before
 STEPS = 4  # of a fit in one go, before what is left is looked at
@@ -91,9 +93,7 @@ class Belief:
         """What else each contact may be, where it is one contact."""
         return [
             [
-                Alternative(
-                    float(np.exp(rival.log_odds)), contact + rival.difference, rival.sigmas
-                )
+                Alternative(float(np.exp(rival.log_odds)), contact + rival.difference, rival.sigmas)
                 for rival in mine.values()
                 if rival.is_one
             ]
@@ -284,7 +284,9 @@ class Search:
         """The contacts that explain most: one after the other is left out while that helps."""
         while account.family.count > 0:
             rests = [
-                self._account(np.delete(account.contacts, k, axis=0), account.fitted.log_ratio, frame)
+                self._account(
+                    np.delete(account.contacts, k, axis=0), account.fitted.log_ratio, frame
+                )
                 for k in range(account.family.count)
             ]
             best = min((rest for rest in rests if rest), key=lambda one: one.fitted.cost)
@@ -302,13 +304,13 @@ class Search:
     def _advanced(self, belief: Belief, frame: Frame) -> Belief:
         """One thing more: a fit, a contact's kinds, what they lead to, or what is missing."""
         account = belief.account
-        if not account.at_minimum:
-            return replace(belief, account=self._descended(account, frame, STEPS))
-        missed = not belief.lacks_none and account.chi_squared > SURPRISE * frame.likelihood.count
-        if missed:
+        # Fitted to its end by itself, the first of several contacts would grow over them all.
+        if not belief.lacks_none and account.chi_squared > SURPRISE * frame.likelihood.count:
             born = self._with_missing(account, frame, far=True)
             if born is not account:
                 return self._grown(belief, born)
+        if not account.at_minimum:
+            return replace(belief, account=self._descended(account, frame, STEPS))
         if belief.rounds < ROUNDS:
             for k, mine in enumerate(belief.rivals):
                 kinds = [kind for kind in self._kinds(account, k, frame) if _is_asked(kind, mine)]
@@ -438,7 +440,7 @@ class Search:
     # What is missing
 
     def _with_missing(self, account: Account, frame: Frame, far: bool) -> Account:
-        """The same contacts and another, where that is likelier; the very same account otherwise."""
+        """The same contacts and another, where that is likelier; else the very same account."""
         if account.family.count >= MAX_CONTACTS:
             return account
         frame.budget.spend(account.fitted)  # about what looking takes, too
@@ -456,7 +458,7 @@ class Search:
             start = self._account(np.vstack([each, born]), account.fitted.log_ratio, frame)
             if start is None:
                 continue
-            steps = self._steps(account, frame)
+            steps = STEPS if holds else self._steps(account, frame)
             grown = self._descended(start, frame, steps, holds_ratio=holds)
             grown = replace(grown, at_minimum=grown.at_minimum and not holds)
             if grown.log_evidence > account.log_evidence:
@@ -478,14 +480,14 @@ class Search:
         )
 
     def _start_peak(self, frame: Frame) -> float:
-        """Peak that a contact starts with: below the graded sheet's onset where that sheet rests."""
+        """Peak that a contact starts with: below the onset where the graded sheet rests."""
         if frame.fits_peaks and frame.measured[Channel.MAGNITUDE].quiet:
             return max(self.field.onset / 2, self.field.peak_limits[0])
         return self.field.typical_peak
 
     @staticmethod
     def _steps(account: Account, frame: Frame) -> int:
-        """Steps of a fit of something else: where the data are unexplained, it may have far to go."""
+        """Steps of a fit of something else: unexplained, it may have far to go."""
         return 2 * STEPS if frame.likelihood.explains(account.chi_squared) else FAR_STEPS
 
     def _account(self, each: FloatArray, log_ratio: float, frame: Frame) -> Account | None:
@@ -567,7 +569,5 @@ def _opened(rivals: Rivals, gain: float) -> Rivals:
     """
     least = min(OPEN, -gain / 2)
     return {
-        kind: one
-        for kind, one in rivals.items()
-        if one.log_odds < least and kind is not Kind.NONE
+        kind: one for kind, one in rivals.items() if one.log_odds < least and kind is not Kind.NONE
     }

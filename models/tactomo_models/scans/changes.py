@@ -36,11 +36,6 @@ from tactomo_models.sensor.description import SensorDescription
 # An uneven sheet has few degrees of freedom: errors of the model go together, about as many
 # voltages at a time, and average out so much less than noise does.
 CORRELATED = 4.0
-# Share of that variance which displaces contacts once the sheet is found as it is, over the even
-# sheet's own errors. On tuning scenes 64 % of hand-made skins' places are then within one sigma and
-# 76 % of crowds'; with half as much more 75 and 81 %.
-DISPLACING = 0.13
-NOISELESS = 1e-9  # of the largest voltage: the noise of data that have none
 UNUSABLE = 1e3  # relative error of a voltage whose reference is zero or no number
 WRONG_WAY = 5.0  # standard uncertainties by which a conductivity may change against its sign
 
@@ -69,16 +64,9 @@ class Changes:
     # (M, K) orthonormal directions in which the sheet's conductivity can move changes over their
     # noise
     modes: FloatArray
-    displaced: float = CORRELATED  # the factor of model errors alone, where they displace contacts
     # (M, K) orthonormal directions of weighted changes that are the sheet's own drift, and the
     # share (K,) of each that is; None where none is allowed for
     drift: tuple[FloatArray, FloatArray] | None = None
-
-    @property
-    def centre_inflation(self) -> FloatArray:
-        """(M,) `variance_inflation` of contacts' places: how a sheet was made displaces them."""
-        share = (self.variance_inflation - 1) / (CORRELATED - 1)
-        return 1 + share * (self.displaced - 1)
 
     def judged_by(self, error_ratio: float) -> Changes:
         """The same for a found sheet, whose errors have so many times the even one's variance."""
@@ -91,7 +79,6 @@ class Changes:
             weight=there / np.sqrt(variance),
             variance_inflation=1 + (CORRELATED - 1) * error / variance,
             tolerance=error_ratio * self.tolerance,
-            displaced=DISPLACING * CORRELATED / error_ratio,
         )
 
     def drifting(self, directions: FloatArray) -> Changes:

@@ -41,9 +41,7 @@ class Likelihood:
     @classmethod
     def of(cls, measured: Mapping[Channel, Changes]) -> Likelihood:
         """The likelihood of what residuals of these changes are."""
-        inverse = [
-            (each.weight > 0) / each.variance_inflation for each in measured.values()
-        ]
+        inverse = [(each.weight > 0) / each.variance_inflation for each in measured.values()]
         together = np.concatenate(inverse)
         return cls(np.sqrt(together), max(float(together.sum()), 1.0))
 

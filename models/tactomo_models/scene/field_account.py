@@ -19,8 +19,8 @@ from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 from tactomo_models.scans.changes import WRONG_WAY
 from tactomo_models.scene.areas import AreaFinder, Areas
 from tactomo_models.scene.drawing import Drawing
-from tactomo_models.scene.field_fit import FieldFit, FittedField, Measured
 from tactomo_models.scene.evidence import Likelihood
+from tactomo_models.scene.field_fit import FieldFit, FittedField, Measured
 from tactomo_models.scene.parameters import E1, E2, EDGE, PEAK, SIZE, UNIT_M, X, Y
 from tactomo_models.scene.pressure import FieldContacts
 from tactomo_models.scene.pressure_field import PressureField
@@ -118,9 +118,7 @@ class FieldAccountant:
                 J[start : start + len(sensed)] = sensed
         return J
 
-    def _covariance(
-        self, fitted: FittedField, measured: Measured, J: FloatArray
-    ) -> FloatArray:
+    def _covariance(self, fitted: FittedField, measured: Measured, J: FloatArray) -> FloatArray:
         """Covariance (N, N) of a field's parameters."""
         likelihood = Likelihood.of(measured)
         information = likelihood.information(J, likelihood.chi_squared(fitted.residual))
@@ -195,7 +193,7 @@ class FieldAccountant:
         likely: Sequence[Alternative],
         own: IntArray,  # the areas that are this contact's
     ) -> FieldAccount:
-        """The mean over what a contact may be; how far that is apart is part of the uncertainties."""
+        """The mean over what a contact may be; uncertainties know how far that is apart."""
         odds = np.array([1.0, *(one.odds for one in likely)])
         share = odds / odds.sum()
         alone = [self._alone(family, one) for one in (contact, *(each.contact for each in likely))]
@@ -208,7 +206,7 @@ class FieldAccountant:
             return float(np.sqrt(share @ (values - share @ values) ** 2))
 
         images = [
-            image + mean(lambda one, at=at: one.images[at])
+            image + mean(partial(_Alone.image, at=at))
             for at, image in enumerate((shown.map, shown.structure, shown.pressure_kpa))
         ]
         shown = replace(shown, map=images[0], structure=images[1], pressure_kpa=images[2])
@@ -221,7 +219,9 @@ class FieldAccountant:
             changed[at] = max(changed[at] + mean(of), 0.0)
             return changed
 
-        def wider(sigmas: FloatArray, of: Callable[[_Alone], float], more: float = 0.0) -> FloatArray:
+        def wider(
+            sigmas: FloatArray, of: Callable[[_Alone], float], more: float = 0.0
+        ) -> FloatArray:
             changed = np.array(sigmas, float)
             changed[at] = np.sqrt(changed[at] ** 2 + spread(of) ** 2 + more)
             return changed
@@ -237,7 +237,6 @@ class FieldAccountant:
             of_peaks = family.unit_kpa * np.array([0.0, *(one.sigmas[PEAK] for one in likely)])
             slopes = np.array([one.slope for one in alone])
             # Whatever else it may be has a peak of its own uncertainty.
-            more_kpa = float(share @ of_peaks**2)
             more = float(share @ (slopes * of_peaks) ** 2)
             evenest = min(
                 zip((contact, *(one.contact for one in likely)), alone, strict=True),
@@ -449,3 +448,7 @@ class _Alone:
     peak_kpa: float
     peak_magnitude: float  # |relative conductivity change| under the peak
     slope: float  # of that by the pressure
+
+    def image(self, at: int) -> FloatArray:
+        """One of its images."""
+        return self.images[at]

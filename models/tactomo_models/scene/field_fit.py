@@ -200,9 +200,9 @@ class FieldFit:
     ) -> FittedField | None:
         """Solve the forward model for given parameters and compare it with the data.
 
-        None where it would touch the background's contacts. Sheets that are `solved` for these very contacts and ratio are
-        not solved again. With a background the voltages, residuals and cost are those of all
-        contacts together; parameters are those of the one that is not frozen.
+        None where it would touch the background's contacts. Sheets that are `solved` for these
+        very contacts and ratio are not solved again. With a background the voltages, residuals and
+        cost are those of all contacts together; parameters are those of the ones not frozen.
         """
         drawing = family.draw(parameters)
         solutions: dict[Channel, Solution] = {}
@@ -287,16 +287,6 @@ class FieldFit:
             sheets[name] = areas
         return Background(others, frozen, sheets, _away(others, frozen))
 
-    def restricted(
-        self, fitted: FittedField, family: Family, parameters: FloatArray, measured: Measured
-    ) -> FittedField:
-        """The same field on fewer sheets, with fewer parameters fitted: no solve."""
-        drawing = family.draw(parameters)
-        compared = self._compared(fitted, measured)
-        return self._judged(
-            family, parameters, fitted.log_ratio, drawing, *compared, fitted.background
-        )
-
     def _compared(
         self, fitted: FittedField, measured: Measured
     ) -> tuple[dict[Channel, Solution], dict[Channel, FloatArray]]:
@@ -366,9 +356,7 @@ class FieldFit:
         normal, gradient = self.normal_equations(fitted, fitted.jacobian)
         return float(gradient @ np.linalg.solve(normal, gradient))
 
-    def normal_equations(
-        self, fitted: FittedField, J: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def normal_equations(self, fitted: FittedField, J: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Matrix (N + 1, N + 1) and gradient (N + 1,) of half the linearised cost."""
         precision, offset = self.prior(fitted)
         normal = J.T @ J
@@ -377,7 +365,7 @@ class FieldFit:
 
     def bounded_ratio(self, log_ratio: float) -> float:
         """A log ratio brought back to where it means something."""
-        return min(max(log_ratio, self._least_ratio), self._most_ratio)
+        return float(min(max(log_ratio, self._least_ratio), self._most_ratio))
 
     def prior(self, fitted: FittedField) -> tuple[FloatArray, FloatArray]:
         """Inverse variances (N + 1,) of parameters and log ratio, and their offsets from it."""
@@ -435,17 +423,3 @@ def _diagonal(matrix: FloatArray) -> FloatArray:
 def _away(family: Family, parameters: FloatArray) -> float:
     """Cost of parameters (N,) by what is likely of them."""
     return float(family.prior_precision @ (parameters - family.prior_mean) ** 2)
-
-
-def covariance_of(
-    jacobian: FloatArray,  # (sum M, n) of the weighted residual
-    precision: FloatArray,  # (n,) inverse variances of the prior
-    # (sum M,) by which the data's variances exceed what independent errors would have
-    inflation: FloatArray,
-    misfit: float,  # that is left of the data
-) -> FloatArray:
-    """Covariance (n, n) of parameters; larger where the data are left unexplained."""
-    prior = np.diag(precision)
-    inverse = np.linalg.inv(jacobian.T @ jacobian + prior)
-    information = jacobian.T @ (inflation[:, None] * jacobian) + prior
-    return np.asarray(inverse @ information @ inverse * max(1.0, misfit**2))

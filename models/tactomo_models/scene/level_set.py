@@ -22,7 +22,6 @@ from tactomo_models.scene.pressure_field import PressureField
 
 KERNEL_SPREAD = 0.7  # standard deviation of a Gaussian over the kernels' distance
 HALF_WIDTH = 0.15  # w of the Heaviside
-HELD = 1e6  # inverse variance of a coefficient that is not to move
 SATURATING_KPA = 1e9  # pressure where none is fitted: the sheet is saturated
 RESTING = -0.5  # f where nothing presses: below -HALF_WIDTH, so h is exactly 0
 
@@ -68,13 +67,6 @@ class LevelSet:
             )
             owned.prior_precision = np.append(self.prior_precision[:kernels], peaks**-2)
         return owned
-
-    def with_peaks_alone(self, parameters: FloatArray) -> LevelSet:
-        """The same with its outlines held where parameters (N,) have them."""
-        held, kernels = copy(self), self.kernels.shape[1]
-        held.prior_mean, held.prior_precision = self.prior_mean.copy(), self.prior_precision.copy()
-        held.prior_mean[:kernels], held.prior_precision[:kernels] = parameters[:kernels], HELD
-        return held
 
     def parameters_of(self, likeness: FloatArray, peaks: FloatArray | None = None) -> FloatArray:
         """Parameters for an image (P,) that is 0 where nothing presses and 1 in contacts.

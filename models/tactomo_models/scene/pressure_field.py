@@ -1,8 +1,8 @@
 """The pressure field: contacts that press on all sheets alike, each of few parameters.
 
 A contact is a closed outline and the pressure inside it. The outline is an ellipse (5 parameters),
-whose radius may be modulated around its edge, which makes it an egg or a rounded rectangle (9). The pressure is even, or falls towards the edge;
-a ring presses with its rim alone.
+whose radius may be modulated around its edge, which makes it an egg or a rounded rectangle (9). The
+pressure is even, or falls towards the edge; a ring presses with its rim alone.
 
     u = B (x - x0),  B = exp(-s) expm(-E),  E = [[e1, e2], [e2, -e1]]     the unit circle of u
     log q = log |u| - sum_k (a_k cos k psi + b_k sin k psi),  psi = angle of u,  k = 3, 4
@@ -104,8 +104,8 @@ class PressureField:
         # and then there is the step from 1 to 0. ICC of tuning scenes without and with it: 0.989,
         # 0.991 at 40 dB, 0.954, 0.960 at 20 dB, 0.979, 0.981 of one graded sheet.
         of_triangles, of_step = 5 / 18, 1 / 3 - 2 / np.pi**2
-        # Of the table's end, that a peak may come to. A tenth of what saturates a sheet is less than
-        # any noise leaves of it; beyond the table all that is told is a lower bound.
+        # Of the table's end, that a peak may come to: less leaves nothing to fit, and beyond the
+        # table all that is told is a lower bound.
         least, beyond = 0.01, 3.0
         x, y = np.ascontiguousarray(forward.bare.points[:, forward.bare.pressable])
         description = forward.description
