@@ -35,8 +35,8 @@ from tactomo_models.scene.parameters import E1, E2, SIZE, UNIT_M, X, Y
 from tactomo_models.scene.pressure_field import PressureField
 
 # Nodes between outlines, below which a neighbour is fitted with a trial: each outline is a node
-# wide, a triangle lies around it, and the trial may move by a node. Where neighbours at 10 mm answer
-# to first order alone, a trial of the very same contact errs by up to 13 nats.
+# wide, a triangle lies around it, and the trial may move by a node. Where neighbours at 10 mm
+# answer to first order alone, a trial of the very same contact errs by up to 13 nats.
 NEAR_NODES = 5
 # Of a trial, which takes three where the data are explained; elsewhere it may have far to go.
 STEPS, FAR_STEPS = 6, 20

@@ -36,6 +36,7 @@ from tactomo_models.sensor.description import SensorDescription
 # An uneven sheet has few degrees of freedom: errors of the model go together, about as many
 # voltages at a time, and average out so much less than noise does.
 CORRELATED = 4.0
+NOISELESS = 1e-9  # of the largest voltage: the noise of data that have none
 UNUSABLE = 1e3  # relative error of a voltage whose reference is zero or no number
 WRONG_WAY = 5.0  # standard uncertainties by which a conductivity may change against its sign
 
