@@ -35,11 +35,11 @@ SETTLED = 5e-3  # share of the cost below which another gain is not worth a step
 # one of 36 scenes then goes another way, at a correlation lower by 0.13.
 FORESEEN = 1e-3
 # Processor time on a quiet core of the 2.5 GHz class, by least squares over frames of all kinds of
-# scenes, to 18 % (`tactomo evaluate solves --budget 8` fits the same). Measured on a busy core, the
-# least of three runs, and divided by 1.45: by so much cold frames took longer than on a quiet one.
-COLD_S = 1e-2  # a frame that starts cold, beside its steps: network, account
-SHEET_S = 1.3e-4  # a step on one sheet
-ENTRY_S = 9e-8  # the same, for each node that is pressed and each parameter
+# scenes, to 22 % (`tactomo evaluate solves --budget 4`). Measured on a busy core and divided by 1.3:
+# by so much cold frames took longer than on a quiet one.
+COLD_S = 5e-3  # a frame that starts cold, beside its steps: network, account
+SHEET_S = 1.6e-4  # a step on one sheet
+ENTRY_S = 3.7e-8  # the same, for each node that is pressed and each parameter
 MAX_DAMPING = 1e6  # no step downhill even at this: a minimum
 STEP_LIMIT = 0.5  # largest change of a parameter in one step
 # Nodes that a contact must have to move in before it would touch those that are frozen: on the
