@@ -925,7 +925,8 @@ static double step(const Field *f, double t) {
   if (f->is_sharp) return fmin(fmax(0.5 + t, 0.0), 1.0);
   if (t <= -1) return 0.0;
   t = fmin(t, 1.0);
-  return 0.5 * (1 + t + sin(PI * t) / PI);
+  /* Below 0 by rounding, a node would pass for one that conducts worse than the bare sheet. */
+  return fmax(0.5 * (1 + t + sin(PI * t) / PI), 0.0);
 }
 
 static double step_slope(double t) { return (1 + cos(PI * fmin(fmax(t, -1.0), 1.0))) / 2; }
@@ -1034,7 +1035,8 @@ int64_t draw(const Field *f, int64_t count, const double *each, int64_t n, const
       if (!press(f, contact + k, c[HOLE] != 0, x[i], y[i], 0, &p)) continue;
       hit = 1;
       no_wide *= 1 - (f->is_sharp ? p.as_is.whole : p.enclosed), no_share *= 1 - p.drawn.share;
-      of_as_is += p.as_is.share, as_is += p.as_is.share * p.as_is.pressure;
+      double within = f->is_sharp ? p.as_is.whole : p.enclosed;
+      of_as_is += within, as_is += within * p.as_is.left * p.as_is.pressure;
       of_drawn += p.drawn.share, drawn += p.drawn.share * p.drawn.pressure;
       stronger += p.drawn.share * contact[k].stronger;
     }
@@ -1075,7 +1077,7 @@ int draw_slopes(const Field *f, int64_t count, const double *each, int64_t n, co
       int is_ring = each[COLUMNS * k + HOLE] != 0 || index[COLUMNS * k + HOLE] >= 0;
       Press *p = pressed + there;
       if (!press(f, contact + k, is_ring, x[i], y[i], 1, p)) continue;
-      of_as_is += p->as_is.share, as_is += p->as_is.share * p->as_is.pressure;
+      of_as_is += p->enclosed, as_is += p->enclosed * p->as_is.left * p->as_is.pressure;
       of_drawn += p->drawn.share, drawn += p->drawn.share * p->drawn.pressure;
       stronger += p->drawn.share * contact[k].stronger, no_share *= 1 - p->drawn.share;
       of[there++] = k;
@@ -1090,9 +1092,14 @@ int draw_slopes(const Field *f, int64_t count, const double *each, int64_t n, co
       double others_wide = 1.0, others_share = 1.0; /* what is pressed twice is pressed once */
       for (int o = 0; o < there; o++)
         if (o != j) others_wide *= 1 - pressed[o].enclosed, others_share *= 1 - pressed[o].drawn.share;
-      double by_wide = step_slope(p->wide), own[2][COLUMNS], share[COLUMNS], kpa[COLUMNS];
+      double by_wide = step_slope(p->wide), own[COLUMNS], share[COLUMNS], kpa[COLUMNS];
+      double left[COLUMNS] = {0.0}; /* what a hole leaves, by all parameters */
       int is_ring = c[HOLE] != 0 || places[HOLE] >= 0;
-      by_parameters(f, c, &p->as_is, is_ring, own[0], own[1]);
+      by_parameters(f, c, &p->as_is, is_ring, share, own);
+      if (c[HOLE] != 0)
+        for (int q = 0; q < f->forms; q++)
+          left[q] = -c[HOLE] * step_slope(p->as_is.hole.t) * p->as_is.hole.by_t[q];
+      if (is_ring) left[HOLE] = -step(f, p->as_is.hole.t);
       by_parameters(f, c, &p->drawn, is_ring, share, kpa);
       share[EDGE] = sizes->by_edge * share[SIZE], share[SIZE] += sizes->by_size * share[SIZE];
       kpa[EDGE] += sizes->by_edge * kpa[SIZE], kpa[SIZE] += sizes->by_size * kpa[SIZE];
@@ -1102,9 +1109,11 @@ int draw_slopes(const Field *f, int64_t count, const double *each, int64_t n, co
         double by = q == SIZE ? sizes->by_size : q == EDGE ? sizes->by_edge : 0.0;
         double strength = share[q] * (sizes->stronger - stronger) -
                           2 * by * sizes->stronger * p->drawn.share;
-        by_enclosed[at] = q < f->forms ? by_wide * p->as_is.outline.by_t[q] * others_wide : 0.0;
-        by_enclosed_kpa[at] =
-            (own[0][q] * (p->as_is.pressure - as_is) + own[1][q] * p->as_is.share) / of_as_is;
+        double within = q < f->forms ? by_wide * p->as_is.outline.by_t[q] : 0.0;
+        by_enclosed[at] = within * others_wide;
+        by_enclosed_kpa[at] = (within * (p->as_is.left * p->as_is.pressure - as_is) +
+                               p->enclosed * (left[q] * p->as_is.pressure + p->as_is.left * own[q])) /
+                              of_as_is;
         by_share[at] = share[q] * others_share * stronger + (1 - no_share) * strength / of_drawn;
         by_pressure[at] =
             (share[q] * (p->drawn.pressure - drawn) + kpa[q] * p->drawn.share) / of_drawn;

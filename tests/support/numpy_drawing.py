@@ -55,7 +55,9 @@ class Contacts:
         self.wide = self._as_is.outline.t + of.offset_m / of.half_width_m
         self._wide = self._as_is.whole if is_sharp else heaviside(self.wide)
         self.enclosed = 1 - np.prod(1 - self._wide, axis=0)
-        self.enclosed_kpa = self._as_is.mean(self._as_is.pressures)
+        self._inside = self._as_is.left * self._as_is.pressures
+        self._all_wide = np.maximum(self._wide.sum(axis=0), 1e-12)
+        self.enclosed_kpa = (self._wide * self._inside).sum(axis=0) / self._all_wide
         self._once = 1 - np.prod(1 - self._drawn.shares, axis=0)
         self._strengths = np.ones_like(self._wide) / left[:, None]
         self._strength = self._drawn.mean(self._strengths)
@@ -65,10 +67,13 @@ class Contacts:
     def slopes(self) -> Slopes:
         """Derivatives (K, COLUMNS, n) of what a `Drawing` has."""
         forms = self._of.forms
-        as_is, pressures = self._as_is.slopes()
-        wide = np.zeros_like(as_is)
+        _, pressures = self._as_is.slopes()
+        wide = np.zeros_like(pressures)
         wide[:, :forms] = heaviside_slope(self.wide)[:, None] * self._as_is.outline.slopes[0]
-        enclosed_kpa = self._as_is.slopes_of_mean(as_is, pressures, self._as_is.pressures)
+        inside = self._as_is.slopes_of_left() * self._as_is.pressures[:, None]
+        inside += self._as_is.left[:, None] * pressures
+        enclosed_kpa = wide * (self._inside - self.enclosed_kpa)[:, None]
+        enclosed_kpa = (enclosed_kpa + self._wide[:, None] * inside) / self._all_wide
         shares, pressures = self._drawn.slopes()
         for slopes in (shares, pressures):  # so far by the size that is drawn
             slopes[:, EDGE] += self._by_edge * slopes[:, SIZE]
@@ -96,10 +101,10 @@ class _Pressed:
         self._hole, self._inner = each[:, HOLE, None], None
         if self._hole.any():
             self._inner = self._inner_outlines()
-            self._left = 1 - self._hole * step(self._inner.t)
+            self.left = 1 - self._hole * step(self._inner.t)
         else:
-            self._left = np.ones_like(self.whole)
-        self.shares = self.whole * self._left
+            self.left = np.ones_like(self.whole)
+        self.shares = self.whole * self.left
         # Pressure is averaged over the rim's width: a node is a cell.
         self._rim = RIM * of.half_width_m * np.exp(-each[:, SIZE, None])
         self._fall = 1 - np.exp(2 * np.minimum(self.outline.log_q, 1.0))
@@ -126,13 +131,24 @@ class _Pressed:
         inner[:, SIZE] -= np.log(2)
         return _Outlines(self._of, inner, self.outline.x_m, self.outline.y_m)
 
+    def slopes_of_left(self) -> FloatArray:
+        """Derivatives (K, COLUMNS, n) of the share that holes leave."""
+        left = np.zeros((len(self._each), COLUMNS, self.shares.shape[1]))
+        if self._inner is not None or self._of.free[:, HOLE].any():
+            inner = self._inner or self._inner_outlines()
+            left[:, HOLE] = -heaviside(inner.t)
+            if self._inner is not None:
+                away = self._hole * heaviside_slope(inner.t)
+                left[:, : self._of.forms] = -away[:, None] * inner.slopes[0]
+        return left
+
     def slopes(self) -> tuple[FloatArray, FloatArray]:
         """Derivatives (K, COLUMNS, n) of each contact's share and pressure."""
         of, each, forms = self._of, self._each, self._of.forms
         by_t, by_log_q = self.outline.slopes
         shares, pressures = np.zeros((2, len(each), COLUMNS, self.shares.shape[1]))
         shares[:, :forms] = (
-            heaviside_slope(self.outline.t / GRADED_WIDTH) / GRADED_WIDTH * self._left
+            heaviside_slope(self.outline.t / GRADED_WIDTH) / GRADED_WIDTH * self.left
         )[:, None] * by_t
         if self._inner is not None or of.free[:, HOLE].any():
             inner = self._inner or self._inner_outlines()

@@ -176,7 +176,7 @@ def damped_steps(
 ) -> Iterator[tuple[FloatArray, float]]:
     """Steps (N,) of Levenberg and Marquardt, shorter and shorter, as long as one would gain."""
     while damping < MAX_DAMPING:
-        step = limited(bounded_step(normal, gradient, damping * scale))
+        step = limited(bounded_step(normal, gradient, 0.1 * damping * scale))
         if -(2 * gradient + normal @ step) @ step * unit < NEGLIGIBLE:
             return
         yield step, damping

@@ -34,8 +34,9 @@ class Drawing:
 def heaviside(t: FloatArray) -> FloatArray:
     """Smoothed step of compact support: 0 below -1, 1 above 1."""
     t = np.clip(t, -1, 1)
-    # Rounding must not leave a trace of 1e-17 outside the support: every such node would be solved.
-    return np.where(t > -1, 0.5 * (1 + t + np.sin(np.pi * t) / np.pi), 0.0)
+    # Rounding must not leave a trace of 1e-17: outside the support every such node would be solved,
+    # and below 0 one would pass for a node that conducts worse than the bare sheet.
+    return np.where(t > -1, np.maximum(0.5 * (1 + t + np.sin(np.pi * t) / np.pi), 0.0), 0.0)
 
 
 def heaviside_slope(t: FloatArray) -> FloatArray:

@@ -23,7 +23,7 @@ from tactomo_models.physics.bare_sheet import solve_bare_sheet
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import mesh_sheet
 from tactomo_models.scene.drawing import Drawing
-from tactomo_models.scene.field_fit import Budget, Family, FittedField, covariance_of
+from tactomo_models.scene.field_fit import Budget, Family, FittedField
 from tactomo_models.scene.level_set import LevelSet
 from tactomo_models.scene.parameters import (
     EDGE,
