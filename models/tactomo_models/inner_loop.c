@@ -1035,8 +1035,8 @@ int64_t draw(const Field *f, int64_t count, const double *each, int64_t n, const
       if (!press(f, contact + k, c[HOLE] != 0, x[i], y[i], 0, &p)) continue;
       hit = 1;
       no_wide *= 1 - (f->is_sharp ? p.as_is.whole : p.enclosed), no_share *= 1 - p.drawn.share;
-      double within = f->is_sharp ? p.as_is.whole : p.enclosed;
-      of_as_is += within, as_is += within * p.as_is.left * p.as_is.pressure;
+      double within = (f->is_sharp ? p.as_is.whole : p.enclosed) * p.as_is.left;
+      of_as_is += within, as_is += within * p.as_is.pressure;
       of_drawn += p.drawn.share, drawn += p.drawn.share * p.drawn.pressure;
       stronger += p.drawn.share * contact[k].stronger;
     }
@@ -1077,7 +1077,8 @@ int draw_slopes(const Field *f, int64_t count, const double *each, int64_t n, co
       int is_ring = each[COLUMNS * k + HOLE] != 0 || index[COLUMNS * k + HOLE] >= 0;
       Press *p = pressed + there;
       if (!press(f, contact + k, is_ring, x[i], y[i], 1, p)) continue;
-      of_as_is += p->enclosed, as_is += p->enclosed * p->as_is.left * p->as_is.pressure;
+      double within = p->enclosed * p->as_is.left;
+      of_as_is += within, as_is += within * p->as_is.pressure;
       of_drawn += p->drawn.share, drawn += p->drawn.share * p->drawn.pressure;
       stronger += p->drawn.share * contact[k].stronger, no_share *= 1 - p->drawn.share;
       of[there++] = k;
@@ -1109,10 +1110,11 @@ int draw_slopes(const Field *f, int64_t count, const double *each, int64_t n, co
         double by = q == SIZE ? sizes->by_size : q == EDGE ? sizes->by_edge : 0.0;
         double strength = share[q] * (sizes->stronger - stronger) -
                           2 * by * sizes->stronger * p->drawn.share;
-        double within = q < f->forms ? by_wide * p->as_is.outline.by_t[q] : 0.0;
-        by_enclosed[at] = within * others_wide;
-        by_enclosed_kpa[at] = (within * (p->as_is.left * p->as_is.pressure - as_is) +
-                               p->enclosed * (left[q] * p->as_is.pressure + p->as_is.left * own[q])) /
+        double enclosed = q < f->forms ? by_wide * p->as_is.outline.by_t[q] : 0.0;
+        double within = enclosed * p->as_is.left + p->enclosed * left[q];
+        by_enclosed[at] = enclosed * others_wide;
+        by_enclosed_kpa[at] = (within * (p->as_is.pressure - as_is) +
+                               p->enclosed * p->as_is.left * own[q]) /
                               of_as_is;
         by_share[at] = share[q] * others_share * stronger + (1 - no_share) * strength / of_drawn;
         by_pressure[at] =

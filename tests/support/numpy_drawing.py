@@ -55,9 +55,9 @@ class Contacts:
         self.wide = self._as_is.outline.t + of.offset_m / of.half_width_m
         self._wide = self._as_is.whole if is_sharp else heaviside(self.wide)
         self.enclosed = 1 - np.prod(1 - self._wide, axis=0)
-        self._inside = self._as_is.left * self._as_is.pressures
-        self._all_wide = np.maximum(self._wide.sum(axis=0), 1e-12)
-        self.enclosed_kpa = (self._wide * self._inside).sum(axis=0) / self._all_wide
+        self._within = self._wide * self._as_is.left
+        self._all_within = np.maximum(self._within.sum(axis=0), 1e-12)
+        self.enclosed_kpa = (self._within * self._as_is.pressures).sum(axis=0) / self._all_within
         self._once = 1 - np.prod(1 - self._drawn.shares, axis=0)
         self._strengths = np.ones_like(self._wide) / left[:, None]
         self._strength = self._drawn.mean(self._strengths)
@@ -70,10 +70,10 @@ class Contacts:
         _, pressures = self._as_is.slopes()
         wide = np.zeros_like(pressures)
         wide[:, :forms] = heaviside_slope(self.wide)[:, None] * self._as_is.outline.slopes[0]
-        inside = self._as_is.slopes_of_left() * self._as_is.pressures[:, None]
-        inside += self._as_is.left[:, None] * pressures
-        enclosed_kpa = wide * (self._inside - self.enclosed_kpa)[:, None]
-        enclosed_kpa = (enclosed_kpa + self._wide[:, None] * inside) / self._all_wide
+        within = wide * self._as_is.left[:, None]
+        within += self._wide[:, None] * self._as_is.slopes_of_left()
+        enclosed_kpa = within * (self._as_is.pressures - self.enclosed_kpa)[:, None]
+        enclosed_kpa = (enclosed_kpa + self._within[:, None] * pressures) / self._all_within
         shares, pressures = self._drawn.slopes()
         for slopes in (shares, pressures):  # so far by the size that is drawn
             slopes[:, EDGE] += self._by_edge * slopes[:, SIZE]
