@@ -55,7 +55,7 @@ def run(fit: FieldFit) -> None:
         each = each.copy()
         each[:, [X, Y, SIZE]] += 0.05 * rng.normal(size=(len(each), 3))
         field = empty.of(each).with_free(slice(HARMONIC, HOLE + 1))
-        fitted = fit.evaluate(field, field.join(each), fit.likely, data, 10**6)
+        fitted = fit.evaluate(field, field.join(each), fit.likely, data)
         assert fitted is not None
         assert np.isfinite(fit.jacobian(fitted, data)).all()
         field.sampled(each, field.x_m, field.y_m, 1e-3)
@@ -71,7 +71,7 @@ def run(fit: FieldFit) -> None:
             fit.evaluate(own, own.join(own.fixed), fit.likely, data, background=background)
     level_set = LevelSet(fit.forward)
     likeness = np.clip(1 - np.hypot(empty.x_m, empty.y_m) / 0.016, 0, 1)
-    fitted = fit.evaluate(level_set, level_set.parameters_of(likeness), fit.likely, data, 10**6)
+    fitted = fit.evaluate(level_set, level_set.parameters_of(likeness), fit.likely, data)
     assert fitted is not None
     assert np.isfinite(fit.jacobian(fitted, data)).all()
     assert np.isfinite(fit.forward.bare_jacobian()).all()

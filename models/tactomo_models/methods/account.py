@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -132,7 +132,7 @@ def descended(
             normal[-1, -1] = 1.0
         if foreseen(normal, gradient) * account.unit < NEGLIGIBLE:
             return replace(account, at_minimum=True)
-        better = _stepped(fit, fitted, normal, gradient, frame)
+        better = _stepped(fit, account, normal, gradient, frame)
         if better is None:
             return replace(account, at_minimum=True)
         frame.budget.spend(better)
@@ -144,24 +144,43 @@ def descended(
 
 
 def _stepped(
-    fit: FieldFit, fitted: FittedField, normal: FloatArray, gradient: FloatArray, frame: Frame
+    fit: FieldFit, account: Account, normal: FloatArray, gradient: FloatArray, frame: Frame
 ) -> FittedField | None:
-    """Damp until a step leads downhill; None where none does."""
-    damping = fitted.damping
-    while damping < MAX_DAMPING:
-        step = bounded_step(normal, gradient, damping)
-        trial = fit.evaluate(
-            fitted.family,
-            fitted.family.bounded(fitted.parameters + step[:-1]),
-            fit.bounded_ratio(fitted.log_ratio + step[-1]),
-            frame.measured,
-        )
+    """The field after a step downhill; None where none is worth a solve."""
+    fitted = account.fitted
+
+    def limited(step: FloatArray) -> FloatArray:
+        parameters = fitted.family.bounded(fitted.parameters + step[:-1])
+        ratio = fit.bounded_ratio(fitted.log_ratio + float(step[-1]))
+        return np.append(parameters - fitted.parameters, ratio - fitted.log_ratio)
+
+    scale = fit.prior(fitted)[0]
+    steps = damped_steps(normal, gradient, scale, fitted.damping, limited, account.unit)
+    for step, damping in steps:
+        parameters, ratio = fitted.parameters + step[:-1], fitted.log_ratio + float(step[-1])
+        trial = fit.evaluate(fitted.family, parameters, ratio, frame.measured)
         if trial is not None:
             frame.budget.spend(trial)
             if trial.cost < fitted.cost:
                 return replace(trial, damping=max(damping / 5, 1e-3))
-        damping *= 5
     return None
+
+
+def damped_steps(
+    normal: FloatArray,  # (N, N) half of the cost's curvature
+    gradient: FloatArray,  # (N,) half of its slope
+    scale: FloatArray,  # (N,) inverse variances of what is likely: what a step is measured by
+    damping: float,  # to begin with, in these
+    limited: Callable[[FloatArray], FloatArray],  # cuts a step where a parameter has its limit
+    unit: float,  # what one unit of cost is of chi-squared
+) -> Iterator[tuple[FloatArray, float]]:
+    """Steps (N,) of Levenberg and Marquardt, shorter and shorter, as long as one would gain."""
+    while damping < MAX_DAMPING:
+        step = limited(bounded_step(normal, gradient, damping * scale))
+        if -(2 * gradient + normal @ step) @ step * unit < NEGLIGIBLE:
+            return
+        yield step, damping
+        damping *= 5
 
 
 def foreseen(normal: FloatArray, gradient: FloatArray) -> float:

@@ -25,12 +25,13 @@ from tactomo_models.methods.account import (
     NEGLIGIBLE,
     Account,
     Frame,
+    damped_steps,
     foreseen,
     without_light_peaks,
 )
 from tactomo_models.methods.kinds import log_prior
 from tactomo_models.scene.evidence import log_occam
-from tactomo_models.scene.field_fit import MAX_DAMPING, FieldFit, FittedField, bounded_step
+from tactomo_models.scene.field_fit import FieldFit, FittedField
 from tactomo_models.scene.parameters import E1, E2, SIZE, UNIT_M, X, Y
 from tactomo_models.scene.pressure_field import PressureField
 
@@ -187,17 +188,23 @@ class Rest:
         gradient = J.T @ at.fitted.residual - own.T @ at.taken + at.prior * at.offset
         if foreseen(normal, gradient) * self._account.unit < NEGLIGIBLE:
             return None, damping
-        while damping < MAX_DAMPING:
-            step = bounded_step(normal, gradient, damping)
-            count = len(at.fitted.parameters)
+        count, fitted = len(at.fitted.parameters), at.fitted
+
+        def limited(step: FloatArray) -> FloatArray:
+            parameters = family.bounded(fitted.parameters + step[:count])
+            ratio = self._fit.bounded_ratio(fitted.log_ratio + float(step[count:].sum()))
+            off = np.append(parameters - fitted.parameters, ratio - fitted.log_ratio)
+            return off[: len(step)]
+
+        steps = damped_steps(normal, gradient, at.prior, damping, limited, self._account.unit)
+        for step, damped in steps:
             trial = self._assessed(
                 family,
-                family.bounded(at.fitted.parameters + step[:count]),
-                self._fit.bounded_ratio(at.fitted.log_ratio + step[count:].sum()),
+                fitted.parameters + step[:count],
+                fitted.log_ratio + float(step[count:].sum()),
             )
             if trial is not None and trial.cost < at.cost:
-                return trial, max(damping / 5, 1e-3)
-            damping *= 5
+                return trial, max(damped / 5, 1e-3)
         return None, damping
 
     def _jacobian(self, at: _Assessed) -> FloatArray:

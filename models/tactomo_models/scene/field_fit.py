@@ -401,7 +401,9 @@ class FieldFit:
         return replace(fitted, damping=damping)
 
 
-def bounded_step(normal: FloatArray, gradient: FloatArray, damping: float) -> FloatArray:
+def bounded_step(
+    normal: FloatArray, gradient: FloatArray, damping: FloatArray | float
+) -> FloatArray:
     """A damped step (N,) of Gauss-Newton, no parameter of which changes by more than the limit."""
     damped = normal.copy()
     _diagonal(damped)[:] += damping

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields, is_dataclass
 
 import numpy as np
@@ -78,6 +79,15 @@ def assert_at(belief: Belief, *each: FloatArray) -> None:
     np.testing.assert_allclose(found, places, atol=3e-4)
 
 
+def followed(search: Search, frames: Iterable[Frame]) -> Belief:
+    """What is believed after some frames, the first of which starts cold."""
+    belief = None
+    for frame in frames:
+        belief = search.advance(belief, frame)
+    assert belief is not None
+    return belief
+
+
 def kinds_by_x(belief: Belief) -> list[Kind]:
     """Kinds of contacts from left to right."""
     each = belief.account.contacts
@@ -117,7 +127,7 @@ def test_what_is_held_is_judged_by_the_new_frame(skin: Skin) -> None:
     frame = skin.frame(LEFT)
     again = search.advance(belief, frame)
     left = skin.sensor.fit.compare(belief.account.fitted, frame.measured).residual
-    assert again.account.chi_squared == pytest.approx(frame.likelihood.chi_squared(left))
+    np.testing.assert_array_equal(again.account.fitted.residual, left)
 
 
 def test_a_contact_that_slides_is_followed(skin: Skin, solves: list[int]) -> None:
@@ -228,13 +238,10 @@ def test_a_step_is_a_pure_function(skin: Skin, change: str) -> None:
 
 def test_work_that_a_budget_cuts_short_goes_on_in_the_next_frames(skin: Skin) -> None:
     """And ends at about the belief of a frame that took its time."""
-    search, belief = Search(skin.sensor.fit), None
-    measured = skin.measured(LEFT, RIGHT)
-    for k in range(300):
-        belief = search.advance(belief, Frame(measured, Budget(1e-3)))
-        assert k or not belief.done
-        if belief.done:
-            break
+    search, measured = Search(skin.sensor.fit), skin.measured(LEFT, RIGHT)
+    frames = (Frame(measured, Budget(1e-3)) for _ in range(300))
+    assert not followed(search, [next(frames)]).done
+    belief = followed(search, frames)
     assert_at(belief, LEFT, RIGHT)
     at_once = search.advance(None, Frame(measured, Budget(PLENTY_S)))
     assert belief.account.log_evidence == pytest.approx(at_once.account.log_evidence, abs=0.5)
@@ -245,14 +252,16 @@ def test_pressures_follow_what_moves_also_when_time_is_short(skin: Skin) -> None
     """Once it is found, a step a frame has to do for outline and pressure."""
     if Channel.MAGNITUDE not in skin.sensor.fit.responses:
         pytest.skip("no sheet tells pressures")
-    search, belief, peaks = Search(skin.sensor.fit), None, np.linspace(0.7, 0.95, 40)
-    for k, peak in enumerate(peaks):
-        pressed = contact(-0.010 + 2.5e-4 * k, 0.002, 0.009, peak=peak)
-        frame = skin.frame(pressed, noise=2e-4, budget_s=1e-4 if k else PLENTY_S)
-        belief = search.advance(belief, frame)
-    (one,) = belief.account.contacts
-    assert one[PEAK] == pytest.approx(peaks[-1], abs=0.03)
-    assert one[X] * UNIT_M == pytest.approx(pressed[X] * UNIT_M, abs=1e-3)
+    pressed = [
+        contact(-0.010 + 2.5e-4 * k, 0.002, 0.009, peak=0.7 + 0.25 * k / 39) for k in range(40)
+    ]
+    frames = (
+        skin.frame(each, noise=2e-4, budget_s=1e-4 if k else PLENTY_S)
+        for k, each in enumerate(pressed)
+    )
+    (one,) = followed(Search(skin.sensor.fit), frames).account.contacts
+    assert one[PEAK] == pytest.approx(pressed[-1][PEAK], abs=0.03)
+    assert one[X] * UNIT_M == pytest.approx(pressed[-1][X] * UNIT_M, abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -341,10 +350,8 @@ def test_edges_and_holes_are_what_the_data_say(skin: Skin, edge: float, hole: fl
     if Channel.MAGNITUDE not in skin.sensor.fit.responses:
         pytest.skip("no sheet tells pressures")
     pressed = contact(-0.004, 0.002, 0.012, peak=0.85, edge=edge, hole=hole)
-    search, belief = Search(skin.sensor.fit), None
-    for _ in range(6):
-        belief = search.advance(belief, skin.frame(pressed, noise=1e-4))
-    (one,) = belief.account.contacts
+    frames = (skin.frame(pressed, noise=1e-4) for _ in range(6))
+    (one,) = followed(Search(skin.sensor.fit), frames).account.contacts
     assert (one[EDGE] > 0, one[HOLE]) == (edge > 0, hole)
     assert one[PEAK] == pytest.approx(pressed[PEAK], rel=0.1)
 
@@ -353,10 +360,8 @@ def test_edges_and_holes_are_what_the_data_say(skin: Skin, edge: float, hole: fl
 def test_an_even_press_that_lands_is_not_soft_for_want_of_time(skin: Skin, budget_s: float) -> None:
     """A fit that was cut short says nothing about edges."""
     pressed = contact(-0.004, 0.002, 0.012, peak=0.85)
-    search, belief = Search(skin.sensor.fit), None
-    for _ in range(60):
-        belief = search.advance(belief, skin.frame(pressed, noise=2e-4, budget_s=budget_s))
-    (one,) = belief.account.contacts
+    frames = (skin.frame(pressed, noise=2e-4, budget_s=budget_s) for _ in range(60))
+    (one,) = followed(Search(skin.sensor.fit), frames).account.contacts
     assert kind_of(one) is Kind.EVEN
     assert np.exp(one[SIZE]) == pytest.approx(0.012, rel=0.02)
 
