@@ -27,9 +27,7 @@ from tactomo_lab.scenes.still_scenes import EvaluationScene
 SceneKind = Literal["still", "moving"]
 Done = Callable[[], None]
 
-# Methods that a budget bounds, and that go on in a frame from what the one before it came to. The
-# others take what they take, and start anew in each frame.
-RUNGS: Final = ("levelset",)  # of auto, whose budgets stand for theirs
+UNHURRIED: Final = ("levelset",)  # charted under the last budget alone
 BUDGETS_S: Final = (0.001, 0.002, 0.005, 0.01, 0.02, DEFAULT_BUDGET_S)
 STILL_BUDGETS_S: Final = (*BUDGETS_S, BUDGET_S)  # the last one: as much as a scene needs
 
@@ -41,7 +39,7 @@ def variants(methods: Iterable[str], budgets_s: Sequence[float] = BUDGETS_S) -> 
         if method not in BUDGETED:
             chosen.append(Variant(method))
         else:
-            budgets = budgets_s[-1:] if method in RUNGS else budgets_s
+            budgets = budgets_s[-1:] if method in UNHURRIED else budgets_s
             chosen += [Variant(method, budget_s) for budget_s in budgets]
     return chosen
 

@@ -34,7 +34,10 @@ from tactomo_models.scans.reference import noise_of_reciprocity
 from tactomo_models.sensor.description import SensorDescription
 
 # An uneven sheet has few degrees of freedom: errors of the model go together, about as many
-# voltages at a time, and average out so much less than noise does.
+# voltages at a time, and average out so much less than noise does. Correlation of the map on tuning
+# rows with 2, 4 and 10: mixed 0.984 each; ordinary, 40 dB 0.987, 0.986, 0.982; rectangles and rings
+# 0.984, 0.986, 0.982; crowds 0.978, 0.981, 0.970; soft on hand-made skins 0.963, 0.962, 0.958, and
+# 48, 56 and 67 % of the places there within one sigma.
 CORRELATED = 4.0
 NOISELESS = 1e-9  # of the largest voltage: the noise of data that have none
 UNUSABLE = 1e3  # relative error of a voltage whose reference is zero or no number

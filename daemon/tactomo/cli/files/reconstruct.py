@@ -101,7 +101,7 @@ def reconstruct(
     usable scan, 32768 untaught.
 
     Methods: *tikhonov* and *noser* are one linear step, regularised so that the image is as noisy,
-    relative to its signal, as the scans are (noise figure 1); *fit* models a few outlines,
+    relative to its signal, as the scans are (noise figure 1); *fit* models a few contacts,
     *levelset* shapes of any form, both nonlinear and down to the scans' noise; *network* is our
     fusion network alone. *auto* is *fit*, and where the sensor has a network, the network proposes
     what the fit starts from, and stands in where the fit does not explain the scans. Where objects
