@@ -365,18 +365,23 @@ class Search:
         """The belief with each contact of its likeliest kind, where that is likelier altogether."""
         log_evidence = belief.account.log_evidence
         better = [born] if (born := self._missed(belief, frame)) else []
+        refused: dict[int, tuple[Kind, float]] = {}  # by the fit of all, and its log odds
         for choice in _choices(belief.rivals):
             changed = self._changed(belief, choice, frame)
-            if changed is not None and changed.account.log_evidence > log_evidence:
+            gain = -np.inf if changed is None else changed.account.log_evidence - log_evidence
+            if changed is not None and gain > 0:
                 better.append(changed)
                 break
+            if len(choice) == 1:
+                refused = {k: (kind, float(gain)) for k, kind in choice.items()}
         if better:
             return max(better, key=lambda one: one.account.log_evidence)
-        rivals = tuple(
-            {kind: replace(one, log_odds=min(one.log_odds, 0.0)) for kind, one in mine.items()}
-            for mine in belief.rivals
-        )
-        return replace(belief, rivals=rivals, rounds=ROUNDS) if rivals != belief.rivals else None
+        if not refused:
+            return None
+        rivals = [dict(mine) for mine in belief.rivals]
+        for k, (kind, gain) in refused.items():
+            rivals[k][kind] = replace(rivals[k][kind], log_odds=gain)
+        return replace(belief, rivals=tuple(rivals))
 
     def _missed(self, belief: Belief, frame: Frame) -> Belief | None:
         """The belief with a contact more, where that is likelier than data left unexplained."""
@@ -526,7 +531,8 @@ def _choices(rivals: tuple[Rivals, ...]) -> list[dict[int, Kind]]:
     if surest is None or odds[surest] < LIKELIER:
         return []
     many = {k: kind for k, kind in likeliest.items() if odds[k] > odds[surest] / 2}
-    return [many, {surest: likeliest[surest]}][: len(many)]
+    alone = {surest: likeliest[surest]}
+    return [many, alone] if len(many) > 1 else [alone]
 
 
 def _is_asked(kind: Kind, rivals: Rivals) -> bool:
