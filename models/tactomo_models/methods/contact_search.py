@@ -24,7 +24,7 @@ from tactomo_protocol import Channel
 from tactomo_models.arrays import FloatArray
 from tactomo_models.methods.account import Account, Frame
 from tactomo_models.scene.field_fit import FieldFit
-from tactomo_models.scene.parameters import SIZE, UNIT_M, X, Y
+from tactomo_models.scene.parameters import SIZE, SMALLEST_SIZE, UNIT_M, X, Y
 
 MAX_MISSING = 2  # places that are told of: the third was never the one
 NEAR_M = 0.012  # of two places, or a place and an outline: nearer ones mean the same contact
@@ -96,6 +96,9 @@ class ContactSearch:
             if gain[spot] < by_chance or len(found) == MAX_MISSING:
                 break
             x, y = float(self._x[spot]), float(self._y[spot])
+            # What is smaller than the mesh can show is an error of the model, not a contact.
+            if area[spot] < np.pi * np.exp(2 * SMALLEST_SIZE):
+                continue
             if all(np.hypot(x - other.x_m, y - other.y_m) > NEAR_M for other in found):
                 radius = min(max(float(np.sqrt(area[spot] / np.pi)), RADIUS_M[0]), RADIUS_M[1])
                 found.append(MissingContact(x, y, radius, float(gain[spot])))

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from tactomo_protocol import Channel
 
-from tactomo_models.arrays import FloatArray
+from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.methods.account import Account, Frame, account_of, descended
 from tactomo_models.methods.contact_search import ContactSearch
 from tactomo_models.methods.kinds import Kind, as_kind, as_one, kind_of
@@ -311,6 +311,9 @@ class Search:
                 return self._grown(belief, born)
         if not account.at_minimum:
             return replace(belief, account=self._descended(account, frame, STEPS))
+        specks = account.contacts[:, SIZE] <= self.field.size_limits[0]
+        if specks.any():
+            return self._without_specks(belief, specks, frame)
         if belief.rounds < ROUNDS:
             for k, mine in enumerate(belief.rivals):
                 kinds = [kind for kind in self._kinds(account, k, frame) if _is_asked(kind, mine)]
@@ -333,6 +336,14 @@ class Search:
             asked_peaks=account.contacts[:, PEAK],
             done=True,
         )
+
+    def _without_specks(self, belief: Belief, specks: BoolArray, frame: Frame) -> Belief:
+        """The belief without contacts as small as may be: they are errors of the model."""
+        account = belief.account
+        rest = self._account(account.contacts[~specks], account.fitted.log_ratio, frame)
+        assert rest is not None  # nothing is frozen
+        begun = self._begun(rest, frame, belief.how)
+        return replace(begun, lacks_none=True, challenged=belief.challenged)
 
     def _kinds(self, account: Account, k: int, frame: Frame) -> list[Kind]:
         """What else a contact may be, as far as that is worth a trial."""
@@ -465,9 +476,10 @@ class Search:
                 continue
             steps = STEPS if holds else self._steps(account, frame)
             grown = self._descended(start, frame, steps, holds_ratio=holds)
-            grown = replace(grown, at_minimum=grown.at_minimum and not holds)
-            if grown.log_evidence > account.log_evidence:
-                return grown
+            # As small as it may be, it is an error of the model, not a contact.
+            is_speck = grown.contacts[-1, SIZE] <= self.field.size_limits[0]
+            if grown.log_evidence > account.log_evidence and not is_speck:
+                return replace(grown, at_minimum=grown.at_minimum and not holds)
         return account
 
     def _grown(self, belief: Belief, account: Account) -> Belief:
