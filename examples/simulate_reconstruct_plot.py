@@ -13,7 +13,7 @@ from tactomo_models import Press, Reconstructor, Reference, SkinSimulator, load_
 picture = sys.argv[1] if len(sys.argv) > 1 else "presses.png"
 skin = load_description("paper_square")
 simulator = SkinSimulator(skin, unevenness=0.03, impedance_spread=0.1)
-presses = [Press(x_m=-0.03, y_m=0.02, pressure_kpa=180, radius_m=0.02), Press(0.03, -0.02, 220, radius_m=0.02)]
+presses = [Press(-0.03, 0.02, pressure_kpa=180, radius_m=0.02), Press(0.03, -0.02, 220, 0.02)]
 
 # A converter's noise is equal on every voltage: here 60 dB below their root mean square.
 rng = np.random.default_rng(0)

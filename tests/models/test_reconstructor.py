@@ -189,7 +189,8 @@ def test_a_steady_light_press_does_not_flicker(
     assert len(ranges) == 80
     assert ranges[-1] == "below"
     assert sum(a != b for a, b in itertools.pairwise(ranges)) <= 1
-    assert all(130 < contact.max_kpa < 140 for contact in contacts), "near the curve's onset"
+    # Near the curve's onset: of a press that falls off, the sheet feels the middle alone.
+    assert all(130 < contact.max_kpa < 150 for contact in contacts), [c.max_kpa for c in contacts]
     harder = reconstructor.reconstruct(**skin.scan(press_mm(-25, 10, 150)))
     assert harder.contacts[0].pressure_range == "within", "at once"
 

@@ -218,14 +218,20 @@ class Rest:
         kept, prior = self._precision[self._keep], at.prior
         away = kept @ (self._offset[self._keep] + response) ** 2 + prior @ at.offset**2
         hessian = scale * (self._J.T @ self._J) + np.diag(kept)
-        told = without_light_peaks(at.fitted, self._jacobian(at))
-        J = likelihood.deflation[:, None] * told
-        cross = scale * (self._J.T @ J)
-        schur = scale * (J.T @ J) + np.diag(prior) - cross.T @ np.linalg.solve(hessian, cross)
+        sensed = self._jacobian(at)
+        told = without_light_peaks(at.fitted, sensed)
+
+        def schur(jacobian: FloatArray) -> FloatArray:
+            J = likelihood.deflation[:, None] * jacobian
+            cross = scale * (self._J.T @ J)
+            own = scale * (J.T @ J) + np.diag(prior)
+            return np.asarray(own - cross.T @ np.linalg.solve(hessian, cross))
+
         log_evidence = likelihood.log(chi_squared) - away / 2
-        log_evidence += log_occam(kept, hessian) + log_occam(prior, schur)
+        log_evidence += log_occam(kept, hessian) + log_occam(prior, schur(told))
         contacts, sigmas = family.split(at.fitted.parameters), np.zeros(family.free.shape)
-        sigmas[family.free] = np.sqrt(np.diag(np.linalg.inv(schur)))[: len(at.fitted.parameters)]
+        variances = np.diag(np.linalg.inv(schur(sensed)))
+        sigmas[family.free] = np.sqrt(variances)[: len(at.fitted.parameters)]
         near = len(self._near)
         log_evidence += log_prior(self._frozen) + log_prior(contacts)
         return Trial(

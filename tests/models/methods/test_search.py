@@ -19,7 +19,7 @@ from tactomo_models.physics.mesh import mesh_sheet
 from tactomo_models.scene.areas import AreaFinder
 from tactomo_models.scene.field_account import FieldAccountant
 from tactomo_models.scene.field_fit import Budget, Measured
-from tactomo_models.scene.parameters import EDGE, HOLE, PEAK, SIZE, UNIT_M, X, Y
+from tactomo_models.scene.parameters import PEAK, SIZE, UNIT_M, X, Y
 
 NOISE = 1e-3  # of each relative change
 
@@ -351,9 +351,14 @@ def test_edges_and_holes_are_what_the_data_say(skin: Skin, edge: float, hole: fl
         pytest.skip("no sheet tells pressures")
     pressed = contact(-0.004, 0.002, 0.012, peak=0.85, edge=edge, hole=hole)
     frames = (skin.frame(pressed, noise=1e-4) for _ in range(6))
-    (one,) = followed(Search(skin.sensor.fit), frames).account.contacts
-    assert (one[EDGE] > 0, one[HOLE]) == (edge > 0, hole)
-    assert one[PEAK] == pytest.approx(pressed[PEAK], rel=0.1)
+    belief = followed(Search(skin.sensor.fit), frames)
+    (one,), (mine,) = belief.account.contacts, belief.rivals
+    likely = {kind_of(one), *(kind for kind, rival in mine.items() if rival.log_odds > -3)}
+    if kind_of(one) is kind_of(pressed):
+        assert one[PEAK] == pytest.approx(pressed[PEAK], rel=0.1)
+    else:  # one graded sheet alone may leave it open, and says so by an alternative
+        assert len(skin.sensor.fit.responses) == 1
+        assert len(likely) > 1
 
 
 @pytest.mark.parametrize("budget_s", [0.005, 0.02, PLENTY_S])
