@@ -90,10 +90,14 @@ class Belief:
 
     @property
     def alternatives(self) -> list[list[Alternative]]:
-        """What else each contact may be, where it is one contact."""
+        """What else each contact may be, where it is one contact, at odds that a float holds."""
         return [
             [
-                Alternative(float(np.exp(rival.log_odds)), contact + rival.difference, rival.sigmas)
+                Alternative(
+                    float(np.exp(min(rival.log_odds, 700))),
+                    contact + rival.difference,
+                    rival.sigmas,
+                )
                 for rival in mine.values()
                 if rival.is_one
             ]
