@@ -219,6 +219,7 @@ def pressures_of(
     peak = curve.pressure(highest)
     spread, own = curve.spread(highest, highest_sigma), curve.sigma(highest)
     peak_sigma = np.hypot(spread, own)
+    least = mean_least = curve.least(highest, highest_sigma)
     if field is not None:
         # The curve in force may be another than the description's table, as after a calibration.
         by_curve = peak / np.maximum(field.peak_kpa, 1e-12)
@@ -226,6 +227,7 @@ def pressures_of(
         force_sigma = np.hypot(field.force_sigma_n * by_curve, force * own / peak)
         kpa = np.minimum(field.mean_kpa * by_curve, peak)  # but for rounding it is
         sigma = np.hypot(field.mean_sigma_kpa * by_curve, own)
+        mean_least = np.minimum(least, np.maximum(kpa - ONE_SIDED_95 * sigma, 0.0))
     else:
         kpa, sigma, force = peak, peak_sigma, 1e3 * peak * areas_m2
         by_area = magnitude * area_sigmas_m2 / areas_m2
@@ -234,7 +236,6 @@ def pressures_of(
         of_area = (kpa - slope * magnitude) * area_sigmas_m2
         of_pressure = np.hypot(curve.spread(magnitude, apart), own) * areas_m2
         force_sigma = 1e3 * np.hypot(of_pressure, of_area)
-    least = curve.least(highest, highest_sigma)
     is_force = within | (~above & curve.covers(highest, highest_sigma))
     at_least = np.maximum(force - ONE_SIDED_95 * np.nan_to_num(force_sigma), 0.0)
 
@@ -242,7 +243,7 @@ def pressures_of(
         return np.where(known, value, np.where(above, bound, np.nan))
 
     return Pressures(
-        kpa=told(kpa, np.minimum(least, np.maximum(kpa - ONE_SIDED_95 * sigma, 0.0))),
+        kpa=told(kpa, mean_least),
         sigma_kpa=told(sigma, nothing),
         force_n=told(force, at_least, is_force),
         force_sigma_n=told(force_sigma, nothing, is_force),

@@ -69,7 +69,8 @@ def test_the_replay_of_a_pressed_skin_gives_the_same_maps(
     hardest = max(contact["pressure_kpa"] for contact in pressed["contacts"])
     assert 240 < hardest <= told["range_kpa"][1]
     highest = np.nanmax(array_from_wire(pressed["pressure_kpa"]))
-    assert highest == pytest.approx(hardest, rel=0.01)  # no node of a network's shape is quite 1
+    # Each kind that a contact may be has its peak elsewhere: no node has the mean of the peaks.
+    assert highest == pytest.approx(hardest, rel=0.02)
     assert {"quiet", "fit", "network"} == {frame["tier"] for frame in live}
     again = replay(path, real=True).of("map")
     assert len(again) == len(live) == open_recording(path).summary.frames
