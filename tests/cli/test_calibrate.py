@@ -250,7 +250,7 @@ def test_a_recording_tells_what_the_sensor_showed(tactomo: Run, tmp_path: Path) 
     ]
     other = tactomo("calibrate", "fit", "log.csv", "--sensor", "sole", *options)
     assert "is a recording of palm, not of sole" in other.stderr
-    assert max(off) < 0.04
+    assert max(off) < 0.06
     if max(off) > 0.02:
         pytest.xfail("an indenter is not known to be flat, and a mean over kinds is off")
 
