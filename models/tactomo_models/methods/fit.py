@@ -120,7 +120,7 @@ class Fit:
         belief = self._search.advance(course.belief, Frame(measurement.changes, budget, propose))
         fitted = belief.account.fitted
         unexplained_s = course.unexplained_s + given_s - budget.left_s
-        if _worst_misfit(fitted) <= BAD_MISFIT:
+        if fitted.worst_misfit <= BAD_MISFIT:
             unexplained_s = 0.0
         course = replace(course, belief=belief, unexplained_s=unexplained_s)
         at_end = belief.done or unexplained_s > PATIENCE_S
@@ -132,7 +132,7 @@ class Fit:
         drifting = self._drifting(measurement)
         beside = self._search.advance(None, Frame(drifting.changes, Budget(given_s)))
         field = beside.account.fitted
-        if _worst_misfit(field) <= EXPLAINED and self._drifted(field, measurement) < MAX_DRIFT:
+        if field.worst_misfit <= EXPLAINED and self._drifted(field, measurement) < MAX_DRIFT:
             return replace(course, belief=beside, drifts=True), drifting
         return replace(course, drifts=False if beside.done else None), measurement
 
@@ -144,7 +144,7 @@ class Fit:
             return None
         propose = self._proposer(measurement)
         plain = self._search.advance(None, Frame(measurement.changes, Budget(given_s), propose))
-        return Course(plain) if _worst_misfit(plain.account.fitted) <= EXPLAINED else None
+        return Course(plain) if plain.account.fitted.worst_misfit <= EXPLAINED else None
 
     def _drifted(self, fitted: FittedField, measurement: Measurement) -> float:
         """By what share a sheet's voltages have drifted at most, beside what presses."""
@@ -181,7 +181,7 @@ class Fit:
         flags = Flag(0)
         if not belief.done and fitted.misfit > unfinished:
             flags |= Flag.NOT_CONVERGED
-        if _worst_misfit(fitted) > BAD_MISFIT or account.goes_wrong_way:
+        if fitted.worst_misfit > BAD_MISFIT or account.goes_wrong_way:
             flags |= Flag.MISFIT_HIGH
         if self._contradicts(belief.account):
             flags |= Flag.MISFIT_HIGH
@@ -241,10 +241,6 @@ class Fit:
         assert held is not None
         steps = 3  # pressures alone are nearly linear
         return self._field_fit.refine(held, measurement.changes, Budget(1.0), 0.0, steps)
-
-
-def _worst_misfit(fitted: FittedField) -> float:
-    return max(fitted.misfit_of(name) for name in fitted.residuals)
 
 
 def _in_words(belief: Belief) -> str:

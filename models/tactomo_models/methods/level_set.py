@@ -39,6 +39,7 @@ class _Solved:
 
     shapes: FittedField  # on the structure sheet
     fitted: FittedField  # the same on all sheets, with pressures
+    account: FieldAccount  # of these
     measured: Measured
 
 
@@ -72,7 +73,6 @@ class LevelSetFit:
         graded = self._fit.responses.get(Channel.MAGNITUDE)
         assert graded is None or isinstance(graded, GradedResponse)
         self._field = PressureField.on(skin.forward, graded)
-        self._last: _Solved | None = None
 
     def solve(
         self, measurement: Measurement, previous: Estimate | None, budget_s: float
@@ -81,12 +81,11 @@ class LevelSetFit:
         if Channel.STRUCTURE not in measurement.changes:
             raise UnsolvableError("the structure channel is missing")
         measured = self._skin.with_model_error(measurement).changes
-        last = self._last if previous is not None else None
-        if previous is not None and last is not None and last.fitted.converged:
-            assert previous.account is not None
-            if are_still(last.measured, measured):
-                still = replace(self._fit.compare(last.fitted, measured), converged=True)
-                return _estimate(still, previous.account, "still")
+        carried = previous.carried if previous is not None else None
+        last = carried if isinstance(carried, _Solved) else None
+        if last is not None and last.fitted.converged and are_still(last.measured, measured):
+            still = replace(self._fit.compare(last.fitted, measured), converged=True)
+            return _estimate(still, last.account, "still", last)
         budget = Budget(budget_s)
         with measurement.timed("shape"):
             outlines = {Channel.STRUCTURE: measured[Channel.STRUCTURE]}
@@ -94,8 +93,7 @@ class LevelSetFit:
             fitted = self._with_pressures(shapes, last, measured, budget)
         with measurement.timed("contacts"):
             account = self._accountant.account(fitted, measured)
-        self._last = _Solved(shapes, fitted, measured)
-        return _estimate(fitted, account, how)
+        return _estimate(fitted, account, how, _Solved(shapes, fitted, account, measured))
 
     def _shapes(
         self, last: _Solved | None, outlines: Measured, budget: Budget
@@ -160,11 +158,11 @@ class LevelSetFit:
         return replace(fitted, converged=fitted.converged and shapes.converged)
 
 
-def _estimate(fitted: FittedField, account: FieldAccount, how: str) -> Estimate:
+def _estimate(fitted: FittedField, account: FieldAccount, how: str, carried: _Solved) -> Estimate:
     flags = Flag(0)
     if not fitted.converged and fitted.misfit > GOOD_MISFIT:
         flags |= Flag.NOT_CONVERGED
-    if max(fitted.misfit_of(name) for name in fitted.residuals) > BAD_MISFIT:
+    if fitted.worst_misfit > BAD_MISFIT:
         flags |= Flag.MISFIT_HIGH
     return Estimate(
         map=account.map if Channel.MAGNITUDE in fitted.residuals else None,
@@ -176,4 +174,5 @@ def _estimate(fitted: FittedField, account: FieldAccount, how: str) -> Estimate:
         misfit=fitted.misfit,
         flags=flags,
         reason=how,
+        carried=carried,
     )

@@ -106,6 +106,11 @@ class FittedField:
         """Root mean square of the noise-weighted residual; about 1 where the model explains all."""
         return float(np.sqrt(np.mean(self.residual**2)))
 
+    @property
+    def worst_misfit(self) -> float:
+        """The misfit of the sheet that is explained worst."""
+        return max(self.misfit_of(name) for name in self.residuals)
+
     def misfit_of(self, channel: Channel) -> float:
         """The same of one sheet."""
         return float(np.sqrt(np.mean(self.residuals[channel] ** 2)))
