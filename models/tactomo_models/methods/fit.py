@@ -14,7 +14,7 @@ import numpy as np
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
-from tactomo_models.methods.account import Account, Frame, Propose
+from tactomo_models.methods.account import Frame, Propose
 from tactomo_models.methods.linear import EitherWay
 from tactomo_models.methods.magnitudes import BAD_MISFIT
 from tactomo_models.methods.method import Estimate, Skin, UnsolvableError
@@ -30,9 +30,6 @@ from tactomo_models.scene.pressure_field import PressureField
 PATIENCE_S = 1.0  # of work on data that no field explains, before a drift is tried
 EXPLAINED = 1.4  # misfit of the worst sheet, below which a drift beside a field is believed
 MAX_DRIFT = 0.2  # of a sheet's voltages, 10 K at 2 % per kelvin: more is a fault
-# Standard deviations of the log ratio's prior: of contrasts from a tenth of saturation to all of
-# it, which ordinary skins have, none comes to two.
-FAR_RATIO = 3.0
 MAX_HELD = 10  # frames without a structure scan that the last field stands in for: 0.5 s
 
 
@@ -183,8 +180,6 @@ class Fit:
             flags |= Flag.NOT_CONVERGED
         if fitted.worst_misfit > BAD_MISFIT or account.goes_wrong_way:
             flags |= Flag.MISFIT_HIGH
-        if self._contradicts(belief.account):
-            flags |= Flag.MISFIT_HIGH
         how = belief.how + (", drifted since the tare" if course.drifts else "")
         return Estimate(
             map=account.map if Channel.MAGNITUDE in measurement.changes else None,
@@ -199,13 +194,6 @@ class Fit:
             reason=f"{how}, {_in_words(belief)}",
             carried=course,
         )
-
-    def _contradicts(self, account: Account) -> bool:
-        """Whether the structure sheet would have to answer to pressure as no such sheet does."""
-        if Channel.STRUCTURE not in account.fitted.residuals or not account.family.count:
-            return False
-        precision, offset = self._field_fit.prior(account.fitted)
-        return bool(abs(offset[-1]) * np.sqrt(precision[-1]) > FAR_RATIO)
 
     def _held(self, course: Course, measurement: Measurement) -> Estimate:
         """Bridge a lost structure scan with the last field, as long as it explains the other."""

@@ -32,6 +32,9 @@ OUTLINE_ERROR = 0.07
 # Of a place, likewise: what is left of electrodes' places once the sheet is found. With half, 48 %
 # of the places on hand-made skins are within one sigma, with twice 75 %.
 PLACE_ERROR = 0.03
+# Standard deviations of what is likely of the log ratio: of contrasts from a tenth of saturation
+# to all of it, which ordinary skins have, none comes to two.
+FAR_RATIO = 3.0
 NEGLIGIBLE = 0.02  # share of an alternative that need not be drawn
 SAMPLES = 3  # per side of a map cell: what an outline covers of it is right to 3 %
 
@@ -119,11 +122,11 @@ class FieldAccountant:
         return J
 
     def _covariance(self, fitted: FittedField, measured: Measured, J: FloatArray) -> FloatArray:
-        """Covariance (N, N) of a field's parameters."""
+        """Covariance (N + 1, N + 1) of a field's parameters and the log ratio."""
         likelihood = Likelihood.of(measured)
         information = likelihood.information(J, likelihood.chi_squared(fitted.residual))
         precision = self._fit.prior(fitted)[0]
-        return np.asarray(np.linalg.inv(information + np.diag(precision)), np.float64)[:-1, :-1]
+        return np.asarray(np.linalg.inv(information + np.diag(precision)), np.float64)
 
     def _drawn(self, fitted: FittedField, measured: Measured) -> FieldAccount:
         near, (solid, share, pressure) = self._images(fitted)
@@ -327,7 +330,8 @@ class FieldAccountant:
             return known
         family, drawing = fitted.family, fitted.drawing
         J = self._sensed(fitted, measured)
-        covariance = self._covariance(fitted, measured, J)
+        with_ratio = self._covariance(fitted, measured, J)
+        covariance = with_ratio[:-1, :-1]
         by_share, by_pressure = drawing.slopes()[2:]
         cell = self._areas.node_areas_m2[drawing.nodes]
         share, pressure = drawing.share, drawing.pressure_kpa
@@ -348,6 +352,8 @@ class FieldAccountant:
             each = family.split(fitted.parameters)
             owner = self._owners(each, places[:, highest])
             edges = each[owner, EDGE]
+            if Channel.STRUCTURE in measured:
+                known["goes_wrong_way"] = self._answers_strangely(fitted, each, with_ratio)
         # What a mesh cannot tell of an outline; magnitudes go against it. A pressure that falls
         # leaves no step there.
         of_mesh = 2 * self._cell_m / np.sqrt(areas.areas_m2 / np.pi)
@@ -376,7 +382,8 @@ class FieldAccountant:
             index = family.index[owner, PEAK]
             by_peak = family.unit_kpa * np.eye(by_share.shape[1])[index]
             rests = peaks <= max(self._graded.onset_kpa, family.unit_kpa * family.peak_limits[0])
-            known["goes_wrong_way"] = self._goes_wrong_way(J[:, index], fitted.residual, rests)
+            less = self._goes_wrong_way(J[:, index], fitted.residual, rests)
+            known["goes_wrong_way"] = known["goes_wrong_way"] or less
         peak_size, peak_slope = self._felt(peaks)
         scale = areas.areas_m2 / area  # the map's, over the mesh's
         by_force = by_share * pressure[:, None] + share[:, None] * by_pressure
@@ -415,6 +422,25 @@ class FieldAccountant:
         size, _ = self._graded.relative_change(pressure_kpa)
         _, slope = self._graded.relative_change(np.maximum(pressure_kpa, self._graded.onset_kpa))
         return np.abs(size), np.abs(slope)
+
+    def _answers_strangely(
+        self,
+        fitted: FittedField,
+        each: FloatArray,  # (K, COLUMNS) its contacts
+        covariance: FloatArray,  # (N + 1, N + 1) of its parameters and the log ratio
+    ) -> bool:
+        """Tell whether the structure sheet would have to answer as no such sheet does.
+
+        What the mesh does not tell of outlines it does not tell of the ratio: far from 1, twice
+        the contrast is as good as an outline larger by a hundredth.
+        """
+        assert isinstance(fitted.family, PressureField)
+        size = fitted.family.index[:, SIZE]
+        by_size = covariance[-1, size] / covariance[size, size]
+        of_mesh = by_size * OUTLINE_ERROR * self._cell_m / np.exp(each[:, SIZE])
+        precision, offset = self._fit.prior(fitted)
+        sigma = np.sqrt(1 / precision[-1] + of_mesh @ of_mesh)
+        return bool(abs(offset[-1]) > FAR_RATIO * sigma)
 
     @staticmethod
     def _goes_wrong_way(
