@@ -22,7 +22,7 @@ from tactomo_protocol import Channel
 from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.methods.account import Account, Frame, account_of, descended
 from tactomo_models.methods.contact_search import ContactSearch
-from tactomo_models.methods.kinds import Kind, as_kind, as_one, kind_of
+from tactomo_models.methods.kinds import SHARES, Kind, as_kind, as_one, kind_of
 from tactomo_models.methods.trial import FAR_STEPS, Rest, Trial
 from tactomo_models.scans.stillness import Since, are_still
 from tactomo_models.scene.field_account import Alternative
@@ -90,7 +90,12 @@ class Belief:
 
     @property
     def alternatives(self) -> list[list[Alternative]]:
-        """What else each contact may be, where it is one contact, at odds that a float holds."""
+        """What else each contact may be, where it is one contact, at odds that a float holds.
+
+        What nobody has asked yet is as likely as it is before any data.
+        """
+        account = self.account
+        unasked = not self.done and account.family.free[:, PEAK].any()
         return [
             [
                 Alternative(
@@ -101,7 +106,10 @@ class Belief:
                 for rival in mine.values()
                 if rival.is_one
             ]
-            for contact, mine in zip(self.account.contacts, self.rivals, strict=True)
+            + (_unasked(contact, sigmas, mine) if unasked else [])
+            for contact, sigmas, mine in zip(
+                account.contacts, account.sigmas, self.rivals, strict=True
+            )
         ]
 
 
@@ -535,6 +543,18 @@ def _touching(contacts: FloatArray, near_m: float) -> Iterator[list[int]]:
     count, group = connected_components(apart < reach[:, None] + reach + near_m)
     groups = [np.flatnonzero(group == number).tolist() for number in range(count)]
     yield from sorted((one for one in groups if len(one) > 1), key=len, reverse=True)
+
+
+def _unasked(contact: FloatArray, sigmas: FloatArray, rivals: Rivals) -> list[Alternative]:
+    """Kinds of other peaks that a contact has not been asked for."""
+    own = kind_of(contact)
+    kinds = {Kind.EVEN, Kind.FALLING, Kind.RING} - {own, *rivals}
+    if own is Kind.ROUNDED:
+        kinds -= {Kind.EVEN}
+    return [
+        Alternative(SHARES[kind] / SHARES[own], as_kind(contact, kind)[0], sigmas)
+        for kind in sorted(kinds)
+    ]
 
 
 def _choices(rivals: tuple[Rivals, ...]) -> list[dict[int, Kind]]:
