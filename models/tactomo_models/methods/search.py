@@ -51,6 +51,23 @@ ANOTHER_PRESS = np.log(1.25)  # change of a peak, from which evidence of a kind 
 
 
 @dataclass(frozen=True)
+class Pass:
+    """What all contacts are asked, before anything is decided."""
+
+    kinds: frozenset[Kind]
+    least: float  # log odds from which a rival takes a contact's place
+    is_last: bool
+
+
+# First what a peak depends on most, by half, for where it makes a contact hopeless, it need be
+# asked for nothing else.
+PASSES = (
+    Pass(frozenset({Kind.EVEN, Kind.FALLING}), -HOPELESS, is_last=False),
+    Pass(frozenset(Kind), LIKELIER, is_last=True),
+)
+
+
+@dataclass(frozen=True)
 class Rival:
     """What else a contact may be."""
 
@@ -326,12 +343,16 @@ class Search:
         specks = account.contacts[:, SIZE] <= self.field.size_limits[0]
         if specks.any():
             return self._without_specks(belief, specks, frame)
-        if belief.rounds < ROUNDS:
+        for each in PASSES if belief.rounds < ROUNDS else ():
             for k, mine in enumerate(belief.rivals):
-                kinds = [kind for kind in self._kinds(account, k, frame) if _is_asked(kind, mine)]
+                kinds = [
+                    kind
+                    for kind in self._kinds(account, k, frame)
+                    if kind in each.kinds and _is_asked(kind, mine)
+                ]
                 if kinds:
                     return self._asked(belief, k, kinds, frame)
-            better = self._decided(belief, frame)
+            better = self._decided(belief, each, frame)
             if better is not None:
                 return better
         if not belief.lacks_none:
@@ -384,12 +405,13 @@ class Search:
         rivals = (*belief.rivals[:k], mine, *belief.rivals[k + 1 :])
         return replace(belief, rivals=rivals)
 
-    def _decided(self, belief: Belief, frame: Frame) -> Belief | None:
+    def _decided(self, belief: Belief, asked: Pass, frame: Frame) -> Belief | None:
         """The belief with each contact of its likeliest kind, where that is likelier altogether."""
         log_evidence = belief.account.log_evidence
-        better = [born] if (born := self._missed(belief, frame)) else []
+        born = self._missed(belief, frame) if asked.is_last else None
+        better = [born] if born else []
         refused: dict[int, tuple[Kind, float]] = {}  # by the fit of all, and its log odds
-        for choice in _choices(belief.rivals):
+        for choice in _choices(belief.rivals, asked.least):
             changed = self._changed(belief, choice, frame)
             gain = -np.inf if changed is None else changed.account.log_evidence - log_evidence
             if changed is not None and gain > 0:
@@ -557,14 +579,14 @@ def _unasked(contact: FloatArray, sigmas: FloatArray, rivals: Rivals) -> list[Al
     ]
 
 
-def _choices(rivals: tuple[Rivals, ...]) -> list[dict[int, Kind]]:
+def _choices(rivals: tuple[Rivals, ...], least: float) -> list[dict[int, Kind]]:
     """What contacts may become: those that are about as sure as the surest at once, or it alone."""
     likeliest = {
         k: max(mine, key=lambda kind: mine[kind].log_odds) for k, mine in enumerate(rivals) if mine
     }
     odds = {k: rivals[k][kind].log_odds for k, kind in likeliest.items()}
     surest = max(odds, key=lambda k: odds[k], default=None)
-    if surest is None or odds[surest] < LIKELIER:
+    if surest is None or odds[surest] < least:
         return []
     many = {k: kind for k, kind in likeliest.items() if odds[k] > odds[surest] / 2}
     alone = {surest: likeliest[surest]}
