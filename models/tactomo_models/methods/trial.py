@@ -41,6 +41,9 @@ from tactomo_models.scene.pressure_field import PressureField
 NEAR_NODES = 5
 # Of a trial, which takes three where the data are explained; elsewhere it may have far to go.
 STEPS, FAR_STEPS = 6, 20
+# A trial is given up where after so many steps the Jacobian foresees an end that is worse by so
+# many nats: twice what makes a rival hopeless.
+SURE_STEPS, HOPELESSLY = 2, 12.0
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,8 @@ class Rest:
         normal = J.T @ J
         normal[np.diag_indices(len(normal))] += self._precision[self._keep]
         self._root = np.linalg.cholesky(normal)
+        others_away = self._precision[self._keep] @ self._offset[self._keep] ** 2
+        self._cost = fitted.cost - float(others_away)  # as a trial's is counted
         self._aside = np.linalg.solve(self._root, J.T)  # (n, sum M): what of a residual they take
         told = without_light_peaks(fitted, account.jacobian)[:, self._keep]
         self._J = frame.likelihood.deflation[:, None] * told
@@ -119,15 +124,20 @@ class Rest:
             return self._touching.trial(contacts)
         if best is None:
             return None
-        damping = 1.0
+        damping, unit = 1.0, self._account.unit
         explained = self._frame.likelihood.explains(self._account.chi_squared)
         steps = STEPS if explained else FAR_STEPS
-        for _ in range(steps if len(best.fitted.parameters) else 0):
-            better, damping = self._step(family, best, damping)
+        for taken in range(steps if len(best.fitted.parameters) else 0):
+            normal, gradient = self._normal_equations(best)
+            left = foreseen(normal, gradient)
+            worse = (best.cost - left - self._cost) * unit / 2
+            if left * unit < NEGLIGIBLE or (taken >= SURE_STEPS and worse > HOPELESSLY):
+                break
+            better, damping = self._step(family, best, normal, gradient, damping)
             if better is None:
                 break
             gain, best = best.cost - better.cost, better
-            if gain * self._account.unit < NEGLIGIBLE:
+            if gain * unit < NEGLIGIBLE:
                 break
         return self._judged(family, best)
 
@@ -177,17 +187,23 @@ class Rest:
         cost = float(residual @ residual - taken @ taken + prior @ offset**2)
         return _Assessed(fitted, taken, prior, offset, cost)
 
-    def _step(
-        self, family: PressureField, at: _Assessed, damping: float
-    ) -> tuple[_Assessed | None, float]:
-        """Levenberg-Marquardt, the others answering: what is better, and the damping for next."""
+    def _normal_equations(self, at: _Assessed) -> tuple[FloatArray, FloatArray]:
+        """Matrix (n, n) and gradient (n,) of half the linearised cost, the others answering."""
         J = self._jacobian(at)
         own = self._aside @ J
         normal = J.T @ J - own.T @ own
         normal[np.diag_indices(len(normal))] += at.prior
-        gradient = J.T @ at.fitted.residual - own.T @ at.taken + at.prior * at.offset
-        if foreseen(normal, gradient) * self._account.unit < NEGLIGIBLE:
-            return None, damping
+        return normal, J.T @ at.fitted.residual - own.T @ at.taken + at.prior * at.offset
+
+    def _step(
+        self,
+        family: PressureField,
+        at: _Assessed,
+        normal: FloatArray,
+        gradient: FloatArray,
+        damping: float,
+    ) -> tuple[_Assessed | None, float]:
+        """Levenberg-Marquardt, the others answering: what is better, and the damping for next."""
         count, fitted = len(at.fitted.parameters), at.fitted
 
         def limited(step: FloatArray) -> FloatArray:
