@@ -23,7 +23,7 @@ from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.methods.account import Account, Frame, account_of, descended
 from tactomo_models.methods.contact_search import ContactSearch
 from tactomo_models.methods.kinds import SHARES, Kind, as_kind, as_one, kind_of
-from tactomo_models.methods.trial import FAR_STEPS, Rest, Trial
+from tactomo_models.methods.trial import FAR_STEPS, Rest, Trial, gaps_between
 from tactomo_models.scans.stillness import Since, are_still
 from tactomo_models.scene.field_account import Alternative
 from tactomo_models.scene.field_fit import COLD_S, FieldFit, Measured
@@ -559,10 +559,7 @@ class Search:
 
 def _touching(contacts: FloatArray, near_m: float) -> Iterator[list[int]]:
     """Groups of contacts whose outlines are so near to each other, the largest group first."""
-    place = contacts[:, [X, Y]] * UNIT_M
-    reach = np.exp(contacts[:, SIZE] + np.hypot(*contacts[:, [E1, E2]].T))
-    apart = np.linalg.norm(place[:, None] - place, axis=2)
-    count, group = connected_components(apart < reach[:, None] + reach + near_m)
+    count, group = connected_components(gaps_between(contacts) < near_m)
     groups = [np.flatnonzero(group == number).tolist() for number in range(count)]
     yield from sorted((one for one in groups if len(one) > 1), key=len, reverse=True)
 

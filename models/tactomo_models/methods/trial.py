@@ -46,6 +46,14 @@ STEPS, FAR_STEPS = 6, 20
 SURE_STEPS, HOPELESSLY = 2, 12.0
 
 
+def gaps_between(contacts: FloatArray) -> FloatArray:
+    """Distances (K, K) between outlines of contacts (K, COLUMNS), m, about."""
+    place = contacts[:, [X, Y]] * UNIT_M
+    reach = np.exp(contacts[:, SIZE] + np.hypot(*contacts[:, [E1, E2]].T))
+    apart = np.linalg.norm(place[:, None] - place, axis=2)
+    return np.asarray(apart - reach[:, None] - reach)
+
+
 @dataclass(frozen=True)
 class Trial:
     """What a trial ended in."""
@@ -83,7 +91,9 @@ class Rest:
         assert isinstance(fitted.family, PressureField)
         self._precision, self._offset = fit.prior(fitted)
         others = [k for k in range(len(account.contacts)) if k not in self._replaced]
-        gaps = self._gaps(others)
+        gaps = gaps_between(account.contacts)[np.ix_(others, self._replaced)].min(
+            axis=1, initial=np.inf
+        )
         nearest = [others[at] for at in np.argsort(gaps)]
         near = np.count_nonzero(gaps < NEAR_NODES * field.half_width_m) if is_apart else len(others)
         self._background = None
@@ -151,18 +161,6 @@ class Rest:
     def _family(self, contacts: FloatArray) -> PressureField:
         every = np.vstack([self._near, contacts])
         return self._field.of(every, fits_peaks=self._frame.fits_peaks)
-
-    def _gaps(self, others: Sequence[int]) -> FloatArray:
-        """Distances of other contacts' outlines from those that are replaced, about."""
-        each = self._account.contacts
-        place, reach = (
-            each[:, [X, Y]] * UNIT_M,
-            np.exp(each[:, SIZE] + np.hypot(*each[:, [E1, E2]].T)),
-        )
-        own = self._replaced
-        apart = np.linalg.norm(place[others][:, None] - place[own], axis=2)
-        gaps = apart - reach[others][:, None] - reach[own]
-        return np.asarray(gaps.min(axis=1, initial=np.inf))
 
     def _evaluated(
         self, family: PressureField, parameters: FloatArray, log_ratio: float
