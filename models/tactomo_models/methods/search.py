@@ -23,24 +23,23 @@ from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.methods.account import Account, Frame, account_of, descended
 from tactomo_models.methods.contact_search import ContactSearch
 from tactomo_models.methods.kinds import SHARES, Kind, as_kind, as_one, kind_of
-from tactomo_models.methods.trial import FAR_STEPS, Rest, Trial, gaps_between
+from tactomo_models.methods.trial import FAR_STEPS, HOPELESS, Rest, Trial, gaps_between
 from tactomo_models.scans.stillness import Since, are_still
 from tactomo_models.scene.field_account import Alternative
 from tactomo_models.scene.field_fit import COLD_S, FieldFit, Measured
-from tactomo_models.scene.parameters import COLUMNS, PEAK, SIZE, UNIT_M, X, Y
+from tactomo_models.scene.parameters import COLUMNS, E1, E2, PEAK, SIZE, UNIT_M, X, Y
 from tactomo_models.scene.pressure_field import PressureField
 from tactomo_models.scene.sheet_response import GradedResponse
 
 MAX_CONTACTS = 12
-# Logarithms of odds. A rival below `HOPELESS` is not asked again: what others become changes its
-# odds by less. One above `OPEN` is asked again once they have become something else.
-HOPELESS, OPEN = -6.0, -3.0
+OPEN = -3.0  # logarithm of odds: a rival above is asked again once others have become another kind
 LIKELIER = (
     1.0  # from which a rival takes a contact's place; below, the mean of both is shown anyway
 )
-# Of a contact that data explain: the uncertainty of a logarithm of its size, from which it may be
-# none. With every contact asked, cold frames take a third longer.
-KNOWN_SIZE = 0.25
+# Of a contact that data explain: half the logarithm of its axes' ratio, from which it may be two
+# (two circles 8 mm apart have 0.2), and the uncertainty of a logarithm of its size, from which it
+# may be none. With every contact asked for both, cold frames take a third longer.
+LONG, KNOWN_SIZE = 0.1, 0.25
 FEW_STEPS = 4  # of starts that are compared: a start's cost says little before
 STEPS = 4  # of a fit in one go, before what is left is looked at
 # Chi-squared over the count of data, from which a contact is missing rather than of another kind.
@@ -59,11 +58,10 @@ class Pass:
 
 
 # First what a peak depends on most, by half: where it makes a contact hopeless, that need be asked
-# for nothing else. Last what costs most.
+# for nothing else.
 PASSES = (
     Pass(frozenset({Kind.EVEN, Kind.FALLING}), -HOPELESS, is_last=False),
-    Pass(frozenset(Kind) - {Kind.TWO}, LIKELIER, is_last=False),
-    Pass(frozenset({Kind.TWO}), LIKELIER, is_last=True),
+    Pass(frozenset(Kind), LIKELIER, is_last=True),
 )
 
 
@@ -347,7 +345,7 @@ class Search:
             for k, mine in enumerate(belief.rivals):
                 kinds = [
                     kind
-                    for kind in self._kinds(belief, k, frame)
+                    for kind in self._kinds(account, k, frame)
                     if kind in each.kinds and _is_asked(kind, mine)
                 ]
                 if kinds:
@@ -378,22 +376,17 @@ class Search:
         begun = self._begun(rest, frame, belief.how)
         return replace(begun, lacks_none=True, challenged=belief.challenged)
 
-    def _kinds(self, belief: Belief, k: int, frame: Frame) -> list[Kind]:
-        """What else a contact may be, as far as that is worth a trial.
-
-        Two contacts leave no ellipse, so that one whose outline is as good is no two.
-        """
-        account = belief.account
-        own = kind_of(account.contacts[k])
+    def _kinds(self, account: Account, k: int, frame: Frame) -> list[Kind]:
+        """What else a contact may be, as far as that is worth a trial."""
+        contact, own = account.contacts[k], kind_of(account.contacts[k])
         kinds = [Kind.EVEN, Kind.ROUNDED]
         if account.family.free[k, PEAK]:
             kinds += [Kind.FALLING, Kind.RING]
         unexplained = not frame.likelihood.explains(account.chi_squared)
         if account.sigmas[k, SIZE] > KNOWN_SIZE or unexplained:
             kinds.append(Kind.NONE)
-        rounded = belief.rivals[k].get(Kind.ROUNDED)
-        bends = own is Kind.ROUNDED or (rounded is not None and rounded.log_odds > 0)
-        if (bends or unexplained) and account.family.count < MAX_CONTACTS:
+        is_long = float(np.hypot(*contact[[E1, E2]])) > LONG or own is Kind.ROUNDED
+        if (is_long or unexplained) and account.family.count < MAX_CONTACTS:
             kinds.append(Kind.TWO)
         return [kind for kind in kinds if kind is not own]
 

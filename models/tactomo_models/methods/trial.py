@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -41,9 +41,13 @@ from tactomo_models.scene.pressure_field import PressureField
 NEAR_NODES = 5
 # Of a trial, which takes three where the data are explained; elsewhere it may have far to go.
 STEPS, FAR_STEPS = 6, 20
-# A trial is given up where after so many steps the Jacobian foresees an end that is worse by so
-# many nats: twice what makes a rival hopeless.
-SURE_STEPS, HOPELESSLY = 2, 12.0
+# Of chi-squared: what the Jacobian foresees of a last step is taken for true, without a solve. With
+# a tenth of it trials take a sixth more solves; maps of mixed presses are the same to 0.0002.
+FORESEEN = 1.0
+# Logarithm of odds: a rival below is not asked again, for what others become changes its odds by
+# less. Where after so many steps the Jacobian foresees such an end, a trial is given up: after one,
+# a tenth fewer solves, rectangles and rings 0.983 instead of 0.984; after three, a tenth more.
+HOPELESS, SURE_STEPS = -6.0, 2
 
 
 def gaps_between(contacts: FloatArray) -> FloatArray:
@@ -113,8 +117,6 @@ class Rest:
         normal = J.T @ J
         normal[np.diag_indices(len(normal))] += self._precision[self._keep]
         self._root = np.linalg.cholesky(normal)
-        others_away = self._precision[self._keep] @ self._offset[self._keep] ** 2
-        self._cost = fitted.cost - float(others_away)  # as a trial's is counted
         self._aside = np.linalg.solve(self._root, J.T)  # (n, sum M): what of a residual they take
         told = without_light_peaks(fitted, account.jacobian)[:, self._keep]
         self._J = frame.likelihood.deflation[:, None] * told
@@ -137,19 +139,24 @@ class Rest:
         damping, unit = 1.0, self._account.unit
         explained = self._frame.likelihood.explains(self._account.chi_squared)
         steps = STEPS if explained else FAR_STEPS
+        J = self._jacobian(best)
         for taken in range(steps if len(best.fitted.parameters) else 0):
-            normal, gradient = self._normal_equations(best)
-            left = foreseen(normal, gradient)
-            worse = (best.cost - left - self._cost) * unit / 2
-            if left * unit < NEGLIGIBLE or (taken >= SURE_STEPS and worse > HOPELESSLY):
-                break
+            normal, gradient = self._normal_equations(best, J)
+            near_end = foreseen(normal, gradient) * unit < FORESEEN
+            if near_end or taken >= SURE_STEPS:
+                newton = np.asarray(-np.linalg.solve(normal, gradient), np.float64)
+                last = self._limited(family, best.fitted, newton)
+                end = self._judged(family, best, J, last)
+                if near_end or end.log_odds < HOPELESS:
+                    return end
             better, damping = self._step(family, best, normal, gradient, damping)
             if better is None:
                 break
             gain, best = best.cost - better.cost, better
+            J = self._jacobian(best)
             if gain * unit < NEGLIGIBLE:
                 break
-        return self._judged(family, best)
+        return self._judged(family, best, J, np.zeros(J.shape[1]))
 
     @cached_property
     def _touching(self) -> Rest:
@@ -185,9 +192,8 @@ class Rest:
         cost = float(residual @ residual - taken @ taken + prior @ offset**2)
         return _Assessed(fitted, taken, prior, offset, cost)
 
-    def _normal_equations(self, at: _Assessed) -> tuple[FloatArray, FloatArray]:
+    def _normal_equations(self, at: _Assessed, J: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Matrix (n, n) and gradient (n,) of half the linearised cost, the others answering."""
-        J = self._jacobian(at)
         own = self._aside @ J
         normal = J.T @ J - own.T @ own
         normal[np.diag_indices(len(normal))] += at.prior
@@ -203,13 +209,7 @@ class Rest:
     ) -> tuple[_Assessed | None, float]:
         """Levenberg-Marquardt, the others answering: what is better, and the damping for next."""
         count, fitted = len(at.fitted.parameters), at.fitted
-
-        def limited(step: FloatArray) -> FloatArray:
-            parameters = family.bounded(fitted.parameters + step[:count])
-            ratio = self._fit.bounded_ratio(fitted.log_ratio + float(step[count:].sum()))
-            off = np.append(parameters - fitted.parameters, ratio - fitted.log_ratio)
-            return off[: len(step)]
-
+        limited = partial(self._limited, family, fitted)
         steps = damped_steps(normal, gradient, at.prior, damping, limited, self._account.unit)
         for step, damped in steps:
             trial = self._assessed(
@@ -221,18 +221,33 @@ class Rest:
                 return trial, max(damped / 5, 1e-3)
         return None, damping
 
+    def _limited(self, family: PressureField, fitted: FittedField, step: FloatArray) -> FloatArray:
+        """A step cut where a parameter, or the log ratio, has its limit."""
+        count = len(fitted.parameters)
+        parameters = family.bounded(fitted.parameters + step[:count])
+        ratio = self._fit.bounded_ratio(fitted.log_ratio + float(step[count:].sum()))
+        off = np.append(parameters - fitted.parameters, ratio - fitted.log_ratio)
+        return off[: len(step)]
+
     def _jacobian(self, at: _Assessed) -> FloatArray:
         return self._fit.jacobian(at.fitted, self._frame.measured)[:, self._own]
 
-    def _judged(self, family: PressureField, at: _Assessed) -> Trial:
+    def _judged(
+        self,
+        family: PressureField,
+        at: _Assessed,
+        sensed: FloatArray,  # (sum M, n) its Jacobian
+        step: FloatArray,  # (n,) that is left to go, to first order
+    ) -> Trial:
         account, likelihood = self._account, self._frame.likelihood
-        chi_squared = likelihood.chi_squared(at.fitted.residual - self._aside.T @ at.taken)
+        ahead = sensed @ step
+        taken = at.taken + self._aside @ ahead
+        chi_squared = likelihood.chi_squared(at.fitted.residual + ahead - self._aside.T @ taken)
         scale = likelihood.precision(chi_squared)
-        response = -np.linalg.solve(self._root.T, at.taken)
+        response = -np.linalg.solve(self._root.T, taken)
         kept, prior = self._precision[self._keep], at.prior
-        away = kept @ (self._offset[self._keep] + response) ** 2 + prior @ at.offset**2
+        away = kept @ (self._offset[self._keep] + response) ** 2 + prior @ (at.offset + step) ** 2
         hessian = scale * (self._J.T @ self._J) + np.diag(kept)
-        sensed = self._jacobian(at)
         told = without_light_peaks(at.fitted, sensed)
 
         def schur(jacobian: FloatArray) -> FloatArray:
@@ -243,9 +258,10 @@ class Rest:
 
         log_evidence = likelihood.log(chi_squared) - away / 2
         log_evidence += log_occam(kept, hessian) + log_occam(prior, schur(told))
-        contacts, sigmas = family.split(at.fitted.parameters), np.zeros(family.free.shape)
+        count, sigmas = len(at.fitted.parameters), np.zeros(family.free.shape)
+        contacts = family.split(at.fitted.parameters + step[:count])
         variances = np.diag(np.linalg.inv(schur(sensed)))
-        sigmas[family.free] = np.sqrt(variances)[: len(at.fitted.parameters)]
+        sigmas[family.free] = np.sqrt(variances)[:count]
         near = len(self._near)
         log_evidence += log_prior(self._frozen) + log_prior(contacts)
         return Trial(
