@@ -107,10 +107,12 @@ class Belief:
     def alternatives(self) -> list[list[Alternative]]:
         """What else each contact may be, where it is one contact, at odds that a float holds.
 
-        What nobody has asked yet is as likely as it is before any data.
+        What nobody has asked yet is as likely as it is before any data. Of what presses too lightly
+        for the graded sheet no kind has another peak.
         """
-        account = self.account
-        unasked = not self.done and account.family.free[:, PEAK].any()
+        account, family = self.account, self.account.family
+        above = account.contacts[:, PEAK] > family.onset
+        unasked = above & family.free[:, PEAK] & (not self.done)
         return [
             [
                 Alternative(
@@ -121,9 +123,9 @@ class Belief:
                 for rival in mine.values()
                 if rival.is_one
             ]
-            + (_unasked(contact, sigmas, mine) if unasked else [])
-            for contact, sigmas, mine in zip(
-                account.contacts, account.sigmas, self.rivals, strict=True
+            + (_unasked(contact, sigmas, mine) if is_open else [])
+            for contact, sigmas, mine, is_open in zip(
+                account.contacts, account.sigmas, self.rivals, unasked, strict=True
             )
         ]
 
