@@ -42,8 +42,8 @@ NEAR_NODES = 5
 # Of a trial, which takes three where the data are explained; elsewhere it may have far to go.
 STEPS, FAR_STEPS = 6, 20
 # Of chi-squared: what the Jacobian foresees of a last step is taken for true, without a solve. Half
-# or twice of it changes solves by 3 % and maps of mixed presses by 0.0001; with twice, a ring that a
-# soft press is taken for is 0.7 nats off.
+# or twice of it changes solves by 3 % and maps of mixed presses by 0.0001; with twice, a ring that
+# a soft press is taken for is 0.7 nats off.
 FORESEEN = 0.5
 # Logarithm of odds: a rival below is not asked again, for what others become changes its odds by
 # less. Where after so many steps the Jacobian foresees such an end, a trial is given up: after one,
