@@ -24,8 +24,7 @@ PRESSED = 50  # the frame of the recorded grasp that is published
 @pytest.mark.slow
 def test_a_skin_becomes_a_bag_with_the_topics_of_the_page(tmp_path: Path) -> None:
     page = Page("docs/ros2.md")
-    demo, *_ = page.commands("Live, where")
-    bag = page.commands("A recording")
+    demo, *bag = page.commands("A recording")
     topics = {
         name.replace("SENSOR", "skin") for name in re.findall(r"^\| `(/\S+)`", page.text, re.M)
     }

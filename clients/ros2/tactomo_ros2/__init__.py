@@ -1,5 +1,5 @@
 """tactomo in ROS 2, without a ROS installation: bags of recordings, and messages live.
 
 `messages` says what a frame is in ROS; `bag` writes recorded frames; `live` passes on a running
-sensor's, by `rmw_zenoh` or by the node in the folder above. Needs the extra `ros2`.
+sensor's, by the node in the folder above. Needs the extra `ros2`.
 """

@@ -1,4 +1,4 @@
-"""A running sensor's frames as ROS 2 messages, for whatever carries them: Zenoh, or a node."""
+"""A running sensor's frames as ROS 2 messages, for a node that publishes them."""
 
 from __future__ import annotations
 

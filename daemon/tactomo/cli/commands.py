@@ -50,7 +50,6 @@ COMMANDS = {
         (RUN, "twin", "Simulate a skin behind simulated firmware.", "run.twin"),
         (RUN, "viewer", "Serve a web page with a daemon's maps and contacts.", "run.viewer"),
         (RUN, "foxglove", "Serve maps, contacts and events to Foxglove.", "run.foxglove"),
-        (RUN, "ros2", "Publish maps and contacts to ROS 2, by Zenoh.", "run.ros2"),
         (STEER, "status", "Show how the daemon is, first what is wrong.", "steer.status"),
         (STEER, "doctor", "Examine a skin at rest, and what to mend.", "doctor.doctor"),
         (STEER, "watch", "Show map, contacts and health in the terminal.", "steer.watch"),

@@ -2,7 +2,7 @@
 
 It needs `pip install 'tactomo[ros2]'` in ROS's Python (3.12: Jazzy, Kilted). Parameters: `sensor`
 and `stream`, whose they are; `keys`, a folder, for a daemon beyond this computer; `parent` and
-`pose`, where the sensor hangs, as in `tactomo ros2`; `tf`, whether contacts get frames.
+`pose`, where the sensor hangs, as in `tactomo export --ros2`; `tf`, whether contacts get frames.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ app = typer_app(
     no_args_is_help=True,
     epilog=examples(
         "tactomo service install left_forearm --port /dev/ttyACM0 --dry-run",
-        "tactomo service status",
+        "tactomo service example > skin.toml",
     ),
 )
 Name = Annotated[str, typer.Argument(help="The skin's name: left_forearm.")]
@@ -67,7 +67,9 @@ def install(
     plan = plan_install(name, names, rules, root, program or _program(dry_run))
     _carry_out(plan, dry_run)
     if not dry_run:
-        typer.echo(f"tactomo@{name} is installed; `tactomo service status {name}` shows how it is")
+        typer.echo(
+            f"tactomo@{name} is installed; `systemctl status tactomo@{name}` shows how it is"
+        )
 
 
 @app.command(
@@ -88,26 +90,6 @@ def uninstall(
     if name is not None:
         _check_name(name)
     _carry_out(plan_uninstall(name, root.absolute()), dry_run)
-
-
-@app.command(epilog=examples("tactomo service status", "tactomo service status palm"))
-def status(
-    name: Annotated[str | None, typer.Argument(help="The skin's name. [all]")] = None,
-) -> None:
-    """Show what systemd says of the skins' services, with the last lines of their logs."""
-    import subprocess
-
-    from tactomo.errors import ServiceError
-    from tactomo.service.installation import check_running_systemd, installed
-
-    check_running_systemd()
-    if name is None and not installed(Path("/")):
-        raise ServiceError(
-            "no skin's service is installed", "tactomo service install NAME --port PORT"
-        )
-    unit = f"tactomo@{name or '*'}.service"
-    command = ["systemctl", "status", "--no-pager", "--lines=5", unit]
-    raise typer.Exit(1 if subprocess.run(command, check=False).returncode else 0)
 
 
 @app.command(epilog=examples("tactomo service example > skin.toml"))
