@@ -21,7 +21,6 @@ from tactomo_models import (
     Reference,
     SensorDescription,
 )
-from tactomo_models.arrays import FloatArray
 from tactomo_models.calibration.calibration_file import PressureCalibration
 from tactomo_models.calibration.taught_skin import TaughtSkin
 from tactomo_models.known_skin import SkinAtStart, skin_at_start
@@ -34,6 +33,7 @@ from tactomo.events import OnEvent, RateLimit
 from tactomo.imaging import frames
 from tactomo.imaging.calibration_in_force import CalibrationInForce
 from tactomo.imaging.frame_marks import FrameMarks
+from tactomo.imaging.frozen_converter import FrozenConverters, Volts
 from tactomo.imaging.kept_reference import KeptReference, KnownSkin
 from tactomo.imaging.method_in_force import Effort, MethodInForce
 from tactomo.imaging.processor_share import ProcessorShare
@@ -45,8 +45,6 @@ from tactomo.stream.publisher import Publisher
 from tactomo.timing import Durations, Rate
 
 REFUSAL_PERIOD_S: Final = 600.0
-
-Volts = dict[Channel, FloatArray]
 
 log = structlog.get_logger()
 
@@ -99,6 +97,7 @@ class Imaging:
             self._fall_back,
             on_event,
         )
+        self._frozen = FrozenConverters(on_event)
         self._kept = kept
         self._is_disputed = False  # the skin at the start was not as the reference in force has it
         self._is_unchecked = False  # what lay on it when the reference in force was taken
@@ -221,6 +220,7 @@ class Imaging:
             self._reconstructor.forget_shape()
         volts = {scan.channel: scan.volts for scan in dual.scans}
         self._publish_scan(dual, timing, volts)
+        volts = self._frozen.without(volts, self.reference)
         clipped = [scan.channel for scan in dual.scans if scan.flags & ScanFlag.SATURATED]
         frame = self._reconstruct(volts, clipped, is_exact=mark is not None)
         if frame is not None and self._is_disputed:

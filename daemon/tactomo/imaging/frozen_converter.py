@@ -1,0 +1,61 @@
+"""A converter that is frozen: its scans repeat bit for bit while their counter goes on.
+
+Noise makes every scan another one. Where the scans of a tare had noise, one that is the last one
+over again was not measured, however whole its packet: what it says of the skin is of another time.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from tactomo_models import Reference
+from tactomo_models.arrays import FloatArray
+from tactomo_protocol import Channel
+
+from tactomo.events import OnEvent
+
+Volts = dict[Channel, FloatArray]
+
+
+class FrozenConverters:
+    """Leaves out channels that repeat themselves. Belongs to one thread."""
+
+    def __init__(self, on_event: OnEvent) -> None:
+        self._on_event = on_event
+        self._last: Volts = {}
+        self._frozen: set[Channel] = set()
+
+    def without(self, volts: Volts, reference: Reference | None) -> Volts:
+        """The channels of a dual scan that were measured; told when that changes for one."""
+        repeats = {
+            channel
+            for channel, scan in volts.items()
+            if channel in self._last
+            and np.array_equal(scan, self._last[channel])
+            and _is_noisy(reference, channel)
+        }
+        self._last = self._last | volts
+        for channel in sorted(repeats - self._frozen):
+            self._on_event(
+                "converter_frozen",
+                "warning",
+                f"{channel} scans repeat bit for bit, though they had noise at the tare; maps go "
+                "on without them",
+                "switch that channel's board off and on; if it stays so, its converter or firmware "
+                "is at fault",
+            )
+        for channel in sorted((self._frozen - repeats) & volts.keys()):
+            self._on_event("converter_back", "info", f"{channel} scans are measured again")
+        self._frozen = (self._frozen - volts.keys()) | repeats
+        return {channel: scan for channel, scan in volts.items() if channel not in repeats}
+
+
+def _is_noisy(reference: Reference | None, channel: Channel) -> bool:
+    """Whether scans at rest differed, in most of their voltages."""
+    noise: Any = getattr(reference, f"{channel}_noise", None)
+    return (
+        reference is not None
+        and reference.is_noise_measured
+        and (noise is not None and float(np.median(noise)) > 0)
+    )

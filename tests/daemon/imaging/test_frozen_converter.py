@@ -1,0 +1,43 @@
+"""Scans that repeat bit for bit were not measured: the channel is missing, and told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from daemon_bench import BOTH, REST, scan
+from tactomo_protocol import Channel
+
+Start = Callable[..., Any]
+
+
+def freeze(b: Any, frozen: tuple[Channel, ...], load: float) -> dict[str, Any]:
+    """Send a dual scan whose frozen channels read what they read at the start."""
+    b.skin.counter += 1
+    for channel in BOTH:
+        fresh = scan(channel, b.skin.counter, REST * (1 + load))
+        stuck = replace(scan(channel, 1), counter=fresh.counter, device_us=fresh.device_us)
+        b.skin.line_of(channel).say(stuck if channel in frozen else fresh)
+    frame: dict[str, Any] = b.listener.frame(b.skin.counter)
+    return frame
+
+
+@pytest.mark.parametrize("frozen", [(Channel.MAGNITUDE,), (Channel.STRUCTURE,), BOTH])
+def test_a_frozen_channel_is_missing_and_told(bench: Start, frozen: tuple[Channel, ...]) -> None:
+    b = bench(ports=2, lossless=True)
+    b.tare()
+    freeze(b, frozen, 0.1)  # the first one repeats nothing
+    flags = {f"{channel}_missing" for channel in frozen}
+    for _ in range(3):
+        frame = freeze(b, frozen, 0.1)
+        assert flags <= set(frame["flags"])
+    for channel in frozen:
+        told = b.listener.wait("event", lambda e, c=channel: e["detail"].startswith(str(c)))
+        assert told["name"] == "converter_frozen"
+        assert told["next_step"]
+    assert b.step(0.1)["flags"] == []
+    b.listener.event("converter_back")
+    names = [event["name"] for event in b.listener.of("event")]
+    assert names.count("converter_frozen") == len(frozen)
