@@ -16,6 +16,7 @@ from selenium import webdriver
 from selenium.common.exceptions import WebDriverException
 from selenium.webdriver.chrome.service import Service
 from tactomo.cli import main
+from tactomo.ending import AS_WELL, ASKED
 from threadpoolctl import threadpool_limits
 
 pytest_plugins = ["model_fixtures"]
@@ -139,7 +140,7 @@ def tactomo(
 
     Whatever is not told to the user as an error comes out as an exception here.
     """
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.getsignal(number) for number in (*ASKED, *AS_WELL)}
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "200")
 

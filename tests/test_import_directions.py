@@ -59,7 +59,7 @@ ORDER = {
     ),
     "tactomo": (
         *("errors", "journal", "log", "events", "endpoint", "timing", "scans", "worker"),
-        "memory",
+        *("ending", "memory"),
         *("protocols", "config", "recordings", "acquisition", "stream", "imaging"),
         *("service", "twin", "cli", "__main__"),
     ),

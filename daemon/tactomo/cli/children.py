@@ -21,6 +21,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from tactomo.cli.parent_watch import VARIABLE
+from tactomo.ending import at_end
 from tactomo.errors import TactomoError
 
 VIEWER_SAYS = "viewer: "
@@ -207,10 +208,9 @@ def interrupt_on_sigterm() -> None:
 
 
 def stop_asked() -> threading.Event:
-    """Return an event that SIGINT and SIGTERM set, which otherwise do nothing from then on."""
+    """Return an event that every signal to end sets, which otherwise do nothing from then on."""
     stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    at_end(lambda *_: stop.set())
     return stop
 
 

@@ -61,6 +61,7 @@ from threadpoolctl import threadpool_limits
 
 from tactomo.acquisition.port import PortReader
 from tactomo.config import DaemonConfig
+from tactomo.ending import at_end
 from tactomo.endpoint import allow_connections
 from tactomo.errors import CommandError, ConfigError
 from tactomo.events import EventBook, Severity
@@ -284,12 +285,11 @@ class Daemon:
         return 0
 
     def run(self) -> int:
-        """Start, serve until SIGTERM or SIGINT, and stop; returns the process's exit status.
+        """Start, serve until a signal asks to end, and stop; returns the process's exit status.
 
         For the main thread. Raises what `start` raises.
         """
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, self._on_signal)
+        at_end(self._on_signal)
         threading.excepthook = _log_thread_failure
         allow_connections()
         self.start()

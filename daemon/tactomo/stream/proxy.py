@@ -11,7 +11,6 @@ alone. One thread, the main one, touches everything.
 from __future__ import annotations
 
 import math
-import signal
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -23,6 +22,7 @@ from tactomo_client import Keys
 from tactomo_client.connection import connect_subscriber
 from tactomo_client.messages import STATUS
 
+from tactomo.ending import at_end
 from tactomo.endpoint import allow_connections
 from tactomo.events import RateLimit, Severity
 from tactomo.stream.access_control import STREAM, Context
@@ -259,12 +259,11 @@ def waiting(socket: zmq.Socket[bytes]) -> Iterator[bytes]:
 
 
 def serve(relay: Relay) -> None:
-    """Open a relay, serve until SIGTERM or SIGINT, and close it; for the main thread.
+    """Open a relay, serve until a signal asks to end, and close it; for the main thread.
 
     Raises what its `open` raises.
     """
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: relay.stop())
+    at_end(lambda *_: relay.stop())
     allow_connections()
     try:
         relay.open()

@@ -107,7 +107,15 @@ def test_a_sensor_of_one_channel_has_one_port() -> None:
 
 
 @pytest.mark.parametrize(
-    "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)]
+    "number",
+    [
+        signal.SIGTERM,
+        signal.SIGHUP,
+        *(
+            pytest.param(number, marks=pytest.mark.slow)
+            for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGUSR1)
+        ),
+    ],
 )
 def test_a_signal_stops_it_within_a_second(spawn: Start, tmp_path: Path, number: int) -> None:
     process, _ = spawn(recording={"file": str(tmp_path / "skin.mcap")})

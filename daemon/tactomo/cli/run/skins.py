@@ -28,6 +28,7 @@ from tactomo_models.methods.trained_networks import SensorNetworks
 from tactomo.cli.failure import explain
 from tactomo.cli.parent_watch import stop_at_end_of
 from tactomo.config import DaemonConfig, Skins
+from tactomo.ending import AS_WELL, ASKED, at_end
 from tactomo.log import configure_logging
 from tactomo.service.daemon import Daemon, load_model
 from tactomo.service.supervision import STATUS_PERIOD_S, notify
@@ -71,7 +72,7 @@ class _Process:
 
 
 class SkinProcesses:
-    """The processes of several skins; `run` them until SIGTERM or SIGINT.
+    """The processes of several skins; `run` them until a signal asks to end.
 
     Args:
         skins: their configurations, and the proxy's address.
@@ -92,8 +93,7 @@ class SkinProcesses:
 
         0 if told to stop or every daemon has come to its end, 1 if none of them ever got ready.
         """
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, self._on_signal)
+        at_end(self._on_signal)
         with contextlib.ExitStack() as undo:
             folder = Path(undo.enter_context(tempfile.TemporaryDirectory(prefix="tactomo-")))
             leash, self._leash_end = os.pipe()
@@ -167,8 +167,9 @@ class SkinProcesses:
             return
         status = 1
         try:
-            for number in (signal.SIGTERM, signal.SIGINT):
-                signal.signal(number, signal.SIG_DFL)
+            for number in (*ASKED, *AS_WELL):
+                if signal.getsignal(number) is not signal.SIG_IGN:
+                    signal.signal(number, signal.SIG_DFL)
             os.close(self._leash_end)
             stop_at_end_of(self._leash)
             os.environ.pop("NOTIFY_SOCKET", None)
