@@ -28,6 +28,7 @@ from tactomo_models.scans.stillness import Since, are_still
 from tactomo_models.scene.field_account import Alternative
 from tactomo_models.scene.field_fit import COLD_S, FieldFit, Measured
 from tactomo_models.scene.parameters import COLUMNS, E1, E2, PEAK, SIZE, UNIT_M, X, Y
+from tactomo_models.scene.pressure import CLEARLY
 from tactomo_models.scene.pressure_field import PressureField
 from tactomo_models.scene.sheet_response import GradedResponse
 
@@ -99,6 +100,7 @@ class Belief:
     challenged: float = 0.0  # chi-squared that no start could better
     is_explained: bool = True  # whether it explains its own frame
     lacks_none: bool = False  # whether no contact is missing, as far as was asked
+    lifts_none: bool = False  # whether no light contact presses harder, as far as was tried
     is_parted: bool = False  # whether no contacts that touch are one, as far as was asked
     done: bool = False  # whether nothing is left to try
     how: str = ""  # in words, what it came from
@@ -205,6 +207,7 @@ class Search:
             since=None,
             frames=frames,
             done=False,
+            lifts_none=False,
             how="warm start",
         )
         due = frames & (frames - 1) == 0
@@ -309,6 +312,28 @@ class Search:
         harder = self._account(each, account.fitted.log_ratio, frame) if light.any() else None
         return [harder] if harder else []
 
+    def _lifted(self, account: Account, frame: Frame) -> Account:
+        """Light contacts pressed as hard as the graded sheet says at its onset, where it does.
+
+        Below the onset a peak has no slope, so that a fit which came there stays.
+        """
+        light = account.family.light(account.fitted.parameters)
+        if not light.any() or not frame.fits_peaks:
+            return account
+        peaks = account.family.index[light, PEAK]
+        by_peak = self.fit.jacobian_at_onset(account.fitted, frame.measured)[:, peaks]
+        power = np.maximum((by_peak**2).sum(axis=0), 1e-12)
+        pull = -by_peak.T @ account.fitted.residuals[Channel.MAGNITUDE]
+        if not (pull > CLEARLY * np.sqrt(power)).any():
+            return account
+        each = account.contacts.copy()
+        each[light, PEAK] = self.field.onset + np.maximum(pull / power, 0.0)
+        start = self._account(each, account.fitted.log_ratio, frame)
+        if start is None:
+            return account
+        lifted = self._descended(start, frame, STEPS)
+        return lifted if lifted.log_evidence > account.log_evidence else account
+
     def _without(self, account: Account, frame: Frame) -> Account:
         """The contacts that explain most: one after the other is left out while that helps."""
         while account.family.count > 0:
@@ -340,6 +365,9 @@ class Search:
                 return self._grown(belief, born)
         if not account.at_minimum:
             return replace(belief, account=self._descended(account, frame, STEPS))
+        if not belief.lifts_none:
+            lifted = self._lifted(account, frame)
+            return replace(belief, account=lifted, lifts_none=lifted is account)
         specks = account.contacts[:, SIZE] <= self.field.size_limits[0]
         if specks.any():
             return self._without_specks(belief, specks, frame)
@@ -467,6 +495,7 @@ class Search:
             rivals=again,
             rounds=belief.rounds + 1,
             lacks_none=False,
+            lifts_none=False,
             is_parted=False,
             moved=np.zeros((0, 2)),
         )
@@ -526,6 +555,7 @@ class Search:
             rivals=rivals,
             rounds=0,
             frames=0,
+            lifts_none=False,
             is_parted=False,
             moved=np.zeros((0, 2)),
         )

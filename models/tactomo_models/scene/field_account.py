@@ -110,15 +110,12 @@ class FieldAccountant:
         light contact's pressure, so that there it is differentiated at its onset.
         """
         J, family = self._fit.jacobian(fitted, measured), fitted.family
-        if isinstance(family, PressureField) and Channel.MAGNITUDE in measured:
-            each = family.split(fitted.parameters)
-            light = family.free[:, PEAK] & (each[:, PEAK] < family.onset)
-            if light.any():
-                each[light, PEAK] = family.onset
-                graded = {Channel.MAGNITUDE: measured[Channel.MAGNITUDE]}
-                sensed = self._fit.jacobian(fitted, graded, family.draw(family.join(each)))
-                start = [*measured].index(Channel.MAGNITUDE) * len(J) // len(measured)
-                J[start : start + len(sensed)] = sensed
+        if not isinstance(family, PressureField) or Channel.MAGNITUDE not in measured:
+            return J
+        if family.light(fitted.parameters).any():
+            sensed = self._fit.jacobian_at_onset(fitted, measured)
+            start = [*measured].index(Channel.MAGNITUDE) * len(J) // len(measured)
+            J[start : start + len(sensed)] = sensed
         return J
 
     def _covariance(self, fitted: FittedField, measured: Measured, J: FloatArray) -> FloatArray:

@@ -26,6 +26,7 @@ from tactomo_models.physics.compiled_sheet import FrozenAreas, Pressed, Solution
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scans.changes import Changes
 from tactomo_models.scene.drawing import Drawing
+from tactomo_models.scene.parameters import PEAK
 from tactomo_models.scene.pressure_field import PressureField
 from tactomo_models.scene.sheet_response import SheetResponse, responses_of
 from tactomo_models.sensor.description import SensorDescription
@@ -328,6 +329,20 @@ class FieldFit:
             )
             sheets.append(by_parameter)
         return np.concatenate(sheets)
+
+    def jacobian_at_onset(self, fitted: FittedField, measured: Measured) -> FloatArray:
+        """The same (M, N + 1) of the graded sheet, with light contacts at the onset: what answers.
+
+        Raises:
+            TypeError: it is no pressure field.
+        """
+        family = fitted.family
+        if not isinstance(family, PressureField):
+            raise TypeError("only contacts of a pressure field have an onset")
+        each = family.split(fitted.parameters)
+        each[family.light(fitted.parameters), PEAK] = family.onset
+        graded = {Channel.MAGNITUDE: measured[Channel.MAGNITUDE]}
+        return self.jacobian(fitted, graded, family.draw(family.join(each)))
 
     def refine(
         self,

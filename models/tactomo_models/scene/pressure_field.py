@@ -193,6 +193,10 @@ class PressureField:
         """Parameters (N,) that are fitted, of all contacts in one vector."""
         return each[self.free]
 
+    def light(self, parameters: FloatArray) -> BoolArray:
+        """Which contacts (K,) press too lightly for the graded sheet to answer."""
+        return np.asarray(self.free[:, PEAK] & (self.split(parameters)[:, PEAK] < self.onset))
+
     @cached_property
     def prior_mean(self) -> FloatArray:
         """Contacts are circles of a fingertip's size, anywhere."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 
 import numpy as np
 import pytest
@@ -105,6 +105,28 @@ def test_nothing_is_no_contact(skin: Skin) -> None:
 
 def test_contacts_are_found_from_nothing(skin: Skin) -> None:
     assert_at(Search(skin.sensor.fit).advance(None, skin.frame(LEFT, RIGHT)), LEFT, RIGHT)
+
+
+@pytest.mark.parametrize("above", [1.1, 1.3])
+def test_a_faint_press_is_told_that_a_noise_test_overlooks(stacked: Skin, above: float) -> None:
+    """Begun below the onset, where a peak has no slope, as where the graded sheet is quiet."""
+    faint = contact(-0.02, 0.01, 0.011, peak=above * stacked.sensor.field.onset)
+    measured = stacked.measured(faint, noise=2e-4)
+    quiet = replace(measured[Channel.MAGNITUDE], quiet=True)
+    frame = Frame({**measured, Channel.MAGNITUDE: quiet}, Budget(PLENTY_S))
+    belief = Search(stacked.sensor.fit).advance(None, frame)
+    [found], [sigmas] = belief.account.contacts, belief.account.sigmas
+    assert found[PEAK] > stacked.sensor.field.onset
+    assert found[PEAK] == pytest.approx(faint[PEAK], abs=4 * sigmas[PEAK])
+
+
+def test_a_press_that_grows_faint_by_faint_is_followed_over_the_onset(stacked: Skin) -> None:
+    onset = stacked.sensor.field.onset
+    peaks = np.linspace(0.8 * onset, 1.2 * onset, 9)
+    frames = [stacked.frame(contact(-0.02, 0.01, 0.011, peak=peak), noise=2e-4) for peak in peaks]
+    belief = followed(Search(stacked.sensor.fit), frames)
+    [found], [sigmas] = belief.account.contacts, belief.account.sigmas
+    assert found[PEAK] == pytest.approx(peaks[-1], abs=4 * sigmas[PEAK])
 
 
 def test_a_still_frame_is_held(skin: Skin, solves: list[int]) -> None:
