@@ -114,7 +114,7 @@ class Belief:
         """
         account, family = self.account, self.account.family
         above = account.contacts[:, PEAK] > family.onset
-        unasked = above & family.free[:, PEAK] & (not self.done)
+        unasked = above & family.free[:, PEAK]
         return [
             [
                 Alternative(
@@ -488,11 +488,12 @@ class Search:
             return None
         changed = self._descended(start, frame, self._steps(account, frame))
         gain = changed.log_evidence - account.log_evidence
-        again = tuple(_opened(mine, gain) for mine in rivals)
+        if belief.rounds + 1 < ROUNDS:  # else nobody is asked again
+            rivals = [_opened(mine, gain) for mine in rivals]
         return replace(
             belief,
             account=changed,
-            rivals=again,
+            rivals=tuple(rivals),
             rounds=belief.rounds + 1,
             lacks_none=False,
             lifts_none=False,
