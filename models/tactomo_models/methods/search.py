@@ -22,8 +22,17 @@ from tactomo_protocol import Channel
 from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.methods.account import Account, Frame, account_of, descended
 from tactomo_models.methods.contact_search import ContactSearch
-from tactomo_models.methods.kinds import SHARES, Kind, as_kind, as_one, kind_of
-from tactomo_models.methods.trial import FAR_STEPS, HOPELESS, Rest, Trial, gaps_between
+from tactomo_models.methods.kinds import Kind, as_kind, as_one, kind_of
+from tactomo_models.methods.rivals import (
+    Rivals,
+    choices,
+    is_asked,
+    opened,
+    rival_of,
+    turned,
+    unasked,
+)
+from tactomo_models.methods.trial import FAR_STEPS, HOPELESS, Rest, gaps_between
 from tactomo_models.scans.stillness import Since, are_still
 from tactomo_models.scene.field_account import Alternative
 from tactomo_models.scene.field_fit import COLD_S, FieldFit, Measured
@@ -33,7 +42,6 @@ from tactomo_models.scene.pressure_field import PressureField
 from tactomo_models.scene.sheet_response import GradedResponse
 
 MAX_CONTACTS = 12
-OPEN = -3.0  # logarithm of odds: a rival above is asked again once others have become another kind
 LIKELIER = (
     1.0  # from which a rival takes a contact's place; below, the mean of both is shown anyway
 )
@@ -67,25 +75,6 @@ PASSES = (
 
 
 @dataclass(frozen=True)
-class Rival:
-    """What else a contact may be."""
-
-    log_odds: float  # over what it is taken for
-    # (COLUMNS,) of its parameters; the two contacts (2, COLUMNS) that it is, or none (0, COLUMNS)
-    difference: FloatArray
-    sigmas: FloatArray  # (COLUMNS,) their standard uncertainties
-    is_open: bool = False  # whether it is to be asked once more
-
-    @property
-    def is_one(self) -> bool:
-        """Whether it is one contact of another kind."""
-        return self.difference.ndim == 1
-
-
-Rivals = Mapping[Kind, Rival]
-
-
-@dataclass(frozen=True)
 class Belief:
     """What is believed of a scene after a frame."""
 
@@ -114,7 +103,7 @@ class Belief:
         """
         account, family = self.account, self.account.family
         above = account.contacts[:, PEAK] > family.onset
-        unasked = above & family.free[:, PEAK]
+        may_differ = above & family.free[:, PEAK]
         return [
             [
                 Alternative(
@@ -125,9 +114,9 @@ class Belief:
                 for rival in mine.values()
                 if rival.is_one
             ]
-            + (_unasked(contact, sigmas, mine) if is_open else [])
+            + (unasked(contact, sigmas, mine) if is_open else [])
             for contact, sigmas, mine, is_open in zip(
-                account.contacts, account.sigmas, self.rivals, unasked, strict=True
+                account.contacts, account.sigmas, self.rivals, may_differ, strict=True
             )
         ]
 
@@ -376,7 +365,7 @@ class Search:
                 kinds = [
                     kind
                     for kind in self._kinds(account, k, frame)
-                    if kind in each.kinds and _is_asked(kind, mine)
+                    if kind in each.kinds and is_asked(kind, mine)
                 ]
                 if kinds:
                     return self._asked(belief, k, kinds, frame)
@@ -427,7 +416,7 @@ class Search:
         mine = dict(belief.rivals[k])
         for kind in kinds:
             trial = rest.trial(as_kind(account.contacts[k], kind))
-            mine[kind] = _rival(trial, account.contacts[k], mine.get(kind))
+            mine[kind] = rival_of(trial, account.contacts[k], mine.get(kind))
             if frame.budget.over:
                 break
         rivals = (*belief.rivals[:k], mine, *belief.rivals[k + 1 :])
@@ -439,7 +428,7 @@ class Search:
         born = self._missed(belief, frame) if asked.is_last else None
         better = [born] if born else []
         refused: dict[int, tuple[Kind, float]] = {}  # by the fit of all, and its log odds
-        for choice in _choices(belief.rivals, asked.least):
+        for choice in choices(belief.rivals, asked.least):
             changed = self._changed(belief, choice, frame)
             gain = -np.inf if changed is None else changed.account.log_evidence - log_evidence
             if changed is not None and gain > 0:
@@ -479,8 +468,7 @@ class Search:
             start = (contact + won.difference)[None] if won.is_one else won.difference
             rows.append(start)
             if won.is_one:
-                turned = _turned(mine, kind, kind_of(contact), account.sigmas[k])
-                rivals.append(turned)
+                rivals.append(turned(mine, kind, kind_of(contact), account.sigmas[k]))
             else:
                 rivals += [{}] * len(start)
         start = self._account(np.vstack(rows), account.fitted.log_ratio, frame)
@@ -489,7 +477,7 @@ class Search:
         changed = self._descended(start, frame, self._steps(account, frame))
         gain = changed.log_evidence - account.log_evidence
         if belief.rounds + 1 < ROUNDS:  # else nobody is asked again
-            rivals = [_opened(mine, gain) for mine in rivals]
+            rivals = [opened(mine, gain) for mine in rivals]
         return replace(
             belief,
             account=changed,
@@ -549,7 +537,7 @@ class Search:
     def _grown(self, belief: Belief, account: Account) -> Belief:
         """The belief with a further contact."""
         gain = account.log_evidence - belief.account.log_evidence
-        rivals = (*(_opened(mine, gain) for mine in belief.rivals), {})
+        rivals = (*(opened(mine, gain) for mine in belief.rivals), {})
         return replace(
             belief,
             account=account,
@@ -593,73 +581,3 @@ def _touching(contacts: FloatArray, near_m: float) -> Iterator[list[int]]:
     count, group = connected_components(gaps_between(contacts) < near_m)
     groups = [np.flatnonzero(group == number).tolist() for number in range(count)]
     yield from sorted((one for one in groups if len(one) > 1), key=len, reverse=True)
-
-
-def _unasked(contact: FloatArray, sigmas: FloatArray, rivals: Rivals) -> list[Alternative]:
-    """Kinds of other peaks that a contact has not been asked for."""
-    own = kind_of(contact)
-    kinds = {Kind.EVEN, Kind.FALLING, Kind.RING} - {own, *rivals}
-    if own is Kind.ROUNDED:
-        kinds -= {Kind.EVEN}
-    return [
-        Alternative(SHARES[kind] / SHARES[own], as_kind(contact, kind)[0], sigmas)
-        for kind in sorted(kinds)
-    ]
-
-
-def _choices(rivals: tuple[Rivals, ...], least: float) -> list[dict[int, Kind]]:
-    """What contacts may become: those that are about as sure as the surest at once, or it alone."""
-    likeliest = {
-        k: max(mine, key=lambda kind: mine[kind].log_odds) for k, mine in enumerate(rivals) if mine
-    }
-    odds = {k: rivals[k][kind].log_odds for k, kind in likeliest.items()}
-    surest = max(odds, key=lambda k: odds[k], default=None)
-    if surest is None or odds[surest] < least:
-        return []
-    many = {k: kind for k, kind in likeliest.items() if odds[k] > odds[surest] / 2}
-    alone = {surest: likeliest[surest]}
-    return [many, alone] if len(many) > 1 else [alone]
-
-
-def _is_asked(kind: Kind, rivals: Rivals) -> bool:
-    """Whether a contact is still to be asked for a kind."""
-    return kind not in rivals or rivals[kind].is_open
-
-
-def _rival(trial: Trial | None, contact: FloatArray, before: Rival | None) -> Rival:
-    """What a trial makes of a rival; of one that was asked before, the mean of both.
-
-    A mean and no sum: where a contact stays, errors of the sheet repeat themselves.
-    """
-    if trial is None:
-        return Rival(-np.inf, np.zeros((0, COLUMNS)), np.zeros((0, COLUMNS)))
-    odds = trial.log_odds if before is None else (trial.log_odds + before.log_odds) / 2
-    if len(trial.contacts) != 1:
-        return Rival(odds, trial.contacts, trial.sigmas)
-    return Rival(odds, trial.contacts[0] - contact, trial.sigmas[0])
-
-
-def _turned(rivals: Rivals, kind: Kind, own: Kind, sigmas: FloatArray) -> Rivals:
-    """The rivals of a contact that has become one of them."""
-    won = rivals[kind]
-    others = {
-        other: replace(
-            rival,
-            log_odds=rival.log_odds - won.log_odds,
-            difference=rival.difference - won.difference * rival.is_one,
-        )
-        for other, rival in rivals.items()
-        if other is not kind
-    }
-    return others | {own: Rival(-won.log_odds, -won.difference, sigmas)}
-
-
-def _opened(rivals: Rivals, gain: float) -> Rivals:
-    """The same, to be asked again where a change of such a gain elsewhere may matter.
-
-    Whether a contact is there at all costs little to ask.
-    """
-    least = min(OPEN, -gain / 2)
-    return {
-        kind: one for kind, one in rivals.items() if one.log_odds < least and kind is not Kind.NONE
-    }
