@@ -157,6 +157,8 @@ def test_voltages_that_are_no_numbers_are_left_to_the_models_and_never_tared(
     answer = b.daemon._pipeline.tare()
     b.until(lambda: b.daemon._imaging.taring.is_on)  # a scan that comes first is none of the tare's
     for number in range(counter, counter + 3):
+        good = good + np.float32(1)  # the very same again would be a frozen converter's
+        bad = bad + np.float32(1)
         line.say(
             Scan(Channel.MAGNITUDE, number, 0, ScanFlag(0), good),
             Scan(Channel.STRUCTURE, number, 0, ScanFlag(0), bad),

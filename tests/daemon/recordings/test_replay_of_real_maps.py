@@ -38,7 +38,7 @@ def test_the_replay_of_a_pressed_skin_gives_the_same_maps(
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     path = tmp_path / "pressed.mcap"
     sensor = load_description("paper_square")
-    skin = SkinSimulator(sensor, spacing_m=0.008)  # coarse, but quick
+    skin = SkinSimulator(sensor, spacing_m=0.004)  # on a coarser one discs look like rings
     b = bench(ports=2, real=True, sync_wait_ms=1000)
 
     def press(*presses: Press, channels: tuple[Channel, ...] = tuple(Channel)) -> Any:

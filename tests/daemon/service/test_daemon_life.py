@@ -118,6 +118,8 @@ def test_a_sensor_of_one_channel_has_one_port() -> None:
     ],
 )
 def test_a_signal_stops_it_within_a_second(spawn: Start, tmp_path: Path, number: int) -> None:
+    if signal.getsignal(number) is signal.SIG_IGN:
+        pytest.skip("whoever runs the tests has this signal ignored, as nohup does")
     process, _ = spawn(recording={"file": str(tmp_path / "skin.mcap")})
     begin_s = time.monotonic()
     process.signal(number)
