@@ -17,6 +17,10 @@ MAX_QUADRATURE: Final = 0.3
 the real part is 5 % short of the modulus."""
 
 
+Volts = dict[Channel, FloatArray]
+"""Voltages (M,) of each channel that a dual scan has."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ChannelScan:
     """One channel's scan as it came in."""

@@ -10,12 +10,10 @@ from typing import Any
 
 import numpy as np
 from tactomo_models import Reference
-from tactomo_models.arrays import FloatArray
 from tactomo_protocol import Channel
 
 from tactomo.events import OnEvent
-
-Volts = dict[Channel, FloatArray]
+from tactomo.scans import Volts
 
 
 class FrozenConverters:

@@ -33,14 +33,14 @@ from tactomo.events import OnEvent, RateLimit
 from tactomo.imaging import frames
 from tactomo.imaging.calibration_in_force import CalibrationInForce
 from tactomo.imaging.frame_marks import FrameMarks
-from tactomo.imaging.frozen_converter import FrozenConverters, Volts
+from tactomo.imaging.frozen_converter import FrozenConverters
 from tactomo.imaging.kept_reference import KeptReference, KnownSkin
 from tactomo.imaging.method_in_force import Effort, MethodInForce
 from tactomo.imaging.processor_share import ProcessorShare
 from tactomo.imaging.tare import Taring
 from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording import calibration_text
-from tactomo.scans import DualScan, Mark, Timing
+from tactomo.scans import DualScan, Mark, Timing, Volts
 from tactomo.stream.publisher import Publisher
 from tactomo.timing import Durations, Rate
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from tactomo_protocol import Channel
@@ -148,12 +148,7 @@ def _stepped(
 ) -> FittedField | None:
     """The field after a step downhill; None where none is worth a solve."""
     fitted = account.fitted
-
-    def limited(step: FloatArray) -> FloatArray:
-        parameters = fitted.family.bounded(fitted.parameters + step[:-1])
-        ratio = fit.bounded_ratio(fitted.log_ratio + float(step[-1]))
-        return np.append(parameters - fitted.parameters, ratio - fitted.log_ratio)
-
+    limited = partial(limited_step, fit, fitted)
     scale = fit.prior(fitted)[0]
     steps = damped_steps(normal, gradient, scale, fitted.damping, limited, account.unit)
     for step, damping in steps:
@@ -164,6 +159,15 @@ def _stepped(
             if trial.cost < fitted.cost:
                 return replace(trial, damping=max(damping / 5, 1e-3))
     return None
+
+
+def limited_step(fit: FieldFit, fitted: FittedField, step: FloatArray) -> FloatArray:
+    """A step (N,), or (N + 1,) with the log ratio, cut where a parameter or that has its limit."""
+    count = len(fitted.parameters)
+    parameters = fitted.family.bounded(fitted.parameters + step[:count])
+    ratio = fit.bounded_ratio(fitted.log_ratio + float(step[count:].sum()))
+    off = np.append(parameters - fitted.parameters, ratio - fitted.log_ratio)
+    return off[: len(step)]
 
 
 def damped_steps(

@@ -65,7 +65,7 @@ def choices(rivals: tuple[Rivals, ...], least: float) -> list[dict[int, Kind]]:
     return [many, alone] if len(many) > 1 else [alone]
 
 
-def is_asked(kind: Kind, rivals: Rivals) -> bool:
+def to_be_asked(kind: Kind, rivals: Rivals) -> bool:
     """Whether a contact is still to be asked for a kind."""
     return kind not in rivals or rivals[kind].is_open
 

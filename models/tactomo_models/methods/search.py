@@ -26,9 +26,9 @@ from tactomo_models.methods.kinds import Kind, as_kind, as_one, kind_of
 from tactomo_models.methods.rivals import (
     Rivals,
     choices,
-    is_asked,
     opened,
     rival_of,
+    to_be_asked,
     turned,
     unasked,
 )
@@ -63,14 +63,13 @@ class Pass:
 
     kinds: frozenset[Kind]
     least: float  # log odds from which a rival takes a contact's place
-    is_last: bool
 
 
 # First what a peak depends on most, by half: where it makes a contact hopeless, that need be asked
 # for nothing else.
 PASSES = (
-    Pass(frozenset({Kind.EVEN, Kind.FALLING}), -HOPELESS, is_last=False),
-    Pass(frozenset(Kind), LIKELIER, is_last=True),
+    Pass(frozenset({Kind.EVEN, Kind.FALLING}), -HOPELESS),
+    Pass(frozenset(Kind), LIKELIER),
 )
 
 
@@ -296,7 +295,7 @@ class Search:
         Down there that sheet answers to nothing, so that no fit finds the way up.
         """
         each = account.contacts.copy()
-        light = account.family.free[:, PEAK] & (each[:, PEAK] < self.field.onset)
+        light = account.family.light(account.fitted.parameters)
         each[light, PEAK] = self.field.typical_peak
         harder = self._account(each, account.fitted.log_ratio, frame) if light.any() else None
         return [harder] if harder else []
@@ -307,7 +306,7 @@ class Search:
         Below the onset a peak has no slope, so that a fit which came there stays.
         """
         light = account.family.light(account.fitted.parameters)
-        if not light.any() or not frame.fits_peaks:
+        if not light.any():
             return account
         peaks = account.family.index[light, PEAK]
         by_peak = self.fit.jacobian_at_onset(account.fitted, frame.measured)[:, peaks]
@@ -365,7 +364,7 @@ class Search:
                 kinds = [
                     kind
                     for kind in self._kinds(account, k, frame)
-                    if kind in each.kinds and is_asked(kind, mine)
+                    if kind in each.kinds and to_be_asked(kind, mine)
                 ]
                 if kinds:
                     return self._asked(belief, k, kinds, frame)
@@ -425,7 +424,7 @@ class Search:
     def _decided(self, belief: Belief, asked: Pass, frame: Frame) -> Belief | None:
         """The belief with each contact of its likeliest kind, where that is likelier altogether."""
         log_evidence = belief.account.log_evidence
-        born = self._missed(belief, frame) if asked.is_last else None
+        born = self._missed(belief, frame) if asked is PASSES[-1] else None
         better = [born] if born else []
         refused: dict[int, tuple[Kind, float]] = {}  # by the fit of all, and its log odds
         for choice in choices(belief.rivals, asked.least):

@@ -26,7 +26,7 @@ from tactomo_models.methods.account import (
     Account,
     Frame,
     damped_steps,
-    foreseen,
+    limited_step,
     without_light_peaks,
 )
 from tactomo_models.methods.kinds import log_prior
@@ -143,10 +143,11 @@ class Rest:
         J = self._jacobian(best)
         for taken in range(steps if len(best.fitted.parameters) else 0):
             normal, gradient = self._normal_equations(best, J)
-            near_end = foreseen(normal, gradient) * unit < FORESEEN
+            newton = -np.linalg.solve(normal, gradient)
+            near_end = float(-gradient @ newton) * unit < FORESEEN
             if near_end or taken >= sure:
-                newton = np.where(J.any(axis=0), -np.linalg.solve(normal, gradient), 0.0)
-                last = self._limited(family, best.fitted, newton)
+                told = np.where(J.any(axis=0), newton, 0.0)
+                last = limited_step(self._fit, best.fitted, told)
                 end = self._judged(family, best, J, last)
                 if near_end or end.log_odds < HOPELESS:
                     return end
@@ -210,7 +211,7 @@ class Rest:
     ) -> tuple[_Assessed | None, float]:
         """Levenberg-Marquardt, the others answering: what is better, and the damping for next."""
         count, fitted = len(at.fitted.parameters), at.fitted
-        limited = partial(self._limited, family, fitted)
+        limited = partial(limited_step, self._fit, fitted)
         steps = damped_steps(normal, gradient, at.prior, damping, limited, self._account.unit)
         for step, damped in steps:
             trial = self._assessed(
@@ -221,14 +222,6 @@ class Rest:
             if trial is not None and trial.cost < at.cost:
                 return trial, max(damped / 5, 1e-3)
         return None, damping
-
-    def _limited(self, family: PressureField, fitted: FittedField, step: FloatArray) -> FloatArray:
-        """A step cut where a parameter, or the log ratio, has its limit."""
-        count = len(fitted.parameters)
-        parameters = family.bounded(fitted.parameters + step[:count])
-        ratio = self._fit.bounded_ratio(fitted.log_ratio + float(step[count:].sum()))
-        off = np.append(parameters - fitted.parameters, ratio - fitted.log_ratio)
-        return off[: len(step)]
 
     def _jacobian(self, at: _Assessed) -> FloatArray:
         return self._fit.jacobian(at.fitted, self._frame.measured)[:, self._own]
