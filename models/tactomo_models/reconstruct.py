@@ -51,7 +51,6 @@ class Reconstructor:
         method: the name of one (see `methods.registry`), or a method that no other reconstructor
             has.
         budget_s: compute time a frame may take, on a machine of the 2.5 GHz class.
-        regularisation: factor on what a rule chooses for the linear methods.
         curve: turns magnitudes into pressures; the description's own table if None.
         taught: corrects where single contacts are, see `taught_skin`.
 
@@ -76,7 +75,6 @@ class Reconstructor:
         *,
         method: str | Method = "auto",
         budget_s: float | None = None,
-        regularisation: float = 1.0,
         curve: PressureCurve | None = None,
         taught: TaughtSkin | None = None,
     ) -> None:
@@ -86,8 +84,7 @@ class Reconstructor:
         self.budget_s = budget_s
         skin = Skin.of(description, artifact)
         self.artifact = skin.artifact
-        factor = regularisation * description.instrument.regularisation
-        self._skin = replace(skin, regularisation=factor)
+        self._skin = replace(skin, regularisation=description.instrument.regularisation)
         self._comparator = Comparator(description, skin.artifact, skin.forward)
         self._sheets: Sheets | None = None  # as the reference tells; None if nobody has asked
         self._methods: dict[str, Method] = {}  # by their names, once they were asked for

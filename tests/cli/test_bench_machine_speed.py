@@ -42,11 +42,6 @@ def test_what_is_in_force_is_shown(
     assert "shipped, of" in damaged.stdout
 
 
-@pytest.mark.parametrize("options", [["--show"], ["--machine-speed", "--chart", "chart.png"]])
-def test_options_that_do_not_go_together(tactomo: Run, options: list[str]) -> None:
-    assert tactomo("bench", *options).returncode == 2
-
-
 @pytest.mark.long
 @pytest.mark.timeout(600)
 def test_a_machine_is_measured(

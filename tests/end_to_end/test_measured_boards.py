@@ -36,7 +36,7 @@ from tactomo_models.sensor.shipped import __path__ as sensors_path
 REST = 100
 """Scans at rest that come first: a daemon tares by twenty, and a controller subscribes."""
 SCALE = 0.62
-"""Of the tanks' changes, as a share of the largest possible: what `evaluate tanks` finds."""
+"""Of the tanks' changes, as a share of the largest possible: what `evaluate measured` finds."""
 ONE_SIDED = '[instrument]\nvoltages = "positive"\nregularisation = 30.0\n'
 UNSIGNED = '[instrument]\nvoltages = "unsigned"\n'
 
@@ -102,7 +102,7 @@ def frames_of(daemon: DaemonProcess, last: int, missed: int = 0) -> dict[int, Fr
 
 @pytest.mark.long
 def test_presses_on_a_round_skin_are_located_through_an_openeit_board(tmp_path: Path) -> None:
-    """As near as by `tactomo evaluate skin`, whose NOSER image comes to 5.7 mm."""
+    """As near as by `tactomo evaluate measured`, whose NOSER image comes to 5.7 mm."""
     path = described(tmp_path, "skin_round", ONE_SIDED)
     sensor = load_description(path)
     presses = read_presses(measured("skin_round_presses.npz"), sensor)
@@ -139,7 +139,7 @@ def off(seen: FloatArray, true_mm: FloatArray, test: BoolArray) -> FloatArray:
 
 @pytest.mark.long
 def test_tanks_come_as_well_through_a_board_that_prints_tables(tmp_path: Path) -> None:
-    """Near what `tactomo evaluate tanks` makes of the same set: 0.86 on average."""
+    """Near what `tactomo evaluate measured` makes of the same set: 0.86 on average."""
     path = described(tmp_path, "tank_uef2017", UNSIGNED)
     sensor = load_description(path)
     tanks = read_tanks(measured("tank_uef2017.npz"), sensor)

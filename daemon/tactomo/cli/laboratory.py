@@ -17,19 +17,13 @@ def not_installed(what: str) -> TactomoError:
     )
 
 
-def installed_measurement(name: str) -> Any:
-    """Return the function that the laboratory adds to `tactomo bench` under a name, or None."""
-    from importlib.metadata import entry_points
-
-    return next((entry.load() for entry in entry_points(group=BENCH, name=name)), None)
-
-
 def measurement(name: str) -> Any:
     """Return the function that the laboratory adds to `tactomo bench` under a name.
 
     Raises TactomoError where the laboratory is not installed.
     """
-    measure = installed_measurement(name)
-    if measure is None:
-        raise not_installed(f"bench --{name}")
-    return measure
+    from importlib.metadata import entry_points
+
+    for entry in entry_points(group=BENCH, name=name):
+        return entry.load()
+    raise not_installed(f"bench --{name}")

@@ -9,9 +9,9 @@ import typer
 from tactomo.cli.options import Description, JsonOutput, examples, typer_app
 from tactomo.cli.output import print_json, table
 from tactomo.cli.plot.plot import save_figure
-from tactomo.errors import TactomoError
 
 from tactomo_lab.commands.evaluate import Picture, shown
+from tactomo_lab.commands.measured import tank_of
 
 if TYPE_CHECKING:
     from tactomo_lab.evaluation.ktc import Challenge, ChallengeOutcome
@@ -46,15 +46,9 @@ def ktc(
     trained on simulated tanks alone makes objects of five linear images, and these are refined
     until they explain the voltages. Level l of 1 to 7 loses the first 2 (l - 1) electrodes.
     """
-    from tactomo_models import load_description
-
     from tactomo_lab.evaluation.ktc import evaluate_challenge, read_challenge
 
-    description = load_description(sensor)
-    if description.sheet.shape != "disc" or description.structure is None:
-        raise TactomoError(
-            f"{description.name!r} is no round tank", "give a description such as tank_ktc2023"
-        )
+    description = tank_of(sensor)
     given = read_challenge(file, description)
     if level is not None:
         given = given.at_level(level)

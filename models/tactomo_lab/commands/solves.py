@@ -6,8 +6,6 @@ contact and mesh on larger and larger sheets. In the last two only the inner qua
 can be pressed, so that its Green's function fits into memory.
 
 Times are this thread's processor time, the median of several runs, BLAS on one thread.
-
-`--budget N`: instead, what the constants of `field_fit.Budget` are here.
 """
 
 from __future__ import annotations
@@ -16,9 +14,8 @@ import statistics
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import typer
 from tactomo.cli.options import DEFAULT_DESCRIPTION, Description, JsonOutput, examples, typer_app
 from tactomo.cli.output import print_json, table
 
@@ -32,7 +29,6 @@ LARGER = (1.0, 1.4, 2.0, 2.8)  # over the sensor's own sheet
 PARAMETERS = 7  # of one elliptic contact and the ratio: what a Jacobian is taken by
 ENOUGH_S = 0.2
 RUNS = (5, 51)
-BUDGETS_S = (0.02, 0.05, 0.1)
 
 
 @dataclass(frozen=True)
@@ -54,18 +50,10 @@ app = typer_app()
 
 
 @app.command(
-    epilog=examples(
-        "tactomo evaluate solves --json > solves.json", "tactomo evaluate solves --budget 8"
-    )
+    epilog=examples("tactomo evaluate solves", "tactomo evaluate solves --json > solves.json")
 )
 def solves(
     description: Description = DEFAULT_DESCRIPTION,
-    budget: Annotated[
-        int,
-        typer.Option(
-            min=0, help="Instead, fit a budget's model of time to so many scenes of each kind."
-        ),
-    ] = 0,
     as_json: JsonOutput = False,
 ) -> None:
     """Measure one forward solve against pressed area, mesh and sheet size. Takes about a minute."""
@@ -75,11 +63,6 @@ def solves(
     from threadpoolctl import threadpool_limits
 
     sensor = load_description(description)
-    if budget:
-        with Console(stderr=True).status("reconstructing"), threadpool_limits(1):
-            law = _budget_law(sensor, budget)
-        print_json({"machine": machine(), "description": description, **law})
-        return
     with Console(stderr=True).status("solving"), threadpool_limits(1):
         rows = list(_rows(sensor))
     if as_json:
@@ -94,47 +77,6 @@ def solves(
         ratio = f"{row.sparse_ms / row.solve_ms:.1f}"
         shown.add_row(row.series, ratio, *(f"{number:.3g}" for number in numbers))
     Console().print(shown)
-
-
-def _budget_law(sensor: SensorDescription, count: int) -> dict[str, float]:
-    """Constants of `field_fit.Budget` by least relative squares, and the relative rms left."""
-    import numpy as np
-    from scipy.optimize import nnls
-    from tactomo_models import Reconstructor
-    from tactomo_models.methods.auto import Auto
-    from tactomo_models.methods.fit import Course
-    from tactomo_models.scans.measurement import Measurement
-    from tactomo_models.scene.field_fit import Budget, FittedField
-
-    from tactomo_lab.evaluation.field import STILL_ROWS, scenes_of_row
-
-    class Counted(Budget):
-        def spend(self, fitted: FittedField) -> None:
-            entries = [len(s.nodes) * len(fitted.parameters) for s in fitted.solutions.values()]
-            terms[-1] += 0, len(entries), sum(entries)
-            super().spend(fitted)
-
-    class CountedAuto(Auto):
-        def _followed(
-            self, course: Course, measurement: Measurement, budget: Budget
-        ) -> tuple[Course, Measurement]:
-            return super()._followed(course, measurement, Counted(budget.left_s))
-
-    terms, seconds = [], []
-    lines = (scenes_of_row(sensor, row, "tuning", count) for row in STILL_ROWS)
-    for scene in (scene for line in lines for scenes in line.values() for scene in scenes):
-        reconstructor = Reconstructor(scene.description, method=CountedAuto())
-        reconstructor.set_reference(scene.reference)
-        for budget_s in BUDGETS_S:
-            reconstructor.budget_s = budget_s
-            reconstructor.reset()
-            terms.append(np.array([1.0, 0.0, 0.0]))
-            begin_s = time.thread_time()
-            reconstructor.reconstruct(scene.magnitude, scene.structure)
-            seconds.append(time.thread_time() - begin_s)
-    law, _ = nnls(np.array(terms) / np.array(seconds)[:, None], np.ones(len(seconds)))
-    off = float(np.std(np.array(terms) @ law / seconds))
-    return dict(zip(("cold_s", "sheet_s", "entry_s", "off"), (*law.tolist(), off), strict=True))
 
 
 def _rows(sensor: SensorDescription) -> Iterator[Row]:

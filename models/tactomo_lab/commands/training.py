@@ -204,7 +204,7 @@ def train_tanks(
         "tank.onnx"
     ),
 ) -> None:
-    """Simulate round tanks, and train the network that `tactomo evaluate ktc` and `tanks` use.
+    """Simulate round tanks, and train the network that `tactomo evaluate ktc` and `measured` use.
 
     Tanks hold one to four objects of either kind and of many outlines; the network sees them by 32
     electrodes of which none to twelve are lost, and by 16. Scenes that are there already are not

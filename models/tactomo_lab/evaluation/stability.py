@@ -94,11 +94,18 @@ def make_case(
         regime=regime,
         name=f"{seed_set} {number}",
         plan=plan,
-        description=planned.told,
+        description=_regularised(planned.told, plan.regularisation),
         reference=reference,
         frames=frames,
         truth=truth_of(planned.true, plan.frames[-1]),
     )
+
+
+def _regularised(told: SensorDescription, factor: float) -> SensorDescription:
+    """The sensor with so many times its factor on what the linear methods choose."""
+    weighted = {"regularisation": factor * told.instrument.regularisation}
+    instrument = told.instrument.model_copy(update=weighted)
+    return told.model_copy(update={"instrument": instrument})
 
 
 @dataclass(frozen=True)
@@ -241,10 +248,7 @@ def reconstruct_case(case: Case, *methods: str, artifact: Artifact | None = None
     """
     artifact = artifact or _artifact(case.description)
     budget_s = BUDGET_S if len(case.frames) == 1 else None
-    factor = case.plan.regularisation
-    reconstructor = Reconstructor(
-        case.description, artifact, budget_s=budget_s, regularisation=factor
-    )
+    reconstructor = Reconstructor(case.description, artifact, budget_s=budget_s)
     outcomes = []
     with threadpool_limits(1):
         reconstructor.set_reference(case.reference)  # costs more than many a method

@@ -36,8 +36,8 @@ SETTLED = 5e-3  # share of the cost below which another gain is not worth a step
 # one of 36 scenes then goes another way, at a correlation lower by 0.13.
 FORESEEN = 1e-3
 # Processor time on a quiet core of the 2.5 GHz class, by least squares over frames of all kinds of
-# scenes, to 22 % (`tactomo evaluate solves --budget 4`). Measured on a busy core, divided by 1.3:
-# by so much cold frames took longer than on a quiet one.
+# scenes, to 22 %. Measured on a busy core, divided by 1.3: by so much cold frames took longer than
+# on a quiet one.
 COLD_S = 5e-3  # a frame that starts cold, beside its steps: network, account
 SHEET_S = 1.6e-4  # a step on one sheet
 ENTRY_S = 3.7e-8  # the same, for each node that is pressed and each parameter

@@ -1,4 +1,4 @@
-"""`tactomo evaluate tanks` and `skin`: tables, JSON, pictures, and files that are none."""
+"""`tactomo evaluate measured`: sets known by their arrays, tables, JSON, files that are none."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from simulated_tanks import simulated_tanks
-from tactomo_lab.commands.measured_page import BEGIN, END, SETS
+from tactomo_lab.commands.measured import BEGIN, END, SETS
 from tactomo_models import load_description
 from whole_system import repository
 
@@ -31,37 +31,22 @@ def tank(tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_tanks_in_numbers_and_pictures(tactomo: Run, tank: Path, tmp_path: Path) -> None:
-    picture = tmp_path / "tanks.png"
+def test_tanks_are_known_by_their_arrays(tactomo: Run, tank: Path, tmp_path: Path) -> None:
     some = simulated_tanks(load_description(tank), "tuning", 2)
     np.savez(tmp_path / "two.npz", dv=some.changes, truth=some.truth, name=np.array(some.names))
-    asked = ("evaluate", "tanks", tmp_path / "two.npz", "--description", tank, "--scale", 1.05)
-    result = tactomo(*asked, "--method", "noser", "--json", "--picture", picture)
-    assert result.returncode == 0
+    asked = ("evaluate", "measured", tmp_path / "two.npz", "--description", tank)
+    result = tactomo(*asked, "--json")
+    assert result.returncode == 0, result.stderr
     told = json.loads(result.stdout)
-    assert (told["simulated"], told["scale"]) == (False, 1.05)
-    assert [one["name"] for one in told["tanks"]] == ["tuning 0", "tuning 1"]
-    mean = np.mean([one["correlation"] for one in told["tanks"]])
-    assert told["mean_correlation"] == {"noser": pytest.approx(mean)}
-    assert 0.4 < mean < 1
-    assert picture.read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.slow
-def test_tanks_in_words(tactomo: Run, tank: Path, tmp_path: Path) -> None:
-    rows = np.linspace(1, -1, 32)[:, None]
-    np.savez(
-        tmp_path / "measured.npz",
-        dv=np.random.default_rng(0).normal(size=(1, 208)),
-        truth=np.sign(rows) * np.ones((1, 32, 32)),
-        name=np.array(["half"]),
-    )
-    asked = ("evaluate", "tanks", tmp_path / "measured.npz", "--description", tank, "--scale", 0.01)
-    result = tactomo(*asked)
-    assert result.returncode == 0
-    assert "measured tanks, tank_uef2017, scale 0.01" in result.stdout
-    for heading in ("half", "tikhonov", "noser", "network", "mean"):
-        assert heading in result.stdout
+    assert told["simulated"] is False
+    (facts,) = told["sets"].values()
+    noser = [one["correlation"] for one in facts["tanks"] if one["method"] == "noser"]
+    assert len(noser) == 2
+    assert facts["mean_correlation"]["noser"] == pytest.approx(np.mean(noser))
+    assert 0.4 < np.mean(noser) < 1
+    words = tactomo(*asked).stdout
+    for heading in ("two.npz", "tuning 0", "tuning 1", "tikhonov", "noser", "network"):
+        assert heading in words
 
 
 @pytest.mark.slow
@@ -74,19 +59,18 @@ def test_presses_in_numbers_and_words(tactomo: Run, tmp_path: Path) -> None:
         dv=rng.normal(size=(40, 192)),
         pos_m=rng.uniform(-0.03, 0.03, size=(40, 3)),
     )
-    result = tactomo("evaluate", "skin", tmp_path / "presses.npz", "--json")
+    result = tactomo("evaluate", "measured", tmp_path / "presses.npz", "--json")
     assert result.returncode == 0
-    told = json.loads(result.stdout)
+    told = json.loads(result.stdout)["sets"]["presses.npz"]
     assert told["presses"] == 40
     noise = told["methods"]["NOSER image"]  # of which nothing can be located
     assert noise["median_mm"] > 0.7 * told["methods"]["mean position (no measurement)"]["median_mm"]
     assert noise["most_mm"] > noise["median_mm"]
-    result = tactomo("evaluate", "skin", tmp_path / "presses.npz")
-    assert "40 measured presses" in result.stdout
+    result = tactomo("evaluate", "measured", tmp_path / "presses.npz")
     assert "taught by" in result.stdout
 
 
-@pytest.mark.parametrize("command", ["tanks", "skin", "ktc"])
+@pytest.mark.parametrize("command", ["measured", "ktc"])
 def test_a_file_that_is_none(tactomo: Run, tmp_path: Path, command: str) -> None:
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
     result = tactomo("evaluate", command, tmp_path / "other.npz")
@@ -95,6 +79,26 @@ def test_a_file_that_is_none(tactomo: Run, tmp_path: Path, command: str) -> None
     result = tactomo("evaluate", command, tmp_path / "absent.npz")
     assert result.returncode == 1
     assert "cannot read" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("tanks.npz", "-d", "paper_square"), "is no round tank"),
+        (("skins.npz", "-d", "paper_square"), "leave it out"),
+        (("tanks.npz", "--into", "page.md"), "goes with a folder"),
+        ((".", "-d", "tank_uef2017"), "goes with one file"),
+    ],
+)
+def test_what_does_not_go_together_is_refused_before_the_work(
+    tactomo: Run, tmp_path: Path, options: tuple[str, ...], told: str
+) -> None:
+    empty = np.zeros(0)
+    np.savez(tmp_path / "tanks.npz", dv=empty, truth=empty, name=empty)
+    np.savez(tmp_path / "skins.npz", a_voltages=empty, a_xy_mm=empty)
+    result = tactomo("evaluate", "measured", *options)
+    assert result.returncode in (1, 2)
+    assert told in " ".join(result.stderr.replace("│", " ").split())
 
 
 @pytest.mark.slow

@@ -243,16 +243,17 @@ def test_regularisation_is_so_many_times_what_the_rule_chooses(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     case = case_of(small, "wrong-lambda")
-    factor = case.plan.regularisation
+    factor = case.description.instrument.regularisation
     assert factor == 0.01
     wrong = by(method, case, small_artifact).frame.map
-    plan = replace(case.plan, regularisation=1.0)
-    right = by(method, replace(case, plan=plan), small_artifact).frame.map
+    told = case.description.model_copy(update={"instrument": small.instrument})
+    case = replace(case, description=told)
+    right = by(method, case, small_artifact).frame.map
     monkeypatch.setattr(
         "tactomo_models.methods.linear.prior_weight",
         lambda *given: factor * linear.prior_weight(*given),
     )
-    expected = by(method, replace(case, plan=plan), small_artifact).frame.map
+    expected = by(method, case, small_artifact).frame.map
     assert wrong is not None
     assert right is not None
     assert expected is not None

@@ -3,8 +3,7 @@
 *Live*: a twin and a daemon as processes of their own, and this process as the subscriber; latency
 is from the moment at which the daemon has read the last byte of a dual scan to the arrival of its
 contacts here, by the clock that both processes share. *Machine speed* is
-`tactomo.cli.bench.machine_speed`'s; *methods* and *chart* are the laboratory's, see
-`tactomo.cli.laboratory`.
+`tactomo.cli.bench.machine_speed`'s; *chart* is the laboratory's, see `tactomo.cli.laboratory`.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ import typer
 
 from tactomo.cli import options
 from tactomo.cli.bench.comparison import compared, read_results, table_of
-from tactomo.cli.laboratory import installed_measurement, measurement, not_installed
+from tactomo.cli.laboratory import measurement
 from tactomo.cli.output import print_json, table
 
 if TYPE_CHECKING:
@@ -38,7 +37,7 @@ SETTLE_S = 1.5
 STATUS_S = 13.0  # at 20 dual scans a second: as far back as the stage times in a status go
 START_S = 60.0
 PLACES = ((0.0, 0.1), (-0.45, -0.4), (0.5, -0.35))  # in shares of half the sheet's size
-LIVE, METHODS, CHART, SPEED = "Live", "Methods", "Speed against accuracy", "Machine speed"
+LIVE, CHART, SPEED = "Live", "Speed against accuracy", "Machine speed"
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,6 @@ class Results:
     live: list[Phase] = field(default_factory=list)
     late_scans: int | None = None
     dropped_scans: int | None = None
-    methods: list[dict[str, Any]] = field(default_factory=list)
     compared: list[dict[str, Any]] = field(default_factory=list)
     chart: list[dict[str, Any]] = field(default_factory=list)
 
@@ -78,7 +76,6 @@ app = options.typer_app()
         "tactomo bench --seconds 20 --ports 1",
         "tactomo bench --json > times.json",
         "tactomo bench --compare times.json",
-        "tactomo bench --no-live --method my_module:MyMethod --method auto",
         "tactomo bench --chart speed_accuracy.png --count 25",
         "tactomo bench --chart mine.png --method my_module:MyMethod --method auto",
         "tactomo bench --machine-speed",
@@ -98,12 +95,6 @@ def bench(
     rate: Annotated[
         float, typer.Option(rich_help_panel=LIVE, help="Dual scans a second of the twin.")
     ] = 20.0,
-    live: Annotated[
-        bool, typer.Option(rich_help_panel=LIVE, help="Measure latency from port to subscriber.")
-    ] = True,
-    method: Annotated[
-        list[str] | None, options.methods_option(" [every installed one]", rich_help_panel=METHODS)
-    ] = None,
     compare: Annotated[
         Path | None,
         typer.Option(help="Set the figures beside those of an earlier run, kept with --json."),
@@ -120,6 +111,9 @@ def bench(
         int,
         typer.Option(min=1, rich_help_panel=CHART, help="Still scenes each of 1 to 4 contacts."),
     ] = 10,
+    method: Annotated[
+        list[str] | None, options.methods_option(" [every installed one]", rich_help_panel=CHART)
+    ] = None,
     machine_speed: Annotated[
         bool,
         typer.Option(
@@ -139,16 +133,11 @@ def bench(
     ] = False,
     as_json: options.JsonOutput = False,
 ) -> None:
-    """Measure latency, rate and time per frame on this machine.
+    """Measure latency and rate on this machine, or what a method's time buys.
 
     Starts a twin and a daemon of its own on free addresses, so a running demo is not disturbed
     (but shares the processor), presses the twin in four ways and measures each. Takes about a
-    minute.
-
-    With the laboratory installed, every method is then timed on simulated scans, on one thread,
-    beside a bare matrix-vector product and pyEIT (`pip install 'tactomo[compare]'`): nothing
-    pressed, cold, still and moving; in ms, and in such products, and what memory it takes. Takes
-    another one or two minutes. `--compare` sets all that beside an earlier run.
+    minute. `--compare` sets it beside an earlier run.
 
     With `--chart`, every method reconstructs simulated presses of mixed kinds on skins made by
     hand, of the reporting seeds: still ones at 40, 20 and 10 dB, each from a cold start, and
@@ -164,10 +153,10 @@ def bench(
         raise typer.BadParameter("--show goes with --machine-speed")
     if machine_speed and chart is not None:
         raise typer.BadParameter("--machine-speed and --chart are two runs")
-    if machine_speed and method:
-        raise typer.BadParameter("--machine-speed measures auto, without --method")
+    if method and chart is None:
+        raise typer.BadParameter("--method goes with --chart")
     if compare is not None and (machine_speed or chart is not None):
-        raise typer.BadParameter("--compare goes with latencies and methods alone")
+        raise typer.BadParameter("--compare goes with latencies alone")
     earlier = None if compare is None else read_results(compare)
     results = Results(machine(), description)
     if chart is not None:
@@ -178,20 +167,14 @@ def bench(
         return
     from rich.console import Console
 
-    time_methods, methods = installed_measurement("methods"), None
-    if time_methods is None and (method or not live):
-        raise not_installed("the table of methods")
     with Console(stderr=True).status("starting") as line:
-        if live:
-            _measure_twin(results, ports, rate, seconds, line.update)
-        if time_methods is not None:
-            results.methods, methods = time_methods(description, method or [], line.update)
+        _measure_twin(results, ports, rate, seconds, line.update)
     if earlier is not None:
         results.compared = compared(earlier, asdict(results))
     if as_json:
         print_json(asdict(results))
     else:
-        _print(results, methods)
+        _print(results)
         if compare is not None:
             _console(results).print(table_of(results.compared, compare))
 
@@ -326,17 +309,14 @@ def _spot(description: SensorDescription, place: tuple[float, float]) -> tuple[f
     return place[0] * description.width_m * 500.0, place[1] * description.height_m * 500.0
 
 
-def _print(results: Results, methods: Table | None) -> None:
+def _print(results: Results) -> None:
     console = _console(results)
-    if results.live:
-        console.print(_live_table(results))
-        console.print(_stage_table(results.live))
-        console.print(
-            f"late scans of the twin: {results.late_scans}; "
-            f"dual scans dropped by the daemon: {results.dropped_scans}"
-        )
-    if methods is not None:
-        console.print(methods)
+    console.print(_live_table(results))
+    console.print(_stage_table(results.live))
+    console.print(
+        f"late scans of the twin: {results.late_scans}; "
+        f"dual scans dropped by the daemon: {results.dropped_scans}"
+    )
 
 
 def _console(results: Results) -> Console:

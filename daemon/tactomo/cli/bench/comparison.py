@@ -1,7 +1,6 @@
 """`tactomo bench --compare`: what has become slower or larger since an earlier `bench --json`.
 
-Methods are compared in bare products of the same run, which hold on another machine as well; live
-latency in milliseconds, which does not.
+Live latency in milliseconds, which holds for one machine.
 """
 
 from __future__ import annotations
@@ -19,9 +18,8 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]  # see `compared`
 
-# What is compared of a row: its name in the table, and the row's keys for p50, p99 and memory.
-METHODS: Final = ("products", "of_product", "p99_of_product", "memory_mb")
-LIVE: Final = ("ms", "latency_p50_ms", "latency_p99_ms", "memory_mb")
+# What is compared of a row, and its key there.
+FIGURES: Final = {"p50": "latency_p50_ms", "p99": "latency_p99_ms", "memory_mb": "memory_mb"}
 NOTICEABLE: Final = 1.3  # ratio that is marked; p50s of two runs on a busy machine: up to 1.3
 
 
@@ -32,7 +30,7 @@ def read_results(path: Path) -> Mapping[str, Any]:
     """
     try:
         results = json.loads(path.read_text("utf-8"))
-        _named(results)
+        _by_scene(results)
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise TactomoError(
             f"cannot compare with {path}: {error}", "write one with: tactomo bench --json > FILE"
@@ -44,38 +42,28 @@ def compared(earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[Row]:
     """Set the rows of two runs beside each other.
 
     Returns:
-        A row for each that both have measured: `what`, `unit`, and p50, p99 and memory_mb as
+        A row for each scene that both have measured: `what`, and p50, p99 (ms) and memory_mb as
         [earlier, now], None where one of them has no figure.
     """
-    before = _named(earlier)
+    before = _by_scene(earlier)
     rows = []
-    for what, (row, unit, *keys) in _named(now).items():
-        if what in before:
-            pairs = [[before[what][0].get(key), row.get(key)] for key in keys]
-            both = [pair if None not in pair else None for pair in pairs]
-            rows.append({"what": what, "unit": unit, **dict(zip(_FIGURES, both, strict=True))})
+    for scene, row in _by_scene(now).items():
+        if scene in before:
+            pairs = {name: [before[scene].get(key), row.get(key)] for name, key in FIGURES.items()}
+            both = {name: None if None in pair else pair for name, pair in pairs.items()}
+            rows.append({"what": f"live: {scene}", **both})
     return rows
 
 
-_FIGURES: Final = ("p50", "p99", "memory_mb")
-
-
-def _named(results: Mapping[str, Any]) -> dict[str, tuple[Row, str, str, str, str]]:
-    """Rows of a run by what they measure, each with its unit and the keys of what is compared."""
-    return {
-        **{f"live: {row['scene']}": (row, *LIVE) for row in results["live"]},
-        **{
-            f"{row['method']}, contacts {row['contacts']}, {row['state']}": (row, *METHODS)
-            for row in results["methods"]
-        },
-    }
+def _by_scene(results: Mapping[str, Any]) -> dict[str, Row]:
+    return {row["scene"]: row for row in results["live"]}
 
 
 def table_of(rows: Iterable[Row], path: Path) -> Table:
     """Lay out a comparison; what has grown noticeably is red, what has shrunk so is green."""
-    shown = table("measured", "unit", "p50", "p99", "memory MB", title=f"{path}, and now")
+    shown = table("measured", "p50 ms", "p99 ms", "memory MB", title=f"{path}, and now")
     for row in rows:
-        shown.add_row(row["what"], row["unit"], *(_change(row[figure]) for figure in _FIGURES))
+        shown.add_row(row["what"], *(_change(row[figure]) for figure in FIGURES))
     return shown
 
 

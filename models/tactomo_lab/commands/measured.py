@@ -1,14 +1,18 @@
-"""`tactomo evaluate measured`: every measured set in a folder, beside what others published."""
+"""`tactomo evaluate measured`: measured sets, recognised by their arrays, and what others say."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
 import typer
-from tactomo.cli.options import examples, typer_app
+from tactomo.cli.options import JsonOutput, examples, typer_app
+from tactomo.cli.output import print_json
 from tactomo.errors import TactomoError
+
+if TYPE_CHECKING:
+    from tactomo_models import SensorDescription
 
 app = typer_app()
 
@@ -18,41 +22,44 @@ TRAINED: Final = (100, 200, 800)  # presses learnt from
 
 
 class Measured(NamedTuple):
-    """What a set shows: the figure of its row, and tables with their captions."""
+    """What a set shows: the figure of its row, tables with their captions, all for programs."""
 
     ours: str
     details: list[str]
+    facts: dict[str, Any]
 
 
 class PublicSet(NamedTuple):
     """A set that a reader can get.
 
     Attributes:
-        file: what it is to be called; `tactomo evaluate COMMAND --help` names its arrays.
+        file: what it is called.
+        arrays: what sets of its kind are recognised by: how their arrays' names end.
+        description: the shipped sensor that it is of; nothing where none has to be known.
         title: what it is.
         command: what measures it, behind `tactomo evaluate`.
-        measure: the same, as a function of the path.
+        measure: the same, as a function of the path and the sensor.
         published: the best figure of others, with who says so; or a plain method's.
         apart: what is not comparable.
         source: where the raw data are.
     """
 
     file: str
+    arrays: tuple[str, ...]
+    description: str
     title: str
     command: str
-    measure: Callable[[Path], Measured]
+    measure: Callable[[Path, str], Measured]
     published: str
     apart: str
     source: str
 
 
-def challenge(path: Path) -> Measured:
+def challenge(path: Path, sensor: str) -> Measured:
     """Score the challenge's tanks at each level."""
-    from tactomo_models import load_description
-
     from tactomo_lab.evaluation.ktc import evaluate_challenge, read_challenge
 
-    tank = load_description("tank_ktc2023")
+    tank = tank_of(sensor)
     given = read_challenge(path, tank)
     tanks = [list(evaluate_challenge(given.at_level(level), tank)) for level in range(1, 8)]
     means = [_mean([one.score for one in level]) for level in tanks]
@@ -63,19 +70,35 @@ def challenge(path: Path) -> Measured:
         *_table(["level", *map(str, range(1, 8))], [["score", *(f"{m:.3f}" for m in means)]]),
         f"{seconds:.1f} s a tank on one core (processor time).",
     ]
-    return Measured(f"{3 * sum(means):.1f} of 21", details)
+    return Measured(f"{3 * sum(means):.1f} of 21", details, {"score_by_level": means})
 
 
-def saline_tanks(path: Path) -> Measured:
+def tank_of(sensor: str) -> SensorDescription:
+    """Load the description of a round tank.
+
+    Raises TactomoError where it is none.
+    """
+    from tactomo_models import load_description
+
+    description = load_description(sensor)
+    if description.sheet.shape != "disc" or description.channels != ("structure",):
+        raise TactomoError(
+            f"{description.name!r} is no round tank",
+            "give a description of one, such as tank_uef2017 or tank_ktc2023",
+        )
+    return description
+
+
+def saline_tanks(path: Path, sensor: str) -> Measured:
     """Correlate images of tanks with the truth, by three methods."""
     from scipy.stats import spearmanr
-    from tactomo_models import load_description
 
     from tactomo_lab.evaluation.tanks import TankImager, evaluate_tanks, read_tanks
 
-    tank = load_description("tank_uef2017")
+    tank = tank_of(sensor)
     methods = ["network", "noser", "tikhonov"]
-    found = list(evaluate_tanks(TankImager(tank), read_tanks(path, tank), methods))
+    tanks = read_tanks(path, tank)
+    found = list(evaluate_tanks(TankImager(tank), tanks, methods))
     of = {name: [one for one in found if one.method == name] for name in methods}
     ours, noser, tikhonov = (_mean([one.correlation for one in of[name]]) for name in methods)
     ranks = spearmanr(
@@ -92,28 +115,40 @@ def saline_tanks(path: Path) -> Measured:
         ),
         f"The network's confidence ranks them by {ranks.statistic:.2f} (Spearman).",
     ]
-    return Measured(f"{ours:.3f} (NOSER {noser:.2f}, Tikhonov {tikhonov:.2f})", details)
+    told = ("name", "method", "correlation", "misfit", "confidence", "seconds")
+    facts = {
+        "mean_correlation": {"network": ours, "noser": noser, "tikhonov": tikhonov},
+        "tanks": [{name: getattr(one, name) for name in told} for one in found],
+    }
+    return Measured(f"{ours:.3f} (NOSER {noser:.2f}, Tikhonov {tikhonov:.2f})", details, facts)
 
 
-def round_skin(path: Path) -> Measured:
+def round_skin(path: Path, sensor: str) -> Measured:
     """Locate a robot's presses by several methods, cross-validated."""
     from tactomo_models import load_description
 
     from tactomo_lab.evaluation.skin_presses import localise, read_presses
 
-    skin = load_description("skin_round")
-    found = localise(read_presses(path, skin), skin)
+    skin = load_description(sensor)
+    presses = read_presses(path, skin)
+    found = localise(presses, skin)
     physics = min(one.median_mm for one in found if "image" in one.method)
     taught = min(one.median_mm for one in found if "taught" in one.method)
     rows = [[one.method, f"{one.median_mm:.1f}", f"{one.most_mm:.1f}"] for one in found]
     return Measured(
         f"{taught:.1f} mm (median) taught by the other presses; {physics:.1f} mm by physics alone",
         ["Ten folds:", *_table(["error, mm", "median", "95 %"], rows)],
+        {
+            "presses": len(presses.changes),
+            "methods": {
+                one.method: {"median_mm": one.median_mm, "most_mm": one.most_mm} for one in found
+            },
+        },
     )
 
 
-def soft_skins(path: Path) -> Measured:
-    """Learn skins from their first presses, and locate the last 800."""
+def soft_skins(path: Path, sensor: str) -> Measured:
+    """Learn skins from their first presses, and locate the last 800; of any make."""
     from threadpoolctl import threadpool_limits
 
     from tactomo_lab.evaluation.taught_presses import judge, read_skins
@@ -131,12 +166,15 @@ def soft_skins(path: Path) -> Measured:
             "Median error, mm, by presses learnt from:",
             *_table(["presses", *(skin.name for skin in skins), "mean"], rows),
         ],
+        {"mean_median_mm": dict(zip(map(str, TRAINED), means, strict=True))},
     )
 
 
 SETS: Final = (
     PublicSet(
         "ktc2023_training.npz",
+        ("injection", "measurement", "reference", "voltages", "truth"),
+        "tank_ktc2023",
         "Kuopio Tomography Challenge 2023, 32 electrodes, sum of scores",
         "ktc FILE --level 1, to 7",
         challenge,
@@ -147,8 +185,10 @@ SETS: Final = (
     ),
     PublicSet(
         "tank_uef2017.npz",
+        ("dv", "truth", "name"),
+        "tank_uef2017",
         "University of Eastern Finland 2017, saline tanks of 16 electrodes, mean correlation",
-        "tanks FILE",
+        "measured FILE",
         saline_tanks,
         "one-step NOSER 0.76 over the whole set; no published correlation was found",
         "the whole set has more tanks",
@@ -156,8 +196,10 @@ SETS: Final = (
     ),
     PublicSet(
         "skin_round_presses.npz",
+        ("lookup", "dv", "pos_m"),
+        "skin_round",
         "Round e-skin of 80 mm (Hardman), 1250 robot presses",
-        "skin FILE",
+        "measured FILE",
         round_skin,
         "none was found for these presses",
         "",
@@ -165,6 +207,8 @@ SETS: Final = (
     ),
     PublicSet(
         "skins_anisotropy.npz",
+        ("_voltages", "_xy_mm"),
+        "",
         "Five soft skins of 80 mm (Hardman), learnt from the first 800 presses of each, judged on "
         "the last 800",
         "presses FILE --train 800",
@@ -178,41 +222,101 @@ SETS: Final = (
 
 @app.command(
     epilog=examples(
-        "tactomo evaluate measured data/", "tactomo evaluate measured data/ --into docs/measured.md"
+        "tactomo evaluate measured data/",
+        "tactomo evaluate measured data/ --into docs/measured.md",
+        "tactomo evaluate measured my_tanks.npz -d my_tank.toml --json",
     )
 )
 def measured(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Where the sets lie.")],
+    path: Annotated[
+        Path, typer.Argument(metavar="DIR|FILE.npz", help="Where sets lie, or one of your own.")
+    ],
     into: Annotated[
-        Path | None, typer.Option(help="A page to put the tables into, between its two marks.")
+        Path | None, typer.Option(help="A page to put DIR's tables into, between its two marks.")
     ] = None,
+    sensor: Annotated[
+        str | None,
+        typer.Option("--description", "-d", help="Sensor of FILE. [that of the public set]"),
+    ] = None,
+    as_json: JsonOutput = False,
 ) -> None:
-    """Measure every public set that is in DIR, and tell it beside the best published figure.
+    """Measure a set, or every public set that is in DIR beside the best published figure.
 
-    Prints Markdown. The sets: ktc2023_training.npz, tank_uef2017.npz, skin_round_presses.npz and
-    skins_anisotropy.npz, with the arrays that `tactomo evaluate ktc`, `tanks`, `skin` and
-    `presses` take; what is missing is said in its row. All four take two minutes of one core.
+    Prints Markdown. FILE is recognised by its arrays. *Tanks with objects*: `dv` (n, M), by how
+    much each voltage grew when the objects came in, on one unknown scale common to all; `truth`
+    (n, rows, columns), 1 in what conducts better than the saline and -1 in what conducts worse,
+    row 0 at the top, the disc filling the picture; `name` (n,). The figure is the Pearson
+    correlation of the image with the truth over the disc; the network's confidence is the
+    correlation to expect. *Presses of a robot*: `lookup` (M, 4), the source, sink, v+ and v-
+    electrode of each voltage; `dv` (n, M); `pos_m` (n, 2), where it pressed, in its own frame. How
+    the skin lies there is fitted to some presses and judged on others. *Tanks of the Kuopio
+    Tomography Challenge* and *presses on skins of unknown make*: as `tactomo evaluate ktc` and
+    `presses` take them, at every level and after 100, 200 and 800 presses.
+
+    The public sets: ktc2023_training.npz, tank_uef2017.npz, skin_round_presses.npz and
+    skins_anisotropy.npz; what is missing is said in its row. All four take two minutes of one core.
     """
-    from rich.console import Console
-
+    if not path.is_dir():
+        if into is not None:
+            raise typer.BadParameter("--into goes with a folder")
+        found = _measure(path, _recognised(path), sensor)
+        lines = [f"{path.name}: {found.ours}", "", *found.details]
+        _tell({path.name: found}, "\n".join(lines), as_json)
+        return
+    if sensor is not None:
+        raise typer.BadParameter("--description goes with one file")
     before, after = ("", "") if into is None else _around(into)
-    there = [each for each in SETS if (folder / each.file).exists()]
+    there = [each for each in SETS if (path / each.file).exists()]
     if not there:
         names = ", ".join(each.file for each in SETS)
-        raise TactomoError(f"{folder} holds none of the sets", f"put some there: {names}")
-    found = {}
-    for each in there:
-        with Console(stderr=True).status(each.file):
-            found[each.file] = each.measure(folder / each.file)
-    text = "\n".join(_page(found)) + "\n"
+        raise TactomoError(f"{path} holds none of the sets", f"put some there: {names}")
+    sets = {each.file: _measure(path / each.file, each, None) for each in there}
+    text = "\n".join(_page(sets)) + "\n"
     if into is None:
-        typer.echo(text)
+        _tell(sets, text, as_json)
         return
     from tactomo_models.archive import write_whole
 
     page = before + text + after
     write_whole(into, lambda file: file.write(page.encode()))
     typer.echo(f"wrote {into}", err=True)
+
+
+def _tell(sets: dict[str, Measured], text: str, as_json: bool) -> None:
+    if as_json:
+        print_json({"simulated": False, "sets": {name: one.facts for name, one in sets.items()}})
+    else:
+        typer.echo(text)
+
+
+def _measure(path: Path, kind: PublicSet, sensor: str | None) -> Measured:
+    from rich.console import Console
+
+    if sensor is not None and not kind.description:
+        raise typer.BadParameter("--description: presses alone are learnt from; leave it out")
+    with Console(stderr=True).status(path.name):
+        return kind.measure(path, sensor or kind.description)
+
+
+def _recognised(path: Path) -> PublicSet:
+    """Return the public set that a file has the arrays of.
+
+    Raises TactomoError where the file cannot be read, or has the arrays of none.
+    """
+    from tactomo_models.archive import read_arrays
+
+    try:
+        names = list(read_arrays(path))
+    except OSError as error:
+        raise TactomoError(f"cannot read {path}: {error.strerror}", "give a set's .npz") from error
+    for each in SETS:
+        if all(any(name.endswith(array) for name in names) for array in each.arrays):
+            return each
+    known = "; ".join(", ".join(each.arrays) for each in SETS)
+    raise TactomoError(
+        f"{path} is no set of measured scans: it holds {', '.join(names) or 'nothing'}",
+        f"give the arrays of one: {known}",
+    )
 
 
 def _around(page: Path) -> tuple[str, str]:
