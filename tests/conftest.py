@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
+from needs import lacking
 from selenium import webdriver
 from selenium.common.exceptions import WebDriverException
 from selenium.webdriver.chrome.service import Service
@@ -93,7 +94,7 @@ def _chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[webdriver.Ch
     program = program or shutil.which("google-chrome")
     driver = shutil.which("chromedriver")
     if program is None or driver is None:
-        pytest.skip("needs Chromium and chromedriver on the PATH")
+        lacking("needs Chromium and chromedriver on the PATH")
     options = webdriver.ChromeOptions()
     options.binary_location = program
     for option in CHROMIUM_OPTIONS:
@@ -104,7 +105,7 @@ def _chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[webdriver.Ch
     try:
         browser = webdriver.Chrome(options, Service(driver))
     except WebDriverException as error:
-        pytest.skip(f"Chromium does not start: {error.msg}")
+        lacking(f"Chromium does not start: {error.msg}")
     yield browser
     browser.quit()
 

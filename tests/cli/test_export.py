@@ -176,10 +176,19 @@ def test_a_cut_recording_gives_what_is_there_and_says_so(tactomo: Run, grasp: Pa
     data = grasp.read_bytes()
     grasp.write_bytes(data[: len(data) * 2 // 3])
     result = tactomo("export", grasp, "contacts.csv")
-    if result.returncode:  # all of it was in one chunk, and that is cut
-        assert "there are no maps" in result.stderr
-    else:
-        assert "cut" in result.stderr
+    assert result.returncode == 0
+    assert "is cut off or damaged" in result.stderr
+    frames = len({row["time_s"] for row in rows_of(grasp.with_name("contacts.csv"))})
+    assert FRAMES / 2 < frames < FRAMES
+
+
+def test_a_recording_cut_before_its_first_frame_has_nothing_to_export(
+    tactomo: Run, grasp: Path
+) -> None:
+    grasp.write_bytes(grasp.read_bytes()[:600])
+    result = tactomo("export", grasp, "contacts.csv")
+    assert result.returncode == 1
+    assert "no dual scan of paper_square is in it" in result.stderr
 
 
 @pytest.mark.parametrize(

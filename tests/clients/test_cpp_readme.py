@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from cpp_client import CPP_FOLDER, need_headers
+from needs import need
 from page import Page
 from tactomo_client import Contact
 from tactomo_client.fake import FakeSensor
@@ -73,8 +74,7 @@ class Checkout:
 @pytest.fixture(scope="module")
 def checkout(tmp_path_factory: pytest.TempPathFactory) -> Checkout:
     need_headers()
-    if shutil.which("cmake") is None or shutil.which("pkg-config") is None:
-        pytest.skip("needs cmake and pkg-config")
+    need("cmake", "pkg-config")
     return Checkout(tmp_path_factory.mktemp("home"))
 
 

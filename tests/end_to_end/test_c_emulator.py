@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from c_firmware import C_FOLDER, SANITIZED, build, need, runs
+from c_firmware import C_FOLDER, SANITIZED, build, runs
 from daemon_process import DaemonProcess
 from ears import Ears, Heard
+from needs import need
 from page import Page
 from waiting import wait_until
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
-from c_firmware import SANITIZED, Speaker, build, need, runs, speaking
+from c_firmware import SANITIZED, Speaker, build, runs, speaking
+from needs import lacking, need
 
 
 @pytest.fixture(scope="session")
@@ -14,7 +15,7 @@ def sanitized(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Speaker]:
     folder = tmp_path_factory.mktemp("sanitized")
     need("cc")
     if not runs(folder, "cc", SANITIZED):
-        pytest.skip("this compiler has no sanitizers")
+        lacking("needs a compiler with sanitizers")
     with speaking(build("speak", folder, CFLAGS=SANITIZED)) as speaker:
         yield speaker
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from collections import Counter
@@ -13,10 +14,11 @@ from typing import Any
 import protocol_vectors as vectors
 import pytest
 from any_packets import PACKETS, SMALL_PACKETS
-from c_firmware import C_FOLDER, Speaker, answered, build, f64_bits, need, text_bytes
+from c_firmware import C_FOLDER, Speaker, answered, build, f64_bits, text_bytes
 from cobs import cobs
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from needs import lacking, need
 from tactomo_protocol import Command, Decoder, DecoderCounts, Packet, encode
 
 VECTORS = C_FOLDER.parent / "vectors"
@@ -205,13 +207,15 @@ def may_be_sent(text: bytes) -> bool:
 
 @pytest.mark.parametrize("compiler", ["gcc", "clang", "arm-none-eabi-gcc"])
 def test_the_library_compiles_without_a_warning(tmp_path: Path, compiler: str) -> None:
-    need(compiler)
     if compiler == "arm-none-eabi-gcc":
+        if shutil.which(compiler) is None:
+            pytest.skip(f"needs {compiler} on the PATH")
         header = subprocess.run(
             [compiler, "-E", "-xc", "-"], input=b"#include <string.h>", capture_output=True
         )
         if header.returncode != 0:
             pytest.skip("needs the newlib of arm-none-eabi-gcc")
+    need(compiler)
     build("example_firmware.o", tmp_path, compiler)
     for source in ("tactomo_protocol.c", "tactomo_device.c"):
         options = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror", "-Os"]
@@ -231,7 +235,7 @@ def test_a_fuzzer_finds_nothing_in_a_moment(tmp_path: Path, fuzzer: str) -> None
     (tmp_path / "try.c").write_text("int LLVMFuzzerTestOneInput(void) { return 0; }\n")
     tried = ["clang", "-fsanitize=fuzzer,address", "-o", f"{tmp_path}/try", f"{tmp_path}/try.c"]
     if subprocess.run(tried, capture_output=True).returncode != 0:
-        pytest.skip("this clang has no libFuzzer (Debian: libclang-rt-14-dev)")
+        lacking("needs a clang with libFuzzer (Debian: libclang-rt-14-dev)")
     program = build(fuzzer, tmp_path)
     seeds = tmp_path / "seeds"
     subprocess.run(

@@ -6,7 +6,6 @@ PROTOCOL.md with nothing but arithmetic, which shares no line with the package i
 
 import ctypes
 import json
-import shutil
 import struct
 import subprocess
 import sys
@@ -18,6 +17,7 @@ import protocol_vectors as vectors
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from needs import need
 from tactomo_protocol import Decoder, Packet, encode
 
 FOLDER = Path(__file__).parents[2] / "firmware_protocol"
@@ -257,16 +257,14 @@ def test_the_worked_example_is_the_vector() -> None:
 @pytest.fixture(scope="module")
 def c_code(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
     """The C of PROTOCOL.md, compiled."""
-    compiler = shutil.which("cc")
-    if compiler is None:
-        pytest.skip("no C compiler here")
+    need("cc")
     folder = tmp_path_factory.mktemp("c")
     _, after = (FOLDER / "PROTOCOL.md").read_text("utf-8").split("```c\n")
     code, _ = after.split("```", 1)
     source, library = folder / "cobs.c", folder / "cobs.so"
     source.write_text("#include <stddef.h>\n#include <stdint.h>\n" + code)
     options = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]
-    subprocess.run([compiler, *options, "-o", library, source], check=True, timeout=60)
+    subprocess.run(["cc", *options, "-o", library, source], check=True, timeout=60)
     return ctypes.CDLL(str(library))
 
 

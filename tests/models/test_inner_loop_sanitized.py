@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from needs import lacking
 
 ROOT = Path(__file__).parents[2]
 SUPPORT = ROOT / "tests/support"
@@ -35,7 +36,7 @@ def sanitized(folder: Path) -> tuple[Path, Path]:
         build = [compiler, *how, str(SOURCE), "-o", str(library), "-lm"]
         if runtime.is_absolute() and subprocess.run(build, check=False).returncode == 0:
             return library, runtime
-    pytest.skip("needs gcc or clang with sanitizers")
+    lacking("needs gcc or clang with sanitizers")
 
 
 @pytest.mark.slow

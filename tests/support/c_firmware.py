@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import struct
 import subprocess
 from collections.abc import Iterator, Sequence
@@ -10,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-import pytest
+from needs import need
 from tactomo_protocol import (
     Acknowledge,
     Channel,
@@ -28,13 +27,6 @@ from tactomo_protocol import (
 C_FOLDER: Final = Path(__file__).parents[2] / "firmware_protocol" / "c"
 BUILD_S: Final = 120.0
 SANITIZED: Final = "-O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all"
-
-
-def need(*programs: str) -> None:
-    """Skip the test where a program is missing."""
-    for program in programs:
-        if shutil.which(program) is None:
-            pytest.skip(f"needs {program} on the PATH")
 
 
 def build(target: str, folder: Path, compiler: str = "cc", **variables: str) -> Path:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import queue
-import shutil
 import struct
 import subprocess
 import threading
@@ -13,7 +12,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final
 
-import pytest
+from needs import lacking, need
 
 CPP_FOLDER: Final = Path(__file__).parents[2] / "clients" / "cpp"
 PROBE: Final = CPP_FOLDER / "tests" / "probe.cpp"
@@ -26,13 +25,12 @@ PATIENCE_S: Final = 60.0
 
 def need_headers() -> None:
     """Skip the test where a compiler or the libraries' headers are missing."""
-    if shutil.which("c++") is None:
-        pytest.skip(f"needs a C++ compiler: {PACKAGES}")
+    need("c++")
     for header in ("zmq.hpp", "msgpack.hpp"):
         command = ["c++", "-std=c++17", "-DMSGPACK_NO_BOOST", "-x", "c++", "-M", "-"]
         source = f"#include <{header}>\n"
         if subprocess.run(command, input=source, capture_output=True, text=True).returncode:
-            pytest.skip(f"needs {header}: {PACKAGES}")
+            lacking(f"needs {header}: {PACKAGES}")
 
 
 def compile_probe(folder: Path, compiler: str, flags: str) -> Path:

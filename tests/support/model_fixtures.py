@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,36 +15,10 @@ from tactomo_models import (
     load_description,
     load_or_build_artifact,
 )
-from tactomo_models.arrays import BoolArray, FloatArray
-from tactomo_models.physics.actual_sheet import SheetEstimator
-from tactomo_models.physics.bare_sheet import BareSheet, solve_bare_sheet
+from tactomo_models.physics.bare_sheet import solve_bare_sheet
 from tactomo_models.physics.compiled_sheet import CompiledSheet
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.physics.mesh import mesh_sheet
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _sheets_once() -> Iterator[None]:
-    """Find a sheet once for each reference, half a second each: most tests tare on the same."""
-    estimate = SheetEstimator.estimate
-    found: dict[int, BareSheet | None] = {}
-
-    def once(
-        self: SheetEstimator, voltages: FloatArray, usable: BoolArray, noise: FloatArray
-    ) -> ForwardModel | None:
-        taken = (voltages.tobytes(), usable.tobytes(), noise.tobytes())
-        key = hash((self._description.model_dump_json(), *taken))
-        if key not in found:
-            model = estimate(self, voltages, usable, noise)
-            found[key] = None if model is None else model.bare
-            if len(found) > 4:  # tens of megabytes each
-                del found[next(iter(found))]
-        bare = found[key]
-        return None if bare is None else ForwardModel(self._description, bare)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(SheetEstimator, "estimate", once)
-        yield
 
 
 @pytest.fixture(scope="session")

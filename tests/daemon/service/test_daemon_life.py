@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import resource
 import signal
 import threading
@@ -87,12 +88,13 @@ def test_nothing_is_left_after_a_start_that_failed(bench: Start, tmp_path: Path)
     memory: Any = SimpleNamespace(method="auto", budget_s=None, find_sheets=None)
     off = {"track": False}
     local = {"stream": "tcp://127.0.0.1:0", "control": "tcp://127.0.0.1:0"}
-    for settings in (
-        {"ports": [good, bad], **local},
-        {"ports": [good], "stream": "tcp://127.0.0.1:0", "control": b.daemon.control_address},
-        {"ports": [good], "record": Path("/proc/none/skin.mcap"), **local},
+    taken = b.daemon.control_address
+    for settings, says in (
+        ({"ports": [good, bad], **local}, bad),
+        ({"ports": [good], **local, "control": taken}, taken),
+        ({"ports": [good], "recording": {"file": "/proc/none/s.mcap"}, **local}, "/proc/none"),
     ):
-        with pytest.raises(TactomoError):
+        with pytest.raises(TactomoError, match=re.escape(says)):
             Daemon(load_config(baseline=off, **settings), reconstructor=memory).start()
     b.until(lambda: len(os.listdir("/proc/self/fd")) <= before)
     assert set(threading.enumerate()) <= threads

@@ -19,6 +19,11 @@ EVERY = np.ones(208, bool)
 NOISE = np.full(208, 1e-3)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def sheets_once() -> None:
+    """Here each estimate is made anew."""
+
+
 @pytest.fixture
 def estimator(paper: SensorDescription, artifact: Artifact) -> SheetEstimator:
     return SheetEstimator(paper, artifact.bare)
