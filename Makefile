@@ -28,7 +28,7 @@ LOCKED := pyproject.toml --universal --python-version 3.11 --generate-hashes \
 ON_ARM := --python-version 3.11 --python-platform aarch64-manylinux_2_28 --only-binary :all: \
   --no-emit-package tactomo-client --no-emit-package tactomo --no-annotate
 
-.PHONY: help setup run test test-all test-long test-train test-peers faults soak fleet firmware fuzz lint format bench docs wheels deb lock clean
+.PHONY: help setup run test test-all test-long test-train test-peers faults soak fleet firmware fuzz lint format schema bench docs wheels deb lock clean
 
 help:            ## list these targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -83,6 +83,9 @@ lint: $(READY)   ## ruff and mypy --strict
 format: $(READY) ## let ruff rewrite what it can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+schema: $(READY) ## tables of the documentation and the C++ fields, from tactomo_client/schema.py
+	$(BIN)/python clients/write_schema.py
 
 bench: $(READY)  ## latency and time per frame on this machine
 	$(BIN)/tactomo bench $(ARGS)

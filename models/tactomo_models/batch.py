@@ -17,12 +17,18 @@ from tactomo_models.calibration.taught_skin import TaughtSkin
 from tactomo_models.errors import CalibrationError, DataError
 from tactomo_models.reconstruct import Reconstructor
 from tactomo_models.scans.reference import Reference
+from tactomo_models.scene.contacts import Contact
 from tactomo_models.scene.pressure import PressureCurve
 from tactomo_models.scene.reconstruction import Reconstruction
 from tactomo_models.sensor.description import SensorDescription
 
 Progress = Callable[[int, int], None]
 
+CONTACT_TYPES = {
+    name: "U7" if isinstance(value, str) else type(value)
+    for name, value in Contact(0, 0.0, 0.0, 0.0).in_mm().items()
+    if name != "id"
+}
 BUDGET_S = 2.0  # a file has no deadline: enough for any scene to converge within its frame
 
 
@@ -220,7 +226,9 @@ def frame_arrays(
     """Stack frames into the arrays of docs/files.md; a map that is absent is NaN throughout."""
     shape = (description.map.nodes_y, description.map.nodes_x)
     absent = np.full(shape, np.nan, np.float32)
-    contacts = [(i, contact) for i, frame in enumerate(frames) for contact in frame.contacts]
+    contacts = [
+        (i, contact.in_mm()) for i, frame in enumerate(frames) for contact in frame.contacts
+    ]
 
     def column(values: list[float]) -> FloatArray:
         return np.array(values, dtype=np.float64)
@@ -237,22 +245,10 @@ def frame_arrays(
         "force_sigma_n": column([f.force_sigma_n for f in frames]),
         "flags": np.array([int(f.flags) for f in frames], dtype=np.uint32),
         "contact_frame": np.array([i for i, _ in contacts], dtype=np.int64),
-        "contact_x_mm": column([c.x_m * 1e3 for _, c in contacts]),
-        "contact_y_mm": column([c.y_m * 1e3 for _, c in contacts]),
-        "contact_area_mm2": column([c.area_m2 * 1e6 for _, c in contacts]),
-        "contact_magnitude": column([c.magnitude for _, c in contacts]),
-        "contact_sigma": column([c.magnitude_sigma for _, c in contacts]),
-        "contact_x_sigma_mm": column([c.x_sigma_m * 1e3 for _, c in contacts]),
-        "contact_y_sigma_mm": column([c.y_sigma_m * 1e3 for _, c in contacts]),
-        "contact_area_sigma_mm2": column([c.area_sigma_m2 * 1e6 for _, c in contacts]),
-        "contact_pressure_kpa": column([c.pressure_kpa for _, c in contacts]),
-        "contact_pressure_sigma_kpa": column([c.pressure_sigma_kpa for _, c in contacts]),
-        "contact_pressure_range": np.array([str(c.pressure_range) for _, c in contacts], "U7"),
-        "contact_peak_kpa": column([c.peak_kpa for _, c in contacts]),
-        "contact_peak_sigma_kpa": column([c.peak_sigma_kpa for _, c in contacts]),
-        "contact_max_kpa": column([c.max_kpa for _, c in contacts]),
-        "contact_edge": column([c.edge for _, c in contacts]),
-        "contact_taught": np.array([c.taught for _, c in contacts], dtype=bool),
-        "contact_force_n": column([c.force_n for _, c in contacts]),
-        "contact_force_sigma_n": column([c.force_sigma_n for _, c in contacts]),
+        **{
+            "contact_sigma" if name == "magnitude_sigma" else f"contact_{name}": np.array(
+                [contact[name] for _, contact in contacts], dtype
+            )
+            for name, dtype in CONTACT_TYPES.items()
+        },
     }

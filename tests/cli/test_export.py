@@ -98,6 +98,7 @@ def test_maps_as_arrays(tactomo: Run, grasp: Path) -> None:
         light = arrays["contact_id"] == 2
         assert set(frames[light]) == set(range(LIGHT_FROM, LAST_PRESSED))
         assert np.isnan(arrays["contact_pressure_kpa"][light]).all()
+        assert arrays["contact_taught"].dtype == bool
         assert set(arrays["contact_pressure_range"][light]) == {"below"}
         assert (arrays["contact_sigma"][~light] == 0.005).all()
 

@@ -136,11 +136,11 @@ def cpp_view(said: dict[str, Any]) -> dict[str, Any]:
     """The frame that the probe printed, in the words of `python_view`."""
     view = {**said, "flags": sorted(set(said["flags"]))}
     del (
-        view["age_ns"],
+        view["age_now_ns"],
         view["exceeds_150"],
         view["is_known"],
     )  # they go by the time at which they are asked for
-    for name in ("tier", "tier_reason"):
+    for name in ("tier", "tier_reason", "dated_by"):
         view[name] = said[name] or None
     return view
 
@@ -166,7 +166,7 @@ def test_both_clients_see_the_same_contact_at_the_same_sequence_number(
     assert len(shared) == 11
     for sequence in shared:
         assert cpp_view(theirs[sequence]) == python_view(ours[sequence])
-        assert 0 < theirs[sequence]["age_ns"] < PATIENCE_S * 1e9
+        assert 0 < theirs[sequence]["age_now_ns"] < PATIENCE_S * 1e9
     contact = theirs[pressed.sequence]["contacts"][0]
     assert abs(contact["x_mm"] - 20) < 5
     assert abs(contact["y_mm"] + 10) < 5
@@ -591,7 +591,8 @@ def test_both_clients_agree_on_what_is_a_frame(checked: Path, kind: str) -> None
             for contact in wanted["contacts"]:
                 known = contact["pressure_range"] in ("within", "below", "above")
                 contact["pressure_range"] = contact["pressure_range"] if known else "unknown"
-            wanted = {**wanted, **{k: wanted[k] or None for k in ("tier", "tier_reason")}}
+            texts = ("tier", "tier_reason", "dated_by")
+            wanted = {**wanted, **{name: wanted[name] or None for name in texts}}
         assert got == wanted, (outcome.get("problem"), msgpack.unpackb(message[len(head) :]))
     assert 300 < accepted < 2700
 

@@ -127,6 +127,9 @@ def words_of(scene: Any) -> str:
 def test_it_advertises_its_topics_with_their_schemas(client: FoxgloveClient) -> None:
     assert set(client.channels) == {"/tf", *(f"/left/{name}" for name in ALL)}
     assert all(channel["schema"] for channel in client.channels.values())
+    numbers = json.loads(client.channels["/left/frame"]["schema"])["properties"]
+    contact = numbers["contacts"]["items"]["properties"]
+    assert contact["taught"] == {"type": "boolean"}
     kinds = {topic: channel["schemaName"] for topic, channel in client.channels.items()}
     assert kinds["/left/contacts"] == "foxglove.SceneUpdate"
     assert kinds["/left/grid"] == "foxglove.Grid"

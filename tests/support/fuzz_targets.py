@@ -39,7 +39,6 @@ from tactomo.stream.control import COMMANDS
 from tactomo.twin import control as twin_control
 from tactomo.twin.scene import SHIPPED, load_scene
 from tactomo_client import ClientError, ControlError, MessageError
-from tactomo_client.event import Event
 from tactomo_client.frame import frame_from_message
 from tactomo_client.messages import (
     CONTACTS,
@@ -56,7 +55,7 @@ from tactomo_client.messages import (
 )
 from tactomo_client.recording import RecordingWarning
 from tactomo_client.recording import open_recording as open_frames
-from tactomo_client.status import Status
+from tactomo_client.schema import Event, Status
 from tactomo_models import Reference, SensorDescription, load_description, shipped_descriptions
 from tactomo_models.calibration.calibration_file import (
     PressureCalibration,

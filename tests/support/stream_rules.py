@@ -18,7 +18,7 @@ import zmq
 from tables import table
 from tactomo_client.frame import frame_from_message
 from tactomo_client.messages import EVENT, MAP, STATUS, decode_message
-from tactomo_client.status import Status
+from tactomo_client.schema import Status
 
 PAGE = "clients/STREAM.md"
 INT64, UINT64 = range(-(2**63), 2**63), range(2**64)

@@ -98,20 +98,6 @@ void print_member(const char* name, std::string_view value) {
     print_text(value);
 }
 
-std::string_view name_of(tactomo::PressureRange range) {
-    switch (range) {
-        case tactomo::PressureRange::within:
-            return "within";
-        case tactomo::PressureRange::below:
-            return "below";
-        case tactomo::PressureRange::above:
-            return "above";
-        case tactomo::PressureRange::unknown:
-            break;
-    }
-    return "unknown";
-}
-
 std::string_view name_of(tactomo::Answer answer) {
     switch (answer) {
         case tactomo::Answer::yes:
@@ -124,33 +110,33 @@ std::string_view name_of(tactomo::Answer answer) {
     return "cannot tell";
 }
 
-void print_contact(const tactomo::Contact& contact) {
-    std::printf("{\"id\": %" PRId64, contact.id);
-    print_member("x_mm", contact.x_mm);
-    print_member("y_mm", contact.y_mm);
-    print_member("area_mm2", contact.area_mm2);
-    print_member("magnitude", contact.magnitude);
-    print_member("magnitude_sigma", contact.magnitude_sigma);
-    print_member("pressure_kpa", contact.pressure_kpa);
-    print_member("pressure_sigma_kpa", contact.pressure_sigma_kpa);
-    print_member("force_n", contact.force_n);
-    print_member("force_sigma_n", contact.force_sigma_n);
-    print_member("x_sigma_mm", contact.x_sigma_mm);
-    print_member("y_sigma_mm", contact.y_sigma_mm);
-    print_member("area_sigma_mm2", contact.area_sigma_mm2);
-    print_member("pressure_range", name_of(contact.pressure_range));
-    print_member("peak_kpa", contact.peak_kpa);
-    print_member("peak_sigma_kpa", contact.peak_sigma_kpa);
-    print_member("max_kpa", contact.max_kpa);
-    print_member("edge", contact.edge);
-    print_member("taught", contact.taught);
-    print_member("exceeds_150", name_of(contact.exceeds(150)));
-    print("}");
+void print_value(std::uint64_t value) { std::printf("%" PRIu64, value); }
+template <std::size_t N>
+void print_value(const tactomo::Text<N>& value) {
+    print_text(value);
+}
+void print_value(tactomo::PressureRange value) {
+    print_text(tactomo::pressure_ranges[static_cast<std::size_t>(value)]);
+}
+void print_value(const std::array<double, 2>& value) {
+    std::printf("[%.17g, %.17g]", value[0], value[1]);
 }
 
-// The values' bytes in hex, so that NaN and the last bit come through.
-void print_image(const char* name, const tactomo::Image& image) {
-    std::printf(", \"%s\": ", name);
+void print_value(const tactomo::Contact& contact);
+
+/// A list, each entry by its own print_value.
+template <typename Value>
+void print_value(const std::vector<Value>& values) {
+    const char* separator = "[";
+    for (const Value& value : values) {
+        print(std::exchange(separator, ", "));
+        print_value(value);
+    }
+    print(values.empty() ? "[]" : "]");
+}
+
+// Shape and the bytes of the values, as hexadecimal digits.
+void print_value(const tactomo::Image& image) {
     if (!image) return print("null");
     std::printf("{\"shape\": [%zu, %zu], \"hex\": \"", image.rows(), image.columns());
     const auto* bytes = reinterpret_cast<const unsigned char*>(image.data());
@@ -160,44 +146,26 @@ void print_image(const char* name, const tactomo::Image& image) {
     print("\"}");
 }
 
+constexpr auto print_field = [](const char* name, const auto& value, auto) {
+    std::printf(", \"%s\": ", name);
+    print_value(value);
+};
+
+void print_value(const tactomo::Contact& contact) {
+    print("{\"exceeds_150\": ");
+    print_text(name_of(contact.exceeds(150)));
+    tactomo::detail::each_field_of_contact(contact, print_field);
+    print("}");
+}
+
 void print_frame(const tactomo::Frame& frame) {
-    std::printf("{\"sequence\": %" PRIu64, frame.sequence);
-    print_member("sensor", frame.sensor.view());
-    print_member("session", frame.session.view());
-    print_member("scan_counter", frame.scan_counter);
-    print_member("acquired_realtime_ns", frame.acquired_realtime_ns);
-    print_member("acquired_monotonic_ns", frame.acquired_monotonic_ns);
-    print_member("device_us", frame.device_us);
-    print_member("delay_ns", frame.delay_ns);
-    print_member("skew_ms", frame.skew_ms);
-    print_member("tier", frame.tier.view());
-    print_member("tier_reason", frame.tier_reason.view());
-    print_member("misfit", frame.misfit);
-    print_member("confidence", frame.confidence);
-    print_member("force_n", frame.force_n);
-    print_member("force_sigma_n", frame.force_sigma_n);
-    print_member("exceeds_150", name_of(frame.exceeds(150)));
-    std::printf(", \"is_known\": %s", frame.is_known() ? "true" : "false");
-    print_member("age_ns", std::int64_t{frame.age().count()});
-    print_image("map", frame.map);
-    print_image("pressure_kpa", frame.pressure_kpa);
-    print_image("structure", frame.structure);
-    for (const auto& [name, ends] : {std::pair("x_mm", frame.x_mm), std::pair("y_mm", frame.y_mm)}) {
-        std::printf(", \"%s\": [%.17g, %.17g]", name, ends[0], ends[1]);
-    }
-    print(", \"flags\": [");
-    const char* separator = "";
-    for (const auto& flag : frame.flags) {
-        print(std::exchange(separator, ", "));
-        print_text(flag);
-    }
-    print("], \"contacts\": [");
-    separator = "";
-    for (const tactomo::Contact& contact : frame.contacts) {
-        print(std::exchange(separator, ", "));
-        print_contact(contact);
-    }
-    print("]}");
+    print("{\"exceeds_150\": ");
+    print_text(name_of(frame.exceeds(150)));
+    print_member("is_known", frame.is_known());
+    print_member("age_now_ns", std::int64_t{frame.age().count()});
+    tactomo::detail::each_field_of_frame(frame, print_field);
+    tactomo::detail::each_image_of_frame(frame, print_field);
+    print("}");
 }
 
 void print_state(const tactomo::Subscription& skin) {

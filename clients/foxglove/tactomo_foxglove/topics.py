@@ -53,7 +53,7 @@ def _numbers(*names: str) -> dict[str, Any]:
 
 CONTACT_SCHEMA: Final = _object(
     **{
-        field.name: {"int": _INTEGER, "str": _TEXT}.get(str(field.type), _NUMBER)
+        field.name: {"int": _INTEGER, "str": _TEXT, "bool": _TRUTH}.get(str(field.type), _NUMBER)
         for field in fields(Contact)
     },
     trace=_INTEGER,

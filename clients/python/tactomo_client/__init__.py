@@ -44,11 +44,9 @@ from tactomo_client.errors import (
     StreamTimeout,
     TareRefused,
 )
-from tactomo_client.event import Event
-from tactomo_client.frame import Answer, Contact, Frame
 from tactomo_client.keys import Keys
 from tactomo_client.messages import DEFAULT_CONTROL, DEFAULT_STREAM, DEFAULT_TWIN_CONTROL
-from tactomo_client.status import Status
+from tactomo_client.schema import Answer, Contact, Event, Frame, Status
 from tactomo_client.subscription import Subscription, subscribe
 
 __all__ = [

@@ -48,13 +48,11 @@ from tactomo_client.control import (
     to_status,
 )
 from tactomo_client.errors import ClientError
-from tactomo_client.event import Event
 from tactomo_client.filled import filled
-from tactomo_client.frame import Frame
 from tactomo_client.keys import Keys
 from tactomo_client.messages import DEFAULT_CONTROL
 from tactomo_client.reception import Item, Kind, Options, Reception, T_co
-from tactomo_client.status import Status
+from tactomo_client.schema import Event, Frame, Status
 
 __all__ = ["Control", "Daemon", "Subscription", "request", "subscribe"]
 

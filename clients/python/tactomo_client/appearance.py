@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactomo_client.frame import Contact, Frame
+from tactomo_client.schema import Contact, Frame
 
 # Dark to bright, as perceived brightness: black, violet, red, orange, yellow, white.
 COLOURS: Final = ((0, 0, 4), (87, 16, 110), (188, 55, 84), (249, 142, 9), (252, 255, 164))

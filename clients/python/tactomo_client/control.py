@@ -17,7 +17,7 @@ from tactomo_client.errors import ClientError, ControlError, control_error
 from tactomo_client.filled import filled
 from tactomo_client.keys import Keys, as_keys
 from tactomo_client.messages import DEFAULT_CONTROL, decode_reply, encode_request
-from tactomo_client.status import STALE_AFTER_S, Calibration, Status, Taught
+from tactomo_client.schema import STALE_AFTER_S, Calibration, Status, Taught
 
 TIMEOUT_S: Final = 2.0
 TARE_TIMEOUT_S: Final = 30.0  #: for a tare: as long as its dual scans take to come

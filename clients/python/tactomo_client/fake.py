@@ -25,8 +25,8 @@ import zmq
 from numpy.typing import NDArray
 
 from tactomo_client.arguments import checked_seconds
-from tactomo_client.frame import Contact
 from tactomo_client.messages import CONTACTS, MAP, clock_id, encode_message
+from tactomo_client.schema import Contact
 
 
 class FakeSensor:

@@ -13,18 +13,20 @@ NumPy is imported with the first array: a command that only asks for a status do
 from __future__ import annotations
 
 import functools
-import math
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeGuard
+from typing import Any, Final, NamedTuple
 
 import msgpack  # type: ignore[import-untyped]
 
 from tactomo_client.errors import MessageError, control_error
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from tactomo_client.filled import ARRAY_DTYPES as ARRAY_DTYPES
+from tactomo_client.filled import MAX_ARRAY_VALUES as MAX_ARRAY_VALUES
+from tactomo_client.filled import array_from_wire as array_from_wire
+from tactomo_client.filled import array_to_wire as array_to_wire
+from tactomo_client.filled import readers_of
+from tactomo_client.schema import Envelope
 
 SCHEMA: Final = 1
 DEFAULT_STREAM: Final = "tcp://127.0.0.1:5560"
@@ -41,33 +43,9 @@ KINDS: Final = (MAP, CONTACTS, SCAN, STATUS, EVENT)
 MAX_MESSAGE_BYTES: Final = 16 * 1024 * 1024
 MAX_ENTRIES: Final = 4096  #: of one list or map
 MAX_DEPTH: Final = 16  #: of lists and maps in each other
-MAX_ARRAY_VALUES: Final = 1024 * 1024
-MAX_ARRAY_DIMENSIONS: Final = 4
-ARRAY_DTYPES: Final = ("<f4", "<f8", "<i2", "<i4", "<i8", "<u2", "<u4", "<u8", "|i1", "|u1")
 
 _SENSOR_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 _KIND_NAME = re.compile(r"[a-z][a-z_]{0,31}")
-_INT64 = range(-(2**63), 2**63)
-_UINT64 = range(2**64)
-
-# Header field -> (accepted types, may be nil, may be left out). STREAM.md has the meanings.
-_HEADER: Final[dict[str, tuple[tuple[type, ...], bool, bool]]] = {
-    "session": ((str,), False, False),
-    "sequence": ((int,), False, False),
-    "acquired_realtime_ns": ((int,), True, False),
-    "acquired_monotonic_ns": ((int,), True, False),
-    "delay_ns": ((int,), True, True),
-    "dated_by": ((str,), True, True),
-    "device_us": ((int,), True, False),
-    "skew_ms": ((float, int), True, True),
-    "age_ns": ((int,), True, False),
-    "tier": ((str,), True, False),
-    "tier_reason": ((str,), True, False),
-    "flags": ((list, tuple), False, False),
-    "misfit": ((float, int), True, False),
-    "confidence": ((float, int), True, True),
-    "clock_id": ((str,), False, True),
-}
 
 
 class Message(NamedTuple):
@@ -132,43 +110,6 @@ def decode_message(data: bytes) -> Message:
         raise MessageError(f"topic {head!r} and body disagree about sensor or kind")
     _check_header(fields)
     return Message(sensor, kind, fields)
-
-
-def array_to_wire(array: NDArray[Any]) -> dict[str, Any]:
-    """Return `array` (any shape of up to 4 dimensions, real numbers) as its wire map."""
-    import numpy as np
-
-    dtype = array.dtype.newbyteorder("<")
-    if dtype.str not in ARRAY_DTYPES:
-        raise MessageError(f"arrays of {array.dtype} have no wire form", f"use {ARRAY_DTYPES}")
-    if array.ndim not in range(1, MAX_ARRAY_DIMENSIONS + 1) or array.size > MAX_ARRAY_VALUES:
-        raise MessageError(f"an array of shape {array.shape} is too large for a message")
-    data = np.ascontiguousarray(array, dtype=dtype).tobytes()
-    return {"shape": list(array.shape), "dtype": dtype.str, "data": data}
-
-
-def array_from_wire(value: object) -> NDArray[Any]:
-    """Return the array of a wire map, read-only and without copying; raise MessageError if bad."""
-    import numpy as np
-
-    if not isinstance(value, dict):
-        raise MessageError("an array is not a map of shape, dtype and data")
-    shape, dtype_name, data = value.get("shape"), value.get("dtype"), value.get("data")
-    if not isinstance(dtype_name, str) or dtype_name not in ARRAY_DTYPES:
-        raise MessageError(f"array dtype {str(dtype_name)[:40]!r} is not one of {ARRAY_DTYPES}")
-    if (
-        not isinstance(shape, list)
-        or not 1 <= len(shape) <= MAX_ARRAY_DIMENSIONS
-        or not all(type(n) is int and 0 <= n <= MAX_ARRAY_VALUES for n in shape)
-    ):
-        raise MessageError(f"array shape {str(shape)[:80]} is not 1 to 4 lengths")
-    dtype = np.dtype(dtype_name)
-    size = math.prod(shape)
-    if size > MAX_ARRAY_VALUES:
-        raise MessageError(f"an array of shape {shape} is larger than {MAX_ARRAY_VALUES} values")
-    if not isinstance(data, bytes) or len(data) != size * dtype.itemsize:
-        raise MessageError(f"array data do not fill shape {shape} of {dtype_name}")
-    return np.frombuffer(data, dtype=dtype).reshape(shape)
 
 
 @functools.cache
@@ -290,28 +231,9 @@ def _check_depth(fields: Any) -> None:
     raise MessageError(f"the body is nested more than {MAX_DEPTH} deep")
 
 
-def is_integer(value: object, within: range = _INT64) -> TypeGuard[int]:
-    """Whether a value is an integer that its field has room for."""
-    return isinstance(value, int) and not isinstance(value, bool) and value in within
-
-
-def _is_finite(value: object) -> bool:
-    return not isinstance(value, float) or math.isfinite(value)
-
-
 def _check_header(fields: Mapping[str, Any]) -> None:
-    for name, (types, may_be_nil, may_be_absent) in _HEADER.items():
-        if name not in fields:
-            if may_be_absent:
-                continue
-            raise MessageError(f"header field {name!r} is missing")
-        value = fields[name]
-        if value is None and may_be_nil:
-            continue
-        if not isinstance(value, types) or isinstance(value, bool):
-            raise MessageError(f"header field {name!r} is a {type(value).__name__}")
-        within = _UINT64 if name == "sequence" else _INT64
-        if not (is_integer(value, within) if types == (int,) else _is_finite(value)):
-            raise MessageError(f"header field {name!r} is {value}")
-    if not all(isinstance(flag, str) for flag in fields["flags"]):
-        raise MessageError("header field 'flags' holds something that is not a string")
+    readers, required = readers_of(Envelope)
+    if missing := required - fields.keys():
+        raise MessageError(f"field {min(missing)!r} is missing")
+    for name in readers.keys() & fields.keys():
+        readers[name](name, fields[name])

@@ -11,8 +11,7 @@ from typing import Final, Generic, Literal, TypedDict, TypeVar, cast
 from tactomo_client.arguments import checked_seconds
 from tactomo_client.connection import KNOCK_PERIOD_S, Owner, Waiting, connect_subscriber, whole_ms
 from tactomo_client.errors import MessageError, StreamTimeout
-from tactomo_client.event import Event
-from tactomo_client.frame import Frame, frame_from_message
+from tactomo_client.frame import frame_from_message
 from tactomo_client.keys import Keys, as_keys
 from tactomo_client.messages import (
     CONTACTS,
@@ -24,7 +23,7 @@ from tactomo_client.messages import (
     decode_message,
     topic,
 )
-from tactomo_client.status import STALE_AFTER_S, Status
+from tactomo_client.schema import STALE_AFTER_S, Event, Frame, Status
 
 Kind = Literal["map", "contacts", "status", "event"]
 Item = Frame | Status | Event

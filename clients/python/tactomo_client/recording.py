@@ -24,7 +24,7 @@ from typing import Literal
 
 from tactomo_client.arguments import checked_seconds
 from tactomo_client.errors import MessageError, RecordingError
-from tactomo_client.frame import Frame, frame_from_message
+from tactomo_client.frame import frame_from_message
 from tactomo_client.messages import decode_message
 from tactomo_client.recording_file import (
     ENDLESS_NS,
@@ -37,6 +37,7 @@ from tactomo_client.recording_file import (
     read_span,
     records,
 )
+from tactomo_client.schema import Frame
 
 __all__ = ["Recording", "RecordingWarning", "open_recording"]
 

@@ -9,10 +9,8 @@ import zmq
 
 from tactomo_client.arguments import checked_seconds
 from tactomo_client.connection import Owner, wait
-from tactomo_client.event import Event
-from tactomo_client.frame import Frame
 from tactomo_client.reception import Item, Kind, Options, Reception, T_co
-from tactomo_client.status import Status
+from tactomo_client.schema import Event, Frame, Status
 
 
 @overload

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from tactomo_client.frame import PRESSURE_RANGES, Contact, Frame
+from tactomo_client.schema import PRESSURE_RANGES, Contact, Frame
 from tactomo_client.traces import Traces
 
 if TYPE_CHECKING:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tactomo_client.frame import Contact, Frame
+from tactomo_client.schema import Contact, Frame
 
 
 class Traces:

@@ -29,8 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 from tactomo_client import Contact, Frame
-from tactomo_client.frame import PRESSURE_RANGES
 from tactomo_client.placement import Placement
+from tactomo_client.schema import PRESSURE_RANGES
 
 TYPES: Final = get_typestore(Stores.ROS2_HUMBLE)
 """Definitions; their hashes are the same up to Kilted and, but for Humble, part of the wire."""
@@ -38,7 +38,7 @@ CONTACT_POINT: Final = np.dtype(
     [
         *((axis, "<f4") for axis in "xyz"),
         *(
-            (field.name, {"int": "<u4", "str": "u1"}.get(str(field.type), "<f8"))
+            (field.name, {"int": "<u4", "str": "u1", "bool": "u1"}.get(str(field.type), "<f8"))
             for field in fields(Contact)
         ),
     ]

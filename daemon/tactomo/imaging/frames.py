@@ -20,7 +20,6 @@ from tactomo.scans import DualScan, Timing
 from tactomo.stream.publisher import NO_FRAME_YET
 
 MM_PER_M: Final = 1e3
-MM2_PER_M2: Final = 1e6
 
 
 def scan_header(dual: DualScan, timing: Timing) -> dict[str, Any]:
@@ -198,27 +197,8 @@ def _clock(clock: DeviceClock, is_there: bool) -> dict[str, Any]:
 
 
 def _contact(contact: Contact) -> dict[str, Any]:
-    return {
-        "id": contact.id,
-        "x_mm": contact.x_m * MM_PER_M,
-        "y_mm": contact.y_m * MM_PER_M,
-        "area_mm2": contact.area_m2 * MM2_PER_M2,
-        "magnitude": _finite(contact.magnitude),
-        "magnitude_sigma": _finite(contact.magnitude_sigma),
-        "pressure_kpa": _finite(contact.pressure_kpa),
-        "x_sigma_mm": _finite(contact.x_sigma_m * MM_PER_M),
-        "y_sigma_mm": _finite(contact.y_sigma_m * MM_PER_M),
-        "area_sigma_mm2": _finite(contact.area_sigma_m2 * MM2_PER_M2),
-        "pressure_sigma_kpa": _finite(contact.pressure_sigma_kpa),
-        "force_n": _finite(contact.force_n),
-        "force_sigma_n": _finite(contact.force_sigma_n),
-        "pressure_range": str(contact.pressure_range),
-        "peak_kpa": _finite(contact.peak_kpa),
-        "peak_sigma_kpa": _finite(contact.peak_sigma_kpa),
-        "max_kpa": _finite(contact.max_kpa),
-        "edge": _finite(contact.edge),
-        "taught": contact.taught,
-    }
+    fields = contact.in_mm()
+    return {n: _finite(value) if isinstance(value, float) else value for n, value in fields.items()}
 
 
 def _finite(value: float) -> float | None:

@@ -11,8 +11,8 @@ from dataclasses import replace
 from typing import Any, Final
 
 import structlog
-from tactomo_client.frame import TOUCHES_SEEN
 from tactomo_client.messages import CONTACTS, MAP, SCAN
+from tactomo_client.schema import TOUCHES_SEEN
 from tactomo_models import (
     BaselineTracker,
     Flag,

@@ -43,9 +43,10 @@ _COUNTED: Final = frozenset(
     {
         *("uptime_s", "ports", "rates", "scans", "frames", "last_minute", "scan_tally", "events"),
         *("channel_skew_ms", "wall_clock", "stage_ms", "latency_ms", "baseline", "process"),
+        "recording",
     }
 )
-"""Fields of a status that differ from second to second; of ports and events, what they say."""
+"""Fields of a status that differ from second to second; some of them say something beside that."""
 _HEARTBEATS_S: Final[Mapping[str, float]] = {STATUS: STATUS_HEARTBEAT_S}
 _HELD: Final = (MAP, CONTACTS, STATUS)
 _ANSWERED: Final = (STATUS, CONTACTS)
@@ -155,6 +156,8 @@ class _Skin:
                 content["ports"] = [p.get("state") for p in ports if isinstance(p, dict)]
             if isinstance(events, dict):
                 content["events"] = events.get("counts")
+            if isinstance(recording := fields.get("recording"), dict):
+                content["recording"] = recording.get("path")
         sent_s, last = self._sent.get(kind, (0.0, {}))
         if content == last and now_s - sent_s < _HEARTBEATS_S.get(kind, HEARTBEAT_S):
             return False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -51,6 +52,18 @@ class Contact:
     #: whether presses at known places say where it is, and ones of known force how hard it presses;
     #: else the physics alone does
     taught: bool = False
+
+    def in_mm(self) -> dict[str, Any]:
+        """Return its fields by the names that files and messages have: mm and mm², not m and m²."""
+        said = {}
+        for name, value in vars(self).items():
+            if name.endswith("_m"):
+                said[f"{name}m"] = value * 1e3
+            elif name.endswith("_m2"):
+                said[f"{name.removesuffix('_m2')}_mm2"] = value * 1e6
+            else:
+                said[name] = value
+        return said
 
 
 def contacts_of(

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tactomo.imaging.kept_reference import reference_path
-from tactomo_client.frame import TOUCHES_SEEN
+from tactomo_client.schema import TOUCHES_SEEN
 from tactomo_models import Press, SkinSimulator, load_description
 from tactomo_models.arrays import FloatArray
 from tactomo_protocol import Channel

@@ -16,8 +16,8 @@ import tactomo.twin.control
 from tables import table as cells_of
 from tactomo.errors import CommandError
 from tactomo.service import metrics
-from tactomo_client import status
-from tactomo_client.frame import TOUCHES_SEEN
+from tactomo_client import schema as status
+from tactomo_client.schema import TOUCHES_SEEN
 from tactomo_models import Flag
 from tactomo_models.methods.auto import UNSURE_MISFIT
 from tactomo_models.methods.magnitudes import BAD_MISFIT
@@ -93,11 +93,14 @@ def test_the_clients_know_of_which_flags_touches_are_seen() -> None:
     rows = cells_of("clients/STREAM.md", "## Flags")
     seen = {name for name, row in rows.items() if row["Touches seen"] == "yes"}
     assert seen == TOUCHES_SEEN
-    for place in ("cpp/include/tactomo/frame.hpp", "viewer/tactomo_viewer/page/health.js"):
+    for place in ("cpp/include/tactomo/schema.hpp", "viewer/tactomo_viewer/page/health.js"):
         source = (DOCUMENT_FOLDER / place).read_text("utf-8")
         listed = re.search(r"touches_seen[ ={[]+([^;]*);", source, re.I)
         assert listed
         assert set(re.findall(r'"(\w+)"', listed[1])) == seen, place
+    script = re.search(r"TOUCHES_SEEN = \{([^}]*)\}", DOCUMENT)
+    assert script
+    assert set(re.findall(r'"(\w+)"', script[1])) == seen
     after = DOCUMENT.partition("\n## Stale, or nothing pressed?\n")[2].partition("\n1. ")[0]
     assert set(re.findall(r"`(\w+)`", after)) == seen | {"is_known"}
 

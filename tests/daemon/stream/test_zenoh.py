@@ -202,9 +202,11 @@ def test_a_status_is_sent_when_it_says_something_else_and_its_numbers_are_asked_
     one = reader(start(bind="tcp://127.0.0.1:0").address, topic("left", "status"))
     began_s, seen = time.monotonic(), set[int]()
     said: dict[str, Any] = {"state": "running", "frames": 0, "ports": [{"state": "running"}]}
+    said["recording"] = {"path": "/data/grasp.mcap", "bytes": 0}
 
     def send() -> None:
         said["frames"] += 1
+        said["recording"]["bytes"] += 1
         left.publish_message("status", said)
 
     samples.until(lambda: samples.all, send)

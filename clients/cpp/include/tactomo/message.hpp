@@ -218,9 +218,6 @@ private:
     Tape tape_;
 };
 
-/// What may stand in place of a field's value.
-enum class Allow : unsigned { nothing = 0, nil = 1, absence = 2, both = 3 };
-
 /// Reads a map's fields by name. The first one that is wrong is noted, and reading goes on.
 class Fields {
 public:
@@ -230,8 +227,51 @@ public:
         if (tape_[index].type != Token::map) fail("not a map");
     }
 
-    std::int64_t integer(std::string_view name) noexcept {
-        return integer(name, Allow::nothing).value_or(0);
+    void read(std::string_view name, std::int64_t& into, Allow) noexcept {
+        into = integer(name, Allow::nothing).value_or(0);
+    }
+    void read(std::string_view name, std::uint64_t& into, Allow) noexcept { into = counter(name); }
+    void read(std::string_view name, double& into, Allow) noexcept {
+        into = number(name, Allow::nothing).value_or(0);
+    }
+    void read(std::string_view name, std::optional<std::int64_t>& into, Allow allow) noexcept {
+        into = integer(name, allow);
+    }
+    void read(std::string_view name, std::optional<double>& into, Allow allow) noexcept {
+        into = number(name, allow);
+    }
+    void read(std::string_view name, bool& into, Allow) noexcept { into = boolean(name); }
+    template <std::size_t N>
+    void read(std::string_view name, Text<N>& into, Allow allow) noexcept {
+        into = text(name, allow);
+    }
+    void read(std::string_view name, PressureRange& into, Allow allow) noexcept {
+        const auto* const found =
+            std::find(pressure_ranges.begin(), pressure_ranges.end(), text(name, allow));
+        into = found == pressure_ranges.end()
+                   ? PressureRange::unknown
+                   : static_cast<PressureRange>(found - pressure_ranges.begin());
+    }
+    void read(std::string_view name, std::array<double, 2>& into, Allow) noexcept {
+        into = extent(name);
+    }
+    void read(std::string_view name, Image& into, Allow) { image(name, into); }
+    void read(std::string_view name, std::vector<Text<48>>& into, Allow) {
+        into.clear();
+        list(name, [&](std::size_t at) {
+            if (tape_[at].type != Token::text) return fail(name);
+            into.emplace_back() = tape_[at].view();
+        });
+    }
+    void read(std::string_view name, std::vector<Contact>& into, Allow) {
+        into.clear();
+        list(name, [&](std::size_t at) {
+            Fields entry(tape_, at, problem_);
+            each_field_of_contact(into.emplace_back(),
+                                  [&](std::string_view inside, auto& value, Allow allow) {
+                                      entry.read(inside, value, allow);
+                                  });
+        });
     }
     std::optional<std::int64_t> integer(std::string_view name, Allow allow) noexcept {
         const Token* const token = value(name, allow);
@@ -248,7 +288,6 @@ public:
         const Token* const token = value(name, Token::positive);
         return token == nullptr ? 0 : token->unsigned_value;
     }
-    double number(std::string_view name) noexcept { return number(name, Allow::nothing).value_or(0); }
     std::optional<double> number(std::string_view name, Allow allow) noexcept {
         const Token* const token = value(name, allow);
         if (token == nullptr) return {};
@@ -380,37 +419,6 @@ inline std::string clock_id() {
     return id;
 }
 
-inline PressureRange pressure_range(std::string_view name) noexcept {
-    if (name == "within") return PressureRange::within;
-    if (name == "below") return PressureRange::below;
-    if (name == "above") return PressureRange::above;
-    return PressureRange::unknown;
-}
-
-inline Contact contact(Fields& fields) noexcept {
-    Contact read;
-    read.id = fields.integer("id");
-    read.x_mm = fields.number("x_mm");
-    read.y_mm = fields.number("y_mm");
-    read.area_mm2 = fields.number("area_mm2");
-    read.magnitude = fields.number("magnitude", Allow::both);
-    read.magnitude_sigma = fields.number("magnitude_sigma", Allow::both);
-    read.pressure_kpa = fields.number("pressure_kpa", Allow::both);
-    read.x_sigma_mm = fields.number("x_sigma_mm", Allow::both);
-    read.y_sigma_mm = fields.number("y_sigma_mm", Allow::both);
-    read.area_sigma_mm2 = fields.number("area_sigma_mm2", Allow::both);
-    read.pressure_sigma_kpa = fields.number("pressure_sigma_kpa", Allow::both);
-    read.force_n = fields.number("force_n", Allow::both);
-    read.force_sigma_n = fields.number("force_sigma_n", Allow::both);
-    read.pressure_range = pressure_range(fields.text("pressure_range", Allow::absence));
-    read.peak_kpa = fields.number("peak_kpa", Allow::both);
-    read.peak_sigma_kpa = fields.number("peak_sigma_kpa", Allow::both);
-    read.max_kpa = fields.number("max_kpa", Allow::both);
-    read.edge = fields.number("edge", Allow::both);
-    read.taught = fields.boolean("taught");
-    return read;
-}
-
 /// Decodes the messages of one topic.
 class Decoder {
 public:
@@ -433,47 +441,28 @@ public:
         std::string_view problem;
         Fields fields(*tape, 0, problem);
         if (fields.counter("schema") != schema) return "schema";
-        read_envelope(fields, received, frame);
-        read_flags(*tape, fields, frame);
-        read_contacts(*tape, fields, problem, frame);
-        frame.force_n = fields.number("force_n", Allow::both);
-        frame.force_sigma_n = fields.number("force_sigma_n", Allow::both);
-        if (kind_ == Kind::map) read_images(fields, frame);
+        if (topic_.compare(0, topic_.find('/'), fields.text("sensor")) != 0) fields.fail("sensor");
+        if (fields.text("kind") != (kind_ == Kind::map ? "map" : "contacts")) fields.fail("kind");
+        const auto read = [&](std::string_view name, auto& value, Allow allow) {
+            fields.read(name, value, allow);
+        };
+        each_field_of_frame(frame, read);
+        if (kind_ == Kind::map) each_image_of_frame(frame, read);
+        frame.received = received;
+        frame.age_at_receipt = age(frame);
         return problem;
     }
 
 private:
-    void read_envelope(Fields& fields, std::chrono::steady_clock::time_point received,
-                       Frame& frame) const noexcept {
-        frame.sensor = fields.text("sensor");
-        if (topic_.compare(0, topic_.find('/'), fields.text("sensor")) != 0) fields.fail("sensor");
-        if (fields.text("kind") != (kind_ == Kind::map ? "map" : "contacts")) fields.fail("kind");
-        frame.session = fields.text("session");
-        frame.sequence = fields.counter("sequence");
-        frame.scan_counter = fields.integer("scan_counter");
-        frame.acquired_realtime_ns = fields.integer("acquired_realtime_ns");
-        frame.acquired_monotonic_ns = fields.integer("acquired_monotonic_ns");
-        frame.device_us = fields.integer("device_us", Allow::nil);
-        frame.delay_ns = fields.integer("delay_ns", Allow::both);
-        frame.dated_by = fields.text("dated_by", Allow::both);
-        frame.skew_ms = fields.number("skew_ms", Allow::both);
-        frame.tier = fields.text("tier", Allow::nil);
-        frame.tier_reason = fields.text("tier_reason", Allow::nil);
-        frame.misfit = fields.number("misfit", Allow::nil);
-        frame.confidence = fields.number("confidence", Allow::both);
-        frame.received = received;
-        frame.age_at_receipt = age(fields, frame.acquired_monotonic_ns, received);
-    }
     /// Exact where publisher and subscriber read the same clock; otherwise the age at publication,
     /// which leaves out the time that the message was on its way.
-    std::chrono::nanoseconds age(Fields& fields, std::int64_t acquired_ns,
-                                 std::chrono::steady_clock::time_point received) const noexcept {
-        const std::int64_t at_publication_ns = fields.integer("age_ns", Allow::nil).value_or(0);
-        const bool same_clock =
-            !clock_id_.empty() && fields.text("clock_id", Allow::absence) == clock_id_;
+    std::chrono::nanoseconds age(const Frame& frame) const noexcept {
+        const std::int64_t acquired_ns = frame.acquired_monotonic_ns;
+        const std::int64_t at_publication_ns = frame.age_ns.value_or(0);
+        const bool same_clock = !clock_id_.empty() && frame.clock_id == clock_id_;
         // On Linux, which alone has such an identity, steady_clock is CLOCK_MONOTONIC.
         const std::int64_t received_ns =
-            std::chrono::duration_cast<std::chrono::nanoseconds>(received.time_since_epoch()).count();
+            std::chrono::duration_cast<std::chrono::nanoseconds>(frame.received.time_since_epoch()).count();
         const bool is_past = acquired_ns <= received_ns;
         // Halved, so that no clock can be so wrong that ages overflow.
         constexpr std::int64_t limit_ns = std::numeric_limits<std::int64_t>::max() / 2;
@@ -482,28 +471,6 @@ private:
             is_past ? received_ns - std::max(acquired_ns, oldest_ns) : std::int64_t{0};
         const std::int64_t ns = same_clock ? exact_ns : std::max<std::int64_t>(0, at_publication_ns);
         return std::chrono::nanoseconds(std::min(ns, limit_ns));
-    }
-    static void read_flags(const Tape& tape, Fields& fields, Frame& frame) {
-        frame.flags.clear();
-        fields.list("flags", [&](std::size_t at) {
-            if (tape[at].type != Token::text) return fields.fail("flags");
-            frame.flags.emplace_back() = tape[at].view();
-        });
-    }
-    static void read_contacts(const Tape& tape, Fields& fields, std::string_view& problem,
-                              Frame& frame) {
-        frame.contacts.clear();
-        fields.list("contacts", [&](std::size_t at) {
-            Fields entry(tape, at, problem);
-            frame.contacts.push_back(contact(entry));
-        });
-    }
-    static void read_images(Fields& fields, Frame& frame) {
-        fields.image("map", frame.map);
-        fields.image("pressure_kpa", frame.pressure_kpa);
-        fields.image("structure", frame.structure);
-        frame.x_mm = fields.extent("x_mm");
-        frame.y_mm = fields.extent("y_mm");
     }
 
     std::string topic_;

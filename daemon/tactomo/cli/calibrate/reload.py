@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import typer
-from tactomo_client.status import Calibration, Taught
+from tactomo_client.schema import Calibration, Taught
 
 from tactomo.errors import TactomoError
 

@@ -40,9 +40,11 @@ FRAME_TYPES: Final[Mapping[str, str]] = {
 CONTACT_TYPES: Final[Mapping[str, str]] = {
     "contact_frame": "<i8",
     **{
-        ARRAY_COLUMNS.get(field.name, f"contact_{field.name}"): {"int": "<i8", "str": "<U8"}.get(
-            str(field.type), "<f8"
-        )
+        ARRAY_COLUMNS.get(field.name, f"contact_{field.name}"): {
+            "int": "<i8",
+            "str": "<U8",
+            "bool": "?",
+        }.get(str(field.type), "<f8")
         for field in fields(Contact)
     },
 }
