@@ -85,7 +85,7 @@ format: $(READY) ## let ruff rewrite what it can
 	$(BIN)/ruff format .
 
 schema: $(READY) ## tables of the documentation and the C++ fields, from tactomo_client/schema.py
-	$(BIN)/python clients/write_schema.py
+	$(BIN)/python tests/support/write_schema.py
 
 bench: $(READY)  ## latency and time per frame on this machine
 	$(BIN)/tactomo bench $(ARGS)

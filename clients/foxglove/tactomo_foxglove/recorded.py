@@ -25,15 +25,23 @@ def write_mcap(
     description: Mapping[str, Any],  # the sensor, as `status` has it; empty where it is not known
     placement: Placement | None = None,  # where the sensor hangs
 ) -> int:
-    """Write frames as an MCAP file, and return how many there were; one at a time is in memory."""
+    """Write frames as an MCAP file, and return how many there were; one at a time is in memory.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
     context = foxglove.Context()
     transforms = FrameTransformsChannel("/tf", context=context)
     topics = SensorTopics(sensor, context, transforms, placement or Placement())
     options = MCAPWriteOptions(profile=PROFILE, compression_threads=0)
     count = 0
-    with foxglove.open_mcap(file, context=context, writer_options=options):
-        for count, (time_ns, frame, age_s) in enumerate(frames, 1):
-            if count == 1 and description:
-                topics.sheet(description, time_ns)
-            topics.frame(frame, time_ns, age_s)
+    writer = foxglove.open_mcap(file, context=context, writer_options=options)
+    for count, (time_ns, frame, age_s) in enumerate(frames, 1):
+        if count == 1 and description:
+            topics.sheet(description, time_ns)
+        topics.frame(frame, time_ns, age_s)
+    try:
+        writer.close()
+    except RuntimeError as error:  # so it says that an earlier write had failed
+        raise OSError(f"the file could not be written: {error}") from error
     return count

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 from tactomo_client.schema import PRESSURE_RANGES, TOUCHES_SEEN
 
-ROOT: Final = Path(__file__).parents[1]
+ROOT: Final = Path(__file__).parents[2]
 SOURCE: Final = ROOT / "clients/python/tactomo_client/schema.py"
 STREAM: Final = ROOT / "clients/STREAM.md"
 FILES: Final = ROOT / "docs/files.md"
@@ -264,9 +264,9 @@ def _allowed(field: Field) -> str:
     return "both" if field.has_default else "nil"
 
 
-def written(source: str | None = None) -> dict[Path, str]:
-    """Return the text of each file that follows from the schema; another source is for tests."""
-    schema = read_schema(source or SOURCE.read_text("utf-8"))
+def written(source: str) -> dict[Path, str]:
+    """Return the text of each file that follows from the schema."""
+    schema = read_schema(source)
     return {
         STREAM: stream_page(schema, STREAM.read_text("utf-8")),
         FILES: files_page(schema, FILES.read_text("utf-8")),
@@ -275,5 +275,5 @@ def written(source: str | None = None) -> dict[Path, str]:
 
 
 if __name__ == "__main__":
-    for path, text in written().items():
+    for path, text in written(SOURCE.read_text("utf-8")).items():
         path.write_text(text, "utf-8")
