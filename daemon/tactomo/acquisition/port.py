@@ -298,7 +298,7 @@ class PortReader(Worker):
             self._preamble_s = times[0] * 1e-9
             if preamble:
                 entries.insert(0, preamble_entry(self.index, preamble, *times))
-        previous = active.previous
+        previous = None if active.come_over.is_set() else active.previous
         if previous is not None and self._recording in (previous.number, active.number):
             previous.add(entries[-1])
         return active.add(*entries)

@@ -64,7 +64,7 @@ class FrameMarks:
         if dual.recording != active.number:
             return False
         self._recording = active
-        active.previous = None
+        active.come_over.set()
         if self._reference is not None:
             active.references += 1
             self._record_reference(active)

@@ -340,7 +340,6 @@ class Imaging:
         started_s = time.perf_counter()
         self.frame_rate.add(time.monotonic_ns())  # first: what was seen is counted
         header = frames.frame_header(dual, timing, frame)
-        self._publisher.header = header
         self._publisher.publish(CONTACTS, frames.contacts_fields(dual.counter, frame), header)
         active = self._recorder.active
         if self._publisher.wants(MAP) or (active is not None and active.with_maps):

@@ -109,7 +109,7 @@ class Pipeline(Worker):
         # discarded because this thread did not come round to it for seconds.
         self._received: list[Counter[Channel]] = [Counter() for _ in range(ports)]
         self._discarded: Counter[Channel] = Counter()
-        self._used = self._left_out = self._in_hand = 0
+        self._used = self._left_out = self._in_hand = self._joined = 0
         self._ready: deque[DualScan] = deque()  # to be made into frames now
         self._skipped = 0  # dual scans left out because newer ones had come
         self._drop_limit = RateLimit()
@@ -142,10 +142,12 @@ class Pipeline(Worker):
         It adds up but for the few scans that change places meanwhile.
         """
         sync = self.sync
-        with self._deliveries.mutex:
-            queued = sum(len(each.scans) for each in self._deliveries.queue if each is not None)
+        # In this order: what moves on meanwhile counts as waiting, which is never less than 0.
+        gone = self._joined + self._discarded.total()
+        received = sum(self.received.values())
+        queued = received - gone
         return {
-            "received": sum(self.received.values()),
+            "received": received,
             "used": self._used,
             "late": sync.late,
             "repeated": sync.repeated,
@@ -329,6 +331,7 @@ class Pipeline(Worker):
 
     def _join(self, delivery: Delivery) -> list[DualScan]:
         ready: list[DualScan] = []
+        self._joined += len(delivery.scans)
         if self._replay is not None and delivery.replay_pass != self._replay.playback.passes:
             self._left_out += len(delivery.scans)
             return ready

@@ -31,9 +31,10 @@ class ActiveRecording:
         self.with_maps = with_maps
         # the pressure calibration that the file's metadata tell, as text
         self.calibration = calibration
-        # the file before it, as long as that gets the ports' bytes, too. The pipeline's thread ends
-        # that, or the recorder's when it has waited long enough
+        # the file before it, until the recorder's thread has closed that; it gets the ports' bytes,
+        # too, as long as the pipeline's thread has not `come_over` to this one
         self.previous = previous
+        self.come_over = threading.Event()
         self.references = 0  # how many references were added; the pipeline's thread counts
         self.calibrations = 0  # how many pressure calibrations were added, likewise
         # length of the file at the last flush; written by the recorder's thread

@@ -287,7 +287,7 @@ class Recorder(Worker):
         if ending is not None:
             ending.write()
             # The pipeline has come over, or nothing comes that it could come over with.
-            if active.previous is None or active.age_s > OVERLAP_S:
+            if active.come_over.is_set() or active.age_s > OVERLAP_S:
                 self._finish_previous()
         active.write()
         if active.is_overflowed:

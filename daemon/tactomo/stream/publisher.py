@@ -48,7 +48,7 @@ NO_FRAME_YET: Final[dict[str, Any]] = {
 class _Outgoing(NamedTuple):
     kind: str
     sequence: int
-    header: Mapping[str, Any]
+    header: Mapping[str, Any] | None  # None: the newest frame's
     fields: Mapping[str, Any]
 
 
@@ -72,8 +72,7 @@ class Publisher(Worker):
         super().__init__("publisher")
         self.address = ""  # where it is bound, once open
         self.subscribers = 0  # subscriptions in force
-        # the newest frame's; written by the pipeline thread, sent with status and events. One that
-        # cannot be sent gives way to none
+        # that of the newest frame that could be sent; it goes with status and events, too
         self.header: Mapping[str, Any] = NO_FRAME_YET
         # from the last byte of a dual scan to the sending of its contacts
         self.latency = Durations()
@@ -134,7 +133,7 @@ class Publisher(Worker):
         header: Mapping[str, Any] | None = None,
     ) -> None:
         """Hand over a message; for any thread, and never waits."""
-        self._queue.append(self._number(kind, self.header if header is None else header, fields))
+        self._queue.append(self._number(kind, header, fields))
         if not self._stopping.is_set():
             self._wake()
 
@@ -142,7 +141,9 @@ class Publisher(Worker):
         """Return the envelope of the last message of a kind as of now; for any thread."""
         return self._stamp(self._sequence[kind], self.header)
 
-    def _number(self, kind: str, header: Mapping[str, Any], fields: Mapping[str, Any]) -> _Outgoing:
+    def _number(
+        self, kind: str, header: Mapping[str, Any] | None, fields: Mapping[str, Any]
+    ) -> _Outgoing:
         # Numbered when handed over: should the queue overflow, the gap shows.
         with self._lock:
             self._sequence[kind] += 1
@@ -193,12 +194,15 @@ class Publisher(Worker):
 
     def _send(self, message: _Outgoing) -> bytes:
         """Send a message; one that breaks STREAM.md is left out, and its sequence number tells."""
-        envelope = self._stamp(message.sequence, message.header)
+        header = self.header if message.header is None else message.header
+        envelope = self._stamp(message.sequence, header)
         try:
             data = encode_message(self._sensor, message.kind, {**envelope, **message.fields})
         except MessageError as error:
             self._tell_unsent(message, error)
             return b""
+        if message.kind == CONTACTS:
+            self.header = header
         if message.kind not in (STATUS, EVENT):
             self._on_frame(message.kind, data)
         self._socket.send(data, zmq.DONTWAIT)
@@ -207,8 +211,6 @@ class Publisher(Worker):
         return data
 
     def _tell_unsent(self, message: _Outgoing, error: MessageError) -> None:
-        if self.header is message.header:
-            self.header = NO_FRAME_YET  # or the event could not be sent either
         if self._unsent_limit.allows():
             self._on_event(
                 "message_unsent",
@@ -218,7 +220,7 @@ class Publisher(Worker):
             )
 
     def _send_status(self) -> None:
-        self._last_status = self._send(self._number(STATUS, self.header, self._status()))
+        self._last_status = self._send(self._number(STATUS, None, self._status()))
 
     def _tell_cuts(self) -> None:
         """Tell that subscribers were cut off, a second later: then they are back to hear it."""
