@@ -411,8 +411,8 @@ class Port:
     #: By how much `packets`, `corrupt` and `faulty` have risen within it
     received_last_minute: Mapping[str, int] = field(default_factory=dict)
     #: Why the device's scans are not used, if they are not: it does not fit the description, is
-    #: none of the sensor's ``device_ids``, or (of a foreign protocol) cannot be understood or
-    #: refused its configuration
+    #: none of the sensor's ``device_ids``, sends a channel that another port carries, or (of a
+    #: foreign protocol) cannot be understood or refused its configuration
     refusal: str | None = None
     #: Scans that were not used: of an unknown or refused device, unlike its *hello*, or of a
     #: channel that the sensor does not have

@@ -18,7 +18,16 @@ from typing import Final
 
 from tactomo_models import SensorDescription
 from tactomo_models.arrays import FloatArray
-from tactomo_protocol import Acknowledge, AckStatus, CommandCode, DecoderCounts, Hello, Packet, Scan
+from tactomo_protocol import (
+    Acknowledge,
+    AckStatus,
+    Channel,
+    CommandCode,
+    DecoderCounts,
+    Hello,
+    Packet,
+    Scan,
+)
 
 from tactomo.acquisition.adapters import ROOT
 from tactomo.acquisition.connection import Connection
@@ -26,7 +35,7 @@ from tactomo.acquisition.device_clock import MAX_RATE, ClockState, DeviceClock
 from tactomo.acquisition.liveness import DeviceState, Liveness
 from tactomo.acquisition.open_serial import other_holders
 from tactomo.acquisition.replay_port import ReplayEnded, ReplayMoved
-from tactomo.events import OnEvent, RateLimit
+from tactomo.events import OnEvent, RateLimit, Severity
 from tactomo.protocols import PortProtocol, Trouble
 from tactomo.recordings.active_recording import ActiveRecording
 from tactomo.recordings.playback import Playback
@@ -63,6 +72,8 @@ class PortReader(Worker):
         on_event: OnEvent,  # told what happens
         root: Path = ROOT,  # the folder of `/sys` and `/dev`
         playback: Playback | None = None,  # the replay's time, where the port replays
+        # which port carries a channel, of all ports of the sensor; by itself where it is None
+        carriers: dict[Channel, PortReader] | None = None,
     ) -> None:
         super().__init__(f"port-{index}")
         self.index = index
@@ -82,6 +93,7 @@ class PortReader(Worker):
         self._recorder = recorder
         self._deliver = deliver
         self._on_event = on_event
+        self._carriers = {} if carriers is None else carriers
         self._connection = Connection(url, baud, on_event, root, playback)
         self._is_replay = url.startswith(f"{REPLAY_SCHEME}://")
         self._liveness = Liveness(protocol.says_hello, protocol.patience_s)
@@ -90,6 +102,7 @@ class PortReader(Worker):
         self._recording = 0  # number of the recording that has the last chunk
         self._preamble_s = 0.0  # when a recording was last given one
         self._is_known = False  # the device that is plugged in has said hello
+        self._is_doubled = False  # another port carries its channels
         self._asked_s = 0.0  # when the device was last asked, or last sent a scan
         self._trouble_of_protocol: Trouble | None = None
         self._corrupt_told = 0
@@ -100,7 +113,7 @@ class PortReader(Worker):
         self._clock_limit = RateLimit()
         self._is_zeroing = threading.Event()
         self._fault, self._fault_s = "", 0.0  # what was last against the protocol, and when
-        self._fault_limits: dict[str, RateLimit] = {}
+        self._limits: dict[str, RateLimit] = {}
         self._faulty_told = 0
         self._unanswered_s: float | None = None  # since when no command has been acknowledged
         self._is_unanswered_told = False
@@ -332,7 +345,7 @@ class PortReader(Worker):
     def _note_fault(self, kind: str, fault: str, now_s: float) -> None:
         """Take note of, and tell, what a device's firmware does against its protocol."""
         self._fault, self._fault_s = fault, now_s
-        if self._fault_limits.setdefault(kind, RateLimit(TROUBLE_PERIOD_S)).allows():
+        if self._limits.setdefault(kind, RateLimit(TROUBLE_PERIOD_S)).allows():
             self._on_event(
                 "firmware_fault",
                 "warning",
@@ -344,43 +357,74 @@ class PortReader(Worker):
         self._is_known = True
         self._liveness.note_rate(hello.scan_rate_hz)
         before = self.hello
-        if hello == before:
+        if hello == before and not self._is_doubled:
             return
         self.hello = hello
-        self.refusal = self._why_refused(hello)
-        if self.refusal:
-            self._tell_refusal(hello, self._is_foreign(hello))
+        trouble, refused = self._why_refused(hello), self.refusal
+        self.refusal = "" if trouble is None else trouble.cause
+        if hello == before and self.refusal == refused:
+            return
+        if trouble is not None:
+            self._tell_thinned(
+                "device_refused",
+                "error",
+                f"{self.url}: {trouble.cause}; its scans are not used",
+                trouble.next_step,
+            )
+        elif hello == before:
+            self._tell_thinned("device_speaks", "info", self.url)
         elif before is not None and before.device_id != hello.device_id:
-            self._on_event(
+            self._tell_thinned(
                 "device_changed",
                 "warning",
                 f"{self.url}: {hello.device_id} is where {before.device_id} was",
                 "tare, if another skin was plugged in; `device_ids` keeps foreign ones out",
             )
 
-    def _why_refused(self, hello: Hello) -> str:
-        if self._is_foreign(hello):
-            ours = ", ".join(self._device_ids)
-            return f"{hello.device_id} is not one of this sensor's devices, {ours}"
-        return contradiction(hello, self._description)
+    def _tell_thinned(
+        self, name: str, severity: Severity, detail: str, next_step: str = ""
+    ) -> None:
+        """Tell what a device's hellos say: a device may say another thing with each."""
+        if self._limits.setdefault(name, RateLimit()).allows():
+            self._on_event(name, severity, detail, next_step)
 
-    def _is_foreign(self, hello: Hello) -> bool:
-        return bool(self._device_ids) and hello.device_id not in self._device_ids
+    def _why_refused(self, hello: Hello) -> Trouble | None:
+        """Why a device's scans are not used; where they are, its channels are this port's now."""
+        self._is_doubled = False
+        self._give_up_channels()
+        if self._device_ids and hello.device_id not in self._device_ids:
+            return Trouble(
+                f"{hello.device_id} is not one of this sensor's devices, "
+                f"{', '.join(self._device_ids)}",
+                "plug it in elsewhere, or name its port by /dev/serial/by-id or by-path: see "
+                "`tactomo ports`; a device that was replaced belongs into `device_ids`",
+            )
+        if differs := contradiction(hello, self._description):
+            return Trouble(
+                f"{hello.device_id} does not fit {self._description.name}: {differs}",
+                "give the daemon the description of the sensor that is connected",
+            )
+        channels = [channel for channel in hello.channels if channel in self._description.channels]
+        for channel in channels:
+            carrier = self._carriers.setdefault(channel, self)  # one step: ports race for it
+            if carrier is not self and carrier.still_carries(hello.device_id):
+                self._is_doubled = True
+                self._give_up_channels()
+                return Trouble(
+                    f"{hello.device_id} sends the {channel} channel, which {carrier.url} carries",
+                    "two skins are two sensors, each with a daemon of its own; of one skin each "
+                    "board names its own channel alone",
+                )
+        self._carriers.update(dict.fromkeys(channels, self))
+        return None
 
-    def _tell_refusal(self, hello: Hello, is_foreign: bool) -> None:
-        name = self._description.name
-        why = (
-            self.refusal if is_foreign else f"{hello.device_id} does not fit {name}: {self.refusal}"
-        )
-        self._on_event(
-            "device_refused",
-            "error",
-            f"{self.url}: {why}; its scans are not used",
-            "plug it in elsewhere, or name its port by /dev/serial/by-id or by-path: see "
-            "`tactomo ports`; a device that was replaced belongs into `device_ids`"
-            if is_foreign
-            else "give the daemon the description of the sensor that is connected",
-        )
+    def _give_up_channels(self) -> None:
+        for channel in [c for c, port in list(self._carriers.items()) if port is self]:
+            del self._carriers[channel]
+
+    def still_carries(self, device_id: str) -> bool:
+        """Whether its channels are its own beside this device: it did not move from here."""
+        return self.is_open or self.hello is None or self.hello.device_id != device_id
 
     def _ask(self) -> None:
         """Ask the device who it is and to start."""
@@ -513,7 +557,8 @@ class PortReader(Worker):
             detail = f"{self.url}: {trouble.cause}"
             self._on_event("device_refused", "error", detail, trouble.next_step)
         elif self.hello is not None:
-            self.refusal = self._why_refused(self.hello)
+            refused = self._why_refused(self.hello)
+            self.refusal = "" if refused is None else refused.cause
             self._on_event("device_speaks", "info", self.url)
         else:
             self.refusal = ""

@@ -181,6 +181,10 @@ class Daemon:
             self._zero_counters,
             self._on_event,
         )
+        # A channel is one port's. In an exact replay the marks say whose each scan is.
+        carriers: dict[Channel, PortReader] | None = (
+            None if replay is not None and replay.marks else {}
+        )
         self._ports = [
             PortReader(
                 index,
@@ -193,6 +197,7 @@ class Daemon:
                 self._pipeline.deliver,
                 self._on_event,
                 playback=self.playback,
+                carriers=carriers,
             )
             for index, url in enumerate(config.ports)
         ]
