@@ -46,7 +46,8 @@ ORDER = {
         *(
             "errors",
             "arrays",
-            "matlab_hdf5",
+            "foreign_file",
+            "matlab_file",
             "array_files",
             "archive",
             "toml_file",
@@ -58,7 +59,7 @@ ORDER = {
         *("machine_speed", "mujoco_skin", "gymnasium_skin"),
     ),
     "tactomo": (
-        *("errors", "journal", "log", "events", "endpoint", "timing", "scans", "worker"),
+        *("errors", "plain", "journal", "log", "events", "endpoint", "timing", "scans", "worker"),
         *("ending", "memory"),
         *("protocols", "config", "recordings", "acquisition", "stream", "imaging"),
         *("service", "twin", "cli", "__main__"),
@@ -71,7 +72,7 @@ FOREIGN = {
     "onnx": ("tactomo_lab.training.",),
     "mujoco": ("tactomo_models.mujoco_skin.",),
     "gymnasium": ("tactomo_models.gymnasium_skin.",),
-    "h5py": ("tactomo_models.matlab_hdf5",),
+    "h5py": ("tactomo_models.matlab_file",),
     "serial": ("tactomo.",),
     "zmq": ("tactomo.", "tactomo_client.", "tactomo_foxglove."),
 }

@@ -16,6 +16,7 @@ from typing import Any, Literal
 import structlog
 
 from tactomo.journal import is_journal, with_priority
+from tactomo.plain import plain
 
 LogLevel = Literal["debug", "info", "warning", "error"]
 LogFormat = Literal["auto", "text", "json", "journal"]
@@ -39,12 +40,16 @@ def configure_logging(
         return {**event, "sensor": sensor} if sensor else event
 
     structlog.configure(
-        processors=[structlog.processors.add_log_level, name_sensor, *_renderers(form)],
+        processors=[structlog.processors.add_log_level, name_sensor, _plain, *_renderers(form)],
         wrapper_class=structlog.make_filtering_bound_logger(logging.getLevelName(level.upper())),
         # A line is one write: several processes may share the log.
         logger_factory=structlog.WriteLoggerFactory(sys.stderr),
         cache_logger_on_first_use=False,
     )
+
+
+def _plain(_: Any, __: str, event: structlog.typing.EventDict) -> structlog.typing.EventDict:
+    return {key: plain(value) if isinstance(value, str) else value for key, value in event.items()}
 
 
 def _renderers(form: LogFormat) -> list[structlog.typing.Processor]:

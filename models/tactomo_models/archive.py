@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import errno
 import glob
+import math
 import os
 import struct
 import zipfile
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactomo_models.array_files import READERS
+from tactomo_models.array_files import READERS, check_unpacked
 from tactomo_models.errors import DataError
+from tactomo_models.foreign_file import open_regular
+
+_HEADERS: Final = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -29,9 +36,11 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     if read := READERS.get(path.suffix.lower()):
         return read(path)
     try:
-        with zipfile.ZipFile(path) as stored:
-            return {name.removesuffix(".npy"): _array(stored, name) for name in stored.namelist()}
-    except OSError:
+        with open_regular(path) as file, zipfile.ZipFile(file) as stored:
+            members = stored.infolist()
+            check_unpacked(path, sum(member.file_size for member in members), len(members))
+            return {m.filename.removesuffix(".npy"): _array(stored, m) for m in members}
+    except (OSError, DataError):
         raise
     except Exception as error:  # a flipped bit makes zip and header parsers raise almost anything
         raise DataError(
@@ -40,12 +49,16 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
         ) from error
 
 
-def _array(stored: zipfile.ZipFile, name: str) -> NDArray[Any]:
+def _array(stored: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
     """One array: read to its end, where the checksum is compared, unlike by numpy."""
-    with stored.open(name) as member:
+    with stored.open(info) as member:  # numpy makes room for as much as the header says
+        version = np.lib.format.read_magic(member)
+        shape, _, dtype = _HEADERS[version](member)
+        if info.file_size - member.tell() != dtype.itemsize * math.prod(shape):
+            raise ValueError("not as much as its header says")
+    with stored.open(info) as member:
         array: NDArray[Any] = np.lib.format.read_array(member, allow_pickle=False)
-        if member.read(1):
-            raise ValueError("more than its header says")
+        member.read(1)
     return array
 
 

@@ -8,11 +8,13 @@ measured.
 
 from __future__ import annotations
 
+import io
 import pickle
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from array import array
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
@@ -21,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactomo_models.errors import DataError
+from tactomo_models.foreign_file import open_regular, read_regular
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -28,6 +31,10 @@ NUMBERS: Final = "numbers"  # the one array of a file that names none
 VIA_MATLAB: Final = "read it with EIDORS' eidors_readdata, then save('frames.mat', 'vv', '-v7')"
 _GET_FLOATS: Final = 256
 _UCT_MAGIC: Final = bytes([0x88] * 4)
+_SMALL_BYTES: Final = 64 << 20
+_PACKED: Final = 16
+_MOST_ARRAYS: Final = 4096
+_MOST_LINE: Final = 1 << 20  # characters of a frame; the largest pattern has 4096 numbers
 _LARGEST: Final = 1e9  # in any unit of voltage; of other bytes, read as floats, some are larger
 
 
@@ -40,43 +47,37 @@ def read_matlab(path: Path) -> Arrays:
         OSError: the file cannot be read.
         DataError: it is damaged, or h5py is missing.
     """
-    from scipy.io import loadmat
-
-    with path.open("rb") as file:
-        hdf5 = b"MATLAB 7.3" in file.read(128)
-        if hdf5 and not find_spec("h5py"):
+    with open_regular(path) as file:
+        if b"MATLAB 7.3" in file.read(128) and not find_spec("h5py"):
             raise DataError(
                 f"{path} is a .mat of version 7.3, which needs h5py; pip install "
                 f"'tactomo[matlab]', or in MATLAB: x = load('{path.name}'); "
                 f"save('{path.name}', '-struct', 'x', '-v7')"
             )
-        file.seek(0)
-        try:
-            return dict(_numbers("", _hdf5(path) if hdf5 else loadmat(file)))
-        except Exception as error:  # a flipped bit makes the parsers raise almost anything
-            raise DataError(
-                f"cannot read {path}: damaged, or no .mat file; save it anew"
-            ) from error
-
-
-def _hdf5(path: Path) -> Arrays:
-    program = Path(__file__).with_name("matlab_hdf5.py")
-    ended = subprocess.run([sys.executable, program, path], capture_output=True, check=True)
+    program = Path(__file__).with_name("matlab_file.py")
+    most = str(most_unpacked(path))
+    ended = subprocess.run([sys.executable, program, path, most], capture_output=True, check=False)
+    if ended.returncode:
+        raise DataError(
+            f"cannot read {path}: damaged, or no .mat file of numbers, or of more than its size "
+            "bears; save it anew"
+        )
     return dict(pickle.loads(ended.stdout))
 
 
-def _numbers(prefix: str, held: Mapping[str, Any]) -> Iterator[tuple[str, NDArray[Any]]]:
-    for name, value in held.items():
-        array = value.toarray() if hasattr(value, "toarray") else np.asarray(value)
-        if name.startswith("__"):
-            continue
-        if array.dtype.names and array.size == 1:  # a struct
-            fields = {field: array[field].flat[0] for field in array.dtype.names}
-            yield from _numbers(f"{prefix}{name}.", fields)
-        elif array.dtype == object and array.size == 1:  # a cell
-            yield from _numbers(prefix, {name: array.flat[0]})
-        elif array.dtype.kind in "biufc" and array.size:
-            yield prefix + name, array
+def most_unpacked(path: Path) -> int:
+    """Return how many bytes of numbers a packed file is believed to hold: readings pack badly."""
+    return max(_SMALL_BYTES, _PACKED * path.stat().st_size)
+
+
+def check_unpacked(path: Path, size: int, arrays: int) -> None:
+    """Raise DataError where a file unpacks to what no file of measured numbers does."""
+    most = most_unpacked(path)
+    if size > most or arrays > _MOST_ARRAYS:
+        raise DataError(
+            f"{path} claims {arrays} arrays of {size / 1e6:.0f} MB in all; of a file of its size, "
+            f"{_MOST_ARRAYS} of {most / 1e6:.0f} MB are read: save it anew, uncompressed"
+        )
 
 
 def read_text(path: Path) -> Arrays:
@@ -88,36 +89,46 @@ def read_text(path: Path) -> Arrays:
         OSError: the file cannot be read.
         DataError: it holds no rows of numbers of one length.
     """
+    numbers, columns = array("d"), 0  # of each, the real and the imaginary part
     try:
-        lines = path.read_text("utf-8-sig").splitlines()
+        with open_regular(path) as binary, io.TextIOWrapper(binary, "utf-8-sig") as file:
+            for number, line in enumerate(iter(lambda: file.readline(_MOST_LINE), ""), start=1):
+                row = _row(path, number, line, bool(columns))
+                if not row:
+                    continue
+                if columns and len(row) != columns:
+                    raise DataError(
+                        f"{path}, line {number}: {len(row)} numbers, and {columns} in the lines "
+                        "before; save as many in each line"
+                    )
+                columns = len(row)
+                numbers.extend(part for each in row for part in (each.real, each.imag))
     except UnicodeDecodeError as error:
         raise DataError(f"{path} is not text; export numbers, one frame a line") from error
-    rows: list[list[complex]] = []
-    for number, line in enumerate(lines, start=1):
-        line = re.split("[#%]", line, maxsplit=1)[0]
-        if ";" in line:
-            line = line.replace(",", ".")
-        tokens = re.split(r"\s*[,;]\s*|\s+", line.strip(" \t,;"))
-        if tokens == [""]:
-            continue
-        try:
-            row = [_number(token) for token in tokens]
-        except ValueError:
-            if not rows:
-                continue  # header
-            raise DataError(
-                f"{path}, line {number}: what is no number; take the line out, or save it anew"
-            ) from None
-        if rows and len(row) != len(rows[0]):
-            raise DataError(
-                f"{path}, line {number}: {len(row)} numbers, and {len(rows[0])} in the lines "
-                "before; save as many in each line"
-            )
-        rows.append(row)
-    if not rows:
+    if not columns:
         raise DataError(f"{path} holds no line of numbers; save one frame a line or a column")
-    numbers = np.array(rows)
-    return {NUMBERS: numbers if numbers.imag.any() else numbers.real}
+    both = np.frombuffer(numbers, np.complex128).reshape(-1, columns)
+    return {NUMBERS: both if both.imag.any() else both.real.copy()}
+
+
+def _row(path: Path, number: int, line: str, has_begun: bool) -> list[complex]:
+    """Return a line's numbers; none of a comment, an empty line or a header."""
+    if len(line) >= _MOST_LINE:
+        raise DataError(f"{path}, line {number}: longer than any frame; export one frame a line")
+    line = re.split("[#%]", line, maxsplit=1)[0]
+    if ";" in line:
+        line = line.replace(",", ".")
+    tokens = re.split(r"\s*[,;]\s*|\s+", line.strip(" \t\r\n,;"))
+    if tokens == [""]:
+        return []
+    try:
+        return [_number(token) for token in tokens]
+    except ValueError:
+        if not has_begun:
+            return []  # header
+        raise DataError(
+            f"{path}, line {number}: what is no number; take the line out, or save it anew"
+        ) from None
 
 
 def _number(token: str) -> complex:
@@ -134,7 +145,7 @@ def read_get(path: Path) -> Arrays:
         OSError: the file cannot be read.
         DataError: it is none, or of another instrument.
     """
-    data = path.read_bytes()
+    data = read_regular(path, most_unpacked(path))
     if data.startswith(_UCT_MAGIC):
         raise DataError(
             f"{path} is of the University of Cape Town's instrument, whose pattern is in another "

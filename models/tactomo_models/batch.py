@@ -183,7 +183,8 @@ def scans_of(
         )
     lengths = {name: len(channel) for name, channel in scans.items()}
     if len(set(lengths.values())) > 1:
-        raise DataError(f"{source}: channels differ in length: {lengths}")
+        each = ", ".join(f"{count} of {name}" for name, count in lengths.items())
+        raise DataError(f"{source}: channels differ in length: {each}; give as many scans of each")
     return scans, references
 
 

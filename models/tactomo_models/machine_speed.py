@@ -25,6 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from tactomo_models.archive import write_whole
 from tactomo_models.errors import ArtifactError, explain
+from tactomo_models.foreign_file import MAX_TEXT_BYTES, read_regular
 from tactomo_models.physics.artifact import default_path
 from tactomo_models.sensor.description import SensorDescription
 
@@ -116,7 +117,7 @@ def load_machine_speed(path: Path, description: SensorDescription) -> MachineSpe
         FileNotFoundError: there is none.
     """
     try:
-        content = path.read_bytes()
+        content = read_regular(path, MAX_TEXT_BYTES)
         found = MachineSpeed.model_validate_json(content)
     except FileNotFoundError:
         raise

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
-MAX_TOML_BYTES: Final = 1 << 20  # a description has some thousand
+from tactomo_models.foreign_file import MAX_TEXT_BYTES, read_regular
 
 
 def read_toml(path: Path) -> dict[str, Any]:
     """Return what is in a TOML file.
 
     Raises:
-        OSError: the file cannot be read.
-        ValueError: it is not TOML, not UTF-8, or larger or deeper than anything of ours.
+        OSError: the file cannot be read, is no regular file, or larger than anything of ours.
+        ValueError: it is not TOML, not UTF-8, or deeper than anything of ours.
     """
-    with path.open("rb") as file:
-        data = file.read(MAX_TOML_BYTES + 1)
-    if len(data) > MAX_TOML_BYTES:
-        raise ValueError(f"it has more than {MAX_TOML_BYTES} bytes")
-    return parse_toml(data.decode("utf-8-sig"))  # some editors mark it
+    # some editors mark it
+    return parse_toml(read_regular(path, MAX_TEXT_BYTES).decode("utf-8-sig"))
 
 
 def parse_toml(text: str) -> dict[str, Any]:

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hostile_files import BAD_DEVICE, BAD_SENSOR, markup_recording
+from scipy.io import savemat
 
 Run = Callable[..., Any]
 
@@ -50,3 +52,29 @@ def test_info_of_what_cannot_be_read(
 
 def test_models_list(tactomo: Run) -> None:
     assert "paper_square" in tactomo("models", "list").stdout
+
+
+def test_info_of_every_file_that_reconstruct_reads(tactomo: Run, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("1,2,3\n4,5,6\n")
+    facts = json.loads(tactomo("info", "a.csv", "--json").stdout)
+    assert facts["arrays"] == {"numbers": "float64 (2, 3)"}
+    savemat(tmp_path / "a.mat", {"vv": np.ones((2, 208))})
+    facts = json.loads(tactomo("info", "a.mat", "--json").stdout)
+    assert facts["arrays"] == {"vv": "float64 (2, 208)"}
+
+
+def test_names_of_others_are_shown_as_they_are(tactomo: Run, tmp_path: Path) -> None:
+    markup_recording(tmp_path / "a.mcap")
+    result = tactomo("info", "a.mcap")
+    assert result.returncode == 0, result.stderr
+    for name in (BAD_DEVICE, BAD_SENSOR, "skin[left]"):
+        assert name in result.stdout
+    assert "\x1b]" not in result.stdout
+
+
+def test_models_are_not_built_over_a_file(tactomo: Run, tmp_path: Path) -> None:
+    (tmp_path / "thesis.npz").write_text("precious")
+    result = tactomo("models", "build", "-o", "thesis.npz")
+    assert result.returncode == 1
+    assert "thesis.npz exists already" in result.stderr
+    assert (tmp_path / "thesis.npz").read_text() == "precious"

@@ -11,8 +11,10 @@ After it come its message indexes, one for each channel in it, which nothing her
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import IO, Final, NamedTuple
 
 import zstandard
@@ -24,6 +26,9 @@ _MARK: Final = b"\x04\0\0\0zstd"
 _BEFORE_MARK: Final = 37
 _HEADER: Final = struct.Struct("<BQQQQI8sQ")
 _WINDOW_BYTES: Final = 1 << 20
+_RECORD_HEAD: Final = struct.Struct("<BQ")
+_MAX_WASTE: Final = 4  #: times the file's size that may be unpacked in vain
+_LEAST_WASTE: Final = 4 * MAX_RECORD_BYTES
 
 
 class IntactChunk(NamedTuple):
@@ -43,31 +48,49 @@ def intact_chunks(file: IO[bytes], start: int = 0) -> Iterator[IntactChunk]:
     Raises:
         OSError: the disk cannot read it.
     """
-    while (mark := _find_mark(file, start)) is not None:
-        found = _read_chunk(file, mark - _BEFORE_MARK)
-        if found is not None:
+    waste = max(_LEAST_WASTE, _MAX_WASTE * file.seek(0, os.SEEK_END))
+    end = 0  # of what was intact
+    for mark in _marks(file, start + _BEFORE_MARK):
+        chunk = _read_chunk(file, mark - _BEFORE_MARK)
+        if chunk is None:
+            continue
+        is_new = mark >= end
+        try:
+            found = _intact(mark - _BEFORE_MARK, chunk)
+        except Exception:  # damage can fail in any layer: zstd, memory, CRC, struct, utf-8
+            is_new = False
+        else:
+            end = max(end, found.end)
             yield found
-        # Not from its end on: zstd does not mind more than its data, so a damaged length may reach
-        # into the next chunk.
-        start = mark + 1 - _BEFORE_MARK
+        if not is_new:  # such may lie one in the other, and each is unpacked to its end
+            waste -= max(len(chunk.data), chunk.uncompressed_size)
+            if waste < 0:
+                return
 
 
-def _find_mark(file: IO[bytes], start: int) -> int | None:
-    """Return where the next mark is, with room for what comes before it."""
-    position = start + _BEFORE_MARK
-    file.seek(position)
-    window = b""
-    while more := file.read(_WINDOW_BYTES):
-        window = window[-len(_MARK) + 1 :] + more
-        position += len(more)
+def _marks(file: IO[bytes], position: int) -> Iterator[int]:
+    """Yield where marks are, each once.
+
+    Those inside an intact chunk, too: zstd does not mind more than its data, so a damaged length
+    may reach into the next chunk.
+    """
+    tail = b""
+    while True:
+        file.seek(position)
+        more = file.read(_WINDOW_BYTES)
+        if not more:
+            return
+        window = tail + more
         at = window.find(_MARK)
-        if at >= 0:
-            return position - len(window) + at
-    return None
+        while at >= 0:
+            yield position - len(tail) + at
+            at = window.find(_MARK, at + 1)
+        position += len(more)
+        tail = window[-len(_MARK) + 1 :]
 
 
-def _read_chunk(file: IO[bytes], start: int) -> IntactChunk | None:
-    """Return the chunk that begins at `start`; None where there is none, or a damaged one."""
+def _read_chunk(file: IO[bytes], start: int) -> Chunk | None:
+    """Return what looks like a chunk that begins at `start`; None where nothing does."""
     file.seek(start)
     header = file.read(_HEADER.size)
     if len(header) < _HEADER.size:
@@ -75,13 +98,16 @@ def _read_chunk(file: IO[bytes], start: int) -> IntactChunk | None:
     _, _, start_ns, end_ns, uncompressed, crc, _, size = _HEADER.unpack(header)
     if not crc or max(size, uncompressed) > MAX_RECORD_BYTES:
         return None
-    data = file.read(size)
-    chunk = Chunk("zstd", data, end_ns, start_ns, crc, uncompressed)
-    try:
-        records = unpack_chunk(chunk)
-    except Exception:  # damage can fail in any layer: zstd, memory, CRC, struct, utf-8
+    if file.read(len(zstandard.FRAME_HEADER)) != zstandard.FRAME_HEADER:
         return None
-    end = start + len(header) + len(data)
+    file.seek(start + len(header))
+    return Chunk("zstd", file.read(size), end_ns, start_ns, crc, uncompressed)
+
+
+def _intact(start: int, chunk: Chunk) -> IntactChunk:
+    """Return a chunk with what is in it; raises anything at all where it is damaged."""
+    records = unpack_chunk(chunk)
+    end = start + _HEADER.size + len(chunk.data)
     messages = [record for record in records if isinstance(record, Message)]
     channels = [record for record in records if isinstance(record, Channel)]
     return IntactChunk(start, end, end + _index_bytes(messages), messages, channels)
@@ -96,7 +122,8 @@ def unpack_chunk(chunk: Chunk) -> list[McapRecord]:
     """Return the records of a chunk; raises anything at all where it is damaged.
 
     A few kilobytes may claim to be gigabytes: what unpacks to more than a record's bound is damage,
-    and so is a compression that our recordings do not use.
+    and so is a compression that our recordings do not use. They may hold millions of records, too:
+    no record of ours, with a time of its own, is packed into less than a byte.
     """
     size = zstandard.frame_content_size(chunk.data) if chunk.compression == "zstd" else 0
     if (
@@ -104,4 +131,14 @@ def unpack_chunk(chunk: Chunk) -> list[McapRecord]:
         or max(size, chunk.uncompressed_size) > MAX_RECORD_BYTES
     ):
         raise ValueError("not a chunk of ours")
-    return breakup_chunk(chunk, validate_crc=True)
+    unpacked = chunk.data
+    if chunk.compression:
+        unpacked = zstandard.decompress(chunk.data, chunk.uncompressed_size)
+    position, records = 0, 0
+    while position < len(unpacked) and records <= len(chunk.data):
+        position += _RECORD_HEAD.size + _RECORD_HEAD.unpack_from(unpacked, position)[1]
+        records += 1
+    if records > len(chunk.data):
+        raise ValueError("more records than a recording of ours packs into so little")
+    plain = replace(chunk, compression="", data=unpacked)
+    return breakup_chunk(plain, validate_crc=True)

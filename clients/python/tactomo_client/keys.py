@@ -18,6 +18,7 @@ from typing import Any, Final, Self
 import zmq
 
 from tactomo_client.errors import KeysError
+from tactomo_client.regular_file import open_regular
 
 PUBLIC_SUFFIX: Final = ".key"
 SECRET_SUFFIX: Final = ".key_secret"
@@ -117,8 +118,9 @@ def _read(path: Path) -> tuple[bytes, bytes | None]:
     from zmq.auth import load_certificate
 
     try:
-        if path.stat().st_size > _MAX_FILE_BYTES:
-            raise ValueError("it is too large")
+        with open_regular(path) as file:
+            if len(file.read(_MAX_FILE_BYTES + 1)) > _MAX_FILE_BYTES:
+                raise ValueError("it is too large")
         public, secret = load_certificate(path)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error

@@ -25,6 +25,7 @@ except ImportError as error:
 
 from tactomo_client.errors import RecordingError
 from tactomo_client.intact_chunks import MAX_RECORD_BYTES, intact_chunks, unpack_chunk
+from tactomo_client.regular_file import open_regular
 
 PROFILE: Final = "tactomo"
 CHANNELS: Final[Mapping[str, str]] = {
@@ -57,7 +58,7 @@ class Span(NamedTuple):
 def open_file(path: Path) -> IO[bytes]:
     """Open a recording's file as it is; raise RecordingError where that cannot be done."""
     try:
-        return path.open("rb")
+        return open_regular(path)
     except OSError as error:
         raise RecordingError(
             f"cannot open the recording {path}: {error.strerror}", "give the path of a .mcap file"

@@ -12,6 +12,7 @@ import traceback
 from tactomo.cli.commands import app
 from tactomo.cli.failure import explain
 from tactomo.cli.parent_watch import watch_parent
+from tactomo.plain import plain
 
 __all__ = ["app", "main"]
 
@@ -31,5 +32,7 @@ def _print_error(what: Exception | str) -> None:
     """Print an error, or the traceback of a mistake of ours; as an error, where journald reads."""
     from tactomo.journal import is_journal, with_priority
 
-    text = what if isinstance(what, str) else "".join(traceback.format_exception(what)).rstrip()
+    text = (
+        plain(what) if isinstance(what, str) else "".join(traceback.format_exception(what)).rstrip()
+    )
     print(with_priority(text, "error") if is_journal() else text, file=sys.stderr)

@@ -24,6 +24,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from tactomo.cli.laboratory import not_installed
+from tactomo.cli.output import say
 
 ENTRY_POINTS = "tactomo.commands"
 OTHERS = "Of other distributions"
@@ -195,8 +196,8 @@ def _start(
     if version:
         from importlib.metadata import version as version_of
 
-        typer.echo(f"tactomo {version_of('tactomo')}")
+        say(f"tactomo {version_of('tactomo')}")
         raise typer.Exit
     if context.invoked_subcommand is None:
-        typer.echo(context.get_help())
+        say(context.get_help())
         raise typer.Exit(2)

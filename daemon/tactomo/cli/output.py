@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from tactomo.plain import plain
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -24,6 +26,11 @@ def table(*columns: str, left: Container[str] = (), title: str | None = None) ->
         words = name in left or name == columns[0]
         made.add_column(name, justify="left" if words else "right", no_wrap=not words)
     return made
+
+
+def say(text: str = "", err: bool = False, nl: bool = True) -> None:
+    """Print a line that may hold what others wrote, on standard error if `err`."""
+    typer.echo(plain(text), err=err, nl=nl)
 
 
 def print_json(told: Any) -> None:
@@ -42,8 +49,9 @@ def _finite(value: Any) -> Any:
 @contextmanager
 def progress_bar(doing: str) -> Iterator[Callable[[float, float], None]]:
     """Show a bar on standard error while this lasts, if that is a terminal."""
-    from rich.console import Console
     from rich.progress import Progress
+
+    from tactomo.cli.console import Console
 
     with Progress(console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(doing, total=None)

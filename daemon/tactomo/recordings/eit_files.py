@@ -19,6 +19,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from tactomo_models.foreign_file import read_regular
 
 from tactomo.errors import TactomoError
 
@@ -81,9 +82,7 @@ def read_eit_files(paths: Sequence[Path]) -> dict[str, NDArray[Any]]:
 
 def _read(path: Path) -> _Frame:
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise EitFileError(f"{path} has more than {MAX_BYTES >> 20} MB", _ANOTHER)
-        lines = path.read_text("ascii").splitlines()
+        lines = read_regular(path, MAX_BYTES).decode("ascii").splitlines()
     except OSError as error:
         raise EitFileError(
             f"cannot read {path}: {error.strerror}", f"give the path of a {SUFFIX} file"

@@ -61,6 +61,7 @@ from tactomo_client.messages import MAX_ENTRIES, array_from_wire
 from tactomo_models import CalibrationError, Reference, SensorDescription, load_description
 from tactomo_models.calibration.calibration_file import PressureCalibration, parse_calibration
 from tactomo_models.errors import DescriptionError
+from tactomo_models.sensor.description_file import parse_description, shipped_descriptions
 from tactomo_protocol import Channel, Hello, Scan
 
 from tactomo.errors import ConfigError, RecordingError
@@ -72,6 +73,7 @@ REFERENCE_ARRAYS: Final = ("magnitude", "structure", "magnitude_noise", "structu
 DRIFT_ARRAYS: Final = ("magnitude_drift", "structure_drift")
 """Missing in recordings of daemons that did not follow drift."""
 REPLAY_SCHEME: Final = "replay"
+GIVE_DESCRIPTION: Final = "give the description's file by --description"
 PREAMBLE_REACH_NS: Final = 2_000_000_000
 """How long a preamble is of use to a replay that begins after it: those of foreign protocols come
 every second, and one of ours is not needed by a port that knows its device."""
@@ -101,6 +103,26 @@ class Origin:
     calibration: str = ""
     """The pressure calibration that the daemon began it with, as the text of its file; empty for
     none."""
+    description_text: str = ""
+    """The description itself, as `carried_text` has it; empty for a shipped one."""
+
+    def read_description(self) -> SensorDescription:
+        """Return the sensor description that the recording carries, or that is shipped.
+
+        Raises RecordingError where it does neither: what it names by a path is not opened.
+        """
+        try:
+            if self.description_text:
+                return parse_description(self.description_text, "the recorded description")
+            if self.description in shipped_descriptions():
+                return load_description(self.description)
+        except DescriptionError as error:
+            raise RecordingError(str(error), GIVE_DESCRIPTION) from error
+        raise RecordingError(
+            f"the recording's sensor description, {self.description or 'of no name'}, is neither "
+            "in it nor shipped",
+            GIVE_DESCRIPTION,
+        )
 
     def new_protocol(self) -> PortProtocol:
         """Return what turns a port's bytes into packets.
@@ -108,12 +130,12 @@ class Origin:
         Raises RecordingError where it is not known here, or needs a description that is not here.
         """
         try:
-            known = None if self.protocol == NATIVE else load_description(self.description)
+            known = None if self.protocol == NATIVE else self.read_description()
             return protocol_named(self.protocol, known)
-        except (ConfigError, DescriptionError) as error:
+        except ConfigError as error:
             raise RecordingError(
                 f"the recording is of protocol {self.protocol} and cannot be understood: {error}",
-                "put its sensor description where the recording names it",
+                "install what brings that protocol",
             ) from error
 
 
@@ -133,8 +155,8 @@ class Summary:
     end_ns: int = 0
     port_bytes: dict[int, int] = field(default_factory=dict)
     scans: dict[Channel, int] = field(default_factory=dict)
-    hellos: list[Hello] = field(default_factory=list)
-    """The distinct ones, in the order in which they were heard."""
+    hellos: dict[Hello, None] = field(default_factory=dict)
+    """The distinct ones as keys, in the order in which they were heard."""
     corrupt: int = 0  # frames on the ports that were damaged
     faulty: int = 0  # intact ones that break the protocol
     frames: int = 0  # dual scans that the daemon reconstructed while it recorded
@@ -290,7 +312,7 @@ def _summarise(path: Path, origin: Origin) -> Summary:
 
 def _has_chunks(path: Path, start: int) -> bool:
     """Whether an intact chunk begins at or after a position in the file."""
-    with path.open("rb") as file:
+    with open_file(path) as file:
         return any(True for _ in intact_chunks(file, start))
 
 
@@ -304,8 +326,8 @@ def _count_packets(summary: Summary, decoder: PortProtocol, data: bytes) -> None
     for packet in decoder.feed(data):
         if isinstance(packet, Scan):
             summary.scans[packet.channel] = summary.scans.get(packet.channel, 0) + 1
-        elif isinstance(packet, Hello) and packet not in summary.hellos:
-            summary.hellos.append(packet)
+        elif isinstance(packet, Hello):
+            summary.hellos[packet] = None
 
 
 def to_origin(metadata: Mapping[str, str]) -> Origin:
@@ -319,6 +341,7 @@ def to_origin(metadata: Mapping[str, str]) -> Origin:
         version=metadata.get("version", ""),
         protocol=metadata.get("protocol", NATIVE),
         calibration=metadata.get("calibration", ""),
+        description_text=metadata.get("description_text", ""),
     )
 
 

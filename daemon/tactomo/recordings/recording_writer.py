@@ -172,6 +172,7 @@ class RecordingWriter:
             "version": origin.version,
             "protocol": origin.protocol,
             "calibration": origin.calibration,
+            "description_text": origin.description_text,
         }
         self._writer.add_metadata(PROFILE, metadata)
         # Always the same ones in the same order: should the chunk that names them be lost, what
@@ -281,6 +282,7 @@ def write_recording(
     sensor: str,  # the sensor's name
     description: str,  # the sensor description's name or path
     description_sha256: str,  # that description's hash
+    description_text: str = "",  # that description, see `carried_text`
     # the reference to be used on replay; None leaves that to the replay's tare
     reference: Reference | None = None,
 ) -> int:
@@ -290,7 +292,14 @@ def write_recording(
 
     Raises RecordingError where the file exists or cannot be written.
     """
-    origin = Origin(sensor, description, description_sha256, ("import",), version("tactomo"))
+    origin = Origin(
+        sensor=sensor,
+        description=description,
+        description_sha256=description_sha256,
+        ports=("import",),
+        version=version("tactomo"),
+        description_text=description_text,
+    )
     path = Path(path).absolute()
     writer = create(path, origin)
     monotonic_ns, realtime_ns = time.monotonic_ns(), time.time_ns()

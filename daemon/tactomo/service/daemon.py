@@ -56,6 +56,7 @@ from tactomo_models.calibration.calibration_file import (
 from tactomo_models.calibration.taught_skin import TaughtSkin, load_taught, taught_path
 from tactomo_models.machine_speed import MachineSpeed, machine_speed_for
 from tactomo_models.methods.registry import available_methods, check_method
+from tactomo_models.sensor.description_file import carried_text
 from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
 
@@ -119,6 +120,8 @@ class Daemon:
         machine_speed: MachineSpeed | None = None,
         # the description's; by default read, and built if need be
         artifact: Artifact | None = None,
+        # what the sensor is made of, where a recording carries that; by default as configured
+        description: SensorDescription | None = None,
     ) -> None:
         self.config = config
         self.session = uuid.uuid4().hex  # identity of this run, as in every message
@@ -128,7 +131,11 @@ class Daemon:
         self._events = EventBook()
         curve = config.curve
         self._keys = None if curve is None else load_server_keys(curve.secret, curve.clients)
-        description = load_description(config.description)
+        self._description_file: Path | None = None
+        if description is None:
+            description = load_description(config.description)
+            if config.description not in shipped_descriptions():
+                self._description_file = Path(config.description).resolve()
         if len(config.ports) > len(description.channels):
             raise ConfigError(
                 f"{description.name} has one channel, and two ports are given", "give one port"
@@ -144,7 +151,9 @@ class Daemon:
         _check_methods(replay, self._methods, description)
         protocol = _protocol(config)
         channels = tuple(c for c in Channel if c in description.channels)
-        calibration, self._unused = _find_calibration(config, description, replay)
+        calibration, self._unused = _find_calibration(
+            config, description, self._description_file, replay
+        )
         taught = _find_taught(config, description, replay, self._unused)
         origin = _origin(config, protocol, description, calibration)
         self._recorder = Recorder(origin, config.recording, self._on_event)
@@ -215,10 +224,9 @@ class Daemon:
             on_idle=self._check,
             on_event=self._on_event,
         )
-        is_shipped = config.description in shipped_descriptions()
         self._status = Status(
             description,
-            None if is_shipped else Path(config.description).resolve(),
+            self._description_file,
             self._ports,
             self._pipeline,
             self._imaging,
@@ -442,7 +450,9 @@ class Daemon:
                 "calibration_refused",
             )
         try:
-            found, unused = _find_calibration(config, self._description, replay)
+            found, unused = _find_calibration(
+                config, self._description, self._description_file, replay
+            )
             taught = _find_taught(config, self._description, replay, unused)
         except CalibrationError as error:
             found, taught, unused = None, None, [str(error)]
@@ -522,7 +532,7 @@ def _protocol(config: DaemonConfig) -> str:
 
 
 def _find_calibration(
-    config: DaemonConfig, description: SensorDescription, replay: Replay | None
+    config: DaemonConfig, description: SensorDescription, file: Path | None, replay: Replay | None
 ) -> tuple[PressureCalibration | None, list[str]]:
     """Return the pressure calibration to be used, and why others are not.
 
@@ -541,7 +551,7 @@ def _find_calibration(
             ) from error
     if replay is not None and replay.knows_calibration:
         return replay.calibration, unused
-    found = calibration_for(config.name, description, config.description, unused.append)
+    found = calibration_for(config.name, description, file, unused.append)
     return found, unused
 
 
@@ -574,4 +584,5 @@ def _origin(
         version=version("tactomo"),
         protocol=protocol,
         calibration=calibration_text(calibration),
+        description_text=carried_text(description, config.description),
     )

@@ -8,7 +8,6 @@ another device would have another curve.
 from __future__ import annotations
 
 import os
-import stat
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -24,9 +23,9 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from tactomo_models.archive import write_whole
 from tactomo_models.calibration.curve import Fit, Reading, fit_curve
 from tactomo_models.errors import CalibrationError, explain
+from tactomo_models.foreign_file import MAX_TEXT_BYTES, read_regular
 from tactomo_models.scene.pressure import PressureCurve
 from tactomo_models.sensor.description import SensorDescription
-from tactomo_models.sensor.description_file import shipped_descriptions
 
 SUFFIX: Final = ".pressure.json"
 READABLE: Final = "put a file there that may be read, or nothing"
@@ -188,7 +187,7 @@ def read_calibration(path: Path) -> PressureCalibration:
         FileNotFoundError: there is none.
     """
     with reading(path, READABLE):
-        return parse_calibration(path.read_bytes(), str(path))
+        return parse_calibration(read_regular(path, MAX_TEXT_BYTES), str(path))
 
 
 def write_kept(path: Path, write: Callable[[IO[bytes]], object]) -> None:
@@ -205,8 +204,6 @@ def write_kept(path: Path, write: Callable[[IO[bytes]], object]) -> None:
 def reading(path: Path, next_step: str) -> Iterator[None]:
     """Raise CalibrationError for a file that cannot be read, FileNotFoundError for none."""
     try:
-        if not stat.S_ISREG(path.stat().st_mode):  # reading a pipe may never end
-            raise CalibrationError(f"cannot read {path}: it is no regular file; {next_step}")
         yield
     except FileNotFoundError:
         raise
@@ -265,7 +262,7 @@ def calibration_of(description: SensorDescription, path: Path) -> PressureCalibr
 def calibration_for(
     sensor: str,  # its name in the stream
     description: SensorDescription,  # what it is made of
-    source: str,  # where that came from: a shipped name, or a file
+    file: Path | None,  # of the description; None for a shipped one
     # called with one line that says why a calibration that is there is not used
     warn: Callable[[str], None],
 ) -> PressureCalibration | None:
@@ -273,7 +270,8 @@ def calibration_for(
 
     It is looked for in the data folder by the sensor's name, then beside its description's file.
     """
-    for path in _places(sensor, source):
+    beside = [] if file is None else [file.with_suffix(SUFFIX)]
+    for path in [calibration_path(sensor), *beside]:
         try:
             return load_calibration(path, sensor, description)
         except FileNotFoundError:
@@ -281,13 +279,6 @@ def calibration_for(
         except CalibrationError as error:
             warn(str(error))
     return None
-
-
-def _places(sensor: str, source: str) -> list[Path]:
-    own = [calibration_path(sensor)]
-    if source in shipped_descriptions():
-        return own
-    return [*own, Path(source).with_suffix(SUFFIX)]
 
 
 def _rounded(values: Sequence[float] | np.ndarray) -> tuple[float, ...]:

@@ -32,8 +32,9 @@ from numpy.typing import NDArray
 from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.calibration.curve import APART, Direction, Reading, direction_at
 from tactomo_models.errors import CalibrationError
+from tactomo_models.foreign_file import read_regular
 
-MAX_BYTES: Final = 64 << 20  # an hour of lines at 1 kHz
+MAX_BYTES: Final = 16 << 20  # an hour of lines at 1 kHz
 WINDOW_S: Final = 0.5  # of a log: the load is to be still for so long
 MAX_NUMBER: Final = 1e12  # of any kind: seconds since 1970 are 2e9, and squares stay finite
 UNLOADED_KPA: Final = 1.0  # a load cell at rest
@@ -294,8 +295,7 @@ class _Table:
 def _lines(path: Path) -> list[tuple[int, str]]:
     """The numbers and texts of the file's lines that are neither empty nor comments."""
     try:
-        with path.open("rb") as file:
-            text = file.read(MAX_BYTES + 1).decode("utf-8-sig")
+        text = read_regular(path, MAX_BYTES).decode("utf-8-sig")
     except OSError as error:
         raise CalibrationError(f"cannot read {path}: {error.strerror}; give a CSV file") from error
     except UnicodeDecodeError as error:
@@ -305,7 +305,7 @@ def _lines(path: Path) -> list[tuple[int, str]]:
         for number, line in enumerate(text.splitlines(), start=1)
         if line.strip() and not line.lstrip().startswith("#")
     ]
-    if len(lines) < 2 or len(text) > MAX_BYTES:
+    if len(lines) < 2:
         raise CalibrationError(
             f"{path} holds no readings; give a line of column names, and a line for each"
         )

@@ -22,6 +22,7 @@ from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray, Image
 from tactomo_models.errors import ArtifactError
+from tactomo_models.foreign_file import open_regular
 from tactomo_models.methods.prefilter import BANDS, Prefilter, prefilter
 from tactomo_models.physics.artifact import cache_folder
 from tactomo_models.sensor.description import SensorDescription
@@ -284,7 +285,7 @@ def _open(path: Path) -> ort.InferenceSession:
     options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
     options.log_severity_level = 3
     try:
-        path.open("rb").close()  # for an error of the system's; from bytes, a session keeps them
+        open_regular(path).close()  # for an error of the system's; from bytes, a session keeps them
         version = path, path.stat().st_mtime_ns
         if (session := _sessions.get(version)) is None:
             session = ort.InferenceSession(path, options, providers=["CPUExecutionProvider"])

@@ -29,6 +29,9 @@ MAX_TABLE_BYTES = 2_000_000_000
 """Of a sensor's influence tables, which grow as the square of the map's nodes."""
 
 
+MAX_CELL_RATIO = 4
+
+
 class Pattern(Section):
     """Drive pair k is (k, k + drive_offset), measuring pair m is (m, m + measure_offset).
 
@@ -160,6 +163,13 @@ class SensorDescription(Section):
                 f"map: {self.map.nodes_x} x {self.map.nodes_y} nodes with {self.electrode_count} "
                 f"electrodes need tables of {needed / 1e9:.1f} GB, more than "
                 f"{MAX_TABLE_BYTES / 1e9:g}: give fewer nodes"
+            )
+        # Around electrodes, long triangles are halved until they are small in both directions.
+        x_m, y_m = self.width_m / (self.map.nodes_x - 1), self.height_m / (self.map.nodes_y - 1)
+        if max(x_m, y_m) > MAX_CELL_RATIO * min(x_m, y_m):
+            raise ValueError(
+                f"map: its nodes are {x_m * 1e3:g} mm apart along x and {y_m * 1e3:g} mm along y, "
+                f"more than {MAX_CELL_RATIO} times as far; give nodes in proportion to the sheet"
             )
 
     @property

@@ -5,6 +5,8 @@ The shipped ones lie in `tactomo_models/sensors`; who has another sheet copies o
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -47,8 +49,30 @@ def load_description(source: str | Path) -> SensorDescription:
             or out of range; the message names the key, its value and what is allowed.
     """
     name = str(source)
-    try:
+    with _explained(name):
         return SensorDescription.model_validate(_read(name))
+
+
+def carried_text(description: SensorDescription, source: str) -> str:
+    """Return a description as recordings carry it, see `parse_description`; none if shipped."""
+    if source in shipped_descriptions() and load_description(source) == description:
+        return ""
+    return description.model_dump_json(by_alias=True, exclude_unset=True)
+
+
+def parse_description(text: str, source: str) -> SensorDescription:
+    """Read the text of `carried_text`; `source` names it in errors.
+
+    Raises DescriptionError where a key is unknown, missing or out of range.
+    """
+    with _explained(source):
+        return SensorDescription.model_validate_json(text)
+
+
+@contextmanager
+def _explained(name: str) -> Iterator[None]:
+    try:
+        yield
     except ValidationError as error:
         raise DescriptionError(
             "\n".join(f"{name}: {explain(item)}" for item in error.errors())

@@ -429,7 +429,7 @@ def test_the_command_says_what_was_kept_and_lost(tactomo: Run, tmp_path: Path) -
     assert "exists already" in again.stderr
     folder = tactomo("recover", ".")
     assert folder.returncode == 1
-    assert folder.stderr.strip().endswith("Is a directory; give the path of a .mcap file")
+    assert folder.stderr.strip().endswith("it is no regular file; give the path of a .mcap file")
 
 
 def test_a_recovered_file_has_chunks_as_small_as_a_live_one(tmp_path: Path) -> None:

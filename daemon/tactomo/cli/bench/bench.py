@@ -23,13 +23,14 @@ import typer
 from tactomo.cli import options
 from tactomo.cli.bench.comparison import compared, read_results, table_of
 from tactomo.cli.laboratory import measurement
-from tactomo.cli.output import print_json, table
+from tactomo.cli.output import print_json, say, table
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from rich.table import Table
     from tactomo_client import Frame, Subscription
     from tactomo_models import SensorDescription
+
+    from tactomo.cli.console import Console
 
 SENSOR = "bench"
 PAGE_WIDTH = 150
@@ -165,7 +166,7 @@ def bench(
     if machine_speed:
         _machine_speed(results, show, as_json)
         return
-    from rich.console import Console
+    from tactomo.cli.console import Console
 
     with Console(stderr=True).status("starting") as line:
         _measure_twin(results, ports, rate, seconds, line.update)
@@ -197,7 +198,7 @@ def _machine_speed(results: Results, show: bool, as_json: bool) -> None:
     name = results.description
     made = bench_machine_speed.in_force(name) if show else bench_machine_speed.measure(name)
     if as_json:
-        typer.echo(made.model_dump_json(indent=2))
+        say(made.model_dump_json(indent=2))
         return
     console = _console(results)
     console.print(bench_machine_speed.table_of(made))
@@ -321,12 +322,12 @@ def _print(results: Results) -> None:
 
 def _console(results: Results) -> Console:
     """Return where to print, and say there on what everything was measured."""
-    from rich.console import Console
+    from tactomo.cli.console import Console
 
     console = Console()
     if not console.is_terminal:  # a file has no width of its own, and the table needs one
         console = Console(width=PAGE_WIDTH)
-    console.print(f"[bold]{results.machine}[/], sensor {results.description}")
+    console.print(f"{results.machine}, sensor {results.description}")
     return console
 
 

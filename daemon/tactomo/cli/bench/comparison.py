@@ -10,11 +10,14 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from tactomo_models.foreign_file import MAX_TEXT_BYTES, read_regular
+
 from tactomo.cli.output import table
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
     from rich.table import Table
+    from rich.text import Text
 
 Row = dict[str, Any]  # see `compared`
 
@@ -29,7 +32,7 @@ def read_results(path: Path) -> Mapping[str, Any]:
     Raises TactomoError where it cannot be read, or is something else.
     """
     try:
-        results = json.loads(path.read_text("utf-8"))
+        results = json.loads(read_regular(path, MAX_TEXT_BYTES))
         _by_scene(results)
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise TactomoError(
@@ -67,10 +70,12 @@ def table_of(rows: Iterable[Row], path: Path) -> Table:
     return shown
 
 
-def _change(pair: list[float] | None) -> str:
+def _change(pair: list[float] | None) -> Text:
+    from rich.text import Text
+
     if pair is None:
-        return "-"
+        return Text("-")
     earlier, now = pair
     ratio = now / earlier if earlier else float("inf")
     colour = "red" if ratio > NOTICEABLE else "green" if ratio < 1 / NOTICEABLE else "default"
-    return f"{earlier:.3g} > {now:.3g} [{colour}]x{ratio:.2f}[/]"
+    return Text(f"{earlier:.3g} > {now:.3g} ").append(f"x{ratio:.2f}", colour)

@@ -9,8 +9,6 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-import typer
-from rich.console import Console
 from rich.progress import Progress
 from tactomo_models import (
     Press,
@@ -31,7 +29,8 @@ from tactomo_models.machine_speed import (
 from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
 
-from tactomo.cli.output import table
+from tactomo.cli.console import Console
+from tactomo.cli.output import say, table
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -106,7 +105,7 @@ def warned_if_busy() -> Iterator[None]:
     yield
     share = (time.process_time() - own_s) / (time.perf_counter() - wall_s)
     if share < BUSY:
-        typer.echo(
+        say(
             f"the machine was busy: this had {share:.0%} of a core, and its times are too long; "
             "run it again when nothing else runs",
             err=True,

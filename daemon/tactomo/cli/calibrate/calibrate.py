@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tactomo.cli import options
-from tactomo.cli.output import table
+from tactomo.cli.output import say, table
 from tactomo.cli.plot.plot import picture_option
 
 if TYPE_CHECKING:
@@ -192,7 +192,7 @@ def reload(
     from tactomo.cli.calibrate.reload import reload_kept
 
     check_sensor_name(sensor)
-    typer.echo(reload_kept(sensor, control, keys))
+    say(reload_kept(sensor, control, keys))
 
 
 def _path(sensor: str, given: Path | None) -> Path:
@@ -216,12 +216,12 @@ def _draw(made: PressureCalibration, picture: Path | None) -> None:
         from tactomo.cli.calibrate.picture import draw_calibration
 
         draw_calibration(made, picture)
-        typer.echo(f"wrote {picture}")
+        say(f"wrote {picture}")
 
 
 def print_calibration(made: PressureCalibration) -> None:
     """Print a calibration: what it rests on, and the curve with its uncertainty."""
-    from rich.console import Console
+    from tactomo.cli.console import Console
 
     console = Console()
     console.print(f"{made.subject.sensor}: {made.words}", soft_wrap=True, highlight=False)

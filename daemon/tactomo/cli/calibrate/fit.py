@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import typer
 from tactomo_client.recording import open_recording
 from tactomo_models import CalibrationError, load_description
 from tactomo_models.calibration import load_cell
@@ -19,6 +18,7 @@ from tactomo_models.calibration.outliers import find_outliers
 from tactomo.cli.calibrate.live import distrusted
 from tactomo.cli.files.recorded_frames import recorded_frames
 from tactomo.cli.options import DEFAULT_DESCRIPTION
+from tactomo.cli.output import say
 from tactomo.recordings.recording import open_recording as open_bytes
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def fitted(
         subject = subject.model_copy(update={"device_ids": device_ids})
     odd = _odd_lines(joined)
     for note in (*joined.notes, *(f"{line} disagrees with the others" for line in odd)):
-        typer.echo(note, err=True)
+        say(note, err=True)
     return PressureCalibration.of_readings(subject, joined.readings), odd
 
 
@@ -83,8 +83,8 @@ def _with_recording(
     with recorded_frames(path, description) as frames:
         if frames.description is None:
             raise CalibrationError(
-                f"the sensor description that {path} was recorded with is not on this computer; "
-                "give it by --description"
+                f"the sensor description that {path} was recorded with is not in it; give it by "
+                "--description"
             )
         subject = subject_of(sensor, frames.description, _devices_in(path))
         moments = frames.with_progress(frames.moments("contacts"), "reading contacts")

@@ -20,10 +20,11 @@ from tactomo.cli.steer.watch import View
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from tactomo_client import Frame, Status
     from tactomo_models.calibration.calibration_file import PressureCalibration, Subject
     from tactomo_models.calibration.curve import Fit, Reading
+
+    from tactomo.cli.console import Console
 
 STATUS_WAIT_S: Final = 3.0
 STILL_S: Final = 1.0  # for how long a press is to be held still, and is averaged
@@ -63,8 +64,9 @@ def guided(
         TactomoError: no daemon answers, or the sensor has no magnitude channel.
         CalibrationError: what was taken makes no curve yet.
     """
-    from rich.console import Console
     from tactomo_models.calibration.calibration_file import SUFFIX, PressureCalibration
+
+    from tactomo.cli.console import Console
 
     console = Console(highlight=False, soft_wrap=True)
     log = path.with_name(path.name.removesuffix(SUFFIX) + ".readings.csv")
@@ -161,11 +163,11 @@ class _Session:
 
     def _welcome(self) -> None:
         say = self._console.print
-        say(f"Calibrating [bold]{self._view.sensor}[/] against a load cell.")
+        say(f"Calibrating {self._view.sensor} against a load cell.")
         say(
             "Press with one flat indenter, well inside the skin, and go from load to load without "
             "lifting it.\nAt each: hold still, press Enter, and type what the load cell says in "
-            "newtons. [bold]undo[/] drops\nthe last reading, [bold]done[/] or Ctrl-C ends. What "
+            "newtons. undo drops\nthe last reading, done or Ctrl-C ends. What "
             "was taken is kept at once."
         )
         if self._area_mm2 is None:
@@ -293,14 +295,14 @@ class _Session:
         fit = _fit_so_far(self.readings)
         wanted = still_wanted(self.readings)
         if len(self.readings) - 1 in find_outliers(self.readings):
-            self._console.print("[red]The others contradict that reading[/]: undo drops it.")
+            self._console.print("The others contradict that reading: undo drops it.", style="red")
         if fit is not None:
             sigma_kpa = statistics.median(fit.curve.sigma_kpa.tolist())
             self._console.print(f"curve: ± {sigma_kpa:.1f} kPa (median of the range)")
         self._console.print(
             f"Still wanted: {'; '.join(wanted)}."
             if wanted
-            else "[green]That is enough[/]: type done, or go on for a better one."
+            else "That is enough: type done, or go on for a better one."
         )
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tactomo.cli.plot.plot import save_figure
+from tactomo.plain import plain
 
 if TYPE_CHECKING:
     from tactomo_models.calibration.calibration_file import PressureCalibration
@@ -53,7 +54,8 @@ def draw_calibration(made: PressureCalibration, output: Path) -> None:
             )
     axes.set(xlim=(0, right), xlabel="pressure (kPa)", ylabel="|Δσ|/σ₀")
     axes.set_ylim(bottom=0)
-    axes.set_title(f"{made.subject.sensor}: {made.words}", fontsize=10)
+    title = plain(f"{made.subject.sensor}: {made.words}")
+    axes.set_title(title, fontsize=10, parse_math=False)
     axes.legend(fontsize=8, loc="upper left")
     axes.grid(alpha=0.3)
     save_figure(figure, output)

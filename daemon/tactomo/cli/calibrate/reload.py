@@ -9,9 +9,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-import typer
 from tactomo_client.schema import Calibration, Taught
 
+from tactomo.cli.output import say
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
@@ -57,8 +57,8 @@ def keep(
         save_calibration(made, path)
     else:
         save_taught(made, path)
-    typer.echo(f"kept in {path}")
-    typer.echo(taken_up(made, path, control, keys))
+    say(f"kept in {path}")
+    say(taken_up(made, path, control, keys))
 
 
 def taken_up(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tactomo.cli import options
-from tactomo.cli.output import progress_bar
+from tactomo.cli.output import progress_bar, say
 
 if TYPE_CHECKING:
     from tactomo_models import SensorDescription
@@ -161,7 +161,7 @@ def _teach(
         known = read_presses(presses, description)
         taught, notes = teach(known, description, subject, keep_odd=keep_odd, progress=show)
     for note in notes:
-        typer.echo(note, err=True)
+        say(note, err=True)
     _print(taught)
     if path is not None:
         keep(taught, path, control, keys)
@@ -169,7 +169,7 @@ def _teach(
 
 def _print(taught: TaughtSkin) -> None:
     subject = taught.subject
-    typer.echo(f"{subject.sensor}: {taught.words}")
+    say(f"{subject.sensor}: {taught.words}")
     how = "from the voltages alone" if taught.guess_mm is None else "as a correction of the physics"
     devices = ", ".join(subject.device_ids) or "any device"
-    typer.echo(f"learnt {how}; of {devices}, as {subject.description}")
+    say(f"learnt {how}; of {devices}, as {subject.description}")

@@ -21,7 +21,7 @@ from tactomo.cli.doctor.evidence import Evidence, of_daemon
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
-    from rich.console import Console
+    from tactomo.cli.console import Console
 
 REST_S: Final = 2.0
 HOLD_S: Final = 1.0  # for how long a press is to be held still
@@ -43,7 +43,7 @@ def guided(
 
     Raises TactomoError where no daemon answers, or the file is of other presses.
     """
-    from rich.console import Console
+    from tactomo.cli.console import Console
 
     return _Session(
         sensor, stream, keys, description, file, Console(highlight=False, soft_wrap=True)
@@ -72,7 +72,7 @@ class _Session:
     def run(self) -> tuple[SensorDescription, Subject]:
         """Take presses until the user has enough; Ctrl-C ends it, too."""
         say = self._console.print
-        say(f"Teaching [bold]{self._sensor}[/] where it is pressed.")
+        say(f"Teaching {self._sensor} where it is pressed.")
         rest, description = self._rest()
         if self._count:
             say(f"Going on with {self._count} presses in {self._file}.")
@@ -80,9 +80,9 @@ class _Session:
             self._arrays = {f"{name}_reference": volts for name, volts in rest.items()}
         say(
             "Press one known place at a time and hold still: Enter takes it. Or type another "
-            "place, such as [bold]12.5 -30[/]\n(mm from the middle, x to the right, y up), and "
-            "behind it the force, if known: [bold]12.5 -30 8.2[/] (N).\n"
-            "[bold]undo[/] drops the last one, [bold]done[/] or Ctrl-C ends."
+            "place, such as 12.5 -30\n(mm from the middle, x to the right, y up), and "
+            "behind it the force, if known: 12.5 -30 8.2 (N).\n"
+            "undo drops the last one, done or Ctrl-C ends."
         )
         try:
             while self._take_one(description):

@@ -92,10 +92,10 @@ def doctor(
     L (L - 3) voltages, adjacent pairs; or, of L x L, every drive by every measuring pair, the
     pattern known by where the zeros are. How it was read is part of the report.
     """
-    from rich.console import Console
     from tactomo_client.keys import as_keys
     from tactomo_models.health.findings import worst
 
+    from tactomo.cli.console import Console
     from tactomo.cli.doctor.evidence import of_daemon
     from tactomo.cli.doctor.stream_findings import stream_findings
     from tactomo.cli.options import frame_slice
@@ -203,18 +203,17 @@ def _print(
     line: list[Finding],
     verdict: Level,
 ) -> None:
-    from rich.markup import escape
-
-    console.print(f"[bold]{escape(evidence.title)}[/]")
+    console.print(evidence.title, style="bold")
     for note in evidence.notes:
-        console.print(f"[dim]{escape(note)}[/]")
+        console.print(note, style="dim")
     for name, diagnosis in channels.items():
         console.print(_table(name, list(diagnosis.findings)))
     if line:
         console.print(_table("stream", line))
     word = VERDICTS[verdict]
     console.print(
-        f"[bold {COLOURS[verdict]}]{word}[/]" + ("" if verdict == "ok" else _why(verdict))
+        f"[bold {COLOURS[verdict]}]{word}[/]" + ("" if verdict == "ok" else _why(verdict)),
+        markup=True,
     )
 
 
@@ -228,8 +227,8 @@ def _why(verdict: Level) -> str:
 
 
 def _table(title: str, findings: list[Finding]) -> Table:
-    from rich.markup import escape
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(title=title, title_justify="left", title_style="bold")
     for column in ("", "found", "what to do"):
@@ -238,8 +237,8 @@ def _table(title: str, findings: list[Finding]) -> Table:
         colour = COLOURS[finding.level]
         about = finding.about.replace("_", " ")
         table.add_row(
-            f"[{colour}]{MARKS[finding.level]}{about}[/]",
-            f"[{colour}]{escape(finding.detail)}[/]",
+            Text(f"{MARKS[finding.level]}{about}", colour),
+            Text(finding.detail, colour),
             finding.next_step,
         )
     return table

@@ -273,7 +273,7 @@ def of_recording(recording: Recording, description: str | None, frames: slice | 
 
     Raises DoctorError where there are no scans in it.
     """
-    known = load_description(description or recording.origin.description)
+    known = load_description(description) if description else recording.origin.read_description()
     ports = [_PortScans(recording, n) for n in range(len(recording.origin.ports))]
     scans: dict[str, FloatArray] = {}
     times_s: dict[str, FloatArray | None] = {}

@@ -19,6 +19,7 @@ from tactomo.cli.files.recorded_frames import (
     recorded_frames,
 )
 from tactomo.cli.options import Force, Pose, RecordedDescription, examples, typer_app
+from tactomo.cli.output import say
 from tactomo.cli.plot.plot import prepare_file
 from tactomo.cli.run.foxglove import placement_of, write_layout
 from tactomo.errors import TactomoError, needs
@@ -142,9 +143,9 @@ def export(
         if layout is not None:
             write_layout(layout, frames.sensor)
     for line in (*gaps.lines(), *told):
-        typer.echo(line, err=True)
+        say(line, err=True)
     of = "steps" if kind == DATASET else "frames"
-    typer.echo(f"wrote {output}: {KINDS.get(kind, kind)}, {count} {of}")
+    say(f"wrote {output}: {KINDS.get(kind, kind)}, {count} {of}")
 
 
 def _kind(output: Path) -> str:

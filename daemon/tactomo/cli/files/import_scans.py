@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from tactomo.cli import options
+from tactomo.cli.output import say
 
 app = options.typer_app()
 
@@ -48,6 +49,7 @@ def import_scans(
     """
     from rich.progress import track
     from tactomo_models import load_description
+    from tactomo_models.sensor.description_file import carried_text
     from tactomo_protocol import Channel
 
     from tactomo.recordings.imported_scans import read_scans
@@ -67,11 +69,12 @@ def import_scans(
         sensor=sensor,
         description=_portable(description),
         description_sha256=measured.sha256,
+        description_text=carried_text(measured, description),
         reference=read.reference_of(reference),
     )
     for note in read.notes:
-        typer.echo(note)
-    typer.echo(
+        say(note)
+    say(
         f"{recording}: {read.count} scans in {times_s[-1]:.1f} s "
         f"({mean_rate_hz:.1f}/s), {length / 1e6:.2f} MB"
     )

@@ -31,26 +31,29 @@ def info(
     what: Annotated[
         str,
         typer.Argument(
-            help="A recording (.mcap), a folder of them, a built artifact (.npz), or a sensor "
+            help="A recording (.mcap), a folder of them, a file that `tactomo reconstruct` reads "
+            "(.npz, .mat, .csv, .eit), a built artifact (.npz), a calibration (.json), or a sensor "
             "description: a shipped name or a TOML file."
         ),
     ],
     as_json: JsonOutput = False,
 ) -> None:
-    """Describe a recording, a folder of recordings, a built artifact or a sensor description."""
-    if Path(what).is_dir():
+    """Describe a recording, a folder of recordings, a file of scans or a sensor description."""
+    if Path(what).is_dir() and not any(Path(what).glob("*.eit")):
         _show_folder(Path(what), as_json)
         return
     facts = _facts(what)
     if as_json:
         print_json(facts)
         return
-    from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
+
+    from tactomo.cli.console import Console
 
     table = Table(title=what, show_header=False)
     for name, value in facts.items():
-        table.add_row(f"[bold]{name}[/]", _words(value))
+        table.add_row(Text(name, "bold"), _words(value))
     Console().print(table)
 
 
@@ -63,8 +66,9 @@ def _show_folder(folder: Path, as_json: bool) -> None:
     if as_json:
         print_json(rows)
         return
-    from rich.console import Console
     from rich.table import Table
+
+    from tactomo.cli.console import Console
 
     table = Table(title=str(folder))
     for name in ("recording", "sensor", "began", "seconds", "MB", "ends"):
@@ -105,9 +109,13 @@ def _facts(what: str) -> dict[str, Any]:
         from tactomo.recordings.recording import open_recording
 
         return _recording_facts(open_recording(what))
-    if suffix == ".npz":
-        return _array_facts(Path(what))
     from tactomo_models import load_description
+    from tactomo_models.array_files import READERS
+
+    if suffix in (".npz", ".eit", *READERS) or Path(what).is_dir():
+        return _array_facts(Path(what))
+    if suffix == ".json":
+        return _calibration_facts(Path(what))
 
     return _description_facts(load_description(what))
 
@@ -151,6 +159,26 @@ def _array_facts(path: Path) -> dict[str, Any]:
         name: f"{array.dtype} {array.shape}" for name, array in arrays.items() if array.ndim > 0
     }
     return {"kind": kind, "bytes": path.stat().st_size, **facts, "arrays": shapes}
+
+
+def _calibration_facts(path: Path) -> dict[str, Any]:
+    from tactomo_models import CalibrationError
+    from tactomo_models.calibration.calibration_file import read_calibration
+
+    try:
+        made = read_calibration(path)
+    except FileNotFoundError as error:
+        raise CalibrationError(
+            f"there is no file {path}; give the path of a calibration"
+        ) from error
+    subject = made.subject
+    return {
+        "kind": "pressure calibration",
+        "sensor": subject.sensor,
+        "description": subject.description,
+        "devices": list(subject.device_ids),
+        "rests on": made.words,
+    }
 
 
 def _description_facts(description: SensorDescription) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from tactomo.cli.options import (
     frame_slice,
     typer_app,
 )
-from tactomo.cli.output import progress_bar
+from tactomo.cli.output import progress_bar, say
 from tactomo.cli.plot.plot import prepare_file
 
 app = typer_app()
@@ -141,7 +141,7 @@ def reconstruct(
     elif reference.lacks_noise:
         reference = reference.with_noise_of(sensor, *map(given.get, Channel))
     for note in read.notes:
-        typer.echo(note, err=True)
+        say(note, err=True)
     with progress_bar("reconstructing") as show:
         frames = reconstruct_file(
             scans,
@@ -155,8 +155,8 @@ def reconstruct(
         )
     failures = [frame.failure for frame in frames if frame.failure]
     if failures:
-        typer.echo(f"{failures[0]}; {len(failures)} frame(s) are tikhonov's instead", err=True)
-    typer.echo(f"wrote {maps}: {len(frames)} frames")
+        say(f"{failures[0]}; {len(failures)} frame(s) are tikhonov's instead", err=True)
+    say(f"wrote {maps}: {len(frames)} frames")
 
 
 def _is_of_reconstruct(path: Path) -> bool:

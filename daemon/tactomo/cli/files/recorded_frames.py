@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 import typer
 
 from tactomo.cli.children import interrupt_on_sigterm
-from tactomo.cli.output import progress_bar
-from tactomo.errors import TactomoError
+from tactomo.cli.output import progress_bar, say
+from tactomo.errors import RecordingError, TactomoError
 
 if TYPE_CHECKING:
     from tactomo_client import Frame
@@ -49,7 +49,7 @@ class RecordedFrames:
 
     path: Path  # the recording that was given
     sensor: str  # the sensor's name
-    # what the sensor is made of; None where that is not known on this computer
+    # what the sensor is made of; None where the recording does not say it
     description: SensorDescription | None
     start_ns: int  # when the recording begins, nanoseconds since 1970
     start_s: float  # the first frames that are wanted, seconds from there
@@ -145,16 +145,16 @@ def recorded_frames(
         TactomoError: the recording cannot be read or reconstructed, or the times are no times.
     """
     from tactomo_client.recording import open_recording
-    from tactomo_models import ModelError, load_description
+    from tactomo_models import load_description
 
     if end_s is not None and end_s <= start_s:
         raise typer.BadParameter(f"--to {end_s:g} is not after --from {start_s:g}")
     given = open_recording(path)
     known = None
     try:
-        known = load_description(description or given.description)
-    except ModelError:
-        if description or not given.has_frames:
+        known = load_description(description) if description else _carried(given)
+    except RecordingError:
+        if not given.has_frames:
             raise
     with _reported_warnings(), contextlib.ExitStack() as undo:
         remade: list[Recording] = []
@@ -162,7 +162,8 @@ def recorded_frames(
             folder = undo.enter_context(
                 tempfile.TemporaryDirectory(prefix=".tactomo-", dir=scratch)
             )
-            remade = _reconstructed(given, description or given.description, Path(folder))
+            assert known is not None
+            remade = _reconstructed(given, known, Path(folder))
         yield RecordedFrames(
             path,
             given.sensor,
@@ -179,30 +180,37 @@ def recorded_frames(
 def _reported_warnings() -> Iterator[None]:
     """Report on standard error what a recording lacks, each thing once."""
     with warnings.catch_warnings():
-        warnings.showwarning = lambda message, *_, **__: typer.echo(str(message), err=True)
+        warnings.showwarning = lambda message, *_, **__: say(str(message), err=True)
         yield
 
 
-def _reconstructed(given: Recording, description: str, folder: Path) -> list[Recording]:
+def _carried(given: Recording) -> SensorDescription:
+    from tactomo.recordings.recording import open_recording
+
+    return open_recording(given.files[0]).origin.read_description()
+
+
+def _reconstructed(given: Recording, known: SensorDescription, folder: Path) -> list[Recording]:
     """Replay each file of a recording through a daemon of our own, into one that has frames."""
     from tactomo_client.recording import open_recording
 
     interrupt_on_sigterm()
     made: list[Recording] = []
     for file in given.files:
-        _reconstruct_file(file, given.sensor, description, folder / file.name)
+        _reconstruct_file(file, given.sensor, known, folder / file.name)
         made.append(open_recording(folder / file.name))
     if not any(recording.has_frames for recording in made):
         raise TactomoError(
-            f"{given.path} cannot be reconstructed: no dual scan of {description} is in it",
+            f"{given.path} cannot be reconstructed: no dual scan of {known.name} is in it",
             "look at it with `tactomo info`; it may need another --description",
         )
     return made
 
 
-def _reconstruct_file(path: Path, sensor: str, description: str, target: Path) -> None:
-    from rich.console import Console
+def _reconstruct_file(path: Path, sensor: str, known: SensorDescription, target: Path) -> None:
+    from rich.text import Text
 
+    from tactomo.cli.console import Console
     from tactomo.config import load_config
     from tactomo.log import configure_logging
     from tactomo.recordings.recording import open_recording
@@ -213,7 +221,7 @@ def _reconstruct_file(path: Path, sensor: str, description: str, target: Path) -
     with tempfile.TemporaryDirectory(prefix="tactomo-") as sockets:  # their paths must be short
         config = load_config(
             name=sensor or None,
-            description=description,
+            description=known.name,
             ports=recording.replay_urls(speed=0),
             stream=f"ipc://{sockets}/stream",
             control=f"ipc://{sockets}/control",
@@ -221,8 +229,8 @@ def _reconstruct_file(path: Path, sensor: str, description: str, target: Path) -
             exit_at_end=True,
             recording={"file": target, "maps": True},
         )
-        with Console(stderr=True).status(f"reconstructing {path.name}"):
-            daemon = Daemon(config)
+        with Console(stderr=True).status(Text(f"reconstructing {path.name}")):
+            daemon = Daemon(config, description=known)
             daemon.start()
             try:  # not by `run`, for which Ctrl-C is a good end
                 status = daemon.wait()

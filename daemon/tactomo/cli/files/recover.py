@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tactomo.cli.options import RecordingFile, examples, typer_app
+from tactomo.cli.output import say
 
 if TYPE_CHECKING:
     from tactomo.recordings.recording import Summary
@@ -32,9 +33,9 @@ def recover(
     lost. The damaged file stays as it is. A replay of the new file gives the maps of the live run;
     after a gap it starts cold, and it shows no maps where their reference is lost.
     """
-    from rich.console import Console
     from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColumn
 
+    from tactomo.cli.console import Console
     from tactomo.recordings.recording import open_recording
     from tactomo.recordings.recovery import recover as rewrite
 
@@ -47,9 +48,9 @@ def recover(
             progress.update(task, completed=done, total=total)
 
         recovery = rewrite(recording, target, show)
-    typer.echo(f"{target}: {_kept(open_recording(target).summary)}")
+    say(f"{target}: {_kept(open_recording(target).summary)}")
     for line in _lost(recovery):
-        typer.echo(line)
+        say(line)
 
 
 def _kept(summary: Summary) -> str:

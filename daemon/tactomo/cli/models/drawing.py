@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tactomo.cli.options import examples, typer_app
+from tactomo.cli.output import say
 from tactomo.cli.plot.plot import prepare_picture, save_figure
+from tactomo.plain import plain
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -52,10 +54,11 @@ def draw(
     seen and how well it is located, by where it is. Builds the sensor's models where they are
     missing. Needs matplotlib: `pip install 'tactomo[plot]'`.
     """
-    from rich.console import Console
     from tactomo_models import load_description
     from tactomo_models.physics.artifact import load_or_build_artifact
     from tactomo_models.physics.sensitivity import find_visibility
+
+    from tactomo.cli.console import Console
 
     description = load_description(sensor)
     picture = output or Path(f"{description.name}.png")
@@ -63,7 +66,7 @@ def draw(
     with Console(stderr=True).status(description.name):
         seen = find_visibility(description, load_or_build_artifact(description))
     _draw(description, seen, picture)
-    typer.echo(f"wrote {picture}: {description.name}, {_scale_in_words(_scale(description))}")
+    say(f"wrote {picture}: {description.name}, {_scale_in_words(_scale(description))}")
 
 
 def _scale(description: SensorDescription) -> float:
@@ -92,7 +95,8 @@ def _draw(description: SensorDescription, seen: Visibility, output: Path) -> Non
     low = (height - HEAD_MM - panel[1]) / 2
     sheet = place(MARGIN_MM, low + MARGIN_MM, *size_mm)
     _draw_sheet(sheet, description, 1 / scale)
-    figure.text(8 / width, 1 - 5 / height, _title(description, scale), va="top", fontsize=9)
+    title = plain(_title(description, scale))
+    figure.text(8 / width, 1 - 5 / height, title, va="top", fontsize=9, parse_math=False)
     half = (height - HEAD_MM) / 2
     press = f"press of {1e3 * seen.diameter_m:.3g} mm that changes σ by 10 %"
     maps = (

@@ -10,6 +10,7 @@ import typer
 from tactomo.cli.commands import Group
 from tactomo.cli.models.drawing import app as drawing_app
 from tactomo.cli.options import DEFAULT_DESCRIPTION, Description, examples, typer_app
+from tactomo.cli.output import say
 
 app = typer_app(
     help="Build and list the models of sensors.", name="models", cls=Group, no_args_is_help=True
@@ -34,9 +35,9 @@ def build(
     """Build the models of a sensor description: forward model, Jacobian, Tikhonov matrix.
 
     The daemon does this by itself when they are missing; building ahead spares its first start.
-    They are bound to the description by a hash: after a change of geometry, build again.
+    They are bound to the description by a hash: after a change of geometry, build again. A file
+    that is there is not written over, unless it holds these models already.
     """
-    from rich.console import Console
     from tactomo_models import ArtifactError, load_description
     from tactomo_models.physics.artifact import (
         build_artifact,
@@ -45,18 +46,22 @@ def build(
         save_artifact,
     )
 
+    from tactomo.cli.console import Console
+    from tactomo.cli.plot.plot import prepare_file
+
     sensor = load_description(description)
     path = output or default_path(sensor)
     try:
         load_artifact(path, sensor)
-        typer.echo(f"{path} is up to date")
+        say(f"{path} is up to date")
         return
     except ArtifactError:  # missing, damaged, or of another sensor or version: build it
-        pass
+        if output is not None:
+            prepare_file(output, force=False)
     with Console(stderr=True).status(sensor.name) as line:
         artifact = build_artifact(sensor, lambda step: line.update(f"{sensor.name}: {step}"))
         save_artifact(artifact, path)
-    typer.echo(f"wrote {path}")
+    say(f"wrote {path}")
 
 
 @app.command(epilog=examples("tactomo models copy sciospec_disc tank.toml"))
@@ -77,7 +82,7 @@ def copy(
         raise TactomoError(
             f"cannot write {path}: {error.strerror}", "give the path of a file that is not there"
         ) from error
-    typer.echo(f"wrote {path}; give it to --description")
+    say(f"wrote {path}; give it to --description")
 
 
 @app.command(name="list")
@@ -87,4 +92,4 @@ def list_sensors() -> None:
     from tactomo_models.sensor.description_file import shipped_descriptions
 
     for name in shipped_descriptions():
-        typer.echo(f"{name}  {load_description(name).title}")
+        say(f"{name}  {load_description(name).title}")

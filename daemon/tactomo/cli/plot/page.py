@@ -15,6 +15,7 @@ from tactomo_client.appearance import COLOURS, map_pixels, shown_image
 from tactomo.cli.files.recorded_frames import Moment
 from tactomo.cli.plot.course import Course, Track
 from tactomo.imaging.frames import description_fields
+from tactomo.plain import plain
 
 if TYPE_CHECKING:
     from tactomo_models import SensorDescription
@@ -42,7 +43,8 @@ def draw_page(
     strip_in = STRIP_IN if maps else 0.0
     body_in = max(sum(HEIGHTS_IN[row] for row in rows), 6.4 if has_path else 0.0)
     figure = Figure(figsize=(WIDTH_IN, strip_in + body_in + 0.7), layout="constrained")
-    figure.suptitle(f"{title}\n", fontsize=14, x=0.01, ha="left", fontweight="bold")
+    named = f"{plain(title)}\n"
+    figure.suptitle(named, fontsize=14, x=0.01, ha="left", fontweight="bold", parse_math=False)
     figure.text(0.01, 1 - 0.42 / figure.get_figheight(), _subtitle(course), color="0.4")
     parts = [part for part, height in (("strip", strip_in), ("body", body_in)) if height]
     heights = [height for height in (strip_in, body_in) if height]
@@ -319,7 +321,7 @@ def _draw_flags(axes: Any, course: Course, _: dict[str, Any]) -> None:
         axes.broken_barh(
             _bars(course.times_s, present), (height - 0.35, 0.7), color=colour, linewidth=0
         )
-    axes.set_yticks(range(len(rows)), [name for name, _, _ in rows])
+    axes.set_yticks(range(len(rows)), [plain(name) for name, _, _ in rows], parse_math=False)
     axes.tick_params(axis="y", labelsize=7)
     axes.set_ylim(len(rows) - 0.5, -0.5)
 

@@ -11,6 +11,7 @@ import typer
 
 from tactomo.cli.files.recorded_frames import FromOption, ToOption, recorded_frames
 from tactomo.cli.options import Force, RecordedDescription, examples, typer_app
+from tactomo.cli.output import say
 from tactomo.errors import TactomoError, needs
 
 if TYPE_CHECKING:
@@ -72,7 +73,7 @@ def plot(
         maps = read_maps(frames, course) if "maps" in panels else []
         figure = draw_page(course, maps, frames.description, panels, recording.name)
     save_figure(figure, output, PAGE_DPI)
-    typer.echo(
+    say(
         f"wrote {output}: {len(course.tracks)} contact(s) in {len(course.times_s)} frames, "
         f"{course.times_s[-1] - course.times_s[0]:.1f} s"
     )

@@ -9,8 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tactomo.cli import options
+from tactomo.cli.output import say
 
 if TYPE_CHECKING:
+    from tactomo_models import SensorDescription
+
     from tactomo.config import DaemonConfig, Skins
     from tactomo.recordings.playback import Playback
     from tactomo.recordings.recording import Recording
@@ -175,11 +178,14 @@ def replay(
         name = sensor or origin.sensor or options.DEFAULT_NAME
         show_replay(recording, speed, name, stream, control, viewer_port, more)
         return
+    from tactomo_models import load_description
+
     from tactomo.config import load_config
 
+    carried = load_description(description) if description else origin.read_description()
     settings = load_config(
         name=sensor or origin.sensor or None,
-        description=description or origin.description or None,
+        description=description or carried.name,
         calibration=calibration,
         ports=opened.replay_urls(factor),
         method=method,
@@ -198,14 +204,14 @@ def replay(
         if start:
             playback.move(start)
 
-    raise typer.Exit(_run_daemon(settings, begin))
+    raise typer.Exit(_run_daemon(settings, begin, None if description else carried))
 
 
 def warn_of_damage(recording: Recording) -> None:
     """Tell on standard error that a recording is not all there."""
     summary = recording.summary
     if summary.ending:
-        typer.echo(
+        say(
             f"{recording.path} is {summary.ending}. There are {summary.duration_s:.1f} s up to "
             "where it ends",
             err=True,
@@ -213,13 +219,15 @@ def warn_of_damage(recording: Recording) -> None:
 
 
 def _run_daemon(
-    settings: DaemonConfig, begin_replay: Callable[[Playback], None] = lambda _: None
+    settings: DaemonConfig,
+    begin_replay: Callable[[Playback], None] = lambda _: None,
+    description: SensorDescription | None = None,
 ) -> int:
     """Serve until the daemon is stopped, and return its exit status."""
     _prepare(settings)
     from tactomo.service.daemon import Daemon
 
-    daemon = Daemon(settings)
+    daemon = Daemon(settings, description=description)
     if daemon.playback is not None:
         begin_replay(daemon.playback)
     return daemon.run()

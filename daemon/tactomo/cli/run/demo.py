@@ -169,8 +169,10 @@ def _stay(family: Family, addresses: Mapping[str, Any], announce: bool) -> None:
 
 
 def _print_box(addresses: Mapping[str, Any]) -> None:
-    from rich.console import Console
     from rich.panel import Panel
+    from rich.text import Text
+
+    from tactomo.cli.console import Console
 
     name = addresses["sensor"]
     at_control = _flag("--control", addresses["control"], options.DEFAULT_CONTROL)
@@ -178,7 +180,7 @@ def _print_box(addresses: Mapping[str, Any]) -> None:
     named = _flag("--sensor", name, options.DEFAULT_NAME)
     at = addresses["stream"]
     called = f'"{name}"' if at == options.DEFAULT_STREAM else f'"{name}", address="{at}"'
-    lines = [f"open      [bold link={addresses['viewer']}]{addresses['viewer']}[/]"]
+    lines = [f"open      {addresses['viewer']}"]
     if "twin" in addresses:
         at_twin = _flag("--twin-control", addresses["twin"], options.DEFAULT_TWIN_CONTROL)
         lines += [
@@ -194,7 +196,9 @@ def _print_box(addresses: Mapping[str, Any]) -> None:
         "",
         "Ctrl-C stops everything",
     ]
-    Console().print(Panel("\n".join(lines), title=f"tactomo: {name} is running", expand=False))
+    Console().print(
+        Panel("\n".join(lines), title=Text(f"tactomo: {name} is running"), expand=False)
+    )
 
 
 def _flag(name: str, value: str, default: str) -> str:

@@ -9,6 +9,7 @@ import typer
 
 from tactomo.cli import options
 from tactomo.cli.children import print_ready, stop_asked
+from tactomo.cli.output import say
 from tactomo.errors import TactomoError, needs
 
 if TYPE_CHECKING:
@@ -91,10 +92,10 @@ def foxglove(
 
 
 def _print_addresses(bridge: Bridge, layout: Path | None, announce: bool) -> None:
-    typer.echo(f"foxglove: {bridge.url}")
-    typer.echo(f"or open   {bridge.app_url}")
+    say(f"foxglove: {bridge.url}")
+    say(f"or open   {bridge.app_url}")
     if layout is not None:
-        typer.echo(f"layout:   {layout} (import it under Layouts)")
+        say(f"layout:   {layout} (import it under Layouts)")
     if announce:
         print_ready({"url": bridge.url})
 

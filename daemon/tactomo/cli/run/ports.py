@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tactomo.cli.options import JsonOutput, examples, typer_app
-from tactomo.cli.output import print_json
+from tactomo.cli.output import print_json, say
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -68,12 +68,12 @@ def ports(
     if as_json:
         print_json({"ports": [as_fields(row, answers) for row in found]})
         return
-    from rich.console import Console
+    from tactomo.cli.console import Console
 
     if found:
         Console().print(table(found, answers))
     if not paths and not any(row.adapter and row.adapter.is_usb for row in found):
-        typer.echo(NONE_THERE)
+        say(NONE_THERE)
 
 
 @dataclass(frozen=True)

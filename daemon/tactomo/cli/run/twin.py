@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from tactomo.cli import options
+from tactomo.cli.output import say
 
 app = options.typer_app()
 
@@ -90,8 +91,8 @@ def twin(
     running.start()
     try:
         for path in running.ports:
-            typer.echo(f"port     {path}")
-        typer.echo(f"control  {running.control}")
+            say(f"port     {path}")
+        say(f"control  {running.control}")
         if announce:
             print_ready({"ports": running.ports, "control": running.control})
         running.wait()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tactomo.cli.options import examples, typer_app
+from tactomo.cli.output import say
 
 if TYPE_CHECKING:
     from tactomo.service.installation import Plan
@@ -67,9 +68,7 @@ def install(
     plan = plan_install(name, names, rules, root, program or _program(dry_run))
     _carry_out(plan, dry_run)
     if not dry_run:
-        typer.echo(
-            f"tactomo@{name} is installed; `systemctl status tactomo@{name}` shows how it is"
-        )
+        say(f"tactomo@{name} is installed; `systemctl status tactomo@{name}` shows how it is")
 
 
 @app.command(
@@ -97,7 +96,7 @@ def example() -> None:
     """Print a daemon's configuration with every key and its meaning."""
     from tactomo.service.installation import shipped
 
-    typer.echo(shipped("daemon.example.toml"), nl=False)
+    say(shipped("daemon.example.toml"), nl=False)
 
 
 def _check_name(name: str) -> None:
@@ -122,7 +121,7 @@ def _program(dry_run: bool) -> str:
     except ServiceError as error:
         if not dry_run:
             raise
-        typer.echo(f"Not from here: {error}. From {PROGRAM}:\n", err=True)
+        say(f"Not from here: {error}. From {PROGRAM}:\n", err=True)
         return PROGRAM
 
 
@@ -144,8 +143,8 @@ def _show(plan: Plan, with_text: bool) -> None:
     """Print what a plan does; with the text of each file, if that is wanted."""
     for file in plan.files:
         effect = file.effect(plan.root)
-        typer.echo(f"{effect:9}  {plan.root / file.path}")
+        say(f"{effect:9}  {plan.root / file.path}")
         if with_text and effect in ("write", "replace"):
-            typer.echo("".join(f"    {line}\n" for line in (file.text or "").splitlines()))
+            say("".join(f"    {line}\n" for line in (file.text or "").splitlines()))
     for command in plan.commands:
-        typer.echo(f"run        {' '.join(command)}")
+        say(f"run        {' '.join(command)}")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, TypeAlias
 import typer
 
 from tactomo.cli.options import KEYS_VARIABLE, examples, typer_app
+from tactomo.cli.output import say
 
 if TYPE_CHECKING:
     from tactomo.stream.keys import Client
@@ -66,28 +67,24 @@ def make(
     where = (_folder(folder)).absolute()
     make_pair(where, name, is_server=server, force=force)
     secret, public = secret_path(where, name), public_path(where, name)
-    typer.echo(f"{secret}   stays on this computer, mode 0600")
-    typer.echo(f"{public}   is public: copy it\n")
+    say(f"{secret}   stays on this computer, mode 0600")
+    say(f"{public}   is public: copy it\n")
     if not server:
-        typer.echo(f"1. Copy {public.name} to the server's computer, and there run:")
-        typer.echo(f"     tactomo keys allow {public.name} --for SERVER      (to read its stream)")
-        typer.echo(
-            "   with --may-command where it may tare and record, too. SERVER is the name given"
-        )
-        typer.echo("   to `tactomo keys make SERVER --server` there.")
-        typer.echo(f"2. Copy the server's SERVER.key into {where}, which is for")
-        typer.echo("   this one server: keep a folder for each. Then here, for example:")
-        typer.echo(f"     tactomo watch --stream tcp://ROBOT:5560 --keys {shlex.quote(str(where))}")
+        say(f"1. Copy {public.name} to the server's computer, and there run:")
+        say(f"     tactomo keys allow {public.name} --for SERVER      (to read its stream)")
+        say("   with --may-command where it may tare and record, too. SERVER is the name given")
+        say("   to `tactomo keys make SERVER --server` there.")
+        say(f"2. Copy the server's SERVER.key into {where}, which is for")
+        say("   this one server: keep a folder for each. Then here, for example:")
+        say(f"     tactomo watch --stream tcp://ROBOT:5560 --keys {shlex.quote(str(where))}")
         return
-    typer.echo("1. Put into the daemon's configuration, and start it again:")
-    typer.echo(f'     [curve]\n     secret = "{secret}"')
-    typer.echo(f'     clients = "{clients_folder(where, name)}"')
+    say("1. Put into the daemon's configuration, and start it again:")
+    say(f'     [curve]\n     secret = "{secret}"')
+    say(f'     clients = "{clients_folder(where, name)}"')
     if os.geteuid() == 0:
-        typer.echo(f"   The daemon's user must own the secret key: chown USER {secret}")
-    typer.echo(
-        f"2. Copy {public.name} into each client's folder of keys, a folder for each server."
-    )
-    typer.echo(f"3. Let each client in: {how_to_allow(clients_folder(where, name))}")
+        say(f"   The daemon's user must own the secret key: chown USER {secret}")
+    say(f"2. Copy {public.name} into each client's folder of keys, a folder for each server.")
+    say(f"3. Let each client in: {how_to_allow(clients_folder(where, name))}")
 
 
 @app.command(
@@ -113,7 +110,7 @@ def allow(
 
     where = _folder(folder)
     client = put_on_list(where, public, server, may_command=may_command, force=force)
-    typer.echo(f"{client.name} ({client.public}) {_rights(client)} of {server}, in {where}")
+    say(f"{client.name} ({client.public}) {_rights(client)} of {server}, in {where}")
 
 
 @app.command(epilog=examples("tactomo keys revoke desk --for left_forearm"))
@@ -130,7 +127,7 @@ def revoke(
 
     where = _folder(folder)
     take_off_list(where, name, server)
-    typer.echo(f"{name} is off the list of {server}, in {where}")
+    say(f"{name} is off the list of {server}, in {where}")
 
 
 @app.command("list", epilog=examples("tactomo keys list"))
@@ -143,15 +140,15 @@ def list_(folder: Folder = None) -> None:
     where = _folder(folder)
     pairs, servers = list_pairs(where), list_servers(where)
     if not pairs and not servers:
-        typer.echo(f"there are no keys in {where}; make some with `tactomo keys make NAME`")
+        say(f"there are no keys in {where}; make some with `tactomo keys make NAME`")
     for name in pairs:
         path = public_path(where, name)
         public = read_public(path).decode("ascii") if path.exists() else "public key is missing"
-        typer.echo(f"{name}   {public}")
+        say(f"{name}   {public}")
     for name in servers:
-        typer.echo(f"\nclients of {name}:")
+        say(f"\nclients of {name}:")
         for client in list_clients(where, name):
-            typer.echo(f"  {client.name}   {client.public}   {_rights(client)}")
+            say(f"  {client.name}   {client.public}   {_rights(client)}")
 
 
 def _folder(given: Path | None) -> Path:

@@ -9,8 +9,9 @@ import typer
 
 from tactomo.cli import options
 from tactomo.cli.health_issues import health_issues
-from tactomo.cli.output import print_json
+from tactomo.cli.output import print_json, say
 from tactomo.errors import TactomoError
+from tactomo.plain import plain
 
 HEARD_WITHIN_S = 3.0  # a status comes every second
 
@@ -53,11 +54,13 @@ def status(
         print_json(answer)
         return
     for issue in health_issues(answer):
-        typer.secho(issue.what, fg="red" if issue.severity == "error" else "yellow", bold=True)
-        typer.echo(f"    {issue.next_step}")
-    typer.echo(f"{answer['sensor']}: {answer['state']}")
+        typer.secho(
+            plain(issue.what), fg="red" if issue.severity == "error" else "yellow", bold=True
+        )
+        say(f"    {issue.next_step}")
+    say(f"{answer['sensor']}: {answer['state']}")
     for name, value in _rows(answer):
-        typer.echo(f"{typer.style(f'{name:<13} ', bold=True)}{value}")
+        typer.echo(f"{typer.style(f'{name:<13} ', bold=True)}{plain(value)}")
 
 
 def _heard_status(sensor: str, stream: str, keys: Path | None) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tactomo.cli import options
-from tactomo.cli.output import print_json
+from tactomo.cli.output import print_json, say
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
@@ -38,11 +38,11 @@ def tare(
     with Daemon(control, keys=keys) as daemon:
         needs_s = _tare_s(daemon.request("status"))
         if needs_s > SOON_S:
-            typer.echo(f"leave the skin alone: its scans take {needs_s:.0f} s to come", err=True)
+            say(f"leave the skin alone: its scans take {needs_s:.0f} s to come", err=True)
         taken = daemon.tare(TARE_TIMEOUT_S + 2 * needs_s)
-    typer.echo(f"new reference from {taken.scans} dual scans")
+    say(f"new reference from {taken.scans} dual scans")
     if taken.contacts:
-        typer.echo(
+        say(
             f"{taken.contacts} contact(s) were shown meanwhile and now count as nothing pressed; "
             "if something was on the skin, take it off and tare again",
             err=True,
@@ -105,7 +105,7 @@ def record(
             raise typer.BadParameter("stop takes no file, and no --maps")
         _print_recorded(daemon.record_stop())
         return
-    typer.echo(f"recording to {daemon.record_start(path, maps=maps or None).path}")
+    say(f"recording to {daemon.record_start(path, maps=maps or None).path}")
 
 
 @app.command(
@@ -137,7 +137,7 @@ def method(
         in_force = daemon.set_method(name).tier
         if budget_ms is not None:
             daemon.set_budget(budget_ms)
-    typer.echo(f"method {in_force}")
+    say(f"method {in_force}")
 
 
 @app.command(
@@ -200,7 +200,7 @@ def _record_for(daemon: Daemon, path: Path, seconds: float | None, maps: bool | 
 
 
 def _print_recorded(file: RecordedFile) -> None:
-    typer.echo(f"recorded {file.path} ({file.bytes / 1e6:.2f} MB)")
+    say(f"recorded {file.path} ({file.bytes / 1e6:.2f} MB)")
 
 
 def _named(argument: str) -> tuple[str, Any]:

@@ -12,6 +12,7 @@ import typer
 
 from tactomo.cli import options
 from tactomo.errors import TactomoError
+from tactomo.plain import plain
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -43,7 +44,7 @@ def watch(
     Without a terminal (in a pipe) it prints one line a frame instead. Ctrl-C ends it. Where nobody
     publishes the sensor for 5 s from the start, it ends with exit status 1.
     """
-    from rich.console import Console
+    from tactomo.cli.console import Console
 
     view = View(sensor, stream, keys)
     console = Console()
@@ -141,7 +142,7 @@ def _print_lines(view: View, end_s: float) -> None:
         if view.update(min(0.5, max(0.0, end_s - time.monotonic()))):
             silent_s = time.monotonic()
             assert view.frame is not None
-            print(frame_line(view.frame), flush=True)
+            print(plain(frame_line(view.frame)), flush=True)
         elif time.monotonic() - silent_s > 1.0:
             silent_s = time.monotonic()
             print(f"no frame of {view.sensor} at {view.stream}", file=sys.stderr, flush=True)
@@ -167,14 +168,14 @@ def _screen(view: View, columns: int, rows: int) -> RenderableType:
 
     frame = view.frame
     if frame is None:
-        return Panel(_state_line(view), title=f"tactomo watch {view.sensor}")
+        return Panel(_state_line(view), title=Text(f"tactomo watch {view.sensor}"))
     description = view.status.fields.get("description") or {} if view.status else {}
     image = map_text(frame, description, max(10, min(columns - 44, 2 * (rows - 6))))
     body = Table.grid(padding=(0, 2))
     body.add_row(image, Group(_contact_table(frame), Text(), _health(view, frame)))
     panel = Panel(
         body,
-        title=f"tactomo watch {view.sensor}",
+        title=Text(f"tactomo watch {view.sensor}"),
         subtitle="Ctrl-C ends",
         border_style="red" if view.is_gone or view.is_stale else "none",
     )
@@ -246,6 +247,7 @@ def _contact_table(frame: Frame) -> RenderableType:
 
 def _health(view: View, frame: Frame) -> RenderableType:
     from rich.table import Table
+    from rich.text import Text
 
     status = view.status
     latency = status and status.latency_ms
@@ -261,5 +263,5 @@ def _health(view: View, frame: Frame) -> RenderableType:
     }
     table = Table(box=None, show_header=False, pad_edge=False)
     for name, value in rows.items():
-        table.add_row(f"[dim]{name}[/]", value)
+        table.add_row(Text(name, "dim"), value)
     return table

@@ -1,0 +1,29 @@
+"""The terminal: it shows what others wrote, and does nothing of what that says."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from rich import console
+from rich.segment import Segment
+
+from tactomo.plain import plain
+
+
+class Console(console.Console):
+    """Rich's, for which text is text: no markup in it, no emoji's name, no control character.
+
+    What we style ourselves is a `Text`, or printed with `markup=True`.
+    """
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(markup=False, emoji=False, **settings)
+
+    def render(
+        self, renderable: console.RenderableType, options: console.ConsoleOptions | None = None
+    ) -> Iterable[Segment]:
+        """Render, as Rich does, without what a terminal would obey."""
+        for segment in super().render(renderable, options):
+            is_ours = segment.control is not None
+            yield segment if is_ours else Segment(plain(segment.text), segment.style)

@@ -1,0 +1,16 @@
+"""Text of others, such as names of devices, made fit for a terminal and a log."""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+# Control characters but tab and line feed, and what turns the direction of writing.
+_OBEYED: Final = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]"
+)
+
+
+def plain(text: object) -> str:
+    """Return text with nothing in it that a terminal would obey: each such character is a �."""
+    return _OBEYED.sub("\N{REPLACEMENT CHARACTER}", str(text))
