@@ -53,14 +53,22 @@ def status(
     if as_json:
         print_json(answer)
         return
+    answer = _plain(answer)
     for issue in health_issues(answer):
-        typer.secho(
-            plain(issue.what), fg="red" if issue.severity == "error" else "yellow", bold=True
-        )
+        typer.secho(issue.what, fg="red" if issue.severity == "error" else "yellow", bold=True)
         say(f"    {issue.next_step}")
     say(f"{answer['sensor']}: {answer['state']}")
     for name, value in _rows(answer):
-        typer.echo(f"{typer.style(f'{name:<13} ', bold=True)}{plain(value)}")
+        typer.echo(f"{typer.style(f'{name:<13} ', bold=True)}{value}")
+
+
+def _plain(told: Any) -> Any:
+    """Return what was told with no text in it that a terminal would obey."""
+    if isinstance(told, dict):
+        return {plain(key): _plain(value) for key, value in told.items()}
+    if isinstance(told, list | tuple):
+        return [_plain(value) for value in told]
+    return plain(told) if isinstance(told, str) else told
 
 
 def _heard_status(sensor: str, stream: str, keys: Path | None) -> dict[str, Any]:
