@@ -18,7 +18,7 @@ import foxglove
 import zmq
 from foxglove.channels import FrameTransformsChannel
 from foxglove.websocket import StatusLevel, WebSocketServer
-from tactomo_client import ClientError, Frame, Keys, MessageError
+from tactomo_client import ClientError, Frame, Keys, MessageError, schema
 from tactomo_client.connection import connect_subscriber
 from tactomo_client.frame import frame_from_message
 from tactomo_client.messages import EVENT, MAP, STATUS, Message, decode_message, topic
@@ -26,12 +26,11 @@ from tactomo_client.placement import Placement
 
 from tactomo_foxglove.door import FOXGLOVE_ORIGIN, Door, hidden_address
 from tactomo_foxglove.messages import known
-from tactomo_foxglove.topics import SensorTopics
+from tactomo_foxglove.topics import STATUS_NUMBERS, SensorTopics
 
 DEFAULT_HOST: Final = "127.0.0.1"
 DEFAULT_PORT: Final = 8765
 STALE_AFTER_S: Final = 0.5
-GONE_AFTER_S: Final = 3.0
 HEALTH_PERIOD_S: Final = 0.2
 REMIND_PERIOD_S: Final = 1.0
 BACKLOG: Final = 128
@@ -178,21 +177,20 @@ class _Sensor:
 
     @property
     def _is_gone(self) -> bool:
-        return time.monotonic() - self._status_s > GONE_AFTER_S
+        return time.monotonic() - self._status_s > schema.STALE_AFTER_S
 
     def _health(self) -> dict[str, Any]:
         status, frame = self._status, self._frame
         recording = status.get("recording") or {}
-        kept = ("uptime_s", "tier_requested", "frames", "dropped_scans", "incomplete_scans")
         return known(
             {
+                **{name: status.get(name) for name in STATUS_NUMBERS},
                 "state": "gone" if self._is_gone else status.get("state"),
                 "is_stale": self._is_gone or frame is None or frame.is_stale,
                 "age_s": None if frame is None else frame.age_s,
                 "recording": recording.get("path"),
                 "rates": known((status.get("rates") or {}).items()),
                 "latency_ms": known((status.get("latency_ms") or {}).items()),
-                **{name: status.get(name) for name in (*kept, "late_scans")},
             }.items()
         )
 

@@ -21,13 +21,13 @@ as long as it is followed (`tactomo_client.traces`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import fields
 from typing import Any, Final
 
 import foxglove
 from foxglove import channels
-from tactomo_client import Contact, Frame
+from tactomo_client import Contact, Frame, Status
 from tactomo_client.placement import Placement
+from tactomo_client.schema import Percentiles, Rates, wire_fields
 from tactomo_client.traces import Traces
 
 from tactomo_foxglove import messages
@@ -51,42 +51,45 @@ def _numbers(*names: str) -> dict[str, Any]:
     return dict.fromkeys(names, _NUMBER)
 
 
-CONTACT_SCHEMA: Final = _object(
-    **{
-        field.name: {"int": _INTEGER, "str": _TEXT, "bool": _TRUTH}.get(str(field.type), _NUMBER)
-        for field in fields(Contact)
-    },
-    trace=_INTEGER,
+_JSON: Final = {
+    **{"int": _INTEGER, "Unsigned": _INTEGER, "str": _TEXT, "bool": _TRUTH},
+    "frozenset[str]": _list(_TEXT),
+}
+FRAME_NUMBERS: Final = (
+    *("sequence", "scan_counter", "session", "tier", "tier_reason", "flags", "misfit"),
+    *("confidence", "skew_ms", "force_n"),
 )
+STATUS_NUMBERS: Final = (
+    *("state", "tier_requested", "uptime_s"),
+    *("frames", "dropped_scans", "incomplete_scans", "late_scans"),
+)
+
+
+def _fields(kind: type, *names: str) -> dict[str, Any]:
+    """Return JSON's types of a part of a message, or of some of its fields, by `schema`."""
+    known_types = kind.__dataclass_fields__  # type: ignore[attr-defined]
+    types = {name: str(known_types[name].type) for name in names or wire_fields(kind)}
+    return {name: _JSON.get(of.removesuffix(" | None"), _NUMBER) for name, of in types.items()}
+
+
 FRAME_SCHEMA: Final = {
     "title": "tactomo.Frame",
     **_object(
-        sequence=_INTEGER,
-        scan_counter=_INTEGER,
-        session=_TEXT,
-        tier=_TEXT,
-        tier_reason=_TEXT,
-        flags=_list(_TEXT),
-        flag_count=_INTEGER,
-        contact_count=_INTEGER,
-        contacts=_list(CONTACT_SCHEMA),
-        **_numbers("misfit", "confidence", "age_ms", "delay_ms", "skew_ms", "period_ms"),
-        **_numbers("force_n", "pressure_max_kpa"),
-        missed_frames=_INTEGER,
+        **_fields(Frame, *FRAME_NUMBERS),
+        **dict.fromkeys(("flag_count", "contact_count", "missed_frames"), _INTEGER),
+        **_numbers("age_ms", "delay_ms", "period_ms", "pressure_max_kpa"),
+        contacts=_list(_object(**_fields(Contact), trace=_INTEGER)),
     ),
 }
-_PERCENTILES: Final = _object(**_numbers("p50", "p99"))
 HEALTH_SCHEMA: Final = {
     "title": "tactomo.Health",
     **_object(
-        state=_TEXT,
+        **_fields(Status, *STATUS_NUMBERS),
         is_stale=_TRUTH,
-        tier_requested=_TEXT,
         recording=_TEXT,
-        rates=_object(**_numbers("frames_hz", "magnitude_hz", "structure_hz")),
-        latency_ms=_PERCENTILES,
-        **_numbers("age_s", "uptime_s"),
-        **dict.fromkeys(("frames", "dropped_scans", "incomplete_scans", "late_scans"), _INTEGER),
+        rates=_object(**_fields(Rates)),
+        latency_ms=_object(**_fields(Percentiles)),
+        age_s=_NUMBER,
     ),
 }
 
@@ -176,19 +179,12 @@ def _frame_numbers(frame: Frame, last: Frame | None, age_s: float | None) -> dic
     pressures = [c.pressure_kpa for c in frame.contacts if c.pressure_kpa is not None]
     return known(
         {
-            "sequence": frame.sequence,
-            "scan_counter": frame.scan_counter,
-            "session": frame.session,
-            "tier": frame.tier,
-            "tier_reason": frame.tier_reason,
+            **{name: getattr(frame, name) for name in FRAME_NUMBERS},
             "flags": sorted(frame.flags),
             "flag_count": len(frame.flags),
             "contact_count": len(frame.contacts),
-            "misfit": frame.misfit,
-            "confidence": frame.confidence,
             "age_ms": None if age_s is None else age_s * 1e3,
             "delay_ms": None if frame.delay_ns is None else frame.delay_ns * 1e-6,
-            "skew_ms": frame.skew_ms,
             "period_ms": None
             if last is None or not follows
             else (frame.acquired_monotonic_ns - last.acquired_monotonic_ns) * 1e-6,

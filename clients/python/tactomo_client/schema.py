@@ -19,7 +19,7 @@ from typing import Annotated, Any, Final, TypeAlias
 
 from tactomo_client.filled import Image, Received, Volts
 
-STALE_AFTER_S: Final = 3.0  #: a daemon sends its status every second
+STALE_AFTER_S: Final = 3.0  #: a daemon sends its status every second; after so long it is gone
 
 Absent: TypeAlias = None
 Unsigned: TypeAlias = Annotated[int, range(2**64)]

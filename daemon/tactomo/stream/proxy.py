@@ -21,6 +21,7 @@ import zmq
 from tactomo_client import Keys
 from tactomo_client.connection import connect_subscriber
 from tactomo_client.messages import STATUS
+from tactomo_client.schema import STALE_AFTER_S
 
 from tactomo.ending import at_end
 from tactomo.endpoint import allow_connections
@@ -32,7 +33,6 @@ QUEUED_PER_SUBSCRIBER: Final = 256  # of all sensors together; a daemon keeps 64
 PASSED_AT_ONCE: Final = 64
 POLL_MS: Final = 200
 LOOK_S: Final = 1.0
-REMEMBERED_S: Final = 3.0  # a status that is older is not news to a newcomer: its daemon is gone
 SILENT_S: Final = 5.0  # a source that has not answered so long after the start is missed
 LINGER_MS: Final = 200
 MAX_SENSORS: Final = 64
@@ -139,7 +139,7 @@ class Proxy(Relay):
             tell("subscribers_cut", "warning", *SUBSCRIBERS_CUT)
 
     def _repeat_statuses(self, prefixes: set[bytes]) -> None:
-        oldest_s = time.monotonic() - REMEMBERED_S
+        oldest_s = time.monotonic() - STALE_AFTER_S
         for topic, (message, came_s) in self._statuses.items():
             if came_s > oldest_s and any(topic.startswith(prefix) for prefix in prefixes):
                 self._outlet.send(message, zmq.DONTWAIT)
@@ -159,7 +159,7 @@ class Proxy(Relay):
         if kind == STATUS.encode():
             self._statuses[topic + b"\0"] = message, now_s
         other, seen_s = self._sensors.get(sensor, (source, 0.0))
-        if other != source and now_s - seen_s < REMEMBERED_S and sensor not in self._told:
+        if other != source and now_s - seen_s < STALE_AFTER_S and sensor not in self._told:
             self._told.add(sensor)
             tell(
                 "same_sensor_twice",

@@ -18,6 +18,7 @@ import structlog
 import zenoh
 from tactomo_client import MessageError
 from tactomo_client.messages import CONTACTS, EVENT, KINDS, MAP, STATUS, Message, decode_message
+from tactomo_client.schema import STALE_AFTER_S
 
 from tactomo.events import RateLimit
 
@@ -27,8 +28,6 @@ are left for the network; at 20 frames a second it is every sixth one."""
 STATUS_HEARTBEAT_S: Final = 5.0
 """Of a status that says what the last one said: with contacts, a skin at rest then sends a sixth of
 what it sends by the clock. That a daemon is gone, the token tells; its numbers are asked for."""
-REMEMBERED_S: Final = 3.0
-"""A daemon that has said nothing for so long is gone (STREAM.md): a status comes every second."""
 MAX_SENSORS: Final = 1024
 ENCODING: Final = "application/msgpack"
 
@@ -104,7 +103,7 @@ class Publication:
     def forget_silent(self) -> None:
         """Withdraw the skins whose daemons are gone."""
         for name, skin in list(self._skins.items()):
-            if time.monotonic() - skin.came_s > REMEMBERED_S:
+            if time.monotonic() - skin.came_s > STALE_AFTER_S:
                 self._skins.pop(name).withdraw()
 
     def _answer(self, query: zenoh.Query) -> None:

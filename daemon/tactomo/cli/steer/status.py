@@ -13,8 +13,6 @@ from tactomo.cli.output import print_json, say
 from tactomo.errors import TactomoError
 from tactomo.plain import plain
 
-HEARD_WITHIN_S = 3.0  # a status comes every second
-
 app = options.typer_app()
 
 
@@ -74,9 +72,10 @@ def _plain(told: Any) -> Any:
 def _heard_status(sensor: str, stream: str, keys: Path | None) -> dict[str, Any]:
     """Return the status of a sensor from its stream, which repeats it every second."""
     from tactomo_client import subscribe
+    from tactomo_client.schema import STALE_AFTER_S
 
     with subscribe(sensor, kind="status", address=stream, keys=keys) as statuses:
-        status = statuses.wait(HEARD_WITHIN_S)
+        status = statuses.wait(STALE_AFTER_S)
     if status is not None:
         return dict(status.fields)
     raise TactomoError(
