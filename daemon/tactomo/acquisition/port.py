@@ -35,7 +35,7 @@ from tactomo.acquisition.device_clock import MAX_RATE, ClockState, DeviceClock
 from tactomo.acquisition.liveness import DeviceState, Liveness
 from tactomo.acquisition.open_serial import other_holders
 from tactomo.acquisition.replay_port import ReplayEnded, ReplayMoved
-from tactomo.events import OnEvent, RateLimit, Severity
+from tactomo.events import OnEvent, RateLimit
 from tactomo.protocols import PortProtocol, Trouble
 from tactomo.recordings.active_recording import ActiveRecording
 from tactomo.recordings.playback import Playback
@@ -364,29 +364,31 @@ class PortReader(Worker):
         self.refusal = "" if trouble is None else trouble.cause
         if hello == before and self.refusal == refused:
             return
-        if trouble is not None:
-            self._tell_thinned(
+        if trouble is not None and self._allows("device_refused"):
+            self._on_event(
                 "device_refused",
                 "error",
                 f"{self.url}: {trouble.cause}; its scans are not used",
                 trouble.next_step,
             )
-        elif hello == before:
-            self._tell_thinned("device_speaks", "info", self.url)
-        elif before is not None and before.device_id != hello.device_id:
-            self._tell_thinned(
+        elif trouble is None and hello == before and self._allows("device_speaks"):
+            self._on_event("device_speaks", "info", self.url)
+        elif (
+            trouble is None
+            and before is not None
+            and before.device_id != hello.device_id
+            and self._allows("device_changed")
+        ):
+            self._on_event(
                 "device_changed",
                 "warning",
                 f"{self.url}: {hello.device_id} is where {before.device_id} was",
                 "tare, if another skin was plugged in; `device_ids` keeps foreign ones out",
             )
 
-    def _tell_thinned(
-        self, name: str, severity: Severity, detail: str, next_step: str = ""
-    ) -> None:
-        """Tell what a device's hellos say: a device may say another thing with each."""
-        if self._limits.setdefault(name, RateLimit()).allows():
-            self._on_event(name, severity, detail, next_step)
+    def _allows(self, name: str) -> bool:
+        """Whether this may be told now: a device may say another thing with each hello."""
+        return self._limits.setdefault(name, RateLimit()).allows()
 
     def _why_refused(self, hello: Hello) -> Trouble | None:
         """Why a device's scans are not used; where they are, its channels are this port's now."""
