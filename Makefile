@@ -28,7 +28,7 @@ LOCKED := pyproject.toml --universal --python-version 3.11 --generate-hashes \
 ON_ARM := --python-version 3.11 --python-platform aarch64-manylinux_2_28 --only-binary :all: \
   --no-emit-package tactomo-client --no-emit-package tactomo --no-annotate
 
-.PHONY: help setup run test test-all test-long test-train test-peers faults soak fleet firmware fuzz lint format schema bench docs wheels deb lock clean
+.PHONY: help setup run test test-lab test-all test-random test-long test-train test-peers faults soak fleet firmware fuzz lint format schema bench docs wheels deb lock clean
 
 help:            ## list these targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -41,11 +41,20 @@ run: $(RUN_READY)  ## twin, daemon and viewer: a skin to press in the browser
 test: $(READY)   ## the default test suite
 	$(BIN)/pytest -n auto --dist loadfile $(ARGS)
 
+test-lab: $(READY)  ## the tests of the laboratory
+	$(BIN)/pytest tests/lab -n auto --dist loadfile \
+	  -m 'not slow and not long and not train and not peers and not faults' $(ARGS)
+
 test-all: $(READY)  ## every test but the long ones, training and faults; more examples in each
 	$(BIN)/pytest -n auto --dist loadfile -m 'not long and not train and not peers and not faults' \
 	  --hypothesis-profile many $(ARGS)
 
-test-long: $(READY)  ## statistics, measured sets and days of drift: minutes each
+RANDOM_SECONDS ?= 600
+test-random: $(READY)  ## Hypothesis with a new seed, modules in any order, for RANDOM_SECONDS
+	$(BIN)/pytest -n 0 -m 'hypothesis and not long and not train and not peers and not faults' \
+	  --hypothesis-profile new --seconds $(RANDOM_SECONDS) $(ARGS)
+
+test-long: test-random fuzz  ## statistics, measured sets and days of drift: minutes each; random seeds
 	$(BIN)/pytest -m long $(ARGS)
 
 test-train: $(TRAIN_READY)  ## the tests of training; installs PyTorch

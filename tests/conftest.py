@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import random
 import shutil
 import signal
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,8 +38,11 @@ CHROMIUM_OPTIONS = (
 )
 
 
+BEGUN_S = pytest.StashKey[float]()
+
+
 # Nothing depends on the wall clock, nor on how fast the computer is, nor on chance: a change is not
-# refused for what was there before it. For that look with `--hypothesis-profile new`.
+# refused for what was there before it. For that look with `make test-random`.
 PATIENT: dict[str, Any] = {"deadline": None, "suppress_health_check": [HealthCheck.too_slow]}
 settings.register_profile("few", max_examples=20, derandomize=True, **PATIENT)
 settings.register_profile("many", max_examples=100, derandomize=True, **PATIENT)  # `make test-all`
@@ -56,6 +61,27 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--scale", type=float, default=1.0, help="of the fault suite's long measures, do this share"
     )
+    parser.addoption(
+        "--seconds", type=float, help="modules in any order, and no test begins after so many"
+    )
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """With --seconds, shuffle modules: where time is short, each has its turn sooner or later."""
+    if config.getoption("seconds") is not None:
+        paths = list(dict.fromkeys(item.path for item in items))
+        random.shuffle(paths)
+        items.sort(key=lambda item: paths.index(item.path))
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    session.config.stash[BEGUN_S] = time.monotonic()
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    seconds = item.config.getoption("seconds")
+    if seconds is not None and time.monotonic() - item.config.stash[BEGUN_S] > seconds:
+        pytest.skip("the time is up")
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -53,6 +53,7 @@ def test_what_is_valid_is_taken(name: str) -> None:
         assert TARGETS[name].parse(example)
 
 
+@pytest.mark.hypothesis
 @pytest.mark.parametrize("name", TARGETS)
 def test_no_mutation_breaks_a_parser(name: str) -> None:
     target = TARGETS[name]
