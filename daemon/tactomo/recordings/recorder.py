@@ -27,7 +27,7 @@ from tactomo.events import OnEvent
 from tactomo.recordings.active_recording import MAX_QUEUED_BYTES, ActiveRecording
 from tactomo.recordings.recording import Origin
 from tactomo.recordings.recording_writer import create
-from tactomo.recordings.rotation import is_ours, list_recordings, next_path, to_delete
+from tactomo.recordings.rotation import dated, list_recordings, next_path, to_delete
 from tactomo.worker import Worker
 
 FLUSH_S: Final = 0.2
@@ -364,7 +364,8 @@ class Recorder(Worker):
         sensor, path = self._origin.sensor, self.active.path
         try:
             kept = list_recordings(self._folder, sensor)
-            ours = [one for one in kept if one.path == path or is_ours(one.path, sensor)]
+            found = (one if one.path == path else dated(one, sensor) for one in kept)
+            ours = [one for one in found if one is not None]
             for deletion in to_delete(ours, self._rules):
                 deletion.path.unlink()
                 self.deleted += 1

@@ -25,13 +25,13 @@ _STAMP: Final = "%Y%m%dT%H%M%SZ"
 
 
 class KeptRecording(NamedTuple):
-    """A file in the folder, by its name and what the file system says."""
+    """A file in the folder."""
 
     number: int
     path: Path
     size: int
-    begin_s: float  # when it began, seconds since 1970 by the wall clock of that time
-    end_s: float  # when it was last written to, likewise
+    begin_s: float  # when it began, seconds since 1970 by the wall clock of that time, by its name
+    end_s: float  # when the last thing in it was written, likewise; see `dated`
 
 
 class Deletion(NamedTuple):
@@ -67,8 +67,8 @@ def _recordings(folder: Path, sensor: str) -> Iterator[KeptRecording]:
         except (ValueError, FileNotFoundError):  # no such date; deleted by somebody meanwhile
             continue
         if stat.S_ISREG(facts.st_mode):
-            size, end_s = facts.st_size, facts.st_mtime
-            yield KeptRecording(int(name["number"]), path, size, begin.timestamp(), end_s)
+            begin_s = begin.timestamp()
+            yield KeptRecording(int(name["number"]), path, facts.st_size, begin_s, begin_s)
 
 
 def to_delete(
@@ -105,9 +105,18 @@ def _ages_s(recordings: list[KeptRecording]) -> list[float]:
     return [sum(steps_s[2 * index + 1 :]) for index in range(len(recordings))]
 
 
-def is_ours(path: Path, sensor: str) -> bool:
-    """Whether a file's content, too, says that it is a recording of this sensor."""
+def dated(kept: KeptRecording, sensor: str) -> KeptRecording | None:
+    """Return a file with the times of what is in it; None where that is not this sensor's.
+
+    The file system's times do not count: a copy has those of the copying.
+    """
     try:
-        return open_recording(path).origin.sensor == sensor
+        recording = open_recording(kept.path)
+        if recording.origin.sensor != sensor:
+            return None
+        span = recording.span
     except RecordingError:
-        return False
+        return None
+    if not span.start_ns:
+        return kept
+    return kept._replace(begin_s=span.start_ns * 1e-9, end_s=span.end_ns * 1e-9)

@@ -13,8 +13,9 @@ import pytest
 from tactomo.config import RecordingConfig
 from tactomo.errors import RecordingError
 from tactomo.recordings import recorder
-from tactomo.recordings.recording import open_recording
+from tactomo.recordings.recording import Origin, open_recording
 from tactomo.recordings.recording_set import open_replayable
+from tactomo.recordings.recording_writer import RecordingWriter
 from tactomo.recordings.rotation import KeptRecording, list_recordings, to_delete
 from tactomo_client.messages import array_from_wire
 from tactomo_protocol import Channel, Decoder, Scan
@@ -222,9 +223,28 @@ def test_a_clock_that_goes_back_deletes_nothing() -> None:
     assert gone([*days(100, 105), *days(0, 1)]) == []
 
 
-def test_a_file_copied_without_its_times_is_at_most_a_day_long() -> None:
-    copied = [kept(n, n * DAY_S, 5000 * DAY_S) for n in range(3)]
-    assert gone([*copied, kept(3, 5000 * DAY_S, 5000 * DAY_S)]) == []
+def test_files_copied_without_their_times_are_as_old_as_what_is_in_them(
+    bench: Start, tmp_path: Path
+) -> None:
+    folder = tmp_path / "set"
+    folder.mkdir()
+    now_ns = time.time_ns()
+    for hours in range(40, 0, -1):  # an hour each
+        begin_ns = now_ns - hours * 3600 * 10**9
+        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(begin_ns // 10**9))
+        origin = Origin("left", "paper_square", "", ("a",), "0")
+        writer = RecordingWriter(folder / f"left-{41 - hours:06d}-{stamp}.mcap", origin)
+        for at_ns in (begin_ns, begin_ns + 3590 * 10**9):
+            writer.write("port/0", b"\0", at_ns, at_ns)
+        writer.close()
+    b = bench(recording={"folder": folder, "keep_days": 7, "keep_gb": 0, "at_start": True})
+    b.until(lambda: len(list(folder.iterdir())) > 40)
+    assert b.ask("status")["recorder"]["deleted"] == 0
+
+
+def test_a_file_that_says_that_it_lasted_for_years_is_at_most_a_day_long() -> None:
+    claims = [kept(n, n * DAY_S, 5000 * DAY_S) for n in range(3)]
+    assert gone([*claims, kept(3, 5000 * DAY_S, 5000 * DAY_S)]) == []
 
 
 def test_the_file_being_written_stays() -> None:
