@@ -1,10 +1,4 @@
-"""Arrays of numbers in files of other programs: MATLAB's .mat, text, and .get of EIT instruments.
-
-The layout of .get is that of Goettingen's, Viasys' and Draeger's early instruments, 16 electrodes,
-adjacent pairs, as EIDORS reads it (eidors_readdata.m, mceit and draeger-get): 256 floats a frame,
-of which 208 are voltages, each drive's from the pair behind it on; 0 where a reciprocal one was not
-measured.
-"""
+"""Arrays of numbers in files of other programs: MATLAB's .mat and text."""
 
 from __future__ import annotations
 
@@ -28,14 +22,10 @@ from tactomo_models.foreign_file import open_regular, read_regular
 Arrays = dict[str, NDArray[Any]]
 
 NUMBERS: Final = "numbers"  # the one array of a file that names none
-VIA_MATLAB: Final = "read it with EIDORS' eidors_readdata, then save('frames.mat', 'vv', '-v7')"
-_GET_FLOATS: Final = 256
-_UCT_MAGIC: Final = bytes([0x88] * 4)
 _SMALL_BYTES: Final = 64 << 20
 _PACKED: Final = 16
 _MOST_ARRAYS: Final = 4096
 _MOST_LINE: Final = 1 << 20  # characters of a frame; the largest pattern has 4096 numbers
-_LARGEST: Final = 1e9  # in any unit of voltage; of other bytes, read as floats, some are larger
 
 
 def read_matlab(path: Path) -> Arrays:
@@ -138,41 +128,10 @@ def _number(token: str) -> complex:
         return complex(token.replace("i", "j"))
 
 
-def read_get(path: Path) -> Arrays:
-    """Read a .get as `numbers` (T, 208), measuring pairs ascending.
-
-    Raises:
-        OSError: the file cannot be read.
-        DataError: it is none, or of another instrument.
-    """
-    data = read_regular(path, most_unpacked(path))
-    if data.startswith(_UCT_MAGIC):
-        raise DataError(
-            f"{path} is of the University of Cape Town's instrument, whose pattern is in another "
-            f"file; {VIA_MATLAB}"
-        )
-    if data.startswith(b"---Draeger EIT-Software---"):
-        data = re.split(rb"(?:\r?\n){3}", data, maxsplit=1)[-1]
-    frames = np.frombuffer(data[: len(data) // 4 * 4], "<f4").astype(np.float64)
-    frames = frames[: len(frames) // _GET_FLOATS * _GET_FLOATS].reshape(-1, _GET_FLOATS)[:, :208]
-    if not frames.any() or not (np.abs(frames) < _LARGEST).all():
-        raise DataError(
-            f"{path} is no .get of 256 floats a frame (Goettingen, Viasys, Draeger); {VIA_MATLAB}"
-        )
-    drive, place = np.divmod(np.arange(208), 13)
-    square, measured = np.zeros((len(frames), 16, 16)), np.zeros((16, 16), bool)
-    measure = (drive + 2 + place) % 16
-    square[:, drive, measure], measured[drive, measure] = frames, True
-    if not frames[:, 38].any():  # drive 2, pair 0: what drive 0, pair 2 has measured
-        square = np.where(np.tri(16, k=-1, dtype=bool), square.transpose(0, 2, 1), square)
-    return {NUMBERS: square[:, measured]}
-
-
 READERS: Final[dict[str, Callable[[Path], Arrays]]] = {
     ".mat": read_matlab,
     ".csv": read_text,
     ".txt": read_text,
     ".tsv": read_text,
     ".dat": read_text,
-    ".get": read_get,
 }

@@ -42,6 +42,7 @@ LIKE: Final = (0.6, 1.6)
 """Factors between places and contacts that pass as the model's. It is off by 1 % on simulated
 hand-made skins; one doubled axis is 0.5."""
 TURNED_DEG: Final = 15.0  # likewise; 16 electrodes are 22 degrees apart
+SHIFTED: Final = 0.25  # likewise, of the skin's size; frames counted from a corner are off by 0.5
 KNOWN: Final = 0.5
 """Of the error that the middle of all places makes: what locates no better has learnt nothing.
 With shuffled places it is 1.0, of 100 presses on the worst of five measured skins 0.2."""
@@ -217,58 +218,35 @@ def _left_out(others: IntArray) -> list[str]:
 
 def _check_frame(xy_mm: FloatArray, guess_mm: FloatArray, description: SensorDescription) -> None:
     """Refuse coordinates that fit the contacts far better in another frame or unit."""
-
-    def distance_mm(places_mm: FloatArray) -> float:
-        return float(np.median(np.linalg.norm(places_mm - guess_mm, axis=1)))
-
-    x, y = xy_mm.T
-    others = {
-        "x and y seem swapped": (y, x),
-        "x seems to run the other way": (-x, y),
-        "y seems to run the other way": (x, -y),
-        "the frame seems turned by half a turn": (-x, -y),
-        "the frame seems turned by a quarter": (y, -x),
-        "the frame seems turned by a quarter, clockwise": (-y, x),
-        "they seem doubled": (x / 2, y / 2),
-        "they seem halved": (2 * x, 2 * y),
-        "they seem to be centimetres": (10 * x, 10 * y),
-        "they seem to be inches": (25.4 * x, 25.4 * y),
-        "they seem to be counted from a corner": (
-            x - 500 * description.width_m,
-            y - 500 * description.height_m,
-        ),
-    }
-    as_given = distance_mm(xy_mm)
-    why, there = min(
-        ((why, distance_mm(np.stack(places, axis=1))) for why, places in others.items()),
-        key=lambda each: each[1],
-    )
-    width_mm = 1e3 * max(description.width_m, description.height_m)
-    if there < OTHER_FRAME * min(as_given, 0.5 * width_mm):
-        raise CalibrationError(
-            f"places and contacts are {as_given:.0f} mm apart (median), and {there:.0f} mm if "
-            f"{why.removeprefix('they ')}: {why}; give x to the right and y up from the middle, "
-            "seen from the pressed side, in mm"
-        )
     known = np.column_stack([xy_mm, np.ones(len(xy_mm))])
     near = np.ones(len(known), bool)
     for _ in range(2):  # again without the fifth that fits worst: single places may be wrong
         map_ = np.linalg.lstsq(known[near], guess_mm[near], rcond=None)[0]
         off_mm = np.linalg.norm(known @ map_ - guess_mm, axis=1)
         near = off_mm <= np.quantile(off_mm, 0.8)
+    as_given = float(np.median(np.linalg.norm(xy_mm - guess_mm, axis=1)))
     there = float(np.median(off_mm))
-    factors = np.linalg.norm(map_[:2], axis=1)
-    turn_deg = np.degrees(np.arctan2(map_[0, 1] - map_[1, 0], map_[0, 0] + map_[1, 1]))
-    is_like = LIKE[0] < factors.min() <= factors.max() < LIKE[1] and abs(turn_deg) < TURNED_DEG
+    factors, shift_mm = np.linalg.norm(map_[:2], axis=1), map_[2]
+    mirror = 1.0 if np.linalg.det(map_[:2]) >= 0 else -1.0
+    turn_deg = np.degrees(
+        np.arctan2(map_[0, 1] - mirror * map_[1, 0], map_[0, 0] + mirror * map_[1, 1])
+    )
+    size_mm = 1e3 * np.array([description.width_m, description.height_m])
+    is_like = (
+        LIKE[0] < factors.min() <= factors.max() < LIKE[1]
+        and mirror > 0
+        and abs(turn_deg) < TURNED_DEG
+        and (np.abs(shift_mm) < SHIFTED * size_mm).all()
+    )
     if there < OTHER_FRAME * as_given and not is_like:
         raise CalibrationError(
             f"places and contacts are {as_given:.0f} mm apart (median), and {there:.0f} mm if x is "
-            f"multiplied by {factors[0]:.2g}, y by {factors[1]:.2g}, and both are turned by "
-            f"{turn_deg:.0f} degrees: give both in mm, x to the right, y up from the middle"
+            f"multiplied by {factors[0]:.2g}, y by {mirror * factors[1]:.2g}, both are turned by "
+            f"{turn_deg:.0f} degrees and moved by ({shift_mm[0]:.0f}, {shift_mm[1]:.0f}) mm: give "
+            "x to the right and y up from the middle, seen from the pressed side, in mm"
         )
     _check_order(xy_mm, guess_mm)
-    limits_mm = 500 * np.array([description.width_m, description.height_m])
-    outside = np.flatnonzero((np.abs(xy_mm) > limits_mm).any(axis=1))
+    outside = np.flatnonzero((np.abs(xy_mm) > size_mm / 2).any(axis=1))
     if len(outside):
         place = ", ".join(f"{each:.1f}" for each in xy_mm[outside[0]])
         raise CalibrationError(
@@ -303,9 +281,7 @@ def _odd(
         median_mm = float(np.median(off_mm))
         for k in np.flatnonzero(off_mm > ODD * median_mm) if median_mm < best_mm else ():
             x, y = xy_mm[k]
-            swapped = np.linalg.norm(found_mm[k] - (y, x)) < 0.5 * off_mm[k]
-            why = ", which x and y swapped explains" if swapped else ""
-            odd[numbers[k]] = f"press {numbers[k]} at ({x:.1f}, {y:.1f}) mm{why}"
+            odd[numbers[k]] = f"press {numbers[k]} at ({x:.1f}, {y:.1f}) mm"
         best_mm = median_mm
     return [odd[number] for number in sorted(odd)]
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from daemon_process import SENSOR, DaemonProcess
+from measured_skin import MeasuredSkin
 from shared_data import measured
 from tactomo.twin import Twin, TwinConfig
 from tactomo_client import Frame, subscribe
@@ -59,21 +60,17 @@ def playing(
     sensor: Path,
     protocol: str,
     rate_hz: float,
-    once: bool = True,
     **config: Any,
 ) -> Iterator[DaemonProcess]:
     """A board that says these scans, and a daemon on it."""
-    path = tmp_path / "scans.npz"
-    np.savez(path, structure=scans)
     board = TwinConfig(
         load_description(sensor),
         protocol=protocol,
-        play=path,
-        play_once=once,
+        noise_v=0.0,
         rate_hz=rate_hz,
         control="tcp://127.0.0.1:0",
     )
-    twin = Twin(board)
+    twin = Twin(board, MeasuredSkin(scans))
     twin.start()
     daemon = DaemonProcess(
         tmp_path, twin.ports, protocol=protocol, description=str(sensor), ready=False, **config
@@ -182,7 +179,7 @@ def test_a_broken_device_is_flagged_in_every_frame_and_called_broken(tmp_path: P
     table = np.vstack([baseline, baseline, baseline.mean(axis=0) + changes])
     k, m = sensor.pairs.drive[:, 0], sensor.pairs.measure[:, 0]
     scans = table.reshape(-1, 32, 32)[:, k, m]
-    with playing(tmp_path, scans, path, "matrix", 10.0, once=False) as daemon:
+    with playing(tmp_path, scans, path, "matrix", 10.0) as daemon:
         frames = frames_of(daemon, len(scans) - 1, missed=1)
         command = [*(sys.executable, "-m", "tactomo.cli", "doctor", "--json"), "--seconds", "3"]
         command += ["--sensor", SENSOR, "--stream", daemon.stream, "--description", str(path)]

@@ -28,7 +28,7 @@ def frames(
     """Return the messages of each scan's frame; scans are (M,) volts."""
     emulator = started(description)
     return [
-        emulator.frame(Frame(volts, None, begin_s + PERIOD_S * number))
+        emulator.frame(Frame(volts, begin_s + PERIOD_S * number))
         for number, volts in enumerate(scans)
     ]
 

@@ -36,7 +36,7 @@ def test_a_frame_is_read_as_it_was_measured(protocol: str, sensor: SensorDescrip
         board.hear(message)
     assert board.is_streaming
     for row in volts:
-        [*_, scan] = port.feed(b"".join(board.frame(Frame(row, None, 0.0))))
+        [*_, scan] = port.feed(b"".join(board.frame(Frame(row, 0.0))))
         assert isinstance(scan, Scan)
         expected = np.abs(row) if sensor.instrument.voltages == "unsigned" else row
         gain = float(scan.samples @ expected / (expected @ expected))
@@ -50,7 +50,7 @@ def test_a_frame_is_read_as_it_was_measured(protocol: str, sensor: SensorDescrip
 )
 def test_an_openeit_board_obeys_its_keys(key: bytes, said: str) -> None:
     board, port = emulator_of("openeit")(OPENEIT, 20.0), protocol_named("openeit", OPENEIT)
-    frame: Any = Frame(np.ones(192), None, 0.0)
+    frame: Any = Frame(np.ones(192), 0.0)
     assert board.hear(key[:1]) == []
     port.feed(b"\n" + b"".join(board.hear(key[1:])))
     for _ in range(3):

@@ -1,7 +1,7 @@
 """Scans from files of other programs, as volts in the order of a sensor description.
 
 Three layouts are read, told apart by their arrays; Sciospec's .eit files are of the second (see
-`eit_files`), text and .get of the third (see `tactomo_models.array_files`):
+`eit_files`), text of the third (see `tactomo_models.array_files`):
 
 batch
     what `tactomo reconstruct` takes: `magnitude` and/or `structure` (T, M) volts in the
@@ -372,22 +372,6 @@ def _unlike(
 ) -> ImportFileError:
     held = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
     return ImportFileError(f"{path} holds {held or 'nothing'}: {cause}", next_step)
-
-
-def electrode_potentials(
-    path: Path, arrays: dict[str, NDArray[Any]], layout: Layout
-) -> NDArray[np.complexfloating]:
-    """Return single-ended readings as (T, injections, electrodes), in the layout's order of drives.
-
-    Raises:
-        ImportFileError: they do not fit the sensor.
-    """
-    injection, raw = _single_ended_arrays(path, arrays, layout)
-    rows, signs = _injection_rows(path, injection - injection.min(), layout)
-    _, first = np.unique(rows, return_index=True)
-    order = np.sort(first)  # of each drive the first voltage
-    potentials = signs[order][None, :, None] * raw[:, rows[order]]
-    return np.asarray(potentials, dtype=np.complex64)
 
 
 def _single_ended_arrays(

@@ -1,7 +1,6 @@
 """The optional Prometheus endpoint: what `status` says, as metrics, read when somebody scrapes.
 
-Nothing is counted here, so a frame costs nothing more. One thread answers one scrape at a time and
-cuts off who takes too long: a slow scraper holds up other scrapers and nobody else. The address
+Nothing is counted here, so a frame costs nothing more. A slow scraper holds up nobody. The address
 must be of this computer, since neither keys nor encryption guard it; an agent there passes it on.
 
 The names follow Prometheus' conventions: base units in the name, `_total` for what only rises.
@@ -9,14 +8,11 @@ The names follow Prometheus' conventions: base units in the name, `_total` for w
 
 from __future__ import annotations
 
-import contextlib
-import socket
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from socketserver import TCPServer
 from typing import Any, Final
 from urllib.parse import urlsplit
-from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 from tactomo_client.web_access import names_this_computer
 from tactomo_models import Flag
@@ -28,6 +24,7 @@ from tactomo.worker import Worker
 with needs("`metrics`", "pip install 'tactomo[metrics]'"):
     from prometheus_client import CollectorRegistry, ProcessCollector, make_wsgi_app
     from prometheus_client.core import Metric
+    from prometheus_client.exposition import ThreadingWSGIServer
     from prometheus_client.registry import Collector
 
 STATES: Final = (
@@ -65,27 +62,23 @@ class MetricsServer(Worker):
         registry.register(_StatusCollector(status, latency, stages))
         ProcessCollector(registry=registry)
         self._app = make_wsgi_app(registry)
-        self._server: _Server
+        self._server: WSGIServer
 
     def open(self, endpoint: str) -> None:
         """Bind ``HOST:PORT``; raise AddressError where the address cannot be had."""
         parts = urlsplit(f"//{endpoint}")
         host, port = parts.hostname or "", parts.port or 0
         try:
-            self._server = server = _Server((host, port), _Handler)
+            self._server = make_server(host, port, _only_for(host, self._app), _Server, _Handler)
         except OSError as error:
             raise AddressError(
                 f"cannot offer metrics at {endpoint}: {error.strerror or error}",
                 "stop what uses this port, or give another one as metrics",
             ) from error
-        server.set_app(_only_for(host, self._app))
-        self.address = f"http://{host}:{server.server_port}/metrics"
+        self.address = f"http://{host}:{self._server.server_port}/metrics"
 
     def _close(self) -> None:
         self._server.server_close()
-
-    def _wake(self) -> None:
-        self._server.cut()
 
     def _run(self) -> None:
         self._server.timeout = POLL_S
@@ -105,38 +98,11 @@ def _only_for(host: str, app: Any) -> Any:
     return answer
 
 
-class _Server(WSGIServer):
-    """Answers one after the other, and keeps whom it answers so that it can be cut off."""
-
-    _asking: socket.socket | None = None
-    _is_closing = False
-
-    def server_bind(self) -> None:
-        """Bind without asking the name service who we are, which may take long."""
-        TCPServer.server_bind(self)
-        host, self.server_port = self.socket.getsockname()[:2]
-        self.server_name = str(host)
-        self.setup_environ()
-
-    def finish_request(self, request: Any, client_address: Any) -> None:
-        """Answer a scraper."""
-        self._asking = request
-        try:
-            if not self._is_closing:
-                super().finish_request(request, client_address)
-        finally:
-            self._asking = None
+class _Server(ThreadingWSGIServer):
+    """Says nothing of a scraper that went away or took too long."""
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing of a scraper that went away or took too long."""
-
-    def cut(self) -> None:
-        """Hang up on who is being answered, and answer nobody any more; for any thread."""
-        self._is_closing = True
-        asking = self._asking
-        if asking is not None:
-            with contextlib.suppress(OSError):
-                asking.shutdown(socket.SHUT_RDWR)
+        pass
 
 
 class _Handler(WSGIRequestHandler):

@@ -48,7 +48,6 @@ from tactomo.twin.converter import Converter
 from tactomo.twin.firmware import RATE_HZ_MAX, RATE_HZ_MIN, Firmware, Identity, Port, Voltages
 from tactomo.twin.foreign import Emulator, ForeignFirmware
 from tactomo.twin.line import SerialLine
-from tactomo.twin.playing import Player
 from tactomo.twin.scene import Scene, SkinDriftSettings
 from tactomo.twin.surface import Surface
 from tactomo.worker import Bell
@@ -56,8 +55,6 @@ from tactomo.worker import Bell
 # How often a line that nobody has open is looked at; its hang-up cannot be waited on.
 HANGUP_CHECK_S = 0.02
 RATE_HZ = 20.0
-# How long the line stays after the last frame of a file: the host must have read it.
-LINGER_S = 1.0
 # Room above the largest unloaded voltage before the converter clips.
 HEADROOM = 8.0
 # Noise of the converter where none is given, as a share of the largest unloaded voltage: 60 dB
@@ -91,9 +88,7 @@ class TwinConfig:
 
     description: SensorDescription  #: the sensor that it simulates
     ports: int = 1  #: 1 for one line that carries every channel, 2 for a line for each
-    #: scans a second, at first; the host may change it. None for those of the file that is played,
-    #: or 20
-    rate_hz: float | None = None
+    rate_hz: float = RATE_HZ  #: scans a second, at first; the host may change it
     noise_v: float | None = None  #: noise in volts rms; None for a usual converter's
     #: how the skin itself drifts; the scene's if that says so
     skin_drift: SkinDrift = field(default_factory=SkinDrift)
@@ -102,9 +97,6 @@ class TwinConfig:
     #: a scripted scene; it starts with the first scan that a host can receive
     scene: Scene | None = None
     protocol: str = NATIVE  #: what the device speaks; foreign ones have one port and one channel
-    #: an .npz file of measured frames, said in the place of simulated ones
-    play: Path | None = None
-    play_once: bool = False  #: stop after the file's last frame instead of beginning again
     control: str = DEFAULT_TWIN_CONTROL  #: address of the control socket; port 0 takes a free one
     link_folder: Path | None = None  #: where to keep links with stable names to the lines
 
@@ -133,7 +125,7 @@ class TwinConfig:
                 f"{self.protocol} carries one",
                 "give the description of a sensor with one channel, such as tank_disc",
             )
-        if self.rate_hz is not None and not RATE_HZ_MIN <= self.rate_hz <= RATE_HZ_MAX:
+        if not RATE_HZ_MIN <= self.rate_hz <= RATE_HZ_MAX:
             raise ConfigError(
                 f"a rate of {self.rate_hz:g} Hz is out of range",
                 f"give {RATE_HZ_MIN:g} to {RATE_HZ_MAX:g} scans a second",
@@ -168,10 +160,6 @@ class Twin:
             for line, channels in _wiring(config).items():
                 ports.append(Port(SerialLine(line, config.link_folder), channels))
                 undo.callback(ports[-1].line.close)
-            self._player: Player | None = None
-            if config.play is not None:
-                self._player = Player(config.play, config.description, config.play_once)
-                skin = self._player
             self._skin = skin or make_skin(config.description, config.unevenness, config.seed)
             self._drifting = (
                 DriftingSkin(self._skin, config.skin_drift, config.seed)
@@ -181,7 +169,6 @@ class Twin:
             undo.pop_all()
         self._converter = self._make_converter()
         self._powered_s = time.monotonic()
-        self._over_s: float | None = None  # when the last frame of a file was said
         self._firmware = self._make_firmware(ports)
         self._bell = Bell()
         self._solver = ThreadPoolExecutor(max_workers=1, thread_name_prefix="twin-skin")
@@ -229,7 +216,6 @@ class Twin:
                     self._rest()
                     self._control.answer()
                     self._firmware.step()
-                    self._stop_at_end()
         except BaseException as error:  # handed to whoever waits for this thread
             self._failure = error
         finally:
@@ -254,21 +240,11 @@ class Twin:
         poller.poll(math.ceil(timeout_s * 1e3))
         self._bell.hear()
 
-    def _stop_at_end(self) -> None:
-        """Stop a while after the last frame of a file that is played once."""
-        if self._player is None or not self._player.is_over:
-            return
-        self._over_s = self._over_s or time.monotonic()
-        if time.monotonic() - self._over_s > LINGER_S:
-            self._stopping.set()
-
     def _clock(self) -> float:
         return time.monotonic() - self._powered_s
 
     def _sample(self, time_s: float) -> Future[Voltages]:
         """Start computing the voltages of the skin as it is at device time `time_s`."""
-        if self._player is not None and self._player.is_over:
-            return Future()  # never done: nothing follows
         if not self._surface.is_playing and any(p.line.is_open for p in self._firmware.ports):
             self._play_at(time_s)
         presses = [indenter.press() for indenter in self._surface.presses_at(time_s).values()]
@@ -290,19 +266,15 @@ class Twin:
     def _make_firmware(self, ports: list[Port]) -> Firmware:
         config = self.config
         identity = _identity(config.description, config.protocol)
-        own_rate_hz = None if self._player is None else self._player.rate_hz
-        rate_hz = config.rate_hz or own_rate_hz or RATE_HZ
         if config.protocol != NATIVE:
             make = emulator_of(find_protocol(config.protocol).name)
-            emulator: Emulator = make(config.description, rate_hz)
+            emulator: Emulator = make(config.description, config.rate_hz)
             return ForeignFirmware(
                 emulator, identity, ports[0], self._sample, self._converter, self._clock
             )
-        return Firmware(identity, ports, self._sample, self._converter, rate_hz, self._clock)
+        return Firmware(identity, ports, self._sample, self._converter, config.rate_hz, self._clock)
 
     def _make_converter(self) -> Converter:
-        if self._player is not None:  # noise is in what was measured
-            return Converter(HEADROOM * self._player.largest_v, 0.0)
         unloaded = self._skin.voltages([])
         largest_v = max(float(np.max(np.abs(volts))) for volts in unloaded.values())
         noise_v = self.config.noise_v
@@ -391,7 +363,7 @@ class Twin:
         if self._drifting is None:
             raise CommandError(
                 "this twin's skin is not simulated: it does not drift",
-                "start a twin without --play",
+                "start a twin of a simulated skin",
             )
         self._drifting.drift = arguments.skin_drift(self._drifting.drift)
         return {}

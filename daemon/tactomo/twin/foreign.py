@@ -14,14 +14,12 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from tactomo_models import SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_protocol import Channel, ScanFlag
 
 from tactomo.twin.converter import Converter
 from tactomo.twin.firmware import Firmware, Identity, Port, Sample, Voltages
-from tactomo.twin.playing import PlayedFrame
 
 MAX_WAITING_BYTES = 1 << 17
 """What an instrument keeps for a host that is slow to take it; then frames are lost."""
@@ -33,8 +31,6 @@ class Frame:
     """What an instrument has measured in one go round the electrodes."""
 
     volts: FloatArray  #: (M,) in the description's order
-    potentials: NDArray[np.complexfloating] | None
-    """(injections, electrodes) volts against ground, where measured ones are played."""
     time_s: float  #: when it began, by the instrument's clock
 
 
@@ -130,11 +126,8 @@ class ForeignFirmware(Firmware):
     def _say(
         self, port: Port, channel: Channel, sample: Sample, flags: ScanFlag, voltages: Voltages
     ) -> None:
-        if isinstance(voltages, PlayedFrame):
-            frame = Frame(voltages[channel], voltages.potentials, sample.time_s)
-        else:
-            scan = self._scan(channel, sample, flags, voltages)
-            frame = Frame(scan.volts(self._converter.volts_per_count), None, sample.time_s)
+        scan = self._scan(channel, sample, flags, voltages)
+        frame = Frame(scan.volts(self._converter.volts_per_count), sample.time_s)
         if not port.line.is_open:
             port.line.unheard += 1
         elif self._waiting_bytes > MAX_WAITING_BYTES:

@@ -2,8 +2,7 @@
 
 It acknowledges what it is asked, refuses nonsense and what it cannot do, is configured only while
 it does not measure, and sends potentials of all four channel groups, however few have electrodes.
-The skin gives differences of potentials, so the potentials are the smallest that have those; where
-measured ones are played they are said as they are.
+The skin gives differences of potentials, so the potentials are the smallest that have those.
 """
 
 from __future__ import annotations
@@ -89,7 +88,8 @@ class SciospecEmulator:
 
     def frame(self, frame: Frame) -> list[bytes]:
         """Return the data messages of all injections and groups."""
-        potentials = self._potentials(frame)
+        scale = self._amplitude_a / self._description.pattern.current_a
+        potentials = scale * self.potentials_of(frame.volts)
         pairs = list(self._injections)
         messages = np.zeros((len(pairs), GROUPS), DATA)
         messages["tag"] = messages["end"] = DATA_TAG
@@ -108,12 +108,6 @@ class SciospecEmulator:
         self._burst -= self._burst > 0
         self.is_streaming = self.is_streaming and self._burst != 0
         return [each.tobytes() for each in messages.ravel()]
-
-    def _potentials(self, frame: Frame) -> NDArray[np.complexfloating]:
-        if frame.potentials is not None:
-            return frame.potentials
-        scale = self._amplitude_a / self._description.pattern.current_a
-        return scale * self.potentials_of(frame.volts)
 
     def potentials_of(self, volts: FloatArray) -> NDArray[np.complex128]:
         """Return potentials (drives, electrodes) that have a scan's voltages (M,), the least."""

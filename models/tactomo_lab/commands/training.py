@@ -97,7 +97,6 @@ def simulate(
         "tactomo models train scenes/robust",
         "tactomo models train scenes/robust --epochs 5 --output trial.onnx",
         "tactomo models train scenes/robust --start scenes/robust/ours.pt --checkpoint more.pt",
-        "tactomo models train scenes/mine -d my_skin.toml --start trained.onnx --rate 1e-3",
         "tactomo models train scenes/paper --configuration paper-multimodal --device cuda",
     )
 )
@@ -117,10 +116,7 @@ def train(
     ] = None,
     start: Annotated[
         Path | None,
-        typer.Option(
-            help="Begin with the weights of this checkpoint; or with our network, .onnx, of as "
-            "many voltages and nodes."
-        ),
+        typer.Option(help="Begin with the weights of this checkpoint."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of weights, order, noise and turns.")] = 0,
     device: Annotated[Literal["cpu", "cuda"], typer.Option(help="What computes.")] = "cpu",

@@ -19,7 +19,6 @@ from torch import nn
 
 from tactomo_lab.scenes.measures import full_range
 from tactomo_lab.scenes.presets import PresetName
-from tactomo_lab.training import exported
 from tactomo_lab.training.batches import SceneBatches
 from tactomo_lab.training.export import export, notes_of
 from tactomo_lab.training.networks import FusionNetwork, PaperNetwork
@@ -27,7 +26,6 @@ from tactomo_lab.training.objectives import FusionObjective, PaperObjective, lin
 from tactomo_lab.training.train import Objective, Settings, Training, load_weights
 from tactomo_lab.training.training_scenes import read_manifest
 
-NORMALISED_BY = 512  # scenes that an exported network's normalisation is put back by
 BOTH: Final[tuple[Channel, ...]] = (Channel.MAGNITUDE, Channel.STRUCTURE)
 
 
@@ -114,10 +112,6 @@ def prepare(
         bases = dict(zip(configuration.channels, batches.bases, strict=True))
         if start is None:
             network.start_linear(linear_images(batches, scale))
-        elif start.suffix == exported.SUFFIX:
-            some = torch.arange(min(NORMALISED_BY, len(batches.trained)))
-            inputs = batches.draw(some, torch.Generator().manual_seed(seed)).inputs
-            exported.load_exported(network, start, bases, inputs)
         else:
             load_weights(network, start)
         return Prepared(configuration, description, network, FusionObjective(batches), scale, bases)

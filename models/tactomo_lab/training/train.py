@@ -227,7 +227,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _damaged(path: Path) -> str:
-    return f"{path} is no checkpoint, or a damaged one: delete it to begin anew"
+    return f"{path} is no checkpoint, or a damaged one: name another, or delete it to begin anew"
 
 
 def load_checkpoint(training: Training, settings: Settings, path: Path) -> None:

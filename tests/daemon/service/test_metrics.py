@@ -107,6 +107,7 @@ def test_a_slow_scraper_disturbs_nobody_and_does_not_hold_up_the_stop(
         slow.sendall(b"GET /met")
         made.step()
         assert made.ask("status")["frames"] == 4
+        assert scrape(made.daemon)[key("frames_total")] == 4, "another scraper waits for nobody"
         begin_s = time.monotonic()
         made.daemon.stop()
         assert time.monotonic() - begin_s < PATIENCE_S / 2, "less than the scraper's time"

@@ -41,7 +41,7 @@ def import_scans(
     """Turn measured scans (.npz, .eit) into a recording that replays through the daemon.
 
     Reads the layouts of `tactomo reconstruct` (magnitude, structure and their references; frames of
-    one channel in a .mat, text or .get), and single-ended readings as EIT instruments save them:
+    one channel in a .mat or text), and single-ended readings as EIT instruments save them:
     `volts` (T, injections, electrodes) with `injection` (injections, 2) and `t`. Those become
     differences of neighbouring electrodes in the description's order; of complex volts the part in
     phase with the current counts. So do the .eit files that Sciospec's

@@ -34,7 +34,7 @@ app = typer_app()
 )
 def reconstruct(
     scans: Annotated[
-        Path, typer.Argument(metavar="IN", help="Scans: .npz, .mat, .csv, .txt, .get, .eit.")
+        Path, typer.Argument(metavar="IN", help="Scans: .npz, .mat, .csv, .txt, .eit.")
     ],
     maps: Annotated[Path, typer.Argument(metavar="OUT.npz", help="The file to write.")],
     method: Method = "auto",
@@ -67,9 +67,9 @@ def reconstruct(
     IN holds `magnitude` and `structure` (T, M) volts and `magnitude_reference`,
     `structure_reference` (M,), or (n, M) scans at rest; structure may be missing. Or it is what
     `tactomo import` reads, or frames of one channel, one a row or a column: an array of a .mat (up
-    to version 7), numbers in text (.csv, .txt), or a .get of 16 electrodes. Then the reference is
-    an array called reference, baseline, rest, empty or vh, `--reference-frames` of IN, or the mean
-    of the file `--reference`. `--pattern 32:adjacent`, `16:opposite:adjacent` or
+    to version 7), or numbers in text (.csv, .txt). Then the reference is an array called reference,
+    baseline, rest, empty or vh, `--reference-frames` of IN, or the mean of the file `--reference`.
+    `--pattern 32:adjacent`, `16:opposite:adjacent` or
     `16:adjacent:rotated` says which electrodes the numbers are of, where the description says
     otherwise; it gets as many electrodes.
 

@@ -18,7 +18,6 @@ app = options.typer_app()
         "tactomo twin --link /tmp/skin",
         "tactomo twin --ports 1 --scene sliding_finger",
         "tactomo poke press x_mm=10 y_mm=-20",
-        "tactomo twin --description tank_disc --play tank.npz",
     )
 )
 def twin(
@@ -27,19 +26,8 @@ def twin(
         int | None,
         typer.Option(min=1, max=2, help="One line for both channels, or a line for each. [each]"),
     ] = None,
-    rate: Annotated[
-        float | None, typer.Option(help="Dual scans a second. [20, or as in the file that plays]")
-    ] = None,
+    rate: Annotated[float, typer.Option(help="Dual scans a second.")] = 20.0,
     protocol: options.Protocol = "tactomo",
-    play: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.npz", help="Say measured frames, as `tactomo import` reads them, instead."
-        ),
-    ] = None,
-    once: Annotated[
-        bool, typer.Option("--once", help="Stop after the last played frame; else again.")
-    ] = False,
     scene: Annotated[
         Path | None,
         typer.Option(help="A scripted scene, shipped or TOML; starts with the first scan."),
@@ -82,8 +70,6 @@ def twin(
         seed=seed,
         scene=None if scene is None else load_scene(scene),
         protocol=protocol,
-        play=play,
-        play_once=once,
         control=twin_control,
         link_folder=link,
     )
