@@ -10,7 +10,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from matplotlib.figure import Figure
-from tactomo_models.mujoco_skin import MujocoSkin
+from tactomo_models.simulators.mujoco_skin import MujocoSkin
 
 model = mujoco.MjModel.from_xml_path(str(Path(__file__).with_name("gripper.xml")))
 data = mujoco.MjData(model)

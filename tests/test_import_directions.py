@@ -55,8 +55,8 @@ ORDER = {
             "inner_loop",
         ),
         *("sensor", "physics", "scans", "scene", "methods", "simulation"),
-        *("calibration", "health", "drift", "reconstruct", "known_skin", "batch", "teach"),
-        *("machine_speed", "mujoco_skin", "gymnasium_skin"),
+        *("calibration", "health", "drift", "reconstruct", "batch"),
+        *("commissioning", "simulators"),
     ),
     "tactomo": (
         *("errors", "plain", "journal", "log", "events", "endpoint", "timing", "scans", "worker"),
@@ -70,8 +70,8 @@ ORDER = {
 FOREIGN = {
     "torch": ("tactomo_lab.training.",),
     "onnx": ("tactomo_lab.training.",),
-    "mujoco": ("tactomo_models.mujoco_skin.",),
-    "gymnasium": ("tactomo_models.gymnasium_skin.",),
+    "mujoco": ("tactomo_models.simulators.mujoco_skin.",),
+    "gymnasium": ("tactomo_models.simulators.gymnasium_skin.",),
     "h5py": ("tactomo_models.matlab_file",),
     "serial": ("tactomo.",),
     "zmq": ("tactomo.", "tactomo_client.", "tactomo_foxglove."),

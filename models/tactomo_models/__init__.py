@@ -20,10 +20,11 @@ simulation       skins whose truth is known, and how they drift
 calibration      pressure curves from a load cell
 health           what is wrong with a skin or its leads
 drift            a reference that follows the skin
+commissioning    one very skin: what it is taught, and whether something lies on it at a start
+simulators       the skin in MuJoCo and Gymnasium
 ===============  =================================================================================
 
-Above them: `reconstruct` turns scans into frames, `batch` does so for a file, `known_skin` tells
-whether something lies on a skin at a start, `machine_speed` says what a budget of time buys.
+Below the last two, `reconstruct` turns scans into frames, and `batch` does so for a file.
 """
 
 from tactomo_protocol import Channel

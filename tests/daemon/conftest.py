@@ -15,7 +15,7 @@ from tactomo.log import configure_logging
 from tactomo.recordings.recording_set import open_replayable
 from tactomo.service.daemon import Daemon
 from tactomo_client import Keys
-from tactomo_models.machine_speed import MachineSpeed
+from tactomo_models.methods.machine_speed import MachineSpeed
 from waiting import wait_until
 
 

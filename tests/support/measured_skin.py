@@ -10,7 +10,7 @@ from tactomo_protocol import Channel
 
 
 class MeasuredSkin:
-    """Says scans (T, M), volts, one after another, then the last one, whatever presses."""
+    """Says scans (T, M), volts, one after another, again and again, whatever presses."""
 
     def __init__(self, scans: FloatArray) -> None:
         self._scans = scans
@@ -18,6 +18,6 @@ class MeasuredSkin:
 
     def voltages(self, presses: Sequence[Press]) -> dict[Channel, FloatArray]:
         # The first call is the converter's, which asks how large voltages are.
-        scan = self._scans[min(max(self.said - 1, 0), len(self._scans) - 1)]
+        scan = self._scans[max(self.said - 1, 0) % len(self._scans)]
         self.said += 1
         return {Channel.STRUCTURE: scan}

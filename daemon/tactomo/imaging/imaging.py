@@ -23,8 +23,8 @@ from tactomo_models import (
 )
 from tactomo_models.calibration.calibration_file import PressureCalibration
 from tactomo_models.calibration.taught_skin import TaughtSkin
-from tactomo_models.known_skin import SkinAtStart, skin_at_start
-from tactomo_models.machine_speed import MachineSpeed
+from tactomo_models.commissioning.known_skin import SkinAtStart, skin_at_start
+from tactomo_models.methods.machine_speed import MachineSpeed
 from tactomo_models.physics.actual_sheet import Sheets
 from tactomo_protocol import Channel, ScanFlag
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from tactomo_models import Reconstructor
-from tactomo_models.machine_speed import MachineSpeed
+from tactomo_models.methods.machine_speed import MachineSpeed
 from tactomo_models.reconstruct import DEFAULT_BUDGET_S
 
 from tactomo.errors import CommandError

@@ -54,7 +54,7 @@ from tactomo_models.calibration.calibration_file import (
     load_calibration,
 )
 from tactomo_models.calibration.taught_skin import TaughtSkin, load_taught, taught_path
-from tactomo_models.machine_speed import MachineSpeed, machine_speed_for
+from tactomo_models.methods.machine_speed import MachineSpeed, machine_speed_for
 from tactomo_models.methods.registry import available_methods, check_method
 from tactomo_models.sensor.description_file import carried_text
 from tactomo_protocol import Channel

@@ -24,7 +24,7 @@ from tactomo_client.intact_chunks import intact_chunks
 from tactomo_client.messages import array_from_wire
 from tactomo_client.recording import open_recording as open_frames
 from tactomo_models import Reference
-from tactomo_models.machine_speed import MachineSpeed
+from tactomo_models.methods.machine_speed import MachineSpeed
 from tactomo_protocol import Channel, Decoder, Scan, ScanFlag, encode
 
 Start = Callable[..., Any]

@@ -364,7 +364,7 @@ def _stage_table(phases: list[Phase]) -> Table:
 def machine() -> str:
     """Return the processor, its cores that we may use, and the versions that matter."""
     import numpy as np
-    from tactomo_models.machine_speed import processor
+    from tactomo_models.methods.machine_speed import processor
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return (

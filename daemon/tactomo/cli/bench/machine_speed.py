@@ -20,7 +20,7 @@ from tactomo_models import (
     load_or_build_artifact,
 )
 from tactomo_models.arrays import FloatArray
-from tactomo_models.machine_speed import (
+from tactomo_models.methods.machine_speed import (
     MachineSpeed,
     machine_speed_for,
     machine_speed_path,

@@ -153,7 +153,7 @@ def _teach(
     keep_odd: bool,
 ) -> None:
     """Learn from a file, keep what is learnt in `path`, if any, and have the daemon use it."""
-    from tactomo_models.teach import read_presses, teach
+    from tactomo_models.commissioning.teach import read_presses, teach
 
     from tactomo.cli.calibrate.reload import keep
 

@@ -9,8 +9,8 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from tactomo_models.mujoco_skin import MujocoSkin, Touch
 from tactomo_models.scene.pressure import described_curve
+from tactomo_models.simulators.mujoco_skin import MujocoSkin, Touch
 
 
 class TactileObservation(gymnasium.Wrapper[Any, Any, Any, Any]):

@@ -13,8 +13,8 @@ from tactomo_models import DataError
 mujoco = pytest.importorskip("mujoco")
 gymnasium = pytest.importorskip("gymnasium")
 
-from tactomo_models.gymnasium_skin import TactileObservation  # noqa: E402
-from tactomo_models.mujoco_skin import MujocoSkin, Touch  # noqa: E402
+from tactomo_models.simulators.gymnasium_skin import TactileObservation  # noqa: E402
+from tactomo_models.simulators.mujoco_skin import MujocoSkin, Touch  # noqa: E402
 
 STEPS = 300
 CELL_M2 = 0.003**2

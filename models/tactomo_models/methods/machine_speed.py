@@ -164,7 +164,7 @@ def _is_earlier(content: bytes) -> bool:
 
 
 def _shipped() -> MachineSpeed:
-    text = files("tactomo_models").joinpath(SHIPPED).read_text("utf-8")
+    text = files("tactomo_models.methods").joinpath(SHIPPED).read_text("utf-8")
     return MachineSpeed.model_validate_json(text).model_copy(update={"shipped": True})
 
 

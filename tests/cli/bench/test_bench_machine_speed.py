@@ -10,7 +10,11 @@ from typing import Any
 
 import pytest
 from tactomo_models import load_description
-from tactomo_models.machine_speed import MachineSpeed, machine_speed_path, save_machine_speed
+from tactomo_models.methods.machine_speed import (
+    MachineSpeed,
+    machine_speed_path,
+    save_machine_speed,
+)
 
 Run = Callable[..., Any]
 

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tactomo_models import ArtifactError, SensorDescription, machine_speed
-from tactomo_models.machine_speed import (
+from tactomo_models import ArtifactError, SensorDescription
+from tactomo_models.methods import machine_speed
+from tactomo_models.methods.machine_speed import (
     MachineSpeed,
     load_machine_speed,
     machine_speed_for,

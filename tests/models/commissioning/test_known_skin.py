@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from tactomo_models import Press, Reconstructor, Reference, SkinSimulator, load_description
 from tactomo_models.arrays import FloatArray
-from tactomo_models.known_skin import SkinAtStart, skin_at_start
+from tactomo_models.commissioning.known_skin import SkinAtStart, skin_at_start
 from tactomo_protocol import Channel
 
 LIGHT, HARD = 40.0, 180.0

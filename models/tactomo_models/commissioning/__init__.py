@@ -1,0 +1,1 @@
+"""One very skin, before it is used: what it is taught, and whether it is as it was known."""
