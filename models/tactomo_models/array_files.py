@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactomo_models.errors import DataError
-from tactomo_models.foreign_file import open_regular, read_regular
+from tactomo_models.foreign_file import open_regular
 
 Arrays = dict[str, NDArray[Any]]
 
