@@ -182,8 +182,8 @@ class Contacts(Envelope):
     #: The dual scan's counter on the device (32 bits, wraps); the messages of one dual scan share
     #: it
     scan_counter: int
-    #: What is pressed now. **Empty: nothing is pressed**, if the message is not stale and all
-    #: touches are seen (see Stale, or nothing pressed?)
+    #: What is pressed now. **None means that nothing is pressed**, if the message is not stale and
+    #: all touches are seen (see Stale, or nothing pressed?)
     contacts: tuple[Contact, ...]
     #: Force of all contacts together: 0 where nothing is pressed, nil where one contact's is, a
     #: lower bound where one is ``above``

@@ -129,8 +129,8 @@ struct FrameFields {
     /// The dual scan's counter on the device (32 bits, wraps); the messages of one dual scan share
     /// it.
     std::int64_t scan_counter = 0;
-    /// What is pressed now. **Empty: nothing is pressed**, if the message is not stale and all
-    /// touches are seen (see Stale, or nothing pressed?).
+    /// What is pressed now. **None means that nothing is pressed**, if the message is not stale and
+    /// all touches are seen (see Stale, or nothing pressed?).
     std::vector<Contact> contacts;
     /// Force of all contacts together: 0 where nothing is pressed, nil where one contact's is, a
     /// lower bound where one is `above`.
