@@ -7,7 +7,6 @@ goes by the new calibration as soon as that is kept, and so does a replay of wha
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import signal
@@ -24,7 +23,7 @@ from tactomo_client import Contact, request, subscribe
 from tactomo_client.recording import open_recording
 from terminal import Terminal
 from waiting import PATIENCE_S, wait_until
-from whole_system import ANYWHERE
+from whole_system import ANYWHERE, twin_of
 
 NAME = "palm"
 STIFFER = 1.2
@@ -45,17 +44,8 @@ def twin(tmp_path: Path) -> Iterator[dict[str, list[str]]]:
     higher = ", ".join(str(STIFFER * float(kpa)) for kpa in table[1].split(","))
     sensor = tmp_path / "stiffer.toml"
     sensor.write_text(text.replace(table[1], higher, 1))
-    command = [
-        *(sys.executable, "-m", "tactomo.cli", "twin", "--announce", "--twin-control", ANYWHERE),
-        *("--description", str(sensor), "--link", str(tmp_path / "ports"), "--rate", "10"),
-    ]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        try:
-            yield json.loads(next(line for line in process.stdout if line.startswith("{")))
-        finally:
-            process.terminate()
-            process.wait(PATIENCE_S)
+    with twin_of(sensor, tmp_path / "ports") as said:
+        yield said
 
 
 class Bench:

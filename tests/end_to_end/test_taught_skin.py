@@ -7,11 +7,8 @@ reads the twin's serial ports, and goes by what was taught as soon as it is kept
 
 from __future__ import annotations
 
-import json
 import re
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
@@ -25,7 +22,7 @@ from tactomo_client import Frame, subscribe
 from tactomo_client import request as ask
 from terminal import Terminal
 from waiting import PATIENCE_S, wait_until
-from whole_system import ANYWHERE
+from whole_system import twin_of
 
 NAME = "palm"
 PRESSES = 21
@@ -41,17 +38,8 @@ def twin(tmp_path: Path) -> Iterator[dict[str, list[str]]]:
     assert text.count("pitch_m = 0.036") == 1
     sensor = tmp_path / "by_hand.toml"
     sensor.write_text(text.replace("pitch_m = 0.036", "pitch_m = 0.038"))
-    command = [
-        *(sys.executable, "-m", "tactomo.cli", "twin", "--announce", "--twin-control", ANYWHERE),
-        *("--description", str(sensor), "--link", str(tmp_path / "ports"), "--rate", "10"),
-    ]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        try:
-            yield json.loads(next(line for line in process.stdout if line.startswith("{")))
-        finally:
-            process.terminate()
-            process.wait(PATIENCE_S)
+    with twin_of(sensor, tmp_path / "ports") as said:
+        yield said
 
 
 class Bench:

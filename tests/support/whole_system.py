@@ -67,3 +67,19 @@ def running_demo(
 def repository() -> Path:
     """Root of this checkout."""
     return Path(__file__).parents[2]
+
+
+@contextmanager
+def twin_of(description: Path, ports: Path) -> Iterator[dict[str, list[str]]]:
+    """Run `tactomo twin` of a description file, its ports in a folder; yields what it announces."""
+    command = [
+        *(sys.executable, "-m", "tactomo.cli", "twin", "--announce", "--twin-control", ANYWHERE),
+        *("--description", str(description), "--link", str(ports), "--rate", "10"),
+    ]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            yield json.loads(next(line for line in process.stdout if line.startswith("{")))
+        finally:
+            process.terminate()
+            process.wait(PATIENCE_S)

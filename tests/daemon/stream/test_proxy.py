@@ -60,37 +60,6 @@ def proxy() -> Iterator[Callable[..., Running]]:
         running.process.communicate()
 
 
-@pytest.fixture
-def reader() -> Iterator[Callable[..., zmq.Socket[bytes]]]:
-    """Make a subscriber: ``reader(address, prefix)``."""
-    sockets: list[zmq.Socket[bytes]] = []
-
-    def make(address: str, *prefixes: bytes) -> zmq.Socket[bytes]:
-        socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
-        socket.setsockopt(zmq.LINGER, 0)
-        for prefix in prefixes:
-            socket.subscribe(prefix)
-        socket.connect(address)
-        sockets.append(socket)
-        return socket
-
-    yield make
-    for each in sockets:
-        each.close()
-
-
-@pytest.fixture
-def left() -> Iterator[FakeSensor]:
-    with FakeSensor("left") as sensor:
-        yield sensor
-
-
-@pytest.fixture
-def right() -> Iterator[FakeSensor]:
-    with FakeSensor("right") as sensor:
-        yield sensor
-
-
 def next_of(socket: zmq.Socket[bytes], send: Callable[[], object] = lambda: None) -> Any:
     """Return the next message; `send` is called until it comes."""
     deadline = time.monotonic() + PATIENCE_S

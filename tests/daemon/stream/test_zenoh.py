@@ -98,37 +98,6 @@ def start(
         running.process.communicate()
 
 
-@pytest.fixture
-def reader() -> Iterator[Callable[..., zmq.Socket[bytes]]]:
-    """Make a subscriber of ZeroMQ: ``reader(address, prefix)``."""
-    sockets: list[zmq.Socket[bytes]] = []
-
-    def make(address: str, *prefixes: bytes) -> zmq.Socket[bytes]:
-        made: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
-        made.setsockopt(zmq.LINGER, 0)
-        for prefix in prefixes:
-            made.subscribe(prefix)
-        made.connect(address)
-        sockets.append(made)
-        return made
-
-    yield make
-    for each in sockets:
-        each.close()
-
-
-@pytest.fixture
-def left() -> Iterator[FakeSensor]:
-    with FakeSensor("left") as sensor:
-        yield sensor
-
-
-@pytest.fixture
-def right() -> Iterator[FakeSensor]:
-    with FakeSensor("right") as sensor:
-        yield sensor
-
-
 class Samples:
     """What comes under a key expression: (key, its message, count of those sent)."""
 
