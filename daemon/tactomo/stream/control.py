@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from pathlib import PurePosixPath
 from typing import Annotated, Any, Final, NamedTuple
 
 import zmq
@@ -59,17 +60,20 @@ class _Strict(Arguments):
     model_config = ConfigDict(strict=True)
 
 
-def _absolute(path: str) -> str:
+def _recording_path(path: str) -> str:
     # The daemon's own folder is nobody else's business, nor is it where the client is.
     if not path.startswith("/"):
         raise ValueError("give an absolute path on the daemon's computer, such as /data/grasp.mcap")
+    # Who may command is any local user, where there are no keys: no profile, no unit, no key.
+    if PurePosixPath(path).suffix != ".mcap":
+        raise ValueError("give the name of a recording, which ends in .mcap")
     return path
 
 
 class RecordStart(_Strict):
     """Where to record to, and whether with maps; what is not given is as configured."""
 
-    path: Annotated[str, Field(max_length=4096), AfterValidator(_absolute)] | None = None
+    path: Annotated[str, Field(max_length=4096), AfterValidator(_recording_path)] | None = None
     maps: bool | None = None
 
 

@@ -176,8 +176,11 @@ def test_a_frame_that_takes_long_holds_up_no_command(
         ("record_start", {"path": "skin.mcap"}, "bad_argument"),
         ("record_start", {"path": "~/skin.mcap"}, "bad_argument"),
         ("record_start", {"path": "/proc/none/skin.mcap"}, "cannot_write"),
-        ("record_start", {"path": "/tmp/a\0b"}, "cannot_write"),
-        ("record_start", {"path": "/proc/" + "x" * 300}, "cannot_write"),
+        ("record_start", {"path": "/tmp/.bashrc"}, "bad_argument"),
+        ("record_start", {"path": "/tmp/.mcap"}, "bad_argument"),
+        ("record_start", {"path": "/tmp/evil.desktop"}, "bad_argument"),
+        ("record_start", {"path": "/tmp/a\0b.mcap"}, "cannot_write"),
+        ("record_start", {"path": "/proc/" + "x" * 300 + ".mcap"}, "cannot_write"),
         ("record_stop", {}, "not_recording"),
     ],
 )
