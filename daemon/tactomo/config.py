@@ -71,7 +71,7 @@ MethodName = Annotated[str, AfterValidator(_method)]
 ProtocolName = Annotated[str, AfterValidator(_protocol)]
 DeviceId = Annotated[str, Field(min_length=1, max_length=64)]
 MetricsAddress = Annotated[str, AfterValidator(check_metrics_address)]
-BudgetMs = Annotated[float, Field(gt=0, le=10_000)]
+BudgetMs = Annotated[float, Field(ge=0.01, le=10_000)]
 
 
 class Curve(BaseModel, extra="forbid", frozen=True):

@@ -28,7 +28,7 @@ FLAG_ADVICE: Mapping[str, tuple[str, str]] = {
         "take everything off the skin and run `tactomo tare`; is it the right sensor?",
     ),
     "reference_disputed": (
-        "at the start something seemed to lie on the skin",
+        "at the start, or at the tare, something seemed to lie on the skin",
         "take everything off; if contacts are still shown then, run `tactomo tare`",
     ),
     "no_usable_scan": (

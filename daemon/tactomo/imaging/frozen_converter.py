@@ -2,6 +2,7 @@
 
 Noise makes every scan another one. Where the scans of a tare had noise, one that is the last one
 over again was not measured, however whole its packet: what it says of the skin is of another time.
+So it is where a channel never reads anything else than it did all through the tare.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from tactomo_models import Reference
+from tactomo_models.arrays import FloatArray
 from tactomo_protocol import Channel
 
 from tactomo.events import OnEvent
@@ -31,17 +33,16 @@ class FrozenConverters:
             for channel, scan in volts.items()
             if channel in self._last
             and np.array_equal(scan, self._last[channel])
-            and _is_noisy(reference, channel)
+            and _should_differ(reference, channel, scan)
         }
         self._last = self._last | volts
         for channel in sorted(repeats - self._frozen):
             self._on_event(
                 "converter_frozen",
                 "warning",
-                f"{channel} scans repeat bit for bit, though they had noise at the tare; maps go "
-                "on without them",
+                f"{channel} scans repeat bit for bit; maps go on without them",
                 "switch that channel's board off and on; if it stays so, its converter or firmware "
-                "is at fault",
+                "is at fault; then `tactomo tare`, if it was frozen at the tare",
             )
         for channel in sorted((self._frozen - repeats) & volts.keys()):
             self._on_event("converter_back", "info", f"{channel} scans are measured again")
@@ -49,11 +50,15 @@ class FrozenConverters:
         return {channel: scan for channel, scan in volts.items() if channel not in repeats}
 
 
-def _is_noisy(reference: Reference | None, channel: Channel) -> bool:
-    """Whether scans at rest differed, in most of their voltages."""
+def _should_differ(reference: Reference | None, channel: Channel, scan: FloatArray) -> bool:
+    """Whether scans at rest differed in most voltages, or are still the tare's, none of which did.
+
+    Where a tare's did not, and later ones do, it may be a source without noise.
+    """
+    if reference is None or not reference.is_noise_measured:
+        return False
     noise: Any = getattr(reference, f"{channel}_noise", None)
-    return (
-        reference is not None
-        and reference.is_noise_measured
-        and (noise is not None and float(np.median(noise)) > 0)
-    )
+    if noise is None:
+        return False
+    is_noisy = float(np.median(noise)) > 0 and bool(np.any(noise > 1e-12 * np.abs(scan)))
+    return is_noisy or np.allclose(scan, getattr(reference, channel), rtol=1e-12, atol=0)

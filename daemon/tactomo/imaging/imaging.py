@@ -37,7 +37,7 @@ from tactomo.imaging.frozen_converter import FrozenConverters
 from tactomo.imaging.kept_reference import KeptReference, KnownSkin
 from tactomo.imaging.method_in_force import Effort, MethodInForce
 from tactomo.imaging.processor_share import ProcessorShare
-from tactomo.imaging.tare import Taring
+from tactomo.imaging.tare import Taring, is_at_rest
 from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording import calibration_text
 from tactomo.scans import DualScan, Mark, Timing, Volts
@@ -101,6 +101,8 @@ class Imaging:
         self._kept = kept
         self._is_disputed = False  # the skin at the start was not as the reference in force has it
         self._is_unchecked = False  # what lay on it when the reference in force was taken
+        # the one before a tare under contacts, and when it was taken: at rest by it is at rest
+        self._before: KnownSkin | None = None
         self._recorder = recorder
         self._publisher = publisher
         self._on_event = on_event
@@ -137,9 +139,12 @@ class Imaging:
         else:
             self._note_reference(self._tracker.begin(reference, sheets))
 
-    def _take(self, reference: Reference, sheets: Sheets | None, is_asked: bool) -> bool:
+    def _take(
+        self, reference: Reference, sheets: Sheets | None, is_asked: bool, contacts: int
+    ) -> bool:
         """Use a reference that was taken; at the start only if nothing lies on the skin.
 
+        One that was taken while contacts were shown is disputed, and not kept for the next start.
         Returns whether it is in force.
         """
         known = None if is_asked or self.reference is not None else self._known()
@@ -157,11 +162,27 @@ class Imaging:
                 )
         self._is_disputed = False
         is_first = not is_asked and self.reference is None
-        self._is_unchecked = is_first and self._kept is not None and self._kept.is_unreadable
+        self._is_unchecked = contacts > 0 or (
+            is_first and self._kept is not None and self._kept.is_unreadable
+        )
+        self._before = self._known_before() if contacts else None
         self.use_reference(reference, time.time_ns(), sheets)
-        if self._kept is not None and not self._is_unchecked:
+        if contacts:
+            self._on_event(
+                "reference_disputed",
+                "warning",
+                f"the reference was taken while {contacts} contact(s) were shown",
+                "take everything off the skin; if contacts are still shown then: `tactomo tare`",
+            )
+        elif self._kept is not None and not self._is_unchecked:
             self._kept.keep(reference, self.calibration.device_ids)
         return True
+
+    def _known_before(self) -> KnownSkin | None:
+        """The newest reference that was taken while nothing was shown."""
+        if self._before is not None or self.reference is None:
+            return self._before
+        return KnownSkin(self.reference.taken_as_it_is(), self.reference_realtime_ns)
 
     def _fall_back(self, why: str) -> bool:
         """Use the reference that is kept, since none can be taken; returns whether there is one."""
@@ -221,6 +242,8 @@ class Imaging:
         volts = {scan.channel: scan.volts for scan in dual.scans}
         self._publish_scan(dual, timing, volts)
         volts = self._frozen.without(volts, self.reference)
+        if self._before is not None and is_at_rest(volts, self._before.reference):
+            self._restore(self._before)
         clipped = [scan.channel for scan in dual.scans if scan.flags & ScanFlag.SATURATED]
         frame = self._reconstruct(volts, clipped, is_exact=mark is not None)
         if frame is not None and self._is_disputed:
@@ -265,6 +288,17 @@ class Imaging:
             self._on_event("reference_confirmed", "info", detail)
             return frame
         return replace(frame, flags=frame.flags | Flag.REFERENCE_DISPUTED)
+
+    def _restore(self, known: KnownSkin) -> None:
+        """Settle the dispute about a tare: the skin is at rest by the reference before it."""
+        self._before, self._is_unchecked = None, False
+        sheets = self._reconstructor.find_sheets(known.reference)
+        self.use_reference(known.reference, known.realtime_ns, sheets)
+        self._on_event(
+            "reference_confirmed",
+            "info",
+            "the skin is at rest by the reference before the tare, which is used again",
+        )
 
     def _obey(self, mark: Mark) -> None:
         """Put in force what was in force when this dual scan was recorded."""

@@ -3,7 +3,8 @@
 `Taring` is the pipeline's: it begins tares, gives them up and answers who asked. `Tare` is one of
 them. Somebody who presses meanwhile would be averaged into the reference, so scans that move while
 they are collected are refused. A press that lasts and stays the same cannot be told from a bare
-skin whose reference is out of date: whoever tares is told how many contacts were shown meanwhile.
+skin whose reference is out of date: whoever tares is told how many contacts were shown meanwhile,
+and such a reference is disputed.
 
 A reference tells how the sheets were made, which takes about a second to find. That is done beside
 the frames, which are made against the reference before until then.
@@ -12,7 +13,6 @@ the frames, which are made against the reference before until then.
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, Final, NamedTuple
@@ -45,7 +45,6 @@ class _Taken(NamedTuple):
 
     tare: Tare
     reference: Reference
-    contacts: int
     sheets: Future[Sheets | None]
 
 
@@ -60,8 +59,9 @@ class Taring:
         frame_rate: how often frames come.
         find_sheets: finds how the sheets of a reference were made; for any thread.
         waits: whether frames wait for that, so that each is made against what was taken before.
-        put_in_force: called with a reference that was taken, its sheets and whether somebody asked
-            for it; returns whether it is in force, and not an older one.
+        put_in_force: called with a reference that was taken, its sheets, whether somebody asked
+            for it, and how many contacts were shown meanwhile; returns whether it is in force, and
+            not an older one.
         fall_back: called with why none was taken while there is none; returns whether an older
             one is in force now.
         on_event: told what a tare became.
@@ -74,7 +74,7 @@ class Taring:
         frame_rate: Rate,
         find_sheets: Callable[[Reference], Sheets | None],
         waits: bool,
-        put_in_force: Callable[[Reference, Sheets | None, bool], bool],
+        put_in_force: Callable[[Reference, Sheets | None, bool, int], bool],
         fall_back: Callable[[str], bool],
         on_event: OnEvent,
     ) -> None:
@@ -89,13 +89,13 @@ class Taring:
         self._has_reference = False
         self._tare: Tare | None = None
         self._deadline_s = 0.0
-        self._taken: deque[_Taken] = deque()
+        self._taken: _Taken | None = None  # the next tare waits for it, whoever asks meanwhile
         self._finder = ThreadPoolExecutor(1, "sheets")  # the thread starts with the first tare
 
     @property
     def is_on(self) -> bool:
         """Whether a reference is being taken; for any thread."""
-        return self._tare is not None or bool(self._taken)
+        return self._tare is not None or self._taken is not None
 
     def close(self) -> None:
         """Find no more; for any thread, once the pipeline has ended."""
@@ -114,8 +114,12 @@ class Taring:
 
     def check(self) -> None:
         """Put in force what is ready; give up a tare on command for which nothing comes."""
-        while self._taken and (self._waits or self._taken[0].sheets.done()):
-            self._finish(self._taken.popleft())
+        if (taken := self._taken) is not None:
+            self._put_off()
+            if not self._waits and not taken.sheets.done():
+                return
+            self._taken = None
+            self._finish(taken)
         if (tare := self._tare) and tare.answers and time.monotonic() > self._deadline_s:
             self._tare = None
             self._refuse(
@@ -137,9 +141,10 @@ class Taring:
         """
         tare = self._tare
         needed = {channel for channel in self._channels if channel not in lost}
-        if tare is None or not needed or not needed <= volts.keys():
+        if tare is None or self._taken or not needed or not needed <= volts.keys():
             return
         self._put_off()
+        tare.contacts = max(tare.contacts, contacts)
         if not tare.add(volts, needed):
             return
         self._tare = None
@@ -152,13 +157,14 @@ class Taring:
             self._refuse(tare, _refusal_of(error))
             return
         sheets = self._finder.submit(self._find_sheets, reference)
-        self._taken.append(_Taken(tare, reference, contacts, sheets))
+        self._taken = _Taken(tare, reference, sheets)
         self.check()
 
     def _finish(self, taken: _Taken) -> None:
-        tare, reference, contacts, sheets = taken
+        tare, reference, sheets = taken
+        contacts = tare.contacts
         try:
-            is_new = self._put_in_force(reference, sheets.result(), bool(tare.answers))
+            is_new = self._put_in_force(reference, sheets.result(), bool(tare.answers), contacts)
         except ModelError as error:
             self._refuse(tare, _refusal_of(error))
             return
@@ -194,6 +200,7 @@ class Tare:
 
     def __init__(self, scans: int) -> None:
         self.answers: list[Future[Mapping[str, Any]]] = []
+        self.contacts = 0  # how many were shown meanwhile, at most
         self._wanted = scans
         self._volts: dict[Channel, list[Volts]] = {}
 
@@ -222,6 +229,20 @@ class Tare:
         return Reference.from_scans(stacks.get(Channel.MAGNITUDE), stacks.get(Channel.STRUCTURE))
 
 
+def is_at_rest(volts: Mapping[Channel, Volts], reference: Reference) -> bool:
+    """Whether scans (M,) are as the reference has them, but for noise and what rests at that."""
+    for channel, scan in volts.items():
+        rest = getattr(reference, channel)
+        if rest is None:
+            return False
+        noise = getattr(reference, f"{channel}_noise")
+        size = _size(rest)
+        allowed = MOVEMENT_LIMIT + (0.0 if noise is None else _rms(2 * noise / size))
+        if not _rms((scan - rest) / size) <= allowed:
+            return False
+    return bool(volts)
+
+
 def movement_and_noise(scans: Volts) -> tuple[float, float]:
     """Tell slow movement from noise in scans (n, M) of one channel, n at least 2.
 
@@ -229,8 +250,17 @@ def movement_and_noise(scans: Volts) -> tuple[float, float]:
     trend (von Neumann); what the variance has beyond it is movement. Both are relative to the
     voltages, rms over the measurements.
     """
-    size = np.abs(scans.mean(axis=0))
-    relative = scans / np.maximum(size, max(size.max() * SMALLEST_SHARE, np.finfo(float).tiny))
+    relative = scans / _size(scans.mean(axis=0))
     noise = 0.5 * np.mean(np.diff(relative, axis=0) ** 2)
     movement = np.mean(relative.var(axis=0, ddof=1)) - noise
     return float(np.sqrt(max(movement, 0.0))), float(np.sqrt(noise))
+
+
+def _size(volts: Volts) -> Volts:
+    """What changes (M,) are relative to: small voltages do not count for more than larger ones."""
+    size = np.abs(volts)
+    return np.maximum(size, max(size.max() * SMALLEST_SHARE, np.finfo(float).tiny))
+
+
+def _rms(values: Volts) -> float:
+    return float(np.sqrt(np.mean(values**2)))

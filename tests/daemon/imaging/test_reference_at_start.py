@@ -67,20 +67,35 @@ def test_contacts_held_down_through_a_restart_are_still_there(begin: Any) -> Non
 
 
 @pytest.mark.slow
-def test_a_tare_on_command_overrides_the_reference_that_was_kept(begin: Any) -> None:
+def test_two_tares_on_command_override_the_reference_that_was_kept(begin: Any) -> None:
     once(begin)
+    b = begin(volts(True))
+    b.listener.event("reference_disputed")
+    for is_disputed in (True, False):  # contacts are shown during the first, none during the other
+        with ThreadPoolExecutor(1) as pool:
+            answer = pool.submit(b.ask, "tare")
+            while not answer.done():
+                b.step(volts=volts(True))
+        frame = b.step(volts=volts(True))
+        assert frame["contacts"] == []
+        assert ("reference_disputed" in frame["flags"]) == is_disputed
+    b.daemon.stop()
+    again = begin(volts(True))  # it is what the sensor was last known as
+    again.listener.event("tared")
+
+
+@pytest.mark.slow
+def test_what_a_tare_took_under_contacts_is_not_kept(begin: Any) -> None:
+    once(begin)
+    kept = reference_path("left").read_bytes()
     b = begin(volts(True))
     b.listener.event("reference_disputed")
     with ThreadPoolExecutor(1) as pool:
         answer = pool.submit(b.ask, "tare")
         while not answer.done():
             b.step(volts=volts(True))
-    frame = b.step(volts=volts(True))
-    assert frame["contacts"] == []
-    assert "reference_disputed" not in frame["flags"]
     b.daemon.stop()
-    again = begin(volts(True))  # it is what the sensor was last known as
-    again.listener.event("tared")
+    assert reference_path("left").read_bytes() == kept
 
 
 @pytest.mark.slow

@@ -61,3 +61,74 @@ def test_a_daemon_stops_while_it_finds_out_how_sheets_are(
     stopping.join(60)
     assert not stopping.is_alive()
     assert not [t for t in threading.enumerate() if t.name.startswith("sheets")]
+
+
+def tare_under(b: Any, load: float, asked: int = 1) -> list[dict[str, Any]]:
+    """Ask for tares and send scans of a load until all are answered."""
+    with ThreadPoolExecutor(asked) as terminals:
+        answers = [terminals.submit(b.ask, "tare") for _ in range(asked)]
+        b.until(lambda: b.daemon._imaging.taring.is_on)
+        while not all(answer.done() for answer in answers):
+            b.step(load)
+        return [answer.result() for answer in answers]
+
+
+def test_a_tare_under_a_press_is_disputed_until_the_skin_is_at_rest(
+    bench: Callable[..., Any],
+) -> None:
+    b = bench()
+    b.tare()
+    assert b.step(0.2)["flags"] == []
+    [answer] = tare_under(b, 0.2)
+    assert answer["contacts"] == 1
+    told = b.listener.event("reference_disputed")
+    assert "contact" in told["detail"]
+    assert "tactomo tare" in told["next_step"]
+    for _ in range(3):
+        assert b.step(0.2)["flags"] == ["reference_disputed"]
+    released = b.step(0.0)
+    b.listener.event("reference_confirmed")
+    assert released["flags"] == []
+    assert pressed(b.step(0.2)) > 0.09, "measured against the skin at rest again"
+
+
+def test_a_second_tare_with_nothing_shown_settles_it(bench: Callable[..., Any]) -> None:
+    b = bench()
+    b.tare()
+    b.step(0.2)
+    tare_under(b, 0.2)
+    b.until(lambda: abs(pressed(b.step(0.2))) < 0.01)
+    tare_under(b, 0.2)
+    assert b.step(0.2)["flags"] == []
+
+
+def test_who_asks_while_a_reference_is_found_out_about_shares_the_next_one(
+    bench: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found: list[int] = []
+    understood = threading.Event()
+    understood.set()
+
+    def find(*_: object) -> None:
+        found.append(1)
+        understood.wait(60)
+
+    monkeypatch.setattr(Memory, "find_sheets", find)
+    b = bench()
+    b.tare()
+    understood.clear()
+    first = threading.Thread(target=b.ask, args=("tare",))
+    first.start()
+    b.until(lambda: b.step() and len(found) == 2)
+    with ThreadPoolExecutor(6) as terminals:
+        answers = []
+        for _ in range(6):  # one after the other, with scans enough for a reference each
+            answers.append(terminals.submit(b.ask, "tare"))
+            for _ in range(5 * b.daemon.config.tare_scans):
+                b.step()
+        understood.set()
+        b.until(lambda: b.step() and all(answer.done() for answer in answers))
+        assert {answer.result()["scans"] for answer in answers} == {3}
+    first.join()
+    assert len(found) <= 4
+    b.until(lambda: b.ask("status")["state"] == "running")

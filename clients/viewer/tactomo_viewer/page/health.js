@@ -9,7 +9,7 @@ const FLAGS = {
   structure_missing: ["Structure channel missing", "No scans of the structure channel: shapes come from the magnitude channel alone."],
   no_reference: ["No reference", "Not tared yet: press Tare while nothing touches the skin."],
   reference_mismatch: ["Reference doubtful", "The reference does not look like this sensor unloaded, or something was on the skin then: tare while nothing touches it. Is it the right sensor, its electrodes in order?"],
-  reference_disputed: ["Reference of before", "At the start something seemed to lie on the skin, or nobody could tell. Take everything off, then tare."],
+  reference_disputed: ["Reference of before", "At the start, or at the tare, something seemed to lie on the skin, or nobody could tell. Take everything off, then tare."],
   no_usable_scan: ["Nothing measured", "No channel has a scan that can be used: that no contact is shown says nothing. Check the cables and leads."],
   misfit_high: ["Misfit high", "The model does not explain the data. Has the reference aged? Tare. Is a wire loose?"],
   not_converged: ["Not converged", "The reconstruction ran out of its time; this map is the best so far."],
