@@ -494,7 +494,9 @@ def load_model(description: SensorDescription) -> Artifact:
     """Return the artifact of a sensor, built if need be; log and notify that this takes a while."""
     log.info("loading", sensor_model=description.name)
     notify(f"STATUS=loading the model of {description.name}, which is built the first time")
-    return load_or_build_artifact(description)
+    return load_or_build_artifact(
+        description, progress=lambda step: log.info("building", detail=step)
+    )
 
 
 def _make_reconstructor(

@@ -21,7 +21,7 @@ from platformdirs import user_data_path
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from tactomo_models.archive import write_whole
-from tactomo_models.calibration.curve import Fit, Reading, fit_curve
+from tactomo_models.calibration.curve import MAX_KPA, MAX_MAGNITUDE, Fit, Reading, fit_curve
 from tactomo_models.errors import CalibrationError, explain
 from tactomo_models.foreign_file import MAX_TEXT_BYTES, read_regular
 from tactomo_models.scene.pressure import PressureCurve
@@ -117,8 +117,14 @@ class PressureCalibration(BaseModel, extra="forbid", frozen=True, allow_inf_nan=
             raise ValueError("magnitude, pressure_kpa and sigma_kpa differ in length")
         if np.any(np.diff(self.magnitude) <= 0) or np.any(np.diff(self.pressure_kpa) < 0):
             raise ValueError("magnitude and pressure_kpa must rise")
-        if min(self.sigma_kpa) < 0:
-            raise ValueError("sigma_kpa must not be negative")
+        for name, most in (
+            ("magnitude", 2 * MAX_MAGNITUDE),
+            ("pressure_kpa", MAX_KPA),
+            ("sigma_kpa", MAX_KPA),
+        ):
+            values = getattr(self, name)
+            if not 0 <= min(values) <= max(values) <= most:
+                raise ValueError(f"{name} must be between 0 and {most:g}, as any skin's are")
         return self
 
     @classmethod

@@ -1,13 +1,15 @@
 """Built artifacts: what is computed once for a sensor and kept in a file.
 
 An artifact holds the solved bare sheet, its Jacobian and the Tikhonov matrix, with the hash of
-the description it was built for. One that was built for another sensor is refused.
+the description it was built for and of its own content. One that was built for another sensor, or
+holds other numbers than were built, is refused.
 """
 
 from __future__ import annotations
 
+import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,7 +29,7 @@ from tactomo_models.sensor.description import SensorDescription
 
 Progress = Callable[[str], None]
 
-FORMAT = 4  # of the file; rises when what is in it changes
+FORMAT = 5  # of the file; rises when what is in it changes
 NOMINAL_SNR_DB = 60.0  # of the voltages' root mean square; until a tare has seen the real noise
 MODEL_ERROR = 0.003  # relative error of any voltage that no noise accounts for
 GREEN_DTYPE = np.float32  # seven digits of what is known to three
@@ -132,12 +134,23 @@ def save_artifact(artifact: Artifact, path: Path) -> None:
     }
     for name in _BARE_ARRAYS:
         arrays[name] = getattr(artifact.bare, name)
+    arrays["content_sha256"] = _sha256_of(arrays)
     try:
         write_whole(path, lambda file: np.savez(file, **arrays))
     except OSError as error:
         raise ArtifactError(
             f"cannot write {path}: {error.strerror}; free some space or name another path"
         ) from error
+
+
+def _sha256_of(arrays: Mapping[str, object]) -> str:
+    """Hash of every array's name, type, shape and numbers, but for the hash itself."""
+    content = hashlib.sha256()
+    for name in sorted(arrays.keys() - {"content_sha256"}):
+        array = np.ascontiguousarray(arrays[name])
+        content.update(f"{name} {array.dtype.str} {array.shape} ".encode())
+        content.update(array.data)
+    return content.hexdigest()
 
 
 _BARE_ARRAYS = ("points", "triangles", "pressable", "support", "potentials", "transfer")
@@ -162,6 +175,8 @@ def load_artifact(path: Path, description: SensorDescription) -> Artifact:
                 f"{path} was built for sensor {str(arrays['sensor'])!r} ({sha256[:12]}), not for "
                 f"{description.name!r} ({description.sha256[:12]}); {rebuild}"
             )
+        if str(arrays["content_sha256"]) != _sha256_of(arrays):
+            raise ValueError("its numbers are not those that were built")
         # Presses are solved on the sheets as they are: of the even one's 14 MB little is read.
         arrays["greens"] = map_array(path, "greens")
         return _from_arrays(arrays, description)
@@ -202,7 +217,8 @@ def load_or_build_artifact(
     Args:
         description: the sensor.
         path: the file; a place in the user's cache if None.
-        progress: called with a short text at the start of each step of a build.
+        progress: called with a short text at the start of each step of a build, and before it with
+            why a file in the cache is not used.
 
     Raises:
         ArtifactError: the file that was named is damaged or built for another sensor, or cannot
@@ -211,9 +227,11 @@ def load_or_build_artifact(
     target = path or default_path(description)
     try:
         return load_artifact(target, description)
-    except ArtifactError:
+    except ArtifactError as error:
         if path is not None and path.exists():
             raise  # what was asked for by name is not replaced; what is in the cache is
+        if progress is not None and target.exists():
+            progress(f"{error}: it is built anew")
     artifact = build_artifact(description, progress)
     try:
         save_artifact(artifact, target)

@@ -232,12 +232,20 @@ def test_one_beside_the_description_is_found_too(
         ("sigma_kpa", [1.0, 2.0], "differ in length"),
         ("magnitude", None, "magnitude"),
         ("extra", 1, "unknown key extra"),
+        ("pressure_kpa", "negative", "pressure_kpa must be between 0"),
+        ("pressure_kpa", "huge", "pressure_kpa must be between 0"),
+        ("sigma_kpa", "huge", "sigma_kpa must be between 0"),
     ],
 )
 def test_a_damaged_file_is_refused(
     made: PressureCalibration, tmp_path: Path, key: str, value: object, said: str
 ) -> None:
     path = tmp_path / "left.pressure.json"
+    numbers = list(getattr(made, key, ()) if isinstance(value, str) else ())
+    if value == "negative":
+        value = [number - 300 for number in numbers]
+    elif value == "huge":
+        value = [*numbers[:-1], 1e308]
     path.write_text(json.dumps({**made.model_dump(), key: value}))
     with pytest.raises(CalibrationError, match=said):
         read_calibration(path)

@@ -98,6 +98,24 @@ def test_a_header_that_says_fewer_numbers_is_refused(
         load_artifact(file, small)
 
 
+@pytest.mark.parametrize("name", ["triangles", "points", "jacobian", "greens"])
+def test_other_numbers_than_were_built_are_told_and_built_anew(
+    built: Artifact, small: SensorDescription, name: str
+) -> None:
+    file = default_path(small)
+    save_artifact(built, file)
+    with np.load(file) as stored:
+        arrays = dict(stored)
+    np.savez(file, **{**arrays, name: 5 * arrays[name]})
+    told: list[str] = []
+    again = load_or_build_artifact(small, progress=told.append)
+    assert "not those that were built" in told[0]
+    assert "built anew" in told[0]
+    np.testing.assert_array_equal(again.bare.points, built.bare.points)
+    np.testing.assert_array_equal(again.bare.triangles, built.bare.triangles)
+    load_artifact(file, small)
+
+
 @given(st.data())
 def test_a_flipped_bit_is_refused_or_harmless(
     built: Artifact,
