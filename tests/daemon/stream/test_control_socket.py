@@ -170,6 +170,7 @@ def test_a_frame_that_takes_long_holds_up_no_command(
         ("set_tier", {"tier": "best"}, "bad_argument"),
         ("set_tier", {}, "bad_argument"),
         ("set_budget", {"budget_ms": -1}, "bad_argument"),
+        ("set_budget", {"budget_ms": 1e-300}, "bad_argument"),
         ("set_budget", {"budget_ms": "fast"}, "bad_argument"),
         ("record_start", {"path": 7}, "bad_argument"),
         ("record_start", {"path": ""}, "bad_argument"),
