@@ -177,8 +177,8 @@ def tiny_messages(path: Path) -> None:
 
 
 def endless_message(path: Path) -> None:
-    """Chunks of one message of 60 MB of a port each."""
-    data = bytes(60 * MEGABYTE)
+    """Chunks of one message of 30 MB of a port each."""
+    data = bytes(30 * MEGABYTE)
     message = struct.pack("<BQHIQQ", Opcode.MESSAGE, 22 + len(data), 6, 0, 1, 1) + data
     path.write_bytes(_begun(path) + 4 * _chunk(message))
 
@@ -193,8 +193,8 @@ def nested_chunks(path: Path) -> None:
     """Chunks that unpack, one inside the other, each with a wrong checksum."""
     data = b""
     for _ in range(8_000):
-        head = struct.pack("<BQQQQI", 6, 0, 0, 0, 60 * MEGABYTE, 1) + b"\x04\0\0\0zstd"
-        frame = b"\x28\xb5\x2f\xfd\xa0" + struct.pack("<I", 60 * MEGABYTE)
+        head = struct.pack("<BQQQQI", 6, 0, 0, 0, 30 * MEGABYTE, 1) + b"\x04\0\0\0zstd"
+        frame = b"\x28\xb5\x2f\xfd\xa0" + struct.pack("<I", 30 * MEGABYTE)
         frame += struct.pack("<I", (MEGABYTE << 3) | 2)[:3] + b"\0"
         data += head + struct.pack("<Q", 4 * MEGABYTE) + frame
     path.write_bytes(_begun(path) + data)

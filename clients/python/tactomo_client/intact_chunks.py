@@ -21,7 +21,7 @@ import zstandard
 from mcap.records import Channel, Chunk, McapRecord, Message
 from mcap.stream_reader import breakup_chunk
 
-MAX_RECORD_BYTES: Final = 64 << 20  #: of a record, and of what a chunk is unpacked to
+MAX_RECORD_BYTES: Final = 32 << 20  #: of a record, and of what a chunk is unpacked to
 _MARK: Final = b"\x04\0\0\0zstd"
 _BEFORE_MARK: Final = 37
 _HEADER: Final = struct.Struct("<BQQQQI8sQ")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import operator
+import re
 import struct
 from dataclasses import dataclass
 from zlib import crc32
@@ -128,7 +129,7 @@ class Decoder:
 
     def feed(self, data: bytes | bytearray | memoryview) -> list[Packet]:
         """The packets completed by `data`, in order; any bytes in any chunking, never raises."""
-        data = bytes(data)
+        data = re.sub(b"\0\0+", b"\0", data)  # millions of delimiters are one
         packets: list[Packet] = []
         start = 0
         while (end := data.find(0, start)) >= 0:
