@@ -120,7 +120,7 @@ def as_one(contacts: FloatArray) -> FloatArray:
     one[[X, Y]] = centre / UNIT_M
     one[SIZE] = np.log(long * short) / 2
     one[[E1, E2]] = stretch * np.cos(2 * angle), stretch * np.sin(2 * angle)
-    one[PEAK] = contacts[:, PEAK].max()
+    one[PEAK] = min(area @ contacts[:, PEAK] / (long * short), contacts[:, PEAK].max())
     return one
 
 

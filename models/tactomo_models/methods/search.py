@@ -283,11 +283,19 @@ class Search:
         left = self._without(before, frame)
         starts = [belief.account, self._with_missing(belief.account, frame, far=True)]
         starts += self._pressed_harder(before, frame)
+        starts += self._all_as_one(before, frame)
         if left is not before:
             starts.append(self._with_missing(left, frame, far=True))
         best = self._best([*starts, *self._proposed(frame)], frame)
         begun = self._begun(best, frame, "warm start")
         return replace(begun, challenged=best.chi_squared)
+
+    def _all_as_one(self, account: Account, frame: Frame) -> list[Account]:
+        """What the contacts are parts of, where a large one is taken for several."""
+        if account.family.count < 2:
+            return []
+        one = self._account(as_one(account.contacts)[None], account.fitted.log_ratio, frame)
+        return [one] if one else []
 
     def _pressed_harder(self, account: Account, frame: Frame) -> list[Account]:
         """The same contacts, none of them below the graded sheet's onset, if any was.
@@ -359,6 +367,8 @@ class Search:
         specks = account.contacts[:, SIZE] <= self.field.size_limits[0]
         if specks.any():
             return self._without_specks(belief, specks, frame)
+        if not belief.is_parted:
+            return self._joined(belief, frame)
         for each in PASSES if belief.rounds < ROUNDS else ():
             for k, mine in enumerate(belief.rivals):
                 kinds = [
@@ -376,8 +386,6 @@ class Search:
             if born is not account:
                 return self._grown(belief, born)
             return replace(belief, lacks_none=True)
-        if not belief.is_parted:
-            return self._joined(belief, frame)
         precision = self.fit.prior(account.fitted)[0]
         return replace(
             belief,
@@ -484,17 +492,20 @@ class Search:
             rounds=belief.rounds + 1,
             lacks_none=False,
             lifts_none=False,
-            is_parted=False,
             moved=np.zeros((0, 2)),
         )
 
     def _joined(self, belief: Belief, frame: Frame) -> Belief:
         """The belief with contacts that touch as one, where that is likelier."""
         account = belief.account
-        for touching in _touching(account.contacts, self.field.half_width_m):
+        groups = [*_touching(account.contacts, self.field.half_width_m)]
+        every = [*range(account.family.count)]
+        if len(every) > 1 and every not in groups and not frame.likelihood.explains(account.chi_squared):
+            groups.insert(0, every)
+        for touching in groups:
             rest = np.delete(account.contacts, touching, axis=0)
             one = as_one(account.contacts[touching])
-            for kind in (Kind.EVEN, Kind.FALLING):
+            for kind in (Kind.EVEN, Kind.FALLING, Kind.ROUNDED):
                 each = np.vstack([rest, as_kind(one, kind)])
                 start = self._account(each, account.fitted.log_ratio, frame)
                 if start is None:
