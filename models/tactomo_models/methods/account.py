@@ -9,7 +9,7 @@ from functools import cached_property, partial
 import numpy as np
 from tactomo_protocol import Channel
 
-from tactomo_models.arrays import FloatArray
+from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.methods.kinds import log_prior
 from tactomo_models.scene.evidence import Likelihood, log_occam
 from tactomo_models.scene.field_fit import (
@@ -106,14 +106,22 @@ def without_light_peaks(fitted: FittedField, jacobian: FloatArray) -> FloatArray
     """
     family = fitted.family
     assert isinstance(family, PressureField)
-    free = family.free[:, PEAK]
-    peaks = family.index[free, PEAK]
-    above = family.split(fitted.parameters)[free, PEAK] - family.onset
-    light = peaks[above * np.sqrt((jacobian[:, peaks] ** 2).sum(axis=0)) < CLEARLY]
+    light = family.index[hardly_pressed(fitted, jacobian), PEAK]
     if len(light):
         jacobian = jacobian.copy()
         jacobian[:, light] = 0.0
     return jacobian
+
+
+def hardly_pressed(fitted: FittedField, jacobian: FloatArray) -> BoolArray:
+    """Which contacts (K,) press no harder than the graded sheet's onset, as far as data tell."""
+    family = fitted.family
+    assert isinstance(family, PressureField)
+    hardly = family.free[:, PEAK].copy()
+    above = family.split(fitted.parameters)[hardly, PEAK] - family.onset
+    power = (jacobian[:, family.index[hardly, PEAK]] ** 2).sum(axis=0)
+    hardly[hardly] = above * np.sqrt(power) < CLEARLY
+    return np.asarray(hardly)
 
 
 def descended(

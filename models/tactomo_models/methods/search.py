@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import BoolArray, FloatArray
-from tactomo_models.methods.account import Account, Frame, account_of, descended
+from tactomo_models.methods.account import Account, Frame, account_of, descended, hardly_pressed
 from tactomo_models.methods.contact_search import ContactSearch
 from tactomo_models.methods.kinds import Kind, as_kind, as_one, kind_of
 from tactomo_models.methods.rivals import (
@@ -39,7 +39,7 @@ from tactomo_models.scene.field_fit import COLD_S, FieldFit, Measured
 from tactomo_models.scene.parameters import COLUMNS, E1, E2, PEAK, SIZE, UNIT_M, X, Y
 from tactomo_models.scene.pressure import CLEARLY
 from tactomo_models.scene.pressure_field import PressureField
-from tactomo_models.scene.sheet_response import GradedResponse
+from tactomo_models.scene.sheet_response import GradedResponse, SaturatingResponse
 
 MAX_CONTACTS = 12
 LIKELIER = (
@@ -291,7 +291,7 @@ class Search:
         return replace(begun, challenged=best.chi_squared)
 
     def _all_as_one(self, account: Account, frame: Frame) -> list[Account]:
-        """What the contacts are parts of, where a large one is taken for several."""
+        """What contacts may be parts of: a large one that comes lightly is taken for several."""
         if account.family.count < 2:
             return []
         one = self._account(as_one(account.contacts)[None], account.fitted.log_ratio, frame)
@@ -330,6 +330,30 @@ class Search:
         lifted = self._descended(start, frame, STEPS)
         return lifted if lifted.log_evidence > account.log_evidence else account
 
+    def _lightened(self, account: Account, frame: Frame) -> Account:
+        """Light contacts pressed less, at the ratio that is likely, where that is likelier.
+
+        A light press on a sheet that changes much when saturated, and a hard one on a sheet that
+        changes little, look alike. Where a sheet is saturated a peak has no slope, so that a fit
+        which came there stays.
+        """
+        response = self.fit.responses.get(Channel.STRUCTURE)
+        if not isinstance(response, SaturatingResponse) or not account.family.count:
+            return account
+        precision, offset = self.fit.prior(account.fitted)
+        is_likely = precision[-1] * offset[-1] ** 2 < 1
+        if is_likely or not hardly_pressed(account.fitted, account.jacobian).all():
+            return account
+        each, unit = account.contacts.copy(), self.field.unit_kpa
+        share = account.fitted.log_ratio / self.fit.likely
+        reached = share * response.saturation(unit * each[:, PEAK])[0]
+        each[:, PEAK] = response.pressure_at(reached) / unit
+        start = self._account(each, self.fit.likely, frame)
+        if start is None:
+            return account
+        lighter = self._descended(start, frame, STEPS)
+        return lighter if lighter.log_evidence > account.log_evidence else account
+
     def _without(self, account: Account, frame: Frame) -> Account:
         """The contacts that explain most: one after the other is left out while that helps."""
         while account.family.count > 0:
@@ -362,7 +386,7 @@ class Search:
         if not account.at_minimum:
             return replace(belief, account=self._descended(account, frame, STEPS))
         if not belief.lifts_none:
-            lifted = self._lifted(account, frame)
+            lifted = self._lifted(self._lightened(account, frame), frame)
             return replace(belief, account=lifted, lifts_none=lifted is account)
         specks = account.contacts[:, SIZE] <= self.field.size_limits[0]
         if specks.any():
@@ -498,11 +522,7 @@ class Search:
     def _joined(self, belief: Belief, frame: Frame) -> Belief:
         """The belief with contacts that touch as one, where that is likelier."""
         account = belief.account
-        groups = [*_touching(account.contacts, self.field.half_width_m)]
-        every = [*range(account.family.count)]
-        if len(every) > 1 and every not in groups and not frame.likelihood.explains(account.chi_squared):
-            groups.insert(0, every)
-        for touching in groups:
+        for touching in _touching(account.contacts, self.field.half_width_m):
             rest = np.delete(account.contacts, touching, axis=0)
             one = as_one(account.contacts[touching])
             for kind in (Kind.EVEN, Kind.FALLING, Kind.ROUNDED):

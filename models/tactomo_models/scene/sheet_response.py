@@ -136,6 +136,12 @@ class SaturatingResponse:
         piece = np.searchsorted(self.pressure_kpa[1:], pressure_kpa, side="right")
         return share, self._slopes[piece]
 
+    def pressure_at(self, saturation: FloatArray) -> FloatArray:
+        """Least pressure, kPa, at which a share of the full change is reached; of its shape."""
+        if len(self.share) == 0:
+            return np.zeros_like(saturation)
+        return np.interp(saturation, self.share, self.pressure_kpa)
+
     def conductivity(
         self, share: FloatArray, pressure_kpa: FloatArray, log_ratio: float
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
