@@ -22,6 +22,9 @@ each press, by hand.
 from __future__ import annotations
 
 import csv
+import io
+import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, get_args
@@ -218,12 +221,12 @@ class _Table:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        lines = _lines(path)
-        delimiter = max(",;\t", key=lines[0][1].count)
-        self.lines = [number for number, _ in lines[1:]]  # the number of each row's line
+        self.lines: list[int] = []  # the number of each row's line
         self.columns: list[str] = []  # their names
-        self._rows: list[dict[str, str]] = []
-        for number, line in lines:
+        cells_of: list[list[str]] = []  # each column
+        delimiter = ""
+        for number, line in _lines(path):
+            delimiter = delimiter or max(",;\t", key=line.count)
             try:
                 (cells,) = csv.reader([line], delimiter=delimiter, strict=True)
             except (csv.Error, ValueError) as error:
@@ -233,18 +236,25 @@ class _Table:
                     f"{path}, line {number} has {len(cells)} of {len(self.columns)} columns; "
                     "complete it, or leave it out"
                 )
-            cells = [cell.strip() for cell in cells]
             if self.columns:
-                self._rows.append(dict(zip(self.columns, cells, strict=False)))
+                self.lines.append(number)
+                for column, cell in zip(cells_of, cells, strict=False):
+                    column.append(sys.intern(cell.strip()))  # logs say the same again and again
             else:
-                self.columns = [cell.lower() for cell in cells]
-        self.unknown = np.full(len(self._rows), np.nan)  # NaN for each row
+                self.columns = [cell.strip().lower() for cell in cells]
+                cells_of = [[] for _ in cells]
+        if not self.lines:
+            raise CalibrationError(
+                f"{path} holds no readings; give a line of column names, and a line for each"
+            )
+        self._cells = dict(zip(self.columns, cells_of, strict=True))
+        self.unknown = np.full(len(self.lines), np.nan)  # NaN for each row
 
     def numbers(self, column: str, least: float = -MAX_NUMBER) -> FloatArray:
-        values = np.empty(len(self._rows))
-        for i, row in enumerate(self._rows):
+        values = np.empty(len(self.lines))
+        for i, cell in enumerate(self._cells[column]):
             try:
-                values[i] = float(row[column])
+                values[i] = float(cell)
             except (TypeError, ValueError):
                 raise self._bad(i, column, "is no number") from None
             if not least <= values[i] <= MAX_NUMBER:
@@ -274,25 +284,25 @@ class _Table:
             return self.numbers("area_mm2", least=1.0)
         if "diameter_mm" in self.columns:
             return np.pi / 4 * self.numbers("diameter_mm", least=1.0) ** 2
-        return None if area_mm2 is None else np.full(len(self._rows), area_mm2)
+        return None if area_mm2 is None else np.full(len(self.lines), area_mm2)
 
     def directions(self) -> tuple[Direction, ...]:
         if "direction" not in self.columns:
             return ()
-        for i, row in enumerate(self._rows):
-            if row["direction"] not in get_args(Direction):
+        for i, cell in enumerate(self._cells["direction"]):
+            if cell not in get_args(Direction):
                 raise self._bad(i, "direction", "is not up, down or unknown")
-        return tuple(row["direction"] for row in self._rows)  # type: ignore[misc]
+        return tuple(self._cells["direction"])  # type: ignore[arg-type]
 
     def _bad(self, i: int, column: str, why: str) -> CalibrationError:
-        value = self._rows[i][column]
+        value = self._cells[column][i]
         return CalibrationError(
             f"{self._path}, line {self.lines[i]}: {column} = {value!r} {why}; correct it, or "
             "leave the line out"
         )
 
 
-def _lines(path: Path) -> list[tuple[int, str]]:
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """The numbers and texts of the file's lines that are neither empty nor comments."""
     try:
         text = read_regular(path, MAX_BYTES).decode("utf-8-sig")
@@ -300,16 +310,9 @@ def _lines(path: Path) -> list[tuple[int, str]]:
         raise CalibrationError(f"cannot read {path}: {error.strerror}; give a CSV file") from error
     except UnicodeDecodeError as error:
         raise CalibrationError(f"{path} is not text; give a CSV file in UTF-8") from error
-    lines = [
-        (number, line)
-        for number, line in enumerate(text.splitlines(), start=1)
-        if line.strip() and not line.lstrip().startswith("#")
-    ]
-    if len(lines) < 2:
-        raise CalibrationError(
-            f"{path} holds no readings; give a line of column names, and a line for each"
-        )
-    return lines
+    for number, line in enumerate(io.StringIO(text, newline=None), start=1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            yield number, line.rstrip("\n")
 
 
 def _still_pieces(cell: LoadCell) -> list[IntArray]:

@@ -103,6 +103,7 @@ def _halves(even: FloatArray) -> FloatArray:
 def as_one(contacts: FloatArray) -> FloatArray:
     """One even ellipse (COLUMNS,) of the centre and moments of contacts (K, COLUMNS) and between.
 
+    It presses with their force, spread over its area, and no harder than any of them.
     Of an even ellipse with half axes a and b the second moments are a^2 / 4 and b^2 / 4, altogether
     exp(2 s) expm(2 E) / 4 with s and E of `pressure_field`.
     """
