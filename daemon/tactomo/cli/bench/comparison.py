@@ -34,7 +34,7 @@ def read_results(path: Path) -> Mapping[str, Any]:
     try:
         results = json.loads(read_regular(path, MAX_TEXT_BYTES))
         _by_scene(results)
-    except (OSError, ValueError, TypeError, KeyError) as error:
+    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
         raise TactomoError(
             f"cannot compare with {path}: {error}", "write one with: tactomo bench --json > FILE"
         ) from error
