@@ -415,6 +415,30 @@ def test_two_in_a_crowd_are_not_taken_for_one(stacked: Skin) -> None:
     assert belief.how == "still"
 
 
+PALM = contact(0.004, -0.002, 0.036, peak=0.06)  # 18 kPa
+PIECES = tuple(
+    contact(x, y, 0.012)
+    for x, y in ((-0.015, -0.02), (0.02, -0.018), (0.022, 0.016), (-0.014, 0.015))
+)
+
+
+@pytest.mark.parametrize("proposed", [(), PIECES], ids=["found", "proposed in pieces"])
+def test_a_palm_that_comes_lightly_is_one_contact_of_its_pressure(
+    stacked: Skin, proposed: tuple[FloatArray, ...]
+) -> None:
+    """And no sheet that changes little under a hard press, which would explain the data as well."""
+    search, lighter = Search(stacked.sensor.fit), PALM.copy()
+    lighter[PEAK] /= 2
+    belief = None
+    for palm in (lighter, PALM):
+        measured = stacked.measured(palm, noise=2e-4)
+        frame = Frame(measured, Budget(PLENTY_S), lambda: contacts(*proposed))
+        belief = search.advance(belief, frame)
+    assert_at(belief, PALM)
+    (one,) = belief.account.contacts
+    assert one[PEAK] == pytest.approx(PALM[PEAK], rel=0.5)
+
+
 @pytest.mark.slow
 def test_a_crowd_that_moves_shrinks_or_misses_a_sheet_is_followed(stacked: Skin) -> None:
     """What both sheets have found is kept on one, and by the sheets that come back."""
