@@ -58,8 +58,11 @@ class Auto(Fit):
 
     def _concluded(self, course: Course, measurement: Measurement) -> Estimate:
         own = super()._concluded(course, measurement)
-        if not self._has_network or not len(own.areas or ()):
-            return own  # where no contact explains anything, no network knows better
+        assert course.belief is not None
+        # Where every contact was tried and none explains anything, no network knows better.
+        found_none = course.belief.done and not len(own.areas or ())
+        if not self._has_network or found_none:
+            return own
         if own.misfit <= UNSURE_MISFIT and Flag.MISFIT_HIGH not in own.flags:
             return own
         # It has learnt scenes that no few contacts describe; but where data are left unexplained,

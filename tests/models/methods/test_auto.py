@@ -54,6 +54,20 @@ def test_a_cold_start_takes_fewer_solves_from_a_proposal(
     assert needed["auto"] < 0.8 * needed["fit"]
 
 
+@pytest.mark.parametrize("pressure_kpa", [6.0, 20.0, 180.0])
+def test_where_time_ends_before_any_contact_was_tried_the_network_stands_in(
+    paper: SensorDescription, methods: dict[str, Reconstructor], skin: Skin, pressure_kpa: float
+) -> None:
+    """What is proposed may begin further from the data than nothing does."""
+    made = methods["auto"]
+    made.budget_s = 1e-4
+    frame = made.reconstruct(**skin.scan(Press(0.02, -0.01, pressure_kpa, radius_m=0.02)))
+    assert frame.tier == "network"
+    assert frame.flags & Flag.MISFIT_HIGH
+    assert frame.structure is not None
+    assert frame.structure.max() > 0.3
+
+
 def test_what_a_field_explains_is_the_fields(
     paper: SensorDescription, methods: dict[str, Reconstructor], skin: Skin
 ) -> None:
