@@ -42,7 +42,7 @@ def config_file(folder: Path, text: str) -> Path:
         ("ports = ['a']\nbaud = 'fast'", "baud = 'fast'"),
         ("ports = ['a']\ntare_scans = 1", "greater than or equal to 2"),
         ("ports = ['a']\nsync_wait_ms = nan", "sync_wait_ms = nan"),
-        ("ports = ['a']\nbudget_ms = 0", "greater than 0"),
+        ("ports = ['a']\nbudget_ms = 0", "greater than or equal to 0.01"),
         ("ports = ['a']\nmethod = 'best'", "use one of: auto, tikhonov, "),
         ("ports = ['a']\nmethod = 'quiet'", "method = 'quiet'"),
         ("ports = ['a']\nname = 'left arm'", "letters, digits"),
