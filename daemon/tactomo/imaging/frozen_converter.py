@@ -2,7 +2,7 @@
 
 Noise makes every scan another one. Where the scans of a tare had noise, one that is the last one
 over again was not measured, however whole its packet: what it says of the skin is of another time.
-So it is where a channel never reads anything else than it did all through the tare.
+A channel that is frozen all through its first tare cannot be told from a source without noise.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class FrozenConverters:
                 "warning",
                 f"{channel} scans repeat bit for bit; maps go on without them",
                 "switch that channel's board off and on; if it stays so, its converter or firmware "
-                "is at fault; then `tactomo tare`, if it was frozen at the tare",
+                "is at fault",
             )
         for channel in sorted((self._frozen - repeats) & volts.keys()):
             self._on_event("converter_back", "info", f"{channel} scans are measured again")
@@ -51,14 +51,10 @@ class FrozenConverters:
 
 
 def _should_differ(reference: Reference | None, channel: Channel, scan: FloatArray) -> bool:
-    """Whether scans at rest differed in most voltages, or are still the tare's, none of which did.
-
-    Where a tare's did not, and later ones do, it may be a source without noise.
-    """
+    """Whether scans at rest differed in most voltages."""
     if reference is None or not reference.is_noise_measured:
         return False
     noise: Any = getattr(reference, f"{channel}_noise", None)
     if noise is None:
         return False
-    is_noisy = float(np.median(noise)) > 0 and bool(np.any(noise > 1e-12 * np.abs(scan)))
-    return is_noisy or np.allclose(scan, getattr(reference, channel), rtol=1e-12, atol=0)
+    return float(np.median(noise)) > 0 and bool(np.any(noise > 1e-12 * np.abs(scan)))

@@ -69,17 +69,17 @@ def test_a_channel_that_stays_out_is_lost_and_comes_back(bench: Start) -> None:
 
 
 def test_a_channel_that_comes_after_the_tare_says_that_it_has_no_reference(bench: Start) -> None:
-    b = bench(ports=2)
-    magnitude, structure = b.skin.lines
-    both = structure.hello
-    structure.hello = magnitude.hello
+    b = bench(ports=1)
+    (line,) = b.skin.lines
+    both = line.hello
+    line.hello = replace(both, channels=(Channel.MAGNITUDE,))
     b.skin.introduce()  # nobody announces the structure channel, so nobody waits for it
-    structure.hello = both
     b.until(lambda: all(port["device"] for port in b.ask("status")["ports"]))
     for _ in range(3):
         b.step(channels=(Channel.MAGNITUDE,))
     b.listener.event("tared")
-    structure.say(both)
+    line.hello = both
+    line.say(both)
     b.step(channels=(Channel.STRUCTURE, Channel.MAGNITUDE))
     assert b.listener.event("channel_back")["next_step"].startswith("tare")
 

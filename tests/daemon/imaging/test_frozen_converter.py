@@ -41,16 +41,3 @@ def test_a_frozen_channel_is_missing_and_told(bench: Start, frozen: tuple[Channe
     b.listener.event("converter_back")
     names = [event["name"] for event in b.listener.of("event")]
     assert names.count("converter_frozen") == len(frozen)
-
-
-def test_a_channel_that_was_frozen_at_the_first_tare_is_missing_and_told(bench: Start) -> None:
-    b = bench(ports=2, lossless=True)
-    b.skin.introduce()
-    for _ in range(b.daemon.config.tare_scans):
-        freeze(b, (Channel.MAGNITUDE,), 0.0)
-    b.listener.event("tared")
-    for _ in range(3):
-        assert "magnitude_missing" in freeze(b, (Channel.MAGNITUDE,), 0.1)["flags"]
-    told = b.listener.event("converter_frozen")
-    assert "magnitude" in told["detail"]
-    assert "tactomo tare" in told["next_step"]
