@@ -292,7 +292,7 @@ class Search:
 
     def _all_as_one(self, account: Account, frame: Frame) -> list[Account]:
         """What contacts may be parts of: a large one that comes lightly is taken for several."""
-        if account.family.count < 2:
+        if account.family.count < 2 or not _is_light(account):
             return []
         one = self._account(as_one(account.contacts)[None], account.fitted.log_ratio, frame)
         return [one] if one else []
@@ -338,11 +338,9 @@ class Search:
         which came there stays.
         """
         response = self.fit.responses.get(Channel.STRUCTURE)
-        if not isinstance(response, SaturatingResponse) or not account.family.count:
-            return account
         precision, offset = self.fit.prior(account.fitted)
         is_likely = precision[-1] * offset[-1] ** 2 < 1
-        if is_likely or not hardly_pressed(account.fitted, account.jacobian).all():
+        if not isinstance(response, SaturatingResponse) or is_likely or not _is_light(account):
             return account
         each, unit = account.contacts.copy(), self.field.unit_kpa
         share = account.fitted.log_ratio / self.fit.likely
@@ -391,7 +389,7 @@ class Search:
         specks = account.contacts[:, SIZE] <= self.field.size_limits[0]
         if specks.any():
             return self._without_specks(belief, specks, frame)
-        if not belief.is_parted:
+        if not belief.is_parted and _is_light(account):
             return self._joined(belief, frame)
         for each in PASSES if belief.rounds < ROUNDS else ():
             for k, mine in enumerate(belief.rivals):
@@ -410,6 +408,8 @@ class Search:
             if born is not account:
                 return self._grown(belief, born)
             return replace(belief, lacks_none=True)
+        if not belief.is_parted:
+            return self._joined(belief, frame)
         precision = self.fit.prior(account.fitted)[0]
         return replace(
             belief,
@@ -516,6 +516,7 @@ class Search:
             rounds=belief.rounds + 1,
             lacks_none=False,
             lifts_none=False,
+            is_parted=_is_light(changed),
             moved=np.zeros((0, 2)),
         )
 
@@ -604,6 +605,12 @@ class Search:
         self, account: Account, frame: Frame, steps: int, *, holds_ratio: bool = False
     ) -> Account:
         return descended(self.fit, account, frame, steps, holds_ratio=holds_ratio)
+
+
+def _is_light(account: Account) -> bool:
+    """Whether contacts are there, none of which the graded sheet tells to press."""
+    fitted = account.fitted
+    return account.family.count > 0 and bool(hardly_pressed(fitted, account.jacobian).all())
 
 
 def _touching(contacts: FloatArray, near_m: float) -> Iterator[list[int]]:

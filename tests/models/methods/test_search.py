@@ -427,13 +427,13 @@ def test_a_palm_that_comes_lightly_is_one_contact_of_its_pressure(
     stacked: Skin, proposed: tuple[FloatArray, ...]
 ) -> None:
     """And no sheet that changes little under a hard press, which would explain the data as well."""
-    search, lighter = Search(stacked.sensor.fit), PALM.copy()
+    lighter = PALM.copy()
     lighter[PEAK] /= 2
-    belief = None
-    for palm in (lighter, PALM):
-        measured = stacked.measured(palm, noise=2e-4)
-        frame = Frame(measured, Budget(PLENTY_S), lambda: contacts(*proposed))
-        belief = search.advance(belief, frame)
+    frames = (
+        Frame(stacked.measured(palm, noise=2e-4), Budget(PLENTY_S), lambda: contacts(*proposed))
+        for palm in (lighter, PALM)
+    )
+    belief = followed(Search(stacked.sensor.fit), frames)
     assert_at(belief, PALM)
     (one,) = belief.account.contacts
     assert one[PEAK] == pytest.approx(PALM[PEAK], rel=0.5)
