@@ -360,22 +360,18 @@ class PortReader(Worker):
         if hello == before and not self._is_doubled:
             return
         self.hello = hello
-        trouble, refused = self._why_refused(hello), self.refusal
-        self.refusal = "" if trouble is None else trouble.cause
+        refused, trouble = self.refusal, self._judge(hello)
         if hello == before and self.refusal == refused:
             return
-        if trouble is not None and self._allows("device_refused"):
-            self._on_event(
-                "device_refused",
-                "error",
-                f"{self.url}: {trouble.cause}; its scans are not used",
-                trouble.next_step,
-            )
-        elif trouble is None and hello == before and self._allows("device_speaks"):
-            self._on_event("device_speaks", "info", self.url)
+        if trouble is not None:
+            if self._allows("device_refused"):
+                why = f"{self.url}: {trouble.cause}; its scans are not used"
+                self._on_event("device_refused", "error", why, trouble.next_step)
+        elif hello == before:
+            if self._allows("device_speaks"):
+                self._on_event("device_speaks", "info", self.url)
         elif (
-            trouble is None
-            and before is not None
+            before is not None
             and before.device_id != hello.device_id
             and self._allows("device_changed")
         ):
@@ -389,6 +385,12 @@ class PortReader(Worker):
     def _allows(self, name: str) -> bool:
         """Whether this may be told now: a device may say another thing with each hello."""
         return self._limits.setdefault(name, RateLimit()).allows()
+
+    def _judge(self, hello: Hello) -> Trouble | None:
+        """Take note of whether a device's scans are used; return why not."""
+        trouble = self._why_refused(hello)
+        self.refusal = "" if trouble is None else trouble.cause
+        return trouble
 
     def _why_refused(self, hello: Hello) -> Trouble | None:
         """Why a device's scans are not used; where they are, its channels are this port's now."""
@@ -559,8 +561,7 @@ class PortReader(Worker):
             detail = f"{self.url}: {trouble.cause}"
             self._on_event("device_refused", "error", detail, trouble.next_step)
         elif self.hello is not None:
-            refused = self._why_refused(self.hello)
-            self.refusal = "" if refused is None else refused.cause
+            self._judge(self.hello)
             self._on_event("device_speaks", "info", self.url)
         else:
             self.refusal = ""

@@ -33,7 +33,7 @@ class FrozenConverters:
             for channel, scan in volts.items()
             if channel in self._last
             and np.array_equal(scan, self._last[channel])
-            and _should_differ(reference, channel, scan)
+            and _is_noisy(reference, channel, scan)
         }
         self._last = self._last | volts
         for channel in sorted(repeats - self._frozen):
@@ -50,11 +50,9 @@ class FrozenConverters:
         return {channel: scan for channel, scan in volts.items() if channel not in repeats}
 
 
-def _should_differ(reference: Reference | None, channel: Channel, scan: FloatArray) -> bool:
-    """Whether scans at rest differed in most voltages."""
-    if reference is None or not reference.is_noise_measured:
-        return False
+def _is_noisy(reference: Reference | None, channel: Channel, scan: FloatArray) -> bool:
+    """Whether scans at rest differed in most voltages, by more than a mean of equals rounds."""
     noise: Any = getattr(reference, f"{channel}_noise", None)
-    if noise is None:
+    if reference is None or not reference.is_noise_measured or noise is None:
         return False
     return float(np.median(noise)) > 0 and bool(np.any(noise > 1e-12 * np.abs(scan)))

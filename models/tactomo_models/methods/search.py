@@ -249,7 +249,6 @@ class Search:
         """The best of what is proposed, and of nothing."""
         frame.budget.left_s -= COLD_S
         nothing = self._account(np.zeros((0, COLUMNS)), self.fit.likely, frame)
-        assert nothing is not None
         starts = [nothing, *self._proposed(frame)]
         best = self._best(starts, frame)
         return self._begun(best, frame, "cold start" if best.family.count == 0 else "proposed")
@@ -264,9 +263,7 @@ class Search:
             if np.exp(2 * each[:, SIZE]).sum() > np.exp(2 * one[SIZE]) / 2:
                 starts.append(one[None])
         for start in starts:
-            account = self._account(start, self.fit.likely, frame)
-            if account is not None:
-                yield account
+            yield self._account(start, self.fit.likely, frame)
 
     def _best(self, starts: list[Account], frame: Frame) -> Account:
         """The likeliest of starts, after a few steps each; there is at least one."""
@@ -283,19 +280,15 @@ class Search:
         left = self._without(before, frame)
         starts = [belief.account, self._with_missing(belief.account, frame, far=True)]
         starts += self._pressed_harder(before, frame)
-        starts += self._all_as_one(before, frame)
+        if before.family.count > 1 and _is_light(before):
+            # A large contact that comes lightly is first taken for several.
+            one = as_one(before.contacts)[None]
+            starts.append(self._account(one, before.fitted.log_ratio, frame))
         if left is not before:
             starts.append(self._with_missing(left, frame, far=True))
         best = self._best([*starts, *self._proposed(frame)], frame)
         begun = self._begun(best, frame, "warm start")
         return replace(begun, challenged=best.chi_squared)
-
-    def _all_as_one(self, account: Account, frame: Frame) -> list[Account]:
-        """What contacts may be parts of: a large one that comes lightly is taken for several."""
-        if account.family.count < 2 or not _is_light(account):
-            return []
-        one = self._account(as_one(account.contacts)[None], account.fitted.log_ratio, frame)
-        return [one] if one else []
 
     def _pressed_harder(self, account: Account, frame: Frame) -> list[Account]:
         """The same contacts, none of them below the graded sheet's onset, if any was.
@@ -305,8 +298,7 @@ class Search:
         each = account.contacts.copy()
         light = account.family.light(account.fitted.parameters)
         each[light, PEAK] = self.field.typical_peak
-        harder = self._account(each, account.fitted.log_ratio, frame) if light.any() else None
-        return [harder] if harder else []
+        return [self._account(each, account.fitted.log_ratio, frame)] if light.any() else []
 
     def _lifted(self, account: Account, frame: Frame) -> Account:
         """Light contacts pressed as hard as the graded sheet says at its onset, where it does.
@@ -324,11 +316,8 @@ class Search:
             return account
         each = account.contacts.copy()
         each[light, PEAK] = self.field.onset + np.maximum(pull / power, 0.0)
-        start = self._account(each, account.fitted.log_ratio, frame)
-        if start is None:
-            return account
-        lifted = self._descended(start, frame, STEPS)
-        return lifted if lifted.log_evidence > account.log_evidence else account
+        lifted = self._account(each, account.fitted.log_ratio, frame)
+        return self._likelier(account, lifted, frame)
 
     def _lightened(self, account: Account, frame: Frame) -> Account:
         """Light contacts pressed less, at the ratio that is likely, where that is likelier.
@@ -346,11 +335,12 @@ class Search:
         share = account.fitted.log_ratio / self.fit.likely
         reached = share * response.saturation(unit * each[:, PEAK])[0]
         each[:, PEAK] = response.pressure_at(reached) / unit
-        start = self._account(each, self.fit.likely, frame)
-        if start is None:
-            return account
-        lighter = self._descended(start, frame, STEPS)
-        return lighter if lighter.log_evidence > account.log_evidence else account
+        return self._likelier(account, self._account(each, self.fit.likely, frame), frame)
+
+    def _likelier(self, account: Account, start: Account, frame: Frame) -> Account:
+        """What a start leads to, where that is likelier than the account; else this."""
+        other = self._descended(start, frame, STEPS)
+        return other if other.log_evidence > account.log_evidence else account
 
     def _without(self, account: Account, frame: Frame) -> Account:
         """The contacts that explain most: one after the other is left out while that helps."""
@@ -361,7 +351,7 @@ class Search:
                 )
                 for k in range(account.family.count)
             ]
-            best = min((rest for rest in rests if rest), key=lambda one: one.fitted.cost)
+            best = min(rests, key=lambda one: one.fitted.cost)
             if best.fitted.cost >= account.fitted.cost:
                 break
             account = best
@@ -422,7 +412,6 @@ class Search:
         """The belief without contacts as small as may be: they are errors of the model."""
         account = belief.account
         rest = self._account(account.contacts[~specks], account.fitted.log_ratio, frame)
-        assert rest is not None  # nothing is frozen
         begun = self._begun(rest, frame, belief.how)
         return replace(begun, lacks_none=True, challenged=belief.challenged)
 
@@ -461,12 +450,12 @@ class Search:
         refused: dict[int, tuple[Kind, float]] = {}  # by the fit of all, and its log odds
         for choice in choices(belief.rivals, asked.least):
             changed = self._changed(belief, choice, frame)
-            gain = -np.inf if changed is None else changed.account.log_evidence - log_evidence
-            if changed is not None and gain > 0:
+            gain = changed.account.log_evidence - log_evidence
+            if gain > 0:
                 better.append(changed)
                 break
             if len(choice) == 1:
-                refused = {k: (kind, float(gain)) for k, kind in choice.items()}
+                refused = {k: (kind, gain) for k, kind in choice.items()}
         if better:
             return max(better, key=lambda one: one.account.log_evidence)
         if not refused:
@@ -484,7 +473,7 @@ class Search:
         born = self._with_missing(account, frame, far=False)
         return None if born is account else self._grown(belief, born)
 
-    def _changed(self, belief: Belief, choice: Mapping[int, Kind], frame: Frame) -> Belief | None:
+    def _changed(self, belief: Belief, choice: Mapping[int, Kind], frame: Frame) -> Belief:
         """The belief with some contacts of another kind, fitted altogether."""
         account = belief.account
         rows, rivals = [], []
@@ -503,8 +492,6 @@ class Search:
             else:
                 rivals += [{}] * len(start)
         start = self._account(np.vstack(rows), account.fitted.log_ratio, frame)
-        if start is None:
-            return None
         changed = self._descended(start, frame, self._steps(account, frame))
         gain = changed.log_evidence - account.log_evidence
         if belief.rounds + 1 < ROUNDS:  # else nobody is asked again
@@ -516,7 +503,7 @@ class Search:
             rounds=belief.rounds + 1,
             lacks_none=False,
             lifts_none=False,
-            is_parted=_is_light(changed),
+            is_parted=belief.is_parted and _is_light(changed),
             moved=np.zeros((0, 2)),
         )
 
@@ -529,8 +516,6 @@ class Search:
             for kind in (Kind.EVEN, Kind.FALLING, Kind.ROUNDED):
                 each = np.vstack([rest, as_kind(one, kind)])
                 start = self._account(each, account.fitted.log_ratio, frame)
-                if start is None:
-                    continue
                 joined = self._descended(start, frame, self._steps(account, frame))
                 if joined.log_evidence > account.log_evidence:
                     return self._begun(joined, frame, belief.how)
@@ -555,8 +540,6 @@ class Search:
             # With a free ratio the first of several contacts would grow over them all.
             holds = account.chi_squared > SURPRISE * frame.likelihood.count
             start = self._account(np.vstack([each, born]), account.fitted.log_ratio, frame)
-            if start is None:
-                continue
             steps = STEPS if holds else self._steps(account, frame)
             grown = self._descended(start, frame, steps, holds_ratio=holds)
             # As small as it may be, it is an error of the model, not a contact.
@@ -591,13 +574,12 @@ class Search:
         """Steps of a fit of something else: unexplained, it may have far to go."""
         return 2 * STEPS if frame.likelihood.explains(account.chi_squared) else FAR_STEPS
 
-    def _account(self, each: FloatArray, log_ratio: float, frame: Frame) -> Account | None:
+    def _account(self, each: FloatArray, log_ratio: float, frame: Frame) -> Account:
         family = self.field.of(each, fits_peaks=frame.fits_peaks)
         fitted = self.fit.evaluate(
             family, family.bounded(family.join(each)), log_ratio, frame.measured
         )
-        if fitted is None:
-            return None
+        assert fitted is not None  # nothing is frozen
         frame.budget.spend(fitted)
         return account_of(self.fit, fitted, frame)
 
