@@ -30,6 +30,11 @@ class OnEvent(Protocol):
         ...
 
 
+def times(count: int) -> str:
+    """Return "once", "2 times" and so on."""
+    return "once" if count == 1 else f"{count} times"
+
+
 class RateLimit:
     """Lets one event of a kind pass per period; for use by one thread.
 

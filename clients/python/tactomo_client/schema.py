@@ -552,7 +552,7 @@ class Process:
     """What the daemon takes of its computer."""
 
     pid: int
-    cpu_s: float  #: processor time since the start
+    cpu_s: float  #: processor time within `uptime_s`
     memory_bytes: int | None  #: resident
     threads: int
 

@@ -35,7 +35,7 @@ from tactomo.acquisition.device_clock import MAX_RATE, ClockState, DeviceClock
 from tactomo.acquisition.liveness import DeviceState, Liveness
 from tactomo.acquisition.open_serial import other_holders
 from tactomo.acquisition.replay_port import ReplayEnded, ReplayMoved
-from tactomo.events import OnEvent, RateLimit
+from tactomo.events import OnEvent, RateLimit, times
 from tactomo.protocols import PortProtocol, Trouble
 from tactomo.recordings.active_recording import ActiveRecording
 from tactomo.recordings.playback import Playback
@@ -535,7 +535,7 @@ class PortReader(Worker):
                 "device_clock_jumped",
                 "warning",
                 f"{self.url}: the device's clock jumped, or the device was reset; "
-                f"{clock.jumps} times since the start",
+                f"{times(clock.jumps)} since the start",
                 "if it comes again and again, check the device's supply and its timer",
             )
             jumps = clock.jumps

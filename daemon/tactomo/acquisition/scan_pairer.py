@@ -52,8 +52,9 @@ class ScanPairer:
         self.late = self.disordered = 0
         self.repeated = 0  # scans dropped because they had come before
         self.unmarked = 0  # scans dropped because the recorded run did not use them
-        self.resets = 0  # how often a counter went back with its clock: the device was reset
-        self.zeroed = 0  # how often a counter alone went back
+        # how often counters went back with their clocks: once for a device of two channels
+        self.resets = 0
+        self.zeroed = 0  # how often counters alone went back
 
     def push(self, scan: ChannelScan) -> list[DualScan]:
         """Take one scan and return the dual scans that are complete now, in order."""
@@ -107,6 +108,8 @@ class CounterPairer(ScanPairer):
         self._newest: dict[Channel, ChannelScan] = {}
         self._came: dict[Channel, deque[ScanKey]] = {}  # the newest few
         self._epochs: dict[Channel, int] = {}
+        # channels not heard since the last reset (True), or zeroing, of another: theirs is the same
+        self._to_follow: dict[bool, set[Channel]] = {True: set(), False: set()}
         self._joined_ns: dict[Channel, int] = {}  # when each channel was last part of a dual scan
         self._missed: dict[Channel, int] = dict.fromkeys(expected, 0)  # dual scans in a row
         self._gone: tuple[_Instant, int] | None = None  # the newest dual scan sent on, and when
@@ -176,11 +179,16 @@ class CounterPairer(ScanPairer):
             if 0 < back_us <= STALE_US or (back_us == 0 and scan.counter == before.counter):
                 return False
             self._begin_epoch(scan.channel, is_reset=back_us > 0)
+        for channels in self._to_follow.values():
+            channels.discard(scan.channel)
         self._newest[scan.channel] = scan
         return True
 
     def _begin_epoch(self, channel: Channel, is_reset: bool) -> None:
         self._epochs[channel] += _RESET if is_reset else _ZEROED
+        if channel in self._to_follow[is_reset]:
+            return
+        self._to_follow[is_reset] = set(self._epochs) - {channel}
         self.resets += is_reset
         self.zeroed += not is_reset
 

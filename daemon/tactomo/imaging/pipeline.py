@@ -26,7 +26,7 @@ from tactomo.acquisition.scan_pairer import CounterPairer, MarkPairer, ScanPaire
 from tactomo.acquisition.skew import Skew
 from tactomo.acquisition.wall_clock import WallClock
 from tactomo.errors import CommandError
-from tactomo.events import OnEvent, RateLimit
+from tactomo.events import OnEvent, RateLimit, times
 from tactomo.imaging.imaging import Imaging
 from tactomo.recordings.replay import Replay, ReplayClock
 from tactomo.scans import Delivery, DualScan
@@ -392,14 +392,14 @@ class Pipeline(Worker):
                 "device_restarted",
                 "warning",
                 "a device was reset: its scan counter and its clock went back; "
-                f"{now.resets} times since the start",
+                f"{times(now.resets)} since the start",
                 "check its supply; tare again if it lost its settings",
             )
         if now.zeroed > before.zeroed and self._zeroed_limit.allows():
             self._on_event(
                 "counters_zeroed",
                 "info",
-                f"the scan counter went back, the clock on; {now.zeroed} times since the start",
+                f"the scan counter went back, the clock on; {times(now.zeroed)} since the start",
             )
         if now.disordered > before.disordered and self._disorder_limit.allows():
             self._on_event(

@@ -49,6 +49,7 @@ class Status:
         file = self._file and str(self._file)
         self._description = {**description_fields(self._sensor), "file": file}
         self._started_s = time.monotonic()
+        self._started_cpu_s = time.process_time()  # what came before took part of another time
         self._last_minute = LastMinute()
         self._ports_last_minute = {port.url: LastMinute() for port in self._ports}
 
@@ -104,7 +105,7 @@ class Status:
             "recorder": self._recorder_fields(),
             "subscribers": subscribers,
             "events": self._events.fields(),
-            "process": process_fields(),
+            "process": self._process(),
         }
 
     def state(self) -> str:
@@ -157,6 +158,15 @@ class Status:
             "share": method.share,
         }
 
+    def _process(self) -> dict[str, Any]:
+        """Return what this process takes of the computer; its memory is None where nobody says."""
+        return {
+            "pid": os.getpid(),
+            "cpu_s": time.process_time() - self._started_cpu_s,
+            "memory_bytes": resident_bytes(),
+            "threads": threading.active_count(),
+        }
+
     def _rates(self) -> dict[str, float | None]:
         rates = self._pipeline.scan_rates
         return {
@@ -166,16 +176,6 @@ class Status:
             },
             "frames_hz": self._imaging.frame_rate.per_second(),
         }
-
-
-def process_fields() -> dict[str, Any]:
-    """Return what this process takes of the computer; its memory is None where nobody says."""
-    return {
-        "pid": os.getpid(),
-        "cpu_s": time.process_time(),
-        "memory_bytes": resident_bytes(),
-        "threads": threading.active_count(),
-    }
 
 
 def source(ports: list[PortReader]) -> str:

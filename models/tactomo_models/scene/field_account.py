@@ -21,7 +21,7 @@ from tactomo_models.scene.areas import AreaFinder, Areas
 from tactomo_models.scene.drawing import Drawing
 from tactomo_models.scene.evidence import Likelihood
 from tactomo_models.scene.field_fit import FieldFit, FittedField, Measured
-from tactomo_models.scene.parameters import E1, E2, EDGE, PEAK, SIZE, UNIT_M, X, Y
+from tactomo_models.scene.parameters import E1, E2, EDGE, HOLE, PEAK, SIZE, UNIT_M, X, Y
 from tactomo_models.scene.pressure import FieldContacts
 from tactomo_models.scene.pressure_field import PressureField
 from tactomo_models.scene.sheet_response import GradedResponse, SaturatingResponse
@@ -196,18 +196,24 @@ class FieldAccountant:
         """The mean over what a contact may be; uncertainties know how far that is apart."""
         odds = np.array([1.0, *(one.odds for one in likely)])
         share = odds / odds.sum()
-        alone = [self._alone(family, one) for one in (contact, *(each.contact for each in likely))]
+        kinds = [contact, *(each.contact for each in likely)]
+        alone = [self._alone(family, one) for one in kinds]
 
-        def mean(of: Callable[[_Alone], Any]) -> Any:
+        def mean(of: Callable[[_Alone], Any], share: FloatArray = share) -> Any:
             return sum(w * (of(one) - of(alone[0])) for w, one in zip(share, alone, strict=True))
 
         def spread(of: Callable[[_Alone], float]) -> float:
             values = np.array([of(one) for one in alone])
             return float(np.sqrt(share @ (values - share @ values) ** 2))
 
+        # The mean of a disc and a ring is a dent, which neither of them has.
+        is_alike = [(one[HOLE] > 0) == (contact[HOLE] > 0) for one in kinds]
+        alike = odds * is_alike / (odds @ is_alike)
         images = [
-            image + mean(partial(_Alone.image, at=at))
-            for at, image in enumerate((shown.map, shown.structure, shown.pressure_kpa))
+            image + mean(partial(_Alone.image, at=at), shares)
+            for at, (image, shares) in enumerate(
+                ((shown.map, share), (shown.structure, share), (shown.pressure_kpa, alike))
+            )
         ]
         shown = replace(shown, map=images[0], structure=images[1], pressure_kpa=images[2])
         if len(own) != 1:

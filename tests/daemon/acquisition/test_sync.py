@@ -214,6 +214,20 @@ def test_a_board_that_was_reset_alone_is_paired_only_when_both_began_anew() -> N
     assert pairs[-2:] == [[[4, 4]], [[5, 5]]]
 
 
+@pytest.mark.parametrize(("start_us", "counted"), [(100, (1, 0)), (60_000_009, (0, 1))])
+def test_one_reset_of_a_device_with_two_channels_is_one(
+    start_us: int, counted: tuple[int, int]
+) -> None:
+    sync = CounterPairer(BOTH, WAIT_NS)
+    feed(sync, *(scan(channel, 900, 0, 60_000_000) for channel in BOTH))
+    feed(sync, *(scan(channel, 0, 1000, start_us) for channel in BOTH))
+    assert (sync.resets, sync.zeroed) == counted
+    feed(sync, *(scan(channel, 1, 2000, start_us + 9_000_000) for channel in BOTH))
+    again_us = start_us if counted[0] else start_us + 10_000_000
+    feed(sync, *(scan(channel, 0, 3000, again_us) for channel in BOTH))
+    assert (sync.resets, sync.zeroed) == tuple(2 * each for each in counted)
+
+
 @pytest.mark.parametrize(("old", "repeated"), [(7, 1), (6, 0)])
 def test_an_old_scan_is_no_restart_but_a_repetition_or_late(old: int, repeated: int) -> None:
     sync = CounterPairer(BOTH, WAIT_NS)

@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
@@ -176,6 +177,13 @@ def test_a_late_joiner_finds_what_happened(bench: Callable[..., Any]) -> None:
     assert status["frames"] == len(daemon.listener.of("map"))
     assert status["process"]["pid"] == os.getpid()
     assert status["process"]["memory_bytes"] > 10_000_000
+
+
+def test_processor_time_is_of_the_time_that_the_daemon_is_up(bench: Callable[..., Any]) -> None:
+    """What the process did before, such as loading libraries, is no share of this time."""
+    before_s = time.process_time()
+    daemon = bench(ports=1)
+    assert daemon.ask("status")["process"]["cpu_s"] <= time.process_time() - before_s
 
 
 def test_a_trouble_that_goes_on_is_told_ever_more_rarely(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -295,3 +295,18 @@ def test_another_account_that_is_as_likely_is_half_of_what_is_shown(sensor: Sens
         # Numbers of one are summed over the map's samples, of the other over the mesh.
         assert shown == pytest.approx((a + b) / 2, rel=0.05)
         assert sigma == pytest.approx(np.hypot(said, abs(b - a) / 2), rel=0.3)
+
+
+def test_the_pressure_under_an_even_contact_is_even_where_a_ring_is_as_likely(
+    sensor: Sensor,
+) -> None:
+    """No donut: the numbers know of the ring, the picture is of what the contact is taken for."""
+    field, data = explained(sensor, KINDS["flat"])
+    ring = Alternative(1.0, other_of(KINDS["ring"], peak=0.2), np.zeros(COLUMNS))
+    accounts = accountant(sensor)
+    account = accounts.account(field, data, [[ring]])
+    own = accounts.account(field, data)
+    np.testing.assert_allclose(account.pressure_kpa, own.pressure_kpa, atol=1e-6)
+    assert account.contacts is not None
+    assert own.contacts is not None
+    assert account.contacts.mean_sigma_kpa > own.contacts.mean_sigma_kpa
