@@ -32,6 +32,7 @@ PRESSED = 50
 DESCRIPTION = description_fields(load_description("paper_square"))
 ALL = {"sheet", "contacts", "grid", "image", "annotations", "frame", "health", "events"}
 STATUS: Mapping[str, Any] = {
+    "issues": [{"severity": "error", "what": "it hums", "next_step": "oil it"}],
     "state": "running",
     "description": DESCRIPTION,
     "rates": {"frames_hz": 20.0, "magnitude_hz": 20.0, "structure_hz": None},
@@ -199,6 +200,11 @@ def test_numbers_to_plot(client: FoxgloveClient) -> None:
     assert 0 <= numbers["age_ms"] < 20_000
     health = client.wait("/left/health", lambda m: m["rates"] and m["is_stale"] is False)
     assert health["rates"] == {"frames_hz": 20.0, "magnitude_hz": 20.0}
+
+
+def test_what_the_daemon_finds_wrong_is_shown(client: FoxgloveClient) -> None:
+    health = client.wait("/left/health", lambda m: m.get("issues"))
+    assert health["issues"] == STATUS["issues"]
 
 
 def test_the_sheet_hangs_where_it_is_said(sensor: FakeSensor) -> None:

@@ -30,7 +30,6 @@ from tactomo_foxglove.topics import STATUS_NUMBERS, SensorTopics
 
 DEFAULT_HOST: Final = "127.0.0.1"
 DEFAULT_PORT: Final = 8765
-STALE_AFTER_S: Final = 0.5
 HEALTH_PERIOD_S: Final = 0.2
 REMIND_PERIOD_S: Final = 1.0
 BACKLOG: Final = 128
@@ -138,7 +137,9 @@ class _Sensor:
     def take(self, message: Message) -> None:
         now_ns = time.time_ns()
         if message.kind == MAP:
-            self._frame = frame_from_message(message, time.monotonic_ns(), STALE_AFTER_S)
+            self._frame = frame_from_message(
+                message, time.monotonic_ns(), schema.FRAME_STALE_AFTER_S
+            )
             if not self._frame.is_stale:
                 self._topics.frame(self._frame, now_ns, self._frame.age_s)
         elif message.kind == STATUS:
@@ -184,7 +185,7 @@ class _Sensor:
         recording = status.get("recording") or {}
         return known(
             {
-                **{name: status.get(name) for name in STATUS_NUMBERS},
+                **{name: status.get(name) for name in (*STATUS_NUMBERS, "issues")},
                 "state": "gone" if self._is_gone else status.get("state"),
                 "is_stale": self._is_gone or frame is None or frame.is_stale,
                 "age_s": None if frame is None else frame.age_s,

@@ -10,7 +10,7 @@ topic                  schema                      what
 /SENSOR/image          foxglove.RawImage           the map as a picture
 /SENSOR/annotations    foxglove.ImageAnnotations   the contacts on that picture
 /SENSOR/frame          tactomo.Frame (JSON)        the numbers: contacts, misfit, flags, timing
-/SENSOR/health         tactomo.Health (JSON)       live only: age, rates, latency, staleness
+/SENSOR/health         tactomo.Health (JSON)       live only: what is wrong, age, rates, latency
 /SENSOR/events         foxglove.Log                live only: the daemon's events
 =====================  ==========================  =================================================
 
@@ -27,7 +27,7 @@ import foxglove
 from foxglove import channels
 from tactomo_client import Contact, Frame, Status
 from tactomo_client.placement import Placement
-from tactomo_client.schema import Percentiles, Rates, wire_fields
+from tactomo_client.schema import HealthIssue, Percentiles, Rates, wire_fields
 from tactomo_client.traces import Traces
 
 from tactomo_foxglove import messages
@@ -85,6 +85,7 @@ HEALTH_SCHEMA: Final = {
     "title": "tactomo.Health",
     **_object(
         **_fields(Status, *STATUS_NUMBERS),
+        issues=_list(_object(**_fields(HealthIssue))),
         is_stale=_TRUTH,
         recording=_TEXT,
         rates=_object(**_fields(Rates)),

@@ -23,7 +23,7 @@ from tactomo_client.messages import (
     decode_message,
     topic,
 )
-from tactomo_client.schema import STALE_AFTER_S, Event, Frame, Status
+from tactomo_client.schema import FRAME_STALE_AFTER_S, STALE_AFTER_S, Event, Frame, Status
 
 Kind = Literal["map", "contacts", "status", "event"]
 Item = Frame | Status | Event
@@ -40,8 +40,8 @@ class Options(TypedDict, total=False):
 
 
 _STALE_AFTER_S: Final[Mapping[str, float]] = {
-    MAP: 0.5,
-    CONTACTS: 0.5,
+    MAP: FRAME_STALE_AFTER_S,
+    CONTACTS: FRAME_STALE_AFTER_S,
     STATUS: STALE_AFTER_S,
     EVENT: math.inf,
 }

@@ -37,7 +37,7 @@ from tactomo_client.recording_file import (
     read_span,
     records,
 )
-from tactomo_client.schema import Frame
+from tactomo_client.schema import FRAME_STALE_AFTER_S, Frame
 
 __all__ = ["Recording", "RecordingWarning", "open_recording"]
 
@@ -107,7 +107,7 @@ class Recording:
         *,
         start_s: float = 0.0,
         end_s: float = math.inf,
-        stale_after_s: float = 0.5,
+        stale_after_s: float = FRAME_STALE_AFTER_S,
     ) -> Iterator[Frame]:
         """Yield the frames in the order in which they were published.
 

@@ -20,6 +20,7 @@ from typing import Annotated, Any, Final, TypeAlias
 from tactomo_client.filled import Image, Received, Volts
 
 STALE_AFTER_S: Final = 3.0  #: a daemon sends its status every second; after so long it is gone
+FRAME_STALE_AFTER_S: Final = 0.5  #: a frame's age from which it is old
 
 Absent: TypeAlias = None
 Unsigned: TypeAlias = Annotated[int, range(2**64)]
@@ -548,6 +549,15 @@ class EventCounts:
 
 
 @dataclass(frozen=True, slots=True)
+class HealthIssue:
+    """One thing that is wrong with a sensor or its daemon."""
+
+    severity: str  #: ``error`` or ``warning``
+    what: str  #: in words
+    next_step: str  #: what to do about it, in words
+
+
+@dataclass(frozen=True, slots=True)
 class Process:
     """What the daemon takes of its computer."""
 
@@ -582,6 +592,9 @@ class Status(Received):
     #: ``stale`` (there were data, none come: for 1 s, or three periods of what is slower), or, of a
     #: replay, ``paused`` or ``ended``
     state: str = ""
+    #: All that the daemon finds wrong at present, errors first; empty where all is well. Whoever
+    #: shows how a sensor is prints these, and judges nothing but whether messages come
+    issues: tuple[HealthIssue, ...] = ()
     uptime_s: float = 0.0  #: Since the daemon's start
     description: SensorDescription | Absent = None  #: The sensor, see below
     source: Source = field(default_factory=Source)  #: Where scans come from

@@ -6,10 +6,15 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from tactomo_client import Frame, Subscription
+from tactomo_client import Event, Frame, Status, Subscription
 from tactomo_client.placement import Placement
 
-from tactomo_ros2.messages import RosMessage, ros_messages, stale_diagnostics
+from tactomo_ros2.messages import (
+    RosMessage,
+    issue_diagnostics,
+    ros_messages,
+    stale_diagnostics,
+)
 
 WAIT_S: Final = 0.2
 """How soon a stop is noticed."""
@@ -18,12 +23,12 @@ REMIND_S: Final = 1.0
 
 
 def run(
-    skin: Subscription[Frame],
+    skin: Subscription[Frame | Status | Event],
     publish: Callable[[RosMessage], None],
     is_over: Callable[[], bool],
     placement: Placement | None = None,
 ) -> None:
-    """Publish every frame, and once a second that none comes, until `is_over`.
+    """Publish every frame, what is wrong, and once a second that none comes, until `is_over`.
 
     Raises:
         KeysError: the daemon does not let us in.
@@ -31,12 +36,14 @@ def run(
     last: Frame | None = None
     due_s = time.monotonic() + REMIND_S
     while not is_over():
-        frame = skin.wait(WAIT_S)
-        if frame is not None:
-            last = frame
-            for message in ros_messages(frame, frame.acquired_realtime_ns, frame.age_s, placement):
+        item = skin.wait(WAIT_S)
+        if isinstance(item, Status):
+            publish(issue_diagnostics(item, time.time_ns()))
+        elif isinstance(item, Frame):
+            last = item
+            for message in ros_messages(last, last.acquired_realtime_ns, last.age_s, placement):
                 publish(message)
             due_s = time.monotonic() + REMIND_S
-        elif time.monotonic() >= due_s:
+        if time.monotonic() >= due_s:
             due_s += REMIND_S
             publish(stale_diagnostics(skin.sensor, last, time.time_ns()))

@@ -10,7 +10,8 @@ topic                      type                                  message
 /SENSOR/contact_poses      geometry_msgs/                        likewise, in the sensor's frame
                            PoseWithCovarianceStamped
 /tf                        tf2_msgs/TFMessage                    SENSOR to SENSOR/contact_ID
-/diagnostics               diagnostic_msgs/DiagnosticArray       trust, timing, identity
+/diagnostics               diagnostic_msgs/DiagnosticArray       trust, timing, identity; live also
+                                                                 what the daemon finds wrong
 =========================  ====================================  ===================================
 
 Stamps are when the scan was acquired. The frame SENSOR has its origin at the sheet's centre, x to
@@ -28,7 +29,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
-from tactomo_client import Contact, Frame
+from tactomo_client import Contact, Frame, Status
 from tactomo_client.placement import Placement
 from tactomo_client.schema import PRESSURE_RANGES
 
@@ -259,10 +260,25 @@ def _contact_frame(frame: Frame, contact: Contact) -> str:
 
 def stale_diagnostics(sensor: str, frame: Frame | None, now_ns: int) -> RosMessage:
     """Return that no frame comes; `frame` is the last that came, None where none ever did."""
-    header = _new("std_msgs/msg/Header", stamp=_stamp(now_ns), frame_id=sensor)
     known = {} if frame is None else _trust(frame, frame.age_s)
     told = "no frame yet" if frame is None else f"no frame for {frame.age_s:.1f} s"
-    message = _diagnostics(sensor, header, f"{told}: is the daemon running?", known, "STALE")
+    return _diagnosed(sensor, now_ns, f"{told}: is the daemon running?", known, "STALE")
+
+
+def issue_diagnostics(status: Status, now_ns: int) -> RosMessage:
+    """Return what the daemon finds wrong, and what to do about it."""
+    severities = {issue.severity for issue in status.issues}
+    level = "ERROR" if "error" in severities else "WARN" if severities else "OK"
+    told = "; ".join(issue.what for issue in status.issues) or status.state
+    steps = {issue.what: issue.next_step for issue in status.issues}
+    return _diagnosed(status.sensor, now_ns, told, steps, level, ": daemon")
+
+
+def _diagnosed(
+    sensor: str, now_ns: int, told: str, known: Mapping[str, Any], level: str, part: str = ""
+) -> RosMessage:
+    header = _new("std_msgs/msg/Header", stamp=_stamp(now_ns), frame_id=sensor)
+    message = _diagnostics(sensor, header, told, known, level, part)
     kind = topic_types(sensor)["/diagnostics"]
     return RosMessage("/diagnostics", kind, bytes(TYPES.serialize_cdr(message, kind)))
 
@@ -281,7 +297,9 @@ def _trust(frame: Frame, age_s: float | None) -> dict[str, Any]:
     }
 
 
-def _diagnostics(sensor: str, header: Any, told: str, known: Mapping[str, Any], level: str) -> Any:
+def _diagnostics(
+    sensor: str, header: Any, told: str, known: Mapping[str, Any], level: str, part: str = ""
+) -> Any:
     status: Any = TYPES.types["diagnostic_msgs/msg/DiagnosticStatus"]
     values = [
         _new("diagnostic_msgs/msg/KeyValue", key=key, value=str(value))
@@ -290,7 +308,7 @@ def _diagnostics(sensor: str, header: Any, told: str, known: Mapping[str, Any], 
     ]
     one = status(
         level=getattr(status, level),
-        name=f"tactomo: {sensor}",
+        name=f"tactomo: {sensor}{part}",
         message=told,
         hardware_id=sensor,
         values=values,

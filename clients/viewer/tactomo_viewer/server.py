@@ -16,6 +16,7 @@ from importlib import resources
 from aiohttp import WSCloseCode, web
 from aiohttp.typedefs import Handler, Middleware
 from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM, ClientError, Keys, aio
+from tactomo_client.schema import FRAME_STALE_AFTER_S, STALE_AFTER_S
 from tactomo_client.web_access import is_loopback, names_this_computer
 
 from tactomo_viewer.browser import Browser
@@ -57,7 +58,10 @@ class Viewer:
         keys: Keys | None = None,  # for a daemon beyond this computer
     ) -> None:
         may_command = is_loopback(host)
-        self._about = {"sensor": sensor, "stream": stream, "read_only": not may_command}
+        self._about = {
+            **{"sensor": sensor, "stream": stream, "read_only": not may_command},
+            **{"status_stale_ms": 1e3 * STALE_AFTER_S, "frame_stale_ms": 1e3 * FRAME_STALE_AFTER_S},
+        }
         self._browsers: set[Browser] = set()
         self._sockets: set[web.WebSocketResponse] = set()
         self._daemon = aio.Control(control, keys=keys) if may_command else None

@@ -321,7 +321,7 @@ class Daemon:
         """Return the fields of a `status` message as of now, envelope included."""
         envelope = self._publisher.envelope(STATUS)
         topic = {"schema": SCHEMA, "sensor": self.config.name, "kind": STATUS}
-        return {**topic, **envelope, **self._status_fields()}
+        return {**topic, **envelope, **self._status_fields(envelope)}
 
     def _on_signal(self, number: int, _: object) -> None:
         self._why_stopped = signal.Signals(number).name
@@ -329,7 +329,7 @@ class Daemon:
 
     def _last_words(self) -> dict[str, Any]:
         """What one would want to know afterwards of a daemon that is no more."""
-        status = self._status_fields()
+        status = self.status()
         troubles = status["events"]["troubles"]
         said = {key: round(status[key]) for key in ("uptime_s", "frames", "dropped_scans")}
         if not troubles:
@@ -466,8 +466,8 @@ class Daemon:
         for port in self._ports:
             port.zero_counters()
 
-    def _status_fields(self) -> Mapping[str, Any]:
-        return self._status.fields(self._publisher.latency, self._publisher.subscribers)
+    def _status_fields(self, header: Mapping[str, Any]) -> Mapping[str, Any]:
+        return self._status.fields(self._publisher.latency, self._publisher.subscribers, header)
 
     def _record_message(self, kind: str, data: bytes) -> None:
         active = self._recorder.active

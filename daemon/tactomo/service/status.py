@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
@@ -23,6 +23,7 @@ from tactomo.memory import resident_bytes
 from tactomo.recordings.playback import Playback
 from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording import REPLAY_SCHEME
+from tactomo.service.health_issues import health_issues
 from tactomo.timing import Durations, LastMinute
 
 VERSION: Final = version("tactomo")  # read from a file, which may fail later
@@ -53,8 +54,15 @@ class Status:
         self._last_minute = LastMinute()
         self._ports_last_minute = {port.url: LastMinute() for port in self._ports}
 
-    def fields(self, latency: Durations, subscribers: int) -> dict[str, Any]:
+    def fields(
+        self, latency: Durations, subscribers: int, header: Mapping[str, Any]
+    ) -> dict[str, Any]:
         """Return the fields of a `status` message; the publisher's part is handed in."""
+        fields = self._fields(latency, subscribers)
+        issues = health_issues({**header, **fields})
+        return {**fields, "issues": [asdict(issue) for issue in issues]}
+
+    def _fields(self, latency: Durations, subscribers: int) -> dict[str, Any]:
         pipeline, imaging = self._pipeline, self._imaging
         active = self._recorder.active
         reference, taught = imaging.reference, imaging.calibration.taught

@@ -62,8 +62,8 @@ class Publisher(Worker):
         self,
         sensor: str,  # the name in every topic
         session: str,  # identity of this run of the daemon
-        # returns the current fields of a `status` message; called by the thread
-        status: Callable[[], Mapping[str, Any]],
+        # returns the current fields of a `status` message with that header; called by the thread
+        status: Callable[[Mapping[str, Any]], Mapping[str, Any]],
         # called by the thread with kind and bytes of each frame's message, before it is sent:
         # whatever was seen is in the recording
         on_frame: Callable[[str, bytes], None],
@@ -220,7 +220,7 @@ class Publisher(Worker):
             )
 
     def _send_status(self) -> None:
-        self._last_status = self._send(self._number(STATUS, None, self._status()))
+        self._last_status = self._send(self._number(STATUS, None, self._status(self.header)))
 
     def _tell_cuts(self) -> None:
         """Tell that subscribers were cut off, a second later: then they are back to hear it."""

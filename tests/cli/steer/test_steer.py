@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import threading
 from collections.abc import Callable
@@ -10,7 +11,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from tactomo.cli.health_issues import FLAG_ADVICE
+from tactomo.service.health_issues import FLAG_ADVICE, health_issues
 from tactomo_client.fake import FakeSensor
 from tactomo_models import Flag
 
@@ -25,8 +26,7 @@ STATUS = {
     "source": {"kind": "twin"},
     "ports": [
         {
-            "url": "/dev/ttyACM0",
-            "connected": True,
+            **{"url": "/dev/ttyACM0", "connected": True, "state": "running"},
             "device": {"device_id": "twin-paper_square", "channels": ["magnitude"]},
             "packets": 9999,
             "corrupt": 300,
@@ -60,12 +60,18 @@ NEW_DAEMON = {
 }
 
 
+def judge(control: Any) -> None:
+    """Have the status say what the daemon would find wrong with it."""
+    status = control.answers["status"]
+    status["issues"] = [dataclasses.asdict(issue) for issue in health_issues(status)]
+
+
 def test_status_shows_what_matters(tactomo: Run, control: Any) -> None:
     control.answers["status"] = STATUS
     result = tactomo("status", "--control", control.address)
     assert result.returncode == 0
     for words in (
-        *("left_forearm: running", "/dev/ttyACM0 (open)", "300 corrupt", "(not open)"),
+        *("left_forearm: running", "/dev/ttyACM0 (running)", "300 corrupt", "no hello yet"),
         *("p50 4.25 ms", "structure_missing", "19.96 frames/s", "2 dual scans dropped"),
         *("20 dual scans", "/tmp/a.mcap (2.5 MB)", "auto; the newest frame by levelset"),
         *("refused: [neither] contact nor drift", "magnitude -1.23%, unevenly 0.09%"),
@@ -107,11 +113,12 @@ def test_status_begins_with_what_is_wrong_and_what_to_do(tactomo: Run, control: 
         "events": {"counts": {"port_lost": 2, "tared": 1}, "troubles": [trouble]},
         "process": {"pid": 7, "cpu_s": 1.2, "memory_bytes": 90_000_000, "threads": 6},
     }
+    judge(control)
     result = tactomo("status", "--control", control.address)
     lines = [line.strip() for line in result.stdout.splitlines()]
     assert lines[:6] == [
         "scans have stopped coming",
-        "check the ports below",
+        "see what is wrong with the ports",
         "/dev/ttyACM1 is closed: no device",
         "plug it in, or check the cable; it is tried again until it is there",
         "/dev/ttyACM0: 3 of 102 packets came damaged within the last minute",
@@ -119,7 +126,7 @@ def test_status_begins_with_what_is_wrong_and_what_to_do(tactomo: Run, control: 
     ]
     assert "port_lost, 4 min ago: gone" in result.stdout
     assert "port_lost 2, tared 1" in result.stdout
-    assert "pid 7, 10.0 % of a core on average, 90 MB, 6 threads" in result.stdout
+    assert "pid 7, 10.0 % of a core on average, 90.0 MB, 6 threads" in result.stdout
 
 
 def test_what_is_lost_is_told_by_counts_of_the_last_minute(tactomo: Run, control: Any) -> None:
@@ -130,12 +137,14 @@ def test_what_is_lost_is_told_by_counts_of_the_last_minute(tactomo: Run, control
         **{"ports": [idle], "rates": {"magnitude_hz": 0.0}, "dropped_scans": 7058, "frames": 9000},
         "last_minute": {"frames": 600, "dropped_scans": 150, "incomplete_scans": 600},
     }
+    judge(control)
     shown = tactomo("status", "--control", control.address).stdout
     assert "150 of 750 dual scans within the last minute were left out" in shown
     assert "600 of 750 dual scans within the last minute lacked a channel" in shown
     assert "/dev/ttyACM0 is idle\n" in shown
     over = {"last_minute": {"frames": 600, "dropped_scans": 0, "incomplete_scans": 0}}
     control.answers["status"] |= over
+    judge(control)
     shown = tactomo("status", "--control", control.address).stdout
     assert "left out" not in shown
     assert "since the start 7058 dual scans dropped" in shown
@@ -144,10 +153,20 @@ def test_what_is_lost_is_told_by_counts_of_the_last_minute(tactomo: Run, control
 def test_before_the_first_tare_it_says_that_one_is_being_taken(tactomo: Run, control: Any) -> None:
     told = {"ports": [], "flags": ["no_reference"], "dropped_scans": 0, "incomplete_scans": 0}
     control.answers["status"] = {**STATUS, **told, "state": "taring"}
+    judge(control)
     shown = tactomo("status", "--control", control.address).stdout
     assert "a reference is being taken" in shown
     assert "no scans" not in shown
     assert "tactomo tare" not in shown
+
+
+def test_status_prints_what_the_daemon_finds_and_judges_nothing_itself(
+    tactomo: Run, control: Any
+) -> None:
+    told = [{"severity": "error", "what": "it hums", "next_step": "oil it"}]
+    control.answers["status"] = {**STATUS, "state": "stale", "issues": told}
+    shown = tactomo("status", "--control", control.address).stdout
+    assert shown.splitlines()[:3] == ["it hums", "    oil it", "left_forearm: stale"]
 
 
 def test_every_flag_has_its_advice() -> None:

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from daemon_bench import HELLO, VOLTS_PER_COUNT, scan
 from hostile_board import content_of, framed
-from tactomo.cli.health_issues import health_issues
 from tactomo_protocol import Acknowledge, AckStatus, Channel, SampleFormat, Scan, ScanFlag
 
 Start = Callable[..., Any]
@@ -51,11 +50,11 @@ def test_a_hello_with_a_rate_that_cannot_be_is_told_and_the_port_does_not_run(be
     assert "device_idle" not in status["events"]["counts"]
     (port,) = status["ports"]
     assert port["corrupt"] == 0 < port["faulty"]
-    issues = [issue for issue in health_issues(status) if port["url"] in issue.what]
+    issues = [issue for issue in status["issues"] if port["url"] in issue["what"]]
     assert len(issues) == 2  # the port's state, and the share of its packets
     for issue in issues:
-        assert "correct the firmware" in issue.next_step
-        assert "cable" not in issue.next_step
+        assert "correct the firmware" in issue["next_step"]
+        assert "cable" not in issue["next_step"]
 
 
 @pytest.mark.slow
@@ -69,10 +68,10 @@ def test_scans_of_another_length_are_no_waiting_for_a_trigger(bench: Start) -> N
         status: dict[str, Any] = b.ask("status")
         return status if status["ports"][0]["state"] == "faulty" else None
 
-    (issue, *_) = (i for i in health_issues(b.until(while_faulty)) if "faulty" in i.what)
-    assert "its hello says 208" in issue.what
-    assert "trigger" not in issue.next_step
-    assert "correct the firmware" in issue.next_step
+    (issue, *_) = (i for i in b.until(while_faulty)["issues"] if "faulty" in i["what"])
+    assert "its hello says 208" in issue["what"]
+    assert "trigger" not in issue["next_step"]
+    assert "correct the firmware" in issue["next_step"]
 
 
 def test_scans_in_swapped_order_are_told(bench: Start) -> None:

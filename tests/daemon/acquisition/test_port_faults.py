@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import pytest
 from tactomo import timing
-from tactomo.cli.health_issues import health_issues
 from tactomo.config import load_config
 from tactomo.errors import PortBusyError, PortError
 from tactomo.service.daemon import Daemon
@@ -66,14 +65,14 @@ def test_damage_that_is_over_is_not_told_as_present(
     b.listener.event("corrupt_packets")
     status = b.ask("status")
     assert status["ports"][0]["received_last_minute"]["corrupt"] == 1
-    assert any("damaged" in issue.what for issue in health_issues(status))
+    assert any("damaged" in issue["what"] for issue in status["issues"])
     monkeypatch.setattr(timing, "MINUTE_S", 0.5)
     b.step()
     status = b.until(
         lambda: (s := b.ask("status"))["ports"][0]["received_last_minute"]["corrupt"] == 0 and s
     )
     assert status["ports"][0]["corrupt"] == 1
-    assert not any("damaged" in issue.what for issue in health_issues(status))
+    assert not any("damaged" in issue["what"] for issue in status["issues"])
 
 
 def test_a_flood_of_garbage_makes_few_events(bench: Start) -> None:

@@ -59,6 +59,6 @@ def _publish(node: Node, is_over: Callable[[], bool]) -> None:
             publishers[message.topic].publish(message.cdr)
 
     placement = Placement.parse(parent, pose) if parent else None
-    with subscribe(sensor, address=stream, keys=keys or None) as skin:
+    with subscribe(sensor, kind=("map", "status"), address=stream, keys=keys or None) as skin:
         node.get_logger().info(f"publishing {sensor} of {stream}")
         run(skin, publish, is_over, placement)

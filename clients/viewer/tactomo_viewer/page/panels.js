@@ -1,7 +1,5 @@
 // The panels beside the map: what the newest frame, status and events say, as text.
 
-import { explainFlag } from "./health.js";
-
 const EVENTS_SHOWN = 50;
 const TROUBLE_SHOWN_S = 3600;
 const SOURCES = { twin: "simulated skin", device: "device", replay: "replay" };
@@ -78,7 +76,7 @@ export function showQuality(frame, trusted) {
   if (list.dataset.flags === key) return;
   list.dataset.flags = key;
   const chips = !trusted ? [chip("not known", "The newest frame is out of date.", "warn")]
-    : frame.flags.length ? frame.flags.map((flag) => chip(...explainFlag(flag), "warn"))
+    : frame.flags.length ? frame.flags.map((flag) => chip(flag.replaceAll("_", " "), "", "warn"))
     : isLinear ? [chip("linear: coarse", "One linear step: contacts near each other run together, weak ones are missed.", "warn")]
     : [chip("good", "Nothing to be wary of.", "good")];
   list.replaceChildren(...chips);
@@ -98,7 +96,7 @@ export function showStatus(status) {
   setText(byId("source"), SOURCES[source?.kind] ?? "");
   showStages(status.stage_ms ?? {});
   showChannels(status);
-  const { reference, recording, recorder } = status;
+  const { reference, recording } = status;
   setText(byId("reference"), reference
     ? `Reference of ${reference.scans} scans, taken ${clock(reference.taken_realtime_ns)}.`
     : "No reference yet.");
@@ -106,10 +104,6 @@ export function showStatus(status) {
   record.setAttribute("aria-pressed", String(Boolean(recording)));
   setText(record, recording ? `Stop · ${bytes(recording.bytes)}` : "Record");
   record.title = recording ? recording.path : "Record what the ports say to a file";
-  const waits = byId("recorder-waits");
-  setText(waits, recorder?.waits_for ? `Recording waits: ${recorder.waits_for}.`
-    : recorder?.failure ? `A recording ended early: ${recorder.failure}.` : "");
-  waits.hidden = !waits.textContent;
   showMethods(status);
 }
 
@@ -144,8 +138,9 @@ function showStages(stages) {
   });
 }
 
-function showChannels({ state, ports, rates, events, last_minute: minute }) {
-  const lines = [];
+function showChannels({ state, ports, rates, events, issues = [] }) {
+  const lines = issues.map(({ severity, what, next_step: step }) =>
+    [severity === "error" ? "bad" : "warn", what, step]);
   const stands = ["paused", "ended"].includes(state);
   for (const name of ["magnitude", "structure"]) {
     const hz = rates?.[`${name}_hz`];
@@ -153,12 +148,8 @@ function showChannels({ state, ports, rates, events, last_minute: minute }) {
     lines.push([hz > 0 || stands ? "good" : "bad", name,
       hz > 0 ? `${fixed(hz, 1)} scans/s` : stands ? state : "no scans"]);
   }
-  for (const port of ports ?? []) {
-    lines.push(portLine(port));
-  }
-  for (const what of ["incomplete", "dropped"]) {
-    const count = minute?.[`${what}_scans`];
-    if (count) lines.push(["warn", `${what} dual scans`, `${count} in the last minute`]);
+  for (const { url, state: does, device, bytes: received } of ports ?? []) {
+    lines.push(["", url, [does, device?.device_id, bytes(received)].filter(Boolean).join(", ")]);
   }
   // What happened before this page was opened is among them.
   for (const { name, severity, age_s: age } of events?.troubles ?? []) {
@@ -180,15 +171,6 @@ function showChannels({ state, ports, rates, events, last_minute: minute }) {
     setText(label, name);
     setText(value, text);
   });
-}
-
-function portLine({ url, state, connected, refusal, device, bytes: received, received_last_minute: minute }) {
-  if (state === "ended") return ["good", url, "at its end"];
-  if (!connected) return ["bad", url, "not connected"];
-  if (refusal) return ["bad", url, refusal];
-  const wrong = ["corrupt", "faulty"].filter((kind) => minute?.[kind])
-    .map((kind) => `${minute[kind]} ${kind} in the last minute`);
-  return [wrong.length ? "warn" : "good", url, [device?.device_id, bytes(received), ...wrong].filter(Boolean).join(", ")];
 }
 
 export function showEvent(event) {

@@ -1,6 +1,6 @@
 // The page's main part: takes what the link brings, and has it drawn once a screen refresh.
 
-import { ageOf, areTouchesSeen, staleAfter, verdict } from "./health.js";
+import { ageOf, areTouchesSeen, isHeard, staleAfter, verdict } from "./health.js";
 import { Link } from "./link.js";
 import { MapView } from "./map_view.js";
 import { byId, fixed, setText, showContacts, showEvent, showHeld, showQuality, showState, showStatus } from "./panels.js";
@@ -228,10 +228,10 @@ function refresh() {
   const past = timeline.shown;
   const found = past && live?.level !== "error" ? pausedBanner(past, now) : live;
   showBanner(found);
-  const trusted = past !== null || !found || found.level === "info" || found.name === "no-reference";
+  const trusted = past !== null || !found || found.level === "info" || found.name === "issue";
   byId("map").classList.toggle("stale", !trusted);
   document.body.dataset.health = found?.name ?? (state.status ? "good" : "connecting");
-  const linked = link.isOpen && state.status && ageOf(state.status, now) < 3000;
+  const linked = isHeard(state, now);
   if (!linked) showState("gone", found ? "disconnected" : "connecting");
   else if (["stale", "ended"].includes(live?.name)) showState(live.name);
   else showState(state.status.fields.state);
@@ -255,7 +255,7 @@ function refresh() {
     unit: chosen("unit") === "kpa" ? "kPa" : "%",
     value: chosen("unit") === "kpa" ? ({ pressure_kpa: kpa }) => kpa
       : ({ magnitude }) => (magnitude === null ? null : 100 * magnitude),
-    gapMs: staleAfter(state.status?.fields ?? {}),
+    gapMs: staleAfter(state.status?.fields ?? {}, state.hello),
   });
   replay.tick(now);
 }

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
     from tactomo.cli.console import Console
 
-STATUS_WAIT_S: Final = 3.0
 STILL_S: Final = 1.0  # for how long a press is to be held still, and is averaged
 MIN_FRAMES: Final = 5
 STILL_MM: Final = 1.0
@@ -89,7 +88,9 @@ def distrusted(frame: Frame) -> frozenset[str]:
 
 def _first_status(view: View) -> Status:
     """Return the daemon's status; TactomoError where no daemon can measure a magnitude."""
-    end_s = time.monotonic() + STATUS_WAIT_S
+    from tactomo_client.schema import STALE_AFTER_S
+
+    end_s = time.monotonic() + STALE_AFTER_S
     while view.status is None and time.monotonic() < end_s:
         view.update(0.1)
     if view.status is None or view.status.description is None:

@@ -147,7 +147,7 @@ class _Session:
 
     def _why_not(self, heard: Evidence) -> str:
         """Why what was heard is no press; empty where it is one."""
-        flags = sorted(heard.flags.keys() & set(DISTURBED.names()))
+        flags = sorted(heard.flags & set(DISTURBED.names()))
         if flags:
             return f"not to be trusted: {', '.join(flags)}; `tactomo tare` unpressed"
         if heard.pressed < heard.frames or not heard.frames:

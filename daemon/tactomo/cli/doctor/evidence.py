@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from tactomo_client import Keys
+from tactomo_client.schema import STALE_AFTER_S
 from tactomo_models import DescriptionError, SensorDescription, load_description
 from tactomo_models.array_files import NUMBERS
 from tactomo_models.arrays import FloatArray
@@ -39,7 +40,6 @@ from tactomo.recordings.imported_scans import (
 )
 from tactomo.recordings.recording import Recording
 
-STATUS_WAIT_S = 3.0  # a daemon sends its status every second
 CHANGES = "dv"
 
 
@@ -79,7 +79,7 @@ class Evidence:
     after: Mapping[str, Any] = field(default_factory=dict)
     # (n,) of the frames when they were published
     ages_ms: FloatArray = field(default_factory=lambda: np.zeros(0))
-    flags: dict[str, int] = field(default_factory=dict)  # frames by the flags that they had
+    flags: frozenset[str] = frozenset()  # those that any frame had
     pressed: int = 0  # frames with a contact
     frames: int = 0  # frames that came
     notes: tuple[str, ...] = ()  # how it was read, for people
@@ -120,11 +120,9 @@ def of_daemon(
     evidence.before, evidence.after = before, after
     evidence.heard = _heard_of_messages(said[SCAN], before, after)
     evidence.frames = len(said[MAP])
+    evidence.flags = frozenset(flag for frame in said[MAP] for flag in frame["flags"])
     evidence.pressed = sum(bool(frame["contacts"]) for frame in said[MAP])
     evidence.ages_ms = np.array([f["age_ns"] * 1e-6 for f in said[MAP] if f["age_ns"] is not None])
-    for frame in said[MAP]:
-        for flag in frame["flags"]:
-            evidence.flags[flag] = evidence.flags.get(flag, 0) + 1
     return evidence
 
 
@@ -144,7 +142,7 @@ class _Listener:
 
     def first_status(self) -> dict[str, Any]:
         """Wait for a status and forget what came before it; DoctorError where there is none."""
-        end_s = time.monotonic() + STATUS_WAIT_S
+        end_s = time.monotonic() + STALE_AFTER_S
         while not self.said["status"] and (left_s := end_s - time.monotonic()) > 0:
             self.listen(left_s)
         if not self.said["status"]:

@@ -2,25 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from tactomo_models.health.findings import Finding, Level
 
 from tactomo.cli.doctor.evidence import Evidence, Heard
-from tactomo.cli.health_issues import (
-    CORRUPT_NOTED,
-    FASTER,
-    FIRMWARE_STEP,
-    FLAG_ADVICE,
-    health_issues,
-)
+from tactomo.service.health_issues import CORRUPT_NOTED, FIRMWARE_STEP
 
-FLAG_FAULTS = frozenset(
-    {"electrode_fault", "noise_high", "saturated", "channels_swapped", "reference_mismatch"}
-)
-FLAG_SHARE = 0.05  # of the frames: what comes and goes more rarely is advice
 LOST_SHARE = 0.01  # of the dual scans: less is advice
 LATE_SHARE = 0.5  # what a busy computer does to fewer is advice: most frames are in time
 FEWEST_LOST = 3  # below that it is no rate: one of the first 41 says little of the next thousand
@@ -30,11 +19,11 @@ def stream_findings(evidence: Evidence) -> list[Finding]:
     """Return what was found about line, latency and frames; empty for a file of arrays."""
     found: list[Finding] = []
     if evidence.heard is not None:
-        found += [_packets_found(evidence.heard), *_lost_found(evidence)]
+        found += [_packets_found(evidence.heard), _lost_found(evidence, evidence.heard.lost)]
     if len(evidence.ages_ms):
         found.append(_latency_found(evidence))
     if evidence.frames:
-        found += [_pressed_found(evidence), *_flags_found(evidence)]
+        found.append(_pressed_found(evidence))
     return [*found, *_issues_found(evidence)]
 
 
@@ -62,58 +51,26 @@ def _packets_found(heard: Heard) -> Finding:
     )
 
 
-def _lost_found(evidence: Evidence) -> Iterator[Finding]:
-    assert evidence.heard is not None
+def _lost_found(evidence: Evidence, lost: int) -> Finding:
     count = max(len(scans) for scans in evidence.scans.values())
-    dropped, incomplete = (
-        evidence.after.get(key, 0) - evidence.before.get(key, 0)
-        for key in ("dropped_scans", "incomplete_scans")
-    )
+    figures: dict[str, Any] = {"number": float(lost)}
+    if not lost:
+        return Finding("lost_scans", Level.OK, f"none of {count} dual scans", "", figures)
+    before, after = (each.get("dropped_scans", 0) for each in (evidence.before, evidence.after))
     # Scans that came and were left out tell that the computer was busy: then others may have been
-    # lost or come too late for the same reason, and nothing is known against cable and board.
-    is_busy = dropped > LOST_SHARE * count
-    fault_share = LATE_SHARE if is_busy else LOST_SHARE
-    again = "the computer is busy: look again when it is not"
-    yield _share_found(
+    # lost for the same reason, and nothing is known against cable and board.
+    is_busy = after - before > LOST_SHARE * count
+    share = lost / (count + lost)
+    is_fault = share > (LATE_SHARE if is_busy else LOST_SHARE) and lost >= FEWEST_LOST
+    return Finding(
         "lost_scans",
-        evidence.heard.lost,
-        count,
-        "did not arrive",
-        again if is_busy else "is the line too slow for the rate, or the computer too busy?",
-        fault_share,
+        Level.FAULT if is_fault else Level.ADVICE,
+        f"{lost} of {count + lost} dual scans ({share:.1%}) did not arrive",
+        "the computer is busy: look again when it is not"
+        if is_busy
+        else "is the line too slow for the rate, or the computer too busy?",
+        figures,
     )
-    if evidence.after:
-        yield _share_found(
-            "dropped_scans",
-            dropped,
-            count,
-            "were left out because newer ones had come",
-            FASTER,
-            LATE_SHARE,
-        )
-        yield _share_found(
-            "incomplete_scans",
-            incomplete,
-            count,
-            "lacked a channel",
-            again
-            if is_busy
-            else "check that channel's cable; if its scans come late, raise sync_wait_ms",
-            fault_share,
-        )
-
-
-def _share_found(
-    about: str, number: int, count: int, what: str, step: str, fault_share: float
-) -> Finding:
-    figures: dict[str, Any] = {"number": float(number)}
-    if not number:
-        return Finding(about, Level.OK, f"none of {count + number} dual scans", "", figures)
-    share = number / (count + number)
-    is_fault = share > fault_share and number >= FEWEST_LOST
-    level = Level.FAULT if is_fault else Level.ADVICE
-    detail = f"{number} of {count + number} dual scans ({share:.1%}) {what}"
-    return Finding(about, level, detail, step, figures)
 
 
 def _latency_found(evidence: Evidence) -> Finding:
@@ -161,22 +118,10 @@ def _pressed_found(evidence: Evidence) -> Finding:
     )
 
 
-def _flags_found(evidence: Evidence) -> Iterator[Finding]:
-    for flag, number in sorted(evidence.flags.items()):
-        what, step = FLAG_ADVICE.get(flag, (flag.replace("_", " "), ""))
-        share = number / evidence.frames
-        is_fault = flag in FLAG_FAULTS and share > FLAG_SHARE
-        yield Finding(
-            f"flag_{flag}",
-            Level.FAULT if is_fault else Level.ADVICE,
-            f"{what}: in {share:.0%} of the frames",
-            step,
-            {"frames_percent": 1e2 * share},
-        )
-
-
-def _issues_found(evidence: Evidence) -> Iterator[Finding]:
-    """What the status itself says, but for what was counted while listening."""
-    for issue in health_issues({**evidence.after, "flags": []}) if evidence.after else ():
-        level = Level.FAULT if issue.severity == "error" else Level.ADVICE
-        yield Finding("daemon", level, issue.what, issue.next_step)
+def _issues_found(evidence: Evidence) -> list[Finding]:
+    """What the daemon itself finds wrong."""
+    levels = {"error": Level.FAULT, "warning": Level.ADVICE}
+    return [
+        Finding("daemon", levels[issue["severity"]], issue["what"], issue["next_step"])
+        for issue in evidence.after.get("issues") or []
+    ]

@@ -8,7 +8,6 @@ from typing import Annotated, Any
 import typer
 
 from tactomo.cli import options
-from tactomo.cli.health_issues import health_issues
 from tactomo.cli.output import print_json, say
 from tactomo.errors import TactomoError
 from tactomo.plain import plain
@@ -52,9 +51,10 @@ def status(
         print_json(answer)
         return
     answer = _plain(answer)
-    for issue in health_issues(answer):
-        typer.secho(issue.what, fg="red" if issue.severity == "error" else "yellow", bold=True)
-        say(f"    {issue.next_step}")
+    for issue in answer.get("issues") or []:
+        colour = "red" if issue["severity"] == "error" else "yellow"
+        typer.secho(issue["what"], fg=colour, bold=True)
+        say(f"    {issue['next_step']}")
     say(f"{answer['sensor']}: {answer['state']}")
     for name, value in _rows(answer):
         typer.echo(f"{typer.style(f'{name:<13} ', bold=True)}{value}")
@@ -128,7 +128,7 @@ def _rows(status: dict[str, Any]) -> list[tuple[str, str]]:
         ),
         ("reference", f"{reference['scans']} dual scans" if reference else "none yet"),
         ("baseline", _baseline(status.get("baseline") or {})),
-        ("recording", _recording(recording, status.get("recorder") or {})),
+        ("recording", f"{recording['path']} ({_mb(recording['bytes'])})" if recording else "off"),
         ("subscribers", str(status.get("subscribers", "-"))),
         ("events", _events(status.get("events") or {})),
         *(("  last", _trouble(each)) for each in (status.get("events") or {}).get("troubles", [])),
@@ -161,15 +161,6 @@ def _baseline(baseline: dict[str, Any]) -> str:
     return "; ".join([f"{_warn(state)}: {refusal}" if refusal else state, *gone])
 
 
-def _recording(recording: dict[str, Any] | None, recorder: dict[str, Any]) -> str:
-    if recording:
-        return f"{recording['path']} ({recording['bytes'] / 1e6:.1f} MB)"
-    waits_for = recorder.get("waits_for")
-    if waits_for:
-        return f"{_warn('waits')}: {waits_for}"
-    return f"{_warn('off')}: {recorder['failure']}" if recorder.get("failure") else "off"
-
-
 def _events(events: dict[str, Any]) -> str:
     counts = events.get("counts") or {}
     return ", ".join(f"{name} {count}" for name, count in sorted(counts.items())) or "none"
@@ -182,24 +173,23 @@ def _trouble(trouble: dict[str, Any]) -> str:
 
 
 def _process(process: dict[str, Any], uptime_s: float) -> str:
-    memory_bytes = process.get("memory_bytes")
-    memory = "-" if memory_bytes is None else f"{memory_bytes / 1e6:.0f} MB"
     share = 1e2 * (process.get("cpu_s") or 0.0) / max(uptime_s, 1.0)
     return (
         f"pid {process.get('pid', '-')}, {share:.1f} % of a core on average, "
-        f"{memory}, {process.get('threads', '-')} threads"
+        f"{_mb(process.get('memory_bytes'))}, {process.get('threads', '-')} threads"
     )
+
+
+def _mb(size_bytes: float | None) -> str:
+    return "-" if size_bytes is None else f"{size_bytes / 1e6:.1f} MB"
 
 
 def _port_line(port: dict[str, Any]) -> str:
     device = port.get("device") or {}
-    state = port.get("state", "open") if port.get("connected") else _warn("not open")
-    corrupt, problem = port.get("corrupt", 0), port.get("problem")
     return (
-        f"{port.get('url')} ({state}), {device.get('device_id', 'no hello yet')}, "
+        f"{port.get('url')} ({port.get('state', '-')}), {device.get('device_id', 'no hello yet')}, "
         f"{', '.join(device.get('channels', [])) or '-'}; {port.get('packets', 0)} packets, "
-        + (_warn(f"{corrupt} corrupt") if corrupt else "none corrupt")
-        + (f"; {_warn(problem)}" if problem else "")
+        f"{port.get('corrupt', 0)} corrupt"
     )
 
 

@@ -264,4 +264,7 @@ def _health(view: View, frame: Frame) -> RenderableType:
     table = Table(box=None, show_header=False, pad_edge=False)
     for name, value in rows.items():
         table.add_row(Text(name, "dim"), value)
+    for issue in status.issues if status else ():
+        colour = "red" if issue.severity == "error" else "yellow"
+        table.add_row(Text(issue.severity, colour), Text(f"{issue.what}: {issue.next_step}"))
     return table

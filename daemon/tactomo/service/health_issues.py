@@ -1,18 +1,27 @@
 """What is wrong with a running daemon, by its status alone, worst first and with a next step.
 
-`tactomo status` shows it at the top, `tactomo doctor` beside what it measures itself. Nothing here
-imports more than the standard library: a status is asked for often.
+The status carries it, and whoever shows a status prints it: nobody else judges.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any
+
+from tactomo_client.schema import HealthIssue
 
 CORRUPT_NOTED = 1e-3  # share of packets: a line that loses one now and then still serves
 DROPPED_NOTED = 1e-2  # share of the dual scans
+FEWEST_INCOMPLETE = 3  # fewer are no rate: one of the first 41 says little of the next thousand
 LATENCY_TIMER_MS = 2  # what an FTDI adapter holds back for longer is felt
 
+FLAG_ERRORS = frozenset(
+    (
+        *("no_reference", "reference_mismatch", "no_usable_scan", "electrode_fault", "noise_high"),
+        *("saturated", "channels_swapped"),
+    )
+)
+"""Flags of what has to be mended before frames say what presses; the others are warnings."""
 FLAG_ADVICE: Mapping[str, tuple[str, str]] = {
     "magnitude_missing": (
         "no scans of the magnitude channel",
@@ -75,28 +84,20 @@ FLAG_ADVICE: Mapping[str, tuple[str, str]] = {
 }
 FASTER = "give the daemon more of the processor, or choose a faster method or a budget"
 STATES: Mapping[str, tuple[str, str]] = {
-    "waiting_for_port": ("a port is not there yet", "check the ports below"),
-    "waiting_for_data": ("no scan has come yet", "check the ports below"),
-    "stale": ("scans have stopped coming", "check the ports below"),
+    "waiting_for_port": ("a port is not there yet", "see what is wrong with the ports"),
+    "waiting_for_data": ("no scan has come yet", "see what is wrong with the ports"),
+    "stale": ("scans have stopped coming", "see what is wrong with the ports"),
     "late": ("scans come, and frames come late", FASTER),
 }
 FIRMWARE_STEP = (
     "the line is good: correct the firmware, by firmware_protocol/PROTOCOL.md; the event "
     "firmware_fault names the rule"
 )
-TARING = ("a reference is being taken", "leave the skin alone until it runs")
-
-
-class HealthIssue(NamedTuple):
-    """One thing that is wrong: `severity` is warning or error."""
-
-    severity: str
-    what: str
-    next_step: str
+TARING = ("warning", "a reference is being taken", "leave the skin alone until it runs")
 
 
 def health_issues(status: Mapping[str, Any]) -> list[HealthIssue]:
-    """Return what is wrong by a status message, errors first; empty where all is well."""
+    """Return what is wrong by the fields of a status message, errors first; empty if nothing is."""
     found = [
         *_of_state(status),
         *(each for port in status.get("ports") or [] for each in _of_port(port)),
@@ -154,11 +155,12 @@ def _of_method(status: Mapping[str, Any]) -> Iterator[HealthIssue]:
 
 def _of_flags(status: Mapping[str, Any]) -> Iterator[HealthIssue]:
     for flag in status.get("flags") or []:
-        what, step = FLAG_ADVICE.get(flag, (flag.replace("_", " "), ""))
+        severity = "error" if flag in FLAG_ERRORS else "warning"
+        what, step = FLAG_ADVICE[flag]
         if flag == "no_reference" and status.get("state") == "taring":
-            what, step = TARING
+            severity, what, step = TARING
         because = status.get("tier_reason") if flag == "electrode_fault" else None
-        yield HealthIssue("warning", f"{what} ({because})" if because else what, step)
+        yield HealthIssue(severity, f"{what} ({because})" if because else what, step)
 
 
 def _of_losses(status: Mapping[str, Any]) -> Iterator[HealthIssue]:
@@ -166,11 +168,14 @@ def _of_losses(status: Mapping[str, Any]) -> Iterator[HealthIssue]:
     dropped, incomplete = recent.get("dropped_scans") or 0, recent.get("incomplete_scans") or 0
     came = (recent.get("frames") or 0) + dropped
     of = f"of {came} dual scans within the last minute"
-    if dropped > DROPPED_NOTED * came:
+    is_busy = dropped > DROPPED_NOTED * came
+    if is_busy:
         yield HealthIssue("warning", f"{dropped} {of} were left out", FASTER)
     if incomplete > DROPPED_NOTED * came:
+        # A busy computer loses scans, too: then nothing is known against the cable.
+        severity = "warning" if is_busy or incomplete < FEWEST_INCOMPLETE else "error"
         step = "check the cable of the channel that is missing; if it comes late, sync_wait_ms"
-        yield HealthIssue("warning", f"{incomplete} {of} lacked a channel", step)
+        yield HealthIssue(severity, f"{incomplete} {of} lacked a channel", step)
 
 
 def _of_recorder(recorder: Mapping[str, Any]) -> Iterator[HealthIssue]:
