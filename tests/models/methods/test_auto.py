@@ -89,22 +89,6 @@ def test_a_small_contact_beside_a_large_one_is_no_bulge_of_it(
     assert icc(paper, frame, *pair) > 0.97
 
 
-@pytest.mark.slow
-def test_the_hole_of_a_ring_is_seen_where_there_is_little_noise(
-    paper: SensorDescription, methods: dict[str, Reconstructor], simulator: SkinSimulator
-) -> None:
-    """The structure channel sees a disc; the magnitude channel decides, and the data choose."""
-    skin = Skin(simulator, 3e-4)
-    methods["auto"].set_reference(skin.reference())
-    frame = methods["auto"].reconstruct(**skin.scan(RING))
-    assert frame.map is not None
-    row, column = round((0.075 + RING.y_m) / 0.003), round((0.075 + RING.x_m) / 0.003)
-    assert frame.map[row, column] < 0.5 * frame.map.max()
-    assert icc(paper, frame, RING) > 0.98
-    (contact,) = frame.contacts
-    assert contact.pressure_kpa == pytest.approx(RING.pressure_kpa, abs=10)
-
-
 def test_a_rings_pressure_lies_within_what_is_told(
     methods: dict[str, Reconstructor], skin: Skin
 ) -> None:

@@ -130,7 +130,7 @@ def test_a_bad_lead_is_named_and_the_rest_goes_on(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", LEADS)
+@pytest.mark.parametrize("kind", ["floats", "at the rail", "silent"])
 def test_a_lead_that_is_bad_at_the_tare_is_named(
     paper: SensorDescription, artifact: Artifact, skin: Skin, kind: str
 ) -> None:
@@ -177,7 +177,7 @@ def test_a_poor_contact_alone_does_no_harm(
 
 @pytest.mark.parametrize(
     "pair",
-    [(3, 4), *(pytest.param(pair, marks=pytest.mark.slow) for pair in ((5, 6), (2, 4), (1, 9)))],
+    [(3, 4), pytest.param((1, 9), marks=pytest.mark.slow)],
     ids=str,
 )
 @pytest.mark.parametrize("when", ["at the tare", pytest.param("later", marks=pytest.mark.slow)])
@@ -200,14 +200,12 @@ def test_a_short_is_flagged(
     ("order", "shown"),
     [
         ([*range(1, 16), 0], True),
-        ([*range(2, 16), 0, 1], True),
         ([*range(14, -1, -1), 15], True),
-        ([0, 2, 1, *range(3, 16)], True),
         ([0, 1, 9, *range(3, 9), 2, *range(10, 16)], True),
         ([*range(4, 16), *range(4)], False),
         ([*range(15, -1, -1)], False),
     ],
-    ids=["by one", "by two", "reversed", "two beside", "two apart", "by a side", "mirrored"],
+    ids=["by one", "reversed", "two apart", "by a side", "mirrored"],
 )
 def test_an_order_of_electrodes_is_flagged_unless_it_is_a_symmetry_of_the_sheet(
     paper: SensorDescription,
@@ -256,31 +254,6 @@ def test_a_scan_without_a_number_is_not_called_clipped(
     assert Flag.SATURATED not in frame.flags
     assert Flag.INVALID_VOLTAGE in frame.flags
     assert Flag.NO_USABLE_SCAN in frame.flags
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("value", [0.0, 1e-3, -0.1, 1e300, 1e-310])
-def test_a_scan_of_one_value_gives_no_map(
-    paper: SensorDescription, artifact: Artifact, skin: Skin, value: float
-) -> None:
-    constant = each(lambda volts: np.full_like(volts, value))
-    frame = frame_of(paper, artifact, skin, PRESS, later=constant, frames=1)
-    assert frame.map is None
-    assert frame.structure is None
-    assert Flag.INVALID_VOLTAGE in frame.flags
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("size", [1.0, 1e300, -1e300])
-def test_a_voltage_that_cannot_be_is_left_out(
-    paper: SensorDescription, artifact: Artifact, skin: Skin, size: float
-) -> None:
-    def spoil(volts: FloatArray) -> FloatArray:
-        return np.where(np.isin(np.arange(len(volts)), [7, 60, 111]), size, volts)
-
-    frame = frame_of(paper, artifact, skin, PRESS, later=each(spoil))
-    assert frame.flags == Flag.INVALID_VOLTAGE
-    assert_found(frame, PRESS)
 
 
 @pytest.mark.slow

@@ -40,7 +40,7 @@ KINDS = {
     "soft": contact(0.003, -0.002, RADIUS_M, peak=PEAK_SHARE, edge=0.5),
     "ring": contact(0.003, -0.002, RADIUS_M, peak=PEAK_SHARE, hole=1.0),
 }
-GRADED = ["both", "both falling", "both graded", "one graded", "one falling"]
+GRADED = ["both falling", "both graded", "one graded"]
 
 
 @pytest.fixture(scope="module", params=GRADED)

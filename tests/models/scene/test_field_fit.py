@@ -9,7 +9,6 @@ import pytest
 from measured import measured
 from pressed import (
     PLENTY_S,
-    SENSORS,
     Sensor,
     contact,
     contacts,
@@ -54,7 +53,7 @@ SCENES = {
 }
 
 
-@pytest.fixture(scope="module", params=SENSORS)
+@pytest.fixture(scope="module", params=["both", "both falling", "one graded", "structure alone"])
 def sensor(
     request: pytest.FixtureRequest, forward: ForwardModel, small: SensorDescription
 ) -> Sensor:
@@ -162,7 +161,7 @@ def test_estimates_converge_at_second_order(small: SensorDescription, edge: floa
     assert (off[1] < 0.4 * off[0]).all()
 
 
-@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("scene", ["ellipse", "soft ring", "overlapping"])
 def test_the_fit_explains_what_its_own_model_made(sensor: Sensor, scene: str) -> None:
     """Without noise or model error a field comes back from a start beside it."""
     each = SCENES[scene]

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy_drawing import MOST_BLURRED
 from pressed import contact, contacts
 from tactomo_models import SensorDescription
 from tactomo_models.arrays import FloatArray
@@ -31,6 +30,7 @@ from tactomo_models.scene.sheet_response import GradedResponse
 from taylor import taylor_orders
 
 EGG = (0.03, -0.02, 0.04, 0.05)
+MOST_BLURRED = 0.4  # as in inner_loop.c
 SCENES = {
     "circle": contacts(contact()),
     "ellipse": contacts(contact(e=(0.2, -0.1))),
@@ -98,7 +98,7 @@ def test_what_is_drawn_passes_a_taylor_test(field: PressureField, name: str) -> 
     assert orders_of(drawn, parameters, direction) == pytest.approx(2, abs=0.1)
 
 
-@pytest.mark.parametrize("name", ["ellipse", "rounded", "soft and rounded", "overlapping"])
+@pytest.mark.parametrize("name", ["ellipse", "overlapping"])
 @pytest.mark.parametrize("further", FURTHER)
 def test_what_is_not_fitted_yet_passes_it_too(
     field: PressureField, name: str, further: str
