@@ -1,6 +1,6 @@
 """The door for files that anybody may have made: regular ones alone, read up to a bound.
 
-`tactomo_client.regular_file` is the client's, which imports nothing of ours.
+`tactomo_client.errors.open_regular` is the client's, which imports nothing of ours.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ from tactomo_client import (
     aio,
 )
 from tactomo_client.fake import FakeSensor
-from tactomo_client.reception import Kind
+from tactomo_client.subscription import Kind
 
 Run = Callable[[Coroutine[Any, Any, None]], None]
 CONTACT = Contact(3, 10.0, -20.0, 700.0, 0.15, 0.01, 170.0)

@@ -37,8 +37,13 @@ from fuzz_targets import CONTACT, HEADER
 from tactomo.stream import keys as key_files
 from tactomo_client import ClientError, Contact, ControlError, Frame, request, subscribe
 from tactomo_client.fake import FakeSensor
-from tactomo_client.frame import frame_from_message
-from tactomo_client.messages import CONTACTS, MAP, decode_message, encode_message
+from tactomo_client.messages import (
+    CONTACTS,
+    MAP,
+    decode_message,
+    encode_message,
+    frame_from_message,
+)
 from waiting import wait_until
 
 PATIENCE_S = 60.0

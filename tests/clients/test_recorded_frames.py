@@ -138,7 +138,7 @@ def test_a_time_range_reads_no_more_than_it_needs(
     whole: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from tactomo_client import recording_file
-    from tactomo_client.intact_chunks import unpack_chunk
+    from tactomo_client.recording_file import unpack_chunk
 
     unpacked = []
 

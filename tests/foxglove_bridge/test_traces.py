@@ -9,8 +9,7 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 from tactomo_client import Contact, Frame
-from tactomo_client.frame import frame_from_message
-from tactomo_client.messages import decode_message, encode_message
+from tactomo_client.messages import decode_message, encode_message, frame_from_message
 from tactomo_foxglove import write_mcap
 
 PERIOD_NS = 50_000_000

@@ -39,7 +39,6 @@ from tactomo.stream.control import COMMANDS
 from tactomo.twin import control as twin_control
 from tactomo.twin.scene import SHIPPED, load_scene
 from tactomo_client import ClientError, ControlError, MessageError
-from tactomo_client.frame import frame_from_message
 from tactomo_client.messages import (
     CONTACTS,
     EVENT,
@@ -52,6 +51,7 @@ from tactomo_client.messages import (
     encode_message,
     encode_reply,
     encode_request,
+    frame_from_message,
 )
 from tactomo_client.recording import RecordingWarning
 from tactomo_client.recording import open_recording as open_frames

@@ -16,8 +16,7 @@ from typing import Any
 import msgpack  # type: ignore[import-untyped]
 import zmq
 from tables import table
-from tactomo_client.frame import frame_from_message
-from tactomo_client.messages import EVENT, MAP, STATUS, decode_message
+from tactomo_client.messages import EVENT, MAP, STATUS, decode_message, frame_from_message
 from tactomo_client.schema import Status
 
 PAGE = "clients/STREAM.md"

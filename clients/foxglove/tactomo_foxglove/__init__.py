@@ -4,7 +4,7 @@
 same things on the same topics, which `topics` lists. Needs foxglove-sdk, the extra `foxglove`.
 """
 
-from tactomo_client.placement import Placement
+from tactomo_client.appearance import Placement
 
 from tactomo_foxglove.bridge import Bridge, BridgeError
 from tactomo_foxglove.layout import layout_for, shipped_layout

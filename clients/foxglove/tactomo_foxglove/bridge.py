@@ -19,10 +19,17 @@ import zmq
 from foxglove.channels import FrameTransformsChannel
 from foxglove.websocket import StatusLevel, WebSocketServer
 from tactomo_client import ClientError, Frame, Keys, MessageError, schema
+from tactomo_client.appearance import Placement
 from tactomo_client.connection import connect_subscriber
-from tactomo_client.frame import frame_from_message
-from tactomo_client.messages import EVENT, MAP, STATUS, Message, decode_message, topic
-from tactomo_client.placement import Placement
+from tactomo_client.messages import (
+    EVENT,
+    MAP,
+    STATUS,
+    Message,
+    decode_message,
+    frame_from_message,
+    topic,
+)
 
 from tactomo_foxglove.door import FOXGLOVE_ORIGIN, Door, hidden_address
 from tactomo_foxglove.messages import known

@@ -17,7 +17,7 @@ from collections.abc import Collection
 from http.client import HTTPException, parse_headers
 from typing import Any, Final
 
-from tactomo_client.web_access import names_this_computer
+from tactomo_client.connection import names_this_computer
 
 FOXGLOVE_ORIGIN: Final = "https://app.foxglove.dev"
 HEAD_S: Final = 3.0  # who has not sent a request's head by then is cut off, as on the stream

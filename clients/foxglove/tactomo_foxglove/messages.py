@@ -15,7 +15,7 @@ import numpy as np
 from foxglove import messages as fox
 from numpy.typing import NDArray
 from tactomo_client import Contact, Frame, appearance
-from tactomo_client.placement import Placement
+from tactomo_client.appearance import Placement
 
 Pixels = NDArray[np.uint8]
 

@@ -9,7 +9,7 @@ import foxglove
 from foxglove.channels import FrameTransformsChannel
 from foxglove.mcap import MCAPWriteOptions
 from tactomo_client import Frame
-from tactomo_client.placement import Placement
+from tactomo_client.appearance import Placement
 
 from tactomo_foxglove.topics import SensorTopics
 

@@ -15,7 +15,7 @@ topic                  schema                      what
 =====================  ==========================  =================================================
 
 What is unknown is left out of the JSON messages. A contact there has a `trace`, which it keeps for
-as long as it is followed (`tactomo_client.traces`).
+as long as it is followed (`tactomo_client.touch`).
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from typing import Any, Final
 import foxglove
 from foxglove import channels
 from tactomo_client import Contact, Frame, Status
-from tactomo_client.placement import Placement
+from tactomo_client.appearance import Placement
 from tactomo_client.schema import HealthIssue, Percentiles, Rates, wire_fields
-from tactomo_client.traces import Traces
+from tactomo_client.touch import Traces
 
 from tactomo_foxglove import messages
 from tactomo_foxglove.messages import contact_numbers, known

@@ -29,7 +29,6 @@ from typing import Any, Literal, Self, TypeVar, Unpack, cast, overload
 import zmq
 import zmq.asyncio
 
-from tactomo_client.arguments import checked_seconds
 from tactomo_client.connection import Owner, Waiting
 from tactomo_client.control import (
     RECORD_TIMEOUT_S,
@@ -47,12 +46,12 @@ from tactomo_client.control import (
     record_arguments,
     to_status,
 )
-from tactomo_client.errors import ClientError
+from tactomo_client.errors import ClientError, checked_seconds
 from tactomo_client.filled import filled
 from tactomo_client.keys import Keys
 from tactomo_client.messages import DEFAULT_CONTROL
-from tactomo_client.reception import Item, Kind, Options, Reception, T_co
 from tactomo_client.schema import Event, Frame, Status
+from tactomo_client.subscription import Item, Kind, Options, Reception, T_co
 
 __all__ = ["Control", "Daemon", "Subscription", "request", "subscribe"]
 

@@ -8,10 +8,12 @@ in the modules that use it ever waits.
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 import time
 import weakref
 from collections.abc import Generator, Iterable
 from typing import Any, Final, TypeVar
+from urllib.parse import urlsplit
 
 import zmq
 
@@ -156,3 +158,22 @@ def connect_subscriber(
         connection.socket.setsockopt(zmq.SUBSCRIBE, prefix)
     connection.connect()
     return connection
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether only this computer can reach what listens on `host`."""
+    with contextlib.suppress(ValueError):
+        return ipaddress.ip_address(host).is_loopback
+    return host == "localhost"
+
+
+def names_this_computer(host_header: str, served_host: str) -> bool:
+    """Return whether a request was for an IP address, `localhost` or the name that is served."""
+    try:
+        name = urlsplit(f"//{host_header}").hostname or ""
+    except ValueError:
+        return False
+    with contextlib.suppress(ValueError):
+        ipaddress.ip_address(name)
+        return True
+    return name in ("localhost", served_host.lower())

@@ -11,9 +11,8 @@ from typing import Any, Final, Self
 
 import zmq
 
-from tactomo_client.arguments import checked_seconds
 from tactomo_client.connection import Connection, Owner, Waiting, wait, whole_ms
-from tactomo_client.errors import ClientError, ControlError, control_error
+from tactomo_client.errors import ClientError, ControlError, checked_seconds, control_error
 from tactomo_client.filled import filled
 from tactomo_client.keys import Keys, as_keys
 from tactomo_client.messages import DEFAULT_CONTROL, decode_reply, encode_request

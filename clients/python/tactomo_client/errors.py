@@ -19,11 +19,19 @@ ClientError
 │                   does not let them in: the client is not on its list, it is another server
 └── RecordingError  a recording cannot be read: there is no such file, it is another program's, or
                     there are no maps and contacts in it
+
+And the checks of what callers give: `checked_seconds`, `open_regular`.
 """
 
 from __future__ import annotations
 
+import errno
+import math
 import re
+import stat
+from numbers import Real
+from pathlib import Path
+from typing import IO
 
 
 class ClientError(Exception):
@@ -125,3 +133,42 @@ class RecordingError(ClientError):
 
     def __init__(self, cause: str, next_step: str = "", name: str = "bad_recording") -> None:
         super().__init__(cause, next_step, name)
+
+
+def checked_seconds(
+    name: str, value: object, *, endless: bool = True, zero: bool = True, past: bool = False
+) -> float:
+    """Return a time in seconds as a float.
+
+    Args:
+        name: of the argument, for the error.
+        value: what was given for it.
+        endless: whether infinity makes sense.
+        zero: whether 0 does.
+        past: whether less does: what is left of a time that is over.
+
+    Raises:
+        TypeError: it is no number.
+        ValueError: it is NaN, or makes no sense.
+    """
+    if not isinstance(value, Real) or isinstance(value, bool):
+        raise TypeError(f"{name} = {value!r} is no number: give seconds, such as 0.5")
+    try:
+        seconds = float(value)
+    except OverflowError:
+        seconds = -math.inf if value < 0 else math.inf
+    is_in_range = past or seconds > 0 or (zero and seconds == 0)
+    if is_in_range and not math.isnan(seconds) and (endless or math.isfinite(seconds)):
+        return seconds
+    allowed = "any but NaN" if past else "0 or more" if zero else "more than 0"
+    raise ValueError(f"{name} = {value!r}: give {'' if endless else 'finite '}seconds, {allowed}")
+
+
+def open_regular(path: Path) -> IO[bytes]:
+    """Open a regular file for reading: a pipe may never end, and a device may do anything.
+
+    Raises OSError where it cannot be opened, or is no regular file.
+    """
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise OSError(errno.EINVAL, "it is no regular file", str(path))
+    return path.open("rb")

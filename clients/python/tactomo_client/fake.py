@@ -24,7 +24,7 @@ from typing import Any, Self
 import zmq
 from numpy.typing import NDArray
 
-from tactomo_client.arguments import checked_seconds
+from tactomo_client.errors import checked_seconds
 from tactomo_client.messages import CONTACTS, MAP, clock_id, encode_message
 from tactomo_client.schema import Contact
 

@@ -17,8 +17,7 @@ from typing import Any, Final, Self
 
 import zmq
 
-from tactomo_client.errors import KeysError
-from tactomo_client.regular_file import open_regular
+from tactomo_client.errors import KeysError, open_regular
 
 PUBLIC_SUFFIX: Final = ".key"
 SECRET_SUFFIX: Final = ".key_secret"

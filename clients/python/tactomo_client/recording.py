@@ -22,10 +22,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
-from tactomo_client.arguments import checked_seconds
-from tactomo_client.errors import MessageError, RecordingError
-from tactomo_client.frame import frame_from_message
-from tactomo_client.messages import decode_message
+from tactomo_client.errors import MessageError, RecordingError, checked_seconds
+from tactomo_client.messages import decode_message, frame_from_message
 from tactomo_client.recording_file import (
     ENDLESS_NS,
     ROTATED_NAME,

@@ -8,7 +8,7 @@ from typing import Final
 
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from tactomo_client import Frame
-from tactomo_client.placement import Placement
+from tactomo_client.appearance import Placement
 
 from tactomo_ros2.messages import TYPES, ros_messages, topic_types
 

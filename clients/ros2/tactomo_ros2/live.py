@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Final
 
 from tactomo_client import Event, Frame, Status, Subscription
-from tactomo_client.placement import Placement
+from tactomo_client.appearance import Placement
 
 from tactomo_ros2.messages import (
     RosMessage,

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 from tactomo_client import Contact, Frame, Status
-from tactomo_client.placement import Placement
+from tactomo_client.appearance import Placement
 from tactomo_client.schema import PRESSURE_RANGES
 
 TYPES: Final = get_typestore(Stores.ROS2_HUMBLE)

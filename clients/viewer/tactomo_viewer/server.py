@@ -16,8 +16,8 @@ from importlib import resources
 from aiohttp import WSCloseCode, web
 from aiohttp.typedefs import Handler, Middleware
 from tactomo_client import DEFAULT_CONTROL, DEFAULT_STREAM, ClientError, Keys, aio
+from tactomo_client.connection import is_loopback, names_this_computer
 from tactomo_client.schema import FRAME_STALE_AFTER_S, STALE_AFTER_S
-from tactomo_client.web_access import is_loopback, names_this_computer
 
 from tactomo_viewer.browser import Browser
 from tactomo_viewer.feed import Feed

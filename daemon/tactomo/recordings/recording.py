@@ -56,8 +56,8 @@ from mcap.records import Footer, McapRecord, Message, Metadata
 from pydantic import BaseModel, Strict, StrictBool, StrictInt, StrictStr
 from tactomo_client import MessageError, recording_file
 from tactomo_client.errors import RecordingError as ClientRecordingError
-from tactomo_client.intact_chunks import intact_chunks
 from tactomo_client.messages import MAX_ENTRIES, array_from_wire
+from tactomo_client.recording_file import intact_chunks
 from tactomo_models import CalibrationError, Reference, SensorDescription, load_description
 from tactomo_models.calibration.calibration_file import PressureCalibration, parse_calibration
 from tactomo_models.errors import DescriptionError

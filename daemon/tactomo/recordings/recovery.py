@@ -22,8 +22,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Header, Message, Metadata
 from mcap.stream_reader import StreamReader
-from tactomo_client.intact_chunks import intact_chunks
-from tactomo_client.recording_file import CHANNELS, PROFILE
+from tactomo_client.recording_file import CHANNELS, PROFILE, intact_chunks
 from tactomo_models.archive import part_of
 from tactomo_protocol import SCAN_COUNTERS, Channel, Scan
 

@@ -14,7 +14,7 @@ from typing import Any, Final
 from urllib.parse import urlsplit
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
-from tactomo_client.web_access import names_this_computer
+from tactomo_client.connection import names_this_computer
 from tactomo_models import Flag
 
 from tactomo.errors import AddressError, needs

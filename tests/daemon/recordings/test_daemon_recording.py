@@ -19,10 +19,9 @@ from tactomo.scans import Mark, ScanKey
 from tactomo.service import daemon
 from tactomo.service.daemon import Daemon
 from tactomo_client import ControlError
-from tactomo_client.frame import frame_from_message
-from tactomo_client.intact_chunks import intact_chunks
-from tactomo_client.messages import array_from_wire
+from tactomo_client.messages import array_from_wire, frame_from_message
 from tactomo_client.recording import open_recording as open_frames
+from tactomo_client.recording_file import intact_chunks
 from tactomo_models import Reference
 from tactomo_models.methods.machine_speed import MachineSpeed
 from tactomo_protocol import Channel, Decoder, Scan, ScanFlag, encode

@@ -26,8 +26,8 @@ from tactomo.recordings.recording_writer import (
 )
 from tactomo.recordings.recovery import Recovery, recover
 from tactomo.scans import Mark, ScanKey
-from tactomo_client.intact_chunks import intact_chunks
 from tactomo_client.messages import array_from_wire
+from tactomo_client.recording_file import intact_chunks
 from tactomo_models import Reference
 from tactomo_protocol import Channel, Decoder, Hello, SampleFormat, Scan, ScanFlag, encode
 

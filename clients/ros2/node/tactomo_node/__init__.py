@@ -16,7 +16,7 @@ import rclpy
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from tactomo_client import DEFAULT_STREAM, ClientError, subscribe
-from tactomo_client.placement import Placement
+from tactomo_client.appearance import Placement
 from tactomo_ros2.live import run
 from tactomo_ros2.messages import RosMessage, topic_types
 

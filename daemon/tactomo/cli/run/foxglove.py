@@ -13,7 +13,7 @@ from tactomo.cli.output import say
 from tactomo.errors import TactomoError, needs
 
 if TYPE_CHECKING:
-    from tactomo_client.placement import Placement
+    from tactomo_client.appearance import Placement
     from tactomo_foxglove import Bridge
 
 DEFAULT_PORT = 8765
@@ -114,7 +114,7 @@ def write_layout(path: Path, sensor: str) -> None:
 
 def placement_of(parent: str, pose: str) -> Placement:
     """Return the placement that the options mean."""
-    from tactomo_client.placement import Placement
+    from tactomo_client.appearance import Placement
 
     try:
         return Placement.parse(parent, pose)
