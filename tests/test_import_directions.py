@@ -50,6 +50,7 @@ ORDER = {
             "matlab_file",
             "array_files",
             "archive",
+            "growing_arrays",
             "toml_file",
             "robust",
             "inner_loop",

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import tempfile
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from tactomo_models.archive import read_arrays, write_arrays
+from tactomo_models.archive import read_arrays, write_whole
 from tactomo_models.arrays import FloatArray
 from tactomo_models.calibration.taught_skin import TaughtSkin
 from tactomo_models.errors import CalibrationError, DataError
+from tactomo_models.growing_arrays import GrowingArrays
 from tactomo_models.reconstruct import Reconstructor
 from tactomo_models.scans.reference import Reference
 from tactomo_models.scene.contacts import Contact
@@ -24,12 +25,33 @@ from tactomo_models.sensor.description import SensorDescription
 
 Progress = Callable[[int, int], None]
 
+IMAGES = ("map", "pressure_kpa", "structure")
 CONTACT_TYPES = {
-    name: "U7" if isinstance(value, str) else type(value)
-    for name, value in Contact(0, 0.0, 0.0, 0.0).in_mm().items()
-    if name != "id"
+    "contact_frame": np.int64,
+    **{
+        "contact_sigma" if name == "magnitude_sigma" else f"contact_{name}": (
+            "U7" if isinstance(value, str) else type(value)
+        )
+        for name, value in Contact(0, 0.0, 0.0, 0.0).in_mm().items()
+        if name != "id"
+    },
 }
+TYPES = {
+    **dict.fromkeys(IMAGES, np.float32),
+    **dict.fromkeys(("misfit", "confidence", "force_n", "force_sigma_n", "seconds"), np.float64),
+    "flags": np.uint32,
+    **CONTACT_TYPES,
+}
+"""Of the arrays of docs/files.md; a map that is absent is NaN throughout."""
 BUDGET_S = 2.0  # a file has no deadline: enough for any scene to converge within its frame
+
+
+class Reconstructed(NamedTuple):
+    """What became of a file of scans."""
+
+    frames: int
+    failed: int  # frames of another method than the one asked for
+    failure: str  # of the first of these: why
 
 
 def reconstruct_file(
@@ -42,8 +64,8 @@ def reconstruct_file(
     taught: TaughtSkin | None = None,
     progress: Progress | None = None,
     read: tuple[Mapping[str, FloatArray], Reference] | None = None,
-) -> list[Reconstruction]:
-    """Reconstruct every frame of `source` into `target`, and return the frames.
+) -> Reconstructed:
+    """Reconstruct every frame of `source` into `target`, one at a time.
 
     Args:
         source: .npz with `magnitude` (T, M), `structure` (T, M), `magnitude_reference` (M,) or
@@ -66,35 +88,47 @@ def reconstruct_file(
     if not target.parent.is_dir():
         raise DataError(f"cannot write {target}: there is no folder {target.parent}; make it first")
     scans, reference = read or read_scans(source, description)
-    total = max(len(channel) for channel in scans.values())
-    frames: list[Reconstruction] = []
-    seconds = np.zeros(total)
     if taught is not None and (why := taught.changed(reference)):
         raise CalibrationError(f"what was taught does not fit this skin: {why}; teach it anew")
-    with threadpool_limits(1):  # as the daemon runs, so that `seconds` are what a robot would see
-        reconstructor = Reconstructor(
-            description,
-            method=method,
-            budget_s=BUDGET_S,
-            curve=curve,
-            taught=taught,
-        )
-        reconstructor.set_reference(reference)
-        for index in range(total):
-            magnitude, structure = (_scan(scans, n, index) for n in ("magnitude", "structure"))
-            start = time.perf_counter()
-            frames.append(reconstructor.reconstruct(magnitude, structure))
-            seconds[index] = time.perf_counter() - start
-            if progress:
-                progress(index + 1, total)
-    arrays: dict[str, Any] = {"seconds": seconds, **frame_arrays(frames, description)}
+    nodes = (description.map.nodes_y, description.map.nodes_x)
+    failed, failure = 0, ""
+    total = max(len(channel) for channel in scans.values())
     try:
-        write_arrays(target, arrays)
+        with (
+            GrowingArrays(TYPES, _folder_of(target)) as arrays,
+            threadpool_limits(1),  # as the daemon runs: `seconds` are what a robot would see
+        ):
+            reconstructor = Reconstructor(
+                description,
+                method=method,
+                budget_s=BUDGET_S,
+                curve=curve,
+                taught=taught,
+            )
+            reconstructor.set_reference(reference)
+            for index in range(total):
+                magnitude, structure = (_scan(scans, n, index) for n in ("magnitude", "structure"))
+                start = time.perf_counter()
+                frame = reconstructor.reconstruct(magnitude, structure)
+                arrays.append({"seconds": time.perf_counter() - start, **_frame_row(frame)})
+                for contact in frame.contacts:
+                    arrays.append(_contact_row(index, contact))
+                failed += bool(frame.failure)
+                failure = failure or frame.failure
+                if progress:
+                    progress(index + 1, total)
+            write_whole(target, lambda file: arrays.write(file, dict.fromkeys(IMAGES, nodes)))
     except OSError as error:
         raise DataError(
             f"cannot write {target}: {error.strerror}; name a file in a folder that you may write"
         ) from error
-    return frames
+    return Reconstructed(total, failed, failure)
+
+
+def _folder_of(target: Path) -> Path:
+    """Return where files can be that grow into a file; what is no file, as /dev/null, has none."""
+    is_device = target.exists() and not target.is_file()
+    return Path(tempfile.gettempdir()) if is_device else target.resolve().parent
 
 
 def _scan(scans: Mapping[str, FloatArray], name: str, index: int) -> FloatArray | None:
@@ -221,35 +255,15 @@ def checked(source: Path, name: str, array: Any, shape: tuple[int | None, ...]) 
     return np.asarray(array, dtype=np.float64)
 
 
-def frame_arrays(
-    frames: list[Reconstruction], description: SensorDescription
-) -> dict[str, NDArray[Any]]:
-    """Stack frames into the arrays of docs/files.md; a map that is absent is NaN throughout."""
-    shape = (description.map.nodes_y, description.map.nodes_x)
-    absent = np.full(shape, np.nan, np.float32)
-    contacts = [
-        (i, contact.in_mm()) for i, frame in enumerate(frames) for contact in frame.contacts
-    ]
+def _frame_row(frame: Reconstruction) -> dict[str, Any]:
+    names = (*IMAGES, "misfit", "confidence", "force_n", "force_sigma_n")
+    return {**{name: getattr(frame, name) for name in names}, "flags": int(frame.flags)}
 
-    def column(values: list[float]) -> FloatArray:
-        return np.array(values, dtype=np.float64)
 
+def _contact_row(frame: int, contact: Contact) -> dict[str, Any]:
+    values = contact.in_mm()
+    values["sigma"] = values.pop("magnitude_sigma")
     return {
-        "map": np.array([absent if f.map is None else f.map for f in frames]),
-        "pressure_kpa": np.array(
-            [absent if f.pressure_kpa is None else f.pressure_kpa for f in frames]
-        ),
-        "structure": np.array([absent if f.structure is None else f.structure for f in frames]),
-        "misfit": column([f.misfit for f in frames]),
-        "confidence": column([f.confidence for f in frames]),
-        "force_n": column([f.force_n for f in frames]),
-        "force_sigma_n": column([f.force_sigma_n for f in frames]),
-        "flags": np.array([int(f.flags) for f in frames], dtype=np.uint32),
-        "contact_frame": np.array([i for i, _ in contacts], dtype=np.int64),
-        **{
-            "contact_sigma" if name == "magnitude_sigma" else f"contact_{name}": np.array(
-                [contact[name] for _, contact in contacts], dtype
-            )
-            for name, dtype in CONTACT_TYPES.items()
-        },
+        "contact_frame": frame,
+        **{name: values[name.removeprefix("contact_")] for name in list(CONTACT_TYPES)[1:]},
     }

@@ -228,7 +228,7 @@ def test_commands(probe: Path, start: Callable[..., DaemonProcess], tmp_path: Pa
     assert status["ports"] == len(told["ports"]) == 2
     assert status["url"] == told["ports"][0]["url"]
     path = str(tmp_path / "from-cpp.mcap")
-    assert ask("record_start", path) == path
+    assert ask("record_start", "from-cpp.mcap") == path
     stopped = ask("record_stop")
     assert stopped == {"path": path, "bytes": Path(path).stat().st_size}
     assert ask("set_tier", "noser") == "noser"

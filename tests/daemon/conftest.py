@@ -87,6 +87,7 @@ def bench(tmp_path: Path, make_skin: Callable[[Path, int], Any]) -> Iterator[Cal
             "tare_scans": 3,
             "baseline": {"track": real},  # that takes a real one
             **config,
+            "recording": {"folder": tmp_path, **config.get("recording", {})},
         }
         loaded = load_config(None, **settings)
         if "sync_wait_ms" not in config:

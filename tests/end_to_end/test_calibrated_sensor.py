@@ -116,7 +116,7 @@ def test_a_guided_session_makes_pressures_right(bench: Bench, tmp_path: Path) ->
         # The lightest reading that should answer lies within its uncertainty of nothing, or not.
         assert re.search("Still wanted: [34] more that the channel answers to", said)
         recording = tmp_path / "recalibrated.mcap"
-        bench.daemon.ask("record_start", path=str(recording), maps=True)
+        bench.daemon.ask("record_start", path=recording.name, maps=True)
         terminal.enter("done")
         assert terminal.wait() == 0, terminal.shown
     assert f"palm: {len(LEVELS_KPA)} readings" in terminal.shown

@@ -115,13 +115,14 @@ def test_what_is_recorded_replays_and_is_plotted(
     one_sheet: tuple[Demo, str], tmp_path: Path
 ) -> None:
     demo, channel = one_sheet
-    live, again = tmp_path / "live.mcap", tmp_path / "again.mcap"
+    again = tmp_path / "again.mcap"
     with (
         Daemon(demo.control) as daemon,
         subscribe(SENSOR, address=demo.stream, timeout_s=PATIENCE_S) as skin,
     ):
         pressed_frame(demo)
-        with daemon.record(live, maps=True):
+        with daemon.record("live.mcap", maps=True) as recording:
+            live = recording.path
             begin_ns = time.monotonic_ns()  # what was acquired before may not be in it
             since = (frame for frame in skin if frame.acquired_monotonic_ns > begin_ns)
             assert len(list(islice(since, 10))) == 10

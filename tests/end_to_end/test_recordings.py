@@ -70,12 +70,13 @@ class Listener(threading.Thread):
 
 @pytest.mark.slow
 def test_a_replay_gives_the_maps_of_the_live_run(demo: Demo, tmp_path: Path) -> None:
-    live, again = tmp_path / "live.mcap", tmp_path / "again.mcap"
+    again = tmp_path / "again.mcap"
     demo.press(15.0, 20.0, id="a")  # begun under load: the reference must come along
     with subscribe(SENSOR, address=demo.stream, timeout_s=PATIENCE_S) as frames:
         next(frame for frame in frames if frame.contacts)
     with Listener(demo) as listener:
-        request("record_start", demo.control, PATIENCE_S, path=str(live))
+        started = request("record_start", demo.control, PATIENCE_S, path="live.mcap")
+        live = Path(started["path"])
         for x_mm, y_mm in ((15.0, 20.0), (0.0, 0.0), (-40.0, -35.0)):
             demo.press(x_mm, y_mm, id="a", pressure_kpa=170)
             listener.hear_more(12)
@@ -159,9 +160,9 @@ def test_a_measured_stream_is_imported_replayed_and_located(tmp_path: Path) -> N
 def test_a_replay_with_a_page_begins_when_the_page_is_open(
     demo: Demo, browser: Chrome, tmp_path: Path
 ) -> None:
-    path = tmp_path / "short.mcap"
     with Listener(demo) as listener:
-        request("record_start", demo.control, PATIENCE_S, path=str(path))
+        started = request("record_start", demo.control, PATIENCE_S, path="short.mcap")
+        path = Path(started["path"])
         listener.hear_more(20)
         request("record_stop", demo.control, PATIENCE_S)
     control = f"ipc://{tmp_path}/control"

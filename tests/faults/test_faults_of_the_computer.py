@@ -89,7 +89,7 @@ def test_killed_while_recording(
     for number in range(KILLS):
         path = tmp_path / f"killed-{number}.mcap"
         daemon = tared(recording={"sync_s": 0.3})  # else none comes before the end
-        daemon.ask("record_start", path=str(path))
+        daemon.ask("record_start", path=path.name)
         playing = play(moving(scenes.one), 100.0)
         time.sleep(0.5 + np.random.default_rng(number).uniform(0, 0.5))
         killed_ns = time.monotonic_ns()
@@ -189,7 +189,7 @@ def test_the_wall_clock_is_set(
         }
     )
     ears = listen(daemon)
-    daemon.ask("record_start", path=str(path))
+    daemon.ask("record_start", path=path.name)
     begin_s, playing = time.monotonic(), play(still(scenes.rest), 50.0)
     for offset in ("-1d", "+1d"):
         time.sleep(1.0)

@@ -51,12 +51,12 @@ def run(
     tmp_path: Path, paper: SensorDescription, arrays: dict[str, Any], method: str = "auto"
 ) -> dict[str, Any]:
     np.savez(tmp_path / "in.npz", **arrays)
-    frames = reconstruct_file(
+    made = reconstruct_file(
         tmp_path / "in.npz", tmp_path / "out.npz", description=paper, method=method
     )
     with np.load(tmp_path / "out.npz") as stored:
         out = dict(stored)
-    assert len(frames) == len(out["map"])
+    assert made.frames == len(out["map"])
     return out
 
 

@@ -51,6 +51,7 @@ class DaemonProcess:
     ) -> None:
         number = len(list(folder.glob("daemon-*.toml")))
         settings = {"name": SENSOR, "ports": list(ports), "stream": ANYWHERE, "control": ANYWHERE}
+        config["recording"] = {"folder": str(folder), **config.get("recording", {})}
         path = folder / f"daemon-{number}.toml"
         path.write_text("".join(f"{k} = {_toml(v)}\n" for k, v in {**settings, **config}.items()))
         self.log_path = folder / f"daemon-{number}.log"

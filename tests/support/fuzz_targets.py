@@ -209,7 +209,7 @@ def _request_examples() -> list[bytes]:
     return [
         encode_request("set_tier", {"tier": "fit"}),
         encode_request("set_budget", {"budget_ms": 20.0}),
-        encode_request("record_start", {"path": "/tmp/a.mcap"}),
+        encode_request("record_start", {"path": "a.mcap"}),
         encode_request("press", {"x_mm": 1.0, "y_mm": 2.0, "shape": "ring"}),
         encode_request("play", {"scene": {"press": [PRESS]}}),
     ]

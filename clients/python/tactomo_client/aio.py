@@ -189,7 +189,7 @@ class Daemon(Control):
 
         async with Daemon() as daemon:
             await daemon.tare()
-            async with daemon.record("/data/grasp.mcap", maps=True):
+            async with daemon.record("grasp.mcap", maps=True):
                 await grasp()
     """
 

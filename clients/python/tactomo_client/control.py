@@ -232,7 +232,7 @@ class Daemon(Control):
 
         with Daemon() as daemon:
             daemon.tare()
-            with daemon.record("/data/grasp.mcap", maps=True):
+            with daemon.record("grasp.mcap", maps=True):
                 grasp()
     """
 
@@ -261,8 +261,8 @@ class Daemon(Control):
         """Start a recording of what the ports say, which goes on until `record_stop`.
 
         Args:
-            path: the file to write, on the daemon's computer; relative to the folder that this
-                program runs in. None: files in the daemon's own folder.
+            path: the file to write, below the folder of recordings that the daemon is configured
+                with, on its computer. None: files that it names and cuts itself.
             maps: whether maps and contacts are recorded, too; None: as the daemon is configured.
 
         Raises:
@@ -289,7 +289,7 @@ class Daemon(Control):
 
         Example::
 
-            with daemon.record("/data/grasp.mcap", maps=True) as recording:
+            with daemon.record("grasp.mcap", maps=True) as recording:
                 grasp()
             print(recording.file.bytes)
         """
@@ -340,7 +340,7 @@ def to_status(result: Mapping[str, Any]) -> Status:
 
 def record_arguments(path: str | Path | None, maps: bool | None) -> dict[str, Any]:
     """Return the arguments of `record_start` that are given."""
-    where = {} if path is None else {"path": str(Path(path).expanduser().absolute())}
+    where = {} if path is None else {"path": str(path)}
     return where if maps is None else {**where, "maps": maps}
 
 

@@ -84,19 +84,20 @@ class Recorder(Worker):
         """
         super().start()
         if self._rules.file is not None:
-            _wait_for(self.begin(self._rules.file))
+            file = self._rules.file.absolute()
+            _wait_for(self._ask(lambda: self._begin(file, self._rules.maps)))
         elif self._rules.at_start:
             _wait_for(self._ask(self._keep_recording))
 
-    def begin(self, path: Path | None, maps: bool | None = None) -> Future[Mapping[str, Any]]:
-        """Ask for a recording: to a file, or with None to the folder, cut into files.
+    def begin(self, name: str | None, maps: bool | None = None) -> Future[Mapping[str, Any]]:
+        """Ask for a recording into the folder: to a file of that name, or with None cut into files.
 
         With or without `maps` and contacts; None leaves that to the rules. The future gets its
         absolute `path`, or CommandError where one runs already, or RecordingError where the file
-        exists or cannot be created, or the disk has no room.
+        exists, is not in the folder or cannot be created, or the disk has no room.
         """
         with_maps = self._rules.maps if maps is None else maps
-        return self._ask(lambda: self._begin(None if path is None else path.absolute(), with_maps))
+        return self._ask(lambda: self._begin(None if name is None else self._below(name), with_maps))
 
     def end(self) -> Future[Mapping[str, Any]]:
         """Ask for the recording's end.
@@ -212,6 +213,20 @@ class Recorder(Worker):
         self._on_event("recording_started", "info", str(self.active.path))
         self._delete_old()
         return {"path": str(self.active.path)}
+
+    def _below(self, name: str) -> Path:
+        """Return the path of a file below the folder, which is made; no link leads out of it."""
+        folder = self._rules.folder_path
+        with contextlib.suppress(OSError):  # `create` says what is the matter
+            folder.mkdir(parents=True, exist_ok=True)
+        path = folder / name
+        if not Path(os.path.realpath(path.parent)).is_relative_to(os.path.realpath(folder)):
+            raise RecordingError(
+                f"{path.parent} is a link that leads out of {folder}, the folder of recordings",
+                "give a name in that folder, or configure another one: recording.folder",
+                "cannot_write",
+            )
+        return path
 
     def _keep_recording(self) -> None:
         """Record to the folder, now or as soon as that can be done."""
@@ -402,7 +417,7 @@ class Recorder(Worker):
 
 _REST: Final = "see to the disk, then record anew; what was written until then can be replayed"
 _TRIED_AGAIN: Final = "make room on the disk, or see that it can be written; it is tried again"
-_TRY_ELSEWHERE: Final = "give a path in a folder that you may write to"
+_TRY_ELSEWHERE: Final = "see that the daemon may write to its folder of recordings"
 _DIED: Final = "the recorder's thread died"
 _REPORT: Final = "restart the daemon, and please report the traceback in its log"
 _TOO_SLOW: Final = f"the disk is too slow: {MAX_QUEUED_BYTES >> 20} MB wait for it"

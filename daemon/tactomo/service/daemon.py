@@ -399,8 +399,7 @@ class Daemon:
         return self._status.summary(self._publisher.subscribers)
 
     def _record_start(self, arguments: RecordStart) -> Future[Mapping[str, Any]]:
-        path = Path(arguments.path) if arguments.path else None
-        return self._recorder.begin(path, arguments.maps)
+        return self._recorder.begin(arguments.path, arguments.maps)
 
     def _set_tier(self, arguments: SetTier) -> Settling:
         method = arguments.tier

@@ -7,7 +7,6 @@ when it is known, and holds up no other client meanwhile.
 
 from __future__ import annotations
 
-import contextlib
 import math
 import threading
 import time
@@ -33,8 +32,9 @@ from tactomo.worker import Bell, Worker
 MAX_REQUEST_BYTES: Final = 64 * 1024
 POLL_MS: Final = 250  # between looks at what is idle
 POLL_WHILE_PENDING_MS: Final = 10
-MAX_PENDING: Final = 64
+MAX_PENDING: Final = 1024
 QUEUED_PER_CLIENT: Final = 64
+UNREAD_S: Final = 2.0  # how long answers wait for a client whose queue is full of others
 LINGER_MS: Final = 100
 SETTLE_S: Final = 1.0
 """How long a change may wait for the frame that is being made: clients wait 2 s for the answer."""
@@ -60,20 +60,22 @@ class _Strict(Arguments):
     model_config = ConfigDict(strict=True)
 
 
-def _recording_path(path: str) -> str:
-    # The daemon's own folder is nobody else's business, nor is it where the client is.
-    if not path.startswith("/"):
-        raise ValueError("give an absolute path on the daemon's computer, such as /data/grasp.mcap")
+def _recording_name(name: str) -> str:
     # Who may command is any local user, where there are no keys: no profile, no unit, no key.
-    if PurePosixPath(path).suffix != ".mcap":
+    if name.startswith("/") or ".." in name.split("/"):
+        raise ValueError(
+            "give a name below the daemon's folder of recordings, such as grasp.mcap; where that "
+            "is, its configuration says: recording.folder"
+        )
+    if PurePosixPath(name).suffix != ".mcap" or not name.isprintable():
         raise ValueError("give the name of a recording, which ends in .mcap")
-    return path
+    return name
 
 
 class RecordStart(_Strict):
-    """Where to record to, and whether with maps; what is not given is as configured."""
+    """What to record to, and whether with maps; what is not given is as configured."""
 
-    path: Annotated[str, Field(max_length=4096), AfterValidator(_recording_path)] | None = None
+    path: Annotated[str, Field(max_length=1024), AfterValidator(_recording_name)] | None = None
     maps: bool | None = None
 
 
@@ -120,6 +122,13 @@ class _Pending(NamedTuple):
     by_s: float
 
 
+class _Unread(NamedTuple):
+    """An answer for a client who has not read those before it."""
+
+    message: list[bytes]
+    until_s: float
+
+
 class Control(Worker):
     """Answers commands. `open` it, `start` its thread, `stop` it."""
 
@@ -136,6 +145,7 @@ class Control(Worker):
         self._handlers = handlers
         self._on_idle = on_idle
         self._pending: list[_Pending] = []
+        self._unread: list[_Unread] = []
         self._socket: zmq.Socket[bytes]
         self._peers: Peers
         self._bell: Bell
@@ -149,6 +159,7 @@ class Control(Worker):
         self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_REQUEST_BYTES)
         self._socket.setsockopt(zmq.RCVHWM, QUEUED_PER_CLIENT)
         self._socket.setsockopt(zmq.SNDHWM, QUEUED_PER_CLIENT)
+        self._socket.setsockopt(zmq.ROUTER_MANDATORY, 1)  # a full queue is told, not thrown away
         self._peers = Peers(self._socket, endpoint, CONTROL, self._on_event, secret)
         self.address = self._peers.address
         self._bell = Bell()
@@ -173,7 +184,8 @@ class Control(Worker):
         poller.register(self._bell.reader, zmq.POLLIN)
         while not self._stopping.is_set():
             self.turns += 1
-            longest_ms = POLL_WHILE_PENDING_MS if self._pending else POLL_MS
+            waits = self._pending or self._unread
+            longest_ms = POLL_WHILE_PENDING_MS if waits else POLL_MS
             ready = dict(poller.poll(self._peers.wait_ms(longest_ms)))
             self._bell.hear()
             if self._socket in ready:
@@ -198,7 +210,7 @@ class Control(Worker):
         try:
             outcome = self._obey(*decode_request(data))
         except (MessageError, TactomoError) as error:
-            self._send(envelope, encode_error(error.name, error.cause, error.next_step))
+            self._answer(envelope, encode_error(error.name, error.cause, error.next_step))
             return
         if isinstance(outcome, Future):
             self._pending.append(_Pending(envelope, outcome, {}, math.inf))
@@ -206,7 +218,7 @@ class Control(Worker):
             by_s = time.monotonic() + SETTLE_S
             self._pending.append(_Pending(envelope, outcome.in_force, outcome.result, by_s))
         else:
-            self._send(envelope, encode_reply(outcome))
+            self._answer(envelope, encode_reply(outcome))
 
     def _obey(self, command: str, arguments: dict[str, Any]) -> Outcome:
         if len(self._pending) >= MAX_PENDING:
@@ -215,6 +227,8 @@ class Control(Worker):
 
     def _answer_pending(self) -> None:
         now_s = time.monotonic()
+        unsent = [one for one in self._unread if not self._send(one.message)]
+        self._unread = [one for one in unsent if now_s < one.until_s]
         waiting = []
         for pending in self._pending:
             envelope, future, result, by_s = pending
@@ -223,12 +237,24 @@ class Control(Worker):
                 continue
             try:
                 told = future.result() if future.done() else None
-                self._send(envelope, encode_reply(result if told is None else told))
+                self._answer(envelope, encode_reply(result if told is None else told))
             except TactomoError as error:
-                self._send(envelope, encode_error(error.name, error.cause, error.next_step))
+                self._answer(envelope, encode_error(error.name, error.cause, error.next_step))
         self._pending = waiting
 
-    def _send(self, envelope: list[bytes], reply: bytes) -> None:
-        # Somebody who asks and never reads fills their own queue; they do not hold up the others.
-        with contextlib.suppress(zmq.Again):
-            self._socket.send_multipart([*envelope, reply], zmq.DONTWAIT)
+    def _answer(self, envelope: list[bytes], reply: bytes) -> None:
+        message = [*envelope, reply]
+        # Who asks and never reads holds up nobody, and is remembered for so many answers.
+        if not self._send(message) and len(self._unread) < MAX_PENDING:
+            self._unread.append(_Unread(message, time.monotonic() + UNREAD_S))
+
+    def _send(self, message: list[bytes]) -> bool:
+        """Whether nothing is left to do: it was sent, or nobody is there any more."""
+        try:
+            self._socket.send_multipart(message, zmq.DONTWAIT)
+        except zmq.Again:
+            return False
+        except zmq.ZMQError as error:
+            if error.errno != zmq.EHOSTUNREACH:
+                raise
+        return True

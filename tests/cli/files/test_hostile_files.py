@@ -177,3 +177,26 @@ def test_a_hostile_file_costs_little_and_ends_nothing(
         assert "root:" not in ended.said
     if name.startswith(("pipe.", "device.")):
         assert ended.status != 0
+
+
+@pytest.mark.slow
+def test_frames_cost_memory_one_at_a_time(tmp_path: Path) -> None:
+    """Of ten times the frames, the scans themselves alone: 3.3 kB each, and no maps of 31 kB."""
+    skin = SkinSimulator(load_description("paper_square")).voltages([])
+    noise = np.random.default_rng(0)
+    peaks_mb = []
+    for frames in (400, 4000):
+        volts = {
+            str(name): rest * (1 + 1e-4 * noise.normal(size=(frames, len(rest))))
+            for name, rest in skin.items()
+        }
+        rest = {f"{name}_reference": each[:20] for name, each in volts.items()}
+        np.savez(tmp_path / f"{frames}.npz", allow_pickle=False, **volts, **rest)
+        ended = rationed(
+            tmp_path, "reconstruct", f"{frames}.npz", "maps.npz", "--method", "tikhonov", "--force"
+        )
+        assert ended.status == 0, ended.said
+        peaks_mb.append(ended.peak_mb)
+    with np.load(tmp_path / "maps.npz") as made:
+        assert made["map"].shape == (4000, 51, 51)
+    assert peaks_mb[1] - peaks_mb[0] < 40, peaks_mb

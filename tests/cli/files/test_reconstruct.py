@@ -16,6 +16,7 @@ from tactomo_models.calibration.calibration_file import (
     save_calibration,
 )
 from tactomo_models.calibration.curve import Reading
+from tactomo_models.growing_arrays import GrowingArrays
 from tactomo_protocol import Channel
 from typer.testing import CliRunner
 
@@ -177,11 +178,11 @@ def test_half_a_file_is_never_left(
 ) -> None:
     scans_file(tmp_path / "in.npz")
 
-    def interrupted(file: Any, **_: Any) -> None:
+    def interrupted(_: object, file: Any, *__: Any) -> None:
         file.write(b"half of it")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(np, "savez_compressed", interrupted)
+    monkeypatch.setattr(GrowingArrays, "write", interrupted)
     assert tactomo("reconstruct", "in.npz", "out.npz", "--method", "tikhonov").returncode != 0
     assert [path.name for path in tmp_path.iterdir()] == ["in.npz"]
 

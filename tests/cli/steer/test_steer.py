@@ -6,7 +6,6 @@ import dataclasses
 import json
 import threading
 from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -251,12 +250,12 @@ def test_a_wrong_address(tactomo: Run) -> None:
     assert "tcp://127.0.0.1" in result.stderr
 
 
-def test_record_start_gives_an_absolute_path(tactomo: Run, control: Any, tmp_path: Path) -> None:
+def test_record_start_gives_a_name(tactomo: Run, control: Any) -> None:
     control.answers["record_start"] = {"path": "/x.mcap"}
     assert tactomo("record", "start", "x.mcap", "--control", control.address).returncode == 0
     assert tactomo("record", "start", "--control", control.address).returncode == 0
     assert control.requests == [
-        ("record_start", {"path": str(tmp_path / "x.mcap")}),
+        ("record_start", {"path": "x.mcap"}),
         ("record_start", {}),
     ]
 

@@ -218,7 +218,7 @@ def test_an_exact_replay_knows_what_was_known_when_the_recording_began(
     b.tare()
     boards = Boards(b, magnitude=5000, structure=40)
     b.until(lambda: boards.scan() and "channels_skewed" in events(b))
-    b.ask("record_start", path=str(path))
+    b.ask("record_start", path=path.name)
     counters = [boards.scan() for _ in range(3)]
     b.listener.frame(counters[-1])
     b.ask("record_stop")

@@ -44,7 +44,7 @@ def test_the_baseline_follows_and_a_replay_gives_the_same_maps(
     b.listener.event("tared")
     for _ in range(5):
         step(1.0)
-    b.ask("record_start", path=str(path))
+    b.ask("record_start", path=path.name)
     first = b.skin.counter + 1
     gains = np.linspace(1.0, 0.96, 30)
     frames = [step(gain) for gain in gains]

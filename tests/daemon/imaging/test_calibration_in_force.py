@@ -283,7 +283,7 @@ def test_a_replay_goes_by_each_calibration_from_its_frame_on(
 ) -> None:
     pressed = Pressed(bench)
     path = tmp_path / "a.mcap"
-    pressed.bench.ask("record_start", path=str(path))
+    pressed.bench.ask("record_start", path=path.name)
     pressed.press()  # the reconstructor remembers: soon each press is after one like it
     described = pressed.press()
     pressed.reload(1.1)
@@ -313,7 +313,7 @@ def test_a_recording_to_come_begins_with_the_new_one(
     pressed.reload(1.1)
     pressed.forget()
     path = tmp_path / "later.mcap"
-    pressed.bench.ask("record_start", path=str(path))
+    pressed.bench.ask("record_start", path=path.name)
     pressed.press()
     pressed.bench.ask("record_stop")
     kept(factor=3.0)

@@ -119,7 +119,7 @@ def test_the_daemon_reads_a_board_by_a_protocol_that_is_named(folder: Path, boar
         wait_until(lambda: daemon.status()["state"] == "running", "a reference")
         [port] = daemon.status()["ports"]
         assert (port["protocol"], port["device"]["device_id"]) == ("floats", "floats")
-        daemon.ask("record_start", path=str(path))
+        daemon.ask("record_start", path=path.name)
         frames = daemon.status()["frames"]
         wait_until(lambda: daemon.status()["frames"] > frames + 5, "frames")
         daemon.ask("record_stop")

@@ -49,7 +49,7 @@ def record_a_life(b: Any, path: Path) -> dict[int, Any]:
     for _ in range(5):
         b.step(load=0.3)  # what was before the recording must not show in the replay
     first = b.skin.counter + 1
-    assert b.ask("record_start", path=str(path)) == {"path": str(path)}
+    assert b.ask("record_start", path=path.name) == {"path": str(path)}
     for index in range(10):
         b.step(load=0.02 * index)
     b.step(load=0.1, channels=(Channel.MAGNITUDE,))
@@ -95,7 +95,7 @@ def test_a_recording_that_begins_in_the_middle_of_a_packet_has_it_whole(
     (port,) = b.ask("status")["ports"]
     b.skin.lines[0].say(frames[:400])
     b.until(lambda: b.ask("status")["ports"][0]["bytes"] == port["bytes"] + 400)
-    b.ask("record_start", path=str(path))
+    b.ask("record_start", path=path.name)
     b.skin.lines[0].say(frames[400:])
     live = b.listener.frame(500)
     b.ask("record_stop")
@@ -110,7 +110,7 @@ def test_a_replay_leaves_out_what_the_live_run_dropped(
     path = tmp_path / "slow.mcap"
     b = bench(seconds=0.03)
     b.tare()
-    b.ask("record_start", path=str(path))
+    b.ask("record_start", path=path.name)
     start = b.skin.counter
     for index in range(40):
         b.skin.scan(load=0.01 * index)
@@ -141,7 +141,7 @@ def test_a_frame_that_was_seen_is_in_the_recording(
     path = tmp_path / "seen.mcap"
     b = bench()
     b.tare()
-    b.ask("record_start", path=str(path), maps=True)
+    b.ask("record_start", path=path.name, maps=True)
     seen = b.step(load=0.1)
     b.ask("record_stop")
     assert open_recording(path).summary.frames == 1
@@ -259,7 +259,7 @@ def test_a_recording_has_the_frames_that_were_published(bench: Start, tmp_path: 
     path = tmp_path / "frames.mcap"
     b = bench()
     b.tare()
-    b.ask("record_start", path=str(path), maps=True)
+    b.ask("record_start", path=path.name, maps=True)
     first = b.skin.counter + 1
     for load in (0.1, 0.2):
         b.step(load=load)
@@ -272,7 +272,7 @@ def test_a_recording_has_the_frames_that_were_published(bench: Start, tmp_path: 
         assert (frame.sequence, frame.contacts) == (alive.sequence, alive.contacts)
         np.testing.assert_array_equal(frame.map, alive.map)
         assert frame.age_s == alive.age_s
-    b.ask("record_start", path=str(tmp_path / "bytes.mcap"))
+    b.ask("record_start", path="bytes.mcap")
     b.step(load=0.3)
     b.ask("record_stop")
     assert not open_frames(tmp_path / "bytes.mcap").has_frames
@@ -344,22 +344,31 @@ def test_a_file_that_exists_is_not_written_over(bench: Start, tmp_path: Path) ->
     path.write_text("precious")
     b = bench()
     with pytest.raises(Exception, match="exists already"):
-        b.ask("record_start", path=str(path))
+        b.ask("record_start", path=path.name)
     assert path.read_text() == "precious"
 
 
-def test_a_path_is_absolute_and_its_folder_is_there(
-    bench: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    b = bench()
+def test_recordings_go_below_the_configured_folder_alone(bench: Start, tmp_path: Path) -> None:
+    b = bench(recording={"folder": tmp_path / "kept"})
+    (tmp_path / "kept" / "own").mkdir(parents=True)
+    (tmp_path / "kept" / "out").symlink_to(tmp_path)
+    (tmp_path / "kept" / "over.mcap").symlink_to(tmp_path / "elsewhere.mcap")
     before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(ControlError, match="absolute path"):
-        b.ask("record_start", path="skin.mcap")
+    for name in (str(tmp_path / "skin.mcap"), "../skin.mcap", "own/../../skin.mcap"):
+        with pytest.raises(ControlError, match=r"recording\.folder") as refused:
+            b.ask("record_start", path=name)
+        assert refused.value.name == "bad_argument"
+    with pytest.raises(ControlError, match="link that leads out") as led_out:
+        b.ask("record_start", path="out/skin.mcap")
+    assert "recording.folder" in led_out.value.next_step
+    with pytest.raises(ControlError, match="exists already"):
+        b.ask("record_start", path="over.mcap")
     with pytest.raises(ControlError, match="no folder") as caught:
-        b.ask("record_start", path=str(tmp_path / "new" / "folder" / "skin.mcap"))
-    assert f"mkdir -p {tmp_path}/new/folder" in caught.value.next_step
+        b.ask("record_start", path="new/folder/skin.mcap")
+    assert f"mkdir -p {tmp_path}/kept/new/folder" in caught.value.next_step
     assert sorted(tmp_path.rglob("*")) == before
+    assert b.ask("record_start", path="own/a.mcap") == {"path": f"{tmp_path}/kept/own/a.mcap"}
+    b.ask("record_stop")
 
 
 def test_one_recording_at_a_time_and_as_many_as_wanted(bench: Start, tmp_path: Path) -> None:
@@ -367,9 +376,9 @@ def test_one_recording_at_a_time_and_as_many_as_wanted(bench: Start, tmp_path: P
     b.tare()
     for number in range(3):
         path = tmp_path / f"{number}.mcap"
-        b.ask("record_start", path=str(path))
+        b.ask("record_start", path=path.name)
         with pytest.raises(Exception, match="runs already"):
-            b.ask("record_start", path=str(tmp_path / "other.mcap"))
+            b.ask("record_start", path="other.mcap")
         b.step()
         b.ask("record_stop")
         assert open_recording(path).summary.frames == 1

@@ -74,7 +74,7 @@ def life(request: pytest.FixtureRequest, bench: Start, tmp_path: Path) -> Life:
     path = tmp_path / "life.mcap"
     b = bench(ports=request.param)
     b.tare()
-    b.ask("record_start", path=str(path))
+    b.ask("record_start", path=path.name)
     first = b.skin.counter + 1
     for index in range(8):
         b.step(load=0.02 * index)

@@ -141,10 +141,10 @@ def test_a_full_disk_is_recorded_to_again_once_it_has_room(
 def test_a_recording_to_one_file_ends_with_the_room_and_can_be_recovered(
     bench: Start, small_disk: Path, tmp_path: Path
 ) -> None:
-    b = bench(recording={"reserve_mb": 0, "maps": True})
+    b = bench(recording={"reserve_mb": 0, "maps": True, "folder": small_disk})
     b.tare()
     path = small_disk / "one.mcap"
-    b.ask("record_start", path=str(path))
+    b.ask("record_start", path=path.name)
     first = b.skin.counter + 1
     (small_disk / "filler").write_bytes(bytes(shutil.disk_usage(small_disk).free - 300_000))
     step_until(b, lambda: told(b, "recording_failed"))
@@ -158,7 +158,7 @@ def test_a_recording_to_one_file_ends_with_the_room_and_can_be_recovered(
     again = recover(path, tmp_path / "again.mcap").path
     assert counters(again) == found
     with pytest.raises(Exception, match="MB are free"):
-        b.ask("record_start", path=str(small_disk / "two.mcap"))
+        b.ask("record_start", path="two.mcap")
 
 
 @pytest.mark.slow
@@ -243,7 +243,7 @@ def test_a_disk_that_dies(bench: Start, ext4_disk: Path, tmp_path: Path) -> None
         fcntl.ioctl(file, EXT4_SHUTDOWN, NO_LOG_FLUSH)
     step_until(b, lambda: told(b, "recording_failed"))
     b.until(lambda: b.step() and b.ask("status")["state"] == "running")
-    b.ask("record_start", path=str(tmp_path / "elsewhere.mcap"))
+    b.ask("record_start", path="elsewhere.mcap")
     b.step()
     b.ask("record_stop")
     assert open_recording(tmp_path / "elsewhere.mcap").summary.frames == 1
@@ -265,7 +265,7 @@ def test_what_comes_while_the_disk_is_asked_to_keep_it_is_written(
     b = bench(recording={"sync_s": 0.05})
     b.tare()
     path = tmp_path / "kept.mcap"
-    b.ask("record_start", path=str(path))
+    b.ask("record_start", path=path.name)
     b.step()
     assert asked.wait(60)
     b.step()
@@ -277,10 +277,11 @@ def test_what_comes_while_the_disk_is_asked_to_keep_it_is_written(
 
 @pytest.mark.slow
 def test_a_deleted_file_or_folder_is_noticed(bench: Start, tmp_path: Path) -> None:
-    folder, path = tmp_path / "set", tmp_path / "one.mcap"
+    folder = tmp_path / "set"
+    path = folder / "one.mcap"
     b = bench(recording={"folder": folder})
     b.tare()
-    b.ask("record_start", path=str(path))
+    b.ask("record_start", path=path.name)
     path.unlink()
     step_until(b, lambda: told(b, "recording_failed"))
     assert "deleted" in told(b, "recording_failed")[0]["detail"]
@@ -365,7 +366,7 @@ def test_a_mistake_of_ours_ends_the_recording_and_not_the_recorder(
 
     b.daemon._recorder._write = fail
     assert "a mistake" in b.listener.event("recording_failed")["detail"]
-    b.ask("record_start", path=str(tmp_path / "b.mcap"))
+    b.ask("record_start", path="b.mcap")
     b.step()
     b.ask("record_stop")
     assert open_recording(tmp_path / "b.mcap").summary.frames == 1

@@ -49,7 +49,7 @@ def test_the_replay_of_a_pressed_skin_gives_the_same_maps(
         press()
     b.listener.event("tared")
     before = press(Press(0.0, 0.03, 180.0))
-    b.ask("record_start", path=str(path))
+    b.ask("record_start", path=path.name)
     first = b.skin.counter + 1
     after = press(Press(0.0, 0.03, 180.0))  # a recording begins cold, but nobody need notice
     assert [c["id"] for c in before["contacts"]] == [c["id"] for c in after["contacts"]] != []

@@ -161,7 +161,7 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(spawn: Start, tmp_path:
     skin.introduce()
     for _ in range(4):
         skin.scan()
-    process.ask("record_start", path=str(path))
+    process.ask("record_start", path=path.name)
     size = path.stat().st_size
     skin.scan()
     wait_until(lambda: path.stat().st_size > size)

@@ -126,7 +126,8 @@ def test_a_file_of_scans_of_such_a_tank(
         structure=np.array([scan, scan, empty]) * 3.0,
         structure_reference=empty * 3.0,
     )
-    assert len(reconstruct_file(tmp_path / "in.npz", tmp_path / "out.npz", description=tank)) == 3
+    made = reconstruct_file(tmp_path / "in.npz", tmp_path / "out.npz", description=tank)
+    assert made.frames == 3
     with np.load(tmp_path / "out.npz") as out:
         maps = out["structure"]
         assert -1 <= maps.min() < -0.5

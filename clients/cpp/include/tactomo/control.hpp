@@ -185,8 +185,8 @@ public:
     /// still counts as nothing pressed from then on.
     int tare() { return request("tare", std::chrono::seconds(10)).get<int>("scans"); }
 
-    /// Starts recording, and returns to which file; an absolute path on the daemon's computer, or
-    /// none for the daemon's own folder.
+    /// Starts recording, and returns to which file, on the daemon's computer: of this name, below
+    /// the folder of recordings that the daemon is configured with, or of names of its own.
     std::string record_start(const std::string& path = {}) {
         const Reply reply = path.empty() ? request("record_start")
                                          : request("record_start", patience, std::pair("path", path));

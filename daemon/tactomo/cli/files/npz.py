@@ -1,25 +1,17 @@
-"""Maps and contacts as arrays, named as those of `tactomo reconstruct` where they are the same.
-
-A recording may be larger than the memory, and its length shows at its end only: numbers and images
-grow in files, and go from there into the archive.
-"""
+"""Maps and contacts as arrays, named as those of `tactomo reconstruct` where they are the same."""
 
 from __future__ import annotations
 
-import contextlib
-import shutil
-import tempfile
-import zipfile
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import IO, Any, Final
 
 import numpy as np
-from numpy.lib import format as npy
 from tactomo_client import Contact, Frame
 from tactomo_models import Flag
 from tactomo_models.arrays import FloatArray
+from tactomo_models.growing_arrays import GrowingArrays
 
 from tactomo.cli.files.csv import ARRAY_COLUMNS
 from tactomo.cli.files.recorded_frames import Moment
@@ -59,81 +51,19 @@ def write_maps(
 
     An image that a frame does not have, and a number that is not known, is NaN.
     """
-    with (
-        tempfile.TemporaryDirectory(prefix=".tactomo-", dir=scratch) as folder,
-        contextlib.ExitStack() as undo,
-    ):
-        files = {
-            name: undo.enter_context((Path(folder) / name).open("w+b"))
-            for name in ("frames", "contacts", *IMAGES)
-        }
-        images = {name: _Images(files[name]) for name in IMAGES}
-        axes: dict[str, FloatArray] = {}
-        count = 0
+    types = {**FRAME_TYPES, **CONTACT_TYPES, **dict.fromkeys(IMAGES, "<f4")}
+    axes: dict[str, FloatArray] = {}
+    count = 0
+    with GrowingArrays(types, scratch) as arrays:
         for moment in moments:
-            files["frames"].write(_row(FRAME_TYPES, _frame_values(moment)))
+            arrays.append(_frame_values(moment))
             for contact in moment.frame.contacts:
-                files["contacts"].write(_row(CONTACT_TYPES, _contact_values(count, contact)))
-            for name, growing in images.items():
-                growing.put(count, getattr(moment.frame, name))
+                arrays.append(_contact_values(count, contact))
             axes = axes or _axes(moment.frame)
             count += 1
-        arrays: dict[str, Any] = {
-            **_columns(files["frames"], FRAME_TYPES),
-            **_columns(files["contacts"], CONTACT_TYPES),
-            **axes,
-        }
-        with zipfile.ZipFile(output, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-            for name, growing in images.items():
-                with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
-                    growing.write(entry, count, axes)
-            for name, array in arrays.items():
-                with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
-                    npy.write_array(entry, array)
-        return count
-
-
-class _Images:
-    """Images of one kind and shape that grow in a file; NaN for a frame that has none."""
-
-    def __init__(self, file: IO[bytes]) -> None:
-        self._file = file
-        self._rows = 0
-
-    def put(self, row: int, image: FloatArray | None) -> None:
-        if image is not None:
-            self._fill(row, image.shape)
-            self._file.write(image.astype("<f4").tobytes())
-            self._rows += 1
-
-    def write(self, entry: IO[bytes], rows: int, axes: Mapping[str, FloatArray]) -> None:
-        """Write all images into an .npy file; none where no frame had any.
-
-        They pass by: a memory map would count all that is read as this program's memory.
-        """
-        shape: tuple[int, ...] = (0,)
-        if axes:
-            shape = (rows, len(axes["y_mm"]), len(axes["x_mm"]))
-            self._fill(rows, shape[1:])
-        npy.write_array_header_1_0(entry, {"descr": "<f4", "fortran_order": False, "shape": shape})
-        self._file.seek(0)
-        shutil.copyfileobj(self._file, entry)
-
-    def _fill(self, rows: int, shape: tuple[int, ...]) -> None:
-        for _ in range(self._rows, rows):
-            self._file.write(np.full(shape, np.nan, "<f4").tobytes())
-        self._rows = max(self._rows, rows)
-
-
-def _row(types: Mapping[str, str], values: Mapping[str, Any]) -> bytes:
-    return np.array(tuple(values[name] for name in types), list(types.items())).tobytes()
-
-
-def _columns(file: IO[bytes], types: Mapping[str, str]) -> dict[str, Any]:
-    """Return each column of the rows in a file."""
-    file.seek(0)
-    table = np.fromfile(file, list(types.items()))
-    return {name: table[name] for name in types}
+        shape = (len(axes["y_mm"]), len(axes["x_mm"])) if axes else None
+        arrays.write(output, dict.fromkeys(IMAGES, shape) if shape else {}, **axes)
+    return count
 
 
 def _frame_values(moment: Moment) -> dict[str, Any]:
@@ -142,6 +72,7 @@ def _frame_values(moment: Moment) -> dict[str, Any]:
     bits = sum(Flag[name] for flag in frame.flags if (name := flag.upper()) in Flag.__members__)
     return {
         **known,
+        **{name: getattr(frame, name) for name in IMAGES},
         "time_s": time_s,
         "age_s": _known(age_s),
         "tier": frame.tier or "",

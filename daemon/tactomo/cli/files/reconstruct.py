@@ -143,7 +143,7 @@ def reconstruct(
     for note in read.notes:
         say(note, err=True)
     with progress_bar("reconstructing") as show:
-        frames = reconstruct_file(
+        made = reconstruct_file(
             scans,
             maps,
             read=(given, reference),
@@ -153,18 +153,19 @@ def reconstruct(
             curve=curve,
             taught=lesson,
         )
-    failures = [frame.failure for frame in frames if frame.failure]
-    if failures:
-        say(f"{failures[0]}; {len(failures)} frame(s) are tikhonov's instead", err=True)
-    say(f"wrote {maps}: {len(frames)} frames")
+    if made.failed:
+        say(f"{made.failure}; {made.failed} frame(s) are tikhonov's instead", err=True)
+    say(f"wrote {maps}: {made.frames} frames")
 
 
 def _is_of_reconstruct(path: Path) -> bool:
     """Whether a file is what this command writes, which can be computed again."""
-    from tactomo_models import DataError
-    from tactomo_models.archive import read_arrays
+    from zipfile import BadZipFile, ZipFile
+
+    from tactomo_models.foreign_file import open_regular
 
     try:
-        return {"seconds", "misfit", "contact_frame"} <= read_arrays(path).keys()
-    except (OSError, DataError):
+        with open_regular(path) as file, ZipFile(file) as archive:
+            return {"seconds.npy", "misfit.npy", "contact_frame.npy"} <= set(archive.namelist())
+    except (OSError, BadZipFile):
         return False

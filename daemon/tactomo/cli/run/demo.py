@@ -63,7 +63,8 @@ def demo(
     """Start a skin to press in the browser: simulated sensor, daemon and viewer in one command.
 
     The first start builds the sensor's models, which takes a moment. Ctrl-C stops everything.
-    With tcp addresses of port 0 it takes free ports and prints them.
+    With tcp addresses of port 0 it takes free ports and prints them. What `tactomo record` records
+    of it goes into this folder.
     """
     from tactomo.cli.children import new_family
 
@@ -77,6 +78,7 @@ def demo(
         *("--sensor", sensor, "--description", description),
         *("--stream", stream, "--control", control),
         *_optional("--method", method),
+        *("--set", f"recording.folder={json.dumps(str(Path.cwd()))}"),
         *([] if record is None else ["--set", f"recording.file={json.dumps(str(record))}"]),
     ]
     with (

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from contextlib import suppress
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -73,7 +72,7 @@ def record(
             help="Start a recording and return, stop it, or record FILE while this runs.",
         ),
     ],
-    path: Annotated[Path | None, typer.Argument(help="For `start`: the file.")] = None,
+    name: Annotated[str | None, typer.Argument(metavar="[FILE]", help="For `start`.")] = None,
     seconds: Annotated[
         float | None, typer.Option(min=0.1, help="For FILE: how long; until Ctrl-C when left out.")
     ] = None,
@@ -85,27 +84,29 @@ def record(
 ) -> None:
     """Record what the ports say (every byte, with its time) into an MCAP file.
 
-    The daemon writes the file, so it keeps recording when this command ends, and the path is one
-    on the daemon's computer. Without a path it records into its folder, cut into files of which
-    the newest are kept, as its configuration says under [recording]. `tactomo replay` plays a file
-    again; each of several replays by itself.
+    The daemon writes the file, so it keeps recording when this command ends: on its computer, into
+    the folder that its configuration names (`recording.folder`; without that
+    ~/.local/share/tactomo/recordings, of `tactomo demo` the one it was started in), and nowhere
+    else. `start` without FILE cuts the recording into files of which the newest are kept, as the
+    configuration says under [recording]. `tactomo replay` plays a file again; each of several
+    replays by itself.
     """
     from tactomo_client import Daemon
 
     daemon = Daemon(control, keys=keys)
     if what not in ("start", "stop"):
-        if path is not None:
+        if name is not None:
             raise typer.BadParameter("give one file, or `start FILE`")
-        _record_for(daemon, Path(what), seconds, maps or None)
+        _record_for(daemon, what, seconds, maps or None)
         return
     if seconds is not None:
         raise typer.BadParameter("--seconds goes with FILE, not with start or stop")
     if what == "stop":
-        if path is not None or maps:
+        if name is not None or maps:
             raise typer.BadParameter("stop takes no file, and no --maps")
         _print_recorded(daemon.record_stop())
         return
-    say(f"recording to {daemon.record_start(path, maps=maps or None).path}")
+    say(f"recording to {daemon.record_start(name, maps=maps or None).path}")
 
 
 @app.command(
@@ -176,13 +177,13 @@ def poke(
         print_json(answer)
 
 
-def _record_for(daemon: Daemon, path: Path, seconds: float | None, maps: bool | None) -> None:
+def _record_for(daemon: Daemon, name: str, seconds: float | None, maps: bool | None) -> None:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     size = TextColumn("{task.fields[size]}")
     columns = (TextColumn("recording"), BarColumn(), TimeElapsedColumn(), size)
     with (
-        daemon.record(path, maps=maps) as recording,
+        daemon.record(name, maps=maps) as recording,
         suppress(KeyboardInterrupt),  # the way to end a recording without --seconds
         Progress(*columns, transient=True) as progress,
     ):
