@@ -9,9 +9,9 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
-from typing import Any, Final, Literal, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
-Severity = Literal["info", "warning", "error"]
+from tactomo_client.schema import EVENTS
 
 EVENT_PERIOD_S: Final = 1.0
 LONGEST_PERIOD_S: Final = 60.0
@@ -20,14 +20,21 @@ LOGGED_AT_ONCE: Final = 5
 """Lines of one event that the log takes in a row; then one in `LOG_PERIOD_S`."""
 LOG_PERIOD_S: Final = 300.0
 TROUBLES_KEPT: Final = 8
+ENDS: Final = frozenset(kind.end for kind in EVENTS.values())
 
 
 class OnEvent(Protocol):
-    """Called with what happened; never waits and may be called from any thread."""
+    """Called with what happens, as often as it is seen; never waits, and for any thread."""
 
-    def __call__(self, name: str, severity: Severity, detail: str, next_step: str = "") -> None:
-        """Tell it: `name` for programs, `detail` and `next_step` for people."""
-        ...
+    def __call__(
+        self,
+        name: str,  # one of `EVENTS`, which says how often it is told
+        detail: str,  # for people, as is `next_step`
+        next_step: str = "",
+        about: str = "",  # which port or channel, where there are several
+        reason: str = "",  # what has not ended is told again with another one
+    ) -> bool | None:
+        """Tell it, if it is to be told now; return whether it was."""
 
 
 def times(count: int) -> str:
@@ -60,7 +67,7 @@ class RateLimit:
 
 
 class _Happened(NamedTuple):
-    severity: Severity
+    severity: str
     detail: str
     next_step: str
     realtime_ns: int
@@ -68,7 +75,7 @@ class _Happened(NamedTuple):
 
 
 class EventBook:
-    """Counts events by name, keeps the last troubles, and says what the log is to be told.
+    """Says what is to be told, counts that by name, and keeps the last troubles.
 
     For any thread. What it holds is bounded by the number of names.
     """
@@ -78,14 +85,32 @@ class EventBook:
         self._counts: Counter[str] = Counter()
         self._troubles: dict[str, _Happened] = {}  # the last of each name, the newest at the end
         self._allowance: dict[str, _Allowance] = {}
+        self._limits: dict[tuple[str, str], RateLimit] = {}  # by name and what it is about
+        self._lasting: dict[tuple[str, str], str] = {}  # what has not ended, with its reason
 
-    def note(self, name: str, severity: Severity, detail: str, next_step: str) -> int | None:
+    def is_due(self, name: str, about: str = "", reason: str = "") -> bool:
+        """Whether what is seen is told now: the end of what was told, news, and not too often."""
+        kind, key = EVENTS[name], (name, about)
+        with self._lock:
+            over = [each for each in self._lasting if EVENTS[each[0]].end == name]
+            over = [each for each in over if each[1] == about]
+            if self._lasting.get(key) == reason or (name in ENDS and not over):
+                return False
+            if not self._limits.setdefault(key, RateLimit(kind.period_s)).allows():
+                return False
+            for each in over:
+                del self._lasting[each]
+            if kind.end:
+                self._lasting[key] = reason
+            return True
+
+    def note(self, name: str, detail: str, next_step: str) -> int | None:
         """Take note of an event.
 
         Returns:
             None where the log is to be spared this one; else how many it was spared before.
         """
-        now_s = time.monotonic()
+        now_s, severity = time.monotonic(), EVENTS[name].severity
         with self._lock:
             self._counts[name] += 1
             if severity != "info":

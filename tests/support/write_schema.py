@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from tactomo_client.schema import PRESSURE_RANGES, TOUCHES_SEEN
+from tactomo_client.schema import EVENTS, PRESSURE_RANGES, TOUCHES_SEEN
 
 ROOT: Final = Path(__file__).parents[2]
 SOURCE: Final = ROOT / "clients/python/tactomo_client/schema.py"
@@ -75,14 +75,14 @@ def read_schema(source: str) -> dict[str, list[Field]]:
     classes = {}
     for node in ast.parse(source).body:
         if isinstance(node, ast.ClassDef):
-            own = [each for each in node.body if isinstance(each, ast.AnnAssign)]
+            own = [each for each in node.body if isinstance(each, ast.AnnAssign | ast.Assign)]
             found = [_field(each, lines) for each in own]
             classes[node.name] = [each for each in found if each.name[0] != "_"]
     return classes
 
 
-def _field(node: ast.AnnAssign, lines: list[str]) -> Field:
-    name = ast.unparse(node.target)
+def _field(node: ast.AnnAssign | ast.Assign, lines: list[str]) -> Field:
+    name = ast.unparse(node.targets[0] if isinstance(node, ast.Assign) else node.target)
     above = node.lineno - 1
     while lines[above - 1].strip().startswith("#:"):
         above -= 1
@@ -92,7 +92,11 @@ def _field(node: ast.AnnAssign, lines: list[str]) -> Field:
     unit = unit.rstrip(".") or UNITS.get(name.rpartition("_")[2] if "_" in name else "", "")
     is_open = bool(meaning) and meaning[-1] not in ".?"
     return Field(
-        name, ast.unparse(node.annotation), meaning + "." * is_open, unit, node.value is not None
+        name,
+        "" if isinstance(node, ast.Assign) else ast.unparse(node.annotation),
+        meaning + "." * is_open,
+        unit,
+        node.value is not None,
     )
 
 
@@ -139,6 +143,26 @@ def table(schema: dict[str, list[Field]], names: tuple[str, ...], since: str = "
     return "".join(f"{row}\n" for row in rows)
 
 
+def event_rows(schema: dict[str, list[Field]]) -> str:
+    """Return the rows of the table of events."""
+    rows = (
+        f"| `{name}` | {kind.severity} | 1 | {_event_words(schema, name)} |\n"
+        for name, kind in EVENTS.items()
+    )
+    return "".join(rows).replace("|  |", "| |")
+
+
+def _event_words(schema: dict[str, list[Field]], name: str) -> str:
+    (meaning,) = (field.meaning for field in schema["Events"] if field.name == name)
+    kind = EVENTS[name]
+    words = [_markdown(meaning)]
+    if kind.end:
+        words.append(f"Told once, until `{kind.end}`.")
+    if kind.period_s > 1:
+        words.append(f"The next one {kind.period_s:g} s later at the earliest.")
+    return " ".join(word for word in words if word)
+
+
 def _inside(schema: dict[str, list[Field]], kind: str) -> str:
     told = []
     for field in schema[kind]:
@@ -158,6 +182,7 @@ def stream_page(schema: dict[str, list[Field]], page: str) -> str:
     for heading, names in TABLES.items():
         rows = table(schema, names)
         page = _replaced(page, heading, ENVELOPE_ROWS + rows if "Envelope" in names else rows)
+    page = _replaced(page, "### `event`", event_rows(schema), "Event")
     return page
 
 
@@ -176,9 +201,9 @@ def files_page(schema: dict[str, list[Field]], page: str) -> str:
     return page[:start] + rows + page[end:]
 
 
-def _replaced(page: str, heading: str, rows: str) -> str:
+def _replaced(page: str, heading: str, rows: str, column: str = "Name") -> str:
     at = page.index(f"\n{heading}\n")
-    found = re.compile(r"\| Name \|.*\n\|[-|]+\n((?:\|.*\n)+)").search(page, at)
+    found = re.compile(rf"\| {column} \|.*\n\|[-|]+\n((?:\|.*\n)+)").search(page, at)
     assert found, heading
     return page[: found.start(1)] + rows + page[found.end(1) :]
 

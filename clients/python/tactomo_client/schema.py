@@ -278,6 +278,129 @@ class Event(Received):
 
 
 @dataclass(frozen=True, slots=True)
+class EventKind:
+    """How one kind of event is told."""
+
+    severity: str  # ``info``, ``warning`` or ``error``
+    # how long after one the next is told at the earliest; twice as long, up to a minute, while it
+    # goes on. 0: each
+    period_s: float = 0.0
+    end: str = ""  # the event that says that it is over: until then it is told once
+
+
+INFO: Final = EventKind("info")
+WARNING: Final = EventKind("warning")
+ERROR: Final = EventKind("error")
+FREQUENT: Final = EventKind("warning", period_s=1.0)
+
+
+class Events:
+    """All events by name."""
+
+    tared = INFO  #: A new reference is in force
+    #: The reference was not taken: scans too uneven (somebody presses), or none came
+    tare_refused = WARNING
+    #: Something seems to lie on the skin, by the reference kept from before, which is used; or a
+    #: tare was taken while contacts were shown: see the flag of this name
+    reference_disputed = WARNING
+    #: At the start neither drift nor contacts explain how the skin differs from the reference kept
+    #: from before: another skin, it seems. The new reference is used
+    skin_changed = WARNING
+    #: The skin is at rest by the reference that was kept, or by the one before a disputed tare
+    reference_confirmed = INFO
+    #: The reference cannot be kept for the next start, or the one kept cannot be read
+    reference_not_kept = EventKind("warning", period_s=600.0)
+    #: What is seen is neither a contact that explains it nor a drift that skins reach, or might be
+    #: either: the reference does not follow it. ``baseline`` in the status says it for as long as
+    #: it lasts
+    baseline_refused = EventKind("warning", period_s=600.0)
+    #: One channel's scans stay out; maps go on from the other
+    channel_lost = EventKind("warning", end="channel_back")
+    channel_back = INFO  #: They come again
+    #: One channel's scans repeat bit for bit while their counter goes on, though they had noise at
+    #: the tare, or have read nothing else since the first scan of it: they are left out as missing
+    converter_frozen = EventKind("warning", end="converter_back")
+    converter_back = INFO  #: They are measured again
+    #: A port was closed, unplugged, or cannot be opened; it is tried again
+    port_lost = EventKind("error", end="port_back")
+    port_back = INFO  #: It is open again
+    corrupt_packets = FREQUENT  #: Packets on a port were damaged on their way
+    #: Scans of a channel come after those that follow them, and are left out
+    scans_disordered = FREQUENT
+    scans_dropped = FREQUENT  #: Reconstruction lagged and dual scans were left out
+    #: It lagged because others take the processor: frames get half as much time as before
+    processor_shared = EventKind("warning", end="processor_free")
+    processor_free = INFO  #: Frames get all of their time again
+    method_failed = FREQUENT  #: A method of your own failed: the frame is ``tikhonov``'s
+    #: A mistake in tactomo: no frame came of a dual scan
+    reconstruction_failed = EventKind("error", period_s=1.0)
+    device_restarted = FREQUENT  #: A device was reset: its scan counter and its clock went back
+    #: The scan counter went back, the clock did not: someone asked for it
+    counters_zeroed = EventKind("info", period_s=1.0)
+    #: A device's clock jumped or went back; scans are dated by arrival until it is known again
+    device_clock_jumped = FREQUENT
+    #: A device's clock stands still or runs at an impossible rate; scans are dated by arrival
+    device_clock_unusable = WARNING
+    #: The two channels' counters are out of step: see the flag. Two boards are asked to zero them
+    channels_skewed = EventKind("warning", end="channels_in_step")
+    channels_in_step = INFO  #: They are in step again
+    #: The computer's clock was set, or the computer slept. Only ``acquired_realtime_ns`` follows it
+    wall_clock_jumped = WARNING
+    #: A device's scans are not used: ``refusal`` of its port in the status says why
+    device_refused = EventKind("error", period_s=1.0, end="device_speaks")
+    #: A pressure calibration or a teaching is there and not used: it is damaged, or of another
+    #: sensor, device or skin
+    calibration_refused = WARNING
+    #: The pressure calibration and the teaching were read again; what there is, is in force
+    calibration_reloaded = INFO
+    #: Another device is at a port than before, and is used. Tare if it has another skin
+    device_changed = FREQUENT
+    #: Nothing came over an open port for 3 s (or three periods of a slower device, or as long as
+    #: its protocol allows). It is asked again; later the port is closed and opened, ever more
+    #: rarely
+    device_silent = EventKind("warning", period_s=30.0, end="device_speaks")
+    #: Bytes come, but no packet for as long: the wrong baud rate, or no skin
+    device_garbled = EventKind("warning", period_s=30.0, end="device_speaks")
+    #: A device speaks, but sent no scan for as long, although it was asked to start
+    device_idle = EventKind("warning", period_s=30.0, end="device_speaks")
+    device_speaks = INFO  #: It is out of these troubles, or is understood again
+    #: An FTDI adapter holds bytes back for long, and may not be told otherwise
+    latency_timer = WARNING
+    #: A device's packets are intact and break [its protocol](../firmware_protocol/PROTOCOL.md):
+    #: another version, a field out of its range, scans unlike its *hello*. They are not used
+    firmware_fault = EventKind("warning", period_s=30.0)
+    #: A device speaks, and for 3 s has acknowledged no command
+    command_unanswered = EventKind("warning", period_s=600.0)
+    command_refused = WARNING  #: A device did not carry out a command of the daemon's
+    recording_started = INFO
+    recording_stopped = INFO
+    #: A client whose key is not allowed tried to connect: from where, and its public key
+    client_refused = FREQUENT
+    #: A file in the list of clients holds no key; or others could add to the list, and nobody new
+    #: is let in
+    client_key_unusable = WARNING
+    #: The disk is full, too slow or gone, or the file was deleted; the stream goes on
+    recording_failed = ERROR
+    recording_resumed = INFO  #: It goes on: there is room again, or the disk answers again
+    #: The disk has not answered for 5 s; what comes waits in memory, up to 64 MiB
+    recording_stalled = WARNING
+    recording_rotated = INFO  #: It goes on in the next file
+    rotation_failed = WARNING  #: The next file cannot be created: it goes on in the present one
+    recording_deleted = INFO  #: An old file, to keep to ``keep_gb`` or ``keep_days``
+    #: A mistake in tactomo: a message would have broken this page; ``sequence`` has the gap
+    message_unsent = EventKind("error", period_s=1.0)
+    connection_cut = FREQUENT  #: A connection sent 2 MB and more that made no message, and was cut
+    #: There were more subscriptions than the daemon keeps (1 MiB), and all connections were cut
+    subscribers_cut = WARNING
+    replay_ended = INFO  #: The recording is at its end
+
+
+EVENTS: Final[Mapping[str, EventKind]] = {
+    name: kind for name, kind in vars(Events).items() if isinstance(kind, EventKind)
+}
+
+
+@dataclass(frozen=True, slots=True)
 class Percentiles:
     """Of durations, ms."""
 

@@ -17,7 +17,7 @@ from tactomo.acquisition.adapters import LOW_LATENCY_MS, ROOT, device_of
 from tactomo.acquisition.open_serial import DEVICE_GONE, is_path, lower_latency, open_serial
 from tactomo.acquisition.replay_port import ReplayEnded, ReplayMoved, ReplayPort
 from tactomo.errors import PortAbsentError, TactomoError
-from tactomo.events import OnEvent, RateLimit
+from tactomo.events import OnEvent
 from tactomo.recordings.playback import Playback
 
 MAX_READ_BYTES: Final = 65_536
@@ -44,8 +44,6 @@ class Connection:
         self._root = root
         self._on_event = on_event
         self._playback = playback
-        self._told = ""  # the problem that was told last
-        self._told_limit = RateLimit()
         self._serial: serial.Serial | None = None
 
     def open(self) -> None:
@@ -54,7 +52,7 @@ class Connection:
         if self._playback is not None and isinstance(self._serial, ReplayPort):
             self._serial.playback = self._playback
         self.latency_timer_ms = lower_latency(self._serial, self._root)
-        self.problem, self._told, self.is_open = "", "", True
+        self.problem, self.is_open = "", True
         self._tell_slow_adapter()
 
     def try_open(self) -> bool:
@@ -121,24 +119,21 @@ class Connection:
         self._tell_closed("check the cable; the port is tried again until it is back")
 
     def _note(self, error: TactomoError) -> None:
-        """Take note of why the port cannot be opened, and tell it where it is news."""
+        """Take note of why the port cannot be opened, and tell it."""
         self.problem = error.cause
         # That it is not there says no more than that it was lost.
-        is_news = not (isinstance(error, PortAbsentError) and self._told)
-        if is_news and error.cause != self._told and self._told_limit.allows():
-            self._tell_closed(error.next_step)
+        reason = "" if isinstance(error, PortAbsentError) else error.cause
+        self._tell_closed(error.next_step, reason)
 
-    def _tell_closed(self, next_step: str) -> None:
-        self._told = self.problem
+    def _tell_closed(self, next_step: str, reason: str = "") -> None:
         detail = self.problem if self.url in self.problem else f"{self.url}: {self.problem}"
-        self._on_event("port_lost", "error", detail, next_step)
+        self._on_event("port_lost", detail, next_step, self.url, reason)
 
     def _tell_slow_adapter(self) -> None:
         timer_ms, name = self.latency_timer_ms, os.path.basename(device_of(self.url))
         if timer_ms is not None and timer_ms > LOW_LATENCY_MS:
             self._on_event(
                 "latency_timer",
-                "warning",
                 f"{self.url}: the adapter holds bytes back for up to {timer_ms} ms",
                 "install tactomo's udev rules, or as root: "
                 f"`echo 1 > /sys/bus/usb-serial/devices/{name}/latency_timer`",

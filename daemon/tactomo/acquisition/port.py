@@ -35,7 +35,7 @@ from tactomo.acquisition.device_clock import MAX_RATE, ClockState, DeviceClock
 from tactomo.acquisition.liveness import DeviceState, Liveness
 from tactomo.acquisition.open_serial import other_holders
 from tactomo.acquisition.replay_port import ReplayEnded, ReplayMoved
-from tactomo.events import OnEvent, RateLimit, times
+from tactomo.events import OnEvent, times
 from tactomo.protocols import PortProtocol, Trouble
 from tactomo.recordings.active_recording import ActiveRecording
 from tactomo.recordings.playback import Playback
@@ -46,14 +46,28 @@ from tactomo.scans import ChannelScan, Delivery
 from tactomo.worker import Worker
 
 RETRY_S: Final = 0.25
-TROUBLE_PERIOD_S: Final = 30.0
-"""How often at most a device is said to be in trouble: some come and go for hours."""
-
-
 FAULT_LASTS_S: Final = 3.0
 """How long after the last sight of it firmware counts as faulty: three hellos."""
 UNANSWERED_S: Final = 3.0
 """How long a device may leave commands unanswered: it is asked again in half that time."""
+
+
+TROUBLES: Final = {
+    DeviceState.SILENT: (
+        "device_silent",
+        "check its power; it is asked again, and the port is opened anew",
+    ),
+    DeviceState.GARBAGE: (
+        "device_garbled",
+        "wrong baud rate, or another device: set `baud` or `protocol` to the device's; "
+        "`tactomo ports --ask` tells what is where",
+    ),
+    DeviceState.IDLE: (
+        "device_idle",
+        "it is asked to start again and again; check its trigger, or reset it",
+    ),
+}
+"""The event of a device in each state of trouble, and what to do."""
 
 
 class PortReader(Worker):
@@ -105,18 +119,14 @@ class PortReader(Worker):
         self._is_doubled = False  # another port carries its channels
         self._asked_s = 0.0  # when the device was last asked, or last sent a scan
         self._trouble_of_protocol: Trouble | None = None
-        self._corrupt_told = 0
-        self._corrupt_limit = RateLimit()
-        self._trouble_told: DeviceState | None = None
-        self._trouble_limit = RateLimit(TROUBLE_PERIOD_S)
-        self._clock_told = (self.clock.state, 0)
-        self._clock_limit = RateLimit()
+        self._corrupt_seen = 0
+        self._judged: DeviceState | None = None  # when sharers were last looked for
+        self._sharers = ""
+        self._clock_seen = (self.clock.state, 0)
         self._is_zeroing = threading.Event()
         self._fault, self._fault_s = "", 0.0  # what was last against the protocol, and when
-        self._limits: dict[str, RateLimit] = {}
-        self._faulty_told = 0
+        self._faulty_seen = 0
         self._unanswered_s: float | None = None  # since when no command has been acknowledged
-        self._is_unanswered_told = False
 
     @property
     def counts(self) -> DecoderCounts:
@@ -210,14 +220,13 @@ class PortReader(Worker):
 
     def _wait_for_device(self) -> None:
         """Try the port once more, after a while."""
-        self._trouble_told = None
         if not self._stopping.wait(RETRY_S) and self._connection.try_open():
-            self._on_event("port_back", "info", self.url)
+            self._tell("port_back")
             self._greet_newcomer()
 
     def _greet_newcomer(self) -> None:
         """Make a new start with whichever device is at the port now."""
-        self._is_known = self._is_unanswered_told = False
+        self._is_known = False
         self._unanswered_s = None
         self._protocol.restart()
         self._liveness.opened(time.monotonic())
@@ -323,11 +332,9 @@ class PortReader(Worker):
         elif isinstance(packet, Acknowledge):
             self._unanswered_s = None
             if _is_refusal(packet):
-                self._on_event(
-                    "command_refused",
-                    "warning",
-                    f"{self.url}: the device answered command {packet.command} with "
-                    f"{packet.status.name}",
+                name = packet.status.name
+                self._tell(
+                    "command_refused", f"the device answered command {packet.command} with {name}"
                 )
         elif isinstance(packet, Scan):
             self._asked_s = time.monotonic()
@@ -336,22 +343,25 @@ class PortReader(Worker):
             if hello is not None and is_usable:
                 fault = unlike_hello(packet, hello)
                 if fault:
-                    self._note_fault("scan", fault, now_s)
+                    self._note_fault(fault, now_s)
                 elif packet.channel in self._description.channels:
                     return packet.volts(hello.volts_per_count)
             self.unused += 1
         return None
 
-    def _note_fault(self, kind: str, fault: str, now_s: float) -> None:
+    def _note_fault(self, fault: str, now_s: float) -> None:
         """Take note of, and tell, what a device's firmware does against its protocol."""
         self._fault, self._fault_s = fault, now_s
-        if self._limits.setdefault(kind, RateLimit(TROUBLE_PERIOD_S)).allows():
-            self._on_event(
-                "firmware_fault",
-                "warning",
-                f"{self.url}: {fault}; what is so is not used",
-                "the line is good: correct the firmware, by firmware_protocol/PROTOCOL.md",
-            )
+        self._tell(
+            "firmware_fault",
+            f"{fault}; what is so is not used",
+            "the line is good: correct the firmware, by firmware_protocol/PROTOCOL.md",
+        )
+
+    def _tell(self, name: str, words: str = "", next_step: str = "", reason: str = "") -> None:
+        """Tell something of this port."""
+        detail = f"{self.url}: {words}" if words else self.url
+        self._on_event(name, detail, next_step, self.url, reason)
 
     def _greet(self, hello: Hello) -> None:
         self._is_known = True
@@ -364,27 +374,14 @@ class PortReader(Worker):
         if hello == before and self.refusal == refused:
             return
         if trouble is not None:
-            if self._allows("device_refused"):
-                why = f"{self.url}: {trouble.cause}; its scans are not used"
-                self._on_event("device_refused", "error", why, trouble.next_step)
-        elif hello == before:
-            if self._allows("device_speaks"):
-                self._on_event("device_speaks", "info", self.url)
-        elif (
-            before is not None
-            and before.device_id != hello.device_id
-            and self._allows("device_changed")
-        ):
-            self._on_event(
+            why = f"{trouble.cause}; its scans are not used"
+            self._tell("device_refused", why, trouble.next_step, trouble.cause)
+        elif before is not None and before.device_id != hello.device_id:
+            self._tell(
                 "device_changed",
-                "warning",
-                f"{self.url}: {hello.device_id} is where {before.device_id} was",
+                f"{hello.device_id} is where {before.device_id} was",
                 "tare, if another skin was plugged in; `device_ids` keeps foreign ones out",
             )
-
-    def _allows(self, name: str) -> bool:
-        """Whether this may be told now: a device may say another thing with each hello."""
-        return self._limits.setdefault(name, RateLimit()).allows()
 
     def _judge(self, hello: Hello) -> Trouble | None:
         """Take note of whether a device's scans are used; return why not."""
@@ -463,93 +460,65 @@ class PortReader(Worker):
         return bool(self._fault) and time.monotonic() - self._fault_s < FAULT_LASTS_S
 
     def _tell_unanswered(self, now_s: float) -> None:
-        """Tell, once, that a device that speaks acknowledges nothing."""
+        """Tell that a device that speaks acknowledges nothing."""
         since_s, speaks = self._unanswered_s, (DeviceState.RUNNING, DeviceState.IDLE)
         is_due = since_s is not None and now_s - since_s > UNANSWERED_S
-        if is_due and not self._is_unanswered_told and self._liveness.state in speaks:
-            self._is_unanswered_told = True
-            self._on_event(
+        if is_due and self._liveness.state in speaks:
+            self._tell(
                 "command_unanswered",
-                "warning",
-                f"{self.url}: the device speaks, and acknowledges no command",
+                "the device speaks, and acknowledges no command",
                 "check the line from the computer to the device (its RX), and that the firmware "
                 "answers within 100 ms",
             )
 
     def _tell_trouble(self, state: DeviceState) -> None:
-        """Tell when a device falls into trouble and when it is out of it again."""
-        if state is self._trouble_told or state is DeviceState.STARTING:
-            return
+        """Tell in what trouble a device is, and when it is out of it again."""
         trouble = self._trouble(state)
-        if not trouble and self._trouble_told is not None:
-            self._on_event("device_speaks", "info", self.url)
-            self._trouble_told = None
-        elif trouble and self._trouble_limit.allows():
-            self._trouble_told = state
-            detail = f"{self.url}: {trouble}{self._sharers()}"
-            if state is DeviceState.SILENT:
-                self._on_event(
-                    "device_silent",
-                    "warning",
-                    detail,
-                    "check its power; it is asked again, and the port is opened anew",
-                )
-            elif state is DeviceState.GARBAGE:
-                self._on_event(
-                    "device_garbled",
-                    "warning",
-                    detail,
-                    "wrong baud rate, or another device: set `baud` or `protocol` to the device's; "
-                    "`tactomo ports --ask` tells what is where",
-                )
-            elif not self._has_fault:
-                self._on_event(
-                    "device_idle",
-                    "warning",
-                    detail,
-                    "it is asked to start again and again; check its trigger, or reset it",
-                )
-
-    def _sharers(self) -> str:
-        """Name those who take bytes away, which only root can."""
-        sharers = "; ".join(map(str, other_holders(self.url)))
-        return f"; another process has the port open, too ({sharers})" if sharers else ""
+        if state is not self._judged:  # looked for now and then: through all processes
+            sharers = "; ".join(map(str, other_holders(self.url))) if trouble else ""
+            # Which only root can see.
+            self._sharers = (
+                f"; another process has the port open, too ({sharers})" if sharers else ""
+            )
+        self._judged = state
+        if trouble and not (state is DeviceState.IDLE and self._has_fault):
+            name, next_step = TROUBLES[state]
+            self._tell(name, trouble + self._sharers, next_step)
+        elif not trouble and not self.refusal and state is not DeviceState.STARTING:
+            self._tell("device_speaks")
 
     def _end(self, reason: str) -> None:
         self.has_ended = True
         self._deliver(Delivery(self.index, 0, (), has_ended=True, replay_pass=self._pass))
-        self._on_event("replay_ended", "info", f"{self.url}: {reason}")
+        self._tell("replay_ended", reason)
 
     def _begin_pass(self, number: int) -> None:
         """Go on elsewhere in the recording: what had begun to come is not finished."""
         self._pass, self.has_ended = number, False
         self._protocol.restart()
         self.clock = DeviceClock()
-        self._clock_told = (self.clock.state, 0)
+        self._clock_seen = (self.clock.state, 0)
 
     def _tell_clock(self) -> None:
         """Tell of a device's clock that jumped or is none; scans are dated by arrival then."""
-        clock, (state, jumps) = self.clock, self._clock_told
-        if clock.jumps > jumps and self._clock_limit.allows():
-            self._on_event(
+        clock, (state, jumps) = self.clock, self._clock_seen
+        if clock.jumps > jumps:
+            self._tell(
                 "device_clock_jumped",
-                "warning",
-                f"{self.url}: the device's clock jumped, or the device was reset; "
+                f"the device's clock jumped, or the device was reset; "
                 f"{times(clock.jumps)} since the start",
                 "if it comes again and again, check the device's supply and its timer",
             )
-            jumps = clock.jumps
         if clock.state is not state and clock.state is ClockState.UNUSABLE:
-            self._on_event(
+            self._tell(
                 "device_clock_unusable",
-                "warning",
-                f"{self.url}: the device's clock stands still, or is off by more than "
+                f"the device's clock stands still, or is off by more than "
                 f"{MAX_RATE * 1e6:g} ppm, or its channels go by two; what buffers hold "
                 "up is not seen in the ages",
                 "correct the firmware's clock: one for both channels, in microseconds, read as the "
                 "scan begins",
             )
-        self._clock_told = (clock.state, jumps)
+        self._clock_seen = (clock.state, clock.jumps)
 
     def _tell_protocols_trouble(self) -> None:
         """Tell why nothing can be made of what comes, and when it can again."""
@@ -558,31 +527,28 @@ class PortReader(Worker):
             return
         if trouble is not None:
             self.refusal = trouble.cause
-            detail = f"{self.url}: {trouble.cause}"
-            self._on_event("device_refused", "error", detail, trouble.next_step)
+            self._tell("device_refused", trouble.cause, trouble.next_step, trouble.cause)
         elif self.hello is not None:
             self._judge(self.hello)
-            self._on_event("device_speaks", "info", self.url)
         else:
             self.refusal = ""
         self._trouble_of_protocol = trouble
 
     def _tell_corrupt(self) -> None:
         corrupt = self.counts.damaged
-        if corrupt > self._corrupt_told and self._corrupt_limit.allows():
-            self._on_event(
+        if corrupt > self._corrupt_seen:
+            self._tell(
                 "corrupt_packets",
-                "warning",
-                f"{self.url}: {corrupt - self._corrupt_told} damaged, {corrupt} since the start",
+                f"{corrupt} damaged since the start",
                 "check the cable, its shield and the baud rate",
             )
-            self._corrupt_told = corrupt
+        self._corrupt_seen = corrupt
 
     def _tell_faulty(self, now_s: float) -> None:
         faulty = self.counts.faulty
-        if faulty > self._faulty_told and self._protocol.fault:
-            self._note_fault("packet", self._protocol.fault, now_s)
-        self._faulty_told = faulty
+        if faulty > self._faulty_seen and self._protocol.fault:
+            self._note_fault(self._protocol.fault, now_s)
+        self._faulty_seen = faulty
 
 
 def unlike_hello(scan: Scan, hello: Hello) -> str:

@@ -37,7 +37,6 @@ class WallClock:
         self.last_jump_s = jump_s
         self._on_event(
             "wall_clock_jumped",
-            "warning",
             f"the computer's clock was set {abs(jump_s):.1f} s "
             f"{'ahead' if jump_s > 0 else 'back'}, or the computer slept",
             "nothing, unless you compare dates across it: go by monotonic times",

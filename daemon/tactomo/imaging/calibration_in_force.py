@@ -71,14 +71,14 @@ class CalibrationInForce:
         """
         for foreign in self._foreign(calibration, taught):
             step = f"what was in force stays so; run: {foreign.command}"
-            self._on_event("calibration_refused", "warning", foreign.cause, step)
+            self._on_event("calibration_refused", foreign.cause, step)
             raise CommandError(foreign.cause, step, "calibration_refused")
         self._own_taught = taught
         self._use(calibration, calibration_text(calibration))
         words = "none is kept: pressures are the description's"
         detail = words if calibration is None else calibration.words
         detail += "" if taught is None else f"; taught by {taught.words}"
-        self._on_event("calibration_reloaded", "info", detail)
+        self._on_event("calibration_reloaded", detail)
 
     def obey(self, text: str | None) -> None:
         """Put in force what a mark brings: a calibration's text, empty for none, None for no news.
@@ -109,7 +109,7 @@ class CalibrationInForce:
         for foreign in refused:
             if foreign not in self._refused:
                 step = f"until you run `{foreign.command}`, {foreign.until}"
-                self._on_event("calibration_refused", "warning", foreign.cause, step)
+                self._on_event("calibration_refused", foreign.cause, step)
         self._refused = refused
 
     def _foreign(

@@ -24,7 +24,6 @@ class FrozenConverters:
     def __init__(self, on_event: OnEvent) -> None:
         self._on_event = on_event
         self._last: Volts = {}
-        self._frozen: set[Channel] = set()
 
     def without(self, volts: Volts, reference: Reference | None) -> Volts:
         """The channels of a dual scan that were measured; told when that changes for one."""
@@ -36,17 +35,17 @@ class FrozenConverters:
             and _is_noisy(reference, channel, scan)
         }
         self._last = self._last | volts
-        for channel in sorted(repeats - self._frozen):
-            self._on_event(
-                "converter_frozen",
-                "warning",
-                f"{channel} scans repeat bit for bit; maps go on without them",
-                "switch that channel's board off and on; if it stays so, its converter or firmware "
-                "is at fault",
-            )
-        for channel in sorted((self._frozen - repeats) & volts.keys()):
-            self._on_event("converter_back", "info", f"{channel} scans are measured again")
-        self._frozen = (self._frozen - volts.keys()) | repeats
+        for channel in volts:
+            if channel in repeats:
+                self._on_event(
+                    "converter_frozen",
+                    f"{channel} scans repeat bit for bit; maps go on without them",
+                    "switch that channel's board off and on; if it stays so, its converter or "
+                    "firmware is at fault",
+                    channel,
+                )
+            else:
+                self._on_event("converter_back", f"{channel} scans are measured again", "", channel)
         return {channel: scan for channel, scan in volts.items() if channel not in repeats}
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any
 
 import structlog
 from tactomo_client.messages import CONTACTS, MAP, SCAN
@@ -29,7 +29,7 @@ from tactomo_models.physics.actual_sheet import Sheets
 from tactomo_protocol import Channel, ScanFlag
 
 from tactomo.config import BaselineConfig
-from tactomo.events import OnEvent, RateLimit
+from tactomo.events import OnEvent
 from tactomo.imaging import frames
 from tactomo.imaging.calibration_in_force import CalibrationInForce
 from tactomo.imaging.frame_marks import FrameMarks
@@ -43,8 +43,6 @@ from tactomo.recordings.recording import calibration_text
 from tactomo.scans import DualScan, Mark, Timing, Volts
 from tactomo.stream.publisher import Publisher
 from tactomo.timing import Durations, Rate
-
-REFUSAL_PERIOD_S: Final = 600.0
 
 log = structlog.get_logger()
 
@@ -109,8 +107,6 @@ class Imaging:
         self._contacts = 0  # in the last frame
         self._took_s: tuple[float, float] | None = None  # processor time and time; None if quiet
         self._processor = ProcessorShare()
-        self._failure_limit = RateLimit()
-        self._refusal_limit = RateLimit(REFUSAL_PERIOD_S)
 
     @property
     def baseline(self) -> dict[str, Any]:
@@ -156,7 +152,6 @@ class Imaging:
             if found is SkinAtStart.OTHER:
                 self._on_event(
                     "skin_changed",
-                    "warning",
                     f"neither contacts nor drift explain how the skin differs from {known.words}",
                     "if something lies on it, take it off; then `tactomo tare`",
                 )
@@ -170,7 +165,6 @@ class Imaging:
         if contacts:
             self._on_event(
                 "reference_disputed",
-                "warning",
                 f"the reference was taken while {contacts} contact(s) were shown",
                 "take everything off the skin; if contacts are still shown then: `tactomo tare`",
             )
@@ -200,7 +194,6 @@ class Imaging:
         self.use_reference(known.reference, known.realtime_ns, sheets)
         self._on_event(
             "reference_disputed",
-            "warning",
             f"{why}: the reference of {known.words} is used",
             "take everything off the skin; if contacts are still shown then: `tactomo tare`",
         )
@@ -271,21 +264,21 @@ class Imaging:
         if share < before:
             self._on_event(
                 "processor_shared",
-                "warning",
                 f"others take the processor: this skin got {processor.of_core:.0%} of a core while "
                 f"it computed, and frames get {share:.0%} of their time",
                 "give the daemon more of the processor, or fewer skins; it takes more by itself "
                 "once it can",
+                reason=f"{share}",
             )
         elif share == 1:
-            self._on_event("processor_free", "info", "frames get all of their time")
+            self._on_event("processor_free", "frames get all of their time")
 
     def _judge_dispute(self, frame: Reconstruction) -> Reconstruction:
         """Flag a frame, unless it settles the dispute: the skin is again as it was known."""
         if frame.tier == "quiet" and TOUCHES_SEEN.issuperset(frame.flags.names()):
             self._is_disputed = False
             detail = "the skin is at rest by the reference that was kept"
-            self._on_event("reference_confirmed", "info", detail)
+            self._on_event("reference_confirmed", detail)
             return frame
         return replace(frame, flags=frame.flags | Flag.REFERENCE_DISPUTED)
 
@@ -296,7 +289,6 @@ class Imaging:
         self.use_reference(known.reference, known.realtime_ns, sheets)
         self._on_event(
             "reference_confirmed",
-            "info",
             "the skin is at rest by the reference before the tare, which is used again",
         )
 
@@ -329,14 +321,10 @@ class Imaging:
                 self._follow(self._tracker)
         except Exception as error:  # a robot is better off with the next frame than with none
             self._reconstructor.reset()
-            if self._failure_limit.allows():
+            words = f"{type(error).__name__}: {error}"
+            step = "this is a mistake in tactomo: please report it with a recording"
+            if self._on_event("reconstruction_failed", words, step):
                 log.exception("reconstruction_failed")
-                self._on_event(
-                    "reconstruction_failed",
-                    "error",
-                    f"{type(error).__name__}: {error}",
-                    "this is a mistake in tactomo: please report it with a recording",
-                )
             return None
         took_s = time.perf_counter() - started_s
         if frame.tier != "quiet":
@@ -344,9 +332,9 @@ class Imaging:
         self._time("reconstruct", took_s)
         for stage, seconds in frame.stage_s.items():
             self._time(stage, seconds)
-        if frame.failure and self._failure_limit.allows():
+        if frame.failure:
             step = "frames are tikhonov's until it works: mend it, or choose another method"
-            self._on_event("method_failed", "warning", frame.failure, step)
+            self._on_event("method_failed", frame.failure, step)
         return frame
 
     def _follow(self, tracker: BaselineTracker) -> None:
@@ -355,10 +343,9 @@ class Imaging:
             self._note_reference(tracker.reference)
             if self._kept is not None and not self._is_unchecked:
                 self._kept.follow(tracker.reference, self.calibration.device_ids)
-        if tracker.refusal and self._refusal_limit.allows():
+        if tracker.refusal:
             self._on_event(
                 "baseline_refused",
-                "warning",
                 tracker.refusal,
                 "take off what presses, and away what heats or cools the skin; once it is steady: "
                 "`tactomo tare`",

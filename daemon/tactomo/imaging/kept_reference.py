@@ -17,13 +17,12 @@ from tactomo_models.archive import read_arrays, write_arrays
 from tactomo_models.calibration.calibration_file import data_folder
 
 from tactomo.errors import RecordingError
-from tactomo.events import OnEvent, RateLimit
+from tactomo.events import OnEvent
 from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording import REFERENCE_ARRAYS
 
 KEEP_S: Final = 60.0
 """How often a reference that follows drift is kept: drift bounds allow for far more than that."""
-TELL_S: Final = 600.0
 UNKNOWN_S: Final = 86_400.0
 """How long ago a reference held that is of the future: a computer without a clock of its own."""
 
@@ -68,7 +67,6 @@ class KeptReference:
         self._description = description
         self._recorder = recorder
         self._on_event = on_event
-        self._limit = RateLimit(TELL_S)
         self._next_s = 0.0
 
     def read(self, device_ids: Collection[str]) -> KnownSkin | None:
@@ -130,7 +128,6 @@ class KeptReference:
             self._tell(f"cannot write {self._path}: {error.strerror or error}")
 
     def _tell(self, why: str) -> None:
-        if self._limit.allows():
-            step = "make the folder writable, or remove the file; after a restart nobody can tell "
-            step += "a load from the bare skin without it"
-            self._on_event("reference_not_kept", "warning", why, step)
+        step = "make the folder writable, or remove the file; after a restart nobody can tell "
+        step += "a load from the bare skin without it"
+        self._on_event("reference_not_kept", why, step)

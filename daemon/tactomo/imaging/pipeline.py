@@ -44,11 +44,9 @@ ZERO_PERIOD_S: Final = 10.0
 class _SyncState(NamedTuple):
     """What events are told about when it changes."""
 
-    lost: frozenset[Channel]
     resets: int
     zeroed: int
     disordered: int
-    is_skewed: bool
 
 
 class Pipeline(Worker):
@@ -102,8 +100,6 @@ class Pipeline(Worker):
         self.wall_clock = WallClock(on_event)
         self._zero_counters = zero_counters
         self._zero_limit = RateLimit(ZERO_PERIOD_S)
-        self._reset_limit, self._zeroed_limit = RateLimit(), RateLimit()
-        self._disorder_limit = RateLimit()
         self._on_event = on_event
         # Scans: each port's thread counts its own; the port threads share a lock for what is
         # discarded because this thread did not come round to it for seconds.
@@ -112,8 +108,7 @@ class Pipeline(Worker):
         self._used = self._left_out = self._in_hand = self._joined = 0
         self._ready: deque[DualScan] = deque()  # to be made into frames now
         self._skipped = 0  # dual scans left out because newer ones had come
-        self._drop_limit = RateLimit()
-        self._dropped_told = 0
+        self._dropped_seen = 0
         self._is_excused = False  # the dual scans to be dropped next are not worth a warning
         self._announced: dict[int, Hello] = {}  # what each port's device says of itself
         self._begun: set[Channel] = set()  # channels that have been in a dual scan
@@ -366,84 +361,72 @@ class Pipeline(Worker):
         self._in_hand -= left_out
         self._left_out += left_out
         if ready and self._is_excused:  # a new reference takes a while to prepare for
-            self._is_excused, self._dropped_told = False, self.dropped
-        if self.dropped > self._dropped_told and self._drop_limit.allows():
+            self._is_excused, self._dropped_seen = False, self.dropped
+        if self.dropped > self._dropped_seen:
             self._on_event(
                 "scans_dropped",
-                "warning",
-                f"{self.dropped - self._dropped_told} dual scans left out, "
-                f"{self.dropped} since the start",
+                f"{self.dropped} dual scans left out since the start",
                 "give the daemon more of the processor, or set a faster method or a budget",
             )
-            self._dropped_told = self.dropped
+        self._dropped_seen = self.dropped
         return ready[-1:]
 
     def _sync_state(self) -> _SyncState:
         sync = self.sync
-        return _SyncState(
-            frozenset(sync.lost), sync.resets, sync.zeroed, sync.disordered, self.skew.is_skewed
-        )
+        return _SyncState(sync.resets, sync.zeroed, sync.disordered)
 
     def _tell_changes(self, before: _SyncState) -> None:
         now = self._sync_state()
-        self._tell_lost(before.lost, now.lost)
-        if now.resets > before.resets and self._reset_limit.allows():
+        self._tell_lost()
+        if now.resets > before.resets:
             self._on_event(
                 "device_restarted",
-                "warning",
                 "a device was reset: its scan counter and its clock went back; "
                 f"{times(now.resets)} since the start",
                 "check its supply; tare again if it lost its settings",
             )
-        if now.zeroed > before.zeroed and self._zeroed_limit.allows():
+        if now.zeroed > before.zeroed:
             self._on_event(
                 "counters_zeroed",
-                "info",
                 f"the scan counter went back, the clock on; {times(now.zeroed)} since the start",
             )
-        if now.disordered > before.disordered and self._disorder_limit.allows():
+        if now.disordered > before.disordered:
             self._on_event(
                 "scans_disordered",
-                "warning",
                 f"{now.disordered} scans since the start came after their channel's next ones, and "
                 "were left out",
                 "have the firmware send each channel's scans in the order of their counter",
             )
-        if now.is_skewed:
-            self._bring_in_step(is_news=not before.is_skewed)
-        elif before.is_skewed:
-            self._on_event("channels_in_step", "info", "the same counter is the same instant again")
+        if self.skew.is_skewed:
+            self._bring_in_step()
+        else:
+            self._on_event("channels_in_step", "the same counter is the same instant again")
 
-    def _tell_lost(self, before: frozenset[Channel], now: frozenset[Channel]) -> None:
-        for channel in sorted(now - before):
-            self._on_event(
-                "channel_lost",
-                "warning",
-                f"no {channel} scans in time; maps go on without them",
-                "check that channel's cable; if its scans come late, raise sync_wait_ms",
-            )
-        for channel in sorted(before - now):
-            self._on_event(
-                "channel_back",
-                "info",
-                f"{channel} scans come again",
-                "" if self._imaging.has_reference(channel) else "tare: it has no reference yet",
-            )
+    def _tell_lost(self) -> None:
+        for channel in self._channels:
+            if channel in self.sync.lost:
+                self._on_event(
+                    "channel_lost",
+                    f"no {channel} scans in time; maps go on without them",
+                    "check that channel's cable; if its scans come late, raise sync_wait_ms",
+                    channel,
+                )
+                continue
+            step = "" if self._imaging.has_reference(channel) else "tare: it has no reference yet"
+            self._on_event("channel_back", f"{channel} scans come again", step, channel)
 
-    def _bring_in_step(self, is_news: bool) -> None:
+    def _bring_in_step(self) -> None:
         """Have two boards count from 0 again; nothing helps a board that does so by itself."""
         are_two = self._ports > 1 and self._replay is None
-        if is_news:
-            self._on_event(
-                "channels_skewed",
-                "warning",
-                f"the channels' counters are {abs(self.skew.out_of_step_ns) * 1e-6:.0f} ms apart: "
-                "the same counter is not the same instant",
-                "the boards are asked to zero their counters; should it come again, check the "
-                "sync line between them"
-                if are_two
-                else "correct the firmware: both scans of one counter belong to one instant",
-            )
+        self._on_event(
+            "channels_skewed",
+            f"the channels' counters are {abs(self.skew.out_of_step_ns) * 1e-6:.0f} ms apart: "
+            "the same counter is not the same instant",
+            "the boards are asked to zero their counters; should it come again, check the "
+            "sync line between them"
+            if are_two
+            else "correct the firmware: both scans of one counter belong to one instant",
+        )
         if are_two and self._zero_limit.allows():
             self._zero_counters()
 

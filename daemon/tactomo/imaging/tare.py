@@ -172,12 +172,12 @@ class Taring:
         if not is_new:
             return
         shown = f", while {contacts} contact(s) were shown" if contacts else ""
-        self._on_event("tared", "info", f"{reference.scans} dual scans{shown}")
+        self._on_event("tared", f"{reference.scans} dual scans{shown}")
         for answer in tare.answers:  # when all is in force: a status asked for now shows it
             answer.set_result({"scans": reference.scans, "contacts": contacts})
 
     def _refuse(self, tare: Tare, refusal: CommandError) -> None:
-        self._on_event("tare_refused", "warning", refusal.cause, refusal.next_step)
+        self._on_event("tare_refused", refusal.cause, refusal.next_step)
         if not self._has_reference and not self._fall_back(refusal.cause):
             self.start()  # without a reference there is nothing else to do
         for answer in tare.answers:

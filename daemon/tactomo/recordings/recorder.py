@@ -131,7 +131,7 @@ class Recorder(Worker):
             self._is_dead, self.active = True, None
             self.failures += 1
             self.failure = _DIED
-            self._on_event("recording_failed", "error", _DIED, _REPORT)
+            self._on_event("recording_failed", _DIED, _REPORT)
         waits_s = 0.0 if busy_since_s is None else time.monotonic() - busy_since_s
         if (waits_s > STALL_S) != self._is_stalled:
             self._is_stalled = not self._is_stalled
@@ -141,13 +141,12 @@ class Recorder(Worker):
         if self._is_stalled:
             self._on_event(
                 "recording_stalled",
-                "warning",
                 f"the disk has not answered for {waits_s:.0f} s; up to "
                 f"{MAX_QUEUED_BYTES >> 20} MB wait in memory",
                 "look at the disk (dmesg), or record to another one",
             )
         else:
-            self._on_event("recording_resumed", "info", "the disk answers again")
+            self._on_event("recording_resumed", "the disk answers again")
 
     def _ask(self, work: Callable[[], Any]) -> Future[Any]:
         if self._is_dead:
@@ -210,7 +209,7 @@ class Recorder(Worker):
         self._with_maps = with_maps
         self.active = self._create(path)
         self._folder, self.waits_for, self.failure = folder, "", ""
-        self._on_event("recording_started", "info", str(self.active.path))
+        self._on_event("recording_started", str(self.active.path))
         self._delete_old()
         return {"path": str(self.active.path)}
 
@@ -235,7 +234,7 @@ class Recorder(Worker):
         except (OSError, RecordingError) as error:
             self._folder = self._rules.folder_path
             self.failures += 1
-            self._on_event("recording_failed", "error", str(error), self._wait(str(error)))
+            self._on_event("recording_failed", str(error), self._wait(str(error)))
 
     def _create(
         self, path: Path | None, previous: ActiveRecording | None = None, reserves: int = 1
@@ -267,7 +266,7 @@ class Recorder(Worker):
         if active is not None:
             self._finish(active)
             detail = f"{active.path}: {active.bytes_written} bytes"
-            self._on_event("recording_stopped", "info", detail)
+            self._on_event("recording_stopped", detail)
         elif not is_wanted:
             raise CommandError(
                 "nothing is being recorded", "start with record_start", "not_recording"
@@ -336,12 +335,10 @@ class Recorder(Worker):
             following = self._create(None, previous=active)
         except (OSError, RecordingError) as error:
             self._next_try_s = time.monotonic() + RETRY_S
-            self._on_event(
-                "rotation_failed", "warning", f"{error}; going on in {active.path}", _TRIED_AGAIN
-            )
+            self._on_event("rotation_failed", f"{error}; going on in {active.path}", _TRIED_AGAIN)
             return
         self._ending, self.active = active, following
-        self._on_event("recording_rotated", "info", f"{following.path}, after {active.path}")
+        self._on_event("recording_rotated", f"{following.path}, after {active.path}")
         self._delete_old()
 
     def _try_again(self) -> None:
@@ -354,7 +351,7 @@ class Recorder(Worker):
             self._wait(str(error))
             return
         self.waits_for = self.failure = ""
-        self._on_event("recording_resumed", "info", str(self.active.path))
+        self._on_event("recording_resumed", str(self.active.path))
         self._delete_old()
 
     def _stop_early(self, active: ActiveRecording, reason: str) -> None:
@@ -384,7 +381,7 @@ class Recorder(Worker):
             for deletion in to_delete(ours, self._rules):
                 deletion.path.unlink()
                 self.deleted += 1
-                self._on_event("recording_deleted", "info", f"{deletion.path}: {deletion.reason}")
+                self._on_event("recording_deleted", f"{deletion.path}: {deletion.reason}")
         except OSError as error:  # the next file's beginning tries again
             log.warning("recording_not_deleted", detail=str(error))
 
@@ -412,7 +409,7 @@ class Recorder(Worker):
             self.failures += 1
             detail = f"{recording.path}: {reason}, after {recording.bytes_written} bytes"
             self.failure = detail
-            self._on_event("recording_failed", "error", detail, self._wait(reason))
+            self._on_event("recording_failed", detail, self._wait(reason))
 
 
 _REST: Final = "see to the disk, then record anew; what was written until then can be replayed"

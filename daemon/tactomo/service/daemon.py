@@ -37,6 +37,7 @@ from typing import TYPE_CHECKING, Any, Final
 import structlog
 import zmq
 from tactomo_client.messages import EVENT, SCHEMA, STATUS
+from tactomo_client.schema import EVENTS
 from tactomo_models import (
     Artifact,
     ArtifactError,
@@ -65,7 +66,7 @@ from tactomo.config import DaemonConfig
 from tactomo.ending import at_end
 from tactomo.endpoint import allow_connections
 from tactomo.errors import CommandError, ConfigError
-from tactomo.events import EventBook, Severity
+from tactomo.events import EventBook
 from tactomo.imaging.imaging import Imaging
 from tactomo.imaging.kept_reference import KeptReference
 from tactomo.imaging.pipeline import Pipeline
@@ -274,9 +275,7 @@ class Daemon:
             ports=list(self.config.ports),
         )
         for why in self._unused:
-            self._on_event(
-                "calibration_refused", "warning", why, "until then it is as if there were none"
-            )
+            self._on_event("calibration_refused", why, "until then it is as if there were none")
 
     def stop(self) -> None:
         """Stop all threads and close everything; may be called twice."""
@@ -457,7 +456,7 @@ class Daemon:
             found, taught, unused = None, None, [str(error)]
         if unused:
             step = "what was in force stays so"
-            self._on_event("calibration_refused", "warning", unused[0], step)
+            self._on_event("calibration_refused", unused[0], step)
             raise CommandError(unused[0], step, "calibration_refused")
         return self._pipeline.use_calibration(found, taught)
 
@@ -473,8 +472,12 @@ class Daemon:
         if active is not None and active.with_maps:
             active.add(message_entry(kind, data, time.monotonic_ns(), time.time_ns()))
 
-    def _on_event(self, name: str, severity: Severity, detail: str, next_step: str = "") -> None:
-        spared = self._events.note(name, severity, detail, next_step)
+    def _on_event(
+        self, name: str, detail: str, next_step: str = "", about: str = "", reason: str = ""
+    ) -> bool:
+        if not self._events.is_due(name, about, reason):
+            return False
+        severity, spared = EVENTS[name].severity, self._events.note(name, detail, next_step)
         if spared is not None:
             extra: dict[str, Any] = {"next_step": next_step} if next_step else {}
             if spared:
@@ -482,6 +485,7 @@ class Daemon:
             getattr(log, severity)(name, detail=detail, **extra)
         fields = {"name": name, "severity": severity, "detail": detail, "next_step": next_step}
         self._publisher.publish(EVENT, fields)
+        return True
 
 
 def _log_thread_failure(failure: threading.ExceptHookArgs) -> None:

@@ -25,7 +25,7 @@ from tactomo_client.errors import KeysError
 from tactomo_client.keys import PUBLIC_SUFFIX, read_public, read_secret
 from zmq.auth.thread import ThreadAuthenticator
 
-from tactomo.events import OnEvent, RateLimit
+from tactomo.events import OnEvent
 from tactomo.stream.keys import MAY_COMMAND, how_to_allow
 
 STREAM: Final = "stream"
@@ -109,7 +109,7 @@ class AllowList:
         try:
             check_closed(self._folder)
         except KeysError as error:
-            self._on_event("client_key_unusable", "warning", error.cause, error.next_step)
+            self._on_event("client_key_unusable", error.cause, error.next_step)
             return False
         return True
 
@@ -128,7 +128,7 @@ class AllowList:
             try:
                 keys.add(read_public(path))
             except KeysError as error:  # one bad file locks nobody else out
-                self._on_event("client_key_unusable", "warning", error.cause, error.next_step)
+                self._on_event("client_key_unusable", error.cause, error.next_step)
         return frozenset(keys)
 
 
@@ -170,8 +170,7 @@ class AccessControl:
         self._on_revoked = on_revoked
         self._checked_s = 0.0  # of the one thread that calls `check`, as is _revocations
         self._revocations = 0
-        self._refused = 0  # the thread's own, as is _limit
-        self._limit = RateLimit()
+        self._refused = 0  # the thread's own
         self._authenticator = _Authenticator(context)
         for domain in (STREAM, CONTROL):
             self._authenticator.configure_curve_callback(domain, self)
@@ -210,15 +209,13 @@ class AccessControl:
 
     def _tell_refused(self, domain: str, key: str) -> None:
         self._refused += 1
-        if self._limit.allows():
-            self._on_event(
-                "client_refused",
-                "warning",
-                f"{self._authenticator.address} may not use the {domain}: its public key {key} is "
-                f"not allowed ({self._refused} refused so far)",
-                "if it is yours, copy its public key (CLIENT.key) to this computer, and "
-                + how_to_allow(self._clients, may_command=domain == CONTROL),
-            )
+        self._on_event(
+            "client_refused",
+            f"{self._authenticator.address} may not use the {domain}: its public key {key} is "
+            f"not allowed ({self._refused} refused so far)",
+            "if it is yours, copy its public key (CLIENT.key) to this computer, and "
+            + how_to_allow(self._clients, may_command=domain == CONTROL),
+        )
 
 
 class _Authenticator(ThreadAuthenticator):

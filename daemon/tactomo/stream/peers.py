@@ -20,7 +20,7 @@ from zmq.utils.monitor import parse_monitor_message
 
 from tactomo.endpoint import bind
 from tactomo.errors import AddressError
-from tactomo.events import OnEvent, RateLimit
+from tactomo.events import OnEvent
 
 MAX_PARTS: Final = 8  # of a request: identity, empty part, body; and what a few proxies add
 DISCARDED_AT_ONCE: Final = 10_000  # parts: some 10 ms
@@ -62,7 +62,6 @@ class Peers:
         self.monitor = socket.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
         self._connections: dict[int, _Connection] = {}  # by descriptor
         self._is_discarding = False
-        self._limit = RateLimit()
         try:
             self.address = bind(socket, endpoint, purpose, secret=secret, option=option)
         except AddressError:
@@ -125,14 +124,12 @@ class Peers:
             # ZeroMQ sees its end, throws away what it has of it, and closes it: with a reset.
             connection.setsockopt(posix.SOL_SOCKET, posix.SO_LINGER, struct.pack("ii", 1, 0))
             connection.shutdown(posix.SHUT_RDWR)
-            if self._limit.allows():
-                self._on_event(
-                    "connection_cut",
-                    "warning",
-                    f"{peer[0]} port {peer[1]} sent {unread * 1e-6:.1f} MB to the {self._purpose} "
-                    "that made no message",
-                    "find the program that does this",
-                )
+            self._on_event(
+                "connection_cut",
+                f"{peer[0]} port {peer[1]} sent {unread * 1e-6:.1f} MB to the {self._purpose} "
+                "that made no message",
+                "find the program that does this",
+            )
 
 
 def _state(received: int) -> _Connection:

@@ -21,11 +21,11 @@ import zmq
 from tactomo_client import Keys
 from tactomo_client.connection import connect_subscriber
 from tactomo_client.messages import STATUS
-from tactomo_client.schema import STALE_AFTER_S
+from tactomo_client.schema import EVENTS, STALE_AFTER_S
 
 from tactomo.ending import at_end
 from tactomo.endpoint import allow_connections
-from tactomo.events import RateLimit, Severity
+from tactomo.events import RateLimit
 from tactomo.stream.access_control import STREAM, Context
 from tactomo.stream.subscriptions import SUBSCRIBERS_CUT, Subscribers
 
@@ -95,7 +95,9 @@ class Proxy(Relay):
         """
         self._outlet: zmq.Socket[bytes] = self._context.socket(zmq.XPUB)
         self._outlet.setsockopt(zmq.SNDHWM, QUEUED_PER_SUBSCRIBER)
-        self._readers = Subscribers(self._outlet, self._endpoint, STREAM, tell, None, "--bind")
+        self._readers = Subscribers(
+            self._outlet, self._endpoint, STREAM, self._on_event, None, "--bind"
+        )
         self.address = self._readers.address
         for source in self.sources:
             self._inlets.append(self._connect(source))
@@ -137,6 +139,9 @@ class Proxy(Relay):
         self._repeat_statuses(joined & before)
         if self._readers.cuts > cuts and self._flood.allows():
             tell("subscribers_cut", "warning", *SUBSCRIBERS_CUT)
+
+    def _on_event(self, name: str, detail: str, next_step: str = "", *_: str, **__: str) -> None:
+        tell(name, EVENTS[name].severity, detail, next_step)
 
     def _repeat_statuses(self, prefixes: set[bytes]) -> None:
         oldest_s = time.monotonic() - STALE_AFTER_S
@@ -274,6 +279,6 @@ def serve(relay: Relay) -> None:
     log.info("stopped")
 
 
-def tell(name: str, severity: Severity, detail: str, next_step: str = "") -> None:
+def tell(name: str, severity: str, detail: str, next_step: str = "") -> None:
     """Log what happened."""
     getattr(log, severity)(name, detail=detail, next_step=next_step)

@@ -18,7 +18,7 @@ import zmq
 from tactomo_client import MessageError
 from tactomo_client.messages import CONTACTS, EVENT, STATUS, clock_id, encode_message, topic
 
-from tactomo.events import OnEvent, RateLimit
+from tactomo.events import OnEvent
 from tactomo.stream.access_control import STREAM
 from tactomo.stream.subscriptions import SUBSCRIBERS_CUT, Subscribers
 from tactomo.timing import Durations
@@ -85,7 +85,6 @@ class Publisher(Worker):
         self._lock = threading.Lock()
         self._readers: Subscribers  # this thread's own, as are _socket and _cuts_*
         self._cuts_seen = self._cuts_told = 0
-        self._unsent_limit = RateLimit()
         self._prefixes: frozenset[bytes] = frozenset()  # a copy for the other threads
         self._last_status = b""
         self._queue: deque[_Outgoing] = deque(maxlen=MAX_QUEUED)
@@ -199,7 +198,11 @@ class Publisher(Worker):
         try:
             data = encode_message(self._sensor, message.kind, {**envelope, **message.fields})
         except MessageError as error:
-            self._tell_unsent(message, error)
+            self._on_event(
+                "message_unsent",
+                f"a {message.kind} message was left out: {error}",
+                "this is a mistake in tactomo: please report it with a recording",
+            )
             return b""
         if message.kind == CONTACTS:
             self.header = header
@@ -210,15 +213,6 @@ class Publisher(Worker):
             self.latency.add((envelope["age_ns"] - envelope["delay_ns"]) * 1e-9)
         return data
 
-    def _tell_unsent(self, message: _Outgoing, error: MessageError) -> None:
-        if self._unsent_limit.allows():
-            self._on_event(
-                "message_unsent",
-                "error",
-                f"a {message.kind} message was left out: {error}",
-                "this is a mistake in tactomo: please report it with a recording",
-            )
-
     def _send_status(self) -> None:
         self._last_status = self._send(self._number(STATUS, None, self._status(self.header)))
 
@@ -226,7 +220,7 @@ class Publisher(Worker):
         """Tell that subscribers were cut off, a second later: then they are back to hear it."""
         if self._cuts_seen > self._cuts_told:
             self._cuts_told = self._cuts_seen
-            self._on_event("subscribers_cut", "warning", *SUBSCRIBERS_CUT)
+            self._on_event("subscribers_cut", *SUBSCRIBERS_CUT)
         self._cuts_seen = self._readers.cuts
 
     def _read_subscriptions(self) -> None:

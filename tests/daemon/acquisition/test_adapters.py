@@ -161,7 +161,7 @@ def test_a_latency_timer_that_stays_long_is_told(
 ) -> None:
     told: list[str] = []
 
-    def on_event(name: str, severity: str, detail: str, next_step: str = "") -> None:
+    def on_event(name: str, detail: str, next_step: str = "", *_: str, **__: str) -> None:
         told.append(f"{name}: {detail}; {next_step}")
 
     number = os.path.basename(os.path.realpath(line.path))

@@ -22,6 +22,7 @@ from tactomo.acquisition.connection import Connection
 from tactomo.acquisition.liveness import PATIENCE_S
 from tactomo.acquisition.open_serial import DEVICE_GONE, open_serial
 from tactomo.errors import PortAbsentError, PortBusyError
+from tactomo.events import EventBook
 from tactomo.timing import FEW
 from tactomo_models import load_description
 from tactomo_protocol import CommandCode
@@ -42,7 +43,13 @@ def connect(told: list[tuple[str, str]]) -> Iterator[Connect]:
     """Open a connection whose events are in `told`; it is closed later."""
     made: list[Connection] = []
 
-    def on_event(name: str, severity: str, detail: str, next_step: str = "") -> None:
+    book = EventBook()
+
+    def on_event(
+        name: str, detail: str, next_step: str = "", about: str = "", reason: str = ""
+    ) -> None:
+        if not book.is_due(name, about, reason):
+            return
         told.append((name, f"{detail}; {next_step}"))
 
     def open_connection(url: object) -> Connection:

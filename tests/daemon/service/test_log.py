@@ -141,28 +141,56 @@ def test_a_year_of_a_bad_cable_does_not_fill_the_log(monkeypatch: pytest.MonkeyP
     told: list[int] = []
     for _ in range(7200):  # two hours, an event a second
         clock.now_s += 1.0
-        spared = book.note("corrupt_packets", "warning", "3 damaged", "check the cable")
+        spared = book.note("corrupt_packets", "3 damaged", "check the cable")
         told += [] if spared is None else [spared]
     assert len(told) == pytest.approx(LOGGED_AT_ONCE + 7200 / LOG_PERIOD_S, abs=1)
     assert told[:LOGGED_AT_ONCE] == [0] * LOGGED_AT_ONCE
     assert told[-1] == pytest.approx(LOG_PERIOD_S - 1, abs=1)
-    assert book.note("port_lost", "error", "gone", "") == 0, "another event is not held back"
+    assert book.note("port_lost", "gone", "") == 0, "another event is not held back"
     assert book.counts == {"corrupt_packets": 7200, "port_lost": 1}
 
 
 def test_the_book_keeps_the_last_of_each_trouble(monkeypatch: pytest.MonkeyPatch) -> None:
     clock, book = Clock(monkeypatch), EventBook()
-    book.note("port_lost", "error", "first", "")
-    book.note("tared", "info", "20 dual scans", "")
-    book.note("corrupt_packets", "warning", "1 damaged", "check the cable")
+    book.note("port_lost", "first", "")
+    book.note("tared", "20 dual scans", "")
+    book.note("corrupt_packets", "1 damaged", "check the cable")
     clock.now_s += 5.0
-    book.note("port_lost", "error", "second", "")
+    book.note("port_lost", "second", "")
     said: Mapping[str, Any] = book.fields()
     assert said["counts"] == {"port_lost": 2, "tared": 1, "corrupt_packets": 1}
     assert [(t["name"], t["detail"], t["age_s"]) for t in said["troubles"]] == [
         ("port_lost", "second", 0.0),
         ("corrupt_packets", "1 damaged", 5.0),
     ]
+
+
+def test_what_lasts_is_told_once_until_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, book = Clock(monkeypatch), EventBook()
+    assert not book.is_due("channel_back", "structure"), "nothing was lost"
+    assert book.is_due("channel_lost", "structure")
+    clock.now_s += 1e6
+    assert not book.is_due("channel_lost", "structure")
+    assert book.is_due("channel_lost", "magnitude"), "another channel"
+    assert book.is_due("channel_back", "structure")
+    assert not book.is_due("channel_back", "structure")
+    assert book.is_due("channel_lost", "structure")
+    assert book.is_due("port_lost", "a", "held by another process")
+    assert not book.is_due("port_lost", "a", "held by another process")
+    assert book.is_due("port_lost", "a", "gone")
+
+
+def test_one_kind_is_told_ever_more_rarely_and_others_are_not_held_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock, book = Clock(monkeypatch), EventBook()
+    told = 0
+    for _ in range(600):
+        clock.now_s += 0.1
+        told += book.is_due("corrupt_packets", "a")
+    assert 5 <= told <= 7
+    assert book.is_due("corrupt_packets", "b")
+    assert all(book.is_due("tared") for _ in range(5))
 
 
 def test_a_late_joiner_finds_what_happened(bench: Callable[..., Any]) -> None:

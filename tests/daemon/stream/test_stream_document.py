@@ -14,10 +14,11 @@ import tactomo
 import tactomo.stream.control
 import tactomo.twin.control
 from tables import table as cells_of
+from tactomo.acquisition.port import TROUBLES
 from tactomo.errors import CommandError
 from tactomo.service import metrics
 from tactomo_client import schema as status
-from tactomo_client.schema import TOUCHES_SEEN
+from tactomo_client.schema import EVENTS, TOUCHES_SEEN
 from tactomo_models import Flag
 from tactomo_models.methods.auto import UNSURE_MISFIT
 from tactomo_models.methods.magnitudes import BAD_MISFIT
@@ -126,10 +127,23 @@ def test_it_says_from_what_misfit_on_a_frame_is_flagged() -> None:
     assert f"above {UNSURE_MISFIT:g} over both" in row[0]
 
 
-def test_every_event_is_listed() -> None:
-    source = "".join(p.read_text("utf-8") for p in Path(tactomo.__path__[0]).rglob("*.py"))
-    told = set(re.findall(r"\b_?on_event\(\s*\"(\w+)\"", source))
-    assert table("### `event`", "Event") == told
+def test_every_event_is_listed_and_told() -> None:
+    assert table("### `event`", "Event") == EVENTS.keys()
+    assert {kind.end for kind in EVENTS.values() if kind.end} <= EVENTS.keys()
+    sources = Path(tactomo.__path__[0]).rglob("*.py")
+    trees = [ast.parse(path.read_text("utf-8")) for path in sources]
+    told = {name for tree in trees for name in events_told(tree)}
+    assert told | {name for name, _ in TROUBLES.values()} == EVENTS.keys()
+
+
+def events_told(source: ast.AST) -> Iterator[str]:
+    """Yield the names that a module tells as events, written out where they are told."""
+    for call in ast.walk(source):
+        if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Attribute):
+            continue
+        name = call.args[0] if call.args else None
+        if call.func.attr in ("_on_event", "_tell") and isinstance(name, ast.Constant):
+            yield str(name.value)
 
 
 @pytest.mark.parametrize(
