@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from typing import Any
 
 import msgpack  # type: ignore[import-untyped]
@@ -92,34 +91,6 @@ def test_numpy_values_may_stand_anywhere() -> None:
     decoded = decode_message(encode_message("left", "map", fields)).fields
     assert decoded["scan_counter"] == 5
     np.testing.assert_array_equal(array_from_wire(decoded["map"]), np.ones((2, 3)))
-
-
-@given(st.binary(max_size=300))
-def test_no_bytes_break_the_decoders(data: bytes) -> None:
-    for decode in (decode_message, decode_request, decode_reply):
-        with suppress(MessageError, ControlError):
-            decode(data)
-
-
-@given(body=values | st.binary(max_size=80))
-def test_no_body_breaks_the_decoders(body: object) -> None:
-    packed = body if isinstance(body, bytes) else msgpack.packb(body)
-    with pytest.raises(MessageError):
-        decode_message(b"left/map\0" + packed)
-    with pytest.raises(MessageError):
-        decode_reply(packed)
-
-
-@given(data=st.data())
-def test_no_corruption_of_a_message_breaks_the_decoder(data: st.DataObject) -> None:
-    fields = HEADER | {"map": np.zeros((4, 4), np.float32), "contacts": [{"id": 1, "x_mm": 2.0}]}
-    message = bytearray(encode_message("left", "map", fields))
-    for _ in range(data.draw(st.integers(1, 4))):
-        position = data.draw(st.integers(0, len(message) - 1))
-        message[position] = data.draw(st.integers(0, 255))
-    length = data.draw(st.integers(0, len(message)))
-    with suppress(MessageError):
-        array_from_wire(decode_message(bytes(message[:length])).fields.get("map"))
 
 
 @given(

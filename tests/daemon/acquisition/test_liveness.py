@@ -143,14 +143,6 @@ def test_one_long_pause_is_nobodys_pace(device: Liveness) -> None:
     assert device.patience_s == PATIENCE_S
 
 
-def test_another_device_has_another_pace(device: Liveness) -> None:
-    for number in range(5):
-        device.heard(110.0 + 10 * number, 1, 1)
-    assert device.patience_s == pytest.approx(30.0)
-    device.opened(200.0)
-    assert device.patience_s == PATIENCE_S
-
-
 @pytest.mark.parametrize("since_s", [4.0, 60.0])
 def test_what_comes_after_silence_has_its_time_to_become_a_packet(since_s: float) -> None:
     """A frame reaches the reader in pieces: the first one alone is no garbage."""

@@ -167,24 +167,6 @@ def test_a_pty_of_socat_that_is_killed_is_lost_and_found_again(
 
 
 @pytest.mark.slow
-def test_unplugged_and_replugged_again_and_again(bench: Start, until: Until) -> None:
-    b = bench()
-    b.tare()
-    line = b.skin.lines[0]
-    for time_ in range(10):
-        line.unplug()
-        until(lambda: not b.ask("status")["ports"][0]["connected"])
-        line.plug()
-        line.introduce()
-        frame = b.step()
-        assert frame["flags"] == [], time_
-    events = [e["name"] for e in b.listener.of("event") if e["name"].startswith("port")]
-    assert events == ["port_lost", "port_back"] * 10
-    port_threads = [t for t in threading.enumerate() if t.name.startswith("port-")]
-    assert len(port_threads) == 1
-
-
-@pytest.mark.slow
 def test_what_stands_in_the_way_is_told_and_waited_out(
     bench: Start, tmp_path: Path, hold: Hold
 ) -> None:

@@ -252,20 +252,6 @@ def test_a_new_cable_does_not_finish_the_old_line(kind: type[ForeignProtocol]) -
     assert protocol.counts.corrupt == 0
 
 
-@pytest.mark.parametrize("kind", [OpenEit, Matrix])
-@given(data=st.data())
-def test_any_bytes_are_survived(kind: type[ForeignProtocol], data: st.DataObject) -> None:
-    fields = st.sampled_from([b"1", b"2.5", b"-3e2", b"nan", b"inf", b"1e999", b"A", b"x", b"\xff"])
-    pieces = st.sampled_from([b",", b", ", b"\t", b";", b"\n", b"\r\n", b"A\n", b"magnitudes: "])
-    many = st.integers(1, 260).map(lambda n: b"1," * n)
-    stream = b"".join(data.draw(st.lists(st.one_of(fields, pieces, many, st.binary()))))
-    sensor = OPENEIT if kind is OpenEit else MATRIX
-    whole, bytewise = kind(sensor), kind(sensor)
-    expected = whole.feed(stream)
-    assert [p for n in range(len(stream)) for p in bytewise.feed(stream[n : n + 1])] == expected
-    assert whole.counts == bytewise.counts
-
-
 def test_ports_are_recognised_by_what_they_print() -> None:
     assert recognised(openeit_line(VALUES[:192])[300:] + openeit_line(VALUES[:192])) == "openeit"
     assert recognised(teensy_line(np.ones(256)) * 4) == "matrix"

@@ -286,16 +286,6 @@ def test_what_the_instrument_cannot_do_is_refused_at_once(tmp_path: Path) -> Non
         protocol_named("sciospec", sensor(tmp_path, current_a="current_a = 0.1"))
 
 
-@settings(max_examples=50)
-@given(st.binary(max_size=2000))
-def test_any_bytes_are_survived(data: bytes) -> None:
-    port = Sciospec(TANK)
-    port.feed(data)
-    port.feed(stream(MESSAGES[:2]))
-    assert len(port.begun()) < 2 * 8960
-    assert numbers(port.feed(stream(MESSAGES[2:])))[-3:] == [3, 4, 5]
-
-
 def test_it_is_recognised_from_anywhere() -> None:
     assert recognised(stream(MESSAGES)[77:]) == "sciospec"
     assert recognised(b"\0\0" + ACK) == "sciospec"

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-import zmq
 from hostile_page import SUBSCRIBE, post
+from logged_process import LoggedProcess, next_of
 from tactomo_client.fake import FakeSensor
 from tactomo_client.messages import decode_message, topic
 from waiting import PATIENCE_S, wait_until
@@ -28,49 +24,21 @@ serve(Proxy(sys.argv[1:], "tcp://127.0.0.1:0"))
 """
 
 
-class Running:
-    """A proxy in a process of its own."""
-
-    def __init__(self, *sources: str) -> None:
-        command = [sys.executable, "-c", PROGRAM, *sources]
-        self.process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-        self.address: str = self.said("ready")["stream"]
-
-    def said(self, event: str) -> dict[str, Any]:
-        """Return the next such line of its log."""
-        assert self.process.stderr is not None
-        for line in self.process.stderr:
-            entry: dict[str, Any] = json.loads(line)
-            if entry["event"] == event:
-                return entry
-        raise AssertionError(f"it ended with status {self.process.wait()}")
-
-
 @pytest.fixture
-def proxy() -> Iterator[Callable[..., Running]]:
-    started: list[Running] = []
+def proxy() -> Iterator[Callable[..., LoggedProcess]]:
+    started: list[LoggedProcess] = []
 
-    def start(*sensors: FakeSensor) -> Running:
-        started.append(Running(*(sensor.address for sensor in sensors)))
+    def start(*sensors: FakeSensor) -> LoggedProcess:
+        started.append(LoggedProcess("-c", PROGRAM, *(each.address for each in sensors)))
         return started[-1]
 
     yield start
     for running in started:
-        running.process.kill()
-        running.process.communicate()
-
-
-def next_of(socket: zmq.Socket[bytes], send: Callable[[], object] = lambda: None) -> Any:
-    """Return the next message; `send` is called until it comes."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not socket.poll(20):
-        assert time.monotonic() < deadline, "no message came"
-        send()
-    return decode_message(socket.recv())
+        running.end()
 
 
 def test_all_sensors_are_at_one_address(
-    left: FakeSensor, right: FakeSensor, proxy: Callable[..., Running], reader: Any
+    left: FakeSensor, right: FakeSensor, proxy: Callable[..., LoggedProcess], reader: Any
 ) -> None:
     address = proxy(left, right).address
     every = reader(address, b"")
@@ -89,7 +57,7 @@ def test_all_sensors_are_at_one_address(
 
 
 def test_a_daemon_is_asked_for_what_somebody_wants_and_no_longer(
-    left: FakeSensor, proxy: Callable[..., Running], reader: Any
+    left: FakeSensor, proxy: Callable[..., LoggedProcess], reader: Any
 ) -> None:
     address = proxy(left).address
     wanted = topic("left", "contacts")
@@ -105,7 +73,7 @@ def test_a_daemon_is_asked_for_what_somebody_wants_and_no_longer(
 
 
 def test_late_joiners_get_the_last_status_at_once(
-    left: FakeSensor, proxy: Callable[..., Running], reader: Any
+    left: FakeSensor, proxy: Callable[..., LoggedProcess], reader: Any
 ) -> None:
     address = proxy(left).address
     status = topic("left", "status")
@@ -131,7 +99,7 @@ def test_late_joiners_get_the_last_status_at_once(
 
 @pytest.mark.slow
 def test_a_status_of_a_daemon_that_is_gone_is_not_repeated(
-    left: FakeSensor, proxy: Callable[..., Running], reader: Any
+    left: FakeSensor, proxy: Callable[..., LoggedProcess], reader: Any
 ) -> None:
     address = proxy(left).address
     first = reader(address, topic("left", "status"))
@@ -147,7 +115,7 @@ def test_a_status_of_a_daemon_that_is_gone_is_not_repeated(
 
 
 def test_a_daemon_may_come_and_go(
-    tmp_path: Path, proxy: Callable[..., Running], reader: Any
+    tmp_path: Path, proxy: Callable[..., LoggedProcess], reader: Any
 ) -> None:
     with FakeSensor("left", f"ipc://{tmp_path}/left") as left:  # a port may be another's meanwhile
         socket = reader(proxy(left).address, topic("left", "contacts"))
@@ -159,7 +127,7 @@ def test_a_daemon_may_come_and_go(
 
 @pytest.mark.slow
 def test_a_source_that_never_answered_is_missed_once(
-    tmp_path: Path, proxy: Callable[..., Running]
+    tmp_path: Path, proxy: Callable[..., LoggedProcess]
 ) -> None:
     with FakeSensor("left", f"ipc://{tmp_path}/left") as left:  # a port may be another's meanwhile
         pass
@@ -173,7 +141,7 @@ def test_a_source_that_never_answered_is_missed_once(
 
 @pytest.mark.slow
 def test_a_slow_subscriber_slows_nobody(
-    left: FakeSensor, proxy: Callable[..., Running], reader: Any
+    left: FakeSensor, proxy: Callable[..., LoggedProcess], reader: Any
 ) -> None:
     running = proxy(left)
     stalled = reader(running.address, topic("left", "map"))
@@ -192,7 +160,7 @@ def test_a_slow_subscriber_slows_nobody(
 
 
 def test_two_daemons_of_one_name_are_warned_of(
-    left: FakeSensor, proxy: Callable[..., Running], reader: Any
+    left: FakeSensor, proxy: Callable[..., LoggedProcess], reader: Any
 ) -> None:
     with FakeSensor("left") as other:
         running = proxy(left, other)
@@ -211,7 +179,7 @@ def test_two_daemons_of_one_name_are_warned_of(
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_it(
-    left: FakeSensor, proxy: Callable[..., Running], number: signal.Signals
+    left: FakeSensor, proxy: Callable[..., LoggedProcess], number: signal.Signals
 ) -> None:
     running = proxy(left)
     running.process.send_signal(number)
@@ -221,7 +189,7 @@ def test_a_signal_ends_it(
 
 
 def test_a_web_pages_subscription_gets_nothing(
-    proxy: Callable[..., Running], reader: Callable[..., Any], left: FakeSensor
+    proxy: Callable[..., LoggedProcess], reader: Callable[..., Any], left: FakeSensor
 ) -> None:
     running = proxy(left)
     socket = reader(running.address, b"left/")

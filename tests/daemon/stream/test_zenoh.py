@@ -22,7 +22,7 @@ import msgpack  # type: ignore[import-untyped]
 import numpy as np
 import pytest
 import zenoh
-import zmq
+from logged_process import LoggedProcess, next_of
 from page import Page
 from tactomo.stream import zenoh_bridge
 from tactomo.stream.zenoh_publication import ENCODING, HEARTBEAT_S, STATUS_HEARTBEAT_S
@@ -32,28 +32,9 @@ from tactomo_client.messages import decode_message, topic
 from waiting import PATIENCE_S, wait_until
 from whole_system import SENSOR, running_demo
 
+ZENOH = ("-m", "tactomo.cli", "zenoh", "--log-format", "json")
 EXAMPLES = Path(__file__).parents[3] / "deploy/examples"
 TOUCH = [Contact(1, 10.0, 0.0, 700.0, 0.1, 0.01, 170.0)]
-
-
-class Running:
-    """`tactomo zenoh` in a process of its own."""
-
-    def __init__(self, *options: object) -> None:
-        command = [sys.executable, "-m", "tactomo.cli", "zenoh", "--log-format", "json"]
-        self.process = subprocess.Popen(
-            [*command, *map(str, options)], stderr=subprocess.PIPE, text=True
-        )
-        self.address: str = self.said("ready")["stream"]
-
-    def said(self, event: str) -> dict[str, Any]:
-        """Return the next such line of its log."""
-        assert self.process.stderr is not None
-        for line in self.process.stderr:
-            entry: dict[str, Any] = json.loads(line)
-            if entry["event"] == event:
-                return entry
-        raise AssertionError(f"it ended with status {self.process.wait()}")
 
 
 @pytest.fixture
@@ -80,22 +61,21 @@ def desk(tmp_path: Path, configuration: Callable[..., Path]) -> Iterator[zenoh.S
 @pytest.fixture
 def start(
     tmp_path: Path, configuration: Callable[..., Path], desk: zenoh.Session
-) -> Iterator[Callable[..., Running]]:
+) -> Iterator[Callable[..., LoggedProcess]]:
     """Start a bridge that is a client of `desk`: ``start(*sensors, robot="arm", bind=...)``."""
-    started: list[Running] = []
+    started: list[LoggedProcess] = []
     connect = {"endpoints": [f"unixsock-stream/{tmp_path / 'router'}"]}
 
-    def go(*sensors: FakeSensor, **options: object) -> Running:
+    def go(*sensors: FakeSensor, **options: object) -> LoggedProcess:
         config = configuration(mode="client", connect=connect)
         words = [word for sensor in sensors for word in ("--from", sensor.address)]
         words += [str(word) for name, value in options.items() for word in (f"--{name}", value)]
-        started.append(Running("--config", config, *words))
+        started.append(LoggedProcess(*ZENOH, "--config", config, *words))
         return started[-1]
 
     yield go
     for running in started:
-        running.process.kill()
-        running.process.communicate()
+        running.end()
 
 
 class Samples:
@@ -115,17 +95,8 @@ class Samples:
         wait_until(condition, meanwhile=send, step_s=0.02)
 
 
-def next_of(one: zmq.Socket[bytes], send: Callable[[], object] = lambda: None) -> Any:
-    """Return the next message; `send` is called until it comes."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not one.poll(20):
-        assert time.monotonic() < deadline, "no message came"
-        send()
-    return decode_message(one.recv())
-
-
 def test_each_kind_has_its_key_and_its_count(
-    left: FakeSensor, right: FakeSensor, start: Callable[..., Running], desk: zenoh.Session
+    left: FakeSensor, right: FakeSensor, start: Callable[..., LoggedProcess], desk: zenoh.Session
 ) -> None:
     samples = Samples(desk, "tactomo/**")
     start(left, right, robot="arm")
@@ -144,7 +115,7 @@ def test_each_kind_has_its_key_and_its_count(
 
 @pytest.mark.slow
 def test_a_skin_at_rest_is_sent_by_a_heartbeat_and_a_touch_at_once(
-    left: FakeSensor, start: Callable[..., Running], desk: zenoh.Session
+    left: FakeSensor, start: Callable[..., LoggedProcess], desk: zenoh.Session
 ) -> None:
     samples = Samples(desk, "tactomo/arm/left/contacts")
     start(left, robot="arm")
@@ -164,7 +135,7 @@ def test_a_skin_at_rest_is_sent_by_a_heartbeat_and_a_touch_at_once(
 
 @pytest.mark.slow
 def test_a_status_is_sent_when_it_says_something_else_and_its_numbers_are_asked_for(
-    left: FakeSensor, start: Callable[..., Running], desk: zenoh.Session, reader: Any
+    left: FakeSensor, start: Callable[..., LoggedProcess], desk: zenoh.Session, reader: Any
 ) -> None:
     samples = Samples(desk, "tactomo/arm/left/status")
     start(left, robot="arm")
@@ -193,7 +164,7 @@ def test_a_status_is_sent_when_it_says_something_else_and_its_numbers_are_asked_
 
 @pytest.mark.slow
 def test_contacts_and_status_of_a_skin_at_rest_are_a_fifth_of_those_by_the_clock(
-    start: Callable[..., Running], desk: zenoh.Session, reader: Any
+    start: Callable[..., LoggedProcess], desk: zenoh.Session, reader: Any
 ) -> None:
     """A simulated skin behind a real daemon; bytes as a subscriber of all of both gets them."""
     by_zenoh: list[tuple[float, int]] = []
@@ -227,7 +198,7 @@ def test_contacts_and_status_of_a_skin_at_rest_are_a_fifth_of_those_by_the_clock
 
 
 def test_a_query_gets_the_newest_contacts_and_status(
-    left: FakeSensor, start: Callable[..., Running], desk: zenoh.Session
+    left: FakeSensor, start: Callable[..., LoggedProcess], desk: zenoh.Session
 ) -> None:
     samples = Samples(desk, "tactomo/arm/left/status")
     start(left, robot="arm")
@@ -250,7 +221,7 @@ def test_a_query_gets_the_newest_contacts_and_status(
 
 @pytest.mark.slow
 def test_a_token_lives_as_long_as_the_daemon(
-    left: FakeSensor, start: Callable[..., Running], desk: zenoh.Session
+    left: FakeSensor, start: Callable[..., LoggedProcess], desk: zenoh.Session
 ) -> None:
     heard: list[tuple[str, zenoh.SampleKind]] = []
     tokens = desk.liveliness().declare_subscriber(
@@ -268,7 +239,7 @@ def test_a_token_lives_as_long_as_the_daemon(
 
 @pytest.mark.slow
 def test_clients_of_zeromq_find_all_skins_at_one_address(
-    left: FakeSensor, right: FakeSensor, start: Callable[..., Running], reader: Any
+    left: FakeSensor, right: FakeSensor, start: Callable[..., LoggedProcess], reader: Any
 ) -> None:
     start(left, right, robot="arm")
     address = start(bind="tcp://127.0.0.1:0").address
@@ -295,7 +266,7 @@ def test_clients_of_zeromq_find_all_skins_at_one_address(
 
 
 def test_late_joiners_get_the_last_status_at_once(
-    left: FakeSensor, start: Callable[..., Running], reader: Any
+    left: FakeSensor, start: Callable[..., LoggedProcess], reader: Any
 ) -> None:
     start(left, robot="arm")
     address = start(bind="tcp://127.0.0.1:0", robot="arm").address
@@ -317,7 +288,7 @@ def test_late_joiners_get_the_last_status_at_once(
 
 
 def test_what_is_lost_is_counted_and_told(
-    desk: zenoh.Session, start: Callable[..., Running], reader: Any, left: FakeSensor
+    desk: zenoh.Session, start: Callable[..., LoggedProcess], reader: Any, left: FakeSensor
 ) -> None:
     running = start(bind="tcp://127.0.0.1:0")
     socket = reader(running.address, b"")
@@ -332,7 +303,7 @@ def test_what_is_lost_is_counted_and_told(
 
 @pytest.mark.slow
 def test_two_robots_skins_of_one_name_are_not_mixed(
-    desk: zenoh.Session, start: Callable[..., Running], reader: Any, left: FakeSensor
+    desk: zenoh.Session, start: Callable[..., LoggedProcess], reader: Any, left: FakeSensor
 ) -> None:
     running = start(bind="tcp://127.0.0.1:0")
     one = reader(running.address, topic("left", "contacts"))
@@ -356,20 +327,8 @@ def test_two_robots_skins_of_one_name_are_not_mixed(
         wait_until(lambda: next_of(one, lambda: other.publish(TOUCH)).fields["session"] != first)
 
 
-def test_a_daemon_may_come_and_go(
-    tmp_path: Path, start: Callable[..., Running], desk: zenoh.Session
-) -> None:
-    samples = Samples(desk, "tactomo/arm/left/contacts")
-    with FakeSensor("left", f"ipc://{tmp_path}/left") as left:  # a port may be another's meanwhile
-        start(left, robot="arm")
-        samples.until(lambda: samples.all, left.publish)
-        first = samples.all[-1][1]["session"]
-    with FakeSensor("left", left.address) as again:
-        samples.until(lambda: samples.all[-1][1]["session"] != first, again.publish)
-
-
 def test_two_daemons_of_one_name_are_warned_of(
-    left: FakeSensor, start: Callable[..., Running], desk: zenoh.Session
+    left: FakeSensor, start: Callable[..., LoggedProcess], desk: zenoh.Session
 ) -> None:
     samples = Samples(desk, "tactomo/**")
     with FakeSensor("left") as other:
@@ -388,12 +347,9 @@ def test_two_daemons_of_one_name_are_warned_of(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_ends_it(
-    left: FakeSensor, start: Callable[..., Running], number: signal.Signals
-) -> None:
+def test_a_signal_ends_it(left: FakeSensor, start: Callable[..., LoggedProcess]) -> None:
     for running in (start(left), start(bind="tcp://127.0.0.1:0")):
-        running.process.send_signal(number)
+        running.process.send_signal(signal.SIGTERM)
         assert running.process.wait(PATIENCE_S) == 0
         assert running.process.stderr is not None
         assert "Traceback" not in running.process.stderr.read()
@@ -453,7 +409,7 @@ def test_the_examples_let_a_listed_certificate_read_and_no_more(
     desk = example("zenoh_desk.json5", tmp_path, port)
     stranger = tmp_path / "stranger.json5"
     stranger.write_text(desk.read_text().replace("desk.", "stranger."))
-    bridge = Running("--from", left.address, "--robot", "arm", "--config", robot)
+    bridge = LoggedProcess(*ZENOH, "--from", left.address, "--robot", "arm", "--config", robot)
     try:
         with zenoh.open(zenoh.Config.from_file(str(desk))) as allowed:
             samples = Samples(allowed, "tactomo/**")
@@ -482,8 +438,7 @@ def test_the_examples_let_a_listed_certificate_read_and_no_more(
             with pytest.raises(zenoh.ZError):
                 zenoh.open(plain)
     finally:
-        bridge.process.kill()
-        bridge.process.communicate()
+        bridge.end()
 
 
 def test_the_pages_program_prints_touches_and_who_is_there(
@@ -494,8 +449,8 @@ def test_the_pages_program_prints_touches_and_who_is_there(
     script = tmp_path / "touched.py"
     script.write_text(page.file("touched.py"))
     endpoint = {"endpoints": [f"unixsock-stream/{tmp_path / 'zenoh'}"]}
-    bridge = Running(
-        "--from", left.address, "--robot", "arm", "--config", configuration(listen=endpoint)
+    bridge = LoggedProcess(
+        *ZENOH, "--from", left.address, "--robot", "arm", "--config", configuration(listen=endpoint)
     )
     client = configuration(mode="client", connect=endpoint)
     command = [sys.executable, "-I", "-u", str(script), str(client)]
@@ -515,8 +470,7 @@ def test_the_pages_program_prints_touches_and_who_is_there(
         stop.set()
         publishing.join()
         process.kill()
-    bridge.process.kill()
-    bridge.process.communicate()
+    bridge.end()
     assert said == {"tactomo/arm/left is there", "tactomo/arm/left/contacts 10, 0 mm"}
 
 

@@ -19,7 +19,6 @@ from tactomo_models.calibration.calibration_file import (
     calibration_for,
     calibration_path,
     load_calibration,
-    parse_calibration,
     read_calibration,
     save_calibration,
 )
@@ -249,12 +248,6 @@ def test_a_damaged_file_is_refused(
     path.write_text(json.dumps({**made.model_dump(), key: value}))
     with pytest.raises(CalibrationError, match=said):
         read_calibration(path)
-
-
-@given(st.binary(max_size=200))
-def test_any_bytes_are_a_calibration_or_are_refused(content: bytes) -> None:
-    with pytest.raises(CalibrationError, match=r"skin\.json is"):
-        parse_calibration(content, "skin.json")
 
 
 def test_what_cannot_be_read_or_written_is_told(
