@@ -12,18 +12,11 @@ import pytest
 from fake_control import FakeControl
 from tactomo_client import (
     Contact,
-    ControlError,
-    Event,
     Frame,
-    MessageError,
-    NoAnswer,
-    Status,
     StreamTimeout,
-    TareRefused,
     aio,
 )
 from tactomo_client.fake import FakeSensor
-from tactomo_client.subscription import Kind
 
 Run = Callable[[Coroutine[Any, Any, None]], None]
 CONTACT = Contact(3, 10.0, -20.0, 700.0, 0.15, 0.01, 170.0)
@@ -108,24 +101,6 @@ def test_a_cancelled_wait_loses_no_frame(run: Run, pressed: FakeSensor) -> None:
     run(main())
 
 
-def test_latest_is_the_newest_and_does_not_wait(run: Run, sensor: FakeSensor) -> None:
-    async def main() -> None:
-        async with aio.subscribe(
-            "left", address=sensor.address, latest_only=True, stale_after_s=PATIENCE_S
-        ) as skin:
-            assert await skin.latest() is None
-            assert skin.is_stale
-            await asyncio.to_thread(sensor.wait_for_subscriber)
-            for _ in range(50):
-                sensor.publish([CONTACT])
-            while (frame := await skin.latest()) is None or frame.sequence < 50:
-                await asyncio.sleep(0.001)
-            assert await skin.latest() is frame
-            assert not skin.is_stale
-
-    run(main())
-
-
 def test_silence_is_an_error_or_none(run: Run, sensor: FakeSensor) -> None:
     async def main() -> None:
         async with aio.subscribe("left", address=sensor.address, timeout_s=0.05) as skin:
@@ -172,24 +147,6 @@ def test_what_is_left_open_closes_itself(run: Run, pressed: FakeSensor) -> None:
     assert socket.closed
 
 
-def test_status_and_events_come_typed_in_one_stream(run: Run, sensor: FakeSensor) -> None:
-    async def main() -> None:
-        kinds: tuple[Kind, ...] = ("contacts", "status", "event")
-        async with aio.subscribe("left", address=sensor.address, kind=kinds) as news:
-            for _ in kinds:
-                await asyncio.to_thread(sensor.wait_for_subscriber)
-            sensor.publish_message("status", {"state": "running"})
-            sensor.publish([CONTACT])
-            sensor.publish_message("event", {"name": "tared"})
-            status, frame, event = [await anext(news) for _ in range(3)]
-        assert isinstance(status, Status)
-        assert isinstance(frame, Frame)
-        assert isinstance(event, Event)
-        assert (status.state, frame.contacts, event.name) == ("running", (CONTACT,), "tared")
-
-    run(main())
-
-
 def test_commands_of_several_tasks_are_carried_out_one_by_one(run: Run) -> None:
     answers: dict[str, Any] = {
         "tare": {"scans": 20},
@@ -223,21 +180,6 @@ def test_a_command_that_is_given_up_does_not_spoil_the_next(run: Run) -> None:
                 with pytest.raises(asyncio.CancelledError):
                     await giving_up
                 assert (await daemon.tare()).scans == 20
-
-    run(main())
-
-
-def test_errors_have_their_class(run: Run) -> None:
-    async def main() -> None:
-        refusal = ControlError("somebody presses", "lift it", "tare_refused")
-        with FakeControl({"tare": refusal}) as control:
-            async with aio.Daemon(control.address) as daemon:
-                with pytest.raises(TareRefused, match="somebody presses; lift it"):
-                    await daemon.tare()
-        with pytest.raises(NoAnswer, match="nothing answered"):
-            await aio.Daemon("tcp://127.0.0.1:1", timeout_s=0.05).status()
-        with pytest.raises(MessageError, match="not a sensor name"):
-            aio.subscribe("left forearm")
 
     run(main())
 

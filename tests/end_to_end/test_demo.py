@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -14,8 +12,8 @@ from processes import children_of, is_running
 from selenium.webdriver import ActionChains, Chrome
 from selenium.webdriver.common.by import By
 from small_sensor import SMALL
-from waiting import PATIENCE_S, wait_until
-from whole_system import SENSOR, Demo, running_demo
+from waiting import wait_until
+from whole_system import Demo, running_demo
 
 
 @pytest.mark.browser
@@ -53,33 +51,6 @@ def test_a_press_by_mouse_becomes_a_contact_at_that_place(demo: Demo, browser: C
     wait_until(
         lambda: not browser.find_elements(By.CSS_SELECTOR, "#contacts [data-id]"), "the release"
     )
-
-
-def test_a_script_of_pyzmq_and_msgpack_alone_prints_contacts(demo: Demo, tmp_path: Path) -> None:
-    """Written from the stream's documentation: this test imports nothing of ours."""
-    script = tmp_path / "contacts.py"
-    script.write_text(f"""
-import msgpack, zmq
-socket = zmq.Context().socket(zmq.SUB)
-socket.connect({demo.stream!r})
-socket.subscribe(b"{SENSOR}/contacts\\0")
-while True:
-    topic, _, body = socket.recv().partition(b"\\0")
-    message = msgpack.unpackb(body)
-    for contact in message["contacts"]:
-        print(round(contact["x_mm"]), round(contact["y_mm"]), contact["pressure_kpa"])
-        raise SystemExit
-""")
-    demo.clear()
-    demo.press(-40.0, 40.0)
-    done = subprocess.run(
-        [sys.executable, "-I", script], capture_output=True, text=True, timeout=PATIENCE_S
-    )
-    demo.clear()
-    assert done.returncode == 0, done.stderr
-    x_mm, y_mm, _ = done.stdout.split()
-    assert abs(int(x_mm) + 40) < 5
-    assert abs(int(y_mm) - 40) < 5
 
 
 def test_the_readme_subscribes_in_six_lines(demo: Demo, tmp_path: Path) -> None:

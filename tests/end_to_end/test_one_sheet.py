@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from page import first_line_of_the_readme
 from selenium.webdriver import Chrome
 from selenium.webdriver.common.by import By
 from tactomo_client import (
@@ -81,12 +80,6 @@ def test_a_press_becomes_a_contact_there_and_what_the_sheet_cannot_tell_is_absen
         status = daemon.status()
     assert len(status.ports) == 1
     assert status.incomplete_scans == 0
-
-
-def test_the_readmes_client_prints_the_contact(one_sheet: tuple[Demo, str], tmp_path: Path) -> None:
-    demo, _ = one_sheet
-    pressed_frame(demo)
-    assert "kPa" in first_line_of_the_readme(demo, tmp_path)
 
 
 def test_a_method_that_needs_what_the_sheet_lacks_is_refused(one_sheet: tuple[Demo, str]) -> None:

@@ -97,7 +97,9 @@ class Recorder(Worker):
         exists, is not in the folder or cannot be created, or the disk has no room.
         """
         with_maps = self._rules.maps if maps is None else maps
-        return self._ask(lambda: self._begin(None if name is None else self._below(name), with_maps))
+        return self._ask(
+            lambda: self._begin(None if name is None else self._below(name), with_maps)
+        )
 
     def end(self) -> Future[Mapping[str, Any]]:
         """Ask for the recording's end.
