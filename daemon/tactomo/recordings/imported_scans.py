@@ -27,7 +27,7 @@ angle that leaves least of it. The share that is left out is told.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -173,7 +173,7 @@ def read_scans(
     arrays = load_arrays(path)
     path = path if isinstance(path, Path) else path[0]
     if array is None and any(name in arrays for name in Channel):
-        return _batch(path, arrays, description)
+        return _turned_round(_batch(path, arrays, description), description)
     rest: NDArray[Any] | None = None
     if array is None and is_single_ended(arrays):
         raw, time_s = _differences(path, arrays, description)
@@ -182,12 +182,30 @@ def read_scans(
     channel = channel or _only_channel(description)
     volts, notes, turned_rad = _in_phase(path, raw, turn_rad)
     reference = {} if rest is None else {channel: _in_phase(path, rest, turned_rad)[0]}
+    scans = Scans({channel: volts}, time_s, reference, notes, turned_rad)
+    return _turned_round(scans, description)
+
+
+def _turned_round(scans: Scans, description: SensorDescription) -> Scans:
+    """The scans with plus and minus exchanged in each channel whose voltages have wrong signs."""
+    if description.instrument.voltages != "signed":
+        return scans
     signs = rim_signs(description.pairs, description.electrode_count)
-    known = volts[:, signs != 0] * signs[signs != 0]
-    if description.instrument.voltages == "signed" and (known < 0).mean() > TURNED_ROUND:
-        notes += ("all voltages turned round, as if plus and minus were exchanged",)
-        volts, reference = -volts, {name: -each for name, each in reference.items()}
-    return Scans({channel: volts}, time_s, reference, notes, turned_rad)
+    wrong = []
+    for channel, volts in scans.volts.items():
+        known = volts[:, signs != 0] * signs[signs != 0]
+        known = known[np.isfinite(known)]
+        if known.size and (known < 0).mean() > TURNED_ROUND:
+            wrong.append(channel)
+    if not wrong:
+        return scans
+    which = "" if len(scans.volts) == 1 else f" of {' and '.join(wrong)}"
+    note = f"all voltages{which} turned round, as if plus and minus were exchanged"
+    volts, reference = (
+        {name: -each if name in wrong else each for name, each in arrays.items()}
+        for arrays in (scans.volts, scans.reference)
+    )
+    return replace(scans, volts=volts, reference=reference, notes=(*scans.notes, note))
 
 
 def load_arrays(path: Path | Sequence[Path]) -> dict[str, NDArray[Any]]:

@@ -140,6 +140,10 @@ def test_a_sign_of_their_own(tactomo: Run, tmp_path: Path) -> None:
     (tmp_path / "in.csv").write_text(text(-np.vstack([rest, there])))
     said = located(tactomo, tmp_path, tmp_path / "in.csv", "--reference-frames", "0:4")
     assert "turned round" in said
+    [channel] = load_description("tank_disc").channels
+    arrays = {channel: -there, f"{channel}_reference": -rest}
+    np.savez(tmp_path / "in.npz", **arrays)  # type: ignore[arg-type]
+    assert "turned round" in located(tactomo, tmp_path, tmp_path / "in.npz")
 
 
 @pytest.mark.slow
