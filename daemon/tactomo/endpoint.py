@@ -76,6 +76,20 @@ def next_address(address: str, steps: int = 1) -> str:
     return f"{host}:{int(port) + steps * ADDRESS_STEP}"
 
 
+def free_addresses(*addresses: str) -> list[str]:
+    """Return ``tcp://HOST:PORT`` addresses, moved on together to where nothing listens yet."""
+    steps = 0
+    while any(_is_taken(next_address(address, steps)) for address in addresses):
+        steps += 1
+    return [next_address(address, steps) for address in addresses]
+
+
+def _is_taken(address: str) -> bool:
+    parts = urlsplit(address)
+    with posix_socket.socket() as probe:
+        return probe.connect_ex((parts.hostname, parts.port)) == 0
+
+
 def check_metrics_address(address: str) -> str:
     """Return ``HOST:PORT`` of this computer; raise ValueError, saying what to use, otherwise."""
     endpoint = f"tcp://{address}"
@@ -121,7 +135,8 @@ def bind(
         if error.errno == zmq.EADDRINUSE:
             raise AddressError(
                 f"{endpoint} ({purpose}) is in use",
-                f"stop the daemon that runs already, or give another address with {option}",
+                "stop the daemon that runs already, or give another address"
+                + (f", such as {option} {next_address(endpoint)}" if ":" in endpoint[6:] else ""),
                 "address_in_use",
             ) from error
         raise AddressError(

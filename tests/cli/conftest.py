@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import zmq
+from tactomo.running import Running, announced
 from tactomo_client.messages import decode_request, encode_error, encode_reply
 
 
@@ -42,6 +43,8 @@ class ControlServer:
 
 @pytest.fixture
 def control() -> Iterator[ControlServer]:
+    """The control socket of the only sensor that runs on this computer."""
     server = ControlServer()
-    yield server
+    with announced(Running("daemon", server.address, "left_forearm")):
+        yield server
     server.close()

@@ -78,8 +78,9 @@ def test_the_daemon_has_no_more_options_than_a_person_types() -> None:
     ("words", "needed"),
     [
         (["--help"], set()),
-        (["status", "--control", "ipc://@nobody"], {"zmq"}),
-        (["tare", "--control", "ipc://@nobody"], {"zmq"}),
+        (["status"], set()),
+        (["status", "--address", "ipc://@nobody"], {"zmq"}),
+        (["tare", "--address", "ipc://@nobody"], {"zmq"}),
     ],
 )
 def test_nothing_heavy_is_imported_to_answer(words: list[str], needed: set[str]) -> None:

@@ -99,8 +99,8 @@ def test_a_guided_session_makes_pressures_right(bench: Bench, tmp_path: Path) ->
     assert abs(too_low) < 4.5, "the description's table"
     assert wrong.pressure_kpa < 190
     bench.clear()
-    addresses = ("--stream", bench.daemon.stream, "--control", bench.daemon.control)
-    with Terminal("calibrate", "live", "--sensor", NAME, *addresses) as terminal:
+    address = ("--address", bench.daemon.stream)
+    with Terminal("calibrate", "live", "--sensor", NAME, *address) as terminal:
         terminal.wait_for("Diameter of the indenter in mm")
         terminal.enter(str(DIAMETER_MM))
         for number, kpa in enumerate(LEVELS_KPA, start=1):

@@ -182,7 +182,7 @@ def test_a_broken_device_is_flagged_in_every_frame_and_called_broken(tmp_path: P
     with playing(tmp_path, scans, path, "matrix", 10.0) as daemon:
         frames = frames_of(daemon, len(scans) - 1, missed=1)
         command = [*(sys.executable, "-m", "tactomo.cli", "doctor", "--json"), "--seconds", "3"]
-        command += ["--sensor", SENSOR, "--stream", daemon.stream, "--description", str(path)]
+        command += ["--sensor", SENSOR, "--address", daemon.stream, "--description", str(path)]
         doctor = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     pressed = [frame for number, frame in frames.items() if number >= 2 * len(baseline)]
     assert len(pressed) > 50

@@ -136,11 +136,11 @@ def test_what_is_recorded_replays_and_is_plotted(
 @pytest.mark.slow
 def test_status_and_doctor_know_of_one_sheet(one_sheet: tuple[Demo, str]) -> None:
     demo, _ = one_sheet
-    tactomo("status", "--control", demo.control)
+    tactomo("status", "--address", demo.stream)
     demo.clear()
     with subscribe(SENSOR, address=demo.stream, timeout_s=PATIENCE_S) as skin:
         next(frame for frame in skin if not frame.contacts)
-    tactomo("doctor", "-s", SENSOR, "--stream", demo.stream, "--seconds", "2")
+    tactomo("doctor", "-s", SENSOR, "--address", demo.stream, "--seconds", "2")
     demo.press(*AT_MM, **PRESS)
 
 

@@ -93,8 +93,8 @@ def test_a_guided_session_makes_places_right(
     request.addfinalizer(bench.close)
     untaught, is_taught = bench.errors_mm()
     assert not any(is_taught)
-    addresses = ("--stream", bench.daemon.stream, "--control", bench.daemon.control)
-    with Terminal("teach", "live", "--sensor", NAME, *addresses) as terminal:
+    address = ("--address", bench.daemon.stream)
+    with Terminal("teach", "live", "--sensor", NAME, *address) as terminal:
         terminal.wait_for("Take everything off the skin")
         terminal.enter("")
         terminal.wait_for("something presses")

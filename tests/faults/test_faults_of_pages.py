@@ -92,11 +92,11 @@ def test_a_hostile_page(attacker: Attacker, tmp_path: Path, figure: Figure, keys
         ]
         page = family.start(
             *("viewer", "viewer", "--sensor", SENSOR, "--viewer-port", "0", *ours),
-            *("--stream", stream, "--control", control, "--twin-control", twin),
+            *("--address", stream, "--control", control, "--twin-control", twin),
         ).wait_ready()["url"]
         bridge = family.start(
             *("bridge", "foxglove", SENSOR, "--foxglove-port", "0", "--announce", *ours),
-            *("--stream", stream),
+            *("--address", stream),
         ).wait_ready()["url"]
         sockets = {"the viewer's": page.replace("http", "ws") + "socket", "the bridge's": bridge}
         opened = [name for name, at in sockets.items() if attacker.opens_socket(at, PROTOCOL)]

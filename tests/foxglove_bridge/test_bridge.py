@@ -303,7 +303,7 @@ def test_an_address_that_is_taken(sensor: FakeSensor) -> None:
 def test_the_command_serves_until_it_is_stopped(sensor: FakeSensor, tmp_path: Any) -> None:
     layout = tmp_path / "left.json"
     command = [
-        *(sys.executable, "-m", "tactomo.cli", "foxglove", "left", "--stream", sensor.address),
+        *(sys.executable, "-m", "tactomo.cli", "foxglove", "left", "--address", sensor.address),
         *("--foxglove-port", "0", "--layout", str(layout), "--announce"),
     ]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:

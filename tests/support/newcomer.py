@@ -88,7 +88,7 @@ class Newcomer:
         return done.stdout + done.stderr
 
     def _at(self, name: str) -> list[str]:
-        """Options by which a program is given free addresses, or finds those that it asks."""
+        """Options by which a program serves at free addresses; others find it there."""
         served = ["--stream", ANYWHERE, "--control", ANYWHERE]
         here = {
             "demo": [
@@ -101,17 +101,10 @@ class Newcomer:
                 "--announce",
             ],
             "twin": ["--twin-control", ANYWHERE, "--announce"],
-            "foxglove": ["--foxglove-port", "0", "--announce", *self._known("stream")],
-            "poke": self._known("twin-control", "twin"),
+            "foxglove": ["--foxglove-port", "0", "--announce"],
             **dict.fromkeys(("daemon", "replay"), served),
-            **dict.fromkeys(("watch", "doctor"), self._known("stream")),
-            **dict.fromkeys(("status", "tare", "record", "method"), self._known("control")),
         }
         return here.get(name, [])
-
-    def _known(self, option: str, name: str = "") -> list[str]:
-        address = self.addresses.get(name or option)
-        return [f"--{option}", address] if address else []
 
     def _start(self, name: str, line: list[str]) -> str:
         if "/dev/ttyACM0" in line and self.addresses.get("ports"):

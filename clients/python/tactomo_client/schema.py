@@ -719,6 +719,7 @@ class Status(Received):
     #: shows how a sensor is prints these, and judges nothing but whether messages come
     issues: tuple[HealthIssue, ...] = ()
     uptime_s: float = 0.0  #: Since the daemon's start
+    control: str = ""  #: Address of the control socket, as it is bound on the daemon's computer
     description: SensorDescription | Absent = None  #: The sensor, see below
     source: Source = field(default_factory=Source)  #: Where scans come from
     replay: Replay | None = None  #: Of a replay; nil where the ports are live

@@ -128,17 +128,38 @@ GivenChannel: TypeAlias = Annotated[
     Literal["magnitude", "structure"] | None,
     typer.Option(help="Which channel a file of one is of. [the sensor's only one]"),
 ]
-SensorName: TypeAlias = Annotated[
+Sensor: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        "--sensor",
+        "-s",
+        envvar="TACTOMO_SENSOR",
+        help="The sensor's name. [the only one that runs]",
+        show_envvar=False,
+    ),
+]
+Address: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        "--address",
+        "-a",
+        envvar="TACTOMO_ADDRESS",
+        help="Of its stream, such as tcp://robot:5560. [found on this computer]",
+        show_envvar=False,
+    ),
+]
+NewName: TypeAlias = Annotated[
     str, typer.Option("--sensor", "-s", help="The sensor's name in the stream.")
 ]
-StreamAddress: TypeAlias = Annotated[
-    str, typer.Option("--stream", help="Address of the daemon's stream.")
+ServeStream: TypeAlias = Annotated[
+    str | None,
+    typer.Option("--stream", help=f"Where to publish. [{DEFAULT_STREAM}, or the next free]"),
 ]
-ControlAddress: TypeAlias = Annotated[
-    str, typer.Option("--control", help="Address of the daemon's control socket.")
-]
-TwinControlAddress: TypeAlias = Annotated[
-    str, typer.Option("--twin-control", help="Address of the twin's control socket.")
+ServeControl: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        "--control", help=f"Where to take commands. [{DEFAULT_CONTROL}, or the next free]"
+    ),
 ]
 ViewerPort: TypeAlias = Annotated[
     int, typer.Option("--viewer-port", min=0, max=65535, help="Of the page; 0 takes a free one.")

@@ -201,11 +201,11 @@ def _turned_round(scans: Scans, description: SensorDescription) -> Scans:
         return scans
     which = "" if len(scans.volts) == 1 else f" of {' and '.join(wrong)}"
     note = f"all voltages{which} turned round, as if plus and minus were exchanged"
-    volts, reference = (
+    turned = [
         {name: -each if name in wrong else each for name, each in arrays.items()}
         for arrays in (scans.volts, scans.reference)
-    )
-    return replace(scans, volts=volts, reference=reference, notes=(*scans.notes, note))
+    ]
+    return replace(scans, volts=turned[0], reference=turned[1], notes=(*scans.notes, note))
 
 
 def load_arrays(path: Path | Sequence[Path]) -> dict[str, NDArray[Any]]:

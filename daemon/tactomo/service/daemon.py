@@ -75,6 +75,7 @@ from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording import REPLAY_SCHEME, Origin, calibration_text
 from tactomo.recordings.recording_writer import message_entry
 from tactomo.recordings.replay import Replay, parse_replay_url, read_replay, without_calibrations
+from tactomo.running import Running, announced
 from tactomo.service.status import Status
 from tactomo.service.supervision import Supervision, notify
 from tactomo.stream.access_control import AccessControl, load_server_keys
@@ -309,8 +310,10 @@ class Daemon:
         gc.collect()
         gc.freeze()
         notify("READY=1", f"STATUS={self._summary()}")
+        addresses = self.control_address, self.config.name, self.stream_address
         try:
-            return self.wait()
+            with announced(Running("daemon", *addresses, tuple(self.config.ports))):
+                return self.wait()
         finally:
             notify("STOPPING=1", "STATUS=stopping")
             self.stop()
@@ -465,7 +468,9 @@ class Daemon:
             port.zero_counters()
 
     def _status_fields(self, header: Mapping[str, Any]) -> Mapping[str, Any]:
-        return self._status.fields(self._publisher.latency, self._publisher.subscribers, header)
+        publisher = self._publisher
+        fields = self._status.fields(publisher.latency, publisher.subscribers, header)
+        return {**fields, "control": self.control_address}
 
     def _record_message(self, kind: str, data: bytes) -> None:
         active = self._recorder.active

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from fake_control import FakeControl
+from tactomo.running import Running, announced
 from tactomo_client import Contact, ControlError
 from tactomo_client.fake import FakeSensor
 from tactomo_models import SkinSimulator, load_description
@@ -111,7 +112,7 @@ def test_a_table_with_a_slip_is_kept_on_request_alone(tactomo: Run, tmp_path: Pa
         (("fit", "times.csv", "--recording", "a.mcap"), "a.mcap"),
         (("fit", "log.csv", "-o", "."), "cannot write .: Is a directory"),
         (("show",), "run: tactomo calibrate live --sensor palm"),
-        (("live", "--stream", "ipc:///nowhere/at/all"), "no daemon answers"),
+        (("live", "--address", "ipc:///nowhere/at/all"), "no daemon answers"),
     ],
 )
 def test_what_cannot_be_used_is_told(
@@ -133,7 +134,6 @@ KEPT = {"taken": "2026-01-31T12:00:00+00:00", "readings": 9, "range_kpa": [120.0
 @pytest.mark.parametrize(
     ("answers", "said"),
     [
-        ({"status": {"sensor": "sole"}}, "sole, not of palm"),
         (
             {"reload_calibration": ControlError("of b", "stays", "calibration_refused")},
             "of b; stays",
@@ -147,8 +147,8 @@ def test_what_the_running_daemon_makes_of_it_is_told(
     tactomo: Run, tmp_path: Path, answers: dict[str, Any], said: str
 ) -> None:
     (tmp_path / "log.csv").write_text(CSV)
-    with FakeControl({"status": {"sensor": "palm"}} | answers) as control:
-        made = tactomo(*FIT, "--control", control.address)
+    with FakeControl(answers) as control, announced(Running("daemon", control.address, "palm")):
+        made = tactomo(*FIT)
     assert made.returncode == 0, made.stderr
     assert f"kept in {calibration_path('palm')}" in made.stdout
     assert said in made.stdout
@@ -156,9 +156,8 @@ def test_what_the_running_daemon_makes_of_it_is_told(
 
 
 def test_the_daemon_that_runs_is_asked_to_read_it_again(tactomo: Run) -> None:
-    answers: dict[str, Any] = {"status": {"sensor": "palm"}}
-    with FakeControl(answers) as control:
-        command = ("calibrate", "reload", "-s", "palm", "--control", control.address)
+    with FakeControl() as control, announced(Running("daemon", control.address, "palm")):
+        command = ("calibrate", "reload", "-s", "palm")
         control.answers["reload_calibration"] = {"calibration": KEPT}
         told = tactomo(*command)
         assert "in force now" in told.stdout
@@ -169,23 +168,21 @@ def test_the_daemon_that_runs_is_asked_to_read_it_again(tactomo: Run) -> None:
         refused = tactomo(*command)
         assert (refused.returncode, refused.stdout) == (1, "")
         assert "damaged" in refused.stderr
-        control.answers["status"] = {"sensor": "sole"}
-        other = tactomo(*command)
+        other = tactomo("calibrate", "reload", "-s", "sole")
         assert other.returncode == 1
-        assert "sole, not of palm" in other.stderr
+        assert "no sensor 'sole' runs on this computer, but palm" in other.stderr
 
 
 @pytest.mark.slow
 def test_without_a_daemon_it_says_when_it_will_be_in_force(tactomo: Run, tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text(CSV)
-    command = (*FIT, "--control")
-    for address in (f"ipc://{tmp_path}/nobody", "tcp://127.0.0.1:1", "nonsense"):
-        made = tactomo(*command, address)
+    for where in ((), ("--address", f"ipc://{tmp_path}/nobody"), ("--address", "nonsense")):
+        made = tactomo(*FIT, *where)
         assert made.returncode == 0, made.stderr
         assert f"kept in {calibration_path('palm')}" in made.stdout
         assert "not in force yet: " in made.stdout
         assert "tactomo calibrate reload" in made.stdout
-    made = tactomo(*command, "nonsense", "-o", "elsewhere.json")
+    made = tactomo(*FIT, "-o", "elsewhere.json")
     assert f"Copied to {calibration_path('palm')}" in made.stdout
 
 
@@ -298,7 +295,16 @@ def take(terminal: Terminal, pressed: Pressed, number: int, kpa: float, magnitud
 
 @pytest.mark.slow
 def test_a_session_keeps_what_was_taken_and_goes_on(pressed: Pressed) -> None:
-    command = ("calibrate", "live", "-s", "palm", "--stream", pressed.address, "--area-mm2", "1000")
+    command = (
+        "calibrate",
+        "live",
+        "-s",
+        "palm",
+        "--address",
+        pressed.address,
+        "--area-mm2",
+        "1000",
+    )
     log = calibration_path("palm").with_name("palm.readings.csv")
     with Terminal(*command) as terminal:
         take(terminal, pressed, 1, *ROWS[0])

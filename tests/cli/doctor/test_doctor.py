@@ -253,7 +253,7 @@ def test_one_lost_scan_is_no_rate_of_loss(
 
 @pytest.mark.slow
 def test_nobody_there(tactomo: Run) -> None:
-    outcome = tactomo("doctor", "--stream", "ipc:///nowhere/at/all", "--seconds", "1")
+    outcome = tactomo("doctor", "--address", "ipc:///nowhere/at/all", "--seconds", "1")
     assert outcome.returncode == 1
     assert "no daemon answers at ipc:///nowhere/at/all" in outcome.stderr
 
@@ -285,7 +285,7 @@ def test_the_description_that_a_daemon_holds_is_found(
     file = tmp_path_factory.mktemp("elsewhere") / "mine.toml"
     file.write_text(shipped_text("paper_square").replace('"paper_square"', '"mine"'))
     with running_demo("--description", str(file)) as demo:
-        outcome = tactomo("doctor", "-s", SENSOR, "--stream", demo.stream, "--seconds", "2")
+        outcome = tactomo("doctor", "-s", SENSOR, "--address", demo.stream, "--seconds", "2")
     assert outcome.returncode == 0
     assert "is not here" not in outcome.stdout
 
@@ -301,7 +301,7 @@ def test_a_healthy_skin_on_a_busy_computer_is_healthy(demo: Demo) -> None:
     """The daemon gets the processor for moments only; its frames are fewer, and none is wrong."""
     request("tare", demo.control, PATIENCE_S)
     daemon = request("status", demo.control, PATIENCE_S)["process"]["pid"]
-    look = ["-s", SENSOR, "--stream", demo.stream, "--seconds", "4", "--json"]
+    look = ["-s", SENSOR, "--address", demo.stream, "--seconds", "4", "--json"]
     program = (sys.executable, "-m", "tactomo.cli", "doctor", *look)
     with subprocess.Popen(program, stdout=subprocess.PIPE, text=True) as doctor:
         while doctor.poll() is None:
@@ -320,7 +320,7 @@ def test_a_healthy_skin_on_a_busy_computer_is_healthy(demo: Demo) -> None:
 
 
 def test_a_running_daemon(tactomo: Run, demo: Demo) -> None:
-    look = ("doctor", "-s", SENSOR, "--stream", demo.stream, "--seconds", "2", "--json")
+    look = ("doctor", "-s", SENSOR, "--address", demo.stream, "--seconds", "2", "--json")
     request("tare", demo.control, PATIENCE_S)
     found = report(tactomo(*look))
     for channel in found["channels"].values():

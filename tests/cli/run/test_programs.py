@@ -138,7 +138,7 @@ def twin_command() -> Any:
         (["daemon", "--port", "/dev/null", "--set", "tare_scans=1"], "tare_scans = 1"),
         (["replay", "none.mcap"], "cannot open the recording none.mcap"),
         (["replay", "none.mcap", "--viewer"], "cannot open the recording none.mcap"),
-        (["viewer", "--stream", "nowhere", "--viewer-port", "0"], "nowhere"),
+        (["viewer", "--address", "nowhere"], "nowhere"),
         (["reconstruct", "none.npz", "out.npz"], "none.npz"),
         (["plot", "none.mcap"], "cannot open the recording none.mcap"),
     ],
@@ -181,16 +181,12 @@ def test_a_demo_leaves_no_process_behind(start: Run) -> None:
 @pytest.mark.slow
 def test_a_family_notices_whoever_ends_and_tells_its_last_words() -> None:
     with Family() as family:
-        viewer = family.start(
-            "page", "viewer", "--viewer-port", "0", "--stream", "ipc:///nowhere/at/all"
-        )
+        viewer = family.start("page", "viewer", "--viewer-port", "0", *NOWHERE)
         url = viewer.wait_ready()["url"]
         assert url.startswith("http://127.0.0.1:")
         family.start("list", "models", "list").wait_done()  # has done its work: no reason to stop
         taken = url.rstrip("/").rpartition(":")[2]
-        late = family.start(
-            "second", "viewer", "--viewer-port", taken, "--stream", "ipc:///nowhere/at"
-        )
+        late = family.start("second", "viewer", "--viewer-port", taken, *NOWHERE)
         assert family.wait_for_an_end() is late
         assert viewer.is_running
         with pytest.raises(ChildError, match=r"(?s)second stopped.*cannot listen"):
@@ -199,11 +195,12 @@ def test_a_family_notices_whoever_ends_and_tells_its_last_words() -> None:
     assert viewer.status == 0
 
 
+NOWHERE = ("-s", "skin", "--address", "ipc:///nowhere/at/all", "--control", "ipc:///nowhere/too")
 PARENT = """
 import sys
 from tactomo.cli.children import Family
 with Family() as family:
-    viewer = family.start("viewer", "viewer", "--viewer-port", "0", "--stream", "ipc:///nowhere/at/all")
+    viewer = family.start("viewer", "viewer", "--viewer-port", "0", *sys.argv[1:])
     viewer.wait_ready()
     print(viewer.pid, flush=True)
     sys.stdin.read()
@@ -213,7 +210,7 @@ with Family() as family:
 @linux
 def test_a_child_that_is_ready_ends_with_a_parent_that_is_killed() -> None:
     with subprocess.Popen(
-        [sys.executable, "-c", PARENT], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        [sys.executable, "-c", PARENT, *NOWHERE], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as parent:
         assert parent.stdout is not None
         child = int(parent.stdout.readline())

@@ -86,7 +86,17 @@ def test_each_skin_is_served_and_found_by_its_name(
         assert status["process"]["pid"] in children_of(robot.process.popen.pid)
         assert shared_mb(status["process"]["pid"]) > SHARED_MB
     told = subprocess.run(
-        [sys.executable, "-m", "tactomo.cli", "status", "-s", "right", "--stream", proxy, "--json"],
+        [
+            sys.executable,
+            "-m",
+            "tactomo.cli",
+            "status",
+            "-s",
+            "right",
+            "--address",
+            proxy,
+            "--json",
+        ],
         capture_output=True,
         check=True,
         timeout=PATIENCE_S,

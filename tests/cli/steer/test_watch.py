@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tactomo.cli.steer.watch import frame_line, map_text
+from tactomo.running import Running, announced
 from tactomo_client import Contact, subscribe
 from tactomo_client.appearance import PRESSED_COLOUR
 from tactomo_client.fake import FakeSensor
@@ -70,7 +71,7 @@ def in_a_terminal(*arguments: str, until: str) -> tuple[str, int]:
 
 
 def test_it_shows_map_contacts_and_health_and_ends_by_ctrl_c(sensor: FakeSensor) -> None:
-    shown, status = in_a_terminal("--stream", sensor.address, until="19.7 frames/s")
+    shown, status = in_a_terminal("--address", sensor.address, until="19.7 frames/s")
     assert status == 0
     assert "▀" * 51 in shown
     assert "171 kPa" in shown
@@ -78,14 +79,14 @@ def test_it_shows_map_contacts_and_health_and_ends_by_ctrl_c(sensor: FakeSensor)
 
 
 def test_it_says_when_data_are_stale() -> None:
-    with FakeSensor("skin") as fake, old_frames(fake):
-        shown, _ = in_a_terminal("--stream", fake.address, until="STALE")
+    with FakeSensor("left") as fake, old_frames(fake):
+        shown, _ = in_a_terminal(until="STALE")
     assert "STALE: the newest frame is" in shown
 
 
 def test_the_end_of_a_replay_is_not_called_stale() -> None:
-    with FakeSensor("skin") as fake, old_frames(fake, {**STATUS, "state": "ended"}):
-        shown, _ = in_a_terminal("--stream", fake.address, until="19.7 frames/s")
+    with FakeSensor("left") as fake, old_frames(fake, {**STATUS, "state": "ended"}):
+        shown, _ = in_a_terminal(until="19.7 frames/s")
     assert "STALE" not in shown
     assert "ended" in shown
 
@@ -105,19 +106,14 @@ def old_frames(fake: FakeSensor, status: dict[str, Any] = STATUS) -> Iterator[No
 
     thread = threading.Thread(target=publish)
     thread.start()
-    yield
+    with announced(Running("daemon", "", "left", fake.address)):
+        yield
     stop.set()
     thread.join()
 
 
-def test_it_says_when_no_daemon_is_there() -> None:
-    shown, status = in_a_terminal("--stream", "ipc:///nowhere/at/all", until="no daemon answers")
-    assert "is it running?" in shown
-    assert status == 0
-
-
 def test_in_a_pipe_it_prints_a_line_a_frame(sensor: FakeSensor) -> None:
-    command = [sys.executable, "-m", "tactomo.cli", "watch", "--stream", sensor.address]
+    command = [sys.executable, "-m", "tactomo.cli", "watch", "--address", sensor.address]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         lines = [process.stdout.readline() for _ in range(6)]
@@ -150,16 +146,17 @@ def test_it_says_how_well_a_pressure_is_known(fields: dict[str, Any], words: str
 
 @pytest.mark.slow
 def test_in_a_pipe_it_says_that_nothing_comes(tactomo: Run) -> None:
-    result = tactomo("watch", "--stream", "ipc:///nowhere/at/all", "--seconds", "1.5")
-    assert (result.returncode, result.stdout) == (1, "")
+    with announced(Running("daemon", "", "skin", "ipc:///nowhere/at/all")):
+        result = tactomo("watch", "--seconds", "1.5")
+    assert (result.returncode, result.stdout) == (0, "")
     assert "no frame of skin" in result.stderr
 
 
 @pytest.mark.slow
 def test_a_name_that_nobody_publishes_is_told(tactomo: Run, sensor: FakeSensor) -> None:
-    result = tactomo("watch", "--sensor", "other", "--stream", sensor.address)
+    result = tactomo("watch", "--sensor", "other", "--address", sensor.address)
     assert result.returncode == 1
-    assert f"nobody publishes a sensor 'other' at {sensor.address}" in result.stderr
+    assert f"no daemon answers at {sensor.address} for a sensor 'other'" in result.stderr
 
 
 def test_the_picture_is_the_right_way_up() -> None:

@@ -161,7 +161,7 @@ def test_a_stranger_is_turned_away_in_an_event_loop_until_allowed(
 
 def test_another_process_gets_in_with_the_folder_alone(guarded: Any, robot: Robot) -> None:
     command = [sys.executable, "-m", "tactomo.cli", "status", "--json"]
-    command += ["--control", guarded.daemon.control_address]
+    command += ["--address", guarded.daemon.stream_address]
     desk = robot.folder.parent / "clients" / "desk"
     environment = {**os.environ, "TACTOMO_KEYS": str(desk)}
     said = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)

@@ -11,6 +11,7 @@ import typer
 from tactomo.cli import options
 from tactomo.cli.output import say, table
 from tactomo.cli.plot.plot import picture_option
+from tactomo.cli.sensors import find_sensor, name_of
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -28,7 +29,7 @@ app = options.typer_app(
         "uncertainty; below its onset and beyond the last reading contacts say so instead of a "
         "pressure.\n\n"
         "The calibration is kept by the sensor's name and devices. The sensor's daemon uses it at "
-        "once if it runs (at --control), else from its next start. A service keeps its own: `sudo "
+        "once if it runs, else from its next start. A service keeps its own: `sudo "
         "-u tactomo STATE_DIRECTORY=/var/lib/tactomo/NAME tactomo calibrate ... --sensor NAME`, or "
         '`calibration = "FILE"` in its configuration.'
     ),
@@ -59,15 +60,14 @@ Picture = Annotated[Path | None, picture_option("Draw readings and curve")]
     )
 )
 def live(
-    sensor: options.SensorName = options.DEFAULT_NAME,
+    sensor: options.Sensor = None,
     diameter_mm: DiameterMm = None,
     area_mm2: AreaMm2 = None,
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Begin anew, not with what was taken.")
     ] = False,
     output: Output = None,
-    stream: options.StreamAddress = options.DEFAULT_STREAM,
-    control: options.ControlAddress = options.DEFAULT_CONTROL,
+    address: options.Address = None,
     keys: options.KeysFolder = None,
 ) -> None:
     """Be guided, press by press, with the running daemon.
@@ -78,10 +78,11 @@ def live(
     from tactomo.cli.calibrate.live import guided
     from tactomo.cli.calibrate.reload import keep
 
-    path = _path(sensor, output)
-    made = guided(sensor, stream, keys, _area_mm2(diameter_mm, area_mm2), path, fresh=fresh)
+    found = find_sensor(sensor, address, keys)
+    path, area = _path(found.sensor, output), _area_mm2(diameter_mm, area_mm2)
+    made = guided(found.sensor, found.stream, keys, area, path, fresh=fresh)
     print_calibration(made)
-    keep(made, path, control, keys)
+    keep(made, path, address, keys)
 
 
 @app.command(
@@ -94,7 +95,7 @@ def fit(
     readings: Annotated[
         Path, typer.Argument(metavar="FILE.csv", help="What the load cell said, see above.")
     ],
-    sensor: options.SensorName = options.DEFAULT_NAME,
+    sensor: options.Sensor = None,
     recording: Annotated[
         Path | None, typer.Option(metavar="FILE.mcap", help="What the sensor said meanwhile.")
     ] = None,
@@ -114,7 +115,7 @@ def fit(
     keep_odd: Annotated[
         bool, typer.Option("--keep-odd", help="Keep it with lines that the others contradict.")
     ] = False,
-    control: options.ControlAddress = options.DEFAULT_CONTROL,
+    address: options.Address = None,
     keys: options.KeysFolder = None,
 ) -> None:
     """Fit a table of readings.
@@ -132,14 +133,15 @@ def fit(
     from tactomo.cli.calibrate.fit import fitted
     from tactomo.cli.calibrate.reload import keep
 
-    path = _path(sensor, output)
+    name = name_of(sensor)
+    path = _path(name, output)
     made, odd = fitted(
-        sensor, readings, recording, area, time_offset, description, tuple(device_id or ())
+        name, readings, recording, area, time_offset, description, tuple(device_id or ())
     )
     print_calibration(made)
     is_refused = bool(odd) and not keep_odd
     if not (dry_run or is_refused):
-        keep(made, path, control, keys)
+        keep(made, path, address, keys)
     _draw(made, picture)
     if is_refused and not dry_run:
         from tactomo_models import CalibrationError
@@ -162,19 +164,20 @@ def show(
         Path | None,
         typer.Argument(metavar="[FILE]", help="[the one that the sensor's daemon uses]"),
     ] = None,
-    sensor: options.SensorName = options.DEFAULT_NAME,
+    sensor: options.Sensor = None,
     picture: Picture = None,
 ) -> None:
     """Show the calibration that is kept: its curve, its uncertainty, and what it rests on."""
     from tactomo_models import CalibrationError
     from tactomo_models.calibration.calibration_file import read_calibration
 
-    path = _path(sensor, file)
+    name = name_of(sensor)
+    path = _path(name, file)
     try:
         made = read_calibration(path)
     except FileNotFoundError as error:
         raise CalibrationError(
-            f"there is no calibration {path}; run: tactomo calibrate live --sensor {sensor}"
+            f"there is no calibration {path}; run: tactomo calibrate live --sensor {name}"
         ) from error
     print_calibration(made)
     _draw(made, picture)
@@ -182,17 +185,14 @@ def show(
 
 @app.command(epilog=options.examples("tactomo calibrate reload --sensor left_forearm"))
 def reload(
-    sensor: options.SensorName = options.DEFAULT_NAME,
-    control: options.ControlAddress = options.DEFAULT_CONTROL,
+    sensor: options.Sensor = None,
+    address: options.Address = None,
     keys: options.KeysFolder = None,
 ) -> None:
     """Have the running daemon read again the calibration that it finds."""
-    from tactomo_client.messages import check_sensor_name
-
     from tactomo.cli.calibrate.reload import reload_kept
 
-    check_sensor_name(sensor)
-    say(reload_kept(sensor, control, keys))
+    say(reload_kept(sensor, address, keys))
 
 
 def _path(sensor: str, given: Path | None) -> Path:

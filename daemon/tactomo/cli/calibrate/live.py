@@ -96,7 +96,7 @@ def _first_status(view: View) -> Status:
     if view.status is None or view.status.description is None:
         raise TactomoError(
             f"no daemon answers at {view.stream} for a sensor {view.sensor!r}",
-            "start it, or give --stream; `tactomo daemon --help`",
+            "`tactomo status` says how it is",
         )
     if "magnitude" not in view.status.description.modalities:
         raise TactomoError(

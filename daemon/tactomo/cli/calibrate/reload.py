@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 from tactomo_client.schema import Calibration, Taught
 
 from tactomo.cli.output import say
-from tactomo.errors import TactomoError
+from tactomo.cli.sensors import SensorError, find_control, find_sensor
 
 if TYPE_CHECKING:
     from tactomo_client import CalibrationInForce
@@ -23,20 +23,15 @@ if TYPE_CHECKING:
 CONNECT_S: Final = 1.0  # how long to wait where nobody listens: there need not be a daemon
 
 
-class OtherSensorError(TactomoError):
-    """The daemon at the address has another sensor."""
-
-    name = "other_sensor"
-
-
-def reload_kept(sensor: str, control: str, keys: Path | None) -> str:
+def reload_kept(name: str | None, address: str | None, keys: Path | None) -> str:
     """Have the daemon of a sensor read its calibration again; returns in words what is in force.
 
     Raises:
         ClientError: it does not answer, refuses the calibration, or does not let us command.
-        OtherSensorError: it is another sensor's daemon.
+        SensorError: as `find_sensor` does.
     """
-    found = _reloaded(sensor, control, keys).calibration
+    sensor = find_sensor(name, address, keys).sensor
+    found = _reloaded(sensor, address, keys).calibration
     if found is None:
         return f"the daemon of {sensor} found none: pressures are the description's"
     low, high = found.range_kpa
@@ -47,7 +42,7 @@ def reload_kept(sensor: str, control: str, keys: Path | None) -> str:
 
 
 def keep(
-    made: PressureCalibration | TaughtSkin, path: Path, control: str, keys: Path | None
+    made: PressureCalibration | TaughtSkin, path: Path, address: str | None, keys: Path | None
 ) -> None:
     """Write what was made into a file, and have its sensor's daemon go by it, if that runs."""
     from tactomo_models.calibration.calibration_file import PressureCalibration, save_calibration
@@ -58,11 +53,11 @@ def keep(
     else:
         save_taught(made, path)
     say(f"kept in {path}")
-    say(taken_up(made, path, control, keys))
+    say(taken_up(made, path, address, keys))
 
 
 def taken_up(
-    made: PressureCalibration | TaughtSkin, path: Path, control: str, keys: Path | None
+    made: PressureCalibration | TaughtSkin, path: Path, address: str | None, keys: Path | None
 ) -> str:
     """Have the daemon of its sensor, if it runs, go by what was kept in `path`.
 
@@ -78,9 +73,9 @@ def taken_up(
     it = "It" if path.absolute() == own.absolute() else f"Copied to {own}, it"
     later = f"{it} is in force when the daemon of {sensor} starts next, or by: {again}"
     try:
-        found = _reloaded(sensor, control, keys)
-    except (NoAnswer, OtherSensorError) as error:
-        return f"not in force yet: {error.cause}. {later} --control ADDRESS"
+        found = _reloaded(sensor, address, keys)
+    except (NoAnswer, SensorError) as error:
+        return f"not in force yet: {error.cause}. {later}"
     except CalibrationRefused as error:
         return f"not in force: the daemon of {sensor} refused it: {error}"
     except KeysError as error:
@@ -103,17 +98,12 @@ def taken_up(
     )
 
 
-def _reloaded(sensor: str, control: str, keys: Path | None) -> CalibrationInForce:
+def _reloaded(sensor: str, address: str | None, keys: Path | None) -> CalibrationInForce:
     """Ask a sensor's daemon to read what is kept again; returns what is in force."""
     from tactomo_client import Daemon
 
+    control = find_control(sensor, address, keys)
     with Daemon(control, keys=keys, connect_timeout_s=CONNECT_S) as daemon:
-        there = daemon.status().sensor
-        if there != sensor:
-            raise OtherSensorError(
-                f"the daemon at {control} is that of {there}, not of {sensor}",
-                f"give the address of that of {sensor} by --control",
-            )
         return daemon.reload_calibration()
 
 

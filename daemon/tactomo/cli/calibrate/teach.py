@@ -9,6 +9,7 @@ import typer
 
 from tactomo.cli import options
 from tactomo.cli.output import progress_bar, say
+from tactomo.cli.sensors import find_sensor, name_of
 
 if TYPE_CHECKING:
     from tactomo_models import SensorDescription
@@ -25,7 +26,7 @@ app = options.typer_app(
         "then on each single contact says whether what was taught places it; a press unlike all "
         "that were taught is flagged `untaught`.\n\n"
         "It is kept by the sensor's name and devices, and used at once by the sensor's daemon if "
-        "that runs (at --control), else from its next start. A service keeps its own, see "
+        "that runs, else from its next start. A service keeps its own, see "
         "`tactomo calibrate --help`."
     ),
     no_args_is_help=True,
@@ -51,7 +52,7 @@ KeepOdd = Annotated[
     )
 )
 def live(
-    sensor: options.SensorName = options.DEFAULT_NAME,
+    sensor: options.Sensor = None,
     presses: Annotated[
         Path | None,
         typer.Option(metavar="FILE.npz", help="Presses are kept here. [beside what is taught]"),
@@ -59,8 +60,7 @@ def live(
     description: options.GivenDescription = None,
     output: Output = None,
     keep_odd: KeepOdd = False,
-    stream: options.StreamAddress = options.DEFAULT_STREAM,
-    control: options.ControlAddress = options.DEFAULT_CONTROL,
+    address: options.Address = None,
     keys: options.KeysFolder = None,
 ) -> None:
     """Be guided, press by press, with the running daemon.
@@ -70,10 +70,11 @@ def live(
     """
     from tactomo.cli.calibrate.teach_live import guided
 
-    path = _path(sensor, output)
-    file = presses or path.with_name(f"{sensor}.presses.npz")
-    sensor_description, subject = guided(sensor, stream, keys, description, file)
-    _teach(file, sensor_description, subject, path, control, keys, keep_odd=keep_odd)
+    found = find_sensor(sensor, address, keys)
+    path = _path(found.sensor, output)
+    file = presses or path.with_name(f"{found.sensor}.presses.npz")
+    sensor_description, subject = guided(found.sensor, found.stream, keys, description, file)
+    _teach(file, sensor_description, subject, path, address, keys, keep_odd=keep_odd)
 
 
 @app.command(
@@ -84,7 +85,7 @@ def live(
 )
 def fit(
     presses: Annotated[Path, typer.Argument(metavar="FILE.npz", help="Presses, see above.")],
-    sensor: options.SensorName = options.DEFAULT_NAME,
+    sensor: options.Sensor = None,
     description: options.Description = options.DEFAULT_DESCRIPTION,
     device_id: Annotated[
         list[str] | None, typer.Option(help="The device that it was made with; repeat.")
@@ -92,7 +93,7 @@ def fit(
     output: Output = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Keep nothing.")] = False,
     keep_odd: KeepOdd = False,
-    control: options.ControlAddress = options.DEFAULT_CONTROL,
+    address: options.Address = None,
     keys: options.KeysFolder = None,
 ) -> None:
     """Learn from a file of presses.
@@ -107,10 +108,10 @@ def fit(
     from tactomo_models import load_description
     from tactomo_models.calibration.calibration_file import Subject
 
-    known = load_description(description)
-    subject = Subject.of(sensor, known, device_id or ())
-    path = None if dry_run else _path(sensor, output)
-    _teach(presses, known, subject, path, control, keys, keep_odd=keep_odd)
+    known, name = load_description(description), name_of(sensor)
+    subject = Subject.of(name, known, device_id or ())
+    path = None if dry_run else _path(name, output)
+    _teach(presses, known, subject, path, address, keys, keep_odd=keep_odd)
 
 
 @app.command(epilog=options.examples("tactomo teach show --sensor left_forearm"))
@@ -119,18 +120,19 @@ def show(
         Path | None,
         typer.Argument(metavar="[FILE]", help="[the one that the sensor's daemon uses]"),
     ] = None,
-    sensor: options.SensorName = options.DEFAULT_NAME,
+    sensor: options.Sensor = None,
 ) -> None:
     """Show what is kept: what it rests on, and what it brings."""
     from tactomo_models import CalibrationError
     from tactomo_models.calibration.taught_skin import read_taught
 
-    path = _path(sensor, file)
+    name = name_of(sensor)
+    path = _path(name, file)
     try:
         _print(read_taught(path))
     except FileNotFoundError as error:
         raise CalibrationError(
-            f"nothing was taught in {path}; run: tactomo teach live --sensor {sensor}"
+            f"nothing was taught in {path}; run: tactomo teach live --sensor {name}"
         ) from error
 
 
@@ -147,7 +149,7 @@ def _teach(
     description: SensorDescription,
     subject: Subject,
     path: Path | None,
-    control: str,
+    address: str | None,
     keys: Path | None,
     *,
     keep_odd: bool,
@@ -164,7 +166,7 @@ def _teach(
         say(note, err=True)
     _print(taught)
     if path is not None:
-        keep(taught, path, control, keys)
+        keep(taught, path, address, keys)
 
 
 def _print(taught: TaughtSkin) -> None:

@@ -9,6 +9,7 @@ import typer
 
 from tactomo.cli import options
 from tactomo.cli.output import print_json
+from tactomo.cli.sensors import find_sensor
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -47,8 +48,8 @@ def doctor(
             help="A recording (.mcap) or scans (.npz, .mat, text); without, a daemon that runs.",
         ),
     ] = None,
-    sensor: options.SensorName = options.DEFAULT_NAME,
-    stream: options.StreamAddress = options.DEFAULT_STREAM,
+    sensor: options.Sensor = None,
+    address: options.Address = None,
     seconds: Annotated[
         float, typer.Option(min=1.0, help="How long to listen to the daemon.")
     ] = 10.0,
@@ -105,9 +106,10 @@ def doctor(
         if what is None:
             if chosen is not None or array is not None:
                 raise typer.BadParameter("--frames and --array go with a file")
+            found = find_sensor(sensor, address, keys)
             words = "listening to the daemon, {:.0f} of {:g} s: leave the skin alone"
             evidence = of_daemon(
-                *(sensor, stream, seconds, description, as_keys(keys)),
+                *(found.sensor, found.stream, seconds, description, as_keys(keys)),
                 lambda passed_s: line_shown.update(words.format(passed_s, seconds)),
             )
         else:

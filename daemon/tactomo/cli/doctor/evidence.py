@@ -148,7 +148,7 @@ class _Listener:
         if not self.said["status"]:
             raise DoctorError(
                 f"no daemon answers at {self._where}",
-                "start it with `tactomo daemon`, or give --sensor and --stream of one that runs",
+                "`tactomo status` says how it is",
             )
         status = self.said["status"][-1]
         self.said = {kind: [] for kind in self.said} | {"status": [status]}

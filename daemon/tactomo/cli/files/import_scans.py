@@ -36,7 +36,7 @@ def import_scans(
     rate: Annotated[
         float | None, typer.Option(min=0.01, help="Scans a second. [the file's own times, t]")
     ] = None,
-    sensor: options.SensorName = options.DEFAULT_NAME,
+    sensor: options.NewName = options.DEFAULT_NAME,
 ) -> None:
     """Turn measured scans (.npz, .eit) into a recording that replays through the daemon.
 

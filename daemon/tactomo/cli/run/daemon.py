@@ -133,8 +133,8 @@ def replay(
         Path | None, typer.Option(help="Of pressure, by `tactomo calibrate`. [the recorded one]")
     ] = None,
     method: options.Method = "auto",
-    stream: options.StreamAddress = options.DEFAULT_STREAM,
-    control: options.ControlAddress = options.DEFAULT_CONTROL,
+    stream: options.ServeStream = None,
+    control: options.ServeControl = None,
     viewer_port: options.ViewerPort = options.DEFAULT_VIEWER_PORT,
     stay: Annotated[
         bool, typer.Option("--stay", help="Keep running after the recording's end.")
@@ -160,16 +160,16 @@ def replay(
     With --viewer it waits until the page is open. There, or by the command `replay` of the control
     socket, it is paused, stepped, moved and paced while it runs.
     """
+    from tactomo.cli.run.demo import free_of, show_replay
     from tactomo.recordings.recording_set import RecordingSet, open_replayable
 
     factor = _speed(speed)
+    stream, control = free_of((stream, options.DEFAULT_STREAM), (control, options.DEFAULT_CONTROL))
     opened = open_replayable(recording)
     origin = opened.origin
     if with_viewer:
         if record is not None:
             raise typer.BadParameter("--record goes without --viewer")
-        from tactomo.cli.run.demo import show_replay
-
         more = ["--method", method]
         more += [] if description is None else ["--description", description]
         more += [] if calibration is None else ["--calibration", str(calibration)]

@@ -15,6 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tactomo.cli import options
+from tactomo.cli.output import say
+from tactomo.endpoint import free_addresses
+from tactomo.running import running
 
 if TYPE_CHECKING:
     from tactomo.cli.children import Family
@@ -33,7 +36,7 @@ app = options.typer_app()
     )
 )
 def demo(
-    sensor: options.SensorName = options.DEFAULT_NAME,
+    sensor: options.NewName = options.DEFAULT_NAME,
     description: options.Description = options.DEFAULT_DESCRIPTION,
     method: options.GivenMethod = None,
     ports: Annotated[
@@ -49,9 +52,16 @@ def demo(
     ] = None,
     record: Annotated[Path | None, typer.Option(help="Record what the ports say.")] = None,
     viewer_port: options.ViewerPort = options.DEFAULT_VIEWER_PORT,
-    stream: options.StreamAddress = options.DEFAULT_STREAM,
-    control: options.ControlAddress = options.DEFAULT_CONTROL,
-    twin_control: options.TwinControlAddress = options.DEFAULT_TWIN_CONTROL,
+    stream: options.ServeStream = None,
+    control: options.ServeControl = None,
+    twin_control: Annotated[
+        str | None,
+        typer.Option(
+            "--twin-control",
+            help=f"Where to take commands of `tactomo poke`. [{options.DEFAULT_TWIN_CONTROL}, or "
+            "the next that is free]",
+        ),
+    ] = None,
     no_browser: Annotated[
         bool, typer.Option("--no-browser", help="Do not open the page, where there is a desktop.")
     ] = False,
@@ -68,6 +78,11 @@ def demo(
     """
     from tactomo.cli.children import new_family
 
+    stream, control, twin_control = free_of(
+        (stream, options.DEFAULT_STREAM),
+        (control, options.DEFAULT_CONTROL),
+        (twin_control, options.DEFAULT_TWIN_CONTROL),
+    )
     twin_options = [
         *("--description", description, "--rate", str(rate), "--twin-control", twin_control),
         *_optional("--ports", ports),
@@ -102,6 +117,15 @@ def demo(
         _wait_tared(addresses["control"])
         page = page or _open_page(family, addresses, viewer_port, not no_browser)
         _stay(family, {**addresses, "viewer": page}, announce)
+
+
+def free_of(*asked: tuple[str | None, str]) -> list[str]:
+    """Return addresses that were given, and of the others their defaults or the next free ones."""
+    defaults = [default for given, default in asked if given is None]
+    free = free_addresses(*defaults)
+    if free != defaults:
+        say(f"{' and '.join(defaults)} are taken: serving at {' and '.join(free)}", err=True)
+    return [free.pop(0) if given is None else given for given, _ in asked]
 
 
 def _wait_tared(control: str) -> None:
@@ -147,7 +171,7 @@ def _open_page(family: Family, addresses: Mapping[str, Any], port: int, browser:
     """Start the viewer, show its page where there is a desktop, and return the page's URL."""
     viewer = family.start(
         *("viewer", "viewer", "--viewer-port", str(port), "--sensor", addresses["sensor"]),
-        *("--stream", addresses["stream"], "--control", addresses["control"]),
+        *("--address", addresses["stream"], "--control", addresses["control"]),
         *_optional("--twin-control", addresses.get("twin")),
     )
     page = str(viewer.wait_ready()["url"])
@@ -163,48 +187,27 @@ def _stay(family: Family, addresses: Mapping[str, Any], announce: bool) -> None:
     if announce:
         print_ready(addresses)
     else:
-        _print_box(addresses)
+        _print_addresses(addresses)
     try:
         raise family.wait_for_an_end().failure()
     except KeyboardInterrupt:
         print("stopping", file=sys.stderr)
 
 
-def _print_box(addresses: Mapping[str, Any]) -> None:
-    from rich.panel import Panel
-    from rich.text import Text
-
-    from tactomo.cli.console import Console
-
-    name = addresses["sensor"]
-    at_control = _flag("--control", addresses["control"], options.DEFAULT_CONTROL)
-    at_stream = _flag("--stream", addresses["stream"], options.DEFAULT_STREAM)
-    named = _flag("--sensor", name, options.DEFAULT_NAME)
-    at = addresses["stream"]
-    called = f'"{name}"' if at == options.DEFAULT_STREAM else f'"{name}", address="{at}"'
-    lines = [f"open      {addresses['viewer']}"]
+def _print_addresses(addresses: Mapping[str, Any]) -> None:
+    """Say what to do next; lines of commands stand alone, to be copied from any terminal."""
+    name, stream = addresses["sensor"], addresses["stream"]
+    at = "" if len(running("daemon")) == 1 else f" --address {stream}"
+    at_twin = "" if len(running("twin")) == 1 else f" --address {addresses.get('twin')}"
+    say(f"{name} is running; Ctrl-C stops everything. Open, and press the skin there by mouse:\n")
+    say(f"    {addresses['viewer']}\n\nOr in another terminal:\n")
     if "twin" in addresses:
-        at_twin = _flag("--twin-control", addresses["twin"], options.DEFAULT_TWIN_CONTROL)
-        lines += [
-            "          and press the skin there with the mouse",
-            f"press     tactomo poke press x_mm=10 y_mm=-20{at_twin}",
-        ]
-    lines += [
-        f"watch     tactomo watch{named}{at_stream}",
-        f"health    tactomo status{at_control}",
-        f"tare      tactomo tare{at_control}",
-        f"record    tactomo record press.mcap --seconds 10{at_control}",
-        f"Python    for frame in tactomo_client.subscribe({called}): print(frame.contacts)",
-        "",
-        "Ctrl-C stops everything",
-    ]
-    Console().print(
-        Panel("\n".join(lines), title=Text(f"tactomo: {name} is running"), expand=False)
-    )
-
-
-def _flag(name: str, value: str, default: str) -> str:
-    return "" if value == default else f" {name} {value}"
+        say(f"    tactomo poke press x_mm=10 y_mm=-20{at_twin}")
+    for command in ("watch", "status", "tare", "record press.mcap --seconds 10"):
+        say(f"    tactomo {command}{at}")
+    where = "" if stream == options.DEFAULT_STREAM else f', address="{stream}"'
+    say("\nOr in Python:\n\n    from tactomo_client import subscribe\n")
+    say(f'    for frame in subscribe("{name}"{where}):\n        print(frame.contacts)\n')
 
 
 def _optional(name: str, value: object) -> list[str]:

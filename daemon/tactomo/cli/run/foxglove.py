@@ -10,6 +10,7 @@ import typer
 from tactomo.cli import options
 from tactomo.cli.children import print_ready, stop_asked
 from tactomo.cli.output import say
+from tactomo.cli.sensors import find_sensor
 from tactomo.errors import TactomoError, needs
 
 if TYPE_CHECKING:
@@ -32,11 +33,9 @@ app = options.typer_app()
 def foxglove(
     sensors: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="[SENSOR]...", help=f"Names in the stream. [{options.DEFAULT_NAME}]"
-        ),
+        typer.Argument(metavar="[SENSOR]...", help="Names in the stream. [the only one that runs]"),
     ] = None,
-    stream: options.StreamAddress = options.DEFAULT_STREAM,
+    address: options.Address = None,
     host: Annotated[
         str, typer.Option(help="Address to listen on; any but a loopback one lets others look.")
     ] = "127.0.0.1",
@@ -74,13 +73,14 @@ def foxglove(
     from tactomo_client.keys import as_keys
     from tactomo_foxglove import Bridge
 
-    names = sensors or [options.DEFAULT_NAME]
+    found = find_sensor(sensors[0] if sensors else None, address, keys)
+    names = sensors or [found.sensor]
     if layout is not None:
         write_layout(layout, names[0])
     stop = stop_asked()
     with Bridge(
         names,
-        stream,
+        found.stream,
         host,
         foxglove_port,
         as_keys(keys),

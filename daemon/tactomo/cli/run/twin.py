@@ -44,7 +44,9 @@ def twin(
         float, typer.Option(min=0.0, max=0.5, help="Of the sheet's conductivity; 0.05 is 5 %.")
     ] = 0.03,
     seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal noise and drift.")] = 0,
-    twin_control: options.TwinControlAddress = options.DEFAULT_TWIN_CONTROL,
+    twin_control: Annotated[
+        str, typer.Option("--twin-control", help="Where to take commands of `tactomo poke`.")
+    ] = options.DEFAULT_TWIN_CONTROL,
     announce: options.Announce = False,
 ) -> None:
     """Simulate a skin behind simulated firmware, on real pseudo-terminals, until stopped.
@@ -56,6 +58,7 @@ def twin(
     from tactomo_models import load_description
 
     from tactomo.cli.children import interrupt_on_sigterm, print_ready
+    from tactomo.running import Running, announced
     from tactomo.twin import Twin, TwinConfig, load_scene
 
     interrupt_on_sigterm()
@@ -75,13 +78,15 @@ def twin(
     )
     running = Twin(config)
     running.start()
+    paths = tuple(map(str, running.ports))
     try:
-        for path in running.ports:
-            say(f"port     {path}")
-        say(f"control  {running.control}")
-        if announce:
-            print_ready({"ports": running.ports, "control": running.control})
-        running.wait()
+        with announced(Running("twin", running.control, ports=paths)):
+            for path in paths:
+                say(f"port     {path}")
+            say(f"control  {running.control}")
+            if announce:
+                print_ready({"ports": paths, "control": running.control})
+            running.wait()
     except KeyboardInterrupt:
         pass
     finally:

@@ -7,6 +7,8 @@ from typing import Annotated
 import typer
 
 from tactomo.cli import options
+from tactomo.cli.sensors import find_sensor, twin_of
+from tactomo.running import Running
 
 app = options.typer_app()
 
@@ -14,17 +16,18 @@ app = options.typer_app()
 @app.command(
     epilog=options.examples(
         "tactomo viewer --sensor left_forearm",
-        "tactomo viewer --twin-control tcp://127.0.0.1:5562",
+        "tactomo viewer --address tcp://robot:5560 --keys ~/keys/robot",
         "ssh -L 8750:127.0.0.1:8750 robot tactomo viewer",
     )
 )
 def viewer(
-    sensor: options.SensorName = options.DEFAULT_NAME,
-    stream: options.StreamAddress = options.DEFAULT_STREAM,
-    control: options.ControlAddress = options.DEFAULT_CONTROL,
+    sensor: options.Sensor = None,
+    address: options.Address = None,
     twin_control: Annotated[
-        str | None, typer.Option(help="The twin's control socket, to press the skin by mouse.")
+        str | None,
+        typer.Option(help="The twin's control socket, to press the skin by mouse. [found]"),
     ] = None,
+    control: Annotated[str | None, typer.Option(hidden=True)] = None,
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
     viewer_port: options.ViewerPort = options.DEFAULT_VIEWER_PORT,
     keys: options.KeysFolder = None,
@@ -33,4 +36,10 @@ def viewer(
     from tactomo_client.keys import as_keys
     from tactomo_viewer import Viewer
 
-    Viewer(sensor, stream, control, twin_control, host, as_keys(keys)).serve(viewer_port)
+    if control and sensor and address:  # of a daemon that is on its way
+        found = Running("daemon", control, sensor, address)
+    else:
+        found = find_sensor(sensor, address, keys)
+        twin_control = twin_control or twin_of(found)
+    addresses = found.sensor, found.stream, found.control
+    Viewer(*addresses, twin_control, host, as_keys(keys)).serve(viewer_port)

@@ -76,7 +76,7 @@ def make(
         say("   to `tactomo keys make SERVER --server` there.")
         say(f"2. Copy the server's SERVER.key into {where}, which is for")
         say("   this one server: keep a folder for each. Then here, for example:")
-        say(f"     tactomo watch --stream tcp://ROBOT:5560 --keys {shlex.quote(str(where))}")
+        say(f"     tactomo watch --address tcp://ROBOT:5560 --keys {shlex.quote(str(where))}")
         return
     say("1. Put into the daemon's configuration, and start it again:")
     say(f'     [curve]\n     secret = "{secret}"')

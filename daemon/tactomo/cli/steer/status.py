@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
 from tactomo.cli import options
 from tactomo.cli.output import print_json, say
-from tactomo.errors import TactomoError
+from tactomo.cli.sensors import newest_status
 from tactomo.plain import plain
 
 app = options.typer_app()
@@ -19,21 +18,13 @@ app = options.typer_app()
     epilog=options.examples(
         "tactomo status",
         "tactomo status -s left_forearm",
-        "tactomo status -s left_forearm --stream tcp://127.0.0.1:5570",
+        "tactomo status --address tcp://robot:5560 --keys ~/keys/robot",
         "tactomo status --json | jq .latency_ms",
     )
 )
 def status(
-    sensor: Annotated[
-        str | None,
-        typer.Option(
-            "--sensor",
-            "-s",
-            help="Of this sensor, by its stream or `tactomo zenoh`'s. [by the control socket]",
-        ),
-    ] = None,
-    stream: options.StreamAddress = options.DEFAULT_STREAM,
-    control: options.ControlAddress = options.DEFAULT_CONTROL,
+    sensor: options.Sensor = None,
+    address: options.Address = None,
     keys: options.KeysFolder = None,
     as_json: options.JsonOutput = False,
 ) -> None:
@@ -42,11 +33,7 @@ def status(
     Ports, rates, latency, the time of each stage, what was lost, what happened since the start.
     `tactomo doctor` looks deeper.
     """
-    from tactomo_client import request
-
-    answer = request("status", control, keys=keys) if sensor is None else None
-    if answer is None:
-        answer = _heard_status(str(sensor), stream, keys)
+    answer = newest_status(sensor, address, keys)
     if as_json:
         print_json(answer)
         return
@@ -67,22 +54,6 @@ def _plain(told: Any) -> Any:
     if isinstance(told, list | tuple):
         return [_plain(value) for value in told]
     return plain(told) if isinstance(told, str) else told
-
-
-def _heard_status(sensor: str, stream: str, keys: Path | None) -> dict[str, Any]:
-    """Return the status of a sensor from its stream, which repeats it every second."""
-    from tactomo_client import subscribe
-    from tactomo_client.schema import STALE_AFTER_S
-
-    with subscribe(sensor, kind="status", address=stream, keys=keys) as statuses:
-        status = statuses.wait(STALE_AFTER_S)
-    if status is not None:
-        return dict(status.fields)
-    raise TactomoError(
-        f"nothing is heard of sensor {sensor!r} at {stream}",
-        "is its daemon running under this name? `tactomo status` without -s asks the one whose "
-        "control socket is at --control",
-    )
 
 
 def _rows(status: dict[str, Any]) -> list[tuple[str, str]]:

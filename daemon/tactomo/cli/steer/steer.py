@@ -11,6 +11,7 @@ import typer
 
 from tactomo.cli import options
 from tactomo.cli.output import print_json, say
+from tactomo.cli.sensors import find_control, find_twin
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
@@ -24,7 +25,9 @@ app = options.typer_app()
 
 @app.command(epilog=options.examples("tactomo tare"))
 def tare(
-    control: options.ControlAddress = options.DEFAULT_CONTROL, keys: options.KeysFolder = None
+    sensor: options.Sensor = None,
+    address: options.Address = None,
+    keys: options.KeysFolder = None,
 ) -> None:
     """Take a new reference: the next scans of the *unloaded* skin count as "nothing pressed".
 
@@ -34,7 +37,7 @@ def tare(
     from tactomo_client import Daemon
     from tactomo_client.control import TARE_TIMEOUT_S
 
-    with Daemon(control, keys=keys) as daemon:
+    with Daemon(find_control(sensor, address, keys), keys=keys) as daemon:
         needs_s = _tare_s(daemon.request("status"))
         if needs_s > SOON_S:
             say(f"leave the skin alone: its scans take {needs_s:.0f} s to come", err=True)
@@ -79,7 +82,8 @@ def record(
     maps: Annotated[
         bool, typer.Option("--maps", help="With maps and contacts. [as the daemon is configured]")
     ] = False,
-    control: options.ControlAddress = options.DEFAULT_CONTROL,
+    sensor: options.Sensor = None,
+    address: options.Address = None,
     keys: options.KeysFolder = None,
 ) -> None:
     """Record what the ports say (every byte, with its time) into an MCAP file.
@@ -93,7 +97,7 @@ def record(
     """
     from tactomo_client import Daemon
 
-    daemon = Daemon(control, keys=keys)
+    daemon = Daemon(find_control(sensor, address, keys), keys=keys)
     if what not in ("start", "stop"):
         if name is not None:
             raise typer.BadParameter("give one file, or `start FILE`")
@@ -124,7 +128,8 @@ def method(
     budget_ms: Annotated[
         float | None, typer.Option(min=0.1, help="Time that one reconstruction may take.")
     ] = None,
-    control: options.ControlAddress = options.DEFAULT_CONTROL,
+    sensor: options.Sensor = None,
+    address: options.Address = None,
     keys: options.KeysFolder = None,
 ) -> None:
     """Choose the reconstruction method while the daemon runs.
@@ -134,7 +139,7 @@ def method(
     """
     from tactomo_client import Daemon
 
-    with Daemon(control, keys=keys) as daemon:
+    with Daemon(find_control(sensor, address, keys), keys=keys) as daemon:
         in_force = daemon.set_method(name).tier
         if budget_ms is not None:
             daemon.set_budget(budget_ms)
@@ -157,7 +162,10 @@ def poke(
     arguments: Annotated[
         list[str] | None, typer.Argument(metavar="[NAME=VALUE]...", help="Its arguments.")
     ] = None,
-    twin_control: options.TwinControlAddress = options.DEFAULT_TWIN_CONTROL,
+    address: Annotated[
+        str | None,
+        typer.Option("--address", "-a", help="Of the twin's control socket. [the only twin's]"),
+    ] = None,
 ) -> None:
     """Press, move, release and break a running twin, as a test of your own robot would.
 
@@ -168,9 +176,8 @@ def poke(
     """
     from tactomo_client import request
 
-    answer = request(
-        command, twin_control, **dict(_named(argument) for argument in arguments or [])
-    )
+    named = dict(_named(argument) for argument in arguments or [])
+    answer = request(command, find_twin(address), **named)
     if answer.get("released") is False:
         raise TactomoError("nothing of this id presses", "`tactomo poke scene` lists what does")
     if answer:

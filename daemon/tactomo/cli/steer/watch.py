@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tactomo.cli import options
-from tactomo.errors import TactomoError
+from tactomo.cli.sensors import find_sensor
 from tactomo.plain import plain
 
 if TYPE_CHECKING:
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from tactomo_client import Event, Frame, Status
 
 REFRESH_HZ = 12.0
-NOBODY_S = 5.0
-"""How long a name may be silent from the start: a daemon sends its status every second."""
 
 app = options.typer_app()
 
@@ -32,8 +30,8 @@ app = options.typer_app()
     )
 )
 def watch(
-    sensor: options.SensorName = options.DEFAULT_NAME,
-    stream: options.StreamAddress = options.DEFAULT_STREAM,
+    sensor: options.Sensor = None,
+    address: options.Address = None,
     seconds: Annotated[
         float | None, typer.Option(min=0.0, help="Stop after this long; until Ctrl-C without it.")
     ] = None,
@@ -41,12 +39,13 @@ def watch(
 ) -> None:
     """Show the pressure map, the contacts and the daemon's health live in the terminal.
 
-    Without a terminal (in a pipe) it prints one line a frame instead. Ctrl-C ends it. Where nobody
-    publishes the sensor for 5 s from the start, it ends with exit status 1.
+    Without a terminal (in a pipe) it prints one line a frame instead. Ctrl-C ends it. Where no such
+    sensor runs at the start, it ends with exit status 1.
     """
     from tactomo.cli.console import Console
 
-    view = View(sensor, stream, keys)
+    found = find_sensor(sensor, address, keys)
+    view = View(found.sensor, found.stream, keys)
     console = Console()
     end_s = float("inf") if seconds is None else time.monotonic() + seconds
     try:
@@ -54,7 +53,6 @@ def watch(
             _show_live(view, console, end_s)
         else:
             _print_lines(view, end_s)
-        view.check_is_published(0.0)
     except KeyboardInterrupt:
         pass
     finally:
@@ -72,7 +70,6 @@ class View:
         self.frame: Frame | None = None
         self.status: Status | None = None
         self.event: Event | None = None
-        self._begin_s = time.monotonic()
         self._news = subscribe(sensor, address=stream, kind=("map", "status", "event"), keys=keys)
 
     def update(self, wait_s: float) -> bool:
@@ -80,24 +77,12 @@ class View:
 
         Raises:
             KeysError: the server does not let us in.
-            TactomoError: nobody publishes the sensor.
         """
         before = self.frame
         while (item := self._news.wait(wait_s)) is not None:
             wait_s = 0.0
             self._take(item)
-        self.check_is_published(NOBODY_S)
         return self.frame is not before
-
-    def check_is_published(self, patience_s: float) -> None:
-        """Raise TactomoError if nothing has come since the start, and that is so long ago."""
-        is_silent = self.frame is None and self.status is None
-        if is_silent and time.monotonic() - self._begin_s >= patience_s:
-            raise TactomoError(
-                f"nobody publishes a sensor {self.sensor!r} at {self.stream}",
-                "`tactomo status` says whether a daemon runs, and its sensor's name: give that "
-                "with --sensor",
-            )
 
     def close(self) -> None:
         """Close the subscription."""

@@ -1,0 +1,182 @@
+"""Which sensor a command is for: the one that is named, at the address given, or all that runs."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import urlsplit
+
+from tactomo.cli.options import DEFAULT_NAME
+from tactomo.errors import TactomoError
+from tactomo.running import Running, running
+
+STATUS_S: Final = 3.0  # a daemon repeats its status every second
+ALL_S: Final = 1.2  # so long, and every sensor of a stream has been heard
+
+
+class SensorError(TactomoError):
+    """No sensor, or several, may be meant."""
+
+    name = "which_sensor"
+
+
+def find_sensor(name: str | None, address: str | None, keys: Path | None = None) -> Running:
+    """Return the sensor that is meant: the only one there is, where it is not named.
+
+    Args:
+        name: the sensor's; None for the only one.
+        address: of a stream that carries the sensor; None for those that run on this computer.
+        keys: the folder of keys for that address.
+
+    Raises:
+        SensorError: there is none, or there are several.
+        KeysError: the server lets nobody in by these keys.
+    """
+    if address is not None:
+        return _heard_of(name, address, keys)
+    there = running("daemon")
+    meant = [each for each in there if name in (None, each.sensor)]
+    if len(meant) == 1:
+        return meant[0]
+    if meant:
+        raise _several([(each.sensor, each.stream, ", ".join(each.ports)) for each in meant])
+    others = ", ".join(each.sensor for each in there)
+    raise SensorError(
+        f"no sensor{'' if name is None else f' {name!r}'} runs on this computer"
+        + (f", but {others}" if others else ""),
+        "start one by `tactomo daemon` or `tactomo demo`; give the stream of one elsewhere by "
+        "--address",
+    )
+
+
+def find_control(name: str | None, address: str | None, keys: Path | None) -> str:
+    """Return the address of the control socket of the sensor that is meant, see `find_sensor`."""
+    found = find_sensor(name, address, keys)
+    if address is None:
+        return found.control
+    from tactomo_client import request
+
+    there = request("status", found.control, keys=keys).get("sensor")
+    if there != found.sensor:
+        raise SensorError(
+            f"{found.control} is the control socket of {there}, not of {found.sensor}",
+            "run the command on the computer of its daemon",
+        )
+    return found.control
+
+
+def newest_status(
+    name: str | None, address: str | None, keys: Path | None = None
+) -> Mapping[str, Any]:
+    """Return the status of the sensor that is meant, see `find_sensor`."""
+    if address is not None:
+        return _status_of(name, address, keys)
+    control = find_sensor(name, None).control
+    from tactomo_client import request
+
+    return request("status", control, keys=keys)
+
+
+def name_of(name: str | None) -> str:
+    """Return the name of the sensor that is meant, be it running or not."""
+    if name is not None:
+        return name
+    return find_sensor(None, None).sensor if running("daemon") else DEFAULT_NAME
+
+
+def find_twin(address: str | None) -> str:
+    """Return the address of the twin's control socket: the only one's that runs, if none is given.
+
+    Raises:
+        SensorError: none runs, or several do.
+    """
+    if address is not None:
+        return address
+    there = running("twin")
+    if len(there) == 1:
+        return there[0].control
+    if there:
+        raise _several([("a twin", each.control, ", ".join(each.ports)) for each in there])
+    raise SensorError(
+        "no twin runs on this computer", "start one by `tactomo demo` or `tactomo twin`"
+    )
+
+
+def twin_of(sensor: Running) -> str | None:
+    """Return the control address of the twin that a sensor's ports are of, if they are one's."""
+    ports = {os.path.realpath(port) for port in sensor.ports}
+    for twin in running("twin"):
+        if ports and ports <= {os.path.realpath(port) for port in twin.ports}:
+            return twin.control
+    return None
+
+
+def _several(there: list[tuple[str, str, str]]) -> SensorError:
+    listed = "".join(f"\n  {name} at {at}, of {ports}" for name, at, ports in there)
+    names = {name for name, _, _ in there}
+    by = "--sensor NAME" if len(names) == len(there) else "--address ADDRESS"
+    return SensorError(f"{len(there)} run on this computer:{listed}\n", f"say which by {by}")
+
+
+def _heard_of(name: str | None, address: str, keys: Path | None) -> Running:
+    """Return a sensor that a stream carries, by its status."""
+    status = _status_of(name, address, keys)
+    ports = tuple(str(port.get("url")) for port in status.get("ports") or ())
+    control = _from_here(str(status.get("control")), address)
+    return Running("daemon", control, status["sensor"], address, ports)
+
+
+def _status_of(name: str | None, address: str, keys: Path | None) -> Mapping[str, Any]:
+    """Return the status of the only sensor that a stream carries, or of the named one."""
+    statuses = _statuses(name, address, keys)
+    if not statuses:
+        raise SensorError(
+            f"no daemon answers at {address}" + ("" if name is None else f" for a sensor {name!r}"),
+            "is it running, and is this its stream? `tactomo status` shows those of this computer",
+        )
+    if len(statuses) > 1:
+        raise SensorError(
+            f"{address} carries {', '.join(sorted(statuses))}", "say which by --sensor NAME"
+        )
+    return next(iter(statuses.values()))
+
+
+def _from_here(control: str, stream: str) -> str:
+    """Return the address of a control socket as it is reached from where a stream is."""
+    host, port = urlsplit(stream).hostname, control.rpartition(":")[2]
+    return f"tcp://{host}:{port}" if host and control.startswith("tcp:") else control
+
+
+def _statuses(name: str | None, address: str, keys: Path | None) -> Mapping[str, Mapping[str, Any]]:
+    """Return the newest status of each sensor that a stream carries, or of the named one."""
+    import zmq
+    from tactomo_client import MessageError
+    from tactomo_client.connection import connect_subscriber
+    from tactomo_client.keys import as_keys
+    from tactomo_client.messages import STATUS, decode_message, topic
+
+    heard: dict[str, Mapping[str, Any]] = {}
+    topics = [b"" if name is None else topic(name, STATUS)]
+    socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
+    connection = connect_subscriber(socket, address, topics, keys=as_keys(keys))
+    end_s = time.monotonic() + STATUS_S
+    try:
+        while (left_s := end_s - time.monotonic()) > 0 and not (name and heard):
+            if not socket.poll(round(min(left_s, 0.1) * 1e3)):
+                if refusal := connection.refusal():
+                    raise refusal
+                continue
+            try:
+                message = decode_message(socket.recv())
+            except MessageError:
+                continue
+            if not heard:
+                end_s = min(end_s, time.monotonic() + ALL_S)
+            if message.kind == STATUS:
+                heard[message.sensor] = message.fields
+    finally:
+        connection.close()
+    return heard
