@@ -168,11 +168,8 @@ def test_version(tactomo: Run) -> None:
     "arguments",
     [
         ["dance"],
-        ["twin", "--ports", "3"],
         ["daemon", "--method", "best"],
         ["daemon", "--set", "lossless"],
-        ["reconstruct", "in.npz", "out.npz", "--method", "best"],
-        ["replay"],
         ["record", "stop", "here.mcap"],
         ["record", "start", "--seconds", "3"],
         ["poke", "press", "x_mm"],

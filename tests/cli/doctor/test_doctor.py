@@ -139,10 +139,8 @@ def test_complex_scans_are_turned(tactomo: Run, rest: FloatArray) -> None:
         ({"other": (5, 208)}, [], "name the array of scans at rest with --array"),
         ({"rest": (5, 7)}, [], "give --description, or a lookup"),
         ({"rest": (5, 256)}, [], "fit 0 patterns"),
-        ({"rest": (2, 5, 208)}, [], "it must be numbers, (T, voltages)"),
         ({"rest": (5, 208), "lookup": (4, 4)}, [], "source, sink, v+, v-"),
         ({"rest": (5, 208)}, ["--frames", "7:9"], "give other --frames"),
-        ({"rest": (5, 208)}, ["-d", "nosuch"], "cannot read the sensor description"),
     ],
 )
 def test_what_cannot_be_examined_is_said(

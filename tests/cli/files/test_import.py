@@ -123,7 +123,6 @@ def test_the_batch_layout_keeps_channels_reference_and_gaps(tactomo: Run, tmp_pa
 @pytest.mark.parametrize(
     ("arrays", "options", "says"),
     [
-        ({"x": np.zeros(3)}, [], "in.npz holds x (3,): no scans of 208 voltages"),
         ({"magnitude": np.zeros((4, 207))}, ["--rate", "1"], "real numbers of shape T x 208"),
         ({"magnitude": np.zeros((4, 208))}, [], "give --rate"),
         (
@@ -132,7 +131,6 @@ def test_the_batch_layout_keeps_channels_reference_and_gaps(tactomo: Run, tmp_pa
             "differ in length",
         ),
         ({"magnitude": np.zeros((4, 208)), "t": [0, 2, 1, 3]}, [], "t does not rise"),
-        ({"magnitude": np.zeros((4, 208)), "t": [0, 1, np.nan, 3]}, [], "t holds what is out of"),
         ({"magnitude": np.zeros((4, 208)), "t": [0, 1, 2, 1e13]}, [], "t holds what is out of"),
         (
             {"structure": np.zeros((4, 208)), "magnitude": np.array(["a"])},
@@ -248,15 +246,11 @@ def test_channels_that_were_not_measured_are_left_out(tactomo: Run, tmp_path: Pa
     [
         (1, "12", "line 1: 12, not 9 or 11 or 18 header lines; is it a Sciospec file"),
         (1, "eit", "line 1: the number of header lines is no number"),
-        (4, "yesterday", "line 4: it is no date such as"),
         (4, "2024.01.31. 12:30:05.5e999", "line 4: it is no date such as"),
         (8, "3", "line 8: 3 frequencies; save one"),
         (19, "1 1", "line 19: 1 1 is no injection"),
         (20, "0.1\t0.2\t0.3", "line 20: 3 numbers, not pairs"),
-        (22, "0.1\t0.2", "line 22: 2 numbers, not 32 numbers"),
         (24, "0.1\tx", "line 24: it holds what is no number"),
-        (24, "nan\t1", "line 24: 2 numbers, not 32"),
-        (50, None, "line 50: the file ends before it; it was cut off"),
         (19, None, "line 19: no injection; it was cut off"),
     ],
 )

@@ -126,11 +126,8 @@ def test_a_port_in_use_is_named_and_nothing_recorded(bench: Bench, tmp_path: Pat
     ("address", "says"),
     [
         ("0.0.0.0:9460", "can be reached from other computers"),
-        ("robot.local:9460", "can be reached from other computers"),
         ("127.0.0.1", "use 127.0.0.1:PORT"),
-        ("127.0.0.1:99999", "use 127.0.0.1:PORT"),
         ("http://127.0.0.1:9460", "use 127.0.0.1:PORT"),
-        ("", "use 127.0.0.1:PORT"),
     ],
 )
 def test_an_address_that_nothing_guards_is_refused(address: str, says: str) -> None:

@@ -480,9 +480,7 @@ def test_the_pages_program_prints_touches_and_who_is_there(
     [
         ([], 2, "give --from or --bind"),
         (["--from", "ipc:///tmp/a", "--bind", "ipc:///tmp/b"], 2, "one of the two"),
-        (["--bind", "udp://x"], 2, "use tcp://127.0.0.1:PORT"),
         (["--from", "ipc:///tmp/none", "--robot", "a/b"], 2, "'a/b' is not a sensor name"),
-        (["--bind", "ipc:///tmp/x", "--config", "/none.json5"], 1, "No such file or directory"),
         (
             ["--config", "LOCAL", "--from", "ipc:///tmp/a", "--from", "x"],
             1,

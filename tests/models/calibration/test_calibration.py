@@ -157,12 +157,10 @@ def readings_of(kpa: FloatArray = LEVELS, magnitude: FloatArray | None = None) -
     [
         ([], "there are no readings"),
         (readings_of(LEVELS[-3:]), "answers to 3 of 3 readings"),
-        (readings_of(np.full(8, 200.0)), "at 1 different pressures"),
         (readings_of(LEVELS / 3), "does not answer to any of the 10 readings, up to 83 kPa"),
         (readings_of(LEVELS * 1e3, kinked(LEVELS)), "is it in Pa"),
         (readings_of(LEVELS / 1e3, kinked(LEVELS)), "is it in MPa"),
         (readings_of(LEVELS, 100 * kinked(LEVELS)), "is it in per cent"),
-        (readings_of(LEVELS, np.full(10, 0.2)), "does not rise with the pressure: it is"),
         (readings_of(LEVELS, kinked(LEVELS)[::-1]), "does not rise with the pressure: it is"),
     ],
 )
@@ -232,7 +230,6 @@ def test_one_beside_the_description_is_found_too(
         ("magnitude", None, "magnitude"),
         ("extra", 1, "unknown key extra"),
         ("pressure_kpa", "negative", "pressure_kpa must be between 0"),
-        ("pressure_kpa", "huge", "pressure_kpa must be between 0"),
         ("sigma_kpa", "huge", "sigma_kpa must be between 0"),
     ],
 )

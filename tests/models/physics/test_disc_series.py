@@ -13,6 +13,8 @@ tomography", IEEE Trans. Biomed. Eng. 36 (1989); the series is carried further t
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
@@ -37,12 +39,13 @@ def tank() -> SensorDescription:
     return variant(load_description("tank_disc"), sheet={"frame_width_m": 0.0499})
 
 
+@cache
 def series_voltages(
     tank: SensorDescription,
     ratio: float = 1.0,
     inclusion_m: float = 0.0,
     core_m: float | None = None,
-    modes: int = 20_000,
+    modes: int = 10_000,
     order: int = 8,
 ) -> FloatArray:
     """Voltages (M,) of a disc with a concentric inclusion of a conductivity ratio to the rest.
