@@ -368,6 +368,8 @@ class Reconstructor:
             kept = self._ranges | seen
             self._ranges = {known: kept[known] for known in self._tracker.ids if known in kept}
         tier, flags = estimate.made_by or self._name, measurement.flags | estimate.flags
+        if not contacts and not estimate.has_drifted:
+            flags |= Flag.MISFIT_HIGH  # something has changed, and nothing explains it
         if self.taught is not None and len(contacts) == 1:
             with measurement.timed("taught"):
                 contacts = (self.taught.corrected(contacts[0], measurement, tier),)

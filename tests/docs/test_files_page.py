@@ -105,7 +105,7 @@ def test_every_field_of_what_is_recorded_has_its_row() -> None:
     frame = msgpack.unpackb(pack_mark(Mark((), "auto", None)))
     assert table(PAGE, "## A frame").keys() == frame.keys()
     scan = np.ones(3)
-    whole = Reference(scan, scan, scan, scan, 1, scan, scan)
+    whole = Reference(scan, scan, scan, scan, 1, scan, scan, scan, scan)
     reference = msgpack.unpackb(reference_entry(whole, 1, 0, 0).data)
     assert table(PAGE, "## A reference").keys() == reference.keys()
     calibration = msgpack.unpackb(calibration_entry("", 1, 0, 0).data)

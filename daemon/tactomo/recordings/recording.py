@@ -70,7 +70,7 @@ from tactomo.scans import Mark, ScanKey, Timing
 
 RECOVERED: Final = "tactomo-recovered"
 REFERENCE_ARRAYS: Final = ("magnitude", "structure", "magnitude_noise", "structure_noise")
-DRIFT_ARRAYS: Final = ("magnitude_drift", "structure_drift")
+DRIFT_ARRAYS: Final = tuple(f"{c}_{what}" for what in ("drift", "creep") for c in Channel)
 """Missing in recordings of daemons that did not follow drift."""
 REPLAY_SCHEME: Final = "replay"
 GIVE_DESCRIPTION: Final = "give the description's file by --description"

@@ -77,6 +77,10 @@ FLAG_ADVICE: Mapping[str, tuple[str, str]] = {
         "the two channels' scans are not of one instant",
         "check the sync line between the two boards",
     ),
+    "creeping": (
+        "what was pressed comes back slowly, and may hide a light touch",
+        "leave the skin alone for a while, or run `tactomo tare` with nothing on it",
+    ),
     "untaught": (
         "no press like this one was taught: the physics alone says where it is",
         "teach more of the skin by `tactomo teach live`",

@@ -13,7 +13,9 @@ share between two times of a contact that is still. A factor cannot hold a conta
 
 *Something was let go*: what is left is held against what drift may have done since. If it explains
 the data to their noise, by amounts that skins reach in that time, the reference is there at once.
-Only a signal that has just dropped is asked so: a contact that stays is none.
+Only a signal that has just dropped is asked so: a contact that stays is none. Something lighter
+that lay there before the release is followed with it. A frame that would show something if creep
+had not been followed is flagged for that.
 
 A lead that was broken at the tare is left out of all that: what is flagged since then and explained
 does not keep the rest from being followed. A fault that comes later does, until the next tare.
@@ -26,7 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import replace
-from typing import Final, Literal, Protocol
+from typing import Any, Final, Literal, Protocol
 
 import numpy as np
 from tactomo_protocol import Channel
@@ -195,12 +197,10 @@ class BaselineTracker:
     def _move(self, time_s: float) -> None:
         """Put the baseline as it is now in force."""
         assert self.reference is not None
-        drift = {name: channel.put_in_force() for name, channel in self._channels.items()}
-        self.reference = replace(
-            self.reference,
-            magnitude_drift=drift.get(Channel.MAGNITUDE),
-            structure_drift=drift.get(Channel.STRUCTURE),
-        )
+        moved: dict[str, Any] = {}
+        for name, channel in self._channels.items():
+            moved[f"{name}_drift"], moved[f"{name}_creep"] = channel.put_in_force()
+        self.reference = replace(self.reference, **moved)
         self._reconstructor.set_reference(self.reference)
         self._moved_s = time_s
         self.moves += 1
@@ -215,19 +215,20 @@ class BaselineTracker:
             return False
         if self._is_held and not self._release.is_on(time_s, _signal(measurement)):
             return False
+        creep = {name: self._memory.creep(time_s, name) for name in self._channels}
         found = {
             name: channel.explain(
                 time_s,
                 scans[name],
                 measurement.changes[name],
-                self._memory.creep(time_s, name),
+                creep[name],
                 self._time_constant_s,
             )
             for name, channel in self._channels.items()
         }
         if all(each.misfit < 1 and each.excess < 1 for each in found.values()):
             for name, channel in self._channels.items():
-                channel.jump(time_s, found[name])
+                channel.jump(time_s, found[name], creep[name])
             self._let_go()
             return True
         if self._is_held and all(max(e.misfit, e.excess) < doubtful for e in found.values()):

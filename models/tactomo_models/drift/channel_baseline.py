@@ -51,6 +51,7 @@ class ChannelBaseline:
         self.has_moved = False
         self._amounts = np.zeros(subspace.modes.shape[1])
         self._residual = np.zeros(len(tare))
+        self._jumped = np.zeros(len(tare))  # beside creep, since something was let go that creeps
         self._precision = self._noise_variance = np.zeros(len(tare))
         self._seen_s = self._gain_seen_s = self._jumped_s = 0.0
         self._begun_s: float | None = None
@@ -100,6 +101,8 @@ class ChannelBaseline:
         residual = self._now + share * change + ahead * missing[0] - drift
         size = float(np.sqrt(np.mean(self._precision * residual**2)))
         self._residual = residual * min(1.0, MAX_RESIDUAL / max(size, 1e-12))
+        if not creep.any():
+            self._jumped = np.zeros_like(drift)
         self._know(drift + self._residual)
         self._seen_s = self._gain_seen_s = time_s
         return size < MAX_RESIDUAL and self._excess(wanted) < 1
@@ -181,9 +184,11 @@ class ChannelBaseline:
         excess = max(found.excess, self._excess(self._kept() + found.amounts))
         return replace(found, excess=excess)
 
-    def jump(self, time_s: float, found: Explained) -> None:
-        """The baseline is where a scan was explained to be."""
-        self._amounts = self._kept() + found.amounts
+    def jump(self, time_s: float, found: Explained, creep: FloatArray) -> None:
+        """The baseline is where a scan was explained to be, beside or without creep."""
+        before, self._amounts = self._kept(), self._kept() + found.amounts
+        if creep.any():
+            self._jumped = self._jumped + self._subspace.modes @ (self._kept() - before)
         self._know(self._subspace.modes @ self._amounts + self._residual)
         self._seen_s = self._gain_seen_s = self._jumped_s = time_s
 
@@ -200,9 +205,12 @@ class ChannelBaseline:
         return kept
 
     def _explain(self, change: FloatArray, precision: FloatArray, sigma: FloatArray) -> Explained:
+        return self._subspace.explain(change + self._crept(), precision, sigma)
+
+    def _crept(self) -> FloatArray:
+        """Logarithms (M,) of the factors that creep has on the tare."""
         cells = self._subspace.cells
-        crept = self._subspace.modes[:, cells] @ self._amounts[cells]
-        return self._subspace.explain(change + crept, precision, sigma)
+        return np.asarray(self._subspace.modes[:, cells] @ self._amounts[cells])
 
     def _prior(self, time_s: float, creep: FloatArray, lag_s: float) -> FloatArray:
         """Standard deviations (K,) of the modes.
@@ -237,10 +245,10 @@ class ChannelBaseline:
         behind = self._precision * (baseline - self._in_force) ** 2
         self.has_moved = bool(behind.mean() > min_move**2)
 
-    def put_in_force(self) -> FloatArray:
-        """The baseline (M,) as it is known; from now on it is in force."""
+    def put_in_force(self) -> tuple[FloatArray, FloatArray]:
+        """The baseline (M,) as it is known, and the part that may be a touch: in force from now."""
         self._in_force, self.has_moved = self._now, False
-        return self._now
+        return self._now, self._residual + self._crept() + self._jumped
 
     def drift(self) -> Drift:
         """How far what is in force is from the tare."""

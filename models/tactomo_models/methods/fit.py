@@ -188,6 +188,7 @@ class Fit:
             magnitudes=account.magnitudes,
             magnitude_sigmas=account.magnitude_sigmas,
             account=account,
+            has_drifted=bool(course.drifts),
             misfit=fitted.misfit,
             flags=flags,
             made_by="fit",

@@ -110,6 +110,7 @@ class Estimate:
         magnitude_sigmas: (K,) their standard uncertainties, or one for all; where NaN, pressures
             are unknown, too.
         account: what a fitted pressure field says of the same areas; None where none was fitted.
+        has_drifted: whether a drift of the sheets explains what no contact does.
         tells_pressure: whether a pressure map follows from the areas' magnitudes.
         misfit: root mean square of the noise-weighted residual; NaN where it is not known.
         confidence: expected correlation of the map with the truth, 0 to 1; NaN where not known.
@@ -127,6 +128,7 @@ class Estimate:
     magnitudes: FloatArray | None = None
     magnitude_sigmas: FloatArray | float = float("nan")
     account: FieldAccount | None = None
+    has_drifted: bool = False
     tells_pressure: bool = True
     misfit: float = float("nan")
     confidence: float = float("nan")

@@ -174,6 +174,7 @@ class MeasuredChannel:
         self._tare_per_volt = self._per_volt = np.divide(
             1, np.abs(reference), out=np.zeros_like(reference), where=valid
         )
+        self._creep: FloatArray | None = None  # relative changes (M,) that may be a touch's
         self._least_noise = (noiseless * self._per_volt) ** 2
         self._noise = np.where(valid, (of_change * self._per_volt) ** 2, UNUSABLE**2)
         self.relative_noise = np.sqrt(self._noise + MODEL_ERROR**2)
@@ -205,11 +206,16 @@ class MeasuredChannel:
         if whole and explains(sheet, self.reference, self.usable, self.relative_noise):
             self._flags &= ~Flag.REFERENCE_MISMATCH
 
-    def follow(self, drift: FloatArray | None) -> None:
-        """Measure changes against the tare as it has drifted since: (M,) logarithms of factors.
+    def follow(self, drift: FloatArray | None, creep: FloatArray | None) -> None:
+        """Measure changes against the tare as it has drifted since.
 
         What is known of noise, wiring and faults stays that of the tare.
+
+        Args:
+            drift: (M,) logarithms of factors.
+            creep: (M,) the part of it in which a touch may be hidden.
         """
+        self._creep = None if creep is None else np.sign(self.reference) * creep
         factor = 1.0 if drift is None else np.exp(drift)
         self._reference = self.reference * factor
         self._per_volt = self._tare_per_volt / factor
@@ -241,6 +247,11 @@ class MeasuredChannel:
         error = self._error_share**2 * (square + typical)
         statistic = float((square / variance).sum())
         quiet = statistic < noise_limit(count, freedom)
+        if self._creep is not None:
+            unfollowed = (change if quiet else 0.0) + self._creep
+            shown = float((valid * unfollowed**2 / variance).sum()) + (0 if quiet else count)
+            if shown >= noise_limit(count, freedom):
+                flags |= Flag.CREEPING
         total = self._total
         if not (quiet or electrodes) and _fell(total * change, total**2 * variance):
             flags |= Flag.REFERENCE_MISMATCH

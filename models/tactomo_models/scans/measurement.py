@@ -29,8 +29,7 @@ class Measurement:
     #: of each channel that has a usable scan; the others are absent
     changes: Mapping[Channel, Changes]
     flags: Flag = field(default_factory=lambda: Flag(0))  #: what stands in the way of trusting them
-    #: those of `flags` that say what was left out at the tare, and ever since: these scans have
-    #: nothing to add
+    #: those of `flags` that the reference brings along: these scans have nothing to add
     standing_flags: Flag = field(default_factory=lambda: Flag(0))
     faults: tuple[str, ...] = ()  #: in words, which electrodes are left out
     #: seconds spent in each stage of this frame so far
@@ -115,12 +114,9 @@ class Comparator:
         }
 
     def _follow(self, reference: Reference) -> None:
-        drift = {
-            Channel.MAGNITUDE: reference.magnitude_drift,
-            Channel.STRUCTURE: reference.structure_drift,
-        }
         for name, channel in self.channels.items():
-            channel.follow(drift[name])
+            drift, creep = (getattr(reference, f"{name}_{what}") for what in ("drift", "creep"))
+            channel.follow(drift, creep)
 
     def ask_noise(self, *scans: FloatArray | None) -> None:
         """Take the noise of the first frame's scans, where a reference of one scan told none.
@@ -166,7 +162,7 @@ class Comparator:
                 changes[name] = result.changes
         if self._are_swapped(changes):
             flags |= Flag.CHANNELS_SWAPPED
-        standing_flags = flags & LEFT_OUT & ~own_flags
+        standing_flags = flags & (LEFT_OUT & ~own_flags | Flag.CREEPING)
         stage_s = {"data": time.perf_counter() - start_s}
         return Measurement(changes, flags, standing_flags, tuple(faults), stage_s)
 

@@ -58,6 +58,7 @@ class Flag(IntFlag):
     NO_USABLE_SCAN = 8192  # nothing was measured: that no contact is shown says nothing
     REFERENCE_DISPUTED = 16384  # the skin at the start was not as last known; set by who tares
     UNTAUGHT = 32768  # the skin was taught, and no press like this one: the physics alone locates
+    CREEPING = 65536  # what is taken for creep may hide a touch
 
     def names(self) -> list[str]:
         """Names of the flags that are set, in lower case, as the stream carries them."""

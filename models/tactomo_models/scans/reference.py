@@ -31,6 +31,9 @@ class Reference:
     #: been followed
     magnitude_drift: FloatArray | None = None
     structure_drift: FloatArray | None = None  #: (M,) likewise
+    #: (M,) the part of that in which a touch may be hidden: creep, and what no drift explains
+    magnitude_creep: FloatArray | None = None
+    structure_creep: FloatArray | None = None  #: (M,) likewise
 
     #: whether scans at rest told the noise; else reciprocity did, and it is an upper bound
     is_noise_measured: bool = True
@@ -79,6 +82,8 @@ class Reference:
             structure=_drifted(self.structure, self.structure_drift),
             magnitude_drift=None,
             structure_drift=None,
+            magnitude_creep=None,
+            structure_creep=None,
         )
 
     @classmethod

@@ -134,6 +134,20 @@ def test_a_touch_that_stays_when_a_press_is_eased_is_not_taken_for_creep(life: L
     assert set(count(life.lives(120, TOUCH))) == {1}
 
 
+def test_what_creep_may_hide_is_not_known(life: Life) -> None:
+    """A touch beside what was let go is told, or flagged: most of its frames showed nothing."""
+    touch = Press(0.012, 0.012, 4.8, radius_m=0.006)
+    assert set(count(life.lives(10, touch, step_s=0.5))) == {1}, "alone it is told"
+    life.lives(10)
+    life.lives(60, Press(0.0, 0.0, 180.0), step_s=1.0)
+    frames = life.lives(40, touch, step_s=0.5)
+    assert all(frame.contacts or frame.flags for frame in frames)
+    assert any(Flag.CREEPING in frame.flags for frame in frames)
+    frames = life.lives(300)
+    assert not frames[-1].flags
+    assert set(count(frames)) == {0}
+
+
 def test_a_finger_that_comes_down_within_a_minute_is_reported(life: Life) -> None:
     def presses_at(share: float) -> Presses:
         return (replace(PRESS, pressure_kpa=100.0 * share),)

@@ -42,7 +42,7 @@ class Followed:
 
     def learned(self) -> FloatArray:
         """What is taken for the baseline, in standard deviations of one scan."""
-        return self.baseline.put_in_force() / NOISE
+        return self.baseline.put_in_force()[0] / NOISE
 
 
 @pytest.fixture(scope="module")
