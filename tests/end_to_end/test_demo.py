@@ -1,9 +1,11 @@
-"""The demo as a person meets it: the page, the mouse, a script, and Ctrl-C."""
+"""The demo as a person meets it: a press, the page, the mouse, a script, and Ctrl-C."""
 
 from __future__ import annotations
 
+import math
 import os
 import signal
+import time
 from pathlib import Path
 
 import pytest
@@ -12,8 +14,46 @@ from processes import children_of, is_running
 from selenium.webdriver import ActionChains, Chrome
 from selenium.webdriver.common.by import By
 from small_sensor import SMALL
-from waiting import wait_until
-from whole_system import Demo, running_demo
+from tactomo_client import Frame, subscribe
+from waiting import PATIENCE_S, wait_until
+from whole_system import SENSOR, Demo, running_demo
+
+
+@pytest.mark.parametrize(
+    "places", [[(0.0, 0.0)], [(-30.0, 25.0), (35.0, -20.0)]], ids=["centre", "two"]
+)
+def test_every_press_is_found_within_3_mm_with_its_pressure(
+    demo: Demo, places: list[tuple[float, float]]
+) -> None:
+    demo.clear()
+    settled_frame(demo, 0)
+    for number, (x_mm, y_mm) in enumerate(places):
+        demo.press(x_mm, y_mm, id=str(number), pressure_kpa=180, radius_mm=15)
+    frame = settled_frame(demo, len(places), "fit")
+    demo.clear()
+    for place in places:
+        assert min(math.dist((c.x_mm, c.y_mm), place) for c in frame.contacts) < 3.0
+    for contact in frame.contacts:
+        assert contact.pressure_kpa == pytest.approx(180, abs=20)
+        assert contact.area_mm2 == pytest.approx(math.pi * 15**2, rel=0.35)
+    assert frame.map is not None
+    assert frame.map.shape == (51, 51)
+    assert frame.map.max() > 0.1
+
+
+def settled_frame(demo: Demo, contacts: int, tier: str | None = None) -> Frame:
+    """First unflagged frame with so many contacts, of a tier if one is given.
+
+    Where others take the processor, frames get less time until it is free again.
+    """
+    deadline = time.monotonic() + 200.0
+    with subscribe(SENSOR, address=demo.stream, timeout_s=PATIENCE_S) as frames:
+        for frame in frames:
+            settled = not frame.flags and len(frame.contacts) == contacts
+            if settled and tier in (None, frame.tier):
+                return frame
+            assert time.monotonic() < deadline, f"{frame.tier} {frame.contacts} {frame.flags}"
+    raise AssertionError("the stream ended")
 
 
 @pytest.mark.browser

@@ -60,16 +60,9 @@ log = structlog.get_logger()
 
 
 class Publication:
-    """Publishes messages of ZeroMQ's form in Zenoh, under one robot's name. For one thread.
-
-    Attributes:
-        held_back: how many were not sent because nothing had changed.
-        malformed: how many broke the rules of STREAM.md.
-    """
+    """Publishes messages of ZeroMQ's form in Zenoh, under one robot's name. For one thread."""
 
     def __init__(self, session: zenoh.Session, robot: str) -> None:
-        self.held_back = 0
-        self.malformed = 0
         self._session = session
         self._prefix = f"tactomo/{robot}"
         self._skins: dict[str, _Skin] = {}
@@ -82,7 +75,6 @@ class Publication:
         try:
             message = decode_message(data)
         except MessageError:
-            self.malformed += 1
             return  # another program publishes there
         now_s = time.monotonic()
         skin = self._skins.get(message.sensor)
@@ -97,7 +89,7 @@ class Publication:
                 detail=f"{skin.source} and {source} both publish a sensor {message.sensor!r}",
                 next_step="give one of the daemons another name",
             )
-        self.held_back += not skin.take(message, data.partition(b"\0")[2], now_s)
+        skin.take(message, data.partition(b"\0")[2], now_s)
         skin.source = source
 
     def forget_silent(self) -> None:
@@ -133,17 +125,15 @@ class _Skin:
             for kind in KINDS
         }
 
-    def take(self, message: Message, body: bytes, now_s: float) -> bool:
-        """Send a message and return True, unless it tells nothing new and no heartbeat is due."""
+    def take(self, message: Message, body: bytes, now_s: float) -> None:
+        """Send a message, unless it tells nothing new and no heartbeat is due."""
         kind = message.kind
         self.came_s = now_s
-        is_due = kind not in _HELD or self._is_news(message, now_s)
-        if is_due:
+        if kind not in _HELD or self._is_news(message, now_s):
             self._counts[kind] += 1
             self._publishers[kind].put(body, attachment=str(self._counts[kind]))
         if kind in _ANSWERED:
             self.newest[f"{self._prefix}/{kind}"] = body, self._counts[kind]
-        return is_due
 
     def _is_news(self, message: Message, now_s: float) -> bool:
         fields, kind = message.fields, message.kind

@@ -111,12 +111,11 @@ def direction_at(pressures_kpa: FloatArray, index: int) -> Direction:
     return "up" if not len(clear) or clear[-1] > 0 else "down"
 
 
-def fit_curve(readings: Sequence[Reading], *, seed: int = 0) -> Fit:
+def fit_curve(readings: Sequence[Reading]) -> Fit:
     """Fit a sensor's curve to load-cell readings.
 
     Args:
         readings: in any order; those below the onset, too, they are what it is found from.
-        seed: of the bootstrap.
 
     Raises CalibrationError where there are too few readings, none is answered to, units look wrong,
     or the magnitude does not rise with the pressure.
@@ -136,7 +135,7 @@ def fit_curve(readings: Sequence[Reading], *, seed: int = 0) -> Fit:
     slope = np.abs(np.gradient(curve.pressure_kpa, curve.magnitude))
     repeatability = own(curve.magnitude) * slope
     alike = [basis for basis in bases if basis.pieces == rise.basis.pieces]
-    of_fit = _fit_sigma(data, rise, alike, curve.magnitude, np.random.default_rng(seed))
+    of_fit = _fit_sigma(data, rise, alike, curve.magnitude, np.random.default_rng(0))
     middle = float(np.interp(curve.magnitude[-1] / 2, curve.magnitude, repeatability))
     return Fit(
         curve=PressureCurve(curve.magnitude, curve.pressure_kpa, np.hypot(repeatability, of_fit)),

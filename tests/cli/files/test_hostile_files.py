@@ -70,7 +70,6 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
         "calibration": ("reconstruct", "GOOD.npz", "OUT.npz", "--calibration", "FILE"),
         "taught": ("reconstruct", "GOOD.npz", "OUT.npz", "--taught", "FILE"),
         "show": ("calibrate", "show", "FILE"),
-        "compare": ("bench", "--compare", "FILE"),
     },
 }
 KINDS: Final = {".mcap": "recording", ".toml": "description", ".json": "kept"}

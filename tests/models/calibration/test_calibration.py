@@ -82,8 +82,8 @@ def test_without_noise_the_curve_is_the_sensors(response: Response) -> None:
 
 @pytest.mark.parametrize(
     ("noise", "scatter", "hysteresis"),
-    [(0.005, 0.0, 0.0), (0.005, 0.03, 0.0), (0.0, 0.03, 0.04), (0.003, 0.02, 0.08)],
-    ids=["noise", "scatter", "hysteresis", "all of it"],
+    [(0.005, 0.0, 0.0), (0.003, 0.02, 0.08)],
+    ids=["noise", "all of it"],
 )
 def test_held_out_readings_lie_within_the_stated_uncertainty(
     noise: float, scatter: float, hysteresis: float

@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tactomo.cli import options
-from tactomo.cli.bench.comparison import compared, read_results, table_of
 from tactomo.cli.laboratory import measurement
 from tactomo.cli.output import print_json, say, table
 
@@ -64,7 +63,6 @@ class Results:
     live: list[Phase] = field(default_factory=list)
     late_scans: int | None = None
     dropped_scans: int | None = None
-    compared: list[dict[str, Any]] = field(default_factory=list)
     chart: list[dict[str, Any]] = field(default_factory=list)
 
 
@@ -76,7 +74,6 @@ app = options.typer_app()
         "tactomo bench",
         "tactomo bench --seconds 20 --ports 1",
         "tactomo bench --json > times.json",
-        "tactomo bench --compare times.json",
         "tactomo bench --chart speed_accuracy.png --count 25",
         "tactomo bench --chart mine.png --method my_module:MyMethod --method auto",
         "tactomo bench --machine-speed",
@@ -96,10 +93,6 @@ def bench(
     rate: Annotated[
         float, typer.Option(rich_help_panel=LIVE, help="Dual scans a second of the twin.")
     ] = 20.0,
-    compare: Annotated[
-        Path | None,
-        typer.Option(help="Set the figures beside those of an earlier run, kept with --json."),
-    ] = None,
     chart: Annotated[
         Path | None,
         typer.Option(
@@ -138,7 +131,7 @@ def bench(
 
     Starts a twin and a daemon of its own on free addresses, so a running demo is not disturbed
     (but shares the processor), presses the twin in four ways and measures each. Takes about a
-    minute. `--compare` sets it beside an earlier run.
+    minute.
 
     With `--chart`, every method reconstructs simulated presses of mixed kinds on skins made by
     hand, of the reporting seeds: still ones at 40, 20 and 10 dB, each from a cold start, and
@@ -156,9 +149,6 @@ def bench(
         raise typer.BadParameter("--machine-speed and --chart are two runs")
     if method and chart is None:
         raise typer.BadParameter("--method goes with --chart")
-    if compare is not None and (machine_speed or chart is not None):
-        raise typer.BadParameter("--compare goes with latencies alone")
-    earlier = None if compare is None else read_results(compare)
     results = Results(machine(), description)
     if chart is not None:
         _chart(results, chart, count, method or [], as_json)
@@ -170,14 +160,10 @@ def bench(
 
     with Console(stderr=True).status("starting") as line:
         _measure_twin(results, ports, rate, seconds, line.update)
-    if earlier is not None:
-        results.compared = compared(earlier, asdict(results))
     if as_json:
         print_json(asdict(results))
     else:
         _print(results)
-        if compare is not None:
-            _console(results).print(table_of(results.compared, compare))
 
 
 def _chart(results: Results, picture: Path, count: int, methods: list[str], as_json: bool) -> None:
