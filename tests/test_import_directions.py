@@ -61,7 +61,7 @@ ORDER = {
     ),
     "tactomo": (
         *("errors", "plain", "journal", "log", "events", "endpoint", "timing", "scans", "worker"),
-        *("ending", "memory"),
+        *("ending", "memory", "running"),
         *("protocols", "config", "recordings", "acquisition", "stream", "imaging"),
         *("service", "twin", "cli", "__main__"),
     ),

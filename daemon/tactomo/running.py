@@ -17,8 +17,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from platformdirs import user_runtime_path
-
 SERVICES: Final = Path("/run/tactomo")  # a folder for each service, see deploy/systemd
 SUFFIX: Final = ".running.json"
 
@@ -57,7 +55,9 @@ def announced(program: Running) -> Iterator[None]:
 
 def running(kind: Literal["daemon", "twin"]) -> list[Running]:
     """Return the programs that run, and that this user may know of."""
-    folders = [_own_folder(), *(SERVICES.glob("*") if SERVICES.is_dir() else ())]
+    own = _own_folder()
+    is_own = own.is_dir() and own.stat().st_uid == os.getuid()  # the name may be another user's
+    folders = [*([own] if is_own else ()), *(SERVICES.glob("*") if SERVICES.is_dir() else ())]
     found = []
     for folder in folders:
         with contextlib.suppress(OSError):
@@ -67,8 +67,13 @@ def running(kind: Literal["daemon", "twin"]) -> list[Running]:
 
 
 def _own_folder() -> Path:
-    service = os.environ.get("RUNTIME_DIRECTORY")
-    return Path(service) if service else user_runtime_path("tactomo")
+    service, session = map(os.environ.get, ("RUNTIME_DIRECTORY", "XDG_RUNTIME_DIR"))
+    if service:
+        return Path(service)
+    own = Path(session or f"/run/user/{os.getuid()}")
+    return (
+        own / "tactomo" if own.is_dir() else Path(tempfile.gettempdir(), f"tactomo-{os.getuid()}")
+    )
 
 
 def _read(file: Path) -> Running | None:

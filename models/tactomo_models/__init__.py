@@ -27,38 +27,78 @@ simulators       the skin in MuJoCo and Gymnasium
 Below the last two, `reconstruct` turns scans into frames, and `batch` does so for a file.
 """
 
-from tactomo_protocol import Channel
+from __future__ import annotations
 
-from tactomo_models.drift.baseline import BaselineTracker
-from tactomo_models.errors import (
-    ArtifactError,
-    CalibrationError,
-    DataError,
-    DescriptionError,
-    MethodError,
-    ModelError,
-)
-from tactomo_models.methods.method import Estimate, Method, Skin, UnsolvableError
-from tactomo_models.methods.registry import METHODS, available_methods
-from tactomo_models.physics.artifact import (
-    Artifact,
-    build_artifact,
-    default_path,
-    load_artifact,
-    load_or_build_artifact,
-    save_artifact,
-)
-from tactomo_models.reconstruct import Reconstructor
-from tactomo_models.scans.measurement import Measurement
-from tactomo_models.scans.plausibility import Flag
-from tactomo_models.scans.reference import Reference
-from tactomo_models.scene.contacts import Contact
-from tactomo_models.scene.press import Press
-from tactomo_models.scene.pressure import PressureCurve, PressureRange
-from tactomo_models.scene.reconstruction import Reconstruction
-from tactomo_models.sensor.description import SensorDescription
-from tactomo_models.sensor.description_file import load_description, shipped_descriptions
-from tactomo_models.simulation.simulator import SkinSimulator
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tactomo_protocol import Channel
+
+    from tactomo_models.drift.baseline import BaselineTracker
+    from tactomo_models.errors import (
+        ArtifactError,
+        CalibrationError,
+        DataError,
+        DescriptionError,
+        MethodError,
+        ModelError,
+    )
+    from tactomo_models.methods.method import Estimate, Method, Skin, UnsolvableError
+    from tactomo_models.methods.registry import METHODS, available_methods
+    from tactomo_models.physics.artifact import (
+        Artifact,
+        build_artifact,
+        default_path,
+        load_artifact,
+        load_or_build_artifact,
+        save_artifact,
+    )
+    from tactomo_models.reconstruct import Reconstructor
+    from tactomo_models.scans.measurement import Measurement
+    from tactomo_models.scans.plausibility import Flag
+    from tactomo_models.scans.reference import Reference
+    from tactomo_models.scene.contacts import Contact
+    from tactomo_models.scene.press import Press
+    from tactomo_models.scene.pressure import PressureCurve, PressureRange
+    from tactomo_models.scene.reconstruction import Reconstruction
+    from tactomo_models.sensor.description import SensorDescription
+    from tactomo_models.sensor.description_file import load_description, shipped_descriptions
+    from tactomo_models.simulation.simulator import SkinSimulator
+
+_NAMES = {
+    "tactomo_protocol": "Channel",
+    "tactomo_models.drift.baseline": "BaselineTracker",
+    "tactomo_models.errors": (
+        "ArtifactError CalibrationError DataError DescriptionError MethodError ModelError"
+    ),
+    "tactomo_models.methods.method": "Estimate Method Skin UnsolvableError",
+    "tactomo_models.methods.registry": "METHODS available_methods",
+    "tactomo_models.physics.artifact": (
+        "Artifact build_artifact default_path load_artifact load_or_build_artifact save_artifact"
+    ),
+    "tactomo_models.reconstruct": "Reconstructor",
+    "tactomo_models.scans.measurement": "Measurement",
+    "tactomo_models.scans.plausibility": "Flag",
+    "tactomo_models.scans.reference": "Reference",
+    "tactomo_models.scene.contacts": "Contact",
+    "tactomo_models.scene.press": "Press",
+    "tactomo_models.scene.pressure": "PressureCurve PressureRange",
+    "tactomo_models.scene.reconstruction": "Reconstruction",
+    "tactomo_models.sensor.description": "SensorDescription",
+    "tactomo_models.sensor.description_file": "load_description shipped_descriptions",
+    "tactomo_models.simulation.simulator": "SkinSimulator",
+}
+_HOMES = {name: home for home, names in _NAMES.items() for name in names.split()}
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for: all of it, SciPy and the solvers, takes seconds."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(_HOMES[name]), name)
+    return value
+
 
 __all__ = [
     "METHODS",

@@ -79,6 +79,8 @@ def test_the_daemon_has_no_more_options_than_a_person_types() -> None:
     [
         (["--help"], set()),
         (["status"], set()),
+        (["info", "paper_square"], {"numpy", "pydantic", "rich"}),
+        (["ports"], {"rich", "serial"}),
         (["status", "--address", "ipc://@nobody"], {"zmq"}),
         (["tare", "--address", "ipc://@nobody"], {"zmq"}),
     ],

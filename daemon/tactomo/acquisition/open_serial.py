@@ -22,9 +22,7 @@ from typing import Any, Final
 import serial
 
 from tactomo.acquisition import adapters
-from tactomo.acquisition.replay_port import ReplayPort
 from tactomo.errors import PortAbsentError, PortBusyError, PortError, TactomoError
-from tactomo.recordings.recording import REPLAY_SCHEME
 
 READ_TIMEOUT_S: Final = 0.1
 """How long a read waits for its first byte, so how soon a reader notices that it should stop."""
@@ -47,8 +45,14 @@ def open_serial(url: str, baud: int) -> serial.Serial:
         PortError: it is no serial device or may not be opened.
         RecordingError: it is a replay of what is no recording.
     """
+    from tactomo.recordings.recording import REPLAY_SCHEME  # a second, which a list of ports spares
+
     is_replay = url.startswith(f"{REPLAY_SCHEME}://")
-    make: Callable[..., Any] = ReplayPort if is_replay else serial.serial_for_url
+    make: Callable[..., Any] = serial.serial_for_url
+    if is_replay:
+        from tactomo.acquisition.replay_port import ReplayPort
+
+        make = ReplayPort
     try:
         port: serial.Serial = make(
             url,

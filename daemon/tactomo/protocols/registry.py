@@ -20,7 +20,6 @@ from importlib.metadata import entry_points
 from typing import Any, Final, Protocol
 
 from tactomo_models import SensorDescription
-from tactomo_models.methods.registry import search_working_folder
 
 from tactomo.errors import ConfigError
 from tactomo.protocols.interface import PortProtocol
@@ -60,6 +59,8 @@ def find_protocol(name: str) -> ProtocolClass:
     """
     if ":" not in name:
         return _registered(name)
+    from tactomo_models.methods.registry import search_working_folder  # takes a second to import
+
     search_working_folder()
     found: ProtocolClass = _load(name)
     missing = [member for member in _MEMBERS if not hasattr(found, member)]

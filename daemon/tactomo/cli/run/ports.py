@@ -118,16 +118,19 @@ def question(
 
 def as_fields(row: Row, answers: dict[str, Answer]) -> dict[str, Any]:
     """Return a row for programs."""
-    from tactomo.imaging.frames import device_fields
-
     answer = answers.get(row.path)
+    device = None
+    if answer and answer.hello:
+        from tactomo.imaging.frames import device_fields
+
+        device = device_fields(answer.hello)
     return {
         "path": row.path,
         "use": row.use or None,
         "adapter": row.adapter and asdict(row.adapter),
         "held_by": [{"pid": holder.pid, "command": holder.command} for holder in row.held_by],
         "remarks": row.remarks,
-        "device": answer and answer.hello and device_fields(answer.hello),
+        "device": device,
         "no_device_because": (answer and answer.problem) or None,
     }
 
