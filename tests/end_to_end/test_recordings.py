@@ -93,7 +93,8 @@ def test_a_replay_with_a_page_begins_when_the_page_is_open(
         words = (word for line in replay.stdout for word in line.split())
         page = next(word for word in words if word.startswith("http://"))
         waiting = request("status", control, PATIENCE_S)
-        assert (waiting["state"], waiting["frames"]) == ("paused", 0)
+        assert waiting["state"] == "paused"
+        assert waiting["frames"] <= 1  # the first one is shown
         browser.get(page)
         wait_until(
             lambda: request("status", control, PATIENCE_S)["frames"] > 40, "the second round"

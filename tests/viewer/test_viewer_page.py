@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import threading
 import time
 from collections.abc import Iterator
@@ -144,9 +145,15 @@ class Page:
         self.twin = twin
         self.port = 0
 
-    def serve(self) -> None:
+    def serve(self, press_itself: bool = False) -> None:
         """Start the viewer; a second time at the same port."""
-        viewer = Viewer("left", self.skin.address, self.daemon.address, self.twin.address)
+        viewer = Viewer(
+            "left",
+            self.skin.address,
+            self.daemon.address,
+            self.twin.address,
+            press_itself=press_itself,
+        )
         self.served = ServedViewer(viewer, self.port)
         self.port = self.served.port
 
@@ -368,7 +375,7 @@ def test_what_is_touched_too_lightly_is_shown_and_has_no_number(page: Page) -> N
 def test_rate_latency_method_and_quality_are_shown(page: Page) -> None:
     page.skin.frame = {"tier_reason": "two contacts", "flags": ["misfit_high"], "misfit": 3.21}
     page.open()
-    wait_until(lambda: page["quality"].text == "Misfit high")
+    wait_until(lambda: page["quality"].text == "misfit high")
     wait_until(lambda: page["rate"].text.endswith("/s"))
     wait_until(lambda: page["latency"].text.endswith("ms"))
     assert page["made-by"].text == "levelset"
@@ -395,19 +402,30 @@ def test_no_contacts_is_nothing_pressed_only_where_touches_are_seen(page: Page) 
     wait_until(lambda: page["no-contacts"].text == "Not known.")
 
 
-def test_what_comes_under_a_pointer_that_rests_is_read_out(page: Page) -> None:
-    page.skin.press(-50, 0)
-    page.open()
-    wait_until(lambda: page.browser.execute_script("return tactomo.state.drawn?.contacts.length"))
-    x, y = page.browser.execute_script("return tactomo.mmToPixel(30, 30)")
+def point_at(page: Page, x_mm: float, y_mm: float) -> None:
+    """Rest the mouse on a place of the skin."""
+    x, y = page.js("return tactomo.mmToPixel(arguments[0], arguments[1])", x_mm, y_mm)
     canvas = page["map"]
     width, height = canvas.size["width"], canvas.size["height"]
     actions = webdriver.ActionChains(page.browser)
     actions.move_to_element_with_offset(canvas, round(x - width / 2), round(y - height / 2))
     actions.perform()
+
+
+def test_what_comes_under_a_pointer_that_rests_is_read_out(page: Page) -> None:
+    page.skin.press(-50, 0)
+    page.open()
+    wait_until(lambda: page.browser.execute_script("return tactomo.state.drawn?.contacts.length"))
+    point_at(page, 30, 30)
     wait_until(lambda: page["readout"].text.endswith(": 0 kPa"))
     page.skin.press(30, 30)
     wait_until(lambda: page["readout"].text.endswith(": 200 kPa"))
+
+
+def dots(page: Page) -> list[str]:
+    """Return how each channel and port is."""
+    kinds = "return [...document.querySelectorAll('#channels .dot')].map(d => d.dataset.kind)"
+    return list(page.js(kinds))
 
 
 def test_the_end_of_a_replay_is_no_alarm(page: Page) -> None:
@@ -421,9 +439,8 @@ def test_the_end_of_a_replay_is_no_alarm(page: Page) -> None:
     wait_until(lambda: "at its end" in page["banner"].text)
     assert page["banner"].get_attribute("data-level") == "info"
     wait_until(lambda: page["state"].text == "replay ended")
-    kinds = "return [...document.querySelectorAll('#channels .dot')].map(d => d.dataset.kind)"
-    wait_until(lambda: page.js(kinds)[0] == "good")
-    assert "bad" not in page.js(kinds)
+    wait_until(lambda: dots(page)[0] == "good")
+    assert "bad" not in dots(page)
 
 
 def test_what_the_daemon_finds_wrong_is_printed_and_nothing_else_is_judged(page: Page) -> None:
@@ -523,7 +540,7 @@ def test_where_a_quick_finger_ends_up_arrives(page: Page) -> None:
 
 def test_a_press_keeps_its_place_on_a_scrolled_narrow_page(page: Page) -> None:
     page.open(width=390, height=500, mobile=True)
-    page.js("scrollTo(0, 150)")
+    page.js("scrollTo(0, 190)")
     wait_until(lambda: page.js("return scrollY") > 100)
     page.wait_until_pressable()
     page.click(20, -30)
@@ -598,7 +615,7 @@ def test_only_a_simulated_skin_can_be_pressed(page: Page, source: str) -> None:
     page.open()
     wait_until(lambda: page.js("return tactomo.state.status.fields.source.kind") == source)
     page.open()  # anew, for the first status that the viewer had was that of a twin
-    wait_until(lambda: page.js("return tactomo.state.twinAnswers"))
+    wait_until(lambda: page.js("return tactomo.state.twin.answers"))
     assert not page["press-card"].is_displayed()
     page.click(0, 0)
     page.skin.status["source"] = {"kind": "twin"}
@@ -640,7 +657,8 @@ def lanes_with(page: Page, colour: tuple[int, int, int]) -> list[bool]:
         const there = (y0, y1) => {
           const {data} = c.getContext('2d').getImageData(0, y0, w, y1 - y0);
           for (let i = 0; i < data.length; i += 4)
-            if (arguments[0].every((level, k) => Math.abs(data[i + k] - level) < 8)) return true;
+            if (data[i + 3] > 240 && arguments[0].every((l, k) => Math.abs(data[i + k] - l) < 8))
+              return true;
           return false;
         };
         return [there(0, Math.floor(0.4 * h)), there(Math.ceil(0.45 * h), Math.floor(0.8 * h))]"""
@@ -669,14 +687,70 @@ def test_the_strip_shows_each_contacts_pressure_and_force_and_the_events(page: P
         const told = [];
         for (let clientX = left; clientX < right; clientX++) {
           strip.dispatchEvent(new PointerEvent('pointermove', {clientX}));
-          if (strip.title) told.push([strip.title, (right - clientX) / (right - left)]);
+          const words = document.getElementById('readout').textContent;
+          if (words.endsWith('port lost')) told.push((right - clientX) / (right - left));
         }
         return [told, performance.now() - tactomo.timeline.events[0].at]""")
-    assert {title for title, _ in told} == {"port lost"}
-    shares = [share for _, share in told]  # of the strip's width, from its right end
+    shares = told  # of the strip's width, from its right end
     assert max(shares) - min(shares) < 0.03
     assert 0 < age_ms < 1e3 * (time.monotonic() - begin_s) + 50
     assert np.mean(shares) == pytest.approx(age_ms / 60_000, abs=0.03)
+
+
+@pytest.mark.usefixtures("quiet_console")
+def test_a_pressure_that_nobody_knows_is_not_drawn_as_none(page: Page) -> None:
+    page.skin.press(36, -48)
+    (contact,) = page.skin.contacts
+    page.skin.contacts = [replace(contact, pressure_kpa=None, pressure_range="below")]
+    page.open()
+    solid = (86, 180, 233)
+    wait_until(lambda: page.js("return tactomo.timeline.frames.length > 20"))
+    assert lanes_with(page, solid) == [False, False]
+    page.skin.contacts = [contact]
+    wait_until(lambda: lanes_with(page, solid)[0])
+
+
+def test_an_outage_is_told_and_each_event_stands_where_it_happened(page: Page) -> None:
+    page.open()
+    wait_until(lambda: page.js("return tactomo.timeline.frames.length") > 5)
+    lost_ns = time.time_ns()
+    page.skin.sends_frames = False
+    # As a daemon has it: with the time of the newest dual scan, which is the same for both.
+    at = {"acquired_realtime_ns": lost_ns, "severity": "warning", "detail": "", "next_step": ""}
+    page.skin.events = [{**at, "name": "port_lost"}]
+    wait_until(lambda: page.js("return tactomo.timeline.events.length") == 1)
+    time.sleep(1.5)
+    page.skin.events = [{**at, "name": "port_back"}]
+    wait_until(lambda: page.js("return tactomo.timeline.events.length") == 2)
+    page.skin.sends_frames = True
+    wait_until(lambda: page.health == "good")
+    apart_ms = page.js("const [a, b] = tactomo.timeline.events; return b.at - a.at")
+    assert apart_ms > 1400
+    times = "return [...document.querySelectorAll('#events time')].map((t) => t.textContent)"
+    assert len(set(page.js(times))) == 2
+    told = page.js("""
+        const strip = document.getElementById('strip');
+        const {left, right} = strip.getBoundingClientRect();
+        return Array.from({length: right - left}, (_, i) => {
+          strip.dispatchEvent(new PointerEvent('pointermove', {clientX: left + i}));
+          return document.getElementById('readout').textContent;
+        }).filter((words) => words.includes('no data · port'))""")
+    assert told
+
+
+def test_the_strip_is_zoomed_and_tells_the_values_under_the_pointer(page: Page) -> None:
+    page.skin.press(36, -48, kpa=180)
+    page.open()
+    wait_until(lambda: page.js("return tactomo.timeline.frames.length") > 5)
+    for _ in range(9):
+        page["zoom-in"].click()
+    assert page.js("return tactomo.timeline.spanMs") == 5000
+    actions = webdriver.ActionChains(page.browser)
+    right = page["strip"].size["width"] // 2 - 20
+    actions.move_to_element_with_offset(page["strip"], right, 0).perform()
+    wait_until(lambda: page["readout"].text.endswith(" · 1: 180 kPa"))
+    page["zoom-out"].click()
+    assert page.js("return tactomo.timeline.spanMs") == 7500
 
 
 @pytest.mark.slow
@@ -778,6 +852,11 @@ def test_a_replay_is_steered_by_the_page(page: Page) -> None:
     page["loop"].click()
     page["speed"].find_element(By.XPATH, "./option[text()='0.25']").click()
     page["position"].send_keys(Keys.END)
+    wait_until(lambda: page.health == "replay-moving")  # the map is that of before
+    wait_until(lambda: "stale" in page.map_classes)
+    page.skin.sends_frames = True  # of where it stands now
+    wait_until(lambda: page.health == "replay-paused")
+    page.skin.sends_frames = False
     page["play"].click()
     page.skin.status |= {"state": "ended"}
     wait_until(lambda: page["play"].text == "Play" and page["state"].text == "replay ended")
@@ -794,11 +873,20 @@ def test_a_replay_is_steered_by_the_page(page: Page) -> None:
     wait_until(lambda: page.daemon.requests == [("replay", each) for each in asked])
 
 
-def test_a_replay_that_waits_for_the_page_begins_with_it(page: Page) -> None:
+def test_a_replay_that_waits_for_the_page_begins_when_its_first_frame_is_seen(page: Page) -> None:
     page.daemon.answers["replay"] = REPLAY
     waiting = REPLAY | {"paused": True, "waits_for_page": True}
     page.skin.status |= {"state": "paused", "replay": waiting}
+    page.skin.sends_frames = False
+    page.stop_viewer()  # it may have heard of a frame by now
+    page.serve()
     page.browser.get(f"http://127.0.0.1:{page.port}/")
+    wait_until(lambda: page.health == "replay-paused")
+    status = "return tactomo.state.status.receivedAt"
+    first = page.js(status)
+    wait_until(lambda: page.js(status) > first)
+    assert page.daemon.requests == []
+    page.skin.sends_frames = True
     wait_until(lambda: ("replay", {"paused": False}) in page.daemon.requests)
 
 
@@ -842,6 +930,19 @@ def test_the_daemons_methods_can_be_chosen_an_own_one_among_them(page: Page) -> 
     wait_until(lambda: page["made-by"].text == own)
 
 
+def test_a_method_that_others_put_in_force_is_shown_beside_the_pointer_too(page: Page) -> None:
+    page.skin.status |= {"methods": ["auto", "network"], "tier_requested": "auto"}
+    page.open()
+    wait_until(lambda: page["method"].get_attribute("value") == "auto")
+    page.js("document.getElementById('method').focus()")
+    page.skin.status |= {"tier_requested": "network"}
+    wait_until(lambda: page["method"].get_attribute("value") == "network")
+    page.daemon.answers["set_tier"] = ControlError("it has no network", "", "no_network")
+    page["method"].find_element(By.XPATH, "./option[text()='auto']").click()
+    wait_until(lambda: "no network" in page["message"].text)
+    wait_until(lambda: page["method"].get_attribute("value") == "network")
+
+
 def test_the_method_in_force_is_shown_though_the_daemon_lists_none(page: Page) -> None:
     page.skin.status |= {"tier_requested": "fit"}
     page.open()
@@ -856,8 +957,11 @@ def test_stale_data_are_told_and_come_back(page: Page) -> None:
     page.skin.press(36, -48)
     page.open()
     wait_until(lambda: page["count"].text == "1")
+    point_at(page, 36, -48)
+    wait_until(lambda: page["readout"].text.endswith(": 200 kPa"))
     page.skin.sends_frames = False
     wait_until(lambda: page.health == "stale")
+    wait_until(lambda: page["readout"].text.endswith(" mm"))  # of before: nobody knows it now
     assert page.banner.startswith("Stale. The newest scan is ")
     assert page["state"].text == "stale"
     wait_until(lambda: page.map_classes == {"pressable", "stale"})
@@ -874,11 +978,15 @@ def test_stale_data_are_told_and_come_back(page: Page) -> None:
 
 @pytest.mark.slow
 def test_a_daemon_that_is_gone_is_told_and_comes_back(page: Page) -> None:
+    page.skin.status |= {"rates": {"magnitude_hz": 20.6, "structure_hz": 20.6, "frames_hz": 20.6}}
     page.open()
+    wait_until(lambda: dots(page) == ["good", "good", ""])
     page.skin.__exit__()
     wait_until(lambda: page.health == "daemon-gone")
     assert page.banner.startswith("The daemon is gone. Last heard ")
     assert not page["tare"].is_enabled()
+    assert dots(page) == [""] * 3
+    assert "20.6" not in page["channels"].text
     with Skin(page.skin.address) as again:
         again.press(-30, 30)
         wait_until(lambda: page.health == "good")
@@ -916,6 +1024,16 @@ def test_a_tare_is_told(page: Page) -> None:
     assert "do not touch" in page.banner
 
 
+def test_a_daemon_that_has_just_begun_waits_without_an_alarm(page: Page) -> None:
+    page.open()
+    page.skin.status |= {"state": "waiting_for_data", "uptime_s": 2.0}
+    wait_until(lambda: page.health == "no-data")
+    level = page["banner"].get_attribute
+    assert level("data-level") == "info"
+    page.skin.status |= {"uptime_s": 30.0}
+    wait_until(lambda: level("data-level") == "warning")
+
+
 def test_a_missing_reference_is_told(page: Page) -> None:
     page.open()
     page.skin.frame = {"flags": ["no_reference"]}
@@ -929,7 +1047,12 @@ def test_a_daemon_that_never_came_is_waited_for(page: Page) -> None:
     page.stop_viewer()  # it may have heard of the daemon by now
     page.serve()
     page.browser.get(f"http://127.0.0.1:{page.port}/")
+    wait_until(lambda: page.health == "starting")  # is no alarm yet
+    assert page["banner"].get_attribute("data-level") == "info"
+    assert page["state"].text == "connecting"
+    page.js("tactomo.state.openedAt -= 60000")
     wait_until(lambda: page.health == "no-daemon")
+    assert page["banner"].find_element(By.TAG_NAME, "code").text == "tactomo daemon"
     assert f"“left” at {page.skin.address}" in page.banner
     assert page["no-contacts"].text == "Not known."
     with Skin(page.skin.address):
@@ -949,8 +1072,74 @@ def test_nothing_sticks_out_at_any_width(page: Page, width: int) -> None:
     page.open(width=width, height=800)
     wait_until(lambda: "131" in page["contacts"].text)
     assert page.js("return document.documentElement.scrollWidth") <= width
+    table = "const {scrollWidth, clientWidth} = document.querySelector('.scroll');"
+    assert page.js(f"{table} return scrollWidth - clientWidth") == 0  # nothing is cut off
     right = page.js("return tactomo.mmToPixel(75, 0)[0]")
     assert 150 < right < page.js("return document.getElementById('map').clientWidth")
+
+
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (1280, 800), (1920, 1080)])
+def test_nothing_moves_when_a_banner_comes_and_nothing_covers_the_skin(
+    page: Page, width: int, height: int
+) -> None:
+    page.skin.press(0, 0)
+    page.open(width=width, height=height)
+    places = """return ['map', 'strip', 'moment'].map((id) => {
+        const {left, top, width, height} = document.getElementById(id).getBoundingClientRect();
+        return [left, top, width, height]; })"""
+    before = page.js(places)
+    told = {"severity": "error", "what": "frames come late", "next_step": "be quick " * 20}
+    page.skin.status |= {"issues": [told]}
+    wait_until(lambda: page["banner"].is_displayed())
+    assert page.js(places) == before
+    bottom = page.js("return document.getElementById('banner').getBoundingClientRect().bottom")
+    assert bottom <= before[0][1]
+
+
+def test_the_map_is_as_large_as_the_window_lets_it_be(page: Page) -> None:
+    side = "return tactomo.mmToPixel(75, 0)[0] - tactomo.mmToPixel(-75, 0)[0]"
+    sides = []
+    for width, height in ((1280, 800), (1920, 1080), (390, 844)):
+        page.open(width=width, height=height)
+        sides.append(page.js(side))
+    assert all(side >= least for side, least in zip(sides, (440, 690, 295), strict=True)), sides
+
+
+@pytest.mark.usefixtures("quiet_console")
+def test_what_is_pressed_is_compared_with_what_is_felt(page: Page) -> None:
+    page.skin.press(12, 20, kpa=170)
+    page.open()
+    page.wait_until_pressable()
+    assert page["error"].text == ""
+    page.mouse("Pressed", 10, 20)
+    wait_until(lambda: re.fullmatch(r"error (1\.[89]|2\.[012]) mm, −10 kPa", page["error"].text))
+    page.skin.contacts = []
+    wait_until(lambda: page["error"].text == "1 not felt")
+    page.mouse("Released", 10, 20)
+    wait_until(lambda: page["error"].text == "")
+
+
+def test_a_demo_presses_by_itself_until_somebody_does(page: Page) -> None:
+    page.skin.press(0, 0)
+    page.stop_viewer()
+    page.serve(press_itself=True)
+    page.open()
+    wait_until(page.presses)
+    assert "by itself" in page["map-help"].text
+    page.click(40, 40)
+    wait_until(lambda: {40} & {round(press["x_mm"]) for press in page.presses()})
+    assert page.js("return tactomo.touch.presses.length") == 0
+    assert not page.js("return tactomo.idle.isOn || !tactomo.idle.isOver")
+
+
+def test_a_demo_lets_others_press(page: Page) -> None:
+    page.twin.answers["scene"] = {"presses": [{"id": "finger"}]}
+    page.stop_viewer()
+    page.serve(press_itself=True)
+    page.open()
+    page.wait_until_pressable()
+    wait_until(lambda: page.js("return tactomo.idle.isOver"))
+    assert page.presses() == []
 
 
 def test_a_laptop_shows_contacts_method_and_health_without_scrolling(page: Page) -> None:

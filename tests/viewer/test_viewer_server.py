@@ -10,6 +10,7 @@ import re
 import signal
 import socket
 import subprocess
+import sys
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from importlib import resources
@@ -185,6 +186,29 @@ async def test_a_newcomer_gets_what_there_is(sensor: FakeSensor) -> None:
             assert (await second.next("event"))["event"]["name"] == "tared"
             assert (await second.next("event"))["event"]["name"] == "channel_lost"
             await second.frame(1)
+
+
+@on_loop
+async def test_an_event_is_as_old_as_when_it_came(sensor: FakeSensor) -> None:
+    async with viewer_of(sensor) as viewer:
+        async with viewer.page() as page:
+            # The envelope has the time of the newest dual scan: it is of before an outage.
+            sensor.publish_message("event", {"name": "port_back", "acquired_realtime_ns": 10**18})
+            assert (await page.next("event"))["age_ms"] < 10_000
+        await asyncio.sleep(0.2)
+        async with viewer.page() as page:
+            assert (await page.next("event"))["age_ms"] >= 200
+
+
+@on_loop
+async def test_a_page_hears_whether_others_press(sensor: FakeSensor) -> None:
+    with FakeControl({"scene": {"presses": [{"id": "finger"}]}}) as twin:
+        async with viewer_of(sensor, twin=twin.address) as viewer, viewer.page() as page:
+            while not (told := await page.next("twin"))["answers"]:
+                pass
+            assert told["others_press"]
+            twin.answers["scene"] = {"presses": []}
+            assert not (await page.next("twin"))["others_press"]
 
 
 @pytest.mark.slow
@@ -473,6 +497,24 @@ def test_a_port_in_use_says_what_to_do() -> None:
             ViewerError, match=rf"cannot listen on 127.0.0.1 port {port}.*--viewer-port"
         ):
             tactomo_viewer.Viewer("left", NOBODY).serve(port)
+
+
+def test_where_no_port_is_asked_for_the_next_free_one_is_taken() -> None:
+    with socket.socket() as holder:
+        holder.bind(("127.0.0.1", 0))
+        holder.listen()
+        taken = holder.getsockname()[1]
+        program = (
+            f"from tactomo_viewer import server; server.DEFAULT_PORT = {taken}; "
+            f"server.Viewer('left', {NOBODY!r}).serve()"
+        )
+        with subprocess.Popen(
+            [sys.executable, "-c", program], stdout=subprocess.PIPE, text=True
+        ) as viewer:
+            assert viewer.stdout is not None
+            port = int(viewer.stdout.readline().rstrip("/\n").rpartition(":")[2])
+            viewer.terminate()
+        assert taken < port <= taken + 20
 
 
 @pytest.mark.parametrize(

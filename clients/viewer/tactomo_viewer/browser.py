@@ -10,8 +10,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import time
 import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from aiohttp import WSMessage, WSMsgType, web
@@ -56,7 +57,7 @@ class Browser:
         self._last_event = 0
         self._presses: set[str] = set()  # to be released when the page goes away
         self._answers: set[asyncio.Task[None]] = set()
-        self.twin_answers = False
+        self.twin_presses: Sequence[str] | None = None  # their ids; None where no twin answers
 
     def wake(self) -> None:
         """Have another look at what there is to send."""
@@ -98,15 +99,22 @@ class Browser:
                     await self._socket.send_bytes(frame_message(frame))
 
     async def _send_texts(self) -> None:
-        if self._sent.get("twin") != self.twin_answers:
-            self._sent["twin"] = self.twin_answers
-            await self._send("twin", answers=self.twin_answers)
+        own = f"page-{self._name}-"
+        presses = self.twin_presses
+        twin = {
+            "answers": presses is not None,
+            "others_press": any(not press.startswith(own) for press in presses or ()),
+        }
+        if self._sent.get("twin") != twin:
+            self._sent["twin"] = twin
+            await self._send("twin", **twin)
         status = self._feed.status
         if status is not None and self._is_new(status):
             await self._send("status", age_ms=status.age_s * 1e3, status=status.fields)
-        for number, event in [e for e in self._feed.events if e[0] > self._last_event]:
-            self._last_event = number
-            await self._send("event", event=event.fields)
+        for heard in [e for e in self._feed.events if e.number > self._last_event]:
+            self._last_event = heard.number
+            age_ms = (time.monotonic() - heard.heard_s) * 1e3
+            await self._send("event", age_ms=age_ms, event=heard.event.fields)
 
     def _is_new(self, item: object) -> bool:
         kind = type(item).__name__

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable
+from typing import NamedTuple
 
 from tactomo_client import Event, Frame, Keys, KeysError, Status, aio
 
 EVENTS_KEPT = 100
+
+
+class Heard(NamedTuple):
+    """An event as it came."""
+
+    number: int  # from 1
+    heard_s: float  # monotonic: its envelope has the time of the newest dual scan
+    event: Event
 
 
 class Feed:
@@ -23,8 +33,7 @@ class Feed:
     ) -> None:
         self.frame: Frame | None = None  # the newest frame, or None before the first
         self.status: Status | None = None  # the newest status, or None before the first
-        # the recent events, oldest first, each with its number as it came, from 1
-        self.events: deque[tuple[int, Event]] = deque(maxlen=EVENTS_KEPT)
+        self.events: deque[Heard] = deque(maxlen=EVENTS_KEPT)  # the recent ones, oldest first
         self._events_seen = 0
         self._on_change = on_change
         self._news = aio.subscribe(
@@ -52,5 +61,5 @@ class Feed:
             self.status = item
         else:
             self._events_seen += 1
-            self.events.append((self._events_seen, item))
+            self.events.append(Heard(self._events_seen, time.monotonic(), item))
         self._on_change()

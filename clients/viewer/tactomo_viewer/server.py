@@ -9,6 +9,7 @@ was served here (`Origin`). Served beyond this computer, the viewer only shows.
 from __future__ import annotations
 
 import asyncio
+import errno
 import signal
 from collections.abc import AsyncIterator
 from importlib import resources
@@ -25,6 +26,7 @@ from tactomo_viewer.wire import json_text
 
 DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8750
+PORTS_TRIED = 20
 
 TWIN_POLL_S = 1.0
 MAX_QUESTION_BYTES = 16 * 1024
@@ -56,25 +58,28 @@ class Viewer:
         # the address to listen on; on any but a loopback one the viewer only shows
         host: str = DEFAULT_HOST,
         keys: Keys | None = None,  # for a daemon beyond this computer
+        press_itself: bool = False,  # the page presses the twin until somebody does
     ) -> None:
         may_command = is_loopback(host)
         self._about = {
             **{"sensor": sensor, "stream": stream, "read_only": not may_command},
             **{"status_stale_ms": 1e3 * STALE_AFTER_S, "frame_stale_ms": 1e3 * FRAME_STALE_AFTER_S},
+            "press_itself": press_itself,
         }
         self._browsers: set[Browser] = set()
         self._sockets: set[web.WebSocketResponse] = set()
         self._daemon = aio.Control(control, keys=keys) if may_command else None
         self._twin = aio.Control(twin) if may_command and twin else None
-        self._twin_answers = False
+        self._twin_presses: list[str] | None = None  # their ids; None where no twin answers
         self._sensor, self._stream, self._host, self._keys = sensor, stream, host, keys
         self._feed: Feed
 
-    def serve(self, port: int = DEFAULT_PORT) -> None:
+    def serve(self, port: int | None = None) -> None:
         """Serve until SIGINT or SIGTERM; print the page's URL on stdout once it can be opened.
 
         Args:
-            port: the port to listen on; 0 takes a free one.
+            port: the port to listen on; 0 takes a free one, None the first free one from
+                `DEFAULT_PORT` on.
 
         Raises:
             ViewerError: the address cannot be listened on.
@@ -82,27 +87,37 @@ class Viewer:
         """
         asyncio.run(self._serve(port))
 
-    async def _serve(self, port: int) -> None:
+    async def _serve(self, port: int | None) -> None:
         stop = asyncio.Event()
         for number in (signal.SIGINT, signal.SIGTERM):
             asyncio.get_running_loop().add_signal_handler(number, stop.set)
         runner = web.AppRunner(self.app(), access_log=None, shutdown_timeout=1.0)
         await runner.setup()
         try:
-            try:
-                await web.TCPSite(runner, self._host, port).start()
-            except (OSError, OverflowError) as error:
-                reason = getattr(error, "strerror", None) or error
-                raise ViewerError(
-                    f"cannot listen on {self._host} port {port}: {reason}",
-                    "stop the program that uses it, or choose another with --viewer-port (0: any "
-                    "free one)",
-                    name="cannot_listen",
-                ) from error
+            await self._listen(runner, port)
             print(f"viewer: {_url(runner)}", flush=True)
             await stop.wait()
         finally:
             await runner.cleanup()
+
+    async def _listen(self, runner: web.AppRunner, port: int | None) -> None:
+        wanted = DEFAULT_PORT if port is None else port
+        while True:
+            try:
+                await web.TCPSite(runner, self._host, wanted).start()
+                return
+            except (OSError, OverflowError) as error:
+                is_taken = getattr(error, "errno", None) == errno.EADDRINUSE
+                if port is None and is_taken and wanted < DEFAULT_PORT + PORTS_TRIED:
+                    wanted += 1
+                    continue
+                reason = getattr(error, "strerror", None) or error
+                raise ViewerError(
+                    f"cannot listen on {self._host} port {wanted}: {reason}",
+                    "stop the program that uses it, or choose another with --viewer-port (0: any "
+                    "free one)",
+                    name="cannot_listen",
+                ) from error
 
     def app(self) -> web.Application:
         """Return the viewer as an aiohttp application."""
@@ -134,7 +149,7 @@ class Viewer:
         await socket.prepare(request)
         await socket.send_str(json_text({"type": "hello", **self._about}))
         browser = Browser(socket, self._feed, self._daemon, self._twin)
-        browser.twin_answers = self._twin_answers
+        browser.twin_presses = self._twin_presses
         self._browsers.add(browser)
         self._sockets.add(socket)
         try:
@@ -155,14 +170,14 @@ class Viewer:
     async def _watch_twin(self) -> None:
         while self._twin is not None:
             try:
-                await self._twin.request("scene")
-                answers = True
+                scene = await self._twin.request("scene")
+                presses = [str(press["id"]) for press in scene.get("presses", [])]
             except ClientError:
-                answers = False
-            if answers != self._twin_answers:
-                self._twin_answers = answers
+                presses = None
+            if presses != self._twin_presses:
+                self._twin_presses = presses
                 for browser in self._browsers:
-                    browser.twin_answers = answers
+                    browser.twin_presses = presses
                 self._wake()
             await asyncio.sleep(TWIN_POLL_S)
 

@@ -193,8 +193,12 @@ class no_interruption:  # noqa: N801 - reads as a statement
 
 
 def new_family(verbose: bool = False) -> Family:
-    """Return a new family, which SIGTERM ends as Ctrl-C does."""
+    """Return a new family, which SIGTERM ends as Ctrl-C does.
+
+    SIGINT ends it, too, where a shell had it ignored, as it does for what it starts with `&`.
+    """
     interrupt_on_sigterm()
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     return Family(verbose)
 
 

@@ -162,7 +162,13 @@ ServeControl: TypeAlias = Annotated[
     ),
 ]
 ViewerPort: TypeAlias = Annotated[
-    int, typer.Option("--viewer-port", min=0, max=65535, help="Of the page; 0 takes a free one.")
+    int | None,
+    typer.Option(
+        "--viewer-port",
+        min=0,
+        max=65535,
+        help=f"Of the page; 0 takes a free one. [{DEFAULT_VIEWER_PORT}, or the next that is free]",
+    ),
 ]
 KeysFolder: TypeAlias = Annotated[
     Path | None,

@@ -37,6 +37,8 @@ IDLE_S: Final = 0.1
 """How late, at most, a stop or a tare that gives up is noticed."""
 QUEUED_DELIVERIES: Final = 256
 """Reads that wait while a frame is made: some 6 s of two ports at 20 Hz."""
+QUEUED_OF_REPLAY: Final = 8
+"""Likewise of a replay, which waits for frames that take longer, and does not run ahead of them."""
 ZERO_PERIOD_S: Final = 10.0
 """How often devices are asked to zero their counters, while that does not bring them in step."""
 
@@ -113,7 +115,9 @@ class Pipeline(Worker):
         self._announced: dict[int, Hello] = {}  # what each port's device says of itself
         self._begun: set[Channel] = set()  # channels that have been in a dual scan
         self._replay_clock = None if replay is None else ReplayClock(ports, replay.is_paced)
-        self._deliveries: queue.Queue[Delivery | None] = queue.Queue(QUEUED_DELIVERIES)
+        self._deliveries: queue.Queue[Delivery | None] = queue.Queue(
+            QUEUED_DELIVERIES if replay is None else QUEUED_OF_REPLAY
+        )
         self._commands: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = (
             queue.SimpleQueue()
         )
@@ -233,7 +237,7 @@ class Pipeline(Worker):
     @property
     def _takes_all(self) -> bool:
         playback = None if self._replay is None else self._replay.playback
-        return self._is_lossless or (playback is not None and playback.leaves_none_out)
+        return self._is_lossless or (playback is not None and playback.is_paused)
 
     def _is_let_through(self) -> bool:
         """Whether the next dual scan is made a frame now: ports may run ahead of a step's one."""

@@ -9,7 +9,10 @@ from __future__ import annotations
 import math
 import threading
 import time
-from typing import Any
+from typing import Any, Final
+
+MAX_LAG_S: Final = 0.25
+"""How late bytes may be read before the replay waits for whoever reads them."""
 
 
 class Playback:
@@ -38,12 +41,12 @@ class Playback:
         self._changed = threading.Condition(threading.RLock())
 
     @property
-    def leaves_none_out(self) -> bool:
-        """Whether every dual scan is to be shown, as it is while somebody steps."""
+    def is_paused(self) -> bool:
+        """Whether it goes on by steps alone, of which every dual scan is to be shown."""
         return self._is_paused
 
     @property
-    def is_paused(self) -> bool:
+    def _stands(self) -> bool:
         """Whether nothing is due."""
         return self._is_paused and not self._is_stepping
 
@@ -52,7 +55,7 @@ class Playback:
         """How far it is."""
         with self._changed:
             played_ns = 0
-            if self._since_ns is not None and not self.is_paused:
+            if self._since_ns is not None and not self._stands:
                 played_ns = round((time.monotonic_ns() - self._since_ns) * self._pace)
             return self._position_ns + played_ns
 
@@ -86,8 +89,8 @@ class Playback:
                 self._changed.wait(min(wait_s, timeout_s))
             if number != self.passes or self._due_in_s(clock_ns) > 0:
                 return False
-            if not self._pace and clock_ns is not None:
-                self._position_ns = max(self._position_ns, clock_ns)
+            if clock_ns is not None:
+                self._keep_up(clock_ns)
             return True
 
     def steer(self, paused: bool | None, speed: float | None, loop: bool | None) -> None:
@@ -111,18 +114,19 @@ class Playback:
     def lets_through(self) -> bool:
         """Return whether a dual scan may be made a frame now; one that may ends a step."""
         with self._changed:
-            may = not self.is_paused
+            may = not self._stands
             if self._is_stepping:
                 self._settle()
                 self._is_stepping = False
             return may
 
     def move(self, position_s: float) -> None:
-        """Go on `position_s` seconds after the beginning."""
+        """Go on `position_s` seconds after the beginning; while paused, by one dual scan."""
         with self._changed:
             position_ns = self.start_ns + round(position_s * 1e9)
             self.begin_ns = self._position_ns = min(position_ns, self._end_ns)
             self._since_ns = None
+            self._is_stepping = self._is_paused
             self.passes += 1
             self._changed.notify_all()
 
@@ -131,13 +135,23 @@ class Playback:
         """Recorded seconds a second; a step goes at the recorded speed at most."""
         return min(self._speed or 1.0, 1.0) if self._is_stepping else self._speed
 
+    def _keep_up(self, clock_ns: int) -> None:
+        """Have the position follow bytes that are read as fast as possible, or late.
+
+        Those that are read late are shown late: the position must not run ahead of the map.
+        """
+        if not self._pace:
+            self._position_ns = max(self._position_ns, clock_ns)
+        elif clock_ns >= self.begin_ns and -self._due_in_s(clock_ns) > MAX_LAG_S:
+            self._position_ns, self._since_ns = clock_ns, time.monotonic_ns()
+
     def _settle(self) -> None:
         """Count from here and now."""
         self._position_ns = self.position_ns
         self._since_ns = None if self._since_ns is None else time.monotonic_ns()
 
     def _due_in_s(self, clock_ns: int | None) -> float:
-        if clock_ns is None or self.is_paused:
+        if clock_ns is None or self._stands:
             return math.inf
         ahead_ns = clock_ns - self.position_ns
         return 0.0 if not self._pace else ahead_ns * 1e-9 / self._pace

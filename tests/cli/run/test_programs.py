@@ -172,6 +172,21 @@ def test_a_demo_leaves_no_process_behind(start: Run) -> None:
     wait_until(lambda: not any(is_running(child) for child in children))
 
 
+@linux
+def test_a_demo_in_the_background_of_a_script_ends_by_sigint() -> None:
+    # A shell has SIGINT ignored for what it starts with `&` where there is no job control.
+    where = "--viewer-port 0 --stream ipc://$D/s --control ipc://$D/c --twin-control ipc://$D/t"
+    script = f'D=$(mktemp -d); "$0" -m tactomo.cli demo {where} & echo $!; wait'
+    with subprocess.Popen(
+        ["sh", "-c", script, sys.executable], stdout=subprocess.PIPE, text=True
+    ) as shell:
+        assert shell.stdout is not None
+        demo = int(shell.stdout.readline())
+        wait_until(lambda: children_of(demo))
+        os.kill(demo, signal.SIGINT)
+        wait_until(lambda: not is_running(demo))
+
+
 @pytest.mark.slow
 def test_a_family_notices_whoever_ends_and_tells_its_last_words() -> None:
     with Family() as family:

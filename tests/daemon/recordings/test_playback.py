@@ -11,6 +11,7 @@ import pytest
 from daemon_bench import HELLO, Bench, Listener, Memory, scan
 from tactomo.config import load_config
 from tactomo.protocols import protocol_named
+from tactomo.recordings.playback import Playback
 from tactomo.recordings.recording import Origin
 from tactomo.recordings.recording_set import open_replayable
 from tactomo.recordings.recording_writer import RecordingWriter
@@ -158,6 +159,35 @@ def test_a_moved_replay_goes_on_there_against_the_reference_of_then(
     assert [port["corrupt"] for port in status["ports"]] == [0] * len(status["ports"])
     tally = status["scan_tally"]
     assert tally["received"] == sum(n for name, n in tally.items() if name != "received")
+
+
+def test_a_paused_replay_that_is_moved_shows_the_frame_there(play: Any, life: Life) -> None:
+    known = list(life.values)
+    b = play(life.path)
+    for count, number in enumerate((6, len(known) - 3, 2), start=1):
+        middle_s = (life.times_s[known[number - 1]] + life.times_s[known[number]]) / 2
+        b.ask("replay", position_s=middle_s)
+        b.until(lambda count=count: len(counters(b)) == count)
+        assert counters(b)[-1] in known[number : number + 2]
+        status = b.ask("status")
+        assert (status["state"], status["replay"]["paused"]) == ("paused", True)
+        assert status["replay"]["position_s"] == pytest.approx(middle_s, abs=0.5)
+
+
+def test_a_replay_does_not_run_ahead_of_who_reads_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = 100.0
+    monkeypatch.setattr("time.monotonic_ns", lambda: round(now_s * 1e9))
+    playback = Playback(0, 10 * 10**9, speed=2.0)
+    assert playback.wait_until_due(0, 0.0, 0)
+    now_s += 0.5
+    assert playback.wait_until_due(900_000_000, 0.0, 0)  # 50 ms late
+    assert playback.fields()["position_s"] == pytest.approx(1.0)
+    now_s += 3.0  # whoever reads was busy
+    assert playback.wait_until_due(1_100_000_000, 0.0, 0)
+    assert playback.fields()["position_s"] == pytest.approx(1.1)
+    assert not playback.wait_until_due(1_200_000_000, 0.0, 0)
+    now_s += 0.05
+    assert playback.wait_until_due(1_200_000_000, 0.0, 0)
 
 
 @pytest.mark.slow

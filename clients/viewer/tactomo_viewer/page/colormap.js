@@ -22,6 +22,12 @@ const COEFFICIENTS = {
   ],
 };
 
+// Okabe and Ito's colours, which the colour-blind tell apart, without black, yellow and dark blue.
+const CONTACT_COLOURS = ["#e69f00", "#56b4e9", "#009e73", "#d55e00", "#cc79a7"];
+
+/** The colour of a contact on the map, in the table and on the timeline. */
+export const contactColour = (id) => CONTACT_COLOURS[id % CONTACT_COLOURS.length];
+
 export const SIZE = 256;
 
 /** The colours of a map as a table of SIZE × (red, green, blue), 0 to 255. */

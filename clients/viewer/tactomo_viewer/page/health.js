@@ -1,6 +1,13 @@
 // What is wrong, if anything, in words: the banner over the map, and the flags.
 
+import { seconds } from "./values.js";
+
 const STALE_SCANS = 3;        // of a slow sensor: so many scans late
+const SLOW_START_MS = 20_000; // a daemon that builds its models tells nothing meanwhile
+const SOON_S = 10;            // after its start a daemon may wait for its ports and for data
+
+// The map is the skin's of now, or of where a replay stands, though a banner is shown.
+const CURRENT = ["taring", "ended", "replay-paused", "issue"];
 
 // Flags under which every touch is still seen (clients/STREAM.md); of any other nobody knows.
 const TOUCHES_SEEN = ["magnitude_missing", "invalid_voltage", "electrode_fault", "saturated", "channels_skewed", "untaught"];
@@ -15,9 +22,15 @@ export function ageOf(item, now) {
   return item ? item.age_ms + (now - item.receivedAt) : Infinity;
 }
 
+/** Whether the map may be read as what presses now. */
+export function isMapCurrent(found) {
+  return !found || CURRENT.includes(found.name);
+}
+
 /**
  * The banner as {name, level, title, detail}, or null when all is well. What hides everything else
- * comes first. `state` has hello, link, frame, status, openedAt.
+ * comes first. What is under way is an info. `state` has hello, link, frame, status, openedAt,
+ * isMoving.
  */
 export function verdict(state, now) {
   const { link, frame, status, hello } = state;
@@ -27,7 +40,12 @@ export function verdict(state, now) {
       "Trying to reach it again; if it was stopped, start it with `tactomo viewer`.");
   }
   if (!status) {
-    if (now - state.openedAt < 1500) return null;
+    const waited = now - state.openedAt;
+    if (waited < 1500) return null;
+    if (waited < SLOW_START_MS) {
+      return banner("starting", "info", `Waiting for “${hello?.sensor ?? "?"}”.`,
+        "A daemon that starts for the first time builds the sensor's models, which takes up to a minute.");
+    }
     return banner("no-daemon", "warning", "Waiting for the daemon.",
       `Nothing from sensor “${hello?.sensor ?? "?"}” at ${hello?.stream ?? "?"} yet; is it running under this name? Start it with \`tactomo daemon\`.`);
   }
@@ -39,17 +57,24 @@ export function verdict(state, now) {
   if (fields.state === "taring") {
     return banner("taring", "info", "Taring.", "Measuring the unloaded skin: do not touch it.");
   }
+  const errors = (fields.issues ?? []).filter(({ severity }) => severity === "error");
+  const wrong = errors.map(({ what }) => what).join("; ");
+  if (fields.state.startsWith("waiting")) {
+    return banner("no-data", fields.uptime_s < SOON_S ? "info" : "warning", "No data yet.", wrong);
+  }
   if (fields.ports?.length && fields.ports.every((port) => port.state === "ended")) {
     return banner("ended", "info", "The replay is at its end.", "The map shows its last frame.");
+  }
+  if (state.isMoving) {
+    return banner("replay-moving", "info", "The replay is moved.", "The map follows at once.");
   }
   if (fields.replay?.paused) {
     return banner("replay-paused", "info", "The replay is paused.", "The map shows the frame at which it stands.");
   }
-  const errors = (fields.issues ?? []).filter(({ severity }) => severity === "error");
   const age = ageOf(frame, now);
   if (age > staleAfter(fields, hello)) {
     const since = frame ? `The newest scan is ${seconds(age)} old. ` : "";
-    return banner("stale", "error", "Stale.", since + errors.map(({ what }) => what).join("; "));
+    return banner("stale", "error", "Stale.", since + wrong);
   }
   const [issue] = errors;
   return issue ? banner("issue", "warning", `${issue.what}:`, issue.next_step) : null;
@@ -68,8 +93,4 @@ function banner(name, level, title, detail) {
 export function staleAfter({ ports }, hello) {
   const rates = (ports ?? []).map((port) => port.device?.scan_rate_hz).filter((hz) => hz > 0);
   return Math.max(hello?.frame_stale_ms ?? 0, (STALE_SCANS * 1000) / Math.min(...rates, Infinity));
-}
-
-function seconds(ms) {
-  return `${(ms / 1000).toFixed(ms < 9950 ? 1 : 0)} s`;
 }

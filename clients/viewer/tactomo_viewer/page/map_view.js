@@ -1,14 +1,13 @@
 // Draws a frame on the canvas: the sheet with its image, outline, contacts and presses; axes in
 // millimetres; the colour bar. Knows where each millimetre lies, and says so to others.
 
-import { SIZE, colourTable } from "./colormap.js";
+import { SIZE, colourTable, contactColour } from "./colormap.js";
 import { contour, upsample } from "./grid.js";
 
 const FINER = 5;           // intervals of the smooth image for each one of the map
 const OUTLINE_FINER = 3;
 const ELECTRODE_MM = [6, 2.4];  // drawn size: along the rim, across it
 const NARROW_PX = 520;     // below this the colour bar lies under the map
-const BESIDE_PX = 360;     // what stands above and below the map: header, toolbar, the last minute
 
 export class MapView {
   constructor(canvas) {
@@ -38,24 +37,20 @@ export class MapView {
   /** Fit the canvas into the room there is; call when that or the sheet changed. */
   resize() {
     const { canvas, sheet } = this;
-    const room = canvas.parentElement.clientWidth;
-    const narrow = room < NARROW_PX;
+    const size = [canvas.clientWidth, canvas.clientHeight];
+    const narrow = size[0] < NARROW_PX;
     const margin = narrow
-      ? { left: 40, right: 14, top: 14, bottom: 88 }
-      : { left: 52, right: 92, top: 18, bottom: 46 };
+      ? { left: 40, right: 14, top: 8, bottom: 84 }
+      : { left: 52, right: 84, top: 10, bottom: 44 };
     const [wide, high] = [sheet.x[1] - sheet.x[0], sheet.y[1] - sheet.y[0]];
-    const tallest = Math.max(260, window.innerHeight - (narrow ? 220 : BESIDE_PX));
-    const scale = Math.max(0.2, Math.min(
-      (room - margin.left - margin.right) / wide,
-      (tallest - margin.top - margin.bottom) / high,
-    ));
+    const room = [size[0] - margin.left - margin.right, size[1] - margin.top - margin.bottom];
+    const scale = Math.max(0.2, Math.min(room[0] / wide, room[1] / high));
     const [w, h] = [wide * scale, high * scale];
-    // On a wide page what is left over is shared out, so that the map stands in the middle.
-    const left = margin.left + Math.max(0, (room - margin.left - margin.right - w) / 2);
-    this.plot = { left, top: margin.top, width: w, height: h, scale, narrow };
-    const size = [room, Math.ceil(margin.top + h + margin.bottom)];
+    // What is left over is shared out, so that the map stands in the middle.
+    const left = margin.left + Math.max(0, (room[0] - w) / 2);
+    const top = margin.top + Math.max(0, (room[1] - h) / 2);
+    this.plot = { left, top, width: w, height: h, scale, narrow };
     const ratio = window.devicePixelRatio || 1;
-    canvas.style.height = `${size[1]}px`;
     canvas.width = Math.round(size[0] * ratio);
     canvas.height = Math.round(size[1] * ratio);
     this.size = size;
@@ -86,8 +81,7 @@ export class MapView {
 
   /**
    * Draw everything. `scene` has: frame (or null), image (what to colour, or null), scale (its top),
-   * unit (for the colour bar), label(contact), notice (what is missing), hint (what to do),
-   * colormap, smooth, outline,
+   * unit (for the colour bar), label(contact), colormap, smooth, outline,
    * presses (list of {x, y, size, shape, pressure}), cursor ([x, y] or null).
    */
   draw(scene) {
@@ -106,8 +100,6 @@ export class MapView {
     for (const press of scene.presses) this.#press(c, press);
     if (scene.cursor) this.#cursor(c, scene.cursor);
     for (const contact of scene.frame?.contacts ?? []) this.#contact(c, contact, scene.label(contact));
-    if (scene.notice) this.#notice(c, scene.notice);
-    if (scene.hint) this.#hint(c, scene.hint);
     if (scene.image) this.#colourBar(c, scene);
   }
 
@@ -206,7 +198,7 @@ export class MapView {
     c.fill();
     c.beginPath();
     c.roundRect(bx, by, numberWidth, 22, 11);
-    c.fillStyle = "#ffffff";
+    c.fillStyle = contactColour(contact.id);
     c.fill();
     c.textBaseline = "middle";
     c.textAlign = "center";
@@ -240,29 +232,6 @@ export class MapView {
       c.lineTo(px + 13 * dx, py + 13 * dy);
     }
     halo(c, 1.5, "#6fe3ff", "rgba(0, 0, 0, 0.55)");
-  }
-
-  #notice(c, text) {
-    const { left, top, width, height } = this.plot;
-    c.font = `600 13px ${this.theme.font}`;
-    const w = Math.min(width - 16, c.measureText(text).width + 24);
-    const [x, y] = [left + (width - w) / 2, top + height - 38];
-    c.beginPath();
-    c.roundRect(x, y, w, 28, 14);
-    c.fillStyle = "rgba(10, 12, 20, 0.82)";
-    c.fill();
-    c.fillStyle = "#ffd479";
-    c.textAlign = "center";
-    c.textBaseline = "middle";
-    c.fillText(text, left + width / 2, y + 14.5, w - 20);
-  }
-
-  #hint(c, text) {
-    c.font = `15px ${this.theme.font}`;
-    c.fillStyle = "rgba(255, 255, 255, 0.6)";
-    c.textAlign = "center";
-    c.textBaseline = "middle";
-    c.fillText(text, ...this.mmToPixel(0, 0));
   }
 
   #rim(c) {

@@ -1,5 +1,8 @@
 // The panels beside the map: what the newest frame, status and events say, as text.
 
+import { contactColour } from "./colormap.js";
+import { UNITS, fixed, forceOf, pressureOf, quantityText } from "./values.js";
+
 const EVENTS_SHOWN = 50;
 const TROUBLE_SHOWN_S = 3600;
 const SOURCES = { twin: "simulated skin", device: "device", replay: "replay" };
@@ -8,14 +11,7 @@ const LINEAR = ["tikhonov", "noser"];  // one step, which runs contacts together
 
 export const byId = (id) => document.getElementById(id);
 
-/** A number to so many decimals with a true minus sign, or a dash when there is none. */
-export function fixed(value, decimals) {
-  if (value === null || value === undefined || !Number.isFinite(value)) return "–";
-  const text = value.toFixed(decimals);
-  return (Number(text) === 0 ? text.replace("-", "") : text).replace("-", "−");
-}
-
-export function showContacts(contacts, unit, value) {
+export function showContacts(contacts, unit) {
   byId("value-head").textContent = unit === "kpa" ? "kPa" : "Δσ/σ₀ %";
   byId("count").textContent = contacts.length || "";
   byId("no-contacts").hidden = contacts.length > 0;
@@ -24,16 +20,22 @@ export function showContacts(contacts, unit, value) {
     const row = document.createElement("tr");
     for (let i = 0; i < 6; i++) row.append(document.createElement(i ? "td" : "th"));
     row.cells[0].scope = "row";
+    row.cells[0].append(element("span"));
     return row;
   });
   contacts.forEach((contact, i) => {
     const row = body.rows[i];
     Object.assign(row.dataset, { id: contact.id, xMm: contact.x_mm, yMm: contact.y_mm });
+    const id = row.cells[0].firstChild;
+    setText(id, String(contact.id));
+    id.style.background = contactColour(contact.id);
+    const touched = contact.pressure_range === "below" ? "touched" : "–";
     const texts = [
-      String(contact.id), fixed(contact.x_mm, 1), fixed(contact.y_mm, 1),
-      fixed(contact.area_mm2, 0), value(contact), forceText(contact),
+      fixed(contact.x_mm, 1), fixed(contact.y_mm, 1), fixed(contact.area_mm2, 0),
+      quantityText(pressureOf(contact, unit), UNITS[unit][1]) || touched,
+      quantityText(forceOf(contact), 0) || "–",
     ];
-    texts.forEach((text, column) => setText(row.cells[column], text));
+    texts.forEach((text, column) => setText(row.cells[column + 1], text));
   });
 }
 
@@ -51,12 +53,6 @@ export function showHeld(presses, lift) {
     item.append(button);
     return item;
   }));
-}
-
-function forceText({ force_n: force, force_sigma_n: sigma, pressure_range: range }) {
-  if (force === null) return "–";
-  if (range === "above") return `≥ ${fixed(force, 0)}`;
-  return `${fixed(force, 0)}${sigma === null ? "" : ` ± ${fixed(sigma, sigma < 1 ? 1 : 0)}`}`;
 }
 
 export function showState(name, text = STATES[name] ?? String(name)) {
@@ -89,13 +85,14 @@ function chip(text, title, kind) {
   return item;
 }
 
-export function showStatus(status) {
+/** What the newest status says; of one that is out of date, `isCurrent` is false. */
+export function showStatus(status, isCurrent) {
   const { description, source } = status;
   setText(byId("model"), description?.model ?? "");
   byId("source").hidden = !SOURCES[source?.kind];
   setText(byId("source"), SOURCES[source?.kind] ?? "");
   showStages(status.stage_ms ?? {});
-  showChannels(status);
+  showChannels(status, isCurrent);
   const { reference, recording } = status;
   setText(byId("reference"), reference
     ? `Reference of ${reference.scans} scans, taken ${clock(reference.taken_realtime_ns)}.`
@@ -114,7 +111,10 @@ function showMethods({ methods = [], tier_requested: requested }) {
   if (names.join() !== [...choice.options].map(({ value }) => value).join()) {
     choice.replaceChildren(...names.map((name) => element("option", name)));
   }
-  if (document.activeElement !== choice && requested) choice.value = requested;
+  if (!requested) return;
+  // What is being chosen stays, unless another method was put in force meanwhile.
+  if (document.activeElement !== choice || requested !== choice.dataset.inForce) choice.value = requested;
+  choice.dataset.inForce = requested;
 }
 
 function showStages(stages) {
@@ -138,7 +138,7 @@ function showStages(stages) {
   });
 }
 
-function showChannels({ state, ports, rates, events, issues = [] }) {
+function showChannels({ state, ports, rates, events, issues = [] }, isCurrent) {
   const lines = issues.map(({ severity, what, next_step: step }) =>
     [severity === "error" ? "bad" : "warn", what, step]);
   const stands = ["paused", "ended"].includes(state);
@@ -157,6 +157,7 @@ function showChannels({ state, ports, rates, events, issues = [] }) {
     const kind = severity === "error" ? "bad" : "warn";
     lines.push([kind, name.replaceAll("_", " "), `${events.counts[name]} ×, last ${fixed(age / 60, 0)} min ago`]);
   }
+  if (!isCurrent) lines.splice(0, Infinity, ...lines.map(([, name]) => ["", name, "not known"]));
   const list = byId("channels");
   fit(list, lines.length, () => {
     const item = element("li");
@@ -173,13 +174,16 @@ function showChannels({ state, ports, rates, events, issues = [] }) {
   });
 }
 
-export function showEvent(event) {
+/** Take an event into the list; `at` is when it happened, in ms since 1970. */
+export function showEvent(event, at) {
   const item = element("li");
   item.dataset.severity = event.severity;
   item.dataset.name = event.name;
-  const when = element("time", clock(event.acquired_realtime_ns));
+  const when = element("time", new Date(at).toLocaleTimeString());
   const name = element("strong", String(event.name).replaceAll("_", " "));
-  item.append(when, name, element("span", [event.detail, event.next_step].filter(Boolean).join(" ")));
+  const words = element("span");
+  setWords(words, [event.detail, event.next_step].filter(Boolean).join(" "));
+  item.append(when, name, words);
   const list = byId("events");
   list.prepend(item);
   while (list.children.length > EVENTS_SHOWN) list.lastChild.remove();
@@ -200,6 +204,13 @@ function element(tag, text = "") {
 // Untouched text keeps its selection and spares screen readers.
 export function setText(node, text) {
   if (node.textContent !== text) node.textContent = text;
+}
+
+/** Show a text in which `commands` stand in backticks. */
+export function setWords(node, text) {
+  if (node.dataset.words === text) return;
+  node.dataset.words = text;
+  node.replaceChildren(...text.split("`").map((part, i) => (i % 2 ? element("code", part) : part)));
 }
 
 function clock(realtimeNs) {

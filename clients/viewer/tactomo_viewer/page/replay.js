@@ -1,25 +1,31 @@
 // The controls of a replay: they ask the daemon, and show what its status says.
 
-import { byId, fixed, setText } from "./panels.js";
+import { byId, setText } from "./panels.js";
+import { fixed } from "./values.js";
 
 export class Replay {
   /** `command(name, arguments)` asks the daemon, and tells what it refuses. */
   constructor(command) {
     this.command = command;
     this.fields = null;
+    this.moves = null;  // where it is to go on, until that is asked for
+    this.isMoving = false;  // whether the map is still that of before
     byId("play").onclick = () => this.#ask(
       this.#hasEnded ? { position_s: 0, paused: false } : { paused: !this.fields.paused });
     byId("step").onclick = () => this.#ask({ step: true });
-    byId("position").onchange = ({ target }) => this.#ask({ position_s: Number(target.value) });
+    byId("position").oninput = ({ target }) => this.#move(Number(target.value));
     byId("speed").onchange = ({ target }) => this.#ask({ speed: Number(target.value) });
     byId("loop").onchange = ({ target }) => this.#ask({ loop: target.checked });
   }
 
-  /** Take what a status says; its `replay` is null where nothing is replayed. */
-  show({ replay: fields, state }, hello) {
+  /**
+   * Take what a status says; its `replay` is null where nothing is replayed. One that waits for the
+   * page goes on once somebody sees its first frame.
+   */
+  show({ fields: { replay: fields, state }, age_ms }, hello, hasFrame) {
     byId("replay").hidden = !fields;
     if (!fields) return;
-    Object.assign(this, { fields, state, shownAt: performance.now() });
+    Object.assign(this, { fields, state, shownAt: performance.now() - age_ms });
     for (const control of byId("replay").querySelectorAll("button, input, select")) {
       control.disabled = Boolean(hello?.read_only);
     }
@@ -31,7 +37,8 @@ export class Replay {
       speed.append(new Option(fields.speed || "max", fields.speed));
     }
     if (document.activeElement !== speed) speed.value = String(fields.speed);
-    if (fields.waits_for_page && !hello?.read_only) this.#ask({ paused: false });
+    const isSeen = hasFrame && document.visibilityState === "visible";
+    if (fields.waits_for_page && isSeen && !hello?.read_only) this.#ask({ paused: false });
     this.tick(performance.now());
   }
 
@@ -42,9 +49,27 @@ export class Replay {
     const since = fields.paused || this.#hasEnded ? 0 : ((now - this.shownAt) / 1000) * fields.speed;
     const position = Math.min(fields.position_s + since, fields.duration_s);
     const slider = byId("position");
-    if (!slider.matches(":active")) slider.value = position;
+    if (!slider.matches(":active") && this.moves === null) slider.value = position;
     setText(byId("position-text"), `${fixed(Number(slider.value), 1)} / ${fixed(fields.duration_s, 1)} s`);
     slider.ariaValueText = `${fixed(Number(slider.value), 1)} s`;
+  }
+
+  /** Take note of a new frame. */
+  noteFrame() {
+    if (this.moves === null) this.isMoving = false;
+  }
+
+  // While the daemon moves, the slider may be pulled on: then it moves there next.
+  async #move(position_s) {
+    const isUnderWay = this.moves !== null;
+    this.moves = position_s;
+    this.isMoving = true;
+    if (isUnderWay) return;
+    for (let asked = null; asked !== this.moves;) {
+      asked = this.moves;
+      await this.#ask({ position_s: asked });
+    }
+    this.moves = null;
   }
 
   get #hasEnded() {
@@ -52,6 +77,6 @@ export class Replay {
   }
 
   #ask(change) {
-    this.command("replay", change);
+    return this.command("replay", change);
   }
 }

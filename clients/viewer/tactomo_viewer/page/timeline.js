@@ -1,14 +1,17 @@
-// The last minute: its frames, to look back at, and a strip of how hard each contact pressed, with
-// the events on it.
+// The last minute: its frames, to look back at, and a strip of how hard each contact pressed. A band
+// is an uncertainty or a bound, hatched what is not known, shaded a time without frames.
 
+import { contactColour } from "./colormap.js";
+import { areTouchesSeen } from "./health.js";
 import { line, number, theme, ticks } from "./map_view.js";
+import { UNITS, fixed, forceOf, pressureOf, pressureText, quantityText, seconds } from "./values.js";
 
 const KEPT_MS = 60_000;
+const SHORTEST_MS = 5_000;  // of what is shown
+const ZOOM = 1.5;
 const SPACING_MS = 45;  // of the frames kept: 20 a second are some 40 MB of images a minute
 const EVENT_REACH_PX = 6;
-const LANE = { left: 52, right: 14, gap: 12, bottom: 20 };
-// Okabe and Ito's colours, which the colour-blind tell apart, without black and yellow.
-const COLOURS = ["#e69f00", "#56b4e9", "#009e73", "#d55e00", "#cc79a7", "#0072b2"];
+const LANE = { left: 52, right: 14, gap: 10, bottom: 18 };
 
 export class Timeline {
   /** `onLook()` is called when another moment is to be shown. Times are in ms, of performance.now(). */
@@ -16,25 +19,27 @@ export class Timeline {
     Object.assign(this, { canvas, slider, onLook });
     this.frames = [];      // {at, frame}, oldest first
     this.events = [];      // {at, name, severity}
-    this.pausedAt = null;  // the strip's right end while it stands still
+    this.pausedAt = null;  // the newest moment while it stands still
+    this.spanMs = KEPT_MS;
+    this.end = 0;          // the strip's right end
+    this.pointer = null;   // its x on the strip, px
+    this.hatches = {};
     slider.min = -KEPT_MS;
     slider.step = 50;
     slider.oninput = () => this.#look();
-    const scrub = ({ offsetX, buttons }) => {
-      if (!buttons) return;
-      const { left, width } = this.#lanes();
-      this.pause();
-      slider.value = Math.round(((offsetX - left) / width - 1) * KEPT_MS);
-      this.#look();
-    };
     canvas.addEventListener("pointerdown", (event) => {
       canvas.setPointerCapture(event.pointerId);
-      scrub(event);
+      this.#scrub(event);
     });
     canvas.addEventListener("pointermove", (event) => {
-      canvas.title = this.#eventsAt(event.offsetX).join(", ");
-      scrub(event);
+      this.pointer = event.offsetX;
+      this.#scrub(event);
     });
+    canvas.addEventListener("pointerleave", () => { this.pointer = null; });
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.zoom(event.deltaY < 0, this.#time(event.offsetX));
+    }, { passive: false });
   }
 
   add(frame) {
@@ -46,8 +51,8 @@ export class Timeline {
     this.events = this.events.filter(isKept);
   }
 
-  note({ name, severity, acquired_realtime_ns: ns }) {
-    const at = ns / 1e6 - Date.now() + performance.now();
+  /** Take an event that happened at `at`. */
+  note({ name, severity }, at) {
     this.events.push({ at, name: name.replaceAll("_", " "), severity });
   }
 
@@ -65,18 +70,42 @@ export class Timeline {
     this.onLook();
   }
 
+  /** Show a shorter time, or a longer one, around a moment; the right end stays at the newest. */
+  zoom(isCloser, moment = this.#moment) {
+    const before = this.spanMs;
+    this.spanMs = Math.min(KEPT_MS, Math.max(SHORTEST_MS, isCloser ? before / ZOOM : before * ZOOM));
+    this.end = moment + ((this.end - moment) * this.spanMs) / before;
+    this.onLook();
+  }
+
   /** The frame of the moment looked at, {at, frame}; null where that is now, or before all frames. */
   get shown() {
     if (!this.isPaused) return null;
-    const moment = this.pausedAt + Number(this.slider.value);
-    return this.frames.findLast(({ at }) => at <= moment) ?? this.frames[0] ?? null;
+    return this.#frameAt(this.#moment) ?? this.frames[0] ?? null;
+  }
+
+  /** What was at the pointer, in words; nothing where it is elsewhere. */
+  get readout() {
+    if (this.pointer === null || !this.options) return "";
+    const at = this.#time(this.pointer);
+    const found = this.#frameAt(at);
+    const { unit, gapMs } = this.options;
+    const contacts = !found || at - found.at > gapMs ? ["no data"]
+      : found.frame.contacts.map((contact) => {
+        const force = quantityText(forceOf(contact), 0);
+        return `${contact.id}: ${pressureText(contact, unit)}${force ? `, ${force} N` : ""}`;
+      });
+    const near = this.events.filter((event) => Math.abs(this.#x(event.at) - this.pointer) < EVENT_REACH_PX);
+    const ago = `−${seconds(Math.max(0, (this.pausedAt ?? this.end) - at))}`;
+    return [ago, ...contacts, ...near.map(({ name }) => name)].join(" · ");
   }
 
   /**
-   * Draw the strip up to `end`, or to the pause. `value(contact)` is drawn in `unit` above the force;
-   * frames further apart than `gapMs` are not joined.
+   * Draw the strip up to `end`, or to the pause: pressure in `unit` above force. Frames further apart
+   * than `gapMs` are not joined.
    */
-  draw({ end, unit, value, gapMs }) {
+  draw(options) {
+    this.options = options;
     const { canvas } = this;
     const ratio = window.devicePixelRatio || 1;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];
@@ -87,30 +116,65 @@ export class Timeline {
     c.setTransform(ratio, 0, 0, ratio, 0, 0);
     c.clearRect(0, 0, width, height);
     c.font = `11px ${this.theme.font}`;
-    this.end = this.pausedAt ?? end;
-    const frames = this.frames.filter(({ at }) => at > this.end - KEPT_MS && at <= this.end);
-    const lanes = this.#lanes();
-    this.#seconds(c, lanes);
-    this.#lane(c, lanes, 0, unit, frames, value, gapMs);
-    this.#lane(c, lanes, 1, "N", frames, ({ force_n: force }) => force, gapMs);
-    for (const { at, severity } of this.events) this.#event(c, lanes, at, severity);
-    if (this.isPaused) {
-      const x = this.#x(lanes, this.pausedAt + Number(this.slider.value));
-      c.strokeStyle = this.theme.text;
-      c.lineWidth = 1.5;
-      line(c, x, 0, x, lanes.bottom);
-    }
+    this.#keepInView(options.end);
+    const { left, width: wide, bottom } = this.lanes = this.#lanes();
+    const frames = this.frames.filter(({ at }) => at > this.end - this.spanMs - options.gapMs && at <= this.end);
+    this.#seconds(c);
+    c.save();
+    c.beginPath();
+    c.rect(left, 0, wide, bottom);
+    c.clip();
+    this.#outages(c, frames);
+    const scales = [
+      this.#lane(c, 0, frames, (contact) => pressureOf(contact, options.unit)),
+      this.#lane(c, 1, frames, forceOf),
+    ];
+    for (const { at, severity } of this.events) this.#event(c, at, severity);
+    c.strokeStyle = this.theme.text;
+    c.lineWidth = 1.5;
+    if (this.isPaused) this.#upright(c, this.#x(this.#moment));
+    c.lineWidth = 0.75;
+    if (this.pointer !== null) this.#upright(c, this.pointer);
+    c.restore();
+    this.#axis(c, 0, scales[0], UNITS[options.unit][0]);
+    this.#axis(c, 1, scales[1], "N");
+  }
+
+  get #moment() {
+    return this.isPaused ? this.pausedAt + Number(this.slider.value) : this.end;
+  }
+
+  #frameAt(moment) {
+    return this.frames.findLast(({ at }) => at <= moment);
+  }
+
+  #scrub({ offsetX, buttons }) {
+    if (!buttons) return;
+    this.pause();
+    this.slider.value = Math.round(this.#time(offsetX) - this.pausedAt);
+    this.#look();
   }
 
   #look() {
     this.pause();
-    const seconds = -Number(this.slider.value) / 1000;
-    this.slider.ariaValueText = seconds ? `${seconds.toFixed(1)} s before the pause` : "at the pause";
+    const ago = -Number(this.slider.value) / 1000;
+    this.slider.ariaValueText = ago ? `${fixed(ago, 1)} s before the pause` : "at the pause";
     this.onLook();
   }
 
   #isBeforePause(at) {
     return this.isPaused && at <= this.pausedAt && at > this.pausedAt - KEPT_MS;
+  }
+
+  // Live it ends now; while it stands still it may be moved as far as there are frames.
+  #keepInView(now) {
+    if (!this.isPaused) {
+      this.end = now;
+      return;
+    }
+    const moment = this.#moment;
+    this.end = Math.min(Math.max(this.end, moment), moment + this.spanMs);
+    this.end = Math.min(Math.max(this.end, this.pausedAt - KEPT_MS + this.spanMs), this.pausedAt);
   }
 
   #lanes() {
@@ -120,77 +184,135 @@ export class Timeline {
       height: (bottom - LANE.gap) / 2 };
   }
 
-  #x({ left, width }, at) {
-    return left + width * (1 + (at - this.end) / KEPT_MS);
+  #x(at) {
+    const { left, width } = this.#lanes();
+    return left + width * (1 + (at - this.end) / this.spanMs);
   }
 
-  #eventsAt(px) {
-    const lanes = this.#lanes();
-    return this.events.filter(({ at }) => Math.abs(this.#x(lanes, at) - px) < EVENT_REACH_PX)
-      .map(({ name }) => name);
+  #time(x) {
+    const { left, width } = this.#lanes();
+    return this.end + ((x - left) / width - 1) * this.spanMs;
   }
 
-  #seconds(c, lanes) {
+  #upright(c, x) {
+    line(c, x, 0, x, this.lanes.bottom);
+  }
+
+  #seconds(c) {
+    const { lanes } = this;
+    const newest = this.pausedAt ?? this.end;
+    const oldest = (newest - this.end + this.spanMs) / 1000;
     c.fillStyle = this.theme.dim;
     c.strokeStyle = this.theme.line;
     c.textBaseline = "top";
     c.lineWidth = 1;
-    const seconds = lanes.width > 400 ? 10 : 20;
-    for (let ago = 60; ago >= 0; ago -= seconds) {
-      const x = this.#x(lanes, this.end - 1000 * ago);
+    for (const ago of ticks(oldest - this.spanMs / 1000, oldest, lanes.width > 400 ? 6 : 3)) {
+      const x = this.#x(newest - 1000 * ago);
       c.textAlign = ago ? "center" : "right";
-      line(c, x, 0, x, lanes.bottom);
-      c.fillText(ago ? `−${ago} s` : this.isPaused ? "pause" : "now", x + (ago ? 0 : LANE.right), lanes.bottom + 6);
+      this.#upright(c, x);
+      c.fillText(ago ? `−${number(ago)} s` : this.isPaused ? "pause" : "now", x + (ago ? 0 : LANE.right), lanes.bottom + 5);
     }
   }
 
-  #lane(c, lanes, which, unit, frames, value, gapMs) {
-    const base = which ? lanes.bottom : lanes.height;
+  // Times without frames, with how long they were, and those of which no contacts say nothing.
+  #outages(c, frames) {
+    const { gapMs } = this.options;
+    const ends = [...frames.slice(1).map(({ at }) => at), this.end];
+    frames.forEach(({ at, frame }, i) => {
+      const isGap = ends[i] - at > gapMs;
+      if (!isGap && areTouchesSeen(frame)) return;
+      const [x0, x1] = [this.#x(at), this.#x(ends[i])];
+      c.fillStyle = this.#hatch(isGap ? this.theme.axis : this.theme.warn);
+      c.fillRect(x0, 0, x1 - x0, this.lanes.bottom);
+      const text = `no data for ${seconds(ends[i] - at)}`;
+      if (!isGap || c.measureText(text).width + 8 > x1 - x0) return;
+      c.fillStyle = this.theme.text;
+      c.textAlign = "center";
+      c.textBaseline = "middle";
+      c.fillText(text, (x0 + x1) / 2, this.lanes.height / 2);
+    });
+  }
+
+  /** Draw one quantity of all contacts, and return the lane's scale: {base, full, top}. */
+  #lane(c, which, frames, read) {
+    const base = which ? this.lanes.bottom : this.lanes.height;
+    const byContact = new Map();  // session and id -> points
     let top = 0;
-    const byContact = new Map();  // session and id -> [at, value or null] each
     for (const { at, frame } of frames) {
       for (const contact of frame.contacts) {
         const key = `${frame.session} ${contact.id}`;
-        if (!byContact.has(key)) byContact.set(key, { id: contact.id, points: [] });
-        const here = value(contact);
-        byContact.get(key).points.push([at, here]);
-        if (here > top) top = here;
+        if (!byContact.has(key)) byContact.set(key, { colour: contactColour(contact.id), points: [] });
+        const point = { at, ...read(contact) };
+        byContact.get(key).points.push(point);
+        top = Math.max(top, point.high < Infinity ? point.high : point.low);
       }
     }
-    const marks = ticks(0, 1.25 * top || 1, 2);
-    const full = Math.max(1.25 * top, marks.at(-1));
+    const full = Math.max(1.15 * top, ticks(0, 1.15 * top || 1, 2).at(-1));
+    const y = (value) => base - (Math.min(value, full) / full) * this.lanes.height;
+    for (const { colour, points } of byContact.values()) {
+      for (const run of this.#runs(points)) this.#run(c, run, colour, y);
+    }
+    return { base, full, top };
+  }
+
+  // Points that are joined: without a gap, and either all known or none.
+  #runs(points) {
+    const runs = [];
+    let before = null;
+    for (const point of points) {
+      const goesOn = before && point.at - before.at <= this.options.gapMs
+        && (point.value === null) === (before.value === null);
+      if (goesOn) runs.at(-1).push(point);
+      else runs.push([point]);
+      before = point;
+    }
+    return runs;
+  }
+
+  #run(c, run, colour, y) {
+    const isKnown = run[0].value !== null;
+    const x = run.map(({ at }) => this.#x(at));
+    c.beginPath();
+    run.forEach(({ high }, i) => c.lineTo(x[i], y(high)));
+    c.lineTo(x.at(-1) + 1, y(run.at(-1).high));
+    run.toReversed().forEach(({ low }, i) => c.lineTo(x.at(-1 - i), y(low)));
+    c.globalAlpha = isKnown ? 0.3 : 0.7;
+    c.fillStyle = isKnown ? colour : this.#hatch(colour);
+    c.fill();
+    c.globalAlpha = 1;
+    if (!isKnown) return;
+    c.beginPath();
+    run.forEach(({ value }, i) => c.lineTo(x[i], y(value)));
+    c.lineTo(x.at(-1) + 1, y(run.at(-1).value));
+    c.strokeStyle = colour;
+    c.lineWidth = 2;
+    c.stroke();
+  }
+
+  #hatch(colour) {
+    return (this.hatches[colour] ??= hatch(colour));
+  }
+
+  #axis(c, which, { base, full, top }, unit) {
+    const { lanes } = this;
     c.fillStyle = this.theme.dim;
     c.textAlign = "right";
     c.textBaseline = "middle";
-    for (const mark of top ? marks.slice(1) : []) {
+    for (const mark of top ? ticks(0, full, 2).slice(1) : []) {
       c.fillText(number(mark), lanes.left - 6, Math.max(6, base - (mark / full) * lanes.height));
     }
     c.fillText(unit, lanes.left - 6, base - 5);
     c.strokeStyle = this.theme.axis;
     c.lineWidth = 1;
     line(c, lanes.left, base, lanes.left + lanes.width, base);
-    for (const { id, points } of byContact.values()) {
-      c.strokeStyle = COLOURS[id % COLOURS.length];
-      c.lineWidth = 2;
-      c.beginPath();
-      let before = -Infinity;
-      for (const [at, here] of points) {
-        const [x, y] = [this.#x(lanes, at), base - ((here ?? 0) / full) * lanes.height];
-        if (at - before > gapMs) c.moveTo(x, y);
-        else c.lineTo(x, y);  // touched, but not known how hard: along the axis
-        before = at;
-      }
-      c.stroke();
-    }
   }
 
-  #event(c, lanes, at, severity) {
-    const x = this.#x(lanes, at);
-    if (x < lanes.left || x > lanes.left + lanes.width) return;
+  #event(c, at, severity) {
+    const x = this.#x(at);
     c.strokeStyle = c.fillStyle = { warning: this.theme.warn, error: this.theme.bad }[severity] ?? this.theme.accent;
     c.lineWidth = 1;
     c.setLineDash([3, 3]);
-    line(c, x, 0, x, lanes.bottom);
+    this.#upright(c, x);
     c.setLineDash([]);
     c.beginPath();
     c.moveTo(x - 4, 0);
@@ -198,4 +320,12 @@ export class Timeline {
     c.lineTo(x, 7);
     c.fill();
   }
+}
+
+function hatch(colour) {
+  const tile = new OffscreenCanvas(6, 6);
+  const c = tile.getContext("2d");
+  c.strokeStyle = colour;
+  for (const shift of [-6, 0, 6]) line(c, shift - 1, 7, shift + 7, -1);
+  return c.createPattern(tile, "repeat");
 }

@@ -2,6 +2,9 @@
 // its own. A press that moves is sent again at most once at a time, always with its newest place.
 
 const STEP_MM = { plain: 1, shift: 10 };
+const TRAIL = 200;  // places of a press that are remembered
+
+const isSomebodys = (pointer) => typeof pointer === "number" || pointer === "keyboard";
 
 export class Touch {
   /** `indenter()` says with what is pressed: {pressure, size, shape}; `onPress(press)` hears of new ones. */
@@ -63,16 +66,37 @@ export class Touch {
   }
 
   /** Lift one press that is held. */
-  lift(press) {
+  drop(press) {
     press.lifted = true;
     this.held = this.held.filter((held) => held !== press);
     this.link.send({ type: "release", press: press.id });
     this.onChange();
   }
 
+  /** Press by program: `pointer` names what presses, `indenter` is {pressure, size, shape}. */
+  place(pointer, point, indenter) {
+    if (!this.enabled) return;
+    const press = this.down.get(pointer);
+    const rests = press?.x === point[0] && press.y === point[1] && press.pressure === indenter.pressure;
+    if (!press) this.#start(pointer, point, indenter);
+    else if (!rests) this.#move(Object.assign(press, indenter), point);
+  }
+
+  /** Lift what a pointer or a program presses. */
+  lift(pointer) {
+    this.#release(pointer, false);
+  }
+
+  /** Where and how a press was at a moment, of performance.now(); undefined before it was there. */
+  static wasAt(press, moment) {
+    return press.trail.findLast(({ at }) => at <= moment);
+  }
+
   /** The indenter changed: so do the presses that are down. */
   refresh() {
-    for (const press of this.down.values()) this.#send(Object.assign(press, this.indenter()));
+    for (const [pointer, press] of this.down) {
+      if (isSomebodys(pointer)) this.#send(Object.assign(press, this.indenter()));
+    }
   }
 
   #pointerDown(event) {
@@ -119,11 +143,11 @@ export class Touch {
     return this.view.pixelToMm(clientX - box.left, clientY - box.top);
   }
 
-  #start(pointer, [x, y]) {
-    const press = { id: String(++this.count), x, y, ...this.indenter(), held: false };
+  #start(pointer, [x, y], indenter = this.indenter()) {
+    const press = { id: String(++this.count), x, y, ...indenter, held: false, trail: [] };
     this.down.set(pointer, press);
     this.#send(press);
-    this.onPress(press);
+    if (isSomebodys(pointer)) this.onPress(press);
     this.onChange();
   }
 
@@ -151,6 +175,9 @@ export class Touch {
   }
 
   async #send(press) {
+    const { x, y, size, pressure } = press;
+    press.trail.push({ at: performance.now(), x, y, size, pressure });
+    if (press.trail.length > TRAIL) press.trail.shift();
     press.dirty = true;
     if (press.sending) return;
     press.sending = true;

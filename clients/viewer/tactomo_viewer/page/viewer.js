@@ -1,16 +1,19 @@
 // The page's main part: takes what the link brings, and has it drawn once a screen refresh.
 
-import { ageOf, areTouchesSeen, isHeard, staleAfter, verdict } from "./health.js";
+import { ageOf, areTouchesSeen, isHeard, isMapCurrent, staleAfter, verdict } from "./health.js";
+import { Idle } from "./idle.js";
 import { Link } from "./link.js";
 import { MapView } from "./map_view.js";
-import { byId, fixed, setText, showContacts, showEvent, showHeld, showQuality, showState, showStatus } from "./panels.js";
+import { byId, setText, setWords, showContacts, showEvent, showHeld, showQuality, showState, showStatus } from "./panels.js";
 import { Replay } from "./replay.js";
 import { Timeline } from "./timeline.js";
 import { Touch } from "./touch.js";
+import { UNITS, fixed, pressureOf, pressureText, seconds } from "./values.js";
 
 const PANEL_MS = 100;       // how often the texts beside the map change
 const FALLBACK_TOP = { kpa: 300, percent: 30 };
 const PAINTED = 120;        // frames that rate and latency are taken over
+const NEAR_MM = 10;         // beyond a press's rim a contact is another's
 
 const state = {
   hello: null,
@@ -18,10 +21,12 @@ const state = {
   frame: null,              // the newest
   drawn: null,              // the one on the canvas
   status: null,             // {fields, age_ms, receivedAt}
-  twinAnswers: false,
+  twin: { answers: false, others_press: false },
+  isCurrent: false,         // whether the map may be read
   painted: [],              // {at, latency} of the last frames, ms
   fitted: { kpa: 0, percent: 0 },
   awaited: null,            // the press whose picture is awaited
+  get isMoving() { return replay.isMoving; },
 };
 
 const view = new MapView(byId("map"));
@@ -30,25 +35,29 @@ state.link = link;
 const touch = new Touch({
   view, link, indenter,
   onChange: () => {
-    showHeld(touch.held, (press) => touch.lift(press));
+    showHeld(touch.held, (press) => touch.drop(press));
     redraw();
   },
   onPress: (press) => {
     if (!contactNear(press)) state.awaited = { ...press, at: performance.now() };
   },
 });
-
 const timeline = new Timeline({
   canvas: byId("strip"),
   slider: byId("moment"),
   onLook: () => { redraw(); refresh(); },
 });
 const replay = new Replay(command);
+const idle = new Idle({
+  touch,
+  range: () => ({ x: view.sheet.x[1], y: view.sheet.y[1], kpa: scaleTop(null, "kpa") }),
+});
 
 // For those who drive this page from outside, such as its tests.
 window.tactomo = {
   touch,
   timeline,
+  idle,
   mmToPixel: (x, y) => view.mmToPixel(x, y),
   pixelToMm: (x, y) => view.pixelToMm(x, y),
   state,
@@ -60,6 +69,7 @@ function onFrame(frame) {
   if (state.drawn?.session !== frame.session) state.fitted = { kpa: 0, percent: 0 };
   state.frame = frame;
   timeline.add(frame);
+  replay.noteFrame();
   redraw();
 }
 
@@ -75,18 +85,19 @@ function onMessage(message) {
       setText(byId("sensor"), message.sensor);
       document.title = `${message.sensor} · tactomo`;
       byId("events").replaceChildren();  // the server sends the recent ones again
+      timeline.events = [];
     },
     status: () => {
       state.status = { fields: message.status, age_ms: message.age_ms, receivedAt: performance.now() };
       describe(message.status.description);
-      showStatus(message.status);
-      replay.show(message.status, state.hello);
+      showStatus(message.status, true);
+      replay.show(state.status, state.hello, state.drawn !== null);
     },
     event: () => {
-      showEvent(message.event);
-      timeline.note(message.event);
+      showEvent(message.event, Date.now() - message.age_ms);
+      timeline.note(message.event, performance.now() - message.age_ms);
     },
-    twin: () => { state.twinAnswers = message.answers; },
+    twin: () => { state.twin = message; },
   };
   handlers[message.type]?.();
   refresh();
@@ -94,7 +105,7 @@ function onMessage(message) {
 
 function onLink() {
   state.openedAt = performance.now();
-  if (!link.isOpen) state.twinAnswers = false;
+  if (!link.isOpen) state.twin = { answers: false, others_press: false };
   refresh();
 }
 
@@ -134,18 +145,17 @@ function draw() {
     image,
     scale: image ? scaleTop(image, unit) : 1,
     unit: unit === "kpa" ? "kPa" : "Δσ/σ₀ %",
-    label: (contact) => valueText(contact, unit) || touchedText(contact, unit),
-    notice: frame && !image ? noticeFor(frame, unit) : "",
-    hint: touch.enabled && touch.count === 0 && !frame?.contacts.length ? "Press the skin" : "",
+    label: (contact) => pressureText(contact, unit),
     colormap: byId("colormap").value,
     smooth: byId("smooth").checked,
     outline: byId("outline").checked,
     presses: touch.presses,
     cursor: touch.cursor,
   });
-  showReadout();
   if (frame === state.drawn) return;
   state.drawn = frame;
+  showReadout();
+  showError(frame);
   if (frame === state.frame) notePainted(frame);
 }
 
@@ -168,56 +178,44 @@ function imageIn(frame, unit) {
   return map ? { ...map, values: map.values.map((value) => 100 * value) } : null;
 }
 
-function noticeFor(frame, unit) {
-  if (frame.images.map && unit === "kpa") return "No pressure in this frame: choose Δσ/σ₀";
-  if (!frame.images.structure) return "No map in this frame";
-  const has = state.status?.fields.description?.modalities;
-  return has?.includes("magnitude") === false ? "" : "Magnitude missing: only where, not how hard";
-}
-
 // "sensor": the range that the sensor has. "fit": the largest value lately, slowly forgotten.
 function scaleTop(image, unit) {
   const description = state.status?.fields.description ?? {};
   const top = unit === "kpa" ? description.pressure_max_kpa : 100 * description.magnitude_max;
   const full = top > 0 ? top : FALLBACK_TOP[unit];
-  if (chosen("scale") === "sensor") return full;
+  if (!image || chosen("scale") === "sensor") return full;
   let largest = 0;
   for (const value of image.values) if (value > largest) largest = value;
   state.fitted[unit] = Math.max(largest, 0.98 * state.fitted[unit], full / 50);
   return state.fitted[unit];
 }
 
-// Values
-
-function valueText(contact, unit) {
-  const { magnitude, magnitude_sigma: sigma, pressure_kpa: kpa, pressure_sigma_kpa: spread } = contact;
-  if (unit === "percent") {
-    if (magnitude === null) return "";
-    return `${fixed(100 * magnitude, 1)}${sigma === null ? "" : ` ± ${fixed(100 * sigma, 1)}`} %`;
-  }
-  if (kpa === null) return "";
-  if (contact.pressure_range === "above") return `≥ ${fixed(kpa, 0)} kPa`;
-  return `${fixed(kpa, 0)}${spread === null ? "" : ` ± ${fixed(spread, spread < 1 ? 1 : 0)}`} kPa`;
-}
-
-// What stands where there is no number: how hard is not known, that it is touched is.
-function touchedText(contact, unit) {
-  if (unit !== "kpa") return "touched";
-  if (Number.isFinite(contact.max_kpa)) return `at most ${fixed(contact.max_kpa, 0)} kPa`;
-  return contact.pressure_range === "below" ? "touched, pressure unknown" : "touched";
-}
-
-function cellText(contact, unit) {
-  const text = valueText(contact, unit).replace(/ (kPa|%)$/, "");
-  if (text) return text;
-  if (unit === "kpa" && Number.isFinite(contact.max_kpa)) return `≤ ${fixed(contact.max_kpa, 0)}`;
-  return contact.pressure_range === "below" ? "touched" : "–";
-}
+// What is pressed, and what is felt of it
 
 function contactNear({ x, y, size }) {
   return state.drawn?.contacts.some(
     (contact) => Math.hypot(contact.x_mm - x, contact.y_mm - y) < size / 2 + 5,
   );
+}
+
+// How far contacts are from the presses of this page as these were when the frame was measured.
+function showError(frame) {
+  const at = frame ? frame.receivedAt - frame.age_ms : 0;
+  const errors = touch.presses.map((press) => Touch.wasAt(press, at)).filter(Boolean).map((press) => {
+    const [off, contact] = (frame?.contacts ?? [])
+      .map((each) => [Math.hypot(each.x_mm - press.x, each.y_mm - press.y), each])
+      .sort(([a], [b]) => a - b)[0] ?? [Infinity];
+    if (off > press.size / 2 + NEAR_MM) return null;
+    const { value } = pressureOf(contact, "kpa");
+    return { mm: off, kpa: value === null ? null : value - press.pressure };
+  });
+  const felt = errors.filter(Boolean);
+  const worst = (values) => values.filter((value) => value !== null).sort((a, b) => Math.abs(b) - Math.abs(a))[0];
+  const [mm, kpa] = [worst(felt.map((each) => each.mm)), worst(felt.map((each) => each.kpa))];
+  const sizes = [mm !== undefined && `${fixed(mm, 1)} mm`, kpa !== undefined && `${fixed(kpa, 0)} kPa`];
+  const unfelt = errors.length - felt.length;
+  const words = [felt.length && `error ${sizes.filter(Boolean).join(", ")}`, unfelt && `${unfelt} not felt`];
+  setText(byId("error"), words.filter(Boolean).join(" · "));
 }
 
 // Texts and banner
@@ -228,40 +226,58 @@ function refresh() {
   const past = timeline.shown;
   const found = past && live?.level !== "error" ? pausedBanner(past, now) : live;
   showBanner(found);
-  const trusted = past !== null || !found || found.level === "info" || found.name === "issue";
-  byId("map").classList.toggle("stale", !trusted);
+  state.isCurrent = past !== null || isMapCurrent(found);
+  byId("map").classList.toggle("stale", !state.isCurrent);
   document.body.dataset.health = found?.name ?? (state.status ? "good" : "connecting");
   const linked = isHeard(state, now);
-  if (!linked) showState("gone", found ? "disconnected" : "connecting");
-  else if (["stale", "ended"].includes(live?.name)) showState(live.name);
-  else showState(state.status.fields.state);
+  if (linked) showState(["stale", "ended"].includes(live?.name) ? live.name : state.status.fields.state);
+  else if (live?.level === "error") showState("gone", "disconnected");
+  else showState("connecting");
+  if (!linked && state.status) showStatus(state.status.fields, false);
   for (const id of ["tare", "record", "method"]) {
     byId(id).disabled = !linked || Boolean(state.hello?.read_only);
   }
-  const canPress = link.isOpen && state.twinAnswers && state.status?.fields.source?.kind === "twin";
+  const canPress = link.isOpen && state.twin.answers && state.status?.fields.source?.kind === "twin";
   if (canPress) byId("press-card").hidden = false;
+  byId("pressed").hidden = byId("press-card").hidden;
   byId("press-controls").disabled = !canPress;
   touch.enable(Boolean(canPress));  // redraws when that changes
-  setText(byId("map-help"), canPress
-    ? "Press with the mouse, with fingers, or with the arrow keys and the space bar. Shift holds the press."
-    : "");
-  showNumbers(now, trusted);
+  if (state.twin.others_press) idle.stop();
+  else if (state.hello?.press_itself && canPress && !found) idle.begin();
+  else idle.stop(false);
+  setText(byId("map-help"), found ? "" : helpText(canPress));
+  showNumbers(now);
+  showReadout();
   const isPaused = timeline.isPaused;
   byId("pause").setAttribute("aria-pressed", String(isPaused));
   setText(byId("pause"), isPaused ? "Back to now" : "Pause");
   const stands = ["ended", "replay-paused"].includes(live?.name) && state.frame;
   timeline.draw({
     end: stands ? state.frame.receivedAt : now,
-    unit: chosen("unit") === "kpa" ? "kPa" : "%",
-    value: chosen("unit") === "kpa" ? ({ pressure_kpa: kpa }) => kpa
-      : ({ magnitude }) => (magnitude === null ? null : 100 * magnitude),
+    unit: chosen("unit"),
     gapMs: staleAfter(state.status?.fields ?? {}, state.hello),
   });
   replay.tick(now);
 }
 
+// What stands in the banner's place while all is well.
+function helpText(canPress) {
+  const frame = shownFrame();
+  const unit = chosen("unit");
+  if (frame && !imageIn(frame, unit)) {
+    if (frame.images.map && unit === "kpa") return "No pressure in this frame: choose Δσ/σ₀.";
+    if (!frame.images.structure) return "No map in this frame.";
+    const has = state.status?.fields.description?.modalities;
+    if (has?.includes("magnitude") !== false) return "Magnitude missing: only where, not how hard.";
+  }
+  if (idle.isOn) return "The demo presses by itself: press the skin to take over.";
+  return canPress
+    ? "Press with mouse, fingers, or arrow keys and space bar; Shift holds the press."
+    : "";
+}
+
 function pausedBanner({ frame, at }, now) {
-  const detail = `Shown is the frame of ${fixed((now - at) / 1000, 1)} s ago; the skin goes on.`;
+  const detail = `Shown is the frame of ${seconds(now - at)} ago; the skin goes on.`;
   return { name: "paused", level: "info", title: "Looking back.", detail, frame };
 }
 
@@ -275,20 +291,21 @@ function showBanner(found) {
     return;
   }
   // A counting clock in it must not be read out anew every time.
-  const key = found.name + found.title;
+  const key = found.name + found.level + found.title;
   if (key !== bannerShown) {
     bannerShown = key;
+    box.role = found.level === "info" ? "status" : "alert";
     box.dataset.name = found.name;
     box.dataset.level = found.level;
     box.querySelector("strong").textContent = found.title;
   }
   const detail = box.querySelector("span");
   detail.ariaLive = "off";
-  setText(detail, found.detail);
+  setWords(detail, found.detail);
 }
 
-function showNumbers(now, trusted) {
-  const { painted } = state;
+function showNumbers(now) {
+  const { painted, isCurrent } = state;
   const frame = shownFrame();
   const recent = painted.filter(({ at }) => now - at < 2000);
   const rate = recent.length > 1 ? (1000 * (recent.length - 1)) / (recent.at(-1).at - recent[0].at) : 0;
@@ -301,14 +318,13 @@ function showNumbers(now, trusted) {
     : "";
   const age = ageOf(frame, now);
   setText(byId("age"), age < 1e3 ? `${fixed(age, 0)} ms` : age < 1e6 ? `${fixed(age / 1e3, 1)} s` : "–");
-  byId("age").classList.toggle("bad", !trusted);
+  byId("age").classList.toggle("bad", !isCurrent);
   if (!frame) return;
-  const unit = chosen("unit");
-  const known = trusted && !frame.flags.includes("no_reference");
+  const known = isCurrent && !frame.flags.includes("no_reference");
   const contacts = known ? [...frame.contacts].sort((a, b) => a.id - b.id) : [];
-  showContacts(contacts, unit, (contact) => cellText(contact, unit));
+  showContacts(contacts, chosen("unit"));
   setText(byId("no-contacts"), known && areTouchesSeen(frame) ? "Nothing pressed." : "Not known.");
-  showQuality(frame, trusted);
+  showQuality(frame, isCurrent);
   byId("map").ariaLabel = known && (contacts.length || areTouchesSeen(frame))
     ? `Pressure map, ${frame.contacts.length || "no"} contact${frame.contacts.length === 1 ? "" : "s"}`
     : "Pressure map, not known";
@@ -337,16 +353,17 @@ async function command(name, args = {}, done = () => "") {
     ? done(reply.result)
     : [reply.error.cause, reply.error.next_step].filter(Boolean).join("; ");
   say(text, reply.ok);
+  return reply.ok;
 }
 
 let silence = 0;
 
 function say(text, ok) {
   const box = byId("message");
-  box.textContent = text;
+  setWords(box, text);
   box.classList.toggle("bad", !ok);
   clearTimeout(silence);
-  silence = setTimeout(() => { box.textContent = ""; }, 7000);
+  silence = setTimeout(() => setWords(box, ""), 7000);
 }
 
 function chosen(name) {
@@ -364,17 +381,21 @@ byId("record").onclick = () =>
   state.status?.fields.recording
     ? command("record_stop", {}, ({ path }) => `Recorded to ${path}`)
     : command("record_start", {}, ({ path }) => `Recording to ${path}`);
-byId("method").onchange = ({ target }) =>
-  command("set_tier", { tier: target.value }, ({ tier }) => `Method: ${tier}`);
+byId("method").onchange = async ({ target }) => {
+  const ok = await command("set_tier", { tier: target.value }, ({ tier }) => `Method: ${tier}`);
+  if (!ok) target.value = target.dataset.inForce;
+};
 byId("pause").onclick = () => {
   if (timeline.isPaused) timeline.goLive();
   else timeline.pause();
   refresh();
 };
+byId("zoom-in").onclick = () => timeline.zoom(true);
+byId("zoom-out").onclick = () => timeline.zoom(false);
 byId("clear").onclick = () => touch.clear();
 byId("hold").onchange = ({ target }) => { touch.hold = target.checked; };
 for (const id of ["pressure", "size", "shape"]) byId(id).oninput = showIndenter;
-for (const input of document.querySelectorAll(".toolbar input, .toolbar select")) {
+for (const input of document.querySelectorAll("#view input, #view select, input[name=unit]")) {
   input.addEventListener("change", () => { redraw(); refresh(); });
 }
 
@@ -388,26 +409,27 @@ byId("map").addEventListener("pointerleave", () => {
   pointer = null;
   showReadout();
 });
+for (const event of ["pointermove", "pointerleave"]) byId("strip").addEventListener(event, refresh);
 
 function showReadout() {
-  setText(byId("readout"), pointer && view.isOnSheet(...pointer) ? readout(...pointer) : "");
+  setText(byId("readout"), pointer && view.isOnSheet(...pointer) ? readout(...pointer) : timeline.readout);
 }
 
 function readout(x, y) {
   const unit = chosen("unit");
   const frame = shownFrame();
-  const image = imageIn(frame, unit);
   const place = `x ${fixed(x, 0)}, y ${fixed(y, 0)} mm`;
+  const image = state.isCurrent ? imageIn(frame, unit) : null;
   if (!image) return place;
   const { x_mm: [x0, x1], y_mm: [y0, y1] } = frame;
   const ix = Math.round(((x - x0) / (x1 - x0)) * (image.nx - 1));
   const iy = Math.round(((y - y0) / (y1 - y0)) * (image.ny - 1));
   const value = image.values[iy * image.nx + ix];
-  return Number.isFinite(value) ? `${place}: ${fixed(value, unit === "kpa" ? 0 : 1)} ${unit === "kpa" ? "kPa" : "%"}` : place;
+  const [name, decimals] = UNITS[unit];
+  return Number.isFinite(value) ? `${place}: ${fixed(value, decimals)} ${name}` : place;
 }
 
 new ResizeObserver(() => { view.resize(); redraw(); }).observe(byId("map").parentElement);
-addEventListener("resize", () => { view.resize(); redraw(); });
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
 setInterval(refresh, PANEL_MS);
 showIndenter();

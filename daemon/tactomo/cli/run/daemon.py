@@ -135,7 +135,7 @@ def replay(
     method: options.Method = "auto",
     stream: options.ServeStream = None,
     control: options.ServeControl = None,
-    viewer_port: options.ViewerPort = options.DEFAULT_VIEWER_PORT,
+    viewer_port: options.ViewerPort = None,
     stay: Annotated[
         bool, typer.Option("--stay", help="Keep running after the recording's end.")
     ] = False,
@@ -157,8 +157,9 @@ def replay(
     A folder of files that a daemon has cut is played as the one recording that it was, from the
     oldest to the newest; pauses between them are shortened to a second.
 
-    With --viewer it waits until the page is open. There, or by the command `replay` of the control
-    socket, it is paused, stepped, moved and paced while it runs.
+    With --viewer it shows its first frame and waits until somebody looks at the page. There, or by
+    the command `replay` of the control socket, it is paused, stepped, moved and paced while it
+    runs.
     """
     from tactomo.cli.run.demo import free_of, show_replay
     from tactomo.recordings.recording_set import RecordingSet, open_replayable
@@ -201,8 +202,8 @@ def replay(
     def begin(playback: Playback) -> None:
         playback.steer(paused or wait_for_page, None, loop)
         playback.waits_for_page = wait_for_page
-        if start:
-            playback.move(start)
+        if start or playback.is_paused:
+            playback.move(start)  # while paused, the first frame is shown
 
     raise typer.Exit(_run_daemon(settings, begin, None if description else carried))
 

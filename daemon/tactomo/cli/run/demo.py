@@ -51,7 +51,7 @@ def demo(
         float | None, typer.Option(min=0.0, help="Converter noise, µV rms.")
     ] = None,
     record: Annotated[Path | None, typer.Option(help="Record what the ports say.")] = None,
-    viewer_port: options.ViewerPort = options.DEFAULT_VIEWER_PORT,
+    viewer_port: options.ViewerPort = None,
     stream: options.ServeStream = None,
     control: options.ServeControl = None,
     twin_control: Annotated[
@@ -74,7 +74,7 @@ def demo(
 
     The first start builds the sensor's models, which takes a moment. Ctrl-C stops everything.
     With tcp addresses of port 0 it takes free ports and prints them. What `tactomo record` records
-    of it goes into this folder.
+    of it goes into this folder. The page presses the skin by itself until somebody does.
     """
     from tactomo.cli.children import new_family
 
@@ -83,6 +83,8 @@ def demo(
         (control, options.DEFAULT_CONTROL),
         (twin_control, options.DEFAULT_TWIN_CONTROL),
     )
+    # A page that presses would be in the way of whoever asks for these two.
+    presses_itself = scene is None and not announce
     twin_options = [
         *("--description", description, "--rate", str(rate), "--twin-control", twin_control),
         *_optional("--ports", ports),
@@ -107,7 +109,7 @@ def demo(
         page = None
         if not any(address.endswith((":0", ":*")) for address in (stream, control, twin_control)):
             # The page waits for the daemon by itself: it need not wait here.
-            page = _open_page(family, asked, viewer_port, not no_browser)
+            page = _open_page(family, asked, viewer_port, not no_browser, presses_itself)
             print(f"starting; the page is {page}", file=sys.stderr)
         simulated = skin.wait_ready()
         builder.wait_done()
@@ -115,7 +117,7 @@ def demo(
         daemon = family.start("daemon", "daemon", *daemon_options, *lines)
         addresses = {**_served(daemon.wait_ready()), "twin": simulated["control"]}
         _wait_tared(addresses["control"])
-        page = page or _open_page(family, addresses, viewer_port, not no_browser)
+        page = page or _open_page(family, addresses, viewer_port, not no_browser, presses_itself)
         _stay(family, {**addresses, "viewer": page}, announce)
 
 
@@ -146,7 +148,7 @@ def show_replay(
     sensor: str,
     stream: str,
     control: str,
-    viewer_port: int,
+    viewer_port: int | None,
     more: list[str],
 ) -> None:
     """Play a recording through a daemon and show it in the viewer until Ctrl-C."""
@@ -167,10 +169,18 @@ def _served(ready: Mapping[str, Any]) -> dict[str, Any]:
     return {name: ready[name] for name in ("sensor", "stream", "control", "ports")}
 
 
-def _open_page(family: Family, addresses: Mapping[str, Any], port: int, browser: bool) -> str:
+def _open_page(
+    family: Family,
+    addresses: Mapping[str, Any],
+    port: int | None,
+    browser: bool,
+    presses_itself: bool = False,
+) -> str:
     """Start the viewer, show its page where there is a desktop, and return the page's URL."""
     viewer = family.start(
-        *("viewer", "viewer", "--viewer-port", str(port), "--sensor", addresses["sensor"]),
+        *("viewer", "viewer", "--sensor", addresses["sensor"]),
+        *_optional("--viewer-port", port),
+        *(["--press-itself"] if presses_itself else []),
         *("--address", addresses["stream"], "--control", addresses["control"]),
         *_optional("--twin-control", addresses.get("twin")),
     )

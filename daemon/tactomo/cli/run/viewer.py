@@ -29,8 +29,9 @@ def viewer(
     ] = None,
     control: Annotated[str | None, typer.Option(hidden=True)] = None,
     host: Annotated[str, typer.Option(help="Address to listen on.")] = "127.0.0.1",
-    viewer_port: options.ViewerPort = options.DEFAULT_VIEWER_PORT,
+    viewer_port: options.ViewerPort = None,
     keys: options.KeysFolder = None,
+    press_itself: Annotated[bool, typer.Option("--press-itself", hidden=True)] = False,
 ) -> None:
     """Serve a web page that shows the maps and contacts of a running daemon."""
     from tactomo_client.keys import as_keys
@@ -42,4 +43,5 @@ def viewer(
         found = find_sensor(sensor, address, keys)
         twin_control = twin_control or twin_of(found)
     addresses = found.sensor, found.stream, found.control
-    Viewer(*addresses, twin_control, host, as_keys(keys)).serve(viewer_port)
+    viewer = Viewer(*addresses, twin_control, host, as_keys(keys), press_itself)
+    viewer.serve(viewer_port)
