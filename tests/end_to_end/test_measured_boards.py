@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 import pytest
 from daemon_process import SENSOR, DaemonProcess
-from measured_skin import MeasuredSkin
+from emulated_board import MeasuredSkin, emulated
 from shared_data import measured
-from tactomo.twin import Twin, TwinConfig
 from tactomo_client import Frame, subscribe
 from tactomo_lab.evaluation.skin_presses import read_presses
 from tactomo_lab.evaluation.tanks import (
@@ -32,7 +31,7 @@ from tactomo_models import Artifact, SensorDescription, build_artifact, load_des
 from tactomo_models.arrays import BoolArray, FloatArray
 from tactomo_models.physics.forward import ForwardModel
 from tactomo_models.scans.reference import noise_of_reciprocity
-from tactomo_models.sensor.shipped import __path__ as sensors_path
+from tactomo_models.sensor.description_file import shipped_text
 
 REST = 100
 """Scans at rest that come first: a daemon tares by twenty, and a controller subscribes."""
@@ -44,7 +43,7 @@ UNSIGNED = '[instrument]\nvoltages = "unsigned"\n'
 
 def described(tmp_path: Path, name: str, more: str = "") -> Path:
     path = tmp_path / f"{name}.toml"
-    path.write_text(f"{(Path(sensors_path[0]) / f'{name}.toml').read_text('utf-8')}\n{more}")
+    path.write_text(f"{shipped_text(name)}\n{more}")
     return path
 
 
@@ -55,32 +54,13 @@ def bare_volts(sensor: SensorDescription, artifact: Artifact) -> FloatArray:
 
 @contextmanager
 def playing(
-    tmp_path: Path,
-    scans: FloatArray,
-    sensor: Path,
-    protocol: str,
-    rate_hz: float,
-    **config: Any,
+    tmp_path: Path, scans: FloatArray, sensor: Path, protocol: str, rate_hz: float, **config: Any
 ) -> Iterator[DaemonProcess]:
     """A board that says these scans, and a daemon on it."""
-    board = TwinConfig(
-        load_description(sensor),
-        protocol=protocol,
-        noise_v=0.0,
-        rate_hz=rate_hz,
-        control="tcp://127.0.0.1:0",
-    )
-    twin = Twin(board, MeasuredSkin(scans))
-    twin.start()
-    daemon = DaemonProcess(
-        tmp_path, twin.ports, protocol=protocol, description=str(sensor), ready=False, **config
-    )
-    try:
-        daemon.wait_ready()
+    skin = MeasuredSkin(scans)
+    rate = {"rate_hz": rate_hz, "noise_v": 0.0}
+    with emulated(tmp_path, str(sensor), protocol, skin, config, **rate) as (_, daemon):
         yield daemon
-    finally:
-        daemon.kill()
-        twin.stop()
 
 
 def frames_of(daemon: DaemonProcess, last: int, missed: int = 0) -> dict[int, Frame]:

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import pytest
-from daemon_process import SENSOR, DaemonProcess
-from tactomo.twin import Twin, TwinConfig
-from tactomo_client import Frame, request, subscribe
-from tactomo_models import load_description
-from tactomo_models.sensor.shipped import __path__ as sensors_path
+from daemon_process import DaemonProcess
+from emulated_board import changed, emulated, frame_where
+from tactomo.twin import Twin
+from tactomo_client import request
 from waiting import PATIENCE_S, wait_until
 
-COARSE = "[map]\nnodes_x = 25\nnodes_y = 25\n\n[structure]"
 SINGLE_ENDED = (('"unsigned"', '"signed"'), ('= "pairs"', '= "single_ended"'))
 WAITING = (('# start = "y"', 'start = "y"'),)
 SIXTEENTHS = (("volts_per_unit = 1.0", "volts_per_unit = 0.0625"),)
@@ -27,53 +24,14 @@ Start = Callable[..., tuple[Twin, DaemonProcess]]
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
     """Start an emulated board and a daemon on it."""
-    running: list[Any] = []
-
-    def start(
-        protocol: str, board: str, sensor: str = "", as_if: str = "", **config: Any
-    ) -> tuple[Twin, DaemonProcess]:
-        twin = Twin(
-            TwinConfig(
-                load_description(board), protocol=protocol, control="tcp://127.0.0.1:0", **config
-            )
+    with ExitStack() as running:
+        yield lambda protocol, board, /, **daemon: running.enter_context(
+            emulated(tmp_path, board, protocol, daemon=daemon)
         )
-        running.append(twin.stop)
-        twin.start()
-        daemon = DaemonProcess(
-            tmp_path,
-            twin.ports,
-            protocol=as_if or protocol,
-            description=sensor or board,
-            ready=False,
-        )
-        running.append(daemon.kill)
-        daemon.wait_ready()
-        return twin, daemon
-
-    yield start
-    for stop in reversed(running):
-        stop()
-
-
-def changed(tmp_path: Path, name: str, *changes: tuple[str, str]) -> str:
-    """A shipped description with a coarse map and other changes, as a user would edit it."""
-    text = (Path(sensors_path[0]) / f"{name}.toml").read_text("utf-8")
-    for old, new in (("[structure]", COARSE), *changes):
-        assert old in text
-        text = text.replace(old, new)
-    path = tmp_path / f"{name}.toml"
-    path.write_text(text)
-    return str(path)
 
 
 def tared(daemon: DaemonProcess) -> None:
     wait_until(lambda: daemon.told("tared"), "a reference")
-
-
-def frame_where(daemon: DaemonProcess, condition: Callable[[Frame], bool]) -> Frame:
-    """The first frame of which something holds, as a controller gets it."""
-    with closing(subscribe(SENSOR, address=daemon.stream, timeout_s=60.0)) as frames:
-        return next(frame for frame in frames if condition(frame))
 
 
 def press(twin: Twin, x_mm: float, y_mm: float, radius_mm: float = 9.0) -> None:
@@ -108,7 +66,7 @@ def test_a_press_on_an_emulated_board_is_where_it_is(
 @pytest.mark.long
 def test_a_board_of_another_kind_is_refused_by_name(start: Start, tmp_path: Path) -> None:
     board, sensor = changed(tmp_path, "openeit_disc"), changed(tmp_path, "matrix_disc")
-    _, daemon = start("openeit", board, sensor, as_if="matrix")
+    _, daemon = start("openeit", board, description=sensor, protocol="matrix")
     [refusal] = wait_until(lambda: daemon.told("device_refused"), "a refusal")
     said = "192 numbers a line, as of 16 electrodes (opposite drive)"
     assert said in refusal["detail"]
@@ -121,7 +79,7 @@ def test_a_board_of_another_kind_is_refused_by_name(start: Start, tmp_path: Path
 @pytest.mark.slow
 def test_it_stands_what_happens_to_a_cable(start: Start, tmp_path: Path) -> None:
     board = changed(tmp_path, "openeit_disc")
-    twin, daemon = start("openeit", board, link_folder=tmp_path / "links")
+    twin, daemon = start("openeit", board)
     tared(daemon)
     request("garbage", twin.control, PATIENCE_S, count=3000)
     wait_until(lambda: daemon.status()["ports"][0]["corrupt"] > 0, "damage that is counted")

@@ -8,78 +8,35 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from daemon_process import SENSOR, DaemonProcess
-from measured_skin import MeasuredSkin
+from daemon_process import DaemonProcess
+from emulated_board import MeasuredSkin, changed, emulated, frame_where
 from shared_data import measured
 from tactomo.recordings.imported_scans import read_scans
 from tactomo.recordings.recording import open_recording
 from tactomo.twin import Twin, TwinConfig
-from tactomo_client import Frame, request, subscribe
+from tactomo_client import request
 from tactomo_client.recording import open_recording as open_frames
 from tactomo_models import load_description
-from tactomo_models.sensor.shipped import __path__ as sensors_path
 from tactomo_protocol import Scan
 from waiting import PATIENCE_S, wait_until
 
-COARSE = ("[structure]", "[map]\nnodes_x = 25\nnodes_y = 25\n\n[structure]")
-
+TANK = "sciospec_disc"
 Start = Callable[..., tuple[Twin, DaemonProcess]]
 
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Start]:
     """Start an emulated instrument and a daemon on it."""
-    running: list[Callable[[], object]] = []
-
-    def start(
-        sensor: str,
-        daemon: dict[str, Any] | None = None,
-        skin: MeasuredSkin | None = None,
-        **config: Any,
-    ) -> tuple[Twin, DaemonProcess]:
-        settings = {"protocol": "sciospec", "control": "tcp://127.0.0.1:0", **config}
-        # By a link, which goes with the twin: the number of a pty is somebody else's afterwards.
-        settings["link_folder"] = tmp_path / "links"
-        twin = Twin(TwinConfig(load_description(sensor), **settings), skin)
-        running.append(twin.stop)
-        twin.start()
-        served = DaemonProcess(
-            tmp_path,
-            twin.ports,
-            protocol="sciospec",
-            description=sensor,
-            ready=False,
-            **(daemon or {}),
+    with ExitStack() as running:
+        yield lambda sensor, daemon=None, skin=None, **config: running.enter_context(
+            emulated(tmp_path, sensor, "sciospec", skin, daemon, **config)
         )
-        running.append(served.kill)
-        served.wait_ready()
-        return twin, served
-
-    yield start
-    for stop in reversed(running):
-        stop()
-
-
-def sensor(folder: Path, *changes: tuple[str, str]) -> str:
-    """The shipped description with changes, as a user would edit it."""
-    text = (Path(sensors_path[0]) / "sciospec_disc.toml").read_text("utf-8")
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new)
-    path = folder / "tank.toml"
-    path.write_text(text)
-    return str(path)
-
-
-def frame_where(daemon: DaemonProcess, condition: Callable[[Frame], bool]) -> Frame:
-    with closing(subscribe(SENSOR, address=daemon.stream, timeout_s=60.0)) as frames:
-        return next(frame for frame in frames if condition(frame))
 
 
 def is_streaming(twin: Twin) -> bool:
@@ -96,7 +53,7 @@ def tactomo(*arguments: object) -> str:
 @pytest.mark.slow
 def test_an_instrument_is_configured_believed_and_stopped(start: Start, tmp_path: Path) -> None:
     record = {"recording": {"file": str(tmp_path / "a.mcap")}}
-    twin, daemon = start(sensor(tmp_path, COARSE), record)
+    twin, daemon = start(changed(tmp_path, TANK), record)
     wait_until(lambda: daemon.told("tared"), "a reference")
     for x_mm in (40.0, -40.0):
         request("press", twin.control, PATIENCE_S, x_mm=x_mm, y_mm=20.0, radius_mm=15.0)
@@ -132,7 +89,7 @@ def test_an_instrument_is_configured_believed_and_stopped(start: Start, tmp_path
 def test_a_daemon_that_was_killed_leaves_it_measuring_and_the_next_takes_over(
     start: Start, tmp_path: Path
 ) -> None:
-    twin, daemon = start(sensor(tmp_path, COARSE))
+    twin, daemon = start(changed(tmp_path, TANK))
     wait_until(lambda: daemon.told("tared"), "a reference")
     daemon.signal(signal.SIGKILL)
     daemon.popen.wait(PATIENCE_S)
@@ -151,7 +108,7 @@ def test_a_daemon_that_was_killed_leaves_it_measuring_and_the_next_takes_over(
 
 @pytest.mark.slow
 def test_what_the_instrument_refuses_is_named(start: Start, tmp_path: Path) -> None:
-    _, daemon = start(sensor(tmp_path, COARSE, ("scan_rate_hz = 20.0", "scan_rate_hz = 500.0")))
+    _, daemon = start(changed(tmp_path, TANK, ("scan_rate_hz = 20.0", "scan_rate_hz = 500.0")))
     [told] = wait_until(lambda: daemon.told("device_refused"), "a refusal")
     assert "will not measure 500 frames a second (NACK 81)" in told["detail"]
     assert "[instrument]" in told["next_step"]
@@ -161,7 +118,7 @@ def test_what_the_instrument_refuses_is_named(start: Start, tmp_path: Path) -> N
 @pytest.mark.long
 def test_ports_tells_what_speaks_sciospec(tmp_path: Path) -> None:
     config = TwinConfig(
-        load_description(sensor(tmp_path, COARSE)),
+        load_description(changed(tmp_path, TANK)),
         protocol="sciospec",
         control="tcp://127.0.0.1:0",
     )
@@ -179,7 +136,7 @@ def test_a_played_stream_gives_what_its_import_gives(start: Start, tmp_path: Pat
     """The measured cup, said by the emulator and read from its file: equal scans and contacts."""
     path = measured("tank_sciospec_20fps.npz")
     live, imported = tmp_path / "live.mcap", "import.mcap"
-    tank = sensor(tmp_path, COARSE)
+    tank = changed(tmp_path, TANK)
     settings = {"lossless": True, "recording": {"file": str(live), "maps": True}}
     [volts] = read_scans(path, load_description(tank), None).volts.values()
     skin = MeasuredSkin(volts)
@@ -217,9 +174,9 @@ def test_a_played_stream_gives_what_its_import_gives(start: Start, tmp_path: Pat
 @pytest.mark.long
 def test_each_labelled_object_lies_beside_its_electrode(start: Start, tmp_path: Path) -> None:
     """Metal and plastic that stood beside electrodes 1, 5, 9 and 13 of a tank."""
-    tank = sensor(
+    tank = changed(
         tmp_path,
-        COARSE,
+        TANK,
         ("conductivity_ratio = 0.01", "conductivity_ratio = 30\neither_way = true"),
     )
     with np.load(measured("tank_labelled.npz")) as sets:

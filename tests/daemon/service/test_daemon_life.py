@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import resource
 import signal
 import threading
 import time
@@ -152,29 +151,6 @@ def test_a_killed_daemons_recording_opens_up_to_its_last_flush(
     scans, frames = flushed()
     assert scans == 20
     assert frames == len(replay(path).of("map"))
-
-
-@pytest.mark.slow
-def test_a_full_disk_ends_the_recording_and_nothing_else(spawn: Start, tmp_path: Path) -> None:
-    path = tmp_path / "skin.mcap"
-    process, skin = spawn()
-    skin.introduce()
-    for _ in range(4):
-        skin.scan()
-    process.ask("record_start", path=path.name)
-    size = path.stat().st_size
-    skin.scan()
-    wait_until(lambda: path.stat().st_size > size)
-    wait_until(lambda: open_recording(path).summary.frames, meanwhile=skin.scan)
-    # As good as a full disk: no file of that process may grow much further.
-    limit = path.stat().st_size + 4000
-    resource.prlimit(process.popen.pid, resource.RLIMIT_FSIZE, (limit, limit))
-    (failed,) = wait_until(lambda: process.told("recording_failed"), meanwhile=skin.scan)
-    assert process.status()["recording"] is None
-    assert failed["level"] == "error"
-    assert "too large" in failed["detail"]
-    wait_until(lambda: process.status()["state"] == "running", meanwhile=skin.scan)
-    assert open_recording(path).summary.frames > 0
 
 
 def test_a_thread_that_dies_takes_the_daemon_down(bench: Start) -> None:

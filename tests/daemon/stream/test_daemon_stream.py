@@ -175,19 +175,6 @@ def test_where_frames_lag_the_state_is_late_and_not_that_no_scans_come(
 
 
 @pytest.mark.slow
-def test_every_scan_is_reconstructed_if_asked_for(bench: Start) -> None:
-    b = bench(seconds=0.02, lossless=True)
-    b.tare()
-    start = b.skin.counter
-    for _ in range(40):
-        b.skin.scan()
-    b.listener.frame(b.skin.counter)
-    counters = [m["scan_counter"] for m in b.listener.of("map") if m["scan_counter"] > start]
-    assert counters == list(range(start + 1, start + 41))
-    assert b.ask("status")["dropped_scans"] == 0
-
-
-@pytest.mark.slow
 def test_a_reconstruction_that_fails_costs_its_frame_alone(
     bench: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
