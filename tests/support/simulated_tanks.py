@@ -6,6 +6,7 @@ import hashlib
 
 import numpy as np
 from tactomo_lab.evaluation.tanks import Tanks
+from tactomo_lab.scenes.drawing import SeedSet
 from tactomo_lab.scenes.simulation import (
     SHARP_M,
     UnevenSheet,
@@ -13,7 +14,6 @@ from tactomo_lab.scenes.simulation import (
     fine_mesh,
     fitted_mesh,
 )
-from tactomo_lab.scenes.still_scenes import SeedSet
 from tactomo_lab.tanks.images import pixel_grid
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.mesh import SheetMesh

@@ -8,7 +8,7 @@ the picture (`bench_chart_picture`).
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -21,12 +21,13 @@ from tactomo.cli.bench.machine_speed import warned_if_busy
 from tactomo.cli.output import table
 from tactomo.cli.plot.plot import prepare_file, prepare_picture, save_figure
 from tactomo.errors import TactomoError
-from tactomo_models import SensorDescription, available_methods, load_description
+from tactomo_models import available_methods, load_description
 
-from tactomo_lab.evaluation import moving, trade_off
-from tactomo_lab.evaluation.field import scenes_of_regime
-from tactomo_lab.evaluation.sequences import mixed_sequence
-from tactomo_lab.evaluation.still import Variant
+from tactomo_lab.commands.report import shown, usable
+from tactomo_lab.evaluation import trade_off
+from tactomo_lab.evaluation.moving import mixed_sequence
+from tactomo_lab.evaluation.regimes import make_case
+from tactomo_lab.scenes.case import Case
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -86,49 +87,31 @@ def measure_chart(name: str, count: int, methods: Sequence[str] = ()) -> list[tr
     """
     sensor = load_description(name)
     methods = usable(sensor, methods or available_methods())
-    scenes = count * CONTACTS
-    with Progress(console=Console(stderr=True), transient=True) as progress:
-        still = [
-            list(
-                progress.track(
-                    scenes_of_regime(sensor, "mixed", SEEDS, scenes, snr_db=snr_db),
-                    total=scenes,
-                    description=f"simulating still scenes, {snr_db:g} dB",
-                )
-            )
-            for snr_db in STILL_SNR_DB
-        ]
-        numbers = progress.track(range(sequences(count)), description="simulating moving scenes")
-        played = [mixed_sequence(sensor, SEEDS, number, "each change") for number in numbers]
-        points: list[trade_off.Point] = []
-        with warned_if_busy():
-            for drawn in still:
-                asked = trade_off.variants(methods, trade_off.STILL_BUDGETS_S)
-                what = f"measuring on still scenes, {drawn[0].snr_db:g} dB"
-                task = progress.add_task(what, total=len(drawn) * len(asked))
-                points += trade_off.measure_still(drawn, asked, partial(progress.advance, task))
-            points += follow(played, trade_off.variants(methods), progress)
-    return points
+    scenes, points = count * CONTACTS, []
 
+    def still(snr_db: float) -> Iterator[Case]:
+        return (make_case(sensor, "mixed", SEEDS, n, snr_db=snr_db) for n in range(scenes))
 
-def usable(sensor: SensorDescription, methods: Sequence[str]) -> list[str]:
-    """Return the methods that serve a sensor; say on standard error why others are left out."""
-    missing = trade_off.left_out(sensor, methods)
-    for method, reason in missing.items():
-        typer.echo(f"left out: {method}: {reason}", err=True)
-    return [method for method in methods if method not in missing]
-
-
-def follow(
-    sequences: Sequence[moving.Sequence], asked: Sequence[Variant], progress: Progress
-) -> list[trade_off.Point]:
-    """Measure variants on moving scenes, a bar for each of them."""
-    points: list[trade_off.Point] = []
-    for variant in asked:
-        frames = sum(len(sequence.steps) for sequence in sequences)
-        task = progress.add_task(f"measuring on moving scenes: {variant}", total=frames)
-        points += trade_off.measure_moving(sequences, [variant], partial(progress.advance, task))
-        progress.remove_task(task)
+    drawn = [
+        list(shown(still(snr_db), scenes, f"simulating still scenes, {snr_db:g} dB"))
+        for snr_db in STILL_SNR_DB
+    ]
+    moving = [
+        mixed_sequence(sensor, SEEDS, number, "each change")
+        for number in shown(range(sequences(count)), sequences(count), "simulating moving scenes")
+    ]
+    frames = sum(len(case.frames) for case in moving)
+    with warned_if_busy(), Progress(console=Console(stderr=True), transient=True) as progress:
+        for cases, budgets_s in (
+            *((each, trade_off.STILL_BUDGETS_S) for each in drawn),
+            (moving, trade_off.BUDGETS_S),
+        ):
+            asked = trade_off.variants(methods, budgets_s)
+            kind = f"{'still' if cases[0].is_still else 'moving'} scenes"
+            what = f"measuring on {kind}, {cases[0].plan.snr_db:g} dB"
+            total = len(asked) * (frames if cases is moving else len(cases))
+            task = progress.add_task(what, total=total)
+            points += trade_off.measure(cases, asked, partial(progress.advance, task))
     return points
 
 

@@ -3,22 +3,66 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from tactomo.cli import options
 from tactomo.cli.commands import Group
-from tactomo.cli.output import print_json, table
+from tactomo.cli.output import table
 from tactomo.cli.plot.plot import picture_option
 
-if TYPE_CHECKING:
-    from tactomo_lab.evaluation.still import Outcome
+from tactomo_lab.commands.report import (
+    Picture,
+    Seeds,
+    chosen_names,
+    print_suite,
+    shown,
+    tell,
+    usable,
+)
 
-Item = TypeVar("Item")
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from tactomo_lab.evaluation.stability import CaseScore, Trust
+    from tactomo_lab.scenes.measures import Score, Summary
+
+MAPS = ("frames", "ICC", "worst", "shape", "RIE", "flagged", "wrong", "ms", "p99")
+CONTACTS = (*("counted", "missed", "false", "mm", "p95", "area"), *("Δσ", "spread", "kPa", "in σ"))
+PHASES = (
+    *("frames", "ICC", "worst", "shape", "counted", "lost", "most", "ids"),
+    *("flagged", "wrong", "ms", "p99"),
+)
+FIELD_MAPS = (
+    *("frames", "ICC", "RIE", "worst", "shape", "flagged", "silent", "wrong", "alarms"),
+    *("ms", "p99"),
+)
+FIELD_CONTACTS = (
+    *("counted", "right to 10 %", "peak in σ", "surely wrong"),
+    *("mm", "in σ", "place in σ", "area in σ", "overload right", "overload wrong"),
+)
+DAYS = (
+    *("frames", "ghosts/h", "ghosts", "presses", "unseen", "erased", "hidden"),
+    *("distrusted", "refused", "firm Δσ"),
+)
+FEWER = 10  # frames without tracking are slow, for all that they show
+NAME_WIDTH, CELL_WIDTH = 17, 16  # characters of the first and of the other columns of regimes
+IN_WORDS = "auto"  # the method whose doings are told in words, where it is among those asked for
+
+SnrOf = Annotated[
+    Literal["change", "voltage"],
+    typer.Option(
+        help="What noise is measured by: the rms of a channel's voltage changes, or of its "
+        "voltages at rest, of which changes are a few percent or less."
+    ),
+]
 
 app = options.typer_app(
     name="evaluate",
@@ -27,18 +71,17 @@ app = options.typer_app(
     no_args_is_help=True,
 )
 
-Seeds = Annotated[
-    Literal["tuning", "reporting"],
-    typer.Option(help="Tune on the one set of scenes, publish figures of the other."),
-]
-SnrOf = Annotated[
-    Literal["change", "voltage"],
-    typer.Option(
-        help="What noise is measured by: the rms of a channel's voltage changes, or of its "
-        "voltages at rest, of which changes are a few percent or less."
-    ),
-]
-Picture = Annotated[Path | None, picture_option("Draw truth and outcome")]
+
+def _settings(sensor: str, seeds: str, **more: Any) -> dict[str, Any]:
+    return {"simulated": True, "sensor": sensor, "seeds": seeds, **more}
+
+
+def _in_words(settings: dict[str, Any]) -> str:
+    of = "{sensor}, {seeds} seeds, method [bold]{method}[/], SNR of the {snr_of}"
+    return of.format(**settings)
+
+
+# ------------------------------------------------------------------ still scenes
 
 
 @app.command(
@@ -72,7 +115,9 @@ def scenes(
     """
     from tactomo_models import load_description
 
-    from tactomo_lab.evaluation.still import reconstruct_scenes
+    from tactomo_lab.commands.pictures import draw_outcomes
+    from tactomo_lab.evaluation.play import play
+    from tactomo_lab.scenes.measures import summaries, summarise
     from tactomo_lab.scenes.still_scenes import scenes as draw_scenes
 
     numbers, ratios = _range(contacts), _decibels(snr)
@@ -82,80 +127,30 @@ def scenes(
         for ratio in ratios
     )
     total = count * len(numbers) * len(ratios)
-    outcomes = list(shown(reconstruct_scenes(drawn, method), total, f"{seeds} scenes"))
-    settings = settings_of(description.name, seeds, snr_of, method)
-    if as_json:
-        print_json({**settings, "scenes_each": count, **_as_json(outcomes)})
-    else:
-        _print_scenes(settings, outcomes)
-    if picture is not None:
-        from tactomo_lab.commands.pictures import draw_outcomes
+    outcomes = list(shown(play(drawn, method), total, f"{seeds} scenes"))
+    scores = [outcome.score for outcome in outcomes]
+    of_all, by = summarise(scores), summaries(scores)
+    settings = _settings(description.name, seeds, snr_of=snr_of, method=method)
 
-        draw_outcomes(outcomes, picture)
-        typer.echo(f"wrote {picture}", err=True)
+    def show(console: Console) -> None:
+        groups = {"all": of_all}
+        for name, rows in by.items():
+            if len(rows) > 1:
+                groups |= {f"{name} {value}": summary for value, summary in rows.items()}
+        tables = {"maps, cold start": MAPS, "contacts": CONTACTS}
+        print_suite(console, _in_words(settings), tables, groups)
 
-
-@app.command(
-    epilog=options.examples(
-        "tactomo evaluate moving",
-        "tactomo evaluate moving --count 10 --snr 20 --budget-ms 100",
-        "tactomo evaluate moving --seeds reporting --json > moving.json",
-    )
-)
-def moving(
-    seeds: Seeds = "tuning",
-    count: Annotated[int, typer.Option(min=1, help="Sequences.")] = 3,
-    snr: Annotated[float, typer.Option(help="Signal-to-noise ratio in dB.")] = 40.0,
-    snr_of: SnrOf = "change",
-    method: options.Method = "auto",
-    budget_ms: Annotated[
-        float | None, typer.Option(min=1.0, help="Compute time a frame may take. [the daemon's]")
-    ] = None,
-    sensor: options.Description = options.DEFAULT_DESCRIPTION,
-    as_json: options.JsonOutput = False,
-) -> None:
-    """Follow simulated contacts that slide, land, lift, jump, merge and split, frame by frame.
-
-    With lost scans and a tare on the way, at 20 frames a second, under the budget that the daemon
-    has. Each sequence has sheets of its own, as in `tactomo evaluate scenes`. The first run
-    simulates (a minute a sequence) and keeps the voltages in the cache.
-    """
-    from rich.console import Console
-    from rich.progress import Progress
-    from tactomo_models import load_description
-
-    from tactomo_lab.evaluation.moving import draw_sequence, play, summarise_phases
-
-    description = load_description(sensor)
-    played = []
-    with Progress(console=Console(stderr=True), transient=True) as shown:
-        for number in range(count):
-            task = shown.add_task(f"simulating sequence {number + 1} of {count}", total=None)
-            sequence = draw_sequence(description, seeds, number, snr_db=snr, snr_of=snr_of)
-            name = f"reconstructing sequence {number + 1} of {count}"
-            shown.update(task, description=name, total=len(sequence.steps))
-            scores = []
-            for score in play(sequence, method, None if budget_ms is None else budget_ms / 1e3):
-                scores.append(score)
-                shown.advance(task)
-            played.append(scores)
-            shown.remove_task(task)
-    phases = summarise_phases(played)
-    settings = settings_of(description.name, seeds, snr_of, method)
-    if as_json:
-        settings |= {"snr_db": snr, "budget_ms": budget_ms}
-        rows = {name: asdict(summary) for name, summary in phases.items()}
-        frames = [[asdict(score) for score in scores] for scores in played]
-        print_json({**settings, "phases": rows, "sequences": frames})
-    else:
-        print_tables(
-            settings,
-            phases,
-            {f"{count} sequences, {snr:g} dB": PHASES},
-            "worst: ICC that 95 % exceed; shape: ICC of the pressed shape; lost: longest run of "
-            "frames in which that is below 0.8, median and most; ids: identities lost; wrong: "
-            "frames with an ICC below 0.8 or another count, and no flag that says so.",
-        )
+    told = {
+        **settings,
+        "scenes_each": count,
+        "all": asdict(of_all),
+        "by": {
+            name: {value: asdict(summary) for value, summary in rows.items()}
+            for name, rows in by.items()
+        },
+        "scenes": [one.as_json() for one in scores],
+    }
+    tell(told, as_json, show, picture, partial(draw_outcomes, outcomes))
 
 
 def _range(text: str) -> range:
@@ -183,126 +178,297 @@ def _decibels(text: str) -> list[float]:
     return ratios
 
 
-def chosen_names(text: str | None, known: Iterable[str], option: str) -> list[str]:
-    """Return the names from "a,b", in that order; all where nothing was asked for."""
-    known = list(known)
-    names = known if text is None else [name.strip() for name in text.split(",")]
-    for name in names:
-        if name not in known:
-            choices = ", ".join(known)
-            raise typer.BadParameter(f"{option} {name!r}: give one or more of {choices}")
-    return list(dict.fromkeys(names))
+# ------------------------------------------------------------------ moving scenes
 
 
-def shown(items: Iterable[Item], total: int | None, what: str) -> Iterator[Item]:
-    """Pass items on, with a progress bar in the terminal; without an end if there is no total."""
-    from rich.console import Console
-    from rich.progress import track
+@app.command(
+    epilog=options.examples(
+        "tactomo evaluate moving",
+        "tactomo evaluate moving --count 10 --snr 20 --budget-ms 100",
+        "tactomo evaluate moving --seeds reporting --json > moving.json",
+    )
+)
+def moving(
+    seeds: Seeds = "tuning",
+    count: Annotated[int, typer.Option(min=1, help="Sequences.")] = 3,
+    snr: Annotated[float, typer.Option(help="Signal-to-noise ratio in dB.")] = 40.0,
+    snr_of: SnrOf = "change",
+    method: options.Method = "auto",
+    budget_ms: Annotated[
+        float | None, typer.Option(min=1.0, help="Compute time a frame may take. [the daemon's]")
+    ] = None,
+    sensor: options.Description = options.DEFAULT_DESCRIPTION,
+    as_json: options.JsonOutput = False,
+) -> None:
+    """Follow simulated contacts that slide, land, lift, jump, merge and split, frame by frame.
 
-    yield from track(
-        items, description=what, total=total, console=Console(stderr=True), transient=True
+    With lost scans and a tare on the way, at 20 frames a second, under the budget that the daemon
+    has. Each sequence has sheets of its own, as in `tactomo evaluate scenes`. The first run
+    simulates (a minute a sequence) and keeps the voltages in the cache.
+    """
+    from tactomo_models import load_description
+
+    from tactomo_lab.evaluation.moving import draw_sequence, summarise_phases
+    from tactomo_lab.evaluation.play import Variant, play
+
+    description = load_description(sensor)
+    draw = partial(draw_sequence, description, seeds, snr_db=snr, snr_of=snr_of)
+    variant = Variant(method, None if budget_ms is None else budget_ms / 1e3)
+    played = []
+    for number in range(count):
+        outcomes = play(map(draw, [number]), variant)
+        name = f"sequence {number + 1} of {count}"
+        played.append([outcome.score for outcome in shown(outcomes, None, name)])
+    phases = summarise_phases(played)
+    settings = _settings(description.name, seeds, snr_of=snr_of, method=method)
+    told = {
+        **settings,
+        "snr_db": snr,
+        "budget_ms": budget_ms,
+        "phases": {name: asdict(summary) for name, summary in phases.items()},
+        "sequences": [[asdict(score) for score in scores] for scores in played],
+    }
+    tables = {f"{count} sequences, {snr:g} dB": PHASES}
+    tell(told, as_json, lambda to: print_suite(to, _in_words(settings), tables, phases))
+
+
+# ------------------------------------------------------------------ the field's rows
+
+
+@app.command(
+    epilog=options.examples(
+        "tactomo evaluate field",
+        "tactomo evaluate field --rows soft,graded --method fit --count 30",
+        "tactomo evaluate field --seeds reporting --count 50 --json > field.json",
+        "tactomo evaluate field --rows soft --picture soft_press.png",
+    )
+)
+def field(
+    seeds: Seeds = "tuning",
+    count: Annotated[int, typer.Option(min=1, help="Scenes of each line.")] = 10,
+    rows: Annotated[str | None, typer.Option(help="Which rows, with commas. [all of them]")] = None,
+    method: options.Method = "auto",
+    sensor: options.Description = options.DEFAULT_DESCRIPTION,
+    picture: Annotated[
+        Path | None,
+        picture_option("Draw one soft contact, the middle one by correlation: truth and method"),
+    ] = None,
+    as_json: options.JsonOutput = False,
+) -> None:
+    """Reconstruct what one pressure field has to explain: soft presses, one graded sheet, crowds.
+
+    *ordinary*: one to four contacts, at 40, 20 and 10 dB of the change; the others at 40.
+    *rectangles-rings*: of those shapes alone. *hand-made*: electrodes 1 mm off, contact impedances
+    by 30 %, sheets uneven by 10 %. *soft*: balls of 180 to 300 kPa, at 60 dB of the voltages.
+    *graded*: one sheet alone that answers from 0 kPa on. *crowded*: five or six small contacts;
+    *many*: eight to ten. *mixed*: flat ellipses, rectangles, rings and balls side by side, on
+    skins made by hand, at 60 dB of the voltages. *moving*: a sequence of `tactomo evaluate moving`
+    for every ten scenes, without the frames whose scans are lost. *mixed-moving*: such a sequence
+    of mixed presses that land, glide, change pressure and lift, with noise 40 dB under each
+    frame's change and with noise 60 dB under the voltages. *palm*: one contact of 60 mm or more
+    across and 2 to 200 kPa, which comes in a second to ten minutes while the reference follows.
+    *overload*: one to three presses, the first or all beyond the response table's end. All are
+    simulated as in `tactomo evaluate scenes`, still ones reconstructed from a cold start. The
+    first run simulates (a second a scene, a minute a sequence, 10 s a palm) and keeps the voltages
+    in the cache.
+    """
+    from tactomo_models import ModelError, load_description
+
+    from tactomo_lab.commands.pictures import draw_press
+    from tactomo_lab.evaluation.field import ROWS, STILL_ROWS, middle_press, scores_of_row
+    from tactomo_lab.scenes.measures import summarise
+
+    description = load_description(sensor)
+    scores: dict[str, list[Score]] = {}
+    for row in chosen_names(rows, ROWS, "--rows"):
+        total = count if row in STILL_ROWS else None
+        for line, frames in scores_of_row(description, row, method, seeds, count).items():
+            try:
+                scores[line] = list(shown(frames, total, line))
+            except ModelError as error:  # of a row's own sensor, for which a method may not serve
+                typer.echo(f"left out: {line}: {error}", err=True)
+    settings = _settings(description.name, seeds, snr_of="change", method=method)
+    found: dict[str, Summary] = {line: summarise(own) for line, own in scores.items()}
+    lines = {
+        line: {**asdict(found[line]), "scores": [asdict(one) for one in own]}
+        for line, own in scores.items()
+    }
+    tables = {"maps": FIELD_MAPS, "contacts": FIELD_CONTACTS}
+    tell(
+        {**settings, "scenes_each": count, "lines": lines},
+        as_json,
+        lambda console: print_suite(console, _in_words(settings), tables, found),
+        picture,
+        lambda output: draw_press(middle_press(description, method, seeds, count), output),
     )
 
 
-def _as_json(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    from tactomo_lab.scenes.measures import summaries, summarise
+# ------------------------------------------------------------------ days that drift
 
-    scores = [outcome.score for outcome in outcomes]
-    return {
-        "all": asdict(summarise(scores)),
-        "by": {
-            name: {value: asdict(summary) for value, summary in rows.items()}
-            for name, rows in summaries(scores).items()
+
+@app.command(
+    epilog=options.examples(
+        "tactomo evaluate drift",
+        "tactomo evaluate drift --hours 3 --json",
+        "tactomo evaluate drift --seeds reporting --count 2 --picture drift.png",
+    )
+)
+def drift(
+    seeds: Seeds = "tuning",
+    count: Annotated[int, typer.Option(min=1, help="Days.")] = 1,
+    hours: Annotated[float, typer.Option(min=0.5, max=48.0, help="How long a day is.")] = 24.0,
+    sensor: options.Description = options.DEFAULT_DESCRIPTION,
+    picture: Picture = None,
+    as_json: options.JsonOutput = False,
+) -> None:
+    """Live through days of a skin that drifts, with baseline tracking and without.
+
+    The temperature swings by 10 K over a day and steps by 2 K once, by 2 % of conductivity per
+    kelvin, a tenth of it unevenly; what is pressed creeps by 1 % per decade of time and comes back
+    as slowly; contact impedances wander by 10 %. Presses last from seconds to two hours, a third
+    of them too light for the magnitude channel. A frame comes every 20 s, and two a second while
+    something is pressed or let go; every tenth of the former without tracking.
+
+    The first run simulates (some minutes a day) and keeps the voltages in the cache.
+    """
+    from tactomo_models import load_description
+
+    from tactomo_lab.commands.pictures import draw_day
+    from tactomo_lab.evaluation.drifting import live, simulate_day, summarise_day
+
+    description = load_description(sensor)
+    days, found, rows = [], {}, []
+    for number in range(count):
+        day = simulate_day(description, seeds, number, hours)
+        name = f"{seeds} {number}"
+        seen = {}
+        for way, every in (("tracked", 1), ("untracked", FEWER)):
+            frames = live(day, track=way == "tracked", every=every)
+            total = sum(1 for _ in day.times(every))
+            seen[way] = list(shown(frames, total, f"{name}, {way}"))
+            found[f"{name}, {way}"] = summarise_day(seen[way], hours)
+        days.append((day, seen))
+        rows.append({"day": name, **{way: asdict(found[f"{name}, {way}"]) for way in seen}})
+    what = f"{description.name}, {seeds} seeds, {hours:g} hours after one tare"
+    tell(
+        {**_settings(description.name, seeds, hours=hours), "days": rows},
+        as_json,
+        lambda console: print_suite(console, what, {"days": DAYS}, found),
+        picture,
+        lambda output: draw_day(days[0][0], days[0][1], output),
+    )
+
+
+# ------------------------------------------------------------------ where methods fail
+
+
+@app.command(
+    epilog=options.examples(
+        "tactomo evaluate stability --count 2",
+        "tactomo evaluate stability --regime jump,drift --method auto --picture flags.png",
+        "tactomo evaluate stability --seeds reporting --jobs 2 --json > stability.json",
+    )
+)
+def stability(
+    seeds: Seeds = "tuning",
+    count: Annotated[int, typer.Option(min=1, help="Cases of each regime.")] = 6,
+    regime: Annotated[
+        str | None, typer.Option(help="Which regimes, with commas. [all of them]")
+    ] = None,
+    method: Annotated[list[str] | None, options.methods_option(" [all that are available]")] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes that share the work.")] = 1,
+    sensor: options.Description = options.DEFAULT_DESCRIPTION,
+    picture: Annotated[Path | None, picture_option("Draw an overview")] = None,
+    as_json: options.JsonOutput = False,
+) -> None:
+    """Break what reconstruction relies on, one regime at a time, and see whether it is flagged.
+
+    Noise, small contacts, many contacts, bad leads, drift, a stretched sheet, jumps and more: some
+    simulated cases of each regime, reconstructed by every method. A map is bad where its ICC is
+    below 0.7. What tells not to trust it: the flags misfit_high, not_converged, low_confidence,
+    reference_mismatch, noise_high and channels_swapped, or that there is no map. The first run
+    simulates (a second a case, some more where a case is several frames) and keeps the voltages
+    in the cache.
+    """
+    from tactomo_models import available_methods, load_description
+
+    from tactomo_lab.commands.pictures import draw_overview
+    from tactomo_lab.evaluation.regimes import REGIMES
+    from tactomo_lab.evaluation.stability import evaluate_regimes, trust_by_regime
+
+    regimes = chosen_names(regime, REGIMES, "--regime")
+    description = load_description(sensor)
+    chosen = method or usable(description, available_methods())
+    cases = evaluate_regimes(description, regimes, chosen, seeds, count, jobs=jobs)
+    total = len(regimes) * count
+    scores = [one for case in shown(cases, total, f"{seeds} cases") for one in case]
+    by_regime = trust_by_regime(scores)
+    told = {
+        **_settings(description.name, seeds, cases_each=count, methods=chosen),
+        "regimes": {
+            name: {
+                "what": REGIMES[name].what if name in REGIMES else "all of these regimes",
+                "methods": {of: asdict(counts) for of, counts in by_method.items()},
+            }
+            for name, by_method in by_regime.items()
         },
-        "scenes": [one.as_json() for one in scores],
+        "cases": [one.as_json() for one in scores],
     }
 
+    def show(console: Console) -> None:
+        what = f"{description.name}, {seeds} seeds, {count} case(s) of each regime"
+        console.print(f"Simulated, not measured: {what}.")
+        _print_regimes(console, by_regime, scores)
 
-def settings_of(sensor: str, seeds: str, snr_of: str, method: str) -> dict[str, Any]:
-    """Return what was evaluated, for JSON and `print_settings`."""
-    return {"simulated": True, "sensor": sensor, "seeds": seeds, "snr_of": snr_of, "method": method}
+    tell(told, as_json, show, picture, partial(draw_overview, by_regime))
 
 
-def print_tables(
-    settings: dict[str, Any],
-    groups: Mapping[str, object],  # summaries by their names
-    tables: Mapping[str, Sequence[str]],  # by their titles, columns out of `FIGURES`
-    legend: str,
+def _print_regimes(
+    console: Console, rows: dict[str, dict[str, Trust]], scores: Sequence[CaseScore]
 ) -> None:
-    """Print what was evaluated, and tables of what came out."""
-    from rich.console import Console
-
-    console = Console()
+    fit = max(1, (console.width - NAME_WIDTH) // CELL_WIDTH)
+    methods = list(rows["all"])
+    for first in range(0, len(methods), fit):  # as many tables as the terminal is too narrow for
+        console.print(_counts(rows, methods[first : first + fit]))
     console.print(
-        f"Simulated, not measured: {settings['sensor']}, {settings['seeds']} seeds, method "
-        f"[bold]{settings['method']}[/], SNR of the {settings['snr_of']}."
+        "[dim]Each cell: mean ICC; bad maps (ICC < 0.7) without a flag that tells to distrust, of "
+        "all bad ones; good maps with one, of all good ones.[/]\n"
     )
-    for title, columns in tables.items():
-        made = table("", *columns, title=title)
-        for name, summary in groups.items():
-            cells = (FIGURES[column](summary).replace("nan", "-") for column in columns)
-            made.add_row(name, *cells)
-        console.print(made)
-    console.print(f"[dim]{legend}[/]")
+    method = IN_WORDS if IN_WORDS in methods else methods[0]
+    console.print(_doings(method, [one for one in scores if one.method == method]))
 
 
-def _print_scenes(settings: dict[str, Any], outcomes: Sequence[Outcome]) -> None:
-    from tactomo_lab.scenes.measures import summaries, summarise
-
-    scores = [outcome.score for outcome in outcomes]
-    groups = {"all": summarise(scores)}
-    for name, rows in summaries(scores).items():
-        if len(rows) > 1:
-            groups |= {f"{name} {value}": summary for value, summary in rows.items()}
-    print_tables(
-        settings,
-        groups,
-        {"maps, cold start": MAPS, "contacts": CONTACTS},
-        "worst: ICC that 95 % exceed; shape: ICC of the pressed shape; wrong: ICC below 0.8 "
-        "or another count, and no flag that says so. counted: right; missed: of the true contacts; "
-        "false: a scene; mm: centre error, median; Δσ: error of the magnitude, mean, share of the "
-        "range; spread: largest minus smallest at one pressure; in σ: within one reported "
-        "standard uncertainty, 68 % where that is right.",
-    )
+def _counts(rows: dict[str, dict[str, Trust]], methods: Sequence[str]) -> Table:
+    made = table("", *methods)
+    for regime, by_method in rows.items():
+        if regime == "all":
+            made.add_section()
+        made.add_row(regime, *(_trust(by_method[method]) for method in methods))
+    return made
 
 
-# What tables of a summary show under each heading; of a phase, what stands under the same ones.
-FIGURES: dict[str, Callable[[Any], str]] = {
-    "frames": lambda s: str(s.frames),
-    "ICC": lambda s: f"{s.icc:.3f}",
-    "worst": lambda s: f"{s.icc_worst:.2f}",
-    "shape": lambda s: f"{s.icc_structure:.3f}",
-    "RIE": lambda s: f"{s.rie:.3f}",
-    "flagged": lambda s: f"{s.distrusted:.0%}",
-    "silent": lambda s: f"{s.bad_unflagged:.0%}",
-    "alarms": lambda s: f"{s.good_flagged:.0%}",
-    "wrong": lambda s: f"{s.confidently_wrong:.0%}",
-    "ms": lambda s: f"{s.seconds * 1e3:.0f}",
-    "p99": lambda s: f"{s.seconds_99 * 1e3:.0f}",
-    "counted": lambda s: f"{s.count_right:.0%}",
-    "missed": lambda s: f"{s.missed:.0%}",
-    "false": lambda s: f"{s.false:.2f}",
-    "mm": lambda s: f"{s.centre_mm:.2f}",
-    "p95": lambda s: f"{s.centre_mm_95:.1f}",
-    "right to 10 %": lambda s: f"{s.peak_right:.0%}",
-    "overload right": lambda s: f"{s.overload_right:.0%}",
-    "overload wrong": lambda s: f"{s.overload_wrong:.0%}",
-    "surely wrong": lambda s: f"{s.peak_surely_wrong:.0%}",
-    "area": lambda s: f"{s.area_error:.0%}",
-    "Δσ": lambda s: f"{s.magnitude_error:.1%}",
-    "spread": lambda s: f"{s.magnitude_spread:.0%}",
-    "kPa": lambda s: f"{s.pressure_error_kpa:.1f}",
-    "in σ": lambda s: f"{s.within_sigma:.0%}",
-    "place in σ": lambda s: f"{s.place_within_sigma:.0%}",
-    "area in σ": lambda s: f"{s.area_within_sigma:.0%}",
-    "peak in σ": lambda s: f"{s.peak_within_sigma:.0%}",
-    "lost": lambda s: f"{s.recovery:.0f}",
-    "most": lambda s: f"{s.recovery_most:.0f}",
-    "ids": lambda s: str(s.switches),
-}
-MAPS = ("frames", "ICC", "worst", "shape", "RIE", "flagged", "wrong", "ms", "p99")
-CONTACTS = (*("counted", "missed", "false", "mm", "p95", "area"), *("Δσ", "spread", "kPa", "in σ"))
-PHASES = (
-    *("frames", "ICC", "worst", "shape", "counted", "lost", "most", "ids"),
-    *("flagged", "wrong", "ms", "p99"),
-)
+def _trust(counts: Trust) -> str:
+    if not counts.maps:  # the method does not serve this regime's sensor
+        return "-"
+    silent = f"{counts.bad_unwarned}/{counts.bad}"
+    if counts.bad_unwarned:
+        silent = f"[red]{silent}[/]"
+    return f"{counts.icc:.2f} {silent} {counts.good_warned}/{counts.maps - counts.bad}"
+
+
+def _doings(method: str, scores: Sequence[CaseScore]) -> Table:
+    """What one method did in each regime: tiers that made the maps, and flags."""
+    from tactomo_lab.evaluation.regimes import REGIMES
+
+    columns = ("", "what goes wrong", "made by", "flags")
+    made = table(*columns, left=columns, title=f"what {method} did")
+    for regime in dict.fromkeys(one.regime for one in scores):
+        own = [one for one in scores if one.regime == regime]
+        tiers = Counter(one.tier for one in own)
+        flags = Counter(flag for one in own for flag in one.flags)
+        made.add_row(regime, REGIMES[regime].what, _tally(tiers), _tally(flags))
+    return made
+
+
+def _tally(counts: Counter[str]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in counts.most_common()) or "none"

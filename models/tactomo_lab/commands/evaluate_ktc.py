@@ -10,8 +10,8 @@ from tactomo.cli.options import Description, JsonOutput, examples, typer_app
 from tactomo.cli.output import print_json, table
 from tactomo.cli.plot.plot import save_figure
 
-from tactomo_lab.commands.evaluate import Picture, shown
 from tactomo_lab.commands.measured import tank_of
+from tactomo_lab.commands.report import Picture, shown
 
 if TYPE_CHECKING:
     from tactomo_lab.evaluation.ktc import Challenge, ChallengeOutcome

@@ -16,13 +16,13 @@ from tactomo.cli.output import print_json, table
 from tactomo.cli.plot.plot import prepare_folder
 from tactomo.errors import TactomoError
 
-from tactomo_lab.commands.evaluate import Seeds, shown
+from tactomo_lab.commands.report import Seeds, shown
 
 if TYPE_CHECKING:
     from rich.table import Table
     from tactomo_models import SensorDescription
 
-    from tactomo_lab.evaluation.paper import Case, Frame, Rig
+    from tactomo_lab.evaluation.paper import Arrangement, Frame, Rig
 
 FIGURES = (5, 7, 8, 9, 10, 11, 12)
 
@@ -157,14 +157,14 @@ def _figures(text: str) -> set[int]:
 def _simulation_study(study: _Study, asked: set[int]) -> _Part:
     from tactomo_lab.commands.paper_pictures import draw_simulation
     from tactomo_lab.evaluation.paper import COUNTS, SNR_DB, cells, paper_scenes
-    from tactomo_lab.evaluation.still import reconstruct_scenes
+    from tactomo_lab.evaluation.play import play
 
     drawn = chain.from_iterable(
         paper_scenes(study.description, study.seeds, study.count, snr_db=snr_db)
         for snr_db in SNR_DB
     )
     total = study.count * len(COUNTS) * len(SNR_DB) * len(study.methods)
-    points = cells(shown(reconstruct_scenes(drawn, *study.methods), total, "Fig. 5"))
+    points = cells(shown(play(drawn, *study.methods), total, "Fig. 5"))
     measures = (f"{measure} {n}" for measure in ("RIE", "ICC") for n in COUNTS)
     made = table("noise", "method", *measures, left=("method",))
     summary = {(p.snr_db, p.method, p.contacts): p.summary for p in points}
@@ -344,7 +344,7 @@ EXPERIMENTS: dict[tuple[int, ...], Callable[[_Study, set[int]], _Part]] = {
 }
 
 
-def _image(study: _Study, cases: Sequence[Case], what: str) -> list[Frame]:
+def _image(study: _Study, cases: Sequence[Arrangement], what: str) -> list[Frame]:
     from tactomo_lab.evaluation.paper import frames_of, image_cases
 
     total = frames_of(cases) * len(study.rigs) * len(study.methods)

@@ -10,7 +10,7 @@ import typer
 from tactomo.cli.options import JsonOutput, examples, typer_app
 from tactomo.cli.output import print_json, table
 
-from tactomo_lab.commands.evaluate import shown
+from tactomo_lab.commands.report import shown
 
 app = typer_app()
 

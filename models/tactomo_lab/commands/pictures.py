@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +16,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from tactomo_models import SensorDescription
 
-    from tactomo_lab.evaluation.still import Outcome
+    from tactomo_lab.evaluation.drifting import Day, Seen
+    from tactomo_lab.evaluation.play import Outcome
+    from tactomo_lab.evaluation.stability import Trust
 
 ROWS = 4  # scenes of each kind
 CHANGE = "|Δσ|/σ₀"
@@ -38,7 +42,7 @@ def draw_outcomes(outcomes: Sequence[Outcome], output: Path) -> None:
     size = (8.5 * len(kinds), 2.3 * min(ROWS, len(by_icc)) + 0.5)
     figure = Figure(figsize=size, layout="constrained")
     halves: Any = figure.subfigures(1, len(kinds), squeeze=False)[0]
-    size_mm = _size_mm(outcomes[0].scene.description)
+    size_mm = _size_mm(outcomes[0].case.description)
     for half, (kind, chosen) in zip(halves, kinds.items(), strict=True):
         half.suptitle(f"{kind} (maps of {size_mm})")
         grid = half.subplots(len(chosen), 4, squeeze=False)
@@ -48,9 +52,9 @@ def draw_outcomes(outcomes: Sequence[Outcome], output: Path) -> None:
 
 
 def _draw_outcome(axes: Any, outcome: Outcome) -> None:
-    score, truth, frame = outcome.score, outcome.scene.truth, outcome.frame
+    score, truth, frame = outcome.score, outcome.case.truth, outcome.made
     top = max(truth.map.max(), 0.0 if frame.map is None else float(frame.map.max()))
-    sensor = outcome.scene.description
+    sensor = outcome.case.description
     images = (
         (truth.map, top, f"{score.scene}, {score.snr_db:g} dB\ntrue {CHANGE}"),
         (frame.map, top, f"found {CHANGE}, + centres\ncorrelation {score.icc:.3f}"),
@@ -79,16 +83,16 @@ def draw_press(
     """
     from matplotlib.figure import Figure
 
-    scene, frame = outcome.scene, outcome.frame
-    (press,) = scene.layout.presses
-    sensor, truth = scene.description, scene.truth
+    case, frame = outcome.case, outcome.made
+    (press,) = outcome.frame.presses.values()
+    sensor, truth = case.description, case.truth
     figure = Figure(figsize=(11.5, 4), layout="constrained")
     axes: Any = figure.subplots(1, 3)
     maps = (truth.map, frame.map)
     highest = max(float(image.max()) for image in maps if image is not None)
     peaks = [f"{c.peak_kpa:.0f} ± {c.peak_sigma_kpa:.0f} kPa" for c in frame.contacts]
     titles = (
-        f"truth, {scene.layout}, {_size_mm(sensor)}\npeak {press.pressure_kpa:.0f} kPa",
+        f"truth, {case.name}, {_size_mm(sensor)}\npeak {press.pressure_kpa:.0f} kPa",
         f"{outcome.method}, correlation {outcome.score.icc:.3f}\npeak {', '.join(peaks) or 'none'}",
     )
     for panel, image, title in zip(axes, maps, titles, strict=False):
@@ -106,6 +110,79 @@ def draw_press(
     axes[2].set_ylim(top=1.3 * axes[2].get_ylim()[1])  # the legend above the curves
     axes[2].set_title("pressure along the dotted line (kPa)", fontsize=10)
     axes[2].legend(fontsize=8, loc="upper center")
+    save_figure(figure, output)
+
+
+def draw_overview(rows: dict[str, dict[str, Trust]], output: Path) -> None:
+    """Draw regimes by methods: mean ICC as colour, and how many bad maps nothing warned of.
+
+    Raises TactomoError where the picture cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    methods = list(rows["all"])
+    icc = np.array([[counts.icc for counts in row.values()] for row in rows.values()])
+    size = (2.8 + 1.05 * len(methods), 1.9 + 0.3 * len(rows))
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots()
+    image = axes.imshow(icc, vmin=0, vmax=1, cmap="viridis", aspect="auto")
+    axes.set_xticks(range(len(methods)), methods, rotation=30, ha="left", rotation_mode="anchor")
+    axes.set_yticks(range(len(rows)), list(rows))
+    axes.tick_params(top=True, bottom=False, labeltop=True, labelbottom=False, length=0)
+    axes.axhline(len(rows) - 1.5, color="white", linewidth=3)
+    for row, by_method in enumerate(rows.values()):
+        for column, counts in enumerate(by_method.values()):
+            ink = "black" if counts.icc > 0.6 else "white"
+            icc_shown = f"{counts.icc:.2f}" if counts.maps else ""
+            axes.text(column - 0.44, row, icc_shown, va="center", fontsize=8, color=ink)
+            if counts.bad_unwarned:
+                _mark(axes, column + 0.44, row, f"{counts.bad_unwarned}/{counts.maps}")
+    figure.colorbar(image, ax=axes, label="mean ICC with the truth", aspect=30)
+    legend = (
+        "Red: maps with an ICC below 0.7 that no flag told to distrust, of all maps. "
+        "Blank: not for this sensor. Simulated."
+    )
+    figure.supxlabel(textwrap.fill(legend, int(13 * size[0])), fontsize=8)
+    save_figure(figure, output, dpi=DPI)
+
+
+def _mark(axes: Any, x: float, y: float, words: str) -> None:
+    box = {"facecolor": "tab:red", "edgecolor": "none", "pad": 1.5}
+    axes.text(x, y, words, va="center", ha="right", fontsize=8, color="white", bbox=box)
+
+
+def draw_day(day: Day, seen: dict[str, list[Seen]], output: Path) -> None:
+    """Draw the drift and how it is followed, and what is shown tracked and untracked."""
+    from matplotlib.figure import Figure
+
+    tracked, untracked = seen.values()
+    figure = Figure(figsize=(11, 6.5), layout="constrained")
+    axes: Any = figure.subplots(3, 1, sharex=True, height_ratios=(2, 2, 1.6))
+    hours = np.array([each.time_s / 3600 for each in tracked])
+    true = [100 * math.expm1(-day.skin.warming(each.time_s)) for each in tracked]
+    axes[0].plot(hours, true, color="0.6", lw=4, label="of the sheet, by temperature")
+    axes[0].plot(hours, [100 * e.gain for e in tracked], lw=1.2, label="followed")
+    axes[0].set_ylabel("voltages since\nthe tare (%)")
+    axes[0].legend(frameon=False)
+    pressed = [each for each in tracked if each.truth > 0]
+    times = [each.time_s / 3600 for each in pressed]
+    axes[1].plot(times, [e.truth for e in pressed], "_", color="0.6", mew=4, label="true")
+    axes[1].plot(times, [e.magnitude for e in pressed], ".", ms=3, label="tracked")
+    late = [each for each in untracked if each.truth > 0]
+    bare = [e.magnitude for e in late]
+    axes[1].plot([e.time_s / 3600 for e in late], bare, "x", ms=4, label="untracked")
+    axes[1].set_ylabel("|Δσ|/σ₀ of\nfirm presses")
+    axes[1].legend(frameon=False, ncols=3)
+    for each in day.skin.presses:
+        for axis in axes:
+            axis.axvspan(each.start_s / 3600, each.end_s / 3600, color="0.93", lw=0)
+    for label, frames in seen.items():
+        ghosts = [each.ghosts for each in frames]
+        axes[2].plot([e.time_s / 3600 for e in frames], ghosts, label=label)
+    axes[2].set_ylabel("contacts where\nnothing presses")
+    axes[2].set_xlabel("hours since the tare; grey: something presses (simulated)")
+    axes[2].set_xlim(hours[0], hours[-1])
+    axes[2].legend(loc="center right")  # framed: nothing says where ghosts leave room
     save_figure(figure, output)
 
 

@@ -19,10 +19,7 @@ from typing import Final
 
 import numpy as np
 from tactomo_models.arrays import FloatArray
-from tactomo_models.drift.baseline import BaselineTracker
-from tactomo_models.physics.artifact import Artifact, load_or_build_artifact
 from tactomo_models.physics.mesh import SheetMesh
-from tactomo_models.reconstruct import Reconstructor
 from tactomo_models.scans.plausibility import DISTRUST
 from tactomo_models.scans.reference import Reference
 from tactomo_models.scene.press import Press, strongest
@@ -32,26 +29,27 @@ from tactomo_models.simulation.simulator import conductivity_ratio, smooth_noise
 from tactomo_models.simulation.skin_drift import SkinDrift, decades_left
 from tactomo_protocol import Channel
 
-from tactomo_lab.scenes.cache import cached
+from tactomo_lab.evaluation.play import Player, Variant
+from tactomo_lab.scenes.case import (
+    REFERENCE_SCANS,
+    SIMULATION,
+    Case,
+    Frame,
+    as_described,
+    cached,
+)
+from tactomo_lab.scenes.drawing import SeedSet, require_both_channels, seed_of
 from tactomo_lab.scenes.simulation import (
     IMPEDANCE_DEVIATION,
     SHARP_M,
     UNEVENNESS,
     SheetState,
     UnevenSheet,
+    Volts,
     centroids,
     fine_mesh,
     fitted_mesh,
 )
-from tactomo_lab.scenes.still_scenes import (
-    REFERENCE_SCANS,
-    SIMULATION,
-    SeedSet,
-    require_both_channels,
-    seed_of,
-)
-
-Volts = dict[Channel, FloatArray]
 
 DRIFT: Final = SkinDrift(swing_k=10.0, creep=0.01)
 STEP_K: Final = 2.0  # somebody opens a window ...
@@ -239,7 +237,8 @@ class Day:
     skin: DriftingSkin
     hours: float
     stretches: tuple[Stretch, ...]
-    seed: np.random.SeedSequence
+    seed_set: SeedSet
+    number: int
 
     @cached_property
     def changes_s(self) -> FloatArray:
@@ -257,6 +256,26 @@ class Day:
         for time_s in np.unique(np.concatenate(times)):
             if 0 <= time_s < self.hours * 3600:
                 yield float(time_s), self.stretches[int(np.searchsorted(ends, time_s, "right"))]
+
+    def case(self, track: bool, every: int = 1) -> Case:
+        """The day's scans after one tare, of the frames of `times`."""
+        rng, description = (
+            np.random.default_rng(seed_of(self.seed_set, "drift noise", self.number)),
+            self.skin.description,
+        )
+        start = [self.scans(rng, self.stretches[0].at(0.0)) for _ in range(REFERENCE_SCANS)]
+        tare = Reference.from_scans(
+            np.array([scan[Channel.MAGNITUDE] for scan in start]),
+            np.array([scan[Channel.STRUCTURE] for scan in start]),
+        )
+        frames = [
+            Frame({}, self.scans(rng, stretch.at(time_s)), time_s=time_s)
+            for time_s, stretch in self.times(every)
+        ]
+        return Case(
+            *(self.seed_set, self.number, as_described(description), description, description),
+            *(tare, frames, track),
+        )
 
     def scans(self, rng: np.random.Generator, volts: Volts) -> Volts:
         """The volts with a converter's noise."""
@@ -296,7 +315,7 @@ def simulate_day(
         volts = {name: arrays[name][begin:end] for name in description.channels}
         stretches.append(Stretch(pressed, times_s, volts))
         begin = end
-    return Day(skin, hours, tuple(stretches), seed_of(seed_set, "drift noise", number))
+    return Day(skin, hours, tuple(stretches), seed_set, number)
 
 
 def _plan(
@@ -329,32 +348,15 @@ class Seen:
     state: str  # the tracker's; "off" without one
 
 
-def live(
-    day: Day, *, track: bool = True, every: int = 1, artifact: Artifact | None = None
-) -> Iterator[Seen]:
+def live(day: Day, *, track: bool = True, every: int = 1) -> Iterator[Seen]:
     """Reconstruct a day after one tare: all frames, or one of `every` and no bursts."""
-    description = day.skin.description
-    rng = np.random.default_rng(day.seed)
-    reconstructor = Reconstructor(description, artifact or load_or_build_artifact(description))
-    start = [day.scans(rng, day.stretches[0].at(0.0)) for _ in range(REFERENCE_SCANS)]
-    reference = Reference.from_scans(
-        np.array([scan[Channel.MAGNITUDE] for scan in start]),
-        np.array([scan[Channel.STRUCTURE] for scan in start]),
-    )
-    tracker = BaselineTracker(reconstructor) if track else None
-    if tracker is None:
-        reconstructor.set_reference(reference)
-    else:
-        tracker.begin(reference)
-    for time_s, stretch in day.times(every):
-        scan = day.scans(rng, stretch.at(time_s))
-        volts = (scan[Channel.MAGNITUDE], scan[Channel.STRUCTURE])
-        if tracker is None:
-            yield _seen(day, time_s, stretch.pressed, reconstructor.reconstruct(*volts), 0.0, "off")
-        else:
-            frame = tracker.reconstruct(time_s, *volts)
-            gain = tracker.drift[Channel.STRUCTURE].gain
-            yield _seen(day, time_s, stretch.pressed, frame, gain, tracker.state)
+    player = Player(day.skin.description)
+    played = player.play(day.case(track, every), Variant("auto"))
+    for frame, (time_s, stretch) in zip(played, day.times(every), strict=True):
+        gain, state = 0.0, "off"
+        if player.tracker is not None:
+            gain, state = player.tracker.drift[Channel.STRUCTURE].gain, player.tracker.state
+        yield _seen(day, time_s, stretch.pressed, frame.made, gain, state)
 
 
 def _seen(

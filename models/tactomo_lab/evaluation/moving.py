@@ -1,81 +1,92 @@
-"""A moving scene: contacts that slide, land, lift, jump, merge and split; lost scans; a tare.
+"""Moving scenes, at 20 frames a second: a choreography, presses of mixed kinds, a palm that comes.
 
-One choreography in eleven phases at 20 frames a second, played on a sheet of its own with
-indenters, place, contrast and sign drawn from its seed, under the budget that the daemon has.
-What is asked: how well each phase is followed, how soon a warm start recovers from what kills it,
-whether contacts keep their identity, and whether a wrong frame says so.
+*The choreography*: contacts that slide, land, lift, jump, merge and split, lost scans and a tare,
+in eleven phases, played on a sheet of its own with indenters, place, contrast and sign drawn from
+its seed. What is asked: how well each phase is followed, how soon a warm start recovers from what
+kills it, whether contacts keep their identity, and whether a wrong frame says so.
+
+*Mixed presses* are on skins made by hand. Each indenter has a lane of its own, clear of the others:
+it lands, glides along it, changes its pressure, and lifts. *A palm* comes in one second to ten
+minutes, while the daemon's reference follows the skin.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import combinations
+from typing import Final, Literal
 
 import numpy as np
 from tactomo_models.arrays import FloatArray
-from tactomo_models.drift.baseline import BaselineTracker
-from tactomo_models.errors import MethodError
-from tactomo_models.physics.artifact import load_or_build_artifact
-from tactomo_models.reconstruct import Reconstructor
-from tactomo_models.scans.plausibility import DISTRUST, Flag
 from tactomo_models.scans.reference import Reference
 from tactomo_models.scene.press import Press
-from tactomo_models.scene.reconstruction import Reconstruction
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_protocol import Channel
-from threadpoolctl import threadpool_limits
 
-from tactomo_lab.scenes.measures import (
-    WRONG_ICC,
-    FrameScore,
-    Summary,
-    correlation,
-    match,
-    percentile,
-    relative_error,
-    score_contacts,
-    summarise,
+from tactomo_lab.evaluation.regimes import (
+    CONVERTER_DB,
+    PALM_FRAMES,
+    PALM_KPA,
+    Draw,
+    by_hand_as_told,
+    draw_plan,
 )
-from tactomo_lab.scenes.simulation import (
-    TrueContact,
-    Truth,
-    UnevenSkin,
-    fine_mesh,
-    truth_of,
-    with_contrast,
-    with_opposite_magnitude,
-)
-from tactomo_lab.scenes.still_scenes import (
-    BOTH_CHANNELS,
-    CONTRAST,
-    GAP_M,
+from tactomo_lab.scenes.case import (
+    CONTACT_NAMES,
     REFERENCE_SCANS,
-    SIMULATION,
-    SeedSet,
-    SimulatedVolts,
+    Case,
+    Frame,
+    Plan,
+    Simulated,
     SnrOf,
-    gap_m,
-    kept_volts,
     noise_std,
+    simulate,
+)
+from tactomo_lab.scenes.drawing import (
+    BOTH_CHANNELS,
+    GAP_M,
+    SeedSet,
+    draw_contrast,
+    gap_m,
     require_both_channels,
     seed_of,
 )
+from tactomo_lab.scenes.measures import WRONG_ICC, Score, Summary, percentile, summarise
 
-Presses = dict[str, Press]
+Presses = Mapping[str, Press]
+NoiseOf = Literal["each change", "voltage"]
 
 TOUCHDOWN_KPA = 100.0  # of the first frame of a landing: the magnitude channel sees nothing yet
-LOST = DISTRUST | Flag.STRUCTURE_MISSING | Flag.MAGNITUDE_MISSING  # flags that excuse a frame
+INDENTERS = CONTACT_NAMES[:8]
+COMING: Final = "coming"  # phase in which a palm is lighter than any
+PALM_S = (1.0, 600.0)  # in which a palm comes
+NOISE_DB: Final[dict[NoiseOf, float]] = {"each change": 40.0, "voltage": CONVERTER_DB}
+FRAMES = (60, 120)  # of a sequence of mixed presses
+MAX_CONTACTS = 4  # of the first one, one fewer of each that follows
+REST_FRAMES = 4  # before anything lands
+LANDING_FRAMES = 3  # from the touch to the full pressure, and back
+GLIDE_MM = (5.0, 30.0)  # way of a press, in at least `GLIDE_FRAMES`: 120 mm/s at most
+GLIDE_FRAMES = 5
 
 
 @dataclass(frozen=True)
 class Step:
-    """One frame of the choreography."""
+    """One frame of a moving scene, before it is measured."""
 
     phase: str  # its name
     presses: Presses  # what presses, by the name of each contact
     lost: tuple[Channel, ...] = ()  # channels whose scan is lost
     tare: bool = False  # whether the reference is taken anew before it
+
+    @property
+    def countable(self) -> bool:
+        """Whether each contact touches another one, or is clear of it."""
+        gaps = [gap_m(one, other) for one, other in combinations(self.presses.values(), 2)]
+        return all(gap == 0 or gap >= GAP_M for gap in gaps)
+
+
+# ------------------------------------------------------------------ the choreography
 
 
 def choreography(
@@ -103,9 +114,8 @@ def choreography(
 
     here, jumped, beside = at("B", 40, 30), at("A", 10, -40), at("C", -35, -40)
     towards, away = path("C", (-35, -40), (-2, -40), 12), path("C", (-2, -40), (-35, -40), 12)
-    both: tuple[Channel, ...] = (Channel.MAGNITUDE, Channel.STRUCTURE)
     lost: dict[int, tuple[Channel, ...]] = {
-        4: both,
+        4: BOTH_CHANNELS,
         8: (Channel.STRUCTURE,),
         9: (Channel.STRUCTURE,),
         12: (Channel.MAGNITUDE,),
@@ -142,27 +152,6 @@ def choreography(
     ]
 
 
-INDENTERS = "ABCDEFGH"
-
-
-@dataclass(frozen=True)
-class Sequence:
-    """A moving scene as it is measured."""
-
-    name: str  # seed set and number
-    # the sensor as the reconstructor is told; see `scenes.EvaluationScene`
-    description: SensorDescription
-    true_description: SensorDescription  # the sensor as it is, with its true contrast
-    steps: tuple[Step, ...]  # the frames
-    volts: SimulatedVolts  # noise-free voltages, pressed (T, M)
-    snr_db: float  # signal-to-noise ratio
-    noise: dict[Channel, FloatArray]  # (T,) standard deviation of each channel's noise, volts
-    rest_noise: dict[Channel, float]  # likewise of the unpressed scans
-    seed: np.random.SeedSequence  # of the noise
-    # seconds between frames, in which the daemon's reference follows the skin; it stays if None
-    period_s: float | None = None
-
-
 def draw_sequence(
     description: SensorDescription,
     seed_set: SeedSet,
@@ -170,57 +159,32 @@ def draw_sequence(
     *,
     snr_db: float = 40.0,
     snr_of: SnrOf = "change",
-) -> Sequence:
-    """Draw and simulate a moving scene: about a minute, or read from the cache.
+) -> Case:
+    """Draw and simulate the choreography: about a minute, or read from the cache.
 
     Raises DataError where the sensor has a single channel.
     """
     require_both_channels(description)
     rng = np.random.default_rng(seed_of(seed_set, "moving", number))
-    contrast = float(np.exp(rng.uniform(*np.log(CONTRAST))))
-    sensor = with_opposite_magnitude(description) if rng.integers(2) else description
+    contrast, opposite = draw_contrast(rng), bool(rng.integers(2))
     quarters, mirrored = int(rng.integers(4)), bool(rng.integers(2))
     millimetre_m = description.width_m / 150
-    steps = tuple(
-        replace(
-            step,
-            presses={
-                name: _turned(press, quarters, mirrored) for name, press in step.presses.items()
-            },
-        )
+    steps = [
+        replace(step, presses={n: _turned(p, quarters, mirrored) for n, p in step.presses.items()})
         for step in choreography(_draw_indenters(rng, millimetre_m), millimetre_m)
-    )
-    true_sensor = with_contrast(sensor, contrast)
-
-    what = f"{SIMULATION} {seed_set} {number} {steps!r} {true_sensor.model_dump_json()}"
-    sheet_seed = seed_of(seed_set, "moving sheet", number)
-    volts = kept_volts(what, lambda: _simulate(true_sensor, steps, sheet_seed))
+    ]
+    plan = Plan(_frames(steps), contrast, opposite, snr_db=snr_db, snr_of=snr_of)
+    simulated = simulate(description, plan, seed_of(seed_set, "moving sheet", number))
     under_load = np.array([bool(step.presses) for step in steps])
-    loaded = replace(volts, pressed={n: scans[under_load] for n, scans in volts.pressed.items()})
+    pressed = {name: scans[under_load] for name, scans in simulated.volts.pressed.items()}
+    loaded = replace(simulated.volts, pressed=pressed)
     noise = {name: noise_std(loaded, name, snr_db, snr_of) for name in BOTH_CHANNELS}
-    return Sequence(
-        name=f"{seed_set} {number}",
-        description=sensor,
-        true_description=true_sensor,
-        steps=steps,
-        volts=volts,
-        snr_db=snr_db,
-        noise={name: np.full(len(steps), std) for name, std in noise.items()},
-        rest_noise=noise,
-        seed=seed_of(seed_set, "moving noise", number),
-    )
+    seed = seed_of(seed_set, "moving noise", number)
+    return follow(simulated, steps, noise, np.random.default_rng(seed), seed_set, number)
 
 
-def _simulate(
-    sensor: SensorDescription, steps: tuple[Step, ...], seed: np.random.SeedSequence
-) -> SimulatedVolts:
-    """Voltages of each channel at rest (M,) and in every step (T, M); each scene is solved once."""
-    skin = UnevenSkin(sensor, fine_mesh(sensor), seed)
-    scenes = [tuple(step.presses.values()) for step in steps]
-    known = {presses: skin.voltages(presses) for presses in dict.fromkeys(scenes)}
-    frames = {name: [known[presses][name] for presses in scenes] for name in BOTH_CHANNELS}
-    pressed = {name: np.array(volts) for name, volts in frames.items()}
-    return SimulatedVolts(skin.voltages([]), pressed)
+def _frames(steps: Iterable[Step]) -> tuple[tuple[Press, ...], ...]:
+    return tuple(tuple(step.presses.values()) for step in steps)
 
 
 def _draw_indenters(rng: np.random.Generator, millimetre_m: float) -> Presses:
@@ -247,151 +211,197 @@ def _turned(press: Press, quarters: int, mirrored: bool) -> Press:
     return replace(press, x_m=x, y_m=y, angle_rad=angle)
 
 
-@dataclass(frozen=True)
-class StepScore(FrameScore):
-    """How one frame came out; `contacts` has those alone that touch no other.
-
-    Its measures of the map are NaN where nothing presses hard enough to show, or no map was made;
-    that of the shape where nothing presses, or no shape was made.
-    """
-
-    phase: str  # of the choreography
-    groups: int  # how many contacts press, those that touch counted as one
-    # False where contacts are so near each other that either number would do, and where a scan is
-    # lost
-    countable: bool
-    switches: int  # contacts that another identity was given to than they had
-
-    @property
-    def count_right(self) -> bool | None:
-        """See `FrameScore`."""
-        return self.found == self.groups if self.countable else None
-
-    @property
-    def confidently_wrong(self) -> bool:
-        """Whether it shows something else than what presses, and no flag says so."""
-        low = self.icc < WRONG_ICC or self.icc_structure < WRONG_ICC  # what is NaN is not
-        return (low or self.count_right is False) and not self.distrusted
+# ------------------------------------------------------------------ measuring
 
 
-def play(
-    sequence: Sequence, method: str = "auto", budget_s: float | None = None
-) -> Iterator[StepScore]:
-    """Reconstruct a moving scene on one thread; no `budget_s` means the daemon's own."""
-    sensor = sequence.description
-    rng = np.random.default_rng(sequence.seed)
-    reconstructor = Reconstructor(
-        sensor, load_or_build_artifact(sensor), method=method, budget_s=budget_s
-    )
-    identities = _Identities()
-    tracker = None if sequence.period_s is None else BaselineTracker(reconstructor)
-    begin = reconstructor.set_reference if tracker is None else tracker.begin
-    begin(_reference(sequence, rng))
-    for index, step in enumerate(sequence.steps):
-        if step.tare:
-            begin(_reference(sequence, rng))
-        scans = {
-            name: sequence.volts.pressed[name][index]
-            + sequence.noise[name][index] * rng.standard_normal(len(sequence.volts.rest[name]))
-            for name in BOTH_CHANNELS
-        }
-        for name in step.lost:
-            del scans[name]
-        with threadpool_limits(1):
-            begin_s = time.thread_time()
-            volts = scans.get(Channel.MAGNITUDE), scans.get(Channel.STRUCTURE)
-            if tracker is None or sequence.period_s is None:
-                frame = reconstructor.reconstruct(*volts)
-            else:
-                frame = tracker.reconstruct(index * sequence.period_s, *volts)
-            seconds = time.thread_time() - begin_s
-        if frame.failure:  # the frame is another method's
-            raise MethodError(frame.failure)
-        truth = truth_of(sequence.true_description, list(step.presses.values()))
-        yield _score(sensor, step, truth, frame, identities, seconds)
+def follow(
+    simulated: Simulated,
+    steps: Sequence[Step],
+    # standard deviation of each channel's noise, volts: of all scans; (T,) of those of the steps,
+    # and none at rest, of which there is one scan
+    noise: Mapping[Channel, float | FloatArray],
+    rng: np.random.Generator,
+    seed_set: SeedSet,
+    number: int,
+    period_s: float | None = None,  # between frames, in which the reference follows the skin
+) -> Case:
+    """Measure a moving scene."""
+    volts = simulated.volts
 
-
-def _reference(sequence: Sequence, rng: np.random.Generator) -> Reference:
-    """Mean of `REFERENCE_SCANS` scans; where those have no noise, one, as `batch` takes it.
-
-    A file's single reference does not tell how noisy the scans are: they tell it themselves.
-    """
-    volts = sequence.volts
-    if not any(sequence.rest_noise.values()):
+    def tare() -> Reference:
+        if all(isinstance(std, float) for std in noise.values()):
+            rest = [
+                at_rest + noise[name] * rng.standard_normal((REFERENCE_SCANS, len(at_rest)))
+                for name, at_rest in volts.rest.items()
+            ]
+            return Reference.from_scans(*rest)
+        # One scan at rest, as `batch` takes it, does not tell the noise: the others do.
         seen = [
-            volts.pressed[name]
-            + sequence.noise[name][:, None] * rng.standard_normal(volts.pressed[name].shape)
-            for name in BOTH_CHANNELS
+            scans + np.reshape(noise[name], (-1, 1)) * rng.standard_normal(scans.shape)
+            for name, scans in volts.pressed.items()
         ]
-        rest = Reference(volts.rest[Channel.MAGNITUDE], volts.rest[Channel.STRUCTURE])
-        return rest.with_noise_of(sequence.description, *seen)
-    scans = [
-        rest + sequence.rest_noise[name] * rng.standard_normal((REFERENCE_SCANS, len(rest)))
-        for name, rest in volts.rest.items()
-    ]
-    return Reference.from_scans(*scans)
+        one = Reference(volts.rest[Channel.MAGNITUDE], volts.rest[Channel.STRUCTURE])
+        return one.with_noise_of(simulated.told, *seen)
 
-
-def _score(
-    sensor: SensorDescription,
-    step: Step,
-    truth: Truth,
-    frame: Reconstruction,
-    identities: _Identities,
-    seconds: float,
-) -> StepScore:
-    apart, clear = _groups(step.presses)
-    contacts = dict(zip(step.presses, truth.contacts, strict=True))
-    alone = {group[0]: contacts[group[0]] for group in apart if len(group) == 1}
-    shows = frame.map is not None and truth.map.any()
-    return StepScore(
-        contacts=score_contacts(sensor, list(alone.values()), frame.contacts),
-        found=len(frame.contacts),
-        rie=relative_error(frame.map, truth.map) if shows else float("nan"),
-        icc=correlation(frame.map, truth.map) if shows else float("nan"),
-        icc_structure=(
-            correlation(frame.structure, truth.pressed)
-            if frame.structure is not None and truth.pressed.any()
-            else float("nan")
-        ),
-        distrusted=bool(frame.flags & LOST),
-        seconds=seconds,
-        phase=step.phase,
-        groups=len(apart),
-        countable=clear and not step.lost,
-        switches=identities.switches(alone, frame),
+    first = tare()
+    frames = []
+    for index, step in enumerate(steps):
+        anew = tare() if step.tare else None
+        scans = {}
+        for name, pressed in volts.pressed.items():
+            std = np.broadcast_to(noise[name], len(steps))[index]
+            scans[name] = pressed[index] + std * rng.standard_normal(len(volts.rest[name]))
+        kept = {name: scan for name, scan in scans.items() if name not in step.lost}
+        time_s = index * (period_s or 0.0)
+        frames.append(Frame(step.presses, kept, step.phase, anew, time_s, step.countable))
+    return Case(
+        seed_set,
+        number,
+        simulated.plan,
+        simulated.told,
+        simulated.true,
+        first,
+        frames,
+        is_followed=period_s is not None,
     )
 
 
-def _groups(presses: Presses) -> tuple[list[list[str]], bool]:
-    """Names of the contacts that touch each other, and whether all others are clear of them."""
-    groups: list[list[str]] = []
-    clear = True
-    for name, press in presses.items():
-        gaps = {other: gap_m(press, presses[other]) for group in groups for other in group}
-        clear &= all(gap == 0 or gap >= GAP_M for gap in gaps.values())
-        touching = [group for group in groups if any(gaps[other] == 0 for other in group)]
-        groups = [group for group in groups if group not in touching]
-        groups.append([name, *(other for group in touching for other in group)])
-    return groups, clear
+# ------------------------------------------------------------------ mixed presses, and a palm
 
 
-class _Identities:
-    """Remembers which identity each true contact was last given."""
+@dataclass(frozen=True, kw_only=True)
+class Lane(Press):
+    """The rectangle that an indenter glides in, along its x axis."""
 
-    def __init__(self) -> None:
-        self._known: dict[str, int] = {}
+    radius_y_m: float
+    indenter: Press
 
-    def switches(self, contacts: dict[str, TrueContact], frame: Reconstruction) -> int:
-        """Contacts that are given another identity now; one that merged or lifted starts anew."""
-        names = list(contacts)
-        self._known = {name: known for name, known in self._known.items() if name in contacts}
-        switched = 0
-        for here, there in match(frame.contacts, list(contacts.values())):
-            given = frame.contacts[here].id
-            switched += self._known.get(names[there], given) != given
-            self._known[names[there]] = given
-        return switched
+
+def mixed_sequence(
+    description: SensorDescription, seed_set: SeedSet, number: int, noise_of: NoiseOf
+) -> Case:
+    """Draw and simulate presses of mixed kinds that move: about 40 s, or read from the cache.
+
+    Args:
+        description: the sensor; needs both channels.
+        seed_set: which of the two sets of seeds.
+        number: of the sequence; the presses are the same whatever the noise.
+        noise_of: "each change": 40 dB under the change of each frame, and none at rest, of which
+            there is one scan; "voltage": 60 dB under the voltages at rest.
+
+    Raises:
+        DataError: the sensor has a single channel, or no room for what presses.
+    """
+    require_both_channels(description)
+    draw = Draw(
+        description, np.random.default_rng(seed_of(seed_set, "mixed-moving", number)), number
+    )
+    steps = mixed_steps(draw)
+    plan = by_hand_as_told(draw, *_frames(steps))
+    skin = seed_of(seed_set, "stability mixed-moving sheet", number)
+    simulated = simulate(description, plan, skin)
+    noise: dict[Channel, float | FloatArray] = {}
+    for name in BOTH_CHANNELS:
+        noise[name] = noise_std(simulated.volts, name, CONVERTER_DB, "voltage")
+        if noise_of == "each change":
+            change = simulated.volts.pressed[name] - simulated.volts.rest[name]
+            share = 10 ** (-NOISE_DB[noise_of] / 20)
+            noise[name] = np.asarray(np.sqrt(np.mean(change**2, axis=1)) * share)
+    simulated = replace(simulated, plan=replace(plan, snr_db=NOISE_DB[noise_of]))
+    seed = seed_of(seed_set, f"mixed-moving noise {noise_of}", number)
+    return follow(simulated, steps, noise, np.random.default_rng(seed), seed_set, number)
+
+
+def palm_sequence(description: SensorDescription, seed_set: SeedSet, number: int) -> Case:
+    """Draw and simulate a palm that comes, a case of that regime: 7 s, or read from the cache.
+
+    Raises DataError where the sensor has a single channel.
+    """
+    require_both_channels(description)
+    plan = draw_plan(description, "palm", seed_set, number)
+    simulated = simulate(description, plan, seed_of(seed_set, "stability palm sheet", number))
+    steps = [_palm_step(presses) for presses in plan.frames]
+    rng = np.random.default_rng(seed_of(seed_set, "palm seconds", number))
+    period_s = float(np.exp(rng.uniform(*np.log(PALM_S)))) / PALM_FRAMES
+    noise = {n: noise_std(simulated.volts, n, plan.snr_db, plan.snr_of) for n in BOTH_CHANNELS}
+    seed = seed_of(seed_set, "palm noise", number)
+    return follow(simulated, steps, noise, np.random.default_rng(seed), seed_set, number, period_s)
+
+
+def _palm_step(presses: tuple[Press, ...]) -> Step:
+    is_there = any(press.pressure_kpa >= PALM_KPA[0] for press in presses)
+    return Step("palm" if is_there else COMING, dict(zip(INDENTERS, presses, strict=False)))
+
+
+def mixed_steps(draw: Draw) -> list[Step]:
+    """Draw the frames of a sequence: presses of mixed kinds, each in a lane of its own."""
+    lanes = draw.apart(MAX_CONTACTS - draw.number % MAX_CONTACTS, lambda: _draw_lane(draw))
+    frames = int(draw.rng.integers(FRAMES[0], FRAMES[1] + 1))
+    courses = dict(zip(INDENTERS, (_course(draw, lane, frames) for lane in lanes), strict=False))
+    steps = []
+    for frame in range(frames):
+        here = {name: course[frame] for name, course in courses.items()}
+        pressed = {name: press for name, press in here.items() if press.pressure_kpa > 0}
+        steps.append(Step(f"{len(pressed)} pressed", pressed))
+    return steps
+
+
+def _draw_lane(draw: Draw) -> Lane:
+    """A lane anywhere, as wide as its indenter is however it is turned."""
+    indenter = draw.any_kind()
+    reach_m = _reach_m(indenter)
+    return Lane(
+        x_m=indenter.x_m,
+        y_m=indenter.y_m,
+        pressure_kpa=indenter.pressure_kpa,
+        radius_m=reach_m + draw.rng.uniform(*GLIDE_MM) / 2 * draw.mm,
+        radius_y_m=reach_m,
+        angle_rad=draw.rng.uniform(0, np.pi),
+        shape="rectangle",
+        indenter=indenter,
+    )
+
+
+def _reach_m(press: Press) -> float:
+    """Distance of its farthest point from its centre."""
+    a, b = press.radius_m, press.radius_y_m or press.radius_m
+    return float(np.hypot(a, b)) if press.shape == "rectangle" else max(a, b)
+
+
+def _course(draw: Draw, lane: Lane, frames: int) -> list[Press]:
+    """An indenter in every frame; of no pressure while it does not touch."""
+    integers, frame = draw.rng.integers, np.arange(frames)
+    third = frames // 3
+    landed = int(integers(REST_FRAMES + LANDING_FRAMES, third))
+    lifts = int(integers(2 * third, frames + third))  # every other one stays to the end
+    starts, changes = integers(landed, lifts - GLIDE_FRAMES, 2)
+    arrives, changed = integers((starts + GLIDE_FRAMES, changes + 1), lifts + 1)
+    second_kpa = draw.rng.uniform(*draw.kpa_of(lane.indenter.profile))
+    kpa = np.interp(
+        frame,
+        [landed - LANDING_FRAMES, landed, changes, changed, lifts, lifts + LANDING_FRAMES],
+        [0, lane.indenter.pressure_kpa, lane.indenter.pressure_kpa, second_kpa, second_kpa, 0],
+    )
+    end_m = draw.rng.choice((-1, 1)) * (lane.radius_m - lane.radius_y_m)
+    way_m = np.interp(frame, [starts, arrives], [-end_m, end_m])
+    shrink = lane.radius_y_m / _reach_m(lane.indenter)  # of a lane that found no room
+    indenter = replace(
+        lane.indenter,
+        radius_m=shrink * lane.indenter.radius_m,
+        radius_y_m=shrink * (lane.indenter.radius_y_m or lane.indenter.radius_m),
+    )
+    return [
+        replace(
+            indenter,
+            x_m=lane.x_m + along * np.cos(lane.angle_rad),
+            y_m=lane.y_m + along * np.sin(lane.angle_rad),
+            pressure_kpa=pressure,
+        )
+        for along, pressure in zip(way_m.tolist(), kpa.tolist(), strict=True)
+    ]
+
+
+# ------------------------------------------------------------------ summing up
 
 
 @dataclass(frozen=True)
@@ -404,7 +414,7 @@ class PhaseSummary(Summary):
     switches: int  # identities lost, in all
 
 
-def summarise_phases(sequences: Iterable[Iterable[StepScore]]) -> dict[str, PhaseSummary]:
+def summarise_phases(sequences: Iterable[Iterable[Score]]) -> dict[str, PhaseSummary]:
     """Measures of each phase, in order, and of all of them under "all"."""
     played = [list(scores) for scores in sequences]
     phases = dict.fromkeys(score.phase for scores in played for score in scores)
@@ -416,7 +426,7 @@ def summarise_phases(sequences: Iterable[Iterable[StepScore]]) -> dict[str, Phas
     return {**summaries, "all": _summarise([one for part in parts.values() for one in part])}
 
 
-def _summarise(played: list[list[StepScore]]) -> PhaseSummary:
+def _summarise(played: list[list[Score]]) -> PhaseSummary:
     scores = [score for part in played for score in part]
     recovery = [_recovery(part) for part in played]
     return PhaseSummary(
@@ -427,7 +437,7 @@ def _summarise(played: list[list[StepScore]]) -> PhaseSummary:
     )
 
 
-def _recovery(scores: list[StepScore]) -> float:
+def _recovery(scores: list[Score]) -> float:
     """Longest run of frames whose shape is wrong; NaN where none of them is pressed."""
     icc = np.array([score.icc_structure for score in scores])
     wrong = icc[np.isfinite(icc)] < WRONG_ICC

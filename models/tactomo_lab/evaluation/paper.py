@@ -16,43 +16,37 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import combinations, product
 from typing import Any, Final
 
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 from tactomo_models.arrays import FloatArray
-from tactomo_models.batch import BUDGET_S
-from tactomo_models.physics.artifact import Artifact, load_or_build_artifact
-from tactomo_models.reconstruct import Reconstructor
+from tactomo_models.physics.artifact import load_or_build_artifact
 from tactomo_models.scans.reference import Reference
 from tactomo_models.scene.contacts import Contact
 from tactomo_models.scene.press import Press
 from tactomo_models.scene.reconstruction import Reconstruction
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_protocol import Channel
-from threadpoolctl import threadpool_limits
 
-from tactomo_lab.evaluation.still import Outcome
-from tactomo_lab.scenes.cache import cached
+from tactomo_lab.evaluation.play import Outcome, Player, Variant
+from tactomo_lab.scenes.case import (
+    CONTACT_NAMES,
+    REFERENCE_SCANS,
+    Case,
+    Plan,
+    Simulated,
+    as_described,
+    noise_std,
+    simulate,
+)
+from tactomo_lab.scenes.case import Frame as CaseFrame
+from tactomo_lab.scenes.drawing import BOTH_CHANNELS, SeedSet, require_both_channels, seed_of
 from tactomo_lab.scenes.measures import Summary, correlation, full_range, summarise
 from tactomo_lab.scenes.presets import PAPER_CONTACTS, PAPER_CONTRAST, paper_presses
-from tactomo_lab.scenes.simulation import Truth, UnevenSkin, Volts, fine_mesh, truth_of
-from tactomo_lab.scenes.still_scenes import (
-    BOTH_CHANNELS,
-    REFERENCE_SCANS,
-    SIMULATION,
-    EvaluationScene,
-    Layout,
-    SeedSet,
-    SimulatedVolts,
-    Simulation,
-    measure,
-    noise_std,
-    require_both_channels,
-    seed_of,
-)
+from tactomo_lab.scenes.simulation import Truth, Volts
+from tactomo_lab.scenes.still_scenes import still_case
 
 # The paper's three, then ours.
 PAPER_METHODS: Final = ("tikhonov", "cnn-single", "cnn-multimodal")
@@ -93,7 +87,7 @@ def paper_scenes(
     *,
     contacts: Iterable[int] = COUNTS,
     snr_db: float = 40.0,
-) -> Iterator[EvaluationScene]:
+) -> Iterator[Case]:
     """Test scenes of Fig. 5, drawn as the paper's training scenes are but from other seeds.
 
     Raises DataError where the sensor has a single channel, or no room for that many contacts.
@@ -101,14 +95,16 @@ def paper_scenes(
     require_both_channels(description)
     assert description.magnitude is not None
     opposite = description.magnitude.response.sign > 0  # the paper's conductivity falls
-    simulation = Simulation(description, even=True)
     for contact_count in contacts:
         for number in range(count):
             rng = np.random.default_rng(seed_of(seed_set, "paper", contact_count, number))
             presses = paper_presses(description, rng, contact_count)
-            layout = Layout(seed_set, number, presses, "ellipse", PAPER_CONTRAST, opposite)
-            volts = simulation.voltages(layout)
-            yield measure(volts, layout, description, snr_db, "change")
+            plan = Plan(
+                *((presses,), PAPER_CONTRAST, opposite, "ellipse"),
+                unevenness=0.0,
+                impedance_deviation=0.0,
+            )
+            yield still_case(description, plan, seed_set, number, snr_db)
 
 
 @dataclass(frozen=True)
@@ -143,7 +139,7 @@ class Area:
 
 
 @dataclass(frozen=True)
-class Case:
+class Arrangement:
     """One arrangement of indenters, pressed in one or more ways."""
 
     number: int  # the paper's
@@ -153,8 +149,8 @@ class Case:
     ours: bool = False
 
 
-def _single(number: int, x_mm: float, y_mm: float, diameter_mm: float) -> Case:
-    return Case(number, (Area(x_mm, y_mm, diameter_mm),), tuple((kpa,) for kpa in CASE_KPA))
+def _single(number: int, x_mm: float, y_mm: float, diameter_mm: float) -> Arrangement:
+    return Arrangement(number, (Area(x_mm, y_mm, diameter_mm),), tuple((kpa,) for kpa in CASE_KPA))
 
 
 LOW, HIGH = CASE_KPA[0], CASE_KPA[-1]
@@ -166,19 +162,19 @@ SINGLE: Final = (
     _single(4, 36, 36, 40),
 )
 TWO: Final = (
-    Case(5, (Area(0, 0), Area(36, 36)), BOTH_WAYS),
-    Case(6, (Area(-36, -36, 40), Area(36, 36)), BOTH_WAYS),
+    Arrangement(5, (Area(0, 0), Area(36, 36)), BOTH_WAYS),
+    Arrangement(6, (Area(-36, -36, 40), Area(36, 36)), BOTH_WAYS),
 )
 MORE: Final = (
-    Case(7, (Area(-36, -36), Area(36, -36), Area(0, 36)), ((HIGH, LOW, HIGH),), ours=True),
-    Case(8, (Area(-36, 36, 40), Area(36, 36), Area(0, -36)), ((LOW, HIGH, LOW),), ours=True),
-    Case(
+    Arrangement(7, (Area(-36, -36), Area(36, -36), Area(0, 36)), ((HIGH, LOW, HIGH),), ours=True),
+    Arrangement(8, (Area(-36, 36, 40), Area(36, 36), Area(0, -36)), ((LOW, HIGH, LOW),), ours=True),
+    Arrangement(
         9,
         (Area(-36, -36), Area(36, -36), Area(36, 36), Area(-36, 36)),
         ((HIGH, LOW, LOW, HIGH),),
         ours=True,
     ),
-    Case(
+    Arrangement(
         10,
         (Area(-36, -36, 40), Area(36, -36), Area(36, 36), Area(-36, 36, 40)),
         ((HIGH, LOW, HIGH, LOW),),
@@ -188,13 +184,13 @@ MORE: Final = (
 # Fig. 10 is one area pressed in turn in 25 places, which have no number of their own.
 PLACES_MM: Final = tuple(product(GRID_MM * np.arange(-2, 3), repeat=2))
 LOCALISATION: Final = tuple(
-    Case(0, (Area(float(x_mm), float(y_mm)),), ((HIGH,),)) for y_mm, x_mm in PLACES_MM
+    Arrangement(0, (Area(float(x_mm), float(y_mm)),), ((HIGH,),)) for y_mm, x_mm in PLACES_MM
 )
-RESPONSE: Final = Case(0, (Area(36, 36),), tuple((kpa,) for kpa in RESPONSE_KPA))
+RESPONSE: Final = Arrangement(0, (Area(36, 36),), tuple((kpa,) for kpa in RESPONSE_KPA))
 
 
 def presses_of(
-    description: SensorDescription, case: Case, pressures_kpa: Sequence[float]
+    description: SensorDescription, case: Arrangement, pressures_kpa: Sequence[float]
 ) -> tuple[Press, ...]:
     """A case's indenters on a sensor, of the same share of its width as on the paper's."""
     millimetre_m = description.width_m / PAPER_WIDTH_MM
@@ -229,39 +225,32 @@ class Rig:
         self.description = description
         self.sheet = sheet
         self._seed_set = seed_set
-        rest = self._clean(())
-        volts = SimulatedVolts(rest, rest)
-        self._noise = {name: noise_std(volts, name, snr_db, "voltage") for name in BOTH_CHANNELS}
-        self.reference = Reference.from_scans(
-            *(self._noisy(rest, (), REFERENCE_SCANS)[name] for name in BOTH_CHANNELS)
-        )
+        rest = self._simulated(()).volts
+        self._noise = {name: noise_std(rest, name, snr_db, "voltage") for name in BOTH_CHANNELS}
+        self.tare = Reference.from_scans(*self._scans((), REFERENCE_SCANS).values())
 
-    @cached_property
-    def _skin(self) -> UnevenSkin:
-        seed = seed_of(self._seed_set, "paper sheet", self.sheet)
-        return UnevenSkin(self.description, fine_mesh(self.description), seed)
+    def _simulated(self, presses: tuple[Press, ...]) -> Simulated:
+        plan = as_described(self.description, presses)
+        return simulate(self.description, plan, seed_of(self._seed_set, "paper sheet", self.sheet))
 
-    def _clean(self, presses: tuple[Press, ...]) -> Volts:
-        what = f"{SIMULATION} paper {self._seed_set} {self.sheet} {presses!r} "
-        what += self.description.model_dump_json()
-
-        def simulate() -> dict[str, FloatArray]:
-            return {str(name): scan for name, scan in self._skin.voltages(presses).items()}
-
-        volts = cached(what, simulate)
-        return {name: volts[name] for name in BOTH_CHANNELS}
-
-    def _noisy(self, clean: Volts, presses: tuple[Press, ...], scans: int) -> Volts:
+    def _scans(self, presses: tuple[Press, ...], count: int) -> Volts:
+        """So many scans (count, M) of each channel, volts, with noise."""
         rng = np.random.default_rng(seed_of(self._seed_set, f"paper noise {presses}", self.sheet))
+        clean = self._simulated(presses).volts.pressed
         return {
-            name: volts + self._noise[name] * rng.standard_normal((scans, len(volts)))
+            name: volts + self._noise[name] * rng.standard_normal((count, volts.shape[-1]))
             for name, volts in clean.items()
         }
 
-    def scan(self, presses: tuple[Press, ...]) -> Volts:
-        """One scan (M,) of each channel, volts, with noise."""
-        noisy = self._noisy(self._clean(presses), presses, 1)
-        return {name: scans[0] for name, scans in noisy.items()}
+    def press(self, presses: tuple[Press, ...]) -> Case:
+        """One scan under these presses, after the tare."""
+        simulated = self._simulated(presses)
+        scans = {name: volts[0] for name, volts in self._scans(presses, 1).items()}
+        frame = CaseFrame(dict(zip(CONTACT_NAMES, presses, strict=False)), scans)
+        return Case(
+            *(self._seed_set, self.sheet, simulated.plan, simulated.told, simulated.true),
+            *(self.tare, [frame]),
+        )
 
 
 @dataclass(frozen=True)
@@ -279,9 +268,10 @@ def measure_response(rigs: Iterable[Rig]) -> Iterator[Response]:
     for rig in rigs:
         if matrix is None:
             matrix = load_or_build_artifact(rig.description).tikhonov
-        rest: Volts = {n: v for n in BOTH_CHANNELS if (v := getattr(rig.reference, n)) is not None}
+        rest: Volts = {n: v for n in BOTH_CHANNELS if (v := getattr(rig.tare, n)) is not None}
         for (kpa,) in RESPONSE.pressures_kpa:
-            scan = rig.scan(presses_of(rig.description, RESPONSE, (kpa,)) if kpa else ())
+            case = rig.press(presses_of(rig.description, RESPONSE, (kpa,)) if kpa else ())
+            scan = case.frames[0].scans
             # Both conduct better under pressure as shipped; else the image is turned over.
             changes = {n: (scan[n] - rest[n]) / np.abs(rest[n]) for n in BOTH_CHANNELS}
             signs = {n: rig.description.sign(n) for n in BOTH_CHANNELS}
@@ -293,7 +283,7 @@ def measure_response(rigs: Iterable[Rig]) -> Iterator[Response]:
 class Frame:
     """What a method made of one press of one case."""
 
-    case: Case
+    case: Arrangement
     pressures_kpa: tuple[float, ...]
     sheet: int
     method: str
@@ -307,32 +297,25 @@ class Frame:
         return blank if self.made.map is None else self.made.map.astype(np.float64)
 
 
-def frames_of(cases: Sequence[Case]) -> int:
+def frames_of(cases: Sequence[Arrangement]) -> int:
     """How many presses the cases are."""
     return sum(len(case.pressures_kpa) for case in cases)
 
 
 def image_cases(
-    rigs: Iterable[Rig], cases: Sequence[Case], methods: Sequence[str]
+    rigs: Iterable[Rig], arrangements: Sequence[Arrangement], methods: Sequence[str]
 ) -> Iterator[Frame]:
-    """Press each case on each sensor and reconstruct it from a cold start by each method."""
-    artifact: Artifact | None = None
+    """Press each arrangement on each sensor and reconstruct it from a cold start by each method."""
     for rig in rigs:
-        artifact = artifact or load_or_build_artifact(rig.description)
-        reconstructor = Reconstructor(rig.description, artifact, budget_s=BUDGET_S)
-        reconstructor.set_reference(rig.reference)
-        for case in cases:
-            for pressures_kpa in case.pressures_kpa:
-                presses = presses_of(rig.description, case, pressures_kpa)
-                scan, truth = rig.scan(presses), truth_of(rig.description, presses)
+        player = Player(rig.description)
+        for arrangement in arrangements:
+            for pressures_kpa in arrangement.pressures_kpa:
+                case = rig.press(presses_of(rig.description, arrangement, pressures_kpa))
                 for method in methods:
-                    reconstructor.method = method
-                    reconstructor.reset()
-                    with threadpool_limits(1):
-                        made = reconstructor.reconstruct(
-                            scan[Channel.MAGNITUDE], scan[Channel.STRUCTURE]
-                        )
-                    yield Frame(case, pressures_kpa, rig.sheet, method, made, truth)
+                    (played,) = player.play(case, Variant(method))
+                    yield Frame(
+                        arrangement, pressures_kpa, rig.sheet, method, played.made, case.truth
+                    )
 
 
 def magnitude_estimate(values: FloatArray, method: str) -> float:

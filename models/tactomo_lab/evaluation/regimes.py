@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Final, TypeVar
+from typing import Final
 
 import numpy as np
 from tactomo_models.arrays import FloatArray
@@ -23,22 +23,32 @@ from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.sensor.description_file import load_description
 from tactomo_protocol import Channel
 
-from tactomo_lab.scenes.presets import placed_apart, scale_of
-from tactomo_lab.scenes.simulation import AS_MADE, IMPEDANCE_DEVIATION, UNEVENNESS, SheetState
-from tactomo_lab.scenes.still_scenes import (
+from tactomo_lab.scenes.case import (
+    BadLead,
+    Case,
+    Plan,
+    as_described,
+    measure,
+    simulate,
+    with_noise,
+)
+from tactomo_lab.scenes.drawing import (
     BOTH_CHANNELS,
-    CONTRAST,
     PRESSURE_KPA,
+    Placed,
     SeedSet,
-    SnrOf,
+    draw_contrast,
     draw_indenter,
     gap_m,
-    outline_of,
+    is_inside,
+    placed_apart,
+    require_both_channels,
+    scale_of,
     seed_of,
 )
+from tactomo_lab.scenes.simulation import SheetState
 
 Range = tuple[float, float]
-Placed = TypeVar("Placed", bound=Press)
 SensorOf = Callable[[SensorDescription], SensorDescription]
 
 SETTLED_FRAMES = 6  # of a scene that stays, before something happens
@@ -57,41 +67,6 @@ KINDS: Final[tuple[tuple[Shape, Profile], ...]] = (
 )
 
 
-@dataclass(frozen=True)
-class BadLead:
-    """A lead that opens before the last frame."""
-
-    electrode: int  # whose it is
-    level: float  # what its input floats to, times the root mean square of the channel's voltages
-    current: float = 1e-3  # share of the current that still passes
-
-
-@dataclass(frozen=True)
-class Plan:
-    """A case before it is simulated: what is not a default is what makes it hard."""
-
-    frames: tuple[tuple[Press, ...], ...]  # what presses in each; the last one is judged
-    contrast: float  # true one of the structure channel
-    opposite: bool  # whether the magnitude channel changes against the description's sign
-    sign_told: bool = True  # whether the reconstructor knows that
-    snr_db: float = 40.0  # signal-to-noise ratio, and `snr_of` what; see `scenes.noise_std`
-    snr_of: SnrOf = "change"
-    # the sheets that `tared`, `later` and `lead` are about
-    at_fault: tuple[Channel, ...] = BOTH_CHANNELS
-    tared: SheetState = AS_MADE  # their state at the tare
-    later: SheetState = AS_MADE  # their state in the last frame
-    lead: BadLead | None = None  # a lead of theirs that opens before the last frame
-    unevenness: float = UNEVENNESS  # standard deviation of each sheet's smooth conductivity error
-    # standard deviation of the logarithm of the contact impedances
-    impedance_deviation: float = IMPEDANCE_DEVIATION
-    # (L,) by how much electrodes sit off along the rim; in place where empty
-    displaced_m: tuple[float, ...] = ()
-    stretch: float = 0.0  # relative elongation along x, electrodes and all
-    behind: int = 0  # by how many scans the structure channel is late in the last frame
-    lost: int = 0  # how many structure scans are missing at the end
-    regularisation: float = 1.0  # factor on what the linear methods' rule chooses
-
-
 class Draw:
     """Draws what a case is made of."""
 
@@ -107,7 +82,7 @@ class Draw:
         """A plan of these frames, on any sheet."""
         return Plan(
             frames=tuple(tuple(presses) for presses in frames),
-            contrast=float(np.exp(self.rng.uniform(*np.log(CONTRAST)))),
+            contrast=draw_contrast(self.rng),
             opposite=bool(self.rng.integers(2)),
         )
 
@@ -157,7 +132,7 @@ class Draw:
         self, count: int, press: Callable[[], Placed], gap_mm: float = 9
     ) -> tuple[Placed, ...]:
         """So many inside the sensing area, outlines at least so far from each other."""
-        return placed_apart(self.description, self.rng, count, gap_mm * self.mm, press)
+        return placed_apart(self.description, count, gap_mm * self.mm, press)
 
     def tried(
         self, draw: Callable[[], Sequence[Press]], *, may_overlap: bool = False
@@ -169,17 +144,12 @@ class Draw:
         for _ in range(1000):
             presses = tuple(draw())
             apart = may_overlap or all(gap_m(a, b) > 0 for a, b in combinations(presses, 2))
-            if apart and all(self._inside(press) for press in presses):
+            if apart and all(is_inside(self.description, press) for press in presses):
                 return presses
         raise DataError(
             f"no room for {len(presses)} contacts on {self.description.name!r}: its sensing area "
             "is too small"
         )
-
-    def _inside(self, press: Press) -> bool:
-        frame_m = self.description.sheet.frame_width_m
-        x, y = outline_of(press)
-        return bool(self.description.on_sheet(x, y, frame_m).all())
 
     def pair(self, first_mm: Range, second_mm: Range, gap_mm: Range) -> tuple[Press, ...]:
         """Two round contacts, a gap apart."""
@@ -369,12 +339,9 @@ def _mixed(draw: Draw) -> Plan:
 
 def by_hand_as_told(draw: Draw, *frames: Sequence[Press]) -> Plan:
     """A plan on a skin made by hand, electrodes off by up to 1 mm, that answers as described."""
-    structure = draw.description.structure
-    assert structure is not None
-    ratio = structure.saturated_ratio
     off_m = draw.mm * draw.rng.uniform(-1, 1, draw.description.electrode_count)
-    plan = replace(draw.plan(*frames), contrast=max(ratio, 1 / ratio), opposite=False)
-    return replace(_by_hand(plan, off_m), snr_db=CONVERTER_DB, snr_of="voltage")
+    plan = _by_hand(as_described(draw.description, *frames), off_m)
+    return replace(plan, snr_db=CONVERTER_DB, snr_of="voltage")
 
 
 @regime("overload", "One to three presses, the first or all beyond the response table's end.")
@@ -540,3 +507,29 @@ def draw_plan(description: SensorDescription, regime: str, seed_set: SeedSet, nu
     """
     rng = np.random.default_rng(seed_of(seed_set, f"stability {regime}", number))
     return REGIMES[regime].draw(Draw(description, rng, number))
+
+
+def make_case(
+    description: SensorDescription,
+    regime: str,
+    seed_set: SeedSet,
+    number: int,
+    *,
+    snr_db: float | None = None,
+) -> Case:
+    """Draw, simulate and measure a case; the same one every time.
+
+    Its noise is the plan's, or that of a ratio of the change.
+
+    Raises DataError where the sensor has a single channel, or no room for what presses.
+    """
+    require_both_channels(description)
+    description = REGIMES[regime].sensor_of(description)
+    plan = draw_plan(description, regime, seed_set, number)
+    skin, noise = (
+        seed_of(seed_set, f"stability {regime} {what}", number) for what in ("sheet", "noise")
+    )
+    simulated = simulate(description, plan, skin)
+    if snr_db is not None:
+        simulated = with_noise(simulated, snr_db, "change")
+    return measure(simulated, seed_set, number, noise)

@@ -19,10 +19,9 @@ from tactomo_models.methods.registry import BUDGETED, check_method
 from tactomo_models.reconstruct import DEFAULT_BUDGET_S
 from tactomo_models.sensor.description import SensorDescription
 
-from tactomo_lab.evaluation import moving
-from tactomo_lab.evaluation.still import Variant, reconstruct_scenes
-from tactomo_lab.scenes.measures import SceneScore, Summary, summarise
-from tactomo_lab.scenes.still_scenes import EvaluationScene
+from tactomo_lab.evaluation.play import Variant, play
+from tactomo_lab.scenes.case import Case
+from tactomo_lab.scenes.measures import Score, Summary, summarise
 
 SceneKind = Literal["still", "moving"]
 Done = Callable[[], None]
@@ -61,32 +60,19 @@ class Point:
     p99_s: float
 
 
-def measure_still(
-    scenes: Sequence[EvaluationScene], variants: Sequence[Variant], done: Done = lambda: None
-) -> Iterator[Point]:
-    """Reconstruct still scenes of one ratio, each cold; `done` is called after each frame."""
-    scores: dict[Variant, list[SceneScore]] = {variant: [] for variant in variants}
-    for outcome in reconstruct_scenes(scenes, *variants):
+def measure(
+    cases: Sequence[Case], variants: Sequence[Variant], done: Done = lambda: None
+) -> list[Point]:
+    """Play cases of one kind and one ratio; `done` is called after each frame."""
+    scores: dict[Variant, list[Score]] = {variant: [] for variant in variants}
+    for outcome in play(cases, *variants):
         scores[outcome.variant].append(outcome.score)
         done()
-    for variant, own in scores.items():
-        summary = summarise(own)
-        yield _point("still", scenes[0].snr_db, variant, summary)
-
-
-def measure_moving(
-    sequences: Sequence[moving.Sequence], variants: Sequence[Variant], done: Done = lambda: None
-) -> Iterator[Point]:
-    """Follow moving scenes of one ratio frame by frame; `done` is called after each."""
-    for variant in variants:
-        played: list[list[moving.StepScore]] = []
-        for sequence in sequences:
-            played.append([])
-            for score in moving.play(sequence, variant.method, variant.budget_s):
-                played[-1].append(score)
-                done()
-        summary = moving.summarise_phases(played)["all"]
-        yield _point("moving", sequences[0].snr_db, variant, summary)
+    first = cases[0]
+    kind: SceneKind = "still" if first.is_still else "moving"
+    return [
+        _point(kind, first.plan.snr_db, variant, summarise(own)) for variant, own in scores.items()
+    ]
 
 
 def left_out(description: SensorDescription, methods: Iterable[str]) -> dict[str, str]:

@@ -8,7 +8,7 @@ change at `FULL_RANGE_KPA`, as the paper's are, which normalises by it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -17,14 +17,16 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 from tactomo_models.arrays import FloatArray
-from tactomo_models.scans.plausibility import DISTRUST
+from tactomo_models.scans.plausibility import DISTRUST, Flag
 from tactomo_models.scene.contacts import Contact
+from tactomo_models.scene.press import Press
 from tactomo_models.scene.pressure import PressureRange, described_curve
 from tactomo_models.scene.reconstruction import Reconstruction
 from tactomo_models.sensor.description import SensorDescription
 
+from tactomo_lab.scenes.case import Case, Frame
+from tactomo_lab.scenes.drawing import PRESSURE_KPA, gap_m
 from tactomo_lab.scenes.simulation import TrueContact
-from tactomo_lab.scenes.still_scenes import PRESSURE_KPA, EvaluationScene
 
 MATCH_M = 0.012  # centres farther apart belong to different contacts
 WRONG_ICC = 0.8  # a map that correlates less shows something else than what presses
@@ -33,6 +35,7 @@ RIGHT_PEAK = 0.10  # largest relative error of a peak pressure that is right
 SURE_SIGMAS = 3.0  # standard uncertainties that an error exceeds in one of 370 honest reports
 TWO_SIDED_95 = 1.96  # standard uncertainties that 95 % of a normal distribution lie within
 FULL_RANGE_KPA = PRESSURE_KPA[1]
+NOT_WHOLE = DISTRUST | Flag.STRUCTURE_MISSING | Flag.MAGNITUDE_MISSING  # flags that tell a user
 BAND_KPA = 10.0  # pressures that count as one where errors at one pressure are compared
 
 
@@ -123,22 +126,40 @@ class ContactScore:
 
 
 @dataclass(frozen=True)
-class FrameScore:
-    """How one frame was reconstructed."""
+class Score:
+    """How one frame was reconstructed.
 
-    contacts: tuple[ContactScore, ...]  #: one for each true contact
+    Where nothing presses hard enough to show in the map, or a scan was lost and there is no map,
+    the map's measures are NaN; likewise the shape's.
+    """
+
+    scene: str  #: the case's name, e.g. "tuning 3/17"
+    phase: str  #: of a moving scene
+    contacts: tuple[ContactScore, ...]  #: one for each true contact that touches no other
     found: int  #: contacts reported
+    groups: int  #: how many press, those that touch counted as one
+    countable: bool  #: whether that number is clear, and no scan was lost
+    switches: int  #: contacts that another identity was given to than they had
     #: rie, icc: of the magnitude map
     rie: float
     icc: float
     icc_structure: float  #: of the pressed shape
+    flags: tuple[str, ...]  #: names of what was flagged
     distrusted: bool  #: whether a flag told the user not to trust the frame
+    wrong: bool  #: whether it shows something else than what presses
+    tier: str  #: what made it
+    misfit: float  #: as reported
     seconds: float  #: that it took
+    #: shape, contrast, opposite, snr_db: of the case
+    shape: str
+    contrast: float
+    opposite: bool
+    snr_db: float
 
     @property
     def count_right(self) -> bool | None:
         """Whether as many contacts were reported as there are; None where that is not clear."""
-        return self.found == len(self.contacts)
+        return self.found == self.groups if self.countable else None
 
     @property
     def bad(self) -> bool:
@@ -148,22 +169,7 @@ class FrameScore:
     @property
     def confidently_wrong(self) -> bool:
         """Whether it shows something else than what presses, and no flag says so."""
-        return not self.distrusted and (self.icc < WRONG_ICC or self.count_right is False)
-
-
-@dataclass(frozen=True)
-class SceneScore(FrameScore):
-    """How one still scene was reconstructed."""
-
-    scene: str  #: its seed set, number of contacts and number, e.g. "tuning 3/17"
-    flags: tuple[str, ...]  #: names of what was flagged
-    tier: str  #: what made it
-    misfit: float  #: as reported
-    #: shape, contrast, opposite, snr_db: of the scene
-    shape: str
-    contrast: float
-    opposite: bool
-    snr_db: float
+        return not self.distrusted and (self.wrong or self.count_right is False)
 
     def as_json(self) -> dict[str, Any]:
         """All of it as numbers and names."""
@@ -171,26 +177,77 @@ class SceneScore(FrameScore):
         return {**asdict(self), **derived}
 
 
-def score(scene: EvaluationScene, frame: Reconstruction, seconds: float) -> SceneScore:
-    """Compare a reconstruction with the truth."""
-    truth = scene.truth
-    return SceneScore(
-        scene=str(scene.layout),
-        contacts=score_contacts(scene.description, truth.contacts, frame.contacts),
-        found=len(frame.contacts),
-        rie=relative_error(frame.map, truth.map),
-        icc=correlation(frame.map, truth.map),
-        icc_structure=correlation(frame.structure, truth.pressed),
-        flags=tuple(frame.flags.names()),
-        distrusted=bool(frame.flags & DISTRUST),
-        tier=frame.tier,
-        misfit=frame.misfit,
+def score(
+    case: Case,
+    frame: Frame,
+    made: Reconstruction,
+    seconds: float,
+    identities: dict[str, int],  # last given to each true contact; brought up to date
+) -> Score:
+    """Compare a reconstruction of a case's frame with the truth."""
+    truth = case.truth_of(frame)
+    lost = set(case.description.channels) - frame.scans.keys()
+    groups = touching(frame.presses)
+    contacts = dict(zip(frame.presses, truth.contacts, strict=True))
+    alone = {group[0]: contacts[group[0]] for group in groups if len(group) == 1}
+    rie, icc = _likeness(made.map, truth.map, bool(lost))
+    _, icc_structure = _likeness(made.structure, truth.pressed, bool(lost))
+    return Score(
+        scene=case.name,
+        phase=frame.phase,
+        contacts=score_contacts(case.description, list(alone.values()), made.contacts),
+        found=len(made.contacts),
+        groups=len(groups),
+        countable=frame.countable and not lost,
+        switches=_switches(alone, made, identities),
+        rie=rie,
+        icc=icc,
+        icc_structure=icc_structure,
+        flags=tuple(made.flags.names()),
+        distrusted=bool(made.flags & NOT_WHOLE),
+        # Of a moving scene the shape counts, too: it is all that shows of a light touch.
+        wrong=icc < WRONG_ICC or (not case.is_still and icc_structure < WRONG_ICC),
+        tier=made.tier,
+        misfit=made.misfit,
         seconds=seconds,
-        shape=scene.layout.shape,
-        contrast=scene.layout.contrast,
-        opposite=scene.layout.opposite,
-        snr_db=scene.snr_db,
+        shape=case.shape,
+        contrast=case.plan.contrast,
+        opposite=case.plan.opposite,
+        snr_db=case.plan.snr_db,
     )
+
+
+def _likeness(
+    image: NDArray[Any] | None, truth: FloatArray, is_excused: bool
+) -> tuple[float, float]:
+    """RIE and ICC of an image; NaN where there is nothing to show, or no scan to make it of."""
+    if not truth.any() or (image is None and is_excused):
+        return float("nan"), float("nan")
+    return relative_error(image, truth), correlation(image, truth)
+
+
+def touching(presses: Mapping[str, Press]) -> list[list[str]]:
+    """Names of the contacts, in groups that touch each other."""
+    groups: list[list[str]] = []
+    for name, press in presses.items():
+        met = [g for g in groups if any(gap_m(press, presses[other]) == 0 for other in g)]
+        groups = [group for group in groups if group not in met]
+        groups.append([name, *(other for group in met for other in group)])
+    return groups
+
+
+def _switches(
+    contacts: Mapping[str, TrueContact], made: Reconstruction, known: dict[str, int]
+) -> int:
+    """Contacts that are given another identity now; one that merged or lifted starts anew."""
+    names, switched = list(contacts), 0
+    for name in known.keys() - contacts.keys():
+        del known[name]
+    for here, there in match(made.contacts, list(contacts.values())):
+        given = made.contacts[here].id
+        switched += known.get(names[there], given) != given
+        known[names[there]] = given
+    return switched
 
 
 def score_contacts(
@@ -300,7 +357,7 @@ class Summary:
     seconds_99: float
 
 
-def summarise(scores: Sequence[FrameScore]) -> Summary:
+def summarise(scores: Sequence[Score]) -> Summary:
     """Measures of at least one frame."""
     contacts = [contact for one in scores for contact in one.contacts]
     matched = [contact for contact in contacts if not contact.missed]
@@ -374,13 +431,13 @@ def _largest_spread(contacts: Iterable[ContactScore]) -> float:
     return max((max(errors) - min(errors) for errors in bands.values()), default=float("nan"))
 
 
-def _contrast_band(one: SceneScore) -> str:
+def _contrast_band(one: Score) -> str:
     edges = (10, 22, 46, 100)  # equal parts of the logarithm
     index = int(np.searchsorted(edges[1:-1], one.contrast, side="right"))
     return f"{edges[index]}-{edges[index + 1]}"
 
 
-GROUPINGS: dict[str, Callable[[SceneScore], str]] = {
+GROUPINGS: dict[str, Callable[[Score], str]] = {
     "contacts": lambda one: str(len(one.contacts)),
     "SNR (dB)": lambda one: f"{one.snr_db:g}",
     "shape": lambda one: one.shape,
@@ -389,7 +446,7 @@ GROUPINGS: dict[str, Callable[[SceneScore], str]] = {
 }
 
 
-def summaries(scores: Sequence[SceneScore]) -> dict[str, dict[str, Summary]]:
+def summaries(scores: Sequence[Score]) -> dict[str, dict[str, Summary]]:
     """Measures by every grouping: what it goes by, its value, and that value's scenes."""
     return {
         name: {

@@ -9,24 +9,20 @@ paper's; on another sensor they scale with its shorter side and with its own tab
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Final, Literal, TypeVar
+from dataclasses import dataclass
+from typing import Final, Literal
 
 import numpy as np
 from tactomo_models.arrays import FloatArray
-from tactomo_models.errors import DataError
 from tactomo_models.scene.press import Press, Profile, Shape
 from tactomo_models.scene.pressure import PressureCurve
 from tactomo_models.sensor.description import SensorDescription
 
-from tactomo_lab.scenes.still_scenes import CONTRAST, gap_m, outline_of, seed_of
+from tactomo_lab.scenes.drawing import draw_contrast, placed_apart, scale_of, seed_of
 
 PresetName = Literal["paper", "robust"]
-Placed = TypeVar("Placed", bound=Press)
 SCENES: Final[dict[PresetName, int]] = {"paper": 12_000, "robust": 24_000}  # of a whole set
 
-SIDE_M = 0.150  # of the sheet that the lengths below are for
 END_KPA = 300.0  # of the response table that the pressures below are for
 
 PAPER_CONTACTS = 4
@@ -123,7 +119,7 @@ def paper_presses(
             angle_rad=rng.uniform(0, np.pi),
         )
 
-    return placed_apart(description, rng, count, 0.0, one)
+    return placed_apart(description, count, 0.0, one)
 
 
 def _robust(description: SensorDescription, seed: int, number: int) -> TrainingScene:
@@ -140,9 +136,8 @@ def _robust(description: SensorDescription, seed: int, number: int) -> TrainingS
     def one() -> Press:
         return _any_press(description, rng, half_axis_m, soft=soft)
 
-    presses = placed_apart(description, rng, count, gap, one)
-    contrast = float(np.exp(rng.uniform(*np.log(CONTRAST))))
-    return TrainingScene(presses, contrast, opposite, sheets)
+    presses = placed_apart(description, count, gap, one)
+    return TrainingScene(presses, draw_contrast(rng), opposite, sheets)
 
 
 def _any_press(
@@ -175,11 +170,6 @@ def _any_press(
     )
 
 
-def scale_of(description: SensorDescription) -> float:
-    """How large a sensor is, in sheets of 150 mm."""
-    return min(description.width_m, description.height_m) / SIDE_M
-
-
 def _pressure_scale(description: SensorDescription) -> float:
     assert description.magnitude is not None
     return description.magnitude.response.pressure_kpa[-1] / END_KPA
@@ -188,41 +178,6 @@ def _pressure_scale(description: SensorDescription) -> float:
 def _anywhere(description: SensorDescription, rng: np.random.Generator) -> tuple[float, float]:
     x, y = rng.uniform(-0.5, 0.5, 2)
     return x * description.width_m, y * description.height_m
-
-
-def placed_apart(
-    description: SensorDescription,
-    rng: np.random.Generator,
-    count: int,
-    least_gap_m: float,
-    draw: Callable[[], Placed],
-) -> tuple[Placed, ...]:
-    """Draw contacts inside the sensing area that lie apart; anew from the first if one has no room.
-
-    Those that have no room for long are drawn smaller.
-    """
-    frame_m = description.sheet.frame_width_m
-    for trial in range(300):
-        shrink = min(1.0, 60 / (trial + 1))
-        placed: list[Placed] = []
-        for _ in range(40 * count):
-            if len(placed) == count:
-                break
-            press = draw()
-            press = replace(
-                press,
-                radius_m=press.radius_m * shrink,
-                radius_y_m=(press.radius_y_m or press.radius_m) * shrink,
-            )
-            x, y = outline_of(press)
-            inside = description.on_sheet(x, y, frame_m).all()
-            if inside and all(gap_m(press, other) > least_gap_m for other in placed):
-                placed.append(press)
-        if len(placed) == count:
-            return tuple(placed)
-    raise DataError(
-        f"no room for {count} contacts on {description.name!r}: its sensing area is too small"
-    )
 
 
 def _sheet_errors(description: SensorDescription, rng: np.random.Generator) -> SheetErrors:

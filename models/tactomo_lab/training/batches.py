@@ -22,7 +22,7 @@ from tactomo_models.sensor.symmetry import Symmetry, symmetries
 from tactomo_protocol import Channel
 from torch import Tensor
 
-from tactomo_lab.scenes.still_scenes import REFERENCE_SCANS
+from tactomo_lab.scenes.case import REFERENCE_SCANS
 from tactomo_lab.training.training_scenes import read_scenes
 
 LEVELS = 36  # of the table of filters

@@ -36,6 +36,7 @@ from tactomo_models.simulation.simulator import conductivity_ratio, smooth_noise
 from tactomo_protocol import Channel
 from threadpoolctl import threadpool_limits
 
+from tactomo_lab.scenes.drawing import require_both_channels
 from tactomo_lab.scenes.presets import (
     PresetName,
     SheetErrors,
@@ -48,7 +49,6 @@ from tactomo_lab.scenes.simulation import (
     with_contrast,
     with_opposite_magnitude,
 )
-from tactomo_lab.scenes.still_scenes import require_both_channels
 
 SHARD = 200  # scenes in a file
 SPACING_SHARE = 5 / 6  # of the map's nodes' distance: 2.5 mm on the paper's sensor

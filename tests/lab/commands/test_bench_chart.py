@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from tactomo_lab.commands import chart as bench_chart
 from tactomo_lab.commands.chart_picture import draw_chart
-from tactomo_lab.evaluation.still import Variant
+from tactomo_lab.evaluation.play import Variant
 from tactomo_lab.evaluation.trade_off import Point
 from tactomo_models import available_methods
 

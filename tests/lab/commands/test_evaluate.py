@@ -100,7 +100,7 @@ def test_an_hour_of_drift(tactomo: Run, tmp_path: Path) -> None:
     assert day["tracked"]["presses"] == day["untracked"]["presses"] == 3
     assert picture.read_bytes().startswith(b"\x89PNG")
     words = tactomo(*ask).stdout
-    assert "Simulated, not measured: paper_square, 0.75 hours after one tare." in words
+    assert "Simulated, not measured: paper_square, tuning seeds, 0.75 hours after" in words
     assert "tuning 0" in words
-    assert "frames under a press that do not show it" in words
+    assert "hidden: frames under a press that do not show it" in words
     assert "…" not in words

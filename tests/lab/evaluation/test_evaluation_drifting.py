@@ -16,16 +16,19 @@ from tactomo_models.scene.press import Press
 from tactomo_protocol import Channel
 
 
+@pytest.fixture(autouse=True)
+def _built(artifact: Artifact, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tactomo_lab.evaluation.play.load_or_build_artifact", lambda _: artifact)
+
+
 @pytest.mark.slow
-def test_an_hour_of_drift_leaves_no_ghost_and_erases_nothing(
-    paper: SensorDescription, artifact: Artifact
-) -> None:
+def test_an_hour_of_drift_leaves_no_ghost_and_erases_nothing(paper: SensorDescription) -> None:
     day = simulate_day(paper, "tuning", 3, hours=0.75)
     again = simulate_day(paper, "tuning", 3, hours=0.75)
     np.testing.assert_array_equal(
         day.stretches[-1].volts[Channel.STRUCTURE], again.stretches[-1].volts[Channel.STRUCTURE]
     )
-    tracked = summarise_day(list(live(day, artifact=artifact)), day.hours)
+    tracked = summarise_day(list(live(day)), day.hours)
     assert tracked.presses == 3
     assert tracked.ghost_share == tracked.erased == tracked.missed == 0
     assert tracked.refused == 0
@@ -33,15 +36,13 @@ def test_an_hour_of_drift_leaves_no_ghost_and_erases_nothing(
 
 @pytest.mark.long
 @pytest.mark.timeout(7200)
-def test_a_day_of_drift_leaves_no_ghost_and_erases_nothing(
-    paper: SensorDescription, artifact: Artifact
-) -> None:
+def test_a_day_of_drift_leaves_no_ghost_and_erases_nothing(paper: SensorDescription) -> None:
     """Ten minutes, most of which it simulates."""
     day = simulate_day(paper, "tuning", 0)
-    tracked = summarise_day(list(live(day, artifact=artifact)), day.hours)
+    tracked = summarise_day(list(live(day)), day.hours)
     assert tracked.missed == tracked.erased == 0
     assert tracked.ghosts_per_hour == 0
-    untracked = summarise_day(list(live(day, track=False, every=20, artifact=artifact)), day.hours)
+    untracked = summarise_day(list(live(day, track=False, every=20)), day.hours)
     assert untracked.ghost_share > 0.3
     assert untracked.magnitude_error > 2 * tracked.magnitude_error
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tactomo_lab.scenes.measures import (
     MATCH_M,
     ContactScore,
-    SceneScore,
+    Score,
     correlation,
     full_range,
     match,
@@ -78,9 +78,14 @@ def test_a_contact_is_scored_in_the_units_it_says(paper: SensorDescription) -> N
     assert score_contact(paper, TRUE, None).missed
 
 
-def scene(paper: SensorDescription, *found: Contact | None, **other: object) -> SceneScore:
-    one = SceneScore(
+def scene(paper: SensorDescription, *found: Contact | None, **other: object) -> Score:
+    one = Score(
         scene="tuning 1/0",
+        phase="",
+        groups=len(found),
+        countable=True,
+        switches=0,
+        wrong=False,
         contacts=tuple(score_contact(paper, TRUE, contact) for contact in found),
         found=sum(contact is not None for contact in found),
         rie=0.2,
@@ -96,7 +101,8 @@ def scene(paper: SensorDescription, *found: Contact | None, **other: object) -> 
         opposite=False,
         snr_db=40.0,
     )
-    return replace(one, **other)  # type: ignore[arg-type]
+    made = replace(one, **other)  # type: ignore[arg-type]
+    return replace(made, wrong=made.icc < 0.8)
 
 
 def test_what_is_wrong_and_does_not_say_so(paper: SensorDescription) -> None:

@@ -9,21 +9,21 @@ import pytest
 from tactomo_lab.commands.pictures import draw_press
 from tactomo_lab.evaluation.field import (
     STILL_ROWS,
+    cases_of_row,
     middle_press,
-    scenes_of_regime,
-    scenes_of_row,
     scores_of_row,
 )
-from tactomo_lab.evaluation.moving import draw_sequence
-from tactomo_lab.evaluation.sequences import NOISE_DB, mixed_sequence
+from tactomo_lab.evaluation.moving import NOISE_DB, draw_sequence, mixed_sequence
+from tactomo_lab.evaluation.regimes import make_case
+from tactomo_lab.scenes.case import Case
 from tactomo_lab.scenes.measures import summarise
-from tactomo_lab.scenes.still_scenes import EvaluationScene
 from tactomo_models import DataError, SensorDescription
+from tactomo_protocol import Channel
 from variants import variant
 
 
-def one_of(small: SensorDescription, row: str) -> dict[str, EvaluationScene]:
-    lines = scenes_of_row(small, row, "tuning", 1)
+def one_of(small: SensorDescription, row: str) -> dict[str, Case]:
+    lines = cases_of_row(small, row, "tuning", 1)
     return {line: scene for line, scenes in lines.items() for scene in scenes}
 
 
@@ -37,7 +37,7 @@ def test_a_scene_of_each_row_is_reconstructed_and_scored(
     assert list(lines) == list(scenes)
     for line, scores in lines.items():
         (score,) = scores
-        assert len(score.contacts) == len(scenes[line].layout.presses)
+        assert len(score.contacts) == len(scenes[line].frames[0].presses)
         assert -1 <= score.icc <= 1
         assert score.seconds > 0
 
@@ -47,51 +47,50 @@ def test_a_moving_scene_is_scored_where_no_scan_is_lost(small: SensorDescription
     sequence = draw_sequence(small, "tuning", 0)
     (scores,) = scores_of_row(small, "moving", "tikhonov", "tuning", 1).values()
     frames = list(scores)
-    assert len(frames) == sum(not step.lost for step in sequence.steps)
+    assert len(frames) == sum(len(frame.scans) == 2 for frame in sequence.frames)
     assert 0 < summarise(frames).icc < 1
 
 
 def test_ordinary_scenes_are_the_same_ones_at_each_noise(small: SensorDescription) -> None:
     quiet, noisy, noisiest = one_of(small, "ordinary").values()
-    assert quiet.layout == noisy.layout == noisiest.layout
-    assert [scene.snr_db for scene in (quiet, noisy, noisiest)] == [40, 20, 10]
-    assert quiet.reference.magnitude_noise is not None
-    assert noisy.reference.magnitude_noise is not None
+    assert quiet.frames[0].presses == noisy.frames[0].presses == noisiest.frames[0].presses
+    assert [case.plan.snr_db for case in (quiet, noisy, noisiest)] == [40, 20, 10]
+    assert quiet.tare.magnitude_noise is not None
+    assert noisy.tare.magnitude_noise is not None
     np.testing.assert_allclose(
-        noisy.reference.magnitude_noise / quiet.reference.magnitude_noise, 10, rtol=1e-6
+        noisy.tare.magnitude_noise / quiet.tare.magnitude_noise, 10, rtol=1e-6
     )
 
 
 def test_a_regime_is_measured_at_its_own_noise_or_of_the_change(small: SensorDescription) -> None:
     own, quiet, noisy = (
-        next(scenes_of_regime(small, "mixed", "tuning", 1, snr_db=snr_db))
-        for snr_db in (None, 40.0, 20.0)
+        make_case(small, "mixed", "tuning", 0, snr_db=snr_db) for snr_db in (None, 40.0, 20.0)
     )
-    assert own.layout == quiet.layout == noisy.layout
-    told = [(scene.snr_db, scene.snr_of) for scene in (own, quiet, noisy)]
+    assert own.plan.frames == quiet.plan.frames == noisy.plan.frames
+    told = [(case.plan.snr_db, case.plan.snr_of) for case in (own, quiet, noisy)]
     assert told == [(60, "voltage"), (40, "change"), (20, "change")]
-    assert quiet.reference.magnitude_noise is not None
-    assert noisy.reference.magnitude_noise is not None
+    assert quiet.tare.magnitude_noise is not None
+    assert noisy.tare.magnitude_noise is not None
     np.testing.assert_allclose(
-        noisy.reference.magnitude_noise / quiet.reference.magnitude_noise, 10, rtol=1e-6
+        noisy.tare.magnitude_noise / quiet.tare.magnitude_noise, 10, rtol=1e-6
     )
 
 
 def test_one_graded_sheet_has_no_structure_scan(small: SensorDescription) -> None:
     (scene,) = one_of(small, "graded").values()
-    assert scene.structure is None
-    assert scene.reference.structure is None
+    assert scene.frames[0].scans.keys() == {Channel.MAGNITUDE}
+    assert scene.tare.structure is None
     assert scene.description.magnitude is not None
     assert scene.description.channels == ("magnitude",)
     assert scene.description.sha256 == small.sha256  # the same artifact serves
-    (press,) = scene.layout.presses
+    (press,) = scene.plan.frames[0]
     highest = scene.description.magnitude.response.change(np.array(press.pressure_kpa))
     assert 0.5 * highest < scene.truth.map.max() <= highest
 
 
 def test_a_ball_has_its_peak_and_the_mean_over_its_area(small: SensorDescription) -> None:
     (scene,) = one_of(small, "soft").values()
-    (press,), (contact,) = scene.layout.presses, scene.truth.contacts
+    (press,), (contact,) = scene.plan.frames[0], scene.truth.contacts
     assert press.profile == "dome"
     assert contact.pressure_kpa == press.pressure_kpa
     cell_m2 = np.diff(small.map_x_m)[0] * np.diff(small.map_y_m)[0]
@@ -102,7 +101,7 @@ def test_a_ball_has_its_peak_and_the_mean_over_its_area(small: SensorDescription
 @pytest.mark.slow
 def test_one_soft_contact_is_drawn_the_middle_one(small: SensorDescription, tmp_path: Path) -> None:
     middle = middle_press(small, "tikhonov", "tuning", 6)
-    assert len(middle.scene.layout.presses) == 1
+    assert len(middle.frame.presses) == 1
     scores = scores_of_row(small, "soft", "tikhonov", "tuning", 6)["soft"]
     single = sorted(score.icc for score in scores if len(score.contacts) == 1)
     assert middle.score.icc == single[len(single) // 2]
@@ -115,10 +114,10 @@ def test_mixed_moving_presses_are_scored_at_both_noises(small: SensorDescription
     lines = scores_of_row(small, "mixed-moving", "tikhonov", "tuning", 1)
     assert list(lines) == [f"mixed-moving, noise of {of}" for of in ("each change", "voltage")]
     for noise_of, scores in zip(NOISE_DB, lines.values(), strict=True):
-        frames = len(mixed_sequence(small, "tuning", 0, noise_of).steps)
+        frames = len(mixed_sequence(small, "tuning", 0, noise_of).frames)
         assert summarise(list(scores)).frames == frames
 
 
 def test_a_sensor_of_one_channel_has_no_rows(small: SensorDescription) -> None:
     with pytest.raises(DataError, match="one channel"):
-        scenes_of_row(variant(small, magnitude=None), "soft", "tuning", 1)
+        cases_of_row(variant(small, magnitude=None), "soft", "tuning", 1)

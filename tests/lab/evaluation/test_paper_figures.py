@@ -13,7 +13,7 @@ from tactomo_lab.evaluation.paper import (
     RESPONSE_KPA,
     SINGLE,
     TWO,
-    Case,
+    Arrangement,
     Frame,
     Rig,
     cells,
@@ -28,9 +28,9 @@ from tactomo_lab.evaluation.paper import (
     presses_of,
     read_areas,
 )
-from tactomo_lab.evaluation.still import reconstruct_scenes
+from tactomo_lab.evaluation.play import play
+from tactomo_lab.scenes.drawing import BOTH_CHANNELS, gap_m, outline_of
 from tactomo_lab.scenes.simulation import truth_of
-from tactomo_lab.scenes.still_scenes import BOTH_CHANNELS, gap_m, outline_of
 from tactomo_models import Artifact, Reconstruction, SensorDescription, build_artifact
 from tactomo_models.arrays import FloatArray
 from tactomo_models.scene.contacts import Contact
@@ -51,14 +51,14 @@ def small_artifact(small: SensorDescription) -> Artifact:
 
 @pytest.fixture(autouse=True)
 def _built(small_artifact: Artifact, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in ("paper", "still"):
+    for module in ("paper", "play"):
         name = f"tactomo_lab.evaluation.{module}.load_or_build_artifact"
         monkeypatch.setattr(name, lambda _: small_artifact)
 
 
 def frame(
     description: SensorDescription,
-    case: Case,
+    case: Arrangement,
     pressures_kpa: tuple[float, ...],
     image: FloatArray | None,
     method: str = "network",
@@ -90,24 +90,24 @@ def test_cases_fit_on_the_sheet_and_lie_apart(paper: SensorDescription) -> None:
 @pytest.mark.slow
 def test_scenes_of_the_simulation_study(small: SensorDescription) -> None:
     drawn = list(paper_scenes(small, "tuning", 1, snr_db=np.inf))
-    assert [len(scene.layout.presses) for scene in drawn] == [1, 2, 3, 4]
+    assert [len(scene.plan.frames[0]) for scene in drawn] == [1, 2, 3, 4]
     for scene in drawn:
-        assert {press.shape for press in scene.layout.presses} == {"ellipse"}
+        assert {press.shape for press in scene.plan.frames[0]} == {"ellipse"}
         assert 0.05 <= scene.truth.map.max() <= 0.25
-        assert scene.reference.magnitude is not None
-        assert drawn[0].reference.magnitude is not None
+        assert scene.tare.magnitude is not None
+        assert drawn[0].tare.magnitude is not None
         # One even sheet under all of them.
-        np.testing.assert_array_equal(scene.reference.magnitude, drawn[0].reference.magnitude)
+        np.testing.assert_array_equal(scene.tare.magnitude, drawn[0].tare.magnitude)
         assert scene.description.magnitude is not None
         assert scene.description.magnitude.response.sign == -1
     other = next(paper_scenes(small, "reporting", 1))
-    assert other.layout.presses != drawn[0].layout.presses
+    assert other.plan.frames != drawn[0].plan.frames
 
 
 @pytest.mark.slow
 def test_points_of_the_simulation_study(small: SensorDescription) -> None:
     drawn = list(paper_scenes(small, "tuning", 1, contacts=(1, 2)))
-    points = cells(reconstruct_scenes(drawn, "tikhonov", "noser"))
+    points = cells(play(drawn, "tikhonov", "noser"))
     assert [(p.method, p.contacts) for p in points] == [
         ("tikhonov", 1),
         ("noser", 1),
@@ -115,23 +115,24 @@ def test_points_of_the_simulation_study(small: SensorDescription) -> None:
         ("noser", 2),
     ]
     for point in points:
-        (outcome,) = reconstruct_scenes([drawn[point.contacts - 1]], point.method)
+        (outcome,) = play([drawn[point.contacts - 1]], point.method)
         assert point.summary.icc == outcome.score.icc > 0.3
 
 
 def test_a_rig_measures_one_uneven_sensor(small: SensorDescription, rig: Rig) -> None:
     presses = presses_of(small, SINGLE[0], (200.0,))
-    scan = rig.scan(presses)
-    again = Rig(small, "tuning", 0).scan(presses)
     quiet = Rig(small, "tuning", 0, snr_db=np.inf)
     other = Rig(small, "tuning", 1, snr_db=np.inf)
+    case, again, silent = (each.press(presses) for each in (rig, Rig(small, "tuning", 0), quiet))
+    (scan,), (same,), (clean,) = ([f.scans for f in one.frames] for one in (case, again, silent))
     for name in BOTH_CHANNELS:
-        np.testing.assert_array_equal(scan[name], again[name])
-        rest = getattr(quiet.reference, name)
-        noise = scan[name] - quiet.scan(presses)[name]
+        np.testing.assert_array_equal(scan[name], same[name])
+        rest = getattr(quiet.tare, name)
+        noise = scan[name] - clean[name]
         assert np.std(noise) == pytest.approx(1e-3 * np.sqrt(np.mean(rest**2)), rel=0.4)
-        assert 0.003 < np.std(getattr(other.reference, name) / rest) < 0.3
-    assert not np.array_equal(scan[Channel.MAGNITUDE], rig.scan(())[Channel.MAGNITUDE])
+        assert 0.003 < np.std(getattr(other.tare, name) / rest) < 0.3
+    bare = rig.press(()).frames[0].scans
+    assert not np.array_equal(scan[Channel.MAGNITUDE], bare[Channel.MAGNITUDE])
 
 
 # ------------------------------------------------------------------ how it is measured

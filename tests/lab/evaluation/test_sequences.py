@@ -8,32 +8,40 @@ from itertools import combinations, pairwise
 import numpy as np
 import pytest
 from tactomo_lab.evaluation.field import scores_of_row
-from tactomo_lab.evaluation.moving import Sequence, Step, play
+from tactomo_lab.evaluation.moving import (
+    COMING,
+    Step,
+    mixed_sequence,
+    mixed_steps,
+    palm_sequence,
+)
+from tactomo_lab.evaluation.play import play
 from tactomo_lab.evaluation.regimes import KINDS, PALM_FRAMES, Draw
-from tactomo_lab.evaluation.sequences import COMING, mixed_sequence, mixed_steps, palm_sequence
-from tactomo_lab.scenes.still_scenes import BOTH_CHANNELS, GAP_M, gap_m, outline_of
+from tactomo_lab.scenes.case import Case, Frame
+from tactomo_lab.scenes.drawing import BOTH_CHANNELS, GAP_M, gap_m, outline_of
 from tactomo_models import DataError, Press, SensorDescription
+from tactomo_models.arrays import FloatArray
 from variants import variant
 
 
 @pytest.fixture(scope="module")
-def changing(small: SensorDescription) -> Sequence:
+def changing(small: SensorDescription) -> Case:
     return mixed_sequence(small, "tuning", 0, "each change")
 
 
 @pytest.fixture(params=range(12))
-def steps(paper: SensorDescription, request: pytest.FixtureRequest) -> tuple[Step, ...]:
+def steps(paper: SensorDescription, request: pytest.FixtureRequest) -> list[Step]:
     return mixed_steps(Draw(paper, np.random.default_rng(request.param), request.param))
 
 
-def turns(steps: tuple[Step, ...]) -> Iterator[tuple[Press, Press]]:
+def turns(steps: list[Step]) -> Iterator[tuple[Press, Press]]:
     """Each press in a frame and in the next one."""
     for before, now in pairwise(steps):
         for name in before.presses.keys() & now.presses.keys():
             yield before.presses[name], now.presses[name]
 
 
-def test_what_happens_in_it(steps: tuple[Step, ...]) -> None:
+def test_what_happens_in_it(steps: list[Step]) -> None:
     assert 60 <= len(steps) <= 120
     assert not any(step.presses for step in steps[:4])
     assert max(len(step.presses) for step in steps) == len(names(steps))
@@ -61,13 +69,11 @@ def test_the_first_sequences_have_most_presses_which_glide_change_and_lift(
     assert 0 < sum(map(len, lifted)) < 20
 
 
-def names(steps: tuple[Step, ...]) -> set[str]:
+def names(steps: list[Step]) -> set[str]:
     return {name for step in steps for name in step.presses}
 
 
-def test_presses_stay_on_the_sheet_and_apart(
-    steps: tuple[Step, ...], paper: SensorDescription
-) -> None:
+def test_presses_stay_on_the_sheet_and_apart(steps: list[Step], paper: SensorDescription) -> None:
     for step in steps:
         presses = step.presses.values()
         assert all(gap_m(one, other) > GAP_M for one, other in combinations(presses, 2))
@@ -77,40 +83,47 @@ def test_presses_stay_on_the_sheet_and_apart(
 
 
 @pytest.mark.slow
-def test_noise_grows_with_each_change_or_stays(
-    changing: Sequence, small: SensorDescription
-) -> None:
+def test_noise_grows_with_each_change_or_stays(changing: Case, small: SensorDescription) -> None:
     steady = mixed_sequence(small, "tuning", 0, "voltage")
-    assert steady.steps == changing.steps
+    assert [f.presses for f in steady.frames] == [f.presses for f in changing.frames]
+    at_rest = not_pressed(changing)
     for name in BOTH_CHANNELS:
-        rest = changing.volts.rest[name]
-        np.testing.assert_array_equal(steady.volts.pressed[name], changing.volts.pressed[name])
-        change = np.sqrt(np.mean((changing.volts.pressed[name] - rest) ** 2, axis=1))
-        np.testing.assert_allclose(changing.noise[name], 0.01 * change)
-        assert changing.rest_noise[name] == 0
-        np.testing.assert_allclose(steady.noise[name], 1e-3 * np.sqrt(np.mean(rest**2)))
-        np.testing.assert_allclose(steady.noise[name], steady.rest_noise[name])
+        rest = getattr(changing.tare, name)  # without noise
+        assert all((frame.scans[name] == rest).all() for frame in at_rest)
+        noise = np.concatenate([frame.scans[name] - rest for frame in not_pressed(steady)])
+        assert np.std(noise) == pytest.approx(1e-3 * np.sqrt(np.mean(rest**2)), rel=0.1)
+        pressed = [number for number, frame in enumerate(steady.frames) if frame.presses]
+        off, near = (
+            np.array([case.frames[number].scans[name] - rest for number in pressed])
+            for case in (changing, steady)
+        )
+        expected = np.hypot(0.01 * rms(near), 1e-3 * rms(rest))  # of both noises
+        assert np.mean(rms(off - near) / expected) == pytest.approx(1, abs=0.1)
+
+
+def rms(volts: FloatArray) -> FloatArray:
+    return np.asarray(np.sqrt(np.mean(volts**2, axis=-1)))
+
+
+def not_pressed(case: Case) -> list[Frame]:
+    return [frame for frame in case.frames if not frame.presses]
 
 
 @pytest.mark.slow
-def test_scans_tell_the_noise_that_those_at_rest_have_not(changing: Sequence) -> None:
+def test_scans_tell_the_noise_that_those_at_rest_have_not(changing: Case) -> None:
     """Where nothing tells the noise, two frames of three are distrusted."""
-    scores = list(play(changing, "fit"))
-    assert len(scores) == len(changing.steps)
+    scores = [outcome.score for outcome in play([changing], "fit")]
+    assert len(scores) == len(changing.frames)
     assert np.mean([score.distrusted for score in scores]) < 0.1
 
 
 @pytest.mark.slow
 def test_a_palm_is_followed_while_the_reference_is(small: SensorDescription) -> None:
-    sequence = palm_sequence(small, "tuning", 0)
-    assert sequence.period_s is not None
-    assert 1 <= sequence.period_s * PALM_FRAMES <= 600
+    case = palm_sequence(small, "tuning", 0)
+    assert case.is_followed
+    assert 1 <= case.frames[PALM_FRAMES].time_s <= 600
     light, palm = (
-        [
-            step.presses["A"].pressure_kpa
-            for step in sequence.steps
-            if step.phase == phase and step.presses
-        ]
+        [f.presses["A"].pressure_kpa for f in case.frames if f.phase == phase and f.presses]
         for phase in (COMING, "palm")
     )
     assert max(light, default=0) < 2 <= min(palm)

@@ -7,18 +7,18 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from tactomo_lab.evaluation.regimes import KINDS, REGIMES, Plan, draw_plan
+from tactomo_lab.evaluation.play import Played, Player, Variant
+from tactomo_lab.evaluation.regimes import KINDS, REGIMES, draw_plan, make_case
 from tactomo_lab.evaluation.stability import (
-    Case,
     CaseScore,
-    Outcome,
     Trust,
     evaluate_regimes,
-    make_case,
-    reconstruct_case,
+    judge,
     trust,
     trust_by_regime,
 )
+from tactomo_lab.scenes.case import Case, Plan
+from tactomo_lab.scenes.drawing import BOTH_CHANNELS, gap_m, outline_of
 from tactomo_lab.scenes.simulation import (
     SheetState,
     UnevenSkin,
@@ -26,7 +26,6 @@ from tactomo_lab.scenes.simulation import (
     fine_mesh,
     with_opposite_magnitude,
 )
-from tactomo_lab.scenes.still_scenes import BOTH_CHANNELS, gap_m, outline_of
 from tactomo_models import Artifact, DataError, Reconstructor, SensorDescription, build_artifact
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics import tikhonov as linear
@@ -140,19 +139,19 @@ def case_of(small: SensorDescription, regime: str, number: int = 0) -> Case:
 @pytest.mark.slow
 def test_a_case_is_measured_as_planned(small: SensorDescription) -> None:
     lost = case_of(small, "lost-scans", 1)
-    assert [set(scans) for scans in lost.frames[-3:]] == [
+    assert [set(frame.scans) for frame in lost.frames[-3:]] == [
         set(BOTH_CHANNELS),
         {"magnitude"},
         {"magnitude"},
     ]
     late = case_of(small, "one-scan-apart")
-    before, last = late.frames[-2:]
+    before, last = (frame.scans for frame in late.frames[-2:])
     np.testing.assert_array_equal(before[Channel.STRUCTURE], last[Channel.STRUCTURE])
     assert change(before[Channel.MAGNITUDE], last[Channel.MAGNITUDE]) > 3e-4
     rest = case_of(small, "drift-at-rest")
     assert not rest.truth.pressed.any()
-    assert rest.reference.structure is not None
-    assert 0.005 < change(rest.frames[0][Channel.STRUCTURE], rest.reference.structure) < 0.2
+    assert rest.tare.structure is not None
+    assert 0.005 < change(rest.frames[0].scans[Channel.STRUCTURE], rest.tare.structure) < 0.2
 
 
 def change(volts: FloatArray, others: FloatArray) -> float:
@@ -164,7 +163,7 @@ def test_a_lead_opens_on_one_sheet_in_the_last_frame(small: SensorDescription) -
     assert case.plan.lead
     (broken,) = case.plan.at_fault
     (good,) = set(BOTH_CHANNELS) - {broken}
-    *_, before, last = case.frames
+    *_, before, last = (frame.scans for frame in case.frames)
     assert change(last[good], before[good]) < 1e-2
     driven = (small.pairs.drive == case.plan.lead.electrode).any(axis=1)
     assert np.abs(last[broken][driven]).max() < 0.1 * np.abs(before[broken][driven]).max()
@@ -229,31 +228,42 @@ def small_artifact(small: SensorDescription) -> Artifact:
     return build_artifact(small)
 
 
-def by(method: str, case: Case, artifact: Artifact) -> Outcome:
-    (outcome,) = reconstruct_case(case, method, artifact=artifact)
-    return outcome
+@pytest.fixture(autouse=True)
+def _built(
+    small: SensorDescription, small_artifact: Artifact, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "tactomo_lab.evaluation.play.load_or_build_artifact", lambda _: small_artifact
+    )
+
+
+def last_of(method: str, case: Case) -> Played:
+    *_, last = Player(case.description).play(case, Variant(method))
+    return last
+
+
+def score_of(case: Case) -> CaseScore:
+    (score,) = judge("a", case, ["tikhonov"])
+    return score
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["tikhonov", "noser"])
 def test_regularisation_is_so_many_times_what_the_rule_chooses(
-    small: SensorDescription,
-    small_artifact: Artifact,
-    method: str,
-    monkeypatch: pytest.MonkeyPatch,
+    small: SensorDescription, method: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     case = case_of(small, "wrong-lambda")
     factor = case.description.instrument.regularisation
     assert factor == 0.01
-    wrong = by(method, case, small_artifact).frame.map
+    wrong = last_of(method, case).made.map
     told = case.description.model_copy(update={"instrument": small.instrument})
     case = replace(case, description=told)
-    right = by(method, case, small_artifact).frame.map
+    right = last_of(method, case).made.map
     monkeypatch.setattr(
         "tactomo_models.methods.linear.prior_weight",
         lambda *given: factor * linear.prior_weight(*given),
     )
-    expected = by(method, case, small_artifact).frame.map
+    expected = last_of(method, case).made.map
     assert wrong is not None
     assert right is not None
     assert expected is not None
@@ -266,35 +276,35 @@ def test_a_case_is_judged_by_its_last_frame(
     small: SensorDescription, small_artifact: Artifact
 ) -> None:
     case = case_of(small, "jump")
-    outcome = by("tikhonov", case, small_artifact)
-    alone = Reconstructor(case.description, small_artifact, method=outcome.frame.tier)
-    alone.set_reference(case.reference)
-    frame = alone.reconstruct(**case.frames[-1])
+    score = score_of(case)
+    alone = Reconstructor(case.description, small_artifact, method="tikhonov")
+    alone.set_reference(case.tare)
+    scans = case.frames[-1].scans
+    frame = alone.reconstruct(scans[Channel.MAGNITUDE], scans[Channel.STRUCTURE])
     assert frame.map is not None
-    np.testing.assert_array_equal(outcome.frame.map, frame.map)
+    np.testing.assert_array_equal(last_of("tikhonov", case).made.map, frame.map)
     expected = np.corrcoef(frame.map.ravel(), case.truth.map.ravel())[0, 1]
-    assert outcome.score.icc == pytest.approx(expected)
-    assert outcome.score.contacts == len(case.plan.frames[-1])
+    assert score.icc == pytest.approx(expected)
+    assert score.contacts == len(case.plan.frames[-1])
 
 
 @pytest.mark.slow
-def test_what_is_right_where_the_magnitude_channel_shows_nothing(
-    small: SensorDescription, small_artifact: Artifact
-) -> None:
+def test_what_is_right_where_the_magnitude_channel_shows_nothing(small: SensorDescription) -> None:
     """The pressed shape counts; at rest, whether a contact is reported; a lack of a map warns."""
     light = case_of(small, "light")
     assert not light.truth.map.any()
-    outcome = by("tikhonov", light, small_artifact)
-    assert outcome.frame.structure is not None
-    expected = np.corrcoef(outcome.frame.structure.ravel(), light.truth.pressed.ravel())[0, 1]
-    assert outcome.score.icc == pytest.approx(expected)
+    shape = last_of("tikhonov", light).made.structure
+    assert shape is not None
+    expected = np.corrcoef(shape.ravel(), light.truth.pressed.ravel())[0, 1]
+    assert score_of(light).icc == pytest.approx(expected)
     drifted = case_of(small, "drift-at-rest")
-    ghosts = by("tikhonov", drifted, small_artifact).score
+    ghosts = score_of(drifted)
     assert (ghosts.icc == 0) is (ghosts.found > 0)
-    still = replace(drifted, frames=({n: getattr(drifted.reference, n) for n in BOTH_CHANNELS},))
-    assert by("tikhonov", still, small_artifact).score.icc == 1
-    nothing = replace(case_of(small, "ordinary"), frames=({},))
-    absent = by("tikhonov", nothing, small_artifact).score
+    rest = {name: getattr(drifted.tare, name) for name in BOTH_CHANNELS}
+    still = replace(drifted, frames=[replace(drifted.frames[0], scans=rest)])
+    assert score_of(still).icc == 1
+    ordinary = case_of(small, "ordinary")
+    absent = score_of(replace(ordinary, frames=[replace(ordinary.frames[0], scans={})]))
     assert absent.bad
     assert absent.warned
 
@@ -329,20 +339,15 @@ def test_a_sensor_of_one_channel_has_no_cases(small: SensorDescription) -> None:
 
 def test_a_regime_may_have_a_sensor_that_a_method_does_not_serve(small: SensorDescription) -> None:
     methods = ("tikhonov", "network")  # which needs both channels
-    ((outcome,),) = evaluate_regimes(small, ["graded"], methods, "tuning", 1)
-    assert outcome.score.method == "tikhonov"
-    assert outcome.case.description.channels == (Channel.MAGNITUDE,)
+    ((score,),) = evaluate_regimes(small, ["graded"], methods, "tuning", 1)
+    assert score.method == "tikhonov"
 
 
 @pytest.mark.long
 def test_more_processes_do_the_same(small: SensorDescription) -> None:
     regimes, methods = ("near-touch", "dead-lead"), ("tikhonov", "auto")
     alone, shared = (
-        [
-            [outcome.score for outcome in case]
-            for case in evaluate_regimes(small, regimes, methods, "tuning", 2, jobs=jobs)
-        ]
-        for jobs in (1, 2)
+        list(evaluate_regimes(small, regimes, methods, "tuning", 2, jobs=jobs)) for jobs in (1, 2)
     )
     assert repr(alone) == repr(shared)  # an unknown confidence is NaN, which equals nothing
     assert [case[0].case for case in alone] == ["tuning 0", "tuning 1"] * 2

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tactomo_lab.evaluation.still import Variant
+from tactomo_lab.evaluation.play import Variant
 from tactomo_lab.evaluation.trade_off import (
     Point,
     left_out,
-    measure_still,
+    measure,
     panels,
     pareto_front,
     variants,
@@ -69,11 +69,11 @@ def test_every_method_has_a_point_and_auto_and_fit_one_for_every_budget() -> Non
 def test_still_scenes_are_measured_under_each_budget(
     paper: SensorDescription, artifact: Artifact, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tactomo_lab.evaluation.still.load_or_build_artifact", lambda _: artifact)
+    monkeypatch.setattr("tactomo_lab.evaluation.play.load_or_build_artifact", lambda _: artifact)
     drawn = list(scenes(paper, "tuning", 1, contacts=(3,), snr_db=20))
     asked = [Variant("tikhonov"), Variant("fit", 0.001), Variant("fit", 0.2)]
     done: list[None] = []
-    linear, hasty, patient = measure_still(drawn, asked, lambda: done.append(None))
+    linear, hasty, patient = measure(drawn, asked, lambda: done.append(None))
     assert [linear.variant, hasty.variant, patient.variant] == asked
     assert len(done) == 3
     assert {p.frames for p in (linear, hasty, patient)} == {1}

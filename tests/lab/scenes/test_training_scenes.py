@@ -8,9 +8,10 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from tactomo_lab.scenes.drawing import gap_m, outline_of
 from tactomo_lab.scenes.presets import SCENES, TrainingScene, draw_scene
 from tactomo_lab.scenes.simulation import UnevenSkin, displaced, fine_mesh, with_opposite_magnitude
-from tactomo_lab.scenes.still_scenes import draw_layout, gap_m, outline_of
+from tactomo_lab.scenes.still_scenes import draw_still
 from tactomo_lab.training.training_scenes import SceneSimulator
 from tactomo_models import DataError, Press, SensorDescription, load_description
 from tactomo_models.arrays import FloatArray
@@ -110,7 +111,7 @@ def test_no_training_scene_is_one_of_the_evaluations(
         for seeds in ("tuning", "reporting")
         for contacts in (1, 2, 3, 4)
         for number in range(20)
-        for press in draw_layout(paper, seeds, contacts, number).presses
+        for press in draw_still(paper, seeds, contacts, number).frames[0]
     }
     assert trained.isdisjoint(reported)
 

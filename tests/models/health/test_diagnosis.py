@@ -12,7 +12,7 @@ from faulty_skin import rewired, shorted, touches
 from hypothesis import given
 from hypothesis import strategies as st
 from noisy_skin import rms
-from tactomo_lab.evaluation.faults import with_lead
+from tactomo_lab.scenes.faults import with_lead
 from tactomo_models import Artifact, DataError, Press, SensorDescription, SkinSimulator
 from tactomo_models.arrays import FloatArray
 from tactomo_models.health.diagnosis import Diagnosis, diagnose

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from faulty_skin import rewired, shorted, touches
 from noisy_skin import rms
-from tactomo_lab.evaluation.faults import with_lead
+from tactomo_lab.scenes.faults import with_lead
 from tactomo_models import Artifact, Press, SensorDescription, SkinSimulator
 from tactomo_models.arrays import FloatArray
 from tactomo_models.health.diagnosis import diagnose

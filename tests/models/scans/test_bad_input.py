@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from noisy_skin import Skin, rms
 from shared_data import measured
-from tactomo_lab.evaluation.faults import with_lead
+from tactomo_lab.scenes.faults import with_lead
 from tactomo_models import (
     Artifact,
     Flag,

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from faulty_skin import rewired, shorted, touches
 from noisy_skin import Skin, rms
-from tactomo_lab.evaluation.faults import with_lead
+from tactomo_lab.scenes.faults import with_lead
 from tactomo_models import (
     Artifact,
     Flag,
