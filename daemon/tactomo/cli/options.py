@@ -75,10 +75,11 @@ def _known_method(context: typer.Context, name: str | None) -> str | None:
 
 
 def _known_methods(context: typer.Context, names: list[str] | None) -> list[str] | None:
-    """Refuse as wrong usage what is no method, of several."""
-    for name in names or ():
+    """Refuse as wrong usage what is no method, of several, one after another or with commas."""
+    split = [name.strip() for each in names or () for name in each.split(",")]
+    for name in split:
         _known_method(context, name)
-    return names
+    return split or None
 
 
 def method_option(default: str = "") -> Any:

@@ -78,8 +78,8 @@ def map_fields(
         "map": _array(frame.map),
         "pressure_kpa": _array(frame.pressure_kpa),
         "structure": _array(frame.structure),
-        "x_mm": _ends_mm(description.map_x_m),
-        "y_mm": _ends_mm(description.map_y_m),
+        "x_mm": ends_mm(description.map_x_m),
+        "y_mm": ends_mm(description.map_y_m),
         "magnitude_max": magnitude_max(description),
     }
 
@@ -209,5 +209,6 @@ def _array(array: NDArray[Any] | None) -> dict[str, Any] | None:
     return None if array is None else array_to_wire(array)
 
 
-def _ends_mm(positions_m: FloatArray) -> list[float]:
+def ends_mm(positions_m: FloatArray) -> list[float]:
+    """Return the first and the last of positions in millimetres, as a `map` message has them."""
     return [float(positions_m[0]) * MM_PER_M, float(positions_m[-1]) * MM_PER_M]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 from typing import Annotated
 
@@ -12,14 +13,14 @@ from tactomo.cli.options import (
     Description,
     Force,
     GivenChannel,
-    Method,
     ReferenceFrames,
     examples,
     frame_slice,
+    methods_option,
     typer_app,
 )
 from tactomo.cli.output import progress_bar, say
-from tactomo.cli.plot.plot import prepare_file
+from tactomo.cli.plot.plot import picture_option, prepare_file, save_figure
 
 app = typer_app()
 
@@ -28,6 +29,7 @@ app = typer_app()
     epilog=examples(
         "tactomo reconstruct scans.npz maps.npz",
         "tactomo reconstruct scans.npz maps.npz --method tikhonov -d my_skin.toml",
+        "tactomo reconstruct scans.npz maps.npz --method fit,noser --picture maps.png",
         "tactomo reconstruct tank.mat maps.npz -d tank_disc --reference-frames 0:20",
         "tactomo reconstruct full.csv maps.npz -d tank_disc --reference empty.csv --pattern 32:1",
     ),
@@ -37,7 +39,7 @@ def reconstruct(
         Path, typer.Argument(metavar="IN", help="Scans: .npz, .mat, .csv, .txt, .eit.")
     ],
     maps: Annotated[Path, typer.Argument(metavar="OUT.npz", help="The file to write.")],
-    method: Method = "auto",
+    method: Annotated[list[str] | None, methods_option(" [auto]")] = None,
     description: Description = DEFAULT_DESCRIPTION,
     calibration: Annotated[
         Path | None,
@@ -58,6 +60,9 @@ def reconstruct(
         str | None, typer.Option(help="Name of the array of scans in IN. [the one that fits]")
     ] = None,
     channel: GivenChannel = None,
+    picture: Annotated[
+        Path | None, picture_option("Draw the frames that tell most, a row for each method")
+    ] = None,
     force: Force = False,
 ) -> None:
     """Reconstruct a file of scans, without a daemon.
@@ -107,7 +112,8 @@ def reconstruct(
     what the fit starts from, and stands in where the fit does not explain the scans. Where objects
     conduct `either_way`, *fit* and *auto* are *noser*. The laboratory adds
     *pls-paper*, the level set of the paper that tactomo is compared with, and the paper's networks,
-    *cnn-single* and *cnn-multimodal*.
+    *cnn-single* and *cnn-multimodal*. Of several, OUT holds the first one's maps; the others' are
+    drawn beside them in the picture.
     """
     from tactomo_models import load_description
     from tactomo_models.batch import reconstruct_file, reference_at_rest
@@ -142,20 +148,34 @@ def reconstruct(
         reference = reference.with_noise_of(sensor, *map(given.get, Channel))
     for note in read.notes:
         say(note, err=True)
-    with progress_bar("reconstructing") as show:
-        made = reconstruct_file(
-            scans,
-            maps,
-            read=(given, reference),
-            description=sensor,
-            method=method,
-            progress=show,
-            curve=curve,
-            taught=lesson,
-        )
-    if made.failed:
-        say(f"{made.failure}; {made.failed} frame(s) are tikhonov's instead", err=True)
-    say(f"wrote {maps}: {made.frames} frames")
+    methods = method or ["auto"]
+    with tempfile.TemporaryDirectory(prefix="tactomo-") as folder:
+        files = {name: Path(folder, f"{at}.npz") for at, name in enumerate(methods)}
+        files[methods[0]] = maps
+        for name, file in files.items():
+            with progress_bar(f"reconstructing by {name}") as show:
+                made = reconstruct_file(
+                    scans,
+                    file,
+                    read=(given, reference),
+                    description=sensor,
+                    method=name,
+                    progress=show,
+                    curve=curve,
+                    taught=lesson,
+                )
+            if made.failed:
+                say(f"{made.failure}; {made.failed} frame(s) are tikhonov's instead", err=True)
+            if file == maps:
+                say(f"wrote {maps}: {made.frames} frames")
+        if not maps.is_file():  # such as /dev/null
+            return
+        from tactomo.cli.files.reconstructed import draw_methods, print_summary
+
+        print_summary(maps)
+        if picture is not None:
+            save_figure(draw_methods(files, sensor, f"{scans.name}, {sensor.name}"), picture)
+            say(f"wrote {picture}")
 
 
 def _is_of_reconstruct(path: Path) -> bool:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from matplotlib.figure import Figure
-from tactomo_client import Contact
+from tactomo_client import Contact, Frame
 from tactomo_client.appearance import COLOURS, map_pixels, shown_image
 
 from tactomo.cli.files.recorded_frames import Moment
@@ -37,7 +37,6 @@ def draw_page(
     title: str,
 ) -> Figure:
     """Return the page with the panels that are requested and have data."""
-    about = {} if description is None else description_fields(description)
     rows = [panel for panel in panels if panel in HEIGHTS_IN and _has_data(panel, course)]
     has_path = "path" in panels and bool(course.tracks)
     strip_in = STRIP_IN if maps else 0.0
@@ -52,7 +51,11 @@ def draw_page(
     areas = dict(zip(parts, column[:, 0], strict=True))
     colours = _contact_colours(course)
     if maps:
-        _draw_strip(areas["strip"], maps, about)
+        titles = [
+            f"{letter}   {moment.time_s:.2f} s"
+            for letter, moment in zip(LETTERS, maps, strict=False)
+        ]
+        draw_strip(areas["strip"], [moment.frame for moment in maps], description, titles)
     if has_path and rows:
         left, right = areas["body"].subfigures(1, 2, width_ratios=(1.0, 1.35))
         _draw_path(left, course, description, colours)
@@ -88,31 +91,37 @@ def _contact_colours(course: Course) -> dict[str, Any]:
     return {name: palette[i % len(palette)] for i, name in enumerate(course.tracks)}
 
 
-def _draw_strip(figure: Any, maps: Sequence[Moment], about: dict[str, Any]) -> None:
-    """Draw the maps side by side, on one scale."""
+def draw_strip(
+    figure: Any,
+    frames: Sequence[Frame],
+    description: SensorDescription | None,
+    titles: Sequence[str],
+) -> None:
+    """Draw the frames' maps side by side, on one scale, with a bar of its colours as tall."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import LinearSegmentedColormap, Normalize
 
-    axes_row = np.atleast_1d(figure.subplots(1, len(maps), sharey=True))
-    for letter, axes, moment in zip(LETTERS, axes_row, maps, strict=False):
-        _draw_map(axes, moment, about)
-        axes.set_title(f"{letter}   {moment.time_s:.2f} s", fontsize=10)
+    about = {} if description is None else description_fields(description)
+    axes_row = np.atleast_1d(figure.subplots(1, len(frames), sharey=True))
+    for axes, frame, title in zip(axes_row, frames, titles, strict=True):
+        _draw_map(axes, frame, about)
+        axes.set_title(title, fontsize=10)
     axes_row[0].set_ylabel("y (mm)")
-    known = [s for moment in maps if (s := shown_image(moment.frame, about))]
+    known = [s for frame in frames if (s := shown_image(frame, about))]
     if known:
         colours = LinearSegmentedColormap.from_list("map", np.array(COLOURS) / 255)
         scale = ScalarMappable(Normalize(0, known[0][1]), colours)
-        figure.colorbar(scale, ax=axes_row, label=_scale_label(maps[0]), shrink=0.8, pad=0.01)
+        beside_last = axes_row[-1].inset_axes((1.05, 0.0, 0.06, 1.0))
+        figure.colorbar(scale, cax=beside_last, label=_scale_label(frames[0]))
 
 
-def _scale_label(moment: Moment) -> str:
-    if moment.frame.pressure_kpa is not None:
+def _scale_label(frame: Frame) -> str:
+    if frame.pressure_kpa is not None:
         return "pressure (kPa)"
-    return "|Δσ|/σ₀" if moment.frame.map is not None else "pressed"
+    return "|Δσ|/σ₀" if frame.map is not None else "pressed"
 
 
-def _draw_map(axes: Any, moment: Moment, about: dict[str, Any]) -> None:
-    frame = moment.frame
+def _draw_map(axes: Any, frame: Frame, about: dict[str, Any]) -> None:
     pixels = map_pixels(frame, about)
     axes.tick_params(labelsize=7)
     axes.set_xlabel("x (mm)")
