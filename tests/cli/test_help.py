@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -69,6 +70,16 @@ def test_every_option_has_one_name_and_one_meaning() -> None:
     assert meanings.keys() & {"--tier", "--name", "--twin", "--ask-for"} == set()
 
 
+@pytest.mark.parametrize("words", leaves(TOP), ids=" ".join)
+def test_each_example_can_be_copied_from_80_columns(words: tuple[str, ...]) -> None:
+    command = TOP
+    for word in words:
+        command = command.commands[word]
+    margin = 2  # of the help's left and right edge
+    examples = re.findall(r"`(tactomo [^`]+)`", command.epilog or "")
+    assert [line for line in examples if len(line) > 80 - margin] == []
+
+
 def test_the_daemon_has_no_more_options_than_a_person_types() -> None:
     assert len(TOP.commands["daemon"].params) <= 10
 
@@ -80,7 +91,7 @@ def test_the_daemon_has_no_more_options_than_a_person_types() -> None:
         (["--help"], set()),
         (["status"], set()),
         (["info", "paper_square"], {"numpy", "pydantic", "rich"}),
-        (["ports"], {"rich", "serial"}),
+        (["ports"], {"serial"}),
         (["status", "--address", "ipc://@nobody"], {"zmq"}),
         (["tare", "--address", "ipc://@nobody"], {"zmq"}),
     ],

@@ -89,7 +89,7 @@ def _in_words(settings: dict[str, Any]) -> str:
         "tactomo evaluate scenes",
         "tactomo evaluate scenes --count 50 --contacts 1-4 --snr 60,40,20,10",
         "tactomo evaluate scenes --method tikhonov --picture tikhonov.png",
-        "tactomo evaluate scenes --seeds reporting --snr-of voltage --json > report.json",
+        "tactomo evaluate scenes --seeds reporting --json > report.json",
     )
 )
 def scenes(
@@ -365,7 +365,7 @@ def drift(
 @app.command(
     epilog=options.examples(
         "tactomo evaluate stability --count 2",
-        "tactomo evaluate stability --regime jump,drift --method auto --picture flags.png",
+        "tactomo evaluate stability --regime jump,drift --picture flags.png",
         "tactomo evaluate stability --seeds reporting --jobs 2 --json > stability.json",
     )
 )

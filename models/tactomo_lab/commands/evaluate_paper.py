@@ -55,7 +55,7 @@ app = options.typer_app()
 @app.command(
     epilog=options.examples(
         "tactomo evaluate paper",
-        "tactomo evaluate paper --figure 9,10 --method tikhonov --method auto --picture figures",
+        "tactomo evaluate paper --figure 9,10 --method tikhonov,auto --picture figures",
         "tactomo evaluate paper --figure 5 --count 10",
         "tactomo evaluate paper --seeds reporting --json > paper.json",
     )

@@ -96,8 +96,8 @@ def simulate(
     epilog=examples(
         "tactomo models train scenes/robust",
         "tactomo models train scenes/robust --epochs 5 --output trial.onnx",
-        "tactomo models train scenes/robust --start scenes/robust/ours.pt --checkpoint more.pt",
-        "tactomo models train scenes/paper --configuration paper-multimodal --device cuda",
+        "tactomo models train scenes/robust --start ours.pt --checkpoint more.pt",
+        "tactomo models train scenes/paper --configuration paper-multimodal",
     )
 )
 def train(

@@ -82,14 +82,18 @@ def test_what_one_scan_does_not_tell_is_null(tactomo: Run, rest: FloatArray) -> 
 
 
 def test_a_table_names_the_electrode(
-    tactomo: Run, rest: FloatArray, paper: SensorDescription
+    tactomo: Run, rest: FloatArray, paper: SensorDescription, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
     ends = np.hstack([paper.pairs.drive, paper.pairs.measure])
     np.savez("in.npz", structure=noisy(np.where((ends == 3).any(axis=1), 1e-6, 1.0) * rest))
     outcome = tactomo("doctor", "in.npz")
     assert outcome.returncode == 1
     assert "electrode 3 reads next to nothing" in outcome.stdout
-    assert "check its lead" in outcome.stdout
+    told = report(tactomo("doctor", "in.npz", "--json"))["channels"]["structure"]["findings"]
+    steps = [finding["next_step"] for finding in told if finding["next_step"]]
+    assert steps
+    assert all(f" {step}\n" in outcome.stdout for step in steps)  # whole: to be copied
     assert "ill: see what is marked" in outcome.stdout
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import pty
@@ -14,9 +13,8 @@ from typing import Any
 
 import pytest
 from fake_machine import FakeMachine
-from rich.console import Console
 from tactomo.acquisition.identify import identify
-from tactomo.cli.run.ports import question, survey, table
+from tactomo.cli.run.ports import lines, question, survey
 from tactomo_protocol import Channel, Command, Decoder, Hello, SampleFormat, encode
 from waiting import wait_until
 
@@ -68,10 +66,7 @@ def device() -> Iterator[Callable[[bytes], str]]:
 
 
 def shown(machine: FakeMachine, *paths: str) -> str:
-    console = Console(file=io.StringIO(), width=200)
-    console.print(table(survey(paths, machine.root), {}))
-    assert isinstance(console.file, io.StringIO)
-    return console.file.getvalue()
+    return "\n".join(lines(survey(paths, machine.root), {}))
 
 
 def test_adapters_are_shown_with_their_names_holders_and_troubles(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ app = options.typer_app(
     no_args_is_help=True,
     epilog=options.examples(
         "tactomo calibrate live --sensor left_forearm --diameter-mm 30",
-        "tactomo calibrate fit load_cell.csv --sensor left_forearm --recording presses.mcap",
+        "tactomo calibrate fit load_cell.csv --recording presses.mcap",
         "tactomo calibrate show --sensor left_forearm --picture curve.png",
     ),
 )
@@ -87,7 +87,7 @@ def live(
 
 @app.command(
     epilog=options.examples(
-        "tactomo calibrate fit load_cell.csv --sensor left_forearm --recording presses.mcap",
+        "tactomo calibrate fit load_cell.csv --recording presses.mcap",
         "tactomo calibrate fit magnitudes.csv --dry-run --picture curve.png",
     )
 )

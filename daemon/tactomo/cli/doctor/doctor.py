@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from tactomo.cli import options
-from tactomo.cli.output import print_json
+from tactomo.cli.output import print_json, say
 from tactomo.cli.sensors import find_sensor
+from tactomo.plain import plain
 
 if TYPE_CHECKING:
-    from rich.table import Table
     from tactomo_models.health.diagnosis import Diagnosis
     from tactomo_models.health.findings import Finding, Level
 
     from tactomo.cli.doctor.evidence import Evidence
 
-COLOURS = {"ok": "green", "unknown": "dim", "advice": "yellow", "fault": "red", "broken": "red"}
+COLOURS = {
+    "ok": "green",
+    "unknown": None,
+    "advice": "yellow",
+    "fault": "red",
+    "broken": "red",
+}
 MARKS = {"ok": "", "unknown": "? ", "advice": "! ", "fault": "✗ ", "broken": "✗ "}
 VERDICTS = {
     "ok": "healthy",
@@ -122,7 +129,7 @@ def doctor(
     if as_json:
         print_json(report(evidence, channels, line, verdict))
     else:
-        _print(Console(), evidence, channels, line, verdict)
+        _print(evidence, channels, line, verdict)
     raise typer.Exit(0 if VERDICTS[verdict] == "healthy" else 1)
 
 
@@ -199,24 +206,18 @@ def _plain(finding: Finding) -> dict[str, Any]:
 
 
 def _print(
-    console: Any,
-    evidence: Evidence,
-    channels: dict[str, Diagnosis],
-    line: list[Finding],
-    verdict: Level,
+    evidence: Evidence, channels: dict[str, Diagnosis], line: list[Finding], verdict: Level
 ) -> None:
-    console.print(evidence.title, style="bold")
+    """Print lines that the terminal alone breaks: a command in one can be copied."""
+    say(evidence.title)
     for note in evidence.notes:
-        console.print(note, style="dim")
+        say(note)
     for name, diagnosis in channels.items():
-        console.print(_table(name, list(diagnosis.findings)))
+        _print_findings(name, diagnosis.findings)
     if line:
-        console.print(_table("stream", line))
-    word = VERDICTS[verdict]
-    console.print(
-        f"[bold {COLOURS[verdict]}]{word}[/]" + ("" if verdict == "ok" else _why(verdict)),
-        markup=True,
-    )
+        _print_findings("stream", line)
+    typer.secho(f"\n{VERDICTS[verdict]}", fg=COLOURS[verdict], bold=True, nl=False)
+    say("" if verdict == "ok" else _why(verdict))
 
 
 def _why(verdict: Level) -> str:
@@ -228,19 +229,10 @@ def _why(verdict: Level) -> str:
     }[verdict]
 
 
-def _table(title: str, findings: list[Finding]) -> Table:
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(title=title, title_justify="left", title_style="bold")
-    for column in ("", "found", "what to do"):
-        table.add_column(column, overflow="fold")
+def _print_findings(title: str, findings: Sequence[Finding]) -> None:
+    say(f"\n{title}")
     for finding in findings:
-        colour = COLOURS[finding.level]
-        about = finding.about.replace("_", " ")
-        table.add_row(
-            Text(f"{MARKS[finding.level]}{about}", colour),
-            Text(finding.detail, colour),
-            finding.next_step,
-        )
-    return table
+        about = f"{MARKS[finding.level]}{finding.about.replace('_', ' ')}: {finding.detail}"
+        typer.secho(f"  {plain(about)}", fg=COLOURS[finding.level])
+        if finding.next_step:
+            say(f"      {finding.next_step}")

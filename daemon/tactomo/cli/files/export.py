@@ -40,7 +40,7 @@ app = typer_app()
     epilog=examples(
         "tactomo export grasp.mcap grasp_foxglove.mcap --layout skin.json",
         "tactomo export grasp.mcap grasp_bag --ros2",
-        "tactomo export grasp.mcap grasp_dataset --lerobot --robot steps.csv --task 'lift the cup'",
+        "tactomo export grasp.mcap dataset --lerobot --robot steps.csv --task lift",
         "tactomo export grasp.mcap contacts.csv --from 2 --to 10",
         "tactomo export grasp.mcap maps.npz",
     )

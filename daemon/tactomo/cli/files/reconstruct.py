@@ -31,7 +31,7 @@ app = typer_app()
         "tactomo reconstruct scans.npz maps.npz --method tikhonov -d my_skin.toml",
         "tactomo reconstruct scans.npz maps.npz --method fit,noser --picture maps.png",
         "tactomo reconstruct tank.mat maps.npz -d tank_disc --reference-frames 0:20",
-        "tactomo reconstruct full.csv maps.npz -d tank_disc --reference empty.csv --pattern 32:1",
+        "tactomo reconstruct a.csv a.npz -d tank_disc --reference b.csv --pattern 32:1",
     ),
 )
 def reconstruct(

@@ -27,7 +27,7 @@ app = options.typer_app()
         "tactomo daemon --sensor left_forearm --port /dev/ttyACM0 --port /dev/ttyACM1",
         "tactomo daemon /etc/tactomo/left_forearm.toml --method tikhonov",
         "tactomo daemon robot.toml",
-        "tactomo daemon --port /dev/ttyACM0 --set tare_scans=40 --set recording.maps=true",
+        "tactomo daemon --port /dev/ttyACM0 --set recording.maps=true",
     )
 )
 def daemon(

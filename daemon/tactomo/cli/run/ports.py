@@ -14,8 +14,6 @@ from tactomo.cli.options import JsonOutput, examples, typer_app
 from tactomo.cli.output import print_json, say
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from tactomo.acquisition.adapters import Adapter, Holder
     from tactomo.acquisition.identify import Answer
 
@@ -68,10 +66,8 @@ def ports(
     if as_json:
         print_json({"ports": [as_fields(row, answers) for row in found]})
         return
-    from tactomo.cli.console import Console
-
-    if found:
-        Console().print(table(found, answers))
+    for line in lines(found, answers):
+        say(line)
     if not paths and not any(row.adapter and row.adapter.is_usb for row in found):
         say(NONE_THERE)
 
@@ -135,25 +131,17 @@ def as_fields(row: Row, answers: dict[str, Answer]) -> dict[str, Any]:
     }
 
 
-def table(rows: Sequence[Row], answers: dict[str, Answer]) -> Table:
-    """Return the rows as a table for people, from which whole paths can be copied."""
-    from rich.table import Table
-    from rich.text import Text
-
-    shown = Table.grid(padding=(0, 2))
-    shown.add_column(no_wrap=True)
-    shown.add_column(overflow="fold")
+def lines(rows: Sequence[Row], answers: dict[str, Answer]) -> list[str]:
+    """Return the rows as lines for people; what is in one can be copied whole."""
+    told = []
     for row in rows:
-        shown.add_row(Text(row.path, "bold"), Text(_describe(row.adapter)))
-        lines = [("use", row.use), *(("held by", str(holder)) for holder in row.held_by)]
+        told.append(f"{row.path}  {_describe(row.adapter)}")
+        facts = [("use", row.use), *(("held by", str(holder)) for holder in row.held_by)]
         if row.path in answers:
-            lines.append(("device", _describe_device(answers[row.path])))
-        for name, value in lines:
-            if value:
-                shown.add_row(f"  {name}", Text(value))
-        for remark in row.remarks:
-            shown.add_row("  note", Text(remark, "yellow"))
-    return shown
+            facts.append(("device", _describe_device(answers[row.path])))
+        facts += [("note", remark) for remark in row.remarks]
+        told += [f"  {name:7}  {value}" for name, value in facts if value]
+    return told
 
 
 def _row(

@@ -19,7 +19,7 @@ app = typer_app()
 
 @app.command(
     epilog=examples(
-        "tactomo zenoh --from ipc:///run/tactomo/left/stream --from ipc:///run/tactomo/right/stream",
+        "tactomo zenoh --from ipc:///run/tactomo/left/stream --robot arm",
         "tactomo zenoh --from ... --robot arm --config /etc/tactomo/zenoh.json5",
         "tactomo zenoh --bind tcp://127.0.0.1:5570 --robot arm --config desk.json5",
     )

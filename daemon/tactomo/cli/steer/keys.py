@@ -28,7 +28,7 @@ app = typer_app(
     epilog=examples(
         "tactomo keys make left_forearm --server     (on the robot)",
         "tactomo keys make desk                      (on your desk)",
-        "tactomo keys allow desk.key --for left_forearm --may-command     (on the robot)",
+        "tactomo keys allow desk.key --for left_forearm --may-command   (on the robot)",
     ),
 )
 Folder: TypeAlias = Annotated[
