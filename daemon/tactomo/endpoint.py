@@ -135,8 +135,8 @@ def bind(
         if error.errno == zmq.EADDRINUSE:
             raise AddressError(
                 f"{endpoint} ({purpose}) is in use",
-                "stop the daemon that runs already, or give another address"
-                + (f", such as {option} {next_address(endpoint)}" if ":" in endpoint[6:] else ""),
+                f"stop the daemon that runs already, or give another address: {option} "
+                + (next_address(endpoint) if endpoint.startswith("tcp:") else "ipc://PATH"),
                 "address_in_use",
             ) from error
         raise AddressError(

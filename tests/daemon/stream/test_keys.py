@@ -252,11 +252,11 @@ def test_a_reader_is_told_who_can_put_a_calibration_in_force(
     made = PressureCalibration.of_readings(subject_of("left", sensor), readings)
     path = calibration_path("left")
     reader = robot.allow(robot.client("reader"))
-    told = reload.taken_up(made, path, guarded.daemon.control_address, reader)
+    told = reload.taken_up(made, path, guarded.daemon.stream_address, reader)
     assert told.startswith("not in force yet: ")
     assert "calibrate reload --sensor left" in told
     commander = robot.allow(robot.client("chief"), may_command=True)
-    told = reload.taken_up(made, path, guarded.daemon.control_address, commander)
+    told = reload.taken_up(made, path, guarded.daemon.stream_address, commander)
     assert "the description's table" in told
 
 
