@@ -11,25 +11,24 @@ counted in modelled work, so that a recording reconstructs exactly as the live s
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from tactomo_protocol import Channel
 
-from tactomo_models.arrays import BoolArray, FloatArray, Image
+from tactomo_models.arrays import FloatArray, Image
 from tactomo_models.calibration.taught_skin import TaughtSkin
 from tactomo_models.errors import DataError, ModelError
 from tactomo_models.methods.magnitudes import BAD_MISFIT
 from tactomo_models.methods.method import Estimate, Method, Skin, UnsolvableError
 from tactomo_models.methods.registry import check_method, make_method
-from tactomo_models.physics.actual_sheet import SheetEstimator, Sheets
 from tactomo_models.physics.artifact import Artifact
-from tactomo_models.scans.changes import MeasuredChannel
-from tactomo_models.scans.measurement import Comparator, Measurement
+from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scans.reference import Reference
+from tactomo_models.scans.tare import Tare
 from tactomo_models.scene.areas import Areas
 from tactomo_models.scene.contacts import contacts_of, pressure_map, total_force
 from tactomo_models.scene.pressure import PressureCurve, PressureRange, described_curve
@@ -85,8 +84,7 @@ class Reconstructor:
         skin = Skin.of(description, artifact)
         self.artifact = skin.artifact
         self._skin = replace(skin, regularisation=description.instrument.regularisation)
-        self._comparator = Comparator(description, skin.artifact, skin.forward)
-        self._sheets: Sheets | None = None  # as the reference tells; None if nobody has asked
+        self._tare = skin.tare
         self._methods: dict[str, Method] = {}  # by their names, once they were asked for
         self._failures: dict[str, str] = {}  # of methods prepared since the tare; empty if good
         self._previous: Estimate | None = None
@@ -131,58 +129,46 @@ class Reconstructor:
         if name != self._name:
             self._name = name
             self.forget_shape()
-        if self._skin.channels:
+        if self._tare.channels:
             self._prepared(name)
 
-    def set_reference(self, reference: Reference, sheets: Sheets | None = None) -> None:
+    def set_reference(self, reference: Reference) -> None:
         """Measure changes against this unpressed scan from now on.
 
         Forgets the warm start, unless it is the last reference, drifted.
 
-        Args:
-            reference: the unpressed scan.
-            sheets: what `find_sheets` has found by it; if None, they are found now.
+        Raises:
+            DataError: a channel has another number of voltages than the sensor.
+        """
+        if reference.is_followed_from(self._tare.reference):
+            self._tare = replace(self._tare, reference=reference)
+        else:
+            self.use(self.take(reference))
+
+    def use(self, tare: Tare) -> None:
+        """Measure changes against a tare from now on; forgets the warm start."""
+        self._tare = tare
+        self._prepare()
+        self.reset()
+
+    def take(self, reference: Reference) -> Tare:
+        """What a reference tells, with all that the method will ask of it; for any thread.
+
+        Half a second of processor time a sheet, if the method solves presses on sheets as they are.
 
         Raises:
             DataError: a channel has another number of voltages than the sensor.
         """
-        if self._comparator.set_reference(reference) or sheets is not None:
-            self._sheets = sheets
-            self._prepare()
-            self.reset()
-
-    def find_sheets(self, reference: Reference) -> Sheets | None:
-        """Find how the sheets were made, as their reference tells; for any thread.
-
-        Half a second of processor time a sheet. None where the method makes nothing of it.
-
-        Raises:
-            DataError: a channel has another number of voltages than the sensor.
-        """
-        if not _uses_sheets(self._methods[self._name]):
-            return None
-        return self._sheets_of(self._comparator.channels_of(reference))
-
-    def _sheets_of(self, channels: Mapping[Channel, MeasuredChannel]) -> Sheets:
-        structure = self.description.structure
-        if structure is not None and structure.either_way:
-            return {}  # a tank is no skin: its water is even
-        estimator = SheetEstimator(self.description, self.artifact.bare)
-        found = {
-            name: estimator.estimate(each.reference, each.usable, each.relative_noise)
-            for name, each in channels.items()
-        }
-        return {name: sheet for name, sheet in found.items() if sheet is not None}
+        tare = Tare.take(self._tare.sensor, reference)
+        if getattr(self._methods[self._name], "uses_sheets", False):
+            _ = tare.sheets
+        return tare
 
     def _prepare(self) -> None:
         """Prepare the method with the channels and sheets as they are now."""
-        self._skin = replace(self._skin, channels=self._comparator.channels)
+        self._skin = replace(self._skin, tare=self._tare)
         self._failures.clear()
         self._prepared(self._name)
-
-    def usable(self, name: Channel) -> BoolArray:
-        """Voltages (M,) of a channel that the tare has found nothing wrong with."""
-        return self._comparator.channels[name].usable
 
     def reset(self) -> None:
         """Forget the warm start and which contacts were which."""
@@ -220,10 +206,11 @@ class Reconstructor:
         saturated: Collection[Channel] = (),
     ) -> Measurement:
         """The first half of `reconstruct`, which costs little: what has changed."""
-        self._comparator.ask_noise(magnitude, structure)
-        if self._comparator.channels is not self._skin.channels:
-            self._prepare()
-        return self._comparator.compare(magnitude, structure, saturated)
+        if self._tare.asks_noise:
+            self._tare = self._tare.with_noise_of(magnitude, structure)
+            if self._tare.channels is not self._skin.tare.channels:
+                self._prepare()
+        return self._tare.changes(magnitude, structure, saturated)
 
     def solve(self, measurement: Measurement) -> Reconstruction:
         """The second half of `reconstruct`: what follows from a measurement."""
@@ -233,7 +220,8 @@ class Reconstructor:
             flagged = replace(measurement, flags=measurement.flags | Flag.NO_USABLE_SCAN)
             return self._nothing(flagged, "no usable scan")
         if measurement.is_quiet:
-            self._previous = None
+            lasting = None if self._previous is None else self._previous.lasting
+            self._previous = None if lasting is None else Estimate(carried=lasting, lasting=lasting)
             self._tracker.update(np.zeros((0, 2)), np.zeros(0))
             return self._nothing(measurement, "no change above the noise")
         previous, self._previous = self._previous, None
@@ -278,13 +266,8 @@ class Reconstructor:
         self._methods[name] = method
         if name not in self._failures:
             self._failures[name] = ""
-            if self._sheets is None and _uses_sheets(method):
-                self._sheets = self._sheets_of(self._skin.channels)
-            sheets = self._sheets or {}
-            for channel in sheets.keys() & self._skin.channels.keys():
-                self._skin.channels[channel].meet(sheets[channel])
             try:
-                method.prepare(replace(self._skin, sheets=sheets))
+                method.prepare(self._skin)
             except (Exception, SystemExit) as error:
                 if _is_ours(method) or isinstance(error, ModelError):
                     del self._failures[name]
@@ -420,10 +403,6 @@ class _MethodFailedError(Exception):
 
 def _is_ours(method: Method) -> bool:
     return type(method).__module__.startswith("tactomo_models.")
-
-
-def _uses_sheets(method: Method) -> bool:
-    return bool(getattr(method, "uses_sheets", False))
 
 
 def _in_words(error: BaseException) -> str:

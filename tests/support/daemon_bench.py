@@ -13,6 +13,7 @@ import tty
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -224,10 +225,13 @@ class Memory:
         self.curve: PressureCurve | None = None
         self._before = np.zeros((51, 51), np.float32)
 
-    def find_sheets(self, _: Reference) -> None:
-        pass
+    def take(self, reference: Reference) -> Any:
+        return SimpleNamespace(reference=reference)
 
-    def set_reference(self, reference: Reference, sheets: None = None) -> None:
+    def use(self, tare: Any) -> None:
+        self.set_reference(tare.reference)
+
+    def set_reference(self, reference: Reference) -> None:
         self.reference = reference
         self.reset()
 

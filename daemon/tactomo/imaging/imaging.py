@@ -25,7 +25,7 @@ from tactomo_models.calibration.calibration_file import PressureCalibration
 from tactomo_models.calibration.taught_skin import TaughtSkin
 from tactomo_models.commissioning.known_skin import SkinAtStart, skin_at_start
 from tactomo_models.methods.machine_speed import MachineSpeed
-from tactomo_models.physics.actual_sheet import Sheets
+from tactomo_models.scans.tare import Tare
 from tactomo_protocol import Channel, ScanFlag
 
 from tactomo.config import BaselineConfig
@@ -89,7 +89,7 @@ class Imaging:
             tare_scans,
             description.channels,
             self.frame_rate,
-            reconstructor.find_sheets,
+            reconstructor.take,
             waits,
             self._take,
             self._fall_back,
@@ -124,25 +124,26 @@ class Imaging:
         """Whether there is something to measure this channel's changes against."""
         return getattr(self.reference, channel, None) is not None
 
-    def use_reference(
-        self, reference: Reference, realtime_ns: int, sheets: Sheets | None = None
-    ) -> None:
-        """Measure changes against `reference` from the next dual scan on, and follow from it."""
-        self.reference_realtime_ns = realtime_ns
-        if self._tracker is None:
-            self._reconstructor.set_reference(reference, sheets)
-            self._note_reference(reference)
-        else:
-            self._note_reference(self._tracker.begin(reference, sheets))
+    def use_reference(self, reference: Reference, realtime_ns: int) -> None:
+        """Measure changes against `reference` from the next dual scan on, and follow from it.
 
-    def _take(
-        self, reference: Reference, sheets: Sheets | None, is_asked: bool, contacts: int
-    ) -> bool:
+        Where it had drifted itself, that is as good as a tare.
+        """
+        as_it_is = reference if self._tracker is None else reference.taken_as_it_is()
+        self._use(self._reconstructor.take(as_it_is), realtime_ns)
+
+    def _use(self, tare: Tare, realtime_ns: int) -> None:
+        self.reference_realtime_ns = realtime_ns
+        (self._reconstructor.use if self._tracker is None else self._tracker.begin)(tare)
+        self._note_reference(tare.reference)
+
+    def _take(self, tare: Tare, is_asked: bool, contacts: int) -> bool:
         """Use a reference that was taken; at the start only if nothing lies on the skin.
 
         One that was taken while contacts were shown is disputed, and not kept for the next start.
         Returns whether it is in force.
         """
+        reference = tare.reference
         known = None if is_asked or self.reference is not None else self._known()
         if known is not None:
             found = skin_at_start(self._reconstructor, known.reference, reference, known.age_s)
@@ -161,7 +162,7 @@ class Imaging:
             is_first and self._kept is not None and self._kept.is_unreadable
         )
         self._before = self._known_before() if contacts else None
-        self.use_reference(reference, time.time_ns(), sheets)
+        self._use(tare, time.time_ns())
         if contacts:
             self._on_event(
                 "reference_disputed",
@@ -190,8 +191,7 @@ class Imaging:
 
     def _prefer(self, known: KnownSkin, why: str) -> None:
         self._is_disputed = True
-        sheets = self._reconstructor.find_sheets(known.reference)
-        self.use_reference(known.reference, known.realtime_ns, sheets)
+        self.use_reference(known.reference, known.realtime_ns)
         self._on_event(
             "reference_disputed",
             f"{why}: the reference of {known.words} is used",
@@ -285,8 +285,7 @@ class Imaging:
     def _restore(self, known: KnownSkin) -> None:
         """Settle the dispute about a tare: the skin is at rest by the reference before it."""
         self._before, self._is_unchecked = None, False
-        sheets = self._reconstructor.find_sheets(known.reference)
-        self.use_reference(known.reference, known.realtime_ns, sheets)
+        self.use_reference(known.reference, known.realtime_ns)
         self._on_event(
             "reference_confirmed",
             "the skin is at rest by the reference before the tare, which is used again",

@@ -1,10 +1,10 @@
 """Taking a reference: the mean of some dual scans of the unloaded skin, and their noise.
 
-`Taring` is the pipeline's: it begins tares, gives them up and answers who asked. `Tare` is one of
-them. Somebody who presses meanwhile would be averaged into the reference, so scans that move while
-they are collected are refused. A press that lasts and stays the same cannot be told from a bare
-skin whose reference is out of date: whoever tares is told how many contacts were shown meanwhile,
-and such a reference is disputed.
+`Taring` is the pipeline's: it begins tares, gives them up and answers who asked. Somebody who
+presses meanwhile would be averaged into the reference, so scans that move while they are collected
+are refused. A press that lasts and stays the same cannot be told from a bare skin whose reference
+is out of date: whoever tares is told how many contacts were shown meanwhile, and such a reference
+is disputed.
 
 A reference tells how the sheets were made, which takes about a second to find. That is done beside
 the frames, which are made against the reference before until then.
@@ -20,7 +20,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from tactomo_models import ModelError, Reference
 from tactomo_models.arrays import FloatArray
-from tactomo_models.physics.actual_sheet import Sheets
+from tactomo_models.scans.tare import Tare
 from tactomo_protocol import Channel
 
 from tactomo.errors import CommandError
@@ -41,11 +41,10 @@ Volts = FloatArray
 
 
 class _Taken(NamedTuple):
-    """A reference that was taken, while it is found how its sheets were made."""
+    """A reference that was taken, while it is found out what it tells."""
 
-    tare: Tare
-    reference: Reference
-    sheets: Future[Sheets | None]
+    scans: _Scans
+    tare: Future[Tare]
 
 
 class Taring:
@@ -57,11 +56,10 @@ class Taring:
         scans: dual scans for each reference.
         channels: those of the sensor.
         frame_rate: how often frames come.
-        find_sheets: finds how the sheets of a reference were made; for any thread.
+        take: finds what a reference tells; for any thread.
         waits: whether frames wait for that, so that each is made against what was taken before.
-        put_in_force: called with a reference that was taken, its sheets, whether somebody asked
-            for it, and how many contacts were shown meanwhile; returns whether it is in force, and
-            not an older one.
+        put_in_force: called with a tare, whether somebody asked for it, and how many contacts were
+            shown meanwhile; returns whether it is in force, and not an older one.
         fall_back: called with why none was taken while there is none; returns whether an older
             one is in force now.
         on_event: told what a tare became.
@@ -72,22 +70,22 @@ class Taring:
         scans: int,
         channels: Collection[Channel],
         frame_rate: Rate,
-        find_sheets: Callable[[Reference], Sheets | None],
+        take: Callable[[Reference], Tare],
         waits: bool,
-        put_in_force: Callable[[Reference, Sheets | None, bool, int], bool],
+        put_in_force: Callable[[Tare, bool, int], bool],
         fall_back: Callable[[str], bool],
         on_event: OnEvent,
     ) -> None:
         self._scans = scans
         self._channels = channels
         self._frame_rate = frame_rate
-        self._find_sheets = find_sheets
+        self._take = take
         self._waits = waits
         self._put_in_force = put_in_force
         self._fall_back = fall_back
         self._on_event = on_event
         self._has_reference = False
-        self._tare: Tare | None = None
+        self._tare: _Scans | None = None
         self._deadline_s = 0.0
         self._taken: _Taken | None = None  # the next tare waits for it, whoever asks meanwhile
         self._finder = ThreadPoolExecutor(1, "sheets")  # the thread starts with the first tare
@@ -103,7 +101,7 @@ class Taring:
 
     def start(self, answer: Future[Mapping[str, Any]] | None = None) -> None:
         """Take a reference from the dual scans to come; `answer` gets what it became, or why."""
-        self._tare = self._tare or Tare(self._scans)
+        self._tare = self._tare or _Scans(self._scans)
         self._put_off()
         if answer is not None:
             self._tare.answers.append(answer)
@@ -116,7 +114,7 @@ class Taring:
         """Put in force what is ready; give up a tare on command for which nothing comes."""
         if (taken := self._taken) is not None:
             self._put_off()
-            if not self._waits and not taken.sheets.done():
+            if not self._waits and not taken.tare.done():
                 return
             self._taken = None
             self._finish(taken)
@@ -156,15 +154,14 @@ class Taring:
         except ModelError as error:
             self._refuse(tare, _refusal_of(error))
             return
-        sheets = self._finder.submit(self._find_sheets, reference)
-        self._taken = _Taken(tare, reference, sheets)
+        self._taken = _Taken(tare, self._finder.submit(self._take, reference))
         self.check()
 
     def _finish(self, taken: _Taken) -> None:
-        tare, reference, sheets = taken
-        contacts = tare.contacts
+        tare, contacts = taken.scans, taken.scans.contacts
         try:
-            is_new = self._put_in_force(reference, sheets.result(), bool(tare.answers), contacts)
+            known = taken.tare.result()
+            is_new = self._put_in_force(known, bool(tare.answers), contacts)
         except ModelError as error:
             self._refuse(tare, _refusal_of(error))
             return
@@ -172,11 +169,11 @@ class Taring:
         if not is_new:
             return
         shown = f", while {contacts} contact(s) were shown" if contacts else ""
-        self._on_event("tared", f"{reference.scans} dual scans{shown}")
+        self._on_event("tared", f"{known.reference.scans} dual scans{shown}")
         for answer in tare.answers:  # when all is in force: a status asked for now shows it
-            answer.set_result({"scans": reference.scans, "contacts": contacts})
+            answer.set_result({"scans": known.reference.scans, "contacts": contacts})
 
-    def _refuse(self, tare: Tare, refusal: CommandError) -> None:
+    def _refuse(self, tare: _Scans, refusal: CommandError) -> None:
         self._on_event("tare_refused", refusal.cause, refusal.next_step)
         if not self._has_reference and not self._fall_back(refusal.cause):
             self.start()  # without a reference there is nothing else to do
@@ -195,7 +192,7 @@ def _refusal_of(error: ModelError) -> CommandError:
     return CommandError(str(error), "", "tare_refused")
 
 
-class Tare:
+class _Scans:
     """Collects dual scans until there are enough of them."""
 
     def __init__(self, scans: int) -> None:

@@ -54,7 +54,7 @@ class PaperLevelSetMethod:
     def prepare(self, skin: Skin) -> None:
         """Make the level set's equations."""
         self._skin = skin
-        if Channel.STRUCTURE in skin.channels:
+        if Channel.STRUCTURE in skin.tare.channels:
             self._shapes = PaperShapes(skin)
 
     def solve(
@@ -101,7 +101,7 @@ class PreliminaryImages:
 
     def __init__(self, skin: Skin) -> None:
         self._skin = skin
-        self._shapes = PaperShapes(skin) if Channel.STRUCTURE in skin.channels else None
+        self._shapes = PaperShapes(skin) if Channel.STRUCTURE in skin.tare.channels else None
         # Fixed, as the paper's is: what a network was trained on must not depend on the noise.
         self._matrix = tikhonov_matrix(
             skin.artifact.jacobian,

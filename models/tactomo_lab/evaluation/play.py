@@ -112,10 +112,8 @@ class Player:
 
     def _take(self, tare: Reference) -> None:
         with threadpool_limits(1):
-            if self.tracker is None:
-                self._reconstructor.set_reference(tare)
-            else:
-                self.tracker.begin(tare)
+            use = self._reconstructor.use if self.tracker is None else self.tracker.begin
+            use(self._reconstructor.take(tare))
         self._tare = tare
 
 

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from tactomo_models.arrays import FloatArray
 from tactomo_models.methods.method import Skin
-from tactomo_models.scans.measurement import Comparator
 from tactomo_models.scans.reference import Reference
+from tactomo_models.scans.tare import Tare
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_protocol import Channel
 
@@ -85,17 +85,18 @@ class _Imager:
 
     def __init__(self, description: SensorDescription) -> None:
         self._skin = Skin.of(description)
-        self._comparator = Comparator(description, self._skin.artifact, self._skin.forward)
 
     def set_reference(self, reference: Reference) -> None:
-        self._comparator.set_reference(reference)
-        self._images = PreliminaryImages(replace(self._skin, channels=self._comparator.channels))
+        tare = Tare.take(self._skin.tare.sensor, reference)
+        self._skin = replace(self._skin, tare=tare)
+        self._images = PreliminaryImages(self._skin)
 
     def images(self, volts: dict[Channel, FloatArray]) -> dict[Channel, FloatArray]:
         """Images (nodes_y, nodes_x) of both channels' scans (M,)."""
         scans = (volts[Channel.MAGNITUDE], volts[Channel.STRUCTURE])
-        self._comparator.ask_noise(*scans)
-        return self._images.of(self._comparator.compare(*scans).changes, volts.keys())
+        if self._skin.tare.asks_noise:
+            self._skin = replace(self._skin, tare=self._skin.tare.with_noise_of(*scans))
+        return self._images.of(self._skin.tare.changes(*scans).changes, volts.keys())
 
 
 @lru_cache(maxsize=2)

@@ -16,6 +16,7 @@ from tactomo_models.drift.baseline import BaselineTracker
 from tactomo_models.methods.method import Skin
 from tactomo_models.reconstruct import DEFAULT_BUDGET_S, Reconstructor
 from tactomo_models.scans.reference import Reference
+from tactomo_models.scans.tare import Tare
 
 # On simulated sheets of the shipped squares, uneven by 2 to 10 %: contacts leave at most 0.34 of
 # the changes unexplained, or make the sheet deviate from its model 1.8 times as much or more (of a
@@ -44,7 +45,9 @@ def skin_at_start(
     Takes some tenths of a second. The reconstructor measures against `known` from then on.
     """
     tracker = BaselineTracker(reconstructor)
-    tracker.begin(known, sheets={})  # as even ones they tell well enough, and at once
+    sensor = Skin.of(reconstructor.description, reconstructor.artifact).tare.sensor
+    # As even ones the sheets tell well enough, and at once.
+    tracker.begin(Tare.take(sensor, known, is_even=True))
     if tracker.explains_as_drift(now, elapsed_s):
         return SkinAtStart.KNOWN
     gained = _without_gain(known, now)
@@ -54,7 +57,7 @@ def skin_at_start(
     reconstructor.method, reconstructor.budget_s = "fit", DEFAULT_BUDGET_S
     left = min(_left_by_contacts(reconstructor, each) for each in (now, gained))
     reconstructor.method, reconstructor.budget_s = method, budget_s
-    predicted = Skin.of(reconstructor.description, reconstructor.artifact).forward.bare_voltages
+    predicted = sensor.forward.bare_voltages
     grown = max(
         _deviation(getattr(now, name), predicted) / _deviation(getattr(known, name), predicted)
         for name in reconstructor.description.channels

@@ -33,15 +33,15 @@ from typing import Any, Final, Literal, Protocol
 import numpy as np
 from tactomo_protocol import Channel
 
-from tactomo_models.arrays import BoolArray, FloatArray
+from tactomo_models.arrays import FloatArray
 from tactomo_models.drift.channel_baseline import ChannelBaseline, Drift
 from tactomo_models.drift.drift_model import DriftSubspace
 from tactomo_models.drift.press_memory import PressMemory
-from tactomo_models.physics.actual_sheet import Sheets
 from tactomo_models.physics.artifact import Artifact
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scans.reference import Reference
+from tactomo_models.scans.tare import Tare
 from tactomo_models.scene.reconstruction import Reconstruction
 from tactomo_models.sensor.description import SensorDescription
 
@@ -71,11 +71,11 @@ class Solver(Protocol):
     def artifact(self) -> Artifact:
         """What is precomputed for the sensor."""
 
-    def set_reference(self, reference: Reference, sheets: Sheets | None = None) -> None:
-        """Measure changes against this unpressed scan from now on."""
+    def set_reference(self, reference: Reference) -> None:
+        """Measure changes against the tare, drifted, from now on."""
 
-    def usable(self, name: Channel) -> BoolArray:
-        """Voltages (M,) of a channel that the tare has found nothing wrong with."""
+    def use(self, tare: Tare) -> None:
+        """Measure changes against a tare from now on."""
 
     def compare(
         self,
@@ -115,27 +115,18 @@ class BaselineTracker:
         self._moved_s = self._last_s = 0.0
         self._distrusted_s: float | None = None
 
-    def begin(self, reference: Reference, sheets: Sheets | None = None) -> Reference:
-        """Measure against a reference, and follow from there; returns it as it is in force.
-
-        Where it had drifted itself, that is as good as a tare.
-
-        Args:
-            reference: the unpressed scan.
-            sheets: what has been found by it; if None, they are found now.
-        """
-        self.reference = reference = reference.taken_as_it_is()
-        self._reconstructor.set_reference(reference, sheets)
+    def begin(self, tare: Tare) -> None:
+        """Measure against a tare, and follow from there."""
+        self.reference = tare.reference
+        self._reconstructor.use(tare)
         self._channels = {
-            name: ChannelBaseline(self._subspace, tare, self._reconstructor.usable(name))
-            for name in self._reconstructor.description.channels
-            if (tare := getattr(reference, name)) is not None
+            name: ChannelBaseline(self._subspace, getattr(tare.reference, name), channel.usable)
+            for name, channel in tare.channels.items()
         }
         self._memory.clear()
         self._release = _Release()
         self._is_ready = self._is_held = False
         self.refusal, self._distrusted_s, self.moves = "", None, 0
-        return reference
 
     @property
     def state(self) -> State:

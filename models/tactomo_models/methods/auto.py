@@ -68,4 +68,5 @@ class Auto(Fit):
         # It has learnt scenes that no few contacts describe; but where data are left unexplained,
         # sheets may contradict each other, and no network is sure enough to hide that.
         made = network_estimate(self._skin, measurement, "no pressure field explains the data")
-        return replace(made, misfit=own.misfit, flags=made.flags | own.flags, carried=course)
+        flags, at_rest = made.flags | own.flags, course.at_rest
+        return replace(made, misfit=own.misfit, flags=flags, carried=course, lasting=at_rest)

@@ -17,12 +17,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from tactomo_protocol import Channel
 
-from tactomo_models.arrays import FloatArray
+from tactomo_models.arrays import FloatArray, IntArray
 from tactomo_models.methods.account import Account, Frame
+from tactomo_models.physics.forward import ForwardModel, Probes
 from tactomo_models.scene.field_fit import FieldFit
 from tactomo_models.scene.parameters import SIZE, SMALLEST_SIZE, UNIT_M, X, Y
 
@@ -47,6 +49,20 @@ class MissingContact:
     gain: float
 
 
+@lru_cache(maxsize=1)  # takes a tenth of a second, and is the same for each tare
+def _spots(forward: ForwardModel) -> tuple[IntArray, FloatArray, FloatArray, Probes]:
+    """The spots that are looked at: their nodes, places (N,) in metres, and probes there."""
+    grid = 2.0  # distance of the spots, in distances of map nodes
+    reach = 3.0  # radius over which the field is averaged there, likewise
+    description, bare = forward.description, forward.bare
+    spacing = description.width_m / (description.map.nodes_x - 1)
+    x, y = bare.points[:, bare.pressable]
+    cell = np.round(np.stack([x, y]) / (grid * spacing)).astype(int)
+    _, chosen = np.unique(cell, axis=1, return_index=True)
+    nodes = np.sort(chosen)
+    return nodes, x[nodes], y[nodes], forward.probes(x[nodes], y[nodes], reach * spacing)
+
+
 class ContactSearch:
     """Looks for contacts in what is left unexplained.
 
@@ -56,19 +72,9 @@ class ContactSearch:
     """
 
     def __init__(self, fit: FieldFit, ratios: Mapping[Channel, float]) -> None:
-        grid = 2.0  # distance of the spots that are looked at, in distances of map nodes
-        reach = 3.0  # radius over which the field is averaged there, likewise
         self._fit, self._forward = fit, fit.forward
         self._dipoles = {name: 2 * (ratio - 1) / (ratio + 1) for name, ratio in ratios.items()}
-        description = self._forward.description
-        spacing = description.width_m / (description.map.nodes_x - 1)
-        bare = self._forward.bare
-        x, y = bare.points[:, bare.pressable]
-        cell = np.round(np.stack([x, y]) / (grid * spacing)).astype(int)
-        _, chosen = np.unique(cell, axis=1, return_index=True)
-        self._nodes = np.sort(chosen)
-        self._x, self._y = x[self._nodes], y[self._nodes]
-        self._probes = self._forward.probes(self._x, self._y, reach * spacing)
+        self._nodes, self._x, self._y, self._probes = _spots(fit.forward)
 
     def missing(self, account: Account, frame: Frame, *, far: bool) -> list[MissingContact]:
         """The discs that would explain clearly more than chance, the best first.

@@ -19,7 +19,6 @@ from tactomo_models.methods.linear import EitherWay
 from tactomo_models.methods.magnitudes import BAD_MISFIT
 from tactomo_models.methods.method import Estimate, Skin, UnsolvableError
 from tactomo_models.methods.search import Belief, Search
-from tactomo_models.physics.actual_sheet import SheetEstimator
 from tactomo_models.scans.changes import Changes
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
@@ -43,6 +42,11 @@ class Course:
     frames_held: int = 0  # since the last structure scan
     account: FieldAccount | None = None  # of the belief
 
+    @property
+    def at_rest(self) -> Course | None:
+        """What is known once nothing presses: that the sheets have drifted since the tare."""
+        return Course(drifts=True) if self.drifts else None
+
 
 class Fit:
     """A few contacts: their outlines, and how hard each presses."""
@@ -50,20 +54,16 @@ class Fit:
     uses_sheets = True
 
     def prepare(self, skin: Skin) -> None:
-        """Make the fit of this sensor, unless the last tare was of the same."""
-        before = getattr(self, "_skin", None)
+        """Make the fit of this sensor, with its sheets as they are."""
         self._skin = skin
         self._either_way: EitherWay | None = None
         if skin.description.either_way(Channel.STRUCTURE):
             self._either_way = EitherWay()
             self._either_way.prepare(skin)
             return
-        if before is None or before.forward is not skin.forward:
-            self._field_fit = FieldFit(skin.forward, skin.description)
-            self._search = Search(self._field_fit)
-            self._accountant = FieldAccountant(self._field_fit, skin.areas)
-            self._drift: FloatArray | None = None  # see `SheetEstimator.drift`
-        self._field_fit.sheets = dict(skin.sheets)
+        self._field_fit = FieldFit(skin.forward, skin.description, skin.tare.sheets)
+        self._search = Search(self._field_fit)
+        self._accountant = FieldAccountant(self._field_fit, skin.areas)
 
     def solve(
         self, measurement: Measurement, previous: Estimate | None, budget_s: float
@@ -73,7 +73,7 @@ class Fit:
             return self._either_way.solve(measurement, previous, budget_s)
         carried = previous.carried if previous is not None else None
         course = carried if isinstance(carried, Course) else Course()
-        measurement = self._skin.with_model_error(measurement)
+        measurement = self._skin.tare.with_model_error(measurement)
         if Channel.STRUCTURE in self._skin.description.channels - measurement.changes.keys():
             judged = self._drifting(measurement) if course.drifts else measurement
             return self._held(course, judged)
@@ -87,10 +87,9 @@ class Fit:
 
     def _drifting(self, measurement: Measurement) -> Measurement:
         """The same, where the sheets may have drifted since the tare."""
-        if self._drift is None:
-            self._drift = SheetEstimator(self._skin.description, self._skin.artifact.bare).drift()
+        drift = self._skin.tare.sensor.drift
         changes = {
-            name: each.drifting(self._since_tare(name, each)[:, None] * self._drift)
+            name: each.drifting(self._since_tare(name, each)[:, None] * drift)
             for name, each in measurement.changes.items()
         }
         return replace(measurement, changes=changes)
@@ -194,6 +193,7 @@ class Fit:
             made_by="fit",
             reason=f"{how}, {_in_words(belief)}",
             carried=course,
+            lasting=course.at_rest,
         )
 
     def _held(self, course: Course, measurement: Measurement) -> Estimate:
@@ -219,6 +219,7 @@ class Fit:
             made_by="fit",
             reason="the last shape: the structure scan is missing",
             carried=course,
+            lasting=course.at_rest,
         )
 
     def _with_outlines_of(self, last: FittedField, measurement: Measurement) -> FittedField:

@@ -66,8 +66,7 @@ class LevelSetFit:
         """Make the fit of this sensor, with its sheets as they are."""
         self._skin = skin
         self._images = LinearImages(skin, "noser")
-        self._fit = FieldFit(skin.forward, skin.description)
-        self._fit.sheets = dict(skin.sheets)
+        self._fit = FieldFit(skin.forward, skin.description, skin.tare.sheets)
         self._accountant = FieldAccountant(self._fit, skin.areas)
         self._level_set = LevelSet(skin.forward)
         graded = self._fit.responses.get(Channel.MAGNITUDE)
@@ -80,7 +79,7 @@ class LevelSetFit:
         """Refine the shapes, then shapes and pressures together, within the budget."""
         if Channel.STRUCTURE not in measurement.changes:
             raise UnsolvableError("the structure channel is missing")
-        measured = self._skin.with_model_error(measurement).changes
+        measured = self._skin.tare.with_model_error(measurement).changes
         carried = previous.carried if previous is not None else None
         last = carried if isinstance(carried, _Solved) else None
         if last is not None and last.fitted.converged and are_still(last.measured, measured):

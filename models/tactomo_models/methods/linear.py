@@ -71,7 +71,7 @@ class LinearImages:
 
     def _make_matrix(self, channel: Channel) -> FloatArray:
         skin, jacobian = self._skin, self._skin.artifact.jacobian
-        noise = skin.channels[channel].relative_noise
+        noise = skin.tare.channels[channel].relative_noise
         noser = noser_scale(jacobian, noise) if self._prior == "noser" else None
         if channel == Channel.MAGNITUDE:
             prior_scale = even_scale(skin.forward.node_areas_m2) if noser is None else noser
@@ -97,9 +97,9 @@ class Tikhonov:
         self._images = LinearImages(skin, self.prior)
         self._jacobian_by_node = np.ascontiguousarray(skin.artifact.jacobian.T)
         self._node_areas_m2 = skin.forward.node_areas_m2
-        for channel in skin.channels:
+        for channel in skin.tare.channels:
             self._images.matrix(channel)
-        if Channel.MAGNITUDE in skin.channels:  # of each voltage's noise, what the image has
+        if Channel.MAGNITUDE in skin.tare.channels:  # of each voltage's noise, what the image has
             self._voltages_by_node = self._jacobian_by_node.astype(np.float32)
             self._image_noise = self._node_areas_m2 @ self._images.matrix(Channel.MAGNITUDE) ** 2
 

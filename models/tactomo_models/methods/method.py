@@ -18,21 +18,19 @@ A method of one's own is a class with these two functions. This one is complete:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray, Image
 from tactomo_models.methods.trained_networks import SensorNetworks
-from tactomo_models.physics.actual_sheet import Sheets
 from tactomo_models.physics.artifact import Artifact, load_or_build_artifact
 from tactomo_models.physics.forward import ForwardModel
-from tactomo_models.scans.changes import MeasuredChannel
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
+from tactomo_models.scans.reference import Reference
+from tactomo_models.scans.tare import Sensor, Tare
 from tactomo_models.scene.areas import AreaFinder, Areas
 from tactomo_models.scene.field_account import FieldAccount
 from tactomo_models.sensor.description import SensorDescription
@@ -48,10 +46,8 @@ class Skin:
         forward: the model of its sheet.
         areas: finds pressed areas in an image, and takes images from nodes to the map.
         networks: trained for this sensor.
-        channels: those that have a reference, with their noise.
+        tare: what is known of it since then; of no channel before the first one.
         regularisation: factor on the linear methods' regularisation parameter.
-        sheets: the models of those sheets whose references tell how they were made; all others
-            are taken as even. Found for methods alone that say `uses_sheets`.
     """
 
     description: SensorDescription
@@ -59,9 +55,8 @@ class Skin:
     forward: ForwardModel
     areas: AreaFinder
     networks: SensorNetworks
-    channels: Mapping[Channel, MeasuredChannel] = field(default_factory=dict)
+    tare: Tare
     regularisation: float = 1.0
-    sheets: Sheets = field(default_factory=dict)
 
     @property
     def magnitude_sign(self) -> float:
@@ -69,29 +64,14 @@ class Skin:
         has_magnitude = Channel.MAGNITUDE in self.description.channels
         return self.description.sign(Channel.MAGNITUDE) if has_magnitude else 1.0
 
-    @cached_property
-    def _error_ratios(self) -> dict[Channel, float]:
-        """Variance of each found sheet's model errors, over that of an even one."""
-        return {
-            name: self.channels[name].error_ratio(sheet.bare_voltages)
-            for name, sheet in self.sheets.items()
-        }
-
-    def with_model_error(self, measurement: Measurement) -> Measurement:
-        """The same, with each weight from the model error of the sheet as it was found."""
-        changes = {
-            name: each.judged_by(self._error_ratios[name]) if name in self.sheets else each
-            for name, each in measurement.changes.items()
-        }
-        return replace(measurement, changes=changes)
-
     @classmethod
     def of(cls, description: SensorDescription, artifact: Artifact | None = None) -> Skin:
         """A sensor before its first tare; its artifact is read or built if None."""
         artifact = artifact or load_or_build_artifact(description)
         forward = ForwardModel(description, artifact.bare)
         finder, networks = AreaFinder(forward), SensorNetworks(description)
-        return cls(description, artifact, forward, finder, networks)
+        untared = Tare.take(Sensor(description, artifact, forward), Reference(None, None))
+        return cls(description, artifact, forward, finder, networks, untared)
 
 
 @dataclass(frozen=True)
@@ -120,6 +100,8 @@ class Estimate:
         reason: why, in words.
         carried: what the method wants to find in `previous` at the next frame; nobody else reads
             it.
+        lasting: what it wants to find there instead after frames in which nothing pressed; None
+            where it starts cold.
     """
 
     map: FloatArray | Image | None = None
@@ -136,6 +118,7 @@ class Estimate:
     made_by: str = ""
     reason: str = "as requested"
     carried: object = None
+    lasting: object = None
 
 
 class UnsolvableError(Exception):

@@ -144,17 +144,22 @@ class FieldFit:
     Args:
         forward: the model of the sheets.
         description: the sensor; that of `forward` if None.
+        sheets: each sheet as it is, where the tare has told; the even one elsewhere.
 
     Attributes:
         likely: logarithm of the structure sheet's ratio, as likely as any.
     """
 
-    def __init__(self, forward: ForwardModel, description: SensorDescription | None = None) -> None:
+    def __init__(
+        self,
+        forward: ForwardModel,
+        description: SensorDescription | None = None,
+        sheets: Mapping[Channel, ForwardModel] | None = None,
+    ) -> None:
         description = description or forward.description
         self.forward = forward  # the model of an even sheet
         self.responses: dict[Channel, SheetResponse] = responses_of(description)  # of each sheet
-        # each sheet as it is, where the tare has told; the even one elsewhere
-        self.sheets: dict[Channel, ForwardModel] = {}
+        self._sheets = sheets or {}
         saturated = np.log(10.0)
         if description.structure is not None:
             saturated = float(np.log(description.structure.saturated_ratio))
@@ -167,7 +172,7 @@ class FieldFit:
 
     def sheet(self, name: Channel) -> ForwardModel:
         """The model of a channel's sheet: as it is, or an even one."""
-        return self.sheets.get(name, self.forward)
+        return self._sheets.get(name, self.forward)
 
     def compare(self, fitted: FittedField, measured: Measured) -> FittedField:
         """Hold an estimate against other data, without a solve.

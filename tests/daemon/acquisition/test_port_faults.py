@@ -23,7 +23,7 @@ Start = Callable[..., Any]
 
 def refusal(port: str | Path) -> PortError:
     """Return the error with which a daemon refuses to start on a port."""
-    memory: Any = SimpleNamespace(method="auto", budget_s=None, find_sheets=None)
+    memory: Any = SimpleNamespace(method="auto", budget_s=None, take=None)
     local = "tcp://127.0.0.1:0"
     config = load_config(
         None, ports=[str(port)], stream=local, control=local, baseline={"track": False}

@@ -10,10 +10,22 @@ from typing import Any
 import pytest
 from daemon_bench import Memory
 from tactomo_client.messages import array_from_wire
+from tactomo_models import Reference
 
 
 def pressed(frame: dict[str, Any]) -> float:
     return float(array_from_wire(frame["map"])[0, 0])
+
+
+def hold_takes(monkeypatch: pytest.MonkeyPatch, first: Callable[[], object]) -> None:
+    """Have `first` be called before it is found out what a reference tells."""
+    take = Memory.take
+
+    def held(self: Memory, reference: Reference) -> Any:
+        first()
+        return take(self, reference)
+
+    monkeypatch.setattr(Memory, "take", held)
 
 
 @pytest.mark.slow
@@ -22,7 +34,7 @@ def test_frames_go_on_against_the_last_reference_until_the_new_one_is_understood
 ) -> None:
     understood = threading.Event()
     understood.set()
-    monkeypatch.setattr(Memory, "find_sheets", lambda *_: understood.wait(60) and None)
+    hold_takes(monkeypatch, lambda: understood.wait(60))
     b = bench()
     b.tare()
     understood.clear()
@@ -45,11 +57,11 @@ def test_a_daemon_stops_while_it_finds_out_how_sheets_are(
 ) -> None:
     begun, ended = threading.Event(), threading.Event()
 
-    def find(*_: object) -> None:
+    def find() -> None:
         begun.set()
         ended.wait(60)
 
-    monkeypatch.setattr(Memory, "find_sheets", find)
+    hold_takes(monkeypatch, find)
     b = bench()
     b.skin.introduce()
     for _ in range(b.daemon.config.tare_scans + 1):
@@ -109,11 +121,11 @@ def test_who_asks_while_a_reference_is_found_out_about_shares_the_next_one(
     understood = threading.Event()
     understood.set()
 
-    def find(*_: object) -> None:
+    def find() -> None:
         found.append(1)
         understood.wait(60)
 
-    monkeypatch.setattr(Memory, "find_sheets", find)
+    hold_takes(monkeypatch, find)
     b = bench()
     b.tare()
     understood.clear()

@@ -84,7 +84,7 @@ def test_nothing_is_left_after_a_start_that_failed(bench: Start, tmp_path: Path)
     good, bad = os.ttyname(free[1]), str(tmp_path / "absent")
     threads = set(threading.enumerate())
     before = len(os.listdir("/proc/self/fd"))
-    memory: Any = SimpleNamespace(method="auto", budget_s=None, find_sheets=None)
+    memory: Any = SimpleNamespace(method="auto", budget_s=None, take=None)
     off = {"track": False}
     local = {"stream": "tcp://127.0.0.1:0", "control": "tcp://127.0.0.1:0"}
     taken = b.daemon.control_address

@@ -262,7 +262,7 @@ def test_an_address_in_use_is_refused_and_nothing_is_left_open(
     free = "tcp://127.0.0.1:0"
     settings: dict[str, Any] = {"stream": free, "control": free, purpose: taken}
     settings["baseline"] = {"track": False}
-    memory: Any = SimpleNamespace(method="auto", budget_s=None, find_sheets=None)
+    memory: Any = SimpleNamespace(method="auto", budget_s=None, take=None)
     second = Daemon(load_config(ports=["/dev/null"], **settings), reconstructor=memory)
     before = threading.active_count()
     with pytest.raises(AddressError, match="in use") as caught:

@@ -53,7 +53,7 @@ class Life:
     def tare(self) -> None:
         scans = [self.scan() for _ in range(20)]
         stacks = (np.array([scan[name] for scan in scans]) for name in ("magnitude", "structure"))
-        self.tracker.begin(Reference.from_scans(*stacks))
+        self.tracker.begin(self.reconstructor.take(Reference.from_scans(*stacks)))
 
     def scan(self, *presses: Press) -> dict[str, FloatArray]:
         return {

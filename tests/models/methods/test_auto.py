@@ -210,6 +210,23 @@ def test_a_drift_is_believed_until_the_scene_is_new(
     assert len(frame.contacts) == 2
 
 
+def test_a_drift_that_was_learnt_outlives_the_touch(
+    methods: dict[str, Reconstructor], skin: Skin, simulator: SkinSimulator
+) -> None:
+    warm = DriftingSkin(simulator, SkinDrift(step_k=1.5))
+    drifted = {str(name): volts for name, volts in warm.voltages(TWO, 1.0).items()}
+    auto = methods["auto"]
+    auto.set_reference(skin.reference(19))
+    assert "drifted" in auto.reconstruct(**drifted).reason
+    assert auto.reconstruct(**skin.scan()).tier == "quiet"
+    budget_s, auto.budget_s = auto.budget_s, 0.02  # too little to find it out again
+    frame = auto.reconstruct(**drifted)
+    auto.reset()
+    assert "drifted" not in auto.reconstruct(**drifted).reason
+    auto.budget_s = budget_s
+    assert "drifted" in frame.reason
+
+
 @pytest.mark.slow
 def test_a_drift_is_told_where_voltages_have_both_signs() -> None:
     sensor = load_description("openeit_disc")
