@@ -20,7 +20,7 @@ from typing import Any, Self
 from waiting import PATIENCE_S, wait_until
 from whole_system import ANYWHERE
 
-KEEP_RUNNING = ("demo", "twin", "daemon", "foxglove")
+KEEP_RUNNING = ("demo", "twin", "daemon", "foxglove", "viewer")
 
 
 class Newcomer:
@@ -60,6 +60,8 @@ class Newcomer:
         """
         for words, others in self._instead.items():
             command = command.replace(words, others)
+        for number, port in enumerate(self.addresses.get("ports", ())):
+            command = command.replace(f"/dev/ttyACM{number}", port)
         program, name, *rest = shlex.split(command)
         assert program == "tactomo"
         script = Path(sys.executable).with_name("tactomo")  # does not search the working folder
@@ -102,13 +104,12 @@ class Newcomer:
             ],
             "twin": ["--twin-control", ANYWHERE, "--announce"],
             "foxglove": ["--foxglove-port", "0", "--announce"],
+            "viewer": ["--viewer-port", "0"],
             **dict.fromkeys(("daemon", "replay"), served),
         }
         return here.get(name, [])
 
     def _start(self, name: str, line: list[str]) -> str:
-        if "/dev/ttyACM0" in line and self.addresses.get("ports"):
-            line[line.index("/dev/ttyACM0")] = self.addresses["ports"][0]
         process = subprocess.Popen(
             line,
             cwd=self.folder,
@@ -123,6 +124,8 @@ class Newcomer:
         for said in process.stdout:
             heard += said
             told = json.loads(said) if said.startswith("{") else {}
+            if said.startswith("viewer: "):
+                told = {"url": said.removeprefix("viewer: ").strip()}
             if name == "daemon" and told.get("event") != "ready":
                 continue
             if told:
