@@ -28,7 +28,7 @@ LOCKED := pyproject.toml --universal --python-version 3.11 --generate-hashes \
 ON_ARM := --python-version 3.11 --python-platform aarch64-manylinux_2_28 --only-binary :all: \
   --no-emit-package tactomo-client --no-emit-package tactomo --no-annotate
 
-.PHONY: help setup run test test-lab test-all test-random test-long test-train test-peers faults soak fleet firmware fuzz lint format schema bench docs wheels deb lock clean
+.PHONY: help setup run test test-lab test-all test-random test-long test-train test-peers faults soak fleet firmware fuzz lint format schema pictures bench docs wheels deb lock clean
 
 help:            ## list these targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -95,6 +95,9 @@ format: $(READY) ## let ruff rewrite what it can
 
 schema: $(READY) ## tables of the documentation and the C++ fields, from tactomo_client/schema.py
 	$(BIN)/python tests/support/write_schema.py
+
+pictures: $(READY)  ## the page's pictures in docs/, of a demo in Chromium
+	$(BIN)/python tests/support/page_pictures.py
 
 bench: $(READY)  ## latency and time per frame on this machine
 	$(BIN)/tactomo bench $(ARGS)

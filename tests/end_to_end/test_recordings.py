@@ -14,6 +14,7 @@ import pytest
 from mcap.reader import make_reader
 from selenium.webdriver import Chrome
 from shared_data import measured
+from tactomo.recordings.recording_set import open_replayable
 from tactomo_client import request, subscribe
 from tactomo_client.messages import MAP, decode_message
 from waiting import PATIENCE_S, wait_until
@@ -70,16 +71,33 @@ def test_a_measured_stream_is_imported_replayed_and_located(tmp_path: Path) -> N
     assert np.diff(angle).min() > -0.2
 
 
+SCRUB = """
+const slider = document.getElementById('position');
+slider.value = arguments[0];
+slider.dispatchEvent(new Event('input'));
+"""
+SHOWN = """
+const {drawn} = tactomo.state;
+return [document.body.dataset.health, drawn.scan_counter,
+        ...drawn.contacts.map((contact) => [contact.x_mm, contact.y_mm])];
+"""
+
+
 @pytest.mark.slow
 @pytest.mark.browser
-def test_a_replay_with_a_page_begins_when_the_page_is_open(
+def test_a_replay_with_a_page_begins_when_it_is_open_and_shows_where_it_is_moved(
     demo: Demo, browser: Chrome, tmp_path: Path
 ) -> None:
+    demo.press(-40.0, -40.0, pressure_kpa=180)
     with subscribe(SENSOR, address=demo.stream, timeout_s=PATIENCE_S) as frames:
-        started = request("record_start", demo.control, PATIENCE_S, path="short.mcap")
+        next(frame for frame in frames if frame.contacts)
+        started = request("record_start", demo.control, PATIENCE_S, path="short.mcap", maps=True)
         path = Path(started["path"])
-        assert len(list(islice(frames, 20))) == 20
+        for place_mm in (-40.0, -20.0, 0.0, 20.0):
+            demo.press(place_mm, place_mm, pressure_kpa=180)
+            assert len(list(islice(frames, 9))) == 9
         request("record_stop", demo.control, PATIENCE_S)
+    demo.clear()
     control = f"ipc://{tmp_path}/control"
     command = ["replay", path, "--viewer", "--loop", "--viewer-port", 0, "--control", control]
     command += ["--stream", f"ipc://{tmp_path}/stream"]
@@ -97,8 +115,31 @@ def test_a_replay_with_a_page_begins_when_the_page_is_open(
         assert waiting["frames"] <= 1  # the first one is shown
         browser.get(page)
         wait_until(
-            lambda: request("status", control, PATIENCE_S)["frames"] > 40, "the second round"
+            lambda: request("status", control, PATIENCE_S)["frames"] > 60, "the second round"
         )
+        request("replay", control, PATIENCE_S, paused=True)
+        wait_until(lambda: browser.execute_script(SHOWN)[0] == "replay-paused")
+        recording, recorded = open_replayable(path), maps_in(path)
+        times_s = {
+            mark.scans[0].counter: (mark.clock_ns - recording.start_ns) * 1e-9
+            for mark in recording.marks()
+        }
+        counters = sorted(times_s)
+        for number in (20, 6, 26, 11, 15):  # there and back
+            at_s = (times_s[counters[number - 1]] + times_s[counters[number]]) / 2
+            browser.execute_script(SCRUB, at_s)
+            there = counters[number : number + 2]  # its scans may lie on both sides of the middle
+            wait_until(
+                lambda there=there: (
+                    browser.execute_script(SHOWN)[:2]
+                    in [["replay-paused", counter] for counter in there]
+                ),
+                f"the frame at {at_s} s, one of {there}",
+            )
+            _, counter, *places = browser.execute_script(SHOWN)
+            expected = [(c["x_mm"], c["y_mm"]) for c in recorded[counter]["contacts"]]
+            assert len(places) == len(expected) == 1
+            assert math.dist(places[0], expected[0]) < 3
     finally:
         replay.terminate()
         replay.communicate(timeout=PATIENCE_S)

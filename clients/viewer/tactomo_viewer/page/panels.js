@@ -166,6 +166,7 @@ function showChannels({ state, ports, rates, events, issues = [] }, isCurrent) {
     return item;
   });
   lines.forEach(([kind, name, text], i) => {
+    list.children[i].className = i < issues.length ? "issue" : "";
     const [dot, label, value] = list.children[i].children;
     dot.dataset.kind = kind;
     dot.title = kind;
@@ -182,7 +183,7 @@ export function showEvent(event, at) {
   const when = element("time", new Date(at).toLocaleTimeString());
   const name = element("strong", String(event.name).replaceAll("_", " "));
   const words = element("span");
-  setWords(words, [event.detail, event.next_step].filter(Boolean).join(" "));
+  setWords(words, [event.detail, event.next_step].filter(Boolean).join("; "));
   item.append(when, name, words);
   const list = byId("events");
   list.prepend(item);

@@ -311,9 +311,9 @@ export class Timeline {
     const x = this.#x(at);
     c.strokeStyle = c.fillStyle = { warning: this.theme.warn, error: this.theme.bad }[severity] ?? this.theme.accent;
     c.lineWidth = 1;
-    c.setLineDash([3, 3]);
+    c.globalAlpha = 0.4;
     this.#upright(c, x);
-    c.setLineDash([]);
+    c.globalAlpha = 1;
     c.beginPath();
     c.moveTo(x - 4, 0);
     c.lineTo(x + 4, 0);

@@ -244,7 +244,7 @@ function refresh() {
   touch.enable(Boolean(canPress));  // redraws when that changes
   if (state.twin.others_press) idle.stop();
   else if (state.hello?.press_itself && canPress && !found) idle.begin();
-  else idle.stop(false);
+  else if (!canPress || found?.name === "taring") idle.stop(false);
   setText(byId("map-help"), found ? "" : helpText(canPress));
   showNumbers(now);
   showReadout();
