@@ -7,6 +7,7 @@ a computer that is not busy, for the pictures show how fast it is.
 from __future__ import annotations
 
 import io
+import itertools
 import shutil
 import subprocess
 import sys
@@ -38,7 +39,7 @@ def main() -> None:
     still.save(DOCS / "viewer.png", optimize=True)
     pictures = [picture.resize(MOVING_SIZE, Image.Resampling.LANCZOS) for _, picture in seen]
     times_s = [at_s for at_s, _ in seen]
-    lasts_ms = [round(1e3 * (b - a)) for a, b in zip(times_s, times_s[1:], strict=False)]
+    lasts_ms = [round(1e3 * (b - a)) for a, b in itertools.pairwise(times_s)]
     pictures[0].save(
         DOCS / "viewer.webp",
         save_all=True,

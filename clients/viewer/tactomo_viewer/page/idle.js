@@ -6,8 +6,8 @@ const STEP_MS = 50;
 const REST_MS = 3000;  // that a page is left alone before it begins
 // When, where in shares of the sheet's half widths, how hard as a share of the sensor's range.
 const FINGERS = [
-  [[0.5, -0.45, 0.3, 0.5], [3.5, -0.15, 0.05, 0.65], [7, 0.35, -0.25, 0.55], [11, 0.35, 0.35, 0.7], [15, 0.05, 0.45, 0.5], [18, null]],
-  [[5, -0.45, -0.4, 0.5], [9, -0.3, -0.05, 0.65], [13, -0.45, 0.3, 0.3], [17, null]],
+  [[0.5, -0.45, 0.3, 0.5], [3.5, -0.15, 0.05, 0.57], [7, 0.35, -0.25, 0.5], [11, 0.35, 0.35, 0.58], [15, 0.05, 0.45, 0.5], [18, null]],
+  [[5, -0.45, -0.4, 0.5], [9, -0.3, -0.05, 0.57], [13, -0.45, 0.3, 0.3], [17, null]],
 ];
 
 export class Idle {
