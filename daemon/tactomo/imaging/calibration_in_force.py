@@ -15,7 +15,7 @@ from tactomo_models.scene.pressure import described_curve
 
 from tactomo.errors import CommandError
 from tactomo.events import OnEvent
-from tactomo.imaging.frame_marks import FrameMarks
+from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording import calibration_text, recorded_calibration
 
 
@@ -35,7 +35,7 @@ class CalibrationInForce:
         # the sensor, whose own curve is used where there is no calibration
         description: SensorDescription,
         reconstructor: Reconstructor,  # is given the curve
-        marks: FrameMarks,  # told of each new calibration
+        recorder: Recorder,  # told of each new calibration
         on_event: OnEvent,  # told of a calibration that is another device's
         calibration: PressureCalibration | None,  # the sensor's own; None where there is none
         taught: TaughtSkin | None,  # what the sensor was taught; None where nothing was
@@ -46,9 +46,10 @@ class CalibrationInForce:
         self.taught: TaughtSkin | None = None
         self._description = description
         self._reconstructor = reconstructor
-        self._marks = marks
+        self._recorder = recorder
         self._on_event = on_event
         self._own, self._own_taught = calibration, taught
+        self.text = calibration_text(calibration)  # of the sensor's own, in force or not
         self._reference: Reference | None = None
         self.device_ids: frozenset[str] = frozenset()  # of those that have spoken
         self._refused: list[_Foreign] = []
@@ -85,7 +86,7 @@ class CalibrationInForce:
 
         In an exact replay.
         """
-        if text is None or text == self._marks.calibration:
+        if text is None or text == self.text:
             return
         source = "the calibration that was read again while this was recorded"
         self._use(recorded_calibration(text, source, self._description), text)
@@ -94,7 +95,8 @@ class CalibrationInForce:
         """Go by another calibration from the next dual scan on, and say so in the recording."""
         self._own = calibration
         self._judge()
-        self._marks.note_calibration(text)
+        self.text = text
+        self._recorder.set_calibration(text)
 
     def _judge(self) -> None:
         """Put the sensor's own in force, as far as they are of what is connected."""

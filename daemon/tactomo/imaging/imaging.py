@@ -32,14 +32,13 @@ from tactomo.config import BaselineConfig
 from tactomo.events import OnEvent
 from tactomo.imaging import frames
 from tactomo.imaging.calibration_in_force import CalibrationInForce
-from tactomo.imaging.frame_marks import FrameMarks
+from tactomo.imaging.frame_marks import FrameMarks, InForce
 from tactomo.imaging.frozen_converter import FrozenConverters
 from tactomo.imaging.kept_reference import KeptReference, KnownSkin
 from tactomo.imaging.method_in_force import Effort, MethodInForce
 from tactomo.imaging.processor_share import ProcessorShare
 from tactomo.imaging.tare import Taring, is_at_rest
 from tactomo.recordings.recorder import Recorder
-from tactomo.recordings.recording import calibration_text
 from tactomo.scans import DualScan, Mark, Timing, Volts
 from tactomo.stream.publisher import Publisher
 from tactomo.timing import Durations, Rate
@@ -78,11 +77,11 @@ class Imaging:
         self._tracker = (
             BaselineTracker(reconstructor, baseline.time_constant_s) if baseline.track else None
         )
-        self._marks = FrameMarks(recorder, calibration_text(calibration))
+        self._marks = FrameMarks(recorder)
         self.method = MethodInForce(reconstructor, machine_speed)  # requested and effective
         # of pressure, the one in force
         self.calibration = CalibrationInForce(
-            description, reconstructor, self._marks, on_event, calibration, taught
+            description, reconstructor, recorder, on_event, calibration, taught
         )
         # takes references
         self.taring = Taring(
@@ -119,6 +118,12 @@ class Imaging:
         }
         refusal = tracker.refusal or None
         return {"state": tracker.state, "moves": tracker.moves, "refusal": refusal, "drift": drift}
+
+    @property
+    def in_force(self) -> InForce:
+        """What the next frame is made with."""
+        taken_ns, effort = self.reference_realtime_ns, self.method.effective
+        return InForce(self.reference, taken_ns, *effort, self.calibration.text)
 
     def has_reference(self, channel: Channel) -> bool:
         """Whether there is something to measure this channel's changes against."""
@@ -199,11 +204,10 @@ class Imaging:
         )
 
     def _note_reference(self, reference: Reference) -> None:
-        """Say, and record, that this reference is in force."""
+        """Say that this reference is in force."""
         self.reference = reference
         self.calibration.meet_skin(reference)
         self.taring.note_reference()
-        self._marks.note_reference(reference, self.reference_realtime_ns)
 
     def forget(self) -> None:
         """Take the next dual scan for the first one: it does not follow on those before."""
@@ -243,7 +247,7 @@ class Imaging:
             frame = self._judge_dispute(frame)
         elif frame is not None and self._is_unchecked:
             frame = replace(frame, flags=frame.flags | Flag.REFERENCE_DISPUTED)
-        self._marks.mark(dual, timing, *self.method.effective)  # first: what was seen is recorded
+        self._marks.mark(dual, timing, self.in_force)  # first: what was seen is recorded
         if frame is not None:
             self._contacts = len(frame.contacts)
             self._publish_frame(dual, timing, frame)
