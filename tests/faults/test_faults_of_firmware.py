@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import pytest
-from daemon_process import DaemonProcess
+import zenoh
+from daemon_process import SENSOR, DaemonProcess
+from foxglove_client import FoxgloveClient
 from hostile_board import HostileBoard
 from pty_skin import PtySkin, Scenes
 from stream_rules import Subscriber
+from tactomo.cli.children import Family
+from tactomo_client import subscribe
 from tactomo_models import SensorDescription
+from tactomo_ros2.live import run
+from waiting import PATIENCE_S, wait_until
 
 Start = Callable[..., DaemonProcess]
 Figure = Callable[[str], None]
@@ -68,3 +77,91 @@ def test_a_hostile_board(
         try_hostile_board(skin, scenes, daemon, figure, max(SHORT_S, LONG_S * scale / 2))
     finally:
         skin.close()
+
+
+Count = Callable[[], int]
+
+
+@contextmanager
+def foxglove(stream: str, _: Path) -> Iterator[Count]:
+    """The bridge, and who looks through it."""
+    with Family() as family:
+        bridge = family.start(
+            *("bridge", "foxglove", SENSOR, "--foxglove-port", "0", "--announce"),
+            *("--stream", stream),
+        ).wait_ready()
+        with FoxgloveClient(bridge["url"]) as client:
+            yield lambda: sum(client.counts().values())
+
+
+@contextmanager
+def zenoh_bridge(stream: str, folder: Path) -> Iterator[Count]:
+    """The bridge to Zenoh, and a subscriber to all that it publishes."""
+    at = {"endpoints": [f"unixsock-stream/{folder / 'router'}"]}
+    apart = {"scouting": {"multicast": {"enabled": False}}}
+    (folder / "robot.json5").write_text(json.dumps({**apart, "mode": "router", "listen": at}))
+    (folder / "desk.json5").write_text(json.dumps({**apart, "mode": "client", "connect": at}))
+    with Family() as family:
+        family.start(*("zenoh", "zenoh", "--from", stream, "--config", str(folder / "robot.json5")))
+        wait_until((folder / "router").exists, "Zenoh to listen")
+        session = zenoh.open(zenoh.Config.from_file(str(folder / "desk.json5")))
+        heard: list[object] = []
+        session.declare_subscriber("tactomo/**", heard.append)
+        try:
+            yield lambda: len(heard)
+        finally:
+            session.close()  # type: ignore[no-untyped-call]
+
+
+@contextmanager
+def ros(stream: str, _: Path) -> Iterator[Count]:
+    """What the node publishes, without ROS."""
+    ended = threading.Event()
+    heard: list[object] = []
+    failures: list[BaseException] = []
+
+    def publish() -> None:
+        try:
+            with subscribe(SENSOR, kind=("map", "status"), address=stream, timeout_s=600.0) as skin:
+                run(skin, heard.append, ended.is_set)
+        except BaseException as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=publish, name="ros")
+    thread.start()
+    yield lambda: len(heard)
+    ended.set()
+    thread.join(PATIENCE_S)
+    assert not failures
+
+
+@pytest.mark.faults
+@pytest.mark.fault(
+    "A hostile board behind a door: {door.__name__}",
+    "the door goes on, and hands on what comes once the board behaves",
+    "as above for a minute; of ROS 2 what the node publishes, without ROS",
+)
+@pytest.mark.parametrize("door", [foxglove, zenoh_bridge, ros])
+@pytest.mark.timeout(600)
+def test_a_door_beside_a_hostile_board(
+    tmp_path: Path,
+    skin: PtySkin,
+    scenes: Scenes,
+    start: Start,
+    figure: Figure,
+    door: Callable[[str, Path], AbstractContextManager[Count]],
+) -> None:
+    daemon = start(skin.paths)
+    board = HostileBoard(skin, scenes.rest, [*scenes.one, *scenes.two], seed=18)
+    with door(daemon.stream, tmp_path) as count:
+        board.play(SHORT_S, stop=lambda: not daemon.is_running)
+        board.behave(2.0)
+        before = count()
+        board.behave(5.0)
+        after = count()
+    figure(
+        f"{board.packets} packets; {before} messages handed on, {after - before} in 5 s after it"
+    )
+    assert daemon.is_running
+    assert before
+    assert after > before

@@ -28,6 +28,7 @@ MEGABYTE: Final = 1 << 20
 ESCAPES: Final = "\x1b]0;owned\x07\x1b[2J[/b][red][link=file:///etc/passwd]a[/]\u202e\x9b31m"
 BAD_DEVICE: Final = "x[/b]y"
 BAD_SENSOR: Final = "a[/]b"
+NAME: Final = "x[/b]y\x1b[2J\u202e"  # of a file, in a folder
 
 
 def zeros_npz(path: Path, megabytes: int = 1024) -> None:
@@ -255,6 +256,13 @@ def endless(path: Path) -> None:
     path.symlink_to("/dev/zero")
 
 
+def honest_npz(path: Path) -> None:
+    """Nothing is the matter with it but its name."""
+    np.savez(
+        path, allow_pickle=False, structure=np.ones((3, 208)), structure_reference=np.ones(208)
+    )
+
+
 def folder(path: Path) -> None:
     """A folder under the name of a file."""
     path.mkdir()
@@ -288,4 +296,9 @@ CORPUS: Final[dict[str, Callable[[Path], None]]] = {
     **{f"device{suffix}": endless for suffix in (".npz", ".mat", ".csv", ".eit", ".mcap", ".toml")},
     "folder.mcap": folder,
     "folder.npz": folder,
+    f"{NAME}.npz": honest_npz,
+    f"{NAME}.csv": tall_csv,
+    f"{NAME}.mcap": markup_recording,
+    f"{NAME}.toml": titled_description,
+    f"{NAME}.json": deep_json,
 }

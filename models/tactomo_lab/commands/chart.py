@@ -14,11 +14,10 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-import typer
-from rich.console import Console
 from rich.progress import Progress
 from tactomo.cli.bench.machine_speed import warned_if_busy
-from tactomo.cli.output import table
+from tactomo.cli.console import Console
+from tactomo.cli.output import say, table
 from tactomo.cli.plot.plot import prepare_file, prepare_picture, save_figure
 from tactomo.errors import TactomoError
 from tactomo_models import available_methods, load_description
@@ -65,7 +64,7 @@ def chart(
         "figures at points: budget of modelled work; pale: something else is both faster and better"
     )
     save_figure(draw_chart(points, title), picture)
-    typer.echo(f"wrote {picture} and {table_path(picture)}", err=True)
+    say(f"wrote {picture} and {table_path(picture)}", err=True)
     return rows, table_of(points)
 
 

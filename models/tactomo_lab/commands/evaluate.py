@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from tactomo.cli import options
 from tactomo.cli.commands import Group
-from tactomo.cli.output import table
+from tactomo.cli.output import say, table
 from tactomo.cli.plot.plot import picture_option
 
 from tactomo_lab.commands.report import (
@@ -28,8 +28,9 @@ from tactomo_lab.commands.report import (
 )
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
+    from tactomo.cli.console import Console
 
     from tactomo_lab.evaluation.stability import CaseScore, Trust
     from tactomo_lab.scenes.measures import Score, Summary
@@ -77,7 +78,7 @@ def _settings(sensor: str, seeds: str, **more: Any) -> dict[str, Any]:
 
 
 def _in_words(settings: dict[str, Any]) -> str:
-    of = "{sensor}, {seeds} seeds, method [bold]{method}[/], SNR of the {snr_of}"
+    of = "{sensor}, {seeds} seeds, method {method}, SNR of the {snr_of}"
     return of.format(**settings)
 
 
@@ -286,7 +287,7 @@ def field(
             try:
                 scores[line] = list(shown(frames, total, line))
             except ModelError as error:  # of a row's own sensor, for which a method may not serve
-                typer.echo(f"left out: {line}: {error}", err=True)
+                say(f"left out: {line}: {error}", err=True)
     settings = _settings(description.name, seeds, snr_of="change", method=method)
     found: dict[str, Summary] = {line: summarise(own) for line, own in scores.items()}
     lines = {
@@ -431,8 +432,9 @@ def _print_regimes(
     for first in range(0, len(methods), fit):  # as many tables as the terminal is too narrow for
         console.print(_counts(rows, methods[first : first + fit]))
     console.print(
-        "[dim]Each cell: mean ICC; bad maps (ICC < 0.7) without a flag that tells to distrust, of "
-        "all bad ones; good maps with one, of all good ones.[/]\n"
+        "Each cell: mean ICC; bad maps (ICC < 0.7) without a flag that tells to distrust, of "
+        "all bad ones; good maps with one, of all good ones.\n",
+        style="dim",
     )
     method = IN_WORDS if IN_WORDS in methods else methods[0]
     console.print(_doings(method, [one for one in scores if one.method == method]))
@@ -449,11 +451,10 @@ def _counts(rows: dict[str, dict[str, Trust]], methods: Sequence[str]) -> Table:
 
 def _trust(counts: Trust) -> str:
     if not counts.maps:  # the method does not serve this regime's sensor
-        return "-"
-    silent = f"{counts.bad_unwarned}/{counts.bad}"
-    if counts.bad_unwarned:
-        silent = f"[red]{silent}[/]"
-    return f"{counts.icc:.2f} {silent} {counts.good_warned}/{counts.maps - counts.bad}"
+        return Text("-")
+    silent = Text(f"{counts.bad_unwarned}/{counts.bad}", "red" if counts.bad_unwarned else "")
+    good = f" {counts.good_warned}/{counts.maps - counts.bad}"
+    return Text(f"{counts.icc:.2f} ").append_text(silent).append(good)
 
 
 def _doings(method: str, scores: Sequence[CaseScore]) -> Table:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from tactomo.cli.options import Description, JsonOutput, examples, typer_app
-from tactomo.cli.output import print_json, table
+from tactomo.cli.output import print_json, say, table
 from tactomo.cli.plot.plot import save_figure
 
 from tactomo_lab.commands.measured import tank_of
@@ -61,18 +61,18 @@ def ktc(
         _print(tanks)
     if picture is not None:
         _draw(given, tanks, picture)
-        typer.echo(f"wrote {picture}", err=True)
+        say(f"wrote {picture}", err=True)
 
 
 def _print(tanks: list[ChallengeOutcome]) -> None:
-    from rich.console import Console
+    from tactomo.cli.console import Console
 
     made = table("tank", "level", "readings", "score", "misfit", "CPU s")
     for number, tank in enumerate(tanks):
         figures = f"{tank.score:.3f}", f"{tank.misfit:.2f}", f"{tank.seconds:.1f}"
         made.add_row(str(number), str(tank.level), str(tank.readings), *figures)
     made.add_section()
-    made.add_row("[bold]sum[/]", "", "", f"[bold]{sum(tank.score for tank in tanks):.3f}[/]")
+    made.add_row("sum", "", "", f"{sum(tank.score for tank in tanks):.3f}", style="bold")
     Console().print(made)
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from tactomo.cli import options
-from tactomo.cli.output import print_json, table
+from tactomo.cli.output import print_json, say, table
 from tactomo.cli.plot.plot import prepare_folder
 from tactomo.errors import TactomoError
 
@@ -139,7 +139,7 @@ def paper(
     if as_json:
         print_json({**settings, "figures": facts})
     if picture is not None:
-        typer.echo(f"wrote {drawn} pictures to {picture}", err=True)
+        say(f"wrote {drawn} pictures to {picture}", err=True)
 
 
 def _figures(text: str) -> set[int]:
@@ -363,7 +363,7 @@ def _mean_and_deviation(values: Iterable[float], form: str) -> str:
 
 
 def _print_settings(settings: dict[str, Any]) -> None:
-    from rich.console import Console
+    from tactomo.cli.console import Console
 
     console = Console()
     console.print(
@@ -372,14 +372,14 @@ def _print_settings(settings: dict[str, Any]) -> None:
         f"{settings['snr_of_voltages_db']:g} dB of the voltages at rest, one scan a press."
     )
     for method, why in settings["left_out"].items():
-        console.print(f"[yellow]{method} is left out[/]: {why}")
+        console.print(f"{method} is left out: {why}", style="yellow")
 
 
 def _print(part: _Part) -> None:
-    from rich.console import Console
+    from tactomo.cli.console import Console
 
     console = Console()
-    console.print(f"\n[italic]{part.title}[/]")
+    console.print(f"\n{part.title}", style="italic")
     console.print(part.table)
     if part.caption:
-        console.print(f"[dim]{part.caption}[/]")
+        console.print(part.caption, style="dim")

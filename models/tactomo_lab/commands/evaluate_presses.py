@@ -34,7 +34,7 @@ def presses(
     is learnt from, of each skin by itself.
     """
     import numpy as np
-    from rich.console import Console
+    from tactomo.cli.console import Console
     from threadpoolctl import threadpool_limits
 
     from tactomo_lab.evaluation.taught_presses import judge, read_skins
@@ -53,16 +53,18 @@ def presses(
         made.add_row(one.name, str(one.judged), *errors, *shares, since)
     made.add_section()
     made.add_row(
-        "[bold]mean[/]",
+        "mean",
         "",
-        f"[bold]{np.mean([one.median_mm for one in found]):.2f}[/]",
-        f"[bold]{np.mean([one.p95_mm for one in found]):.1f}[/]",
+        f"{np.mean([one.median_mm for one in found]):.2f}",
+        f"{np.mean([one.p95_mm for one in found]):.1f}",
+        style="bold",
     )
     console = Console()
     console.print(f"measured presses, learnt from the first {train} of each skin")
     console.print(made)
     console.print(
-        "[dim]in σ: coordinates within one reported standard uncertainty, 68 % where that is "
+        "in σ: coordinates within one reported standard uncertainty, 68 % where that is "
         "right; taught: presses of which the like was taught; since then: medians of the "
-        "quarters of all later presses.[/]"
+        "quarters of all later presses.",
+        style="dim",
     )

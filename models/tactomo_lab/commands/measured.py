@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
 import typer
 from tactomo.cli.options import JsonOutput, examples, typer_app
-from tactomo.cli.output import print_json
+from tactomo.cli.output import print_json, say
 from tactomo.errors import TactomoError
 
 if TYPE_CHECKING:
@@ -279,22 +279,23 @@ def measured(
 
     page = before + text + after
     write_whole(into, lambda file: file.write(page.encode()))
-    typer.echo(f"wrote {into}", err=True)
+    say(f"wrote {into}", err=True)
 
 
 def _tell(sets: dict[str, Measured], text: str, as_json: bool) -> None:
     if as_json:
         print_json({"simulated": False, "sets": {name: one.facts for name, one in sets.items()}})
     else:
-        typer.echo(text)
+        say(text)
 
 
 def _measure(path: Path, kind: PublicSet, sensor: str | None) -> Measured:
-    from rich.console import Console
+    from rich.text import Text
+    from tactomo.cli.console import Console
 
     if sensor is not None and not kind.description:
         raise typer.BadParameter("--description: presses alone are learnt from; leave it out")
-    with Console(stderr=True).status(path.name):
+    with Console(stderr=True).status(Text(path.name)):
         return kind.measure(path, sensor or kind.description)
 
 

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, TypeVar
 
 import typer
-from tactomo.cli.output import print_json, table
+from tactomo.cli.output import print_json, say, table
 from tactomo.cli.plot.plot import picture_option
 
 if TYPE_CHECKING:
-    from rich.console import Console
     from rich.table import Table
+    from tactomo.cli.console import Console
     from tactomo_models import SensorDescription
 
 Item = TypeVar("Item")
@@ -125,12 +125,12 @@ def tell(
     if as_json:
         print_json(told)
     else:
-        from rich.console import Console
+        from tactomo.cli.console import Console
 
         show(Console())
     if picture is not None and draw is not None:
         draw(picture)
-        typer.echo(f"wrote {picture}", err=True)
+        say(f"wrote {picture}", err=True)
 
 
 def print_suite(
@@ -144,13 +144,13 @@ def print_suite(
     for title, columns in tables.items():
         console.print(summary_table(title, columns, summaries))
     headings = dict.fromkeys(column for each in tables.values() for column in each)
-    console.print(f"[dim]{legend(headings)}[/]")
+    console.print(legend(headings), style="dim")
 
 
 def shown(items: Iterable[Item], total: int | None, what: str) -> Iterator[Item]:
     """Pass items on, with a progress bar in the terminal; without an end if there is no total."""
-    from rich.console import Console
     from rich.progress import track
+    from tactomo.cli.console import Console
 
     yield from track(
         items, description=what, total=total, console=Console(stderr=True), transient=True
@@ -174,5 +174,5 @@ def usable(sensor: SensorDescription, methods: Sequence[str]) -> list[str]:
 
     missing = left_out(sensor, methods)
     for method, reason in missing.items():
-        typer.echo(f"left out: {method}: {reason}", err=True)
+        say(f"left out: {method}: {reason}", err=True)
     return [method for method in methods if method not in missing]

@@ -57,8 +57,8 @@ def solves(
     as_json: JsonOutput = False,
 ) -> None:
     """Measure one forward solve against pressed area, mesh and sheet size. Takes about a minute."""
-    from rich.console import Console
     from tactomo.cli.bench.bench import machine
+    from tactomo.cli.console import Console
     from tactomo_models import load_description
     from threadpoolctl import threadpool_limits
 

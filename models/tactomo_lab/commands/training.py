@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import typer
 from tactomo.cli.options import DEFAULT_DESCRIPTION, Description, JsonOutput, examples, typer_app
-from tactomo.cli.output import print_json
+from tactomo.cli.output import print_json, say
 from tactomo.errors import needs
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def simulate(
         counts = {"scenes": before + now, "new": now}
         print_json({**settings, "sensor": description.name, **counts})
     else:
-        typer.echo(f"{folder}: {total} {preset} scenes, {now} of them new")
+        say(f"{folder}: {total} {preset} scenes, {now} of them new")
 
 
 @app.command(
@@ -179,7 +179,7 @@ def train(
         history = [asdict(epoch) for epoch in training.history]
         print_json({**told, **asdict(settings), "history": history})
     else:
-        typer.echo(f"wrote {written}: {written.stat().st_size / 1e6:.1f} MB")
+        say(f"wrote {written}: {written.stat().st_size / 1e6:.1f} MB")
 
 
 @app.command(
@@ -228,14 +228,15 @@ def train_tanks(
             task = shown.add_task("training", total=steps)
             for loss in train_network(folder, steps, output, seed):
                 shown.update(task, advance=1, description=f"training, loss {loss:.4f}")
-    typer.echo(f"wrote {output}: {output.stat().st_size / 1e6:.1f} MB")
+    say(f"wrote {output}: {output.stat().st_size / 1e6:.1f} MB")
 
 
 def _prepare(
     configuration: str, folder: Path, sensor: str, seed: int, jobs: int | None, start: Path | None
 ) -> Prepared:
     """Read the scenes; the paper's networks need images of them first."""
-    from rich.console import Console
+    from rich.text import Text
+    from tactomo.cli.console import Console
     from tactomo_models import load_description
 
     from tactomo_lab.training.configurations import CONFIGURATIONS, check_scenes, prepare
@@ -247,7 +248,7 @@ def _prepare(
     if chosen.kind != "network":
         steps = make_images(description, folder, jobs=jobs or -1)
         _follow(steps, read_manifest(folder).scenes, "images of the scenes", folder)
-    with Console(stderr=True).status(f"reading {folder}"):
+    with Console(stderr=True).status(Text(f"reading {folder}")):
         return prepare(chosen, folder, description, seed, start)
 
 
@@ -255,7 +256,7 @@ def _train(
     prepared: Prepared, settings: Settings, checkpoint: Path, configuration: str
 ) -> Training:
     """Train to the end, and print what each epoch came to."""
-    from rich.console import Console
+    from tactomo.cli.console import Console
 
     from tactomo_lab.training.train import begin, load_checkpoint, train
 
@@ -284,7 +285,7 @@ def _train(
 
 
 def _stopped(what: str) -> typer.Exit:
-    typer.echo(f"stopped: {what}; run the same command again, it goes on there", err=True)
+    say(f"stopped: {what}; run the same command again, it goes on there", err=True)
     return typer.Exit(INTERRUPTED)
 
 
@@ -321,7 +322,7 @@ def _follow(steps: Iterator[int], total: int, what: str, folder: Path) -> tuple[
 
 
 def _progress() -> Progress:
-    from rich.console import Console
     from rich.progress import Progress
+    from tactomo.cli.console import Console
 
     return Progress(console=Console(stderr=True), transient=True, speed_estimate_period=600)

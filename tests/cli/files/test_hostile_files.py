@@ -48,6 +48,7 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
         ),
         "presses": ("evaluate", "presses", "FILE", "--train", "10"),
         "load_cell": ("calibrate", "fit", "FILE", "--recording", "GOOD.npz"),
+        "robot": ("export", "GOOD.mcap", "OUT", "--lerobot", "--robot", "FILE"),
     },
     "recording": {
         "info": ("info", "FILE"),
@@ -128,6 +129,7 @@ def corpus(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     @cache
     def make(name: str) -> Path:
         path = tmp_path_factory.mktemp("hostile") / name
+        path.parent.mkdir(exist_ok=True)
         CORPUS[name](path)
         return path
 
@@ -144,7 +146,7 @@ def cases() -> Iterator[object]:
     for name in CORPUS:
         for command in COMMANDS[KINDS.get(Path(name).suffix, "arrays")]:
             marks = () if name in QUICK.get(command, ()) else (pytest.mark.slow,)
-            yield pytest.param(name, command, id=f"{command}-{name}", marks=marks)
+            yield pytest.param(name, command, id=f"{command}-{name!a}", marks=marks)
 
 
 @pytest.mark.parametrize(("name", "command"), [*cases()])

@@ -13,6 +13,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -352,9 +353,17 @@ def _mean_of(frames: Sequence[Frame]) -> Held:
 def _read_log(log: Path) -> list[Reading]:
     from tactomo_models.calibration.load_cell import direct_readings, read_load_cell
 
-    if not log.exists() or len(log.read_text("utf-8").splitlines()) < 2:
+    if not log.exists() or _is_begun(log):
         return []
     return list(direct_readings(read_load_cell(log)).readings)
+
+
+def _is_begun(log: Path) -> bool:
+    """Whether a log has its line of names and nothing else."""
+    from tactomo_models.foreign_file import open_regular
+
+    with open_regular(log) as file:
+        return not any(line.strip() for line in islice(file, 1, 3))
 
 
 def _append(log: Path, row: dict[str, str]) -> None:

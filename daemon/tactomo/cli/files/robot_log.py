@@ -8,19 +8,23 @@ A CSV file with a line of names: `monotonic_s` or `realtime_s`, Python's `time.m
 from __future__ import annotations
 
 import csv
+import io
 import math
+from array import array
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from tactomo_models.arrays import FloatArray
+from tactomo_models.foreign_file import open_regular
 
 from tactomo.errors import TactomoError
 
 CLOCKS: Final = ("monotonic_s", "realtime_s")
 ACTION: Final = "action."
 EPISODE: Final = "episode"
+MOST_LINE: Final = 1 << 20  # characters
 
 
 @dataclass(frozen=True)
@@ -60,22 +64,25 @@ def read_robot_log(path: Path) -> RobotLog:
 
     Raises TactomoError where it cannot be read, or a line of it is wrong, which is named.
     """
+    numbers = array("d")
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            lines = csv.reader(file, strict=True)
+        with open_regular(path) as binary, io.TextIOWrapper(binary, "utf-8", newline="") as file:
+            lines = csv.reader(iter(lambda: file.readline(MOST_LINE), ""), strict=True)
             names = [name.strip() for name in next(lines, [])]
-            table = [_numbers(path, number, names, line) for number, line in enumerate(lines, 2)]
+            for number, line in enumerate(lines, 2):
+                numbers.extend(_numbers(path, number, names, line))
     except (OSError, csv.Error, UnicodeDecodeError) as error:
         raise TactomoError(
-            f"cannot read {path}: {error}", "give a CSV file with a line of names"
+            f"cannot read {path}: {getattr(error, 'strerror', None) or error}",
+            "give a CSV file with a line of names",
         ) from error
     clock = next((name for name in CLOCKS if name in names), None)
-    if clock is None or len(set(names)) < len(names) or not table:
+    if clock is None or len(set(names)) < len(names) or not numbers:
         raise TactomoError(
             f"{path} has no column {' or '.join(CLOCKS)}, one name twice, or no steps",
             "write time.monotonic() or time.time() of each of the robot's steps into it",
         )
-    rows = np.array(table)
+    rows = np.frombuffer(numbers).reshape(-1, len(names))
     times_s = rows[:, names.index(clock)]
     episodes = rows[:, names.index(EPISODE)] if EPISODE in names else np.zeros(len(rows))
     back = np.flatnonzero(np.diff(times_s) <= 0)
