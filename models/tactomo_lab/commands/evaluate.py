@@ -449,7 +449,9 @@ def _counts(rows: dict[str, dict[str, Trust]], methods: Sequence[str]) -> Table:
     return made
 
 
-def _trust(counts: Trust) -> str:
+def _trust(counts: Trust) -> Text:
+    from rich.text import Text
+
     if not counts.maps:  # the method does not serve this regime's sensor
         return Text("-")
     silent = Text(f"{counts.bad_unwarned}/{counts.bad}", "red" if counts.bad_unwarned else "")
