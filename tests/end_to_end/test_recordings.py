@@ -128,14 +128,13 @@ def test_a_replay_with_a_page_begins_when_it_is_open_and_shows_where_it_is_moved
         for number in (20, 6, 26, 11, 15):  # there and back
             at_s = (times_s[counters[number - 1]] + times_s[counters[number]]) / 2
             browser.execute_script(SCRUB, at_s)
-            there = counters[number : number + 2]  # its scans may lie on both sides of the middle
-            wait_until(
-                lambda there=there: (
-                    browser.execute_script(SHOWN)[:2]
-                    in [["replay-paused", counter] for counter in there]
-                ),
-                f"the frame at {at_s} s, one of {there}",
-            )
+            # Its scans may lie on both sides of the middle.
+            there = [["replay-paused", counter] for counter in counters[number : number + 2]]
+
+            def is_shown(there: list[Any] = there) -> bool:
+                return browser.execute_script(SHOWN)[:2] in there
+
+            wait_until(is_shown, f"the frame at {at_s} s, one of {there}")
             _, counter, *places = browser.execute_script(SHOWN)
             expected = [(c["x_mm"], c["y_mm"]) for c in recorded[counter]["contacts"]]
             assert len(places) == len(expected) == 1
