@@ -15,10 +15,8 @@ import serial
 
 from tactomo.acquisition.adapters import LOW_LATENCY_MS, ROOT, device_of
 from tactomo.acquisition.open_serial import DEVICE_GONE, is_path, lower_latency, open_serial
-from tactomo.acquisition.replay_port import ReplayEnded, ReplayMoved, ReplayPort
 from tactomo.errors import PortAbsentError, TactomoError
 from tactomo.events import OnEvent
-from tactomo.recordings.playback import Playback
 
 MAX_READ_BYTES: Final = 65_536
 """Taken at once at most, so that a flood of noise cannot keep the thread from its other duties."""
@@ -33,7 +31,6 @@ class Connection:
         baud: int,
         on_event: OnEvent,
         root: Path = ROOT,
-        playback: Playback | None = None,
     ) -> None:
         self.url = url
         self.is_open = False  # whether the device is there at present
@@ -43,14 +40,12 @@ class Connection:
         self._baud = baud
         self._root = root
         self._on_event = on_event
-        self._playback = playback
+        self.has_ended, self.moved = False, 0  # a device's stream neither ends nor moves
         self._serial: serial.Serial | None = None
 
     def open(self) -> None:
         """Open the port; raise PortError or RecordingError where that cannot be done."""
         self._serial = open_serial(self.url, self._baud)
-        if self._playback is not None and isinstance(self._serial, ReplayPort):
-            self._serial.playback = self._playback
         self.latency_timer_ms = lower_latency(self._serial, self._root)
         self.problem, self.is_open = "", True
         self._tell_slow_adapter()
@@ -64,27 +59,20 @@ class Connection:
         return self.is_open
 
     def read(self) -> bytes:
-        """Wait for bytes for a bounded time; none come of a device that has gone.
-
-        Raises:
-            ReplayEnded: the recording that is replayed is at its end.
-            ReplayMoved: it goes on elsewhere.
-        """
+        """Wait for bytes for a bounded time; none come of a device that has gone."""
         try:
             port = self._port
             data = port.read(1)
             if data:
                 data += port.read(min(port.in_waiting, MAX_READ_BYTES))
             return data
-        except (ReplayEnded, ReplayMoved):
-            raise
         except DEVICE_GONE as error:
             self._lose(error)
             return b""
 
     def clock_ns(self, monotonic_ns: int) -> int:
-        """Return when the bytes just read came: `monotonic_ns`, or the recording's time."""
-        return getattr(self._serial, "clock_ns", monotonic_ns)
+        """Return when the bytes just read came: `monotonic_ns`."""
+        return monotonic_ns
 
     def write(self, data: bytes) -> bool:
         """Send bytes, if the device takes them within a short time; returns whether it did."""

@@ -15,9 +15,8 @@ import os
 import stat
 import termios
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import serial
 
@@ -43,18 +42,9 @@ def open_serial(url: str, baud: int) -> serial.Serial:
         PortAbsentError: it does not exist.
         PortBusyError: another process holds it.
         PortError: it is no serial device or may not be opened.
-        RecordingError: it is a replay of what is no recording.
     """
-    from tactomo.recordings.recording import REPLAY_SCHEME  # a second, which a list of ports spares
-
-    is_replay = url.startswith(f"{REPLAY_SCHEME}://")
-    make: Callable[..., Any] = serial.serial_for_url
-    if is_replay:
-        from tactomo.acquisition.replay_port import ReplayPort
-
-        make = ReplayPort
     try:
-        port: serial.Serial = make(
+        port: serial.Serial = serial.serial_for_url(
             url,
             baudrate=baud,
             timeout=READ_TIMEOUT_S,

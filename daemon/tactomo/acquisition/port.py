@@ -34,7 +34,7 @@ from tactomo.acquisition.connection import Connection
 from tactomo.acquisition.device_clock import MAX_RATE, ClockState, DeviceClock
 from tactomo.acquisition.liveness import DeviceState, Liveness
 from tactomo.acquisition.open_serial import other_holders
-from tactomo.acquisition.replay_port import ReplayEnded, ReplayMoved
+from tactomo.acquisition.replay_source import ReplaySource, Source
 from tactomo.events import OnEvent, times
 from tactomo.protocols import PortProtocol, Trouble
 from tactomo.recordings.active_recording import ActiveRecording
@@ -108,8 +108,9 @@ class PortReader(Worker):
         self._deliver = deliver
         self._on_event = on_event
         self._carriers = {} if carriers is None else carriers
-        self._connection = Connection(url, baud, on_event, root, playback)
         self._is_replay = url.startswith(f"{REPLAY_SCHEME}://")
+        live = Connection(url, baud, on_event, root)
+        self._connection: Source = ReplaySource(url, playback) if self._is_replay else live
         self._liveness = Liveness(protocol.says_hello, protocol.patience_s)
         self._protocol = protocol
         self._pass = 0  # of the replay
@@ -199,22 +200,21 @@ class PortReader(Worker):
             if not self._connection.is_open:
                 self._wait_for_device()
                 continue
-            try:
-                self._read_once()
-            except ReplayEnded as end:
-                self._end(str(end))
-            except ReplayMoved as moved:
-                self._begin_pass(*moved.args)
+            self._read_once()
         self._send(self._protocol.stop())
 
     def _read_once(self) -> None:
         """Wait for bytes, for a bounded time, and pass on what they hold."""
-        data = self._connection.read()
+        source = self._connection
+        data = source.read()
         # The clocks are read here, before anything else is done with the bytes.
         realtime_ns, monotonic_ns = time.time_ns(), time.monotonic_ns()
+        if source.moved != self._pass:
+            self._begin_pass(source.moved)
         if data:
-            clock_ns = self._connection.clock_ns(monotonic_ns)
-            self._take(data, realtime_ns, monotonic_ns, clock_ns)
+            self._take(data, realtime_ns, monotonic_ns, source.clock_ns(monotonic_ns))
+        if source.has_ended and not self.has_ended:
+            self._end()
         if not self._is_replay and self._connection.is_open:
             self._attend(monotonic_ns * 1e-9)
 
@@ -487,10 +487,10 @@ class PortReader(Worker):
         elif not trouble and not self.refusal and state is not DeviceState.STARTING:
             self._tell("device_speaks")
 
-    def _end(self, reason: str) -> None:
+    def _end(self) -> None:
         self.has_ended = True
         self._deliver(Delivery(self.index, 0, (), has_ended=True, replay_pass=self._pass))
-        self._tell("replay_ended", reason)
+        self._tell("replay_ended", "the recording has ended")
 
     def _begin_pass(self, number: int) -> None:
         """Go on elsewhere in the recording: what had begun to come is not finished."""

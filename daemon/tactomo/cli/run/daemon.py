@@ -151,7 +151,7 @@ def replay(
 ) -> None:
     """Play a recording through the daemon, which cannot tell it from a device.
 
-    The bytes come back by a mock serial port and take the same way as live ones: the maps equal
+    The bytes are read from the recording and take the same way as live ones: the maps equal
     those of the live run. Without --viewer and --stay it ends with the recording.
 
     A folder of files that a daemon has cut is played as the one recording that it was, from the
