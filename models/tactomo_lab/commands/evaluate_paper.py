@@ -16,7 +16,7 @@ from tactomo.cli.output import print_json, say, table
 from tactomo.cli.plot.plot import prepare_folder
 from tactomo.errors import TactomoError
 
-from tactomo_lab.commands.report import Seeds, shown
+from tactomo_lab.commands.report import Seeds, chosen_names, shown
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -95,7 +95,7 @@ def paper(
     from tactomo_lab.evaluation.paper import DEFAULT_METHODS, Rig
     from tactomo_lab.evaluation.trade_off import left_out
 
-    figures = _figures(figure)
+    figures = {int(name) for name in chosen_names(figure, map(str, FIGURES), "--figure")}
     wanted = method or DEFAULT_METHODS
     if picture is not None:
         prepare_folder(picture)
@@ -140,18 +140,6 @@ def paper(
         print_json({**settings, "figures": facts})
     if picture is not None:
         say(f"wrote {drawn} pictures to {picture}", err=True)
-
-
-def _figures(text: str) -> set[int]:
-    """The numbers from "5,7"."""
-    try:
-        numbers = {int(part) for part in text.split(",")}
-    except ValueError:
-        numbers = set()
-    if not numbers or not numbers.issubset(FIGURES):
-        known = ", ".join(map(str, FIGURES))
-        raise typer.BadParameter(f"--figure {text!r}: give numbers out of {known}, with commas")
-    return numbers
 
 
 def _simulation_study(study: _Study, asked: set[int]) -> _Part:

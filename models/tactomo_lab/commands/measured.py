@@ -1,17 +1,22 @@
-"""`tactomo evaluate measured`: measured sets, recognised by their arrays, and what others say."""
+"""`tactomo evaluate measured`, `ktc` and `presses`: measured sets, and what others say of them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
 import typer
-from tactomo.cli.options import JsonOutput, examples, typer_app
-from tactomo.cli.output import print_json, say
+from tactomo.cli.options import Description, JsonOutput, examples, typer_app
+from tactomo.cli.output import say, table
 from tactomo.errors import TactomoError
 
+from tactomo_lab.commands.report import Picture, shown, tell
+
 if TYPE_CHECKING:
+    from tactomo.cli.console import Console
     from tactomo_models import SensorDescription
 
 app = typer_app()
@@ -61,7 +66,8 @@ def challenge(path: Path, sensor: str) -> Measured:
 
     tank = tank_of(sensor)
     given = read_challenge(path, tank)
-    tanks = [list(evaluate_challenge(given.at_level(level), tank)) for level in range(1, 8)]
+    levels = shown(range(1, 8), 7, "levels")
+    tanks = [list(evaluate_challenge(given.at_level(level), tank)) for level in levels]
     means = [_mean([one.score for one in level]) for level in tanks]
     seconds = _mean([one.seconds for level in tanks for one in level])
     count = len(tanks[0])
@@ -98,7 +104,8 @@ def saline_tanks(path: Path, sensor: str) -> Measured:
     tank = tank_of(sensor)
     methods = ["network", "noser", "tikhonov"]
     tanks = read_tanks(path, tank)
-    found = list(evaluate_tanks(TankImager(tank), tanks, methods))
+    made = evaluate_tanks(TankImager(tank), tanks, methods)
+    found = list(shown(made, len(methods) * len(tanks.names), "tanks"))
     of = {name: [one for one in found if one.method == name] for name in methods}
     ours, noser, tikhonov = (_mean([one.correlation for one in of[name]]) for name in methods)
     ranks = spearmanr(
@@ -127,11 +134,11 @@ def round_skin(path: Path, sensor: str) -> Measured:
     """Locate a robot's presses by several methods, cross-validated."""
     from tactomo_models import load_description
 
-    from tactomo_lab.evaluation.skin_presses import localise, read_presses
+    from tactomo_lab.evaluation.skin_presses import METHODS, localise, read_presses
 
     skin = load_description(sensor)
     presses = read_presses(path, skin)
-    found = localise(presses, skin)
+    found = list(shown(localise(presses, skin), len(METHODS), "methods"))
     physics = min(one.median_mm for one in found if "image" in one.method)
     taught = min(one.median_mm for one in found if "taught" in one.method)
     rows = [[one.method, f"{one.median_mm:.1f}", f"{one.most_mm:.1f}"] for one in found]
@@ -149,17 +156,14 @@ def round_skin(path: Path, sensor: str) -> Measured:
 
 def soft_skins(path: Path, sensor: str) -> Measured:
     """Learn skins from their first presses, and locate the last 800; of any make."""
-    from threadpoolctl import threadpool_limits
-
     from tactomo_lab.evaluation.taught_presses import judge, read_skins
 
     skins, rows, means = read_skins(path), [], []
-    with threadpool_limits(1):
-        for train in TRAINED:
-            found = list(judge(skins, train))
-            means.append(_mean([one.median_mm for one in found]))
-            medians = [f"{one.median_mm:.1f}" for one in found]
-            rows.append([str(train), *medians, f"{means[-1]:.1f}"])
+    for train in TRAINED:
+        found = list(shown(judge(skins, train), len(skins), f"skins, {train} presses"))
+        means.append(_mean([one.median_mm for one in found]))
+        medians = [f"{one.median_mm:.1f}" for one in found]
+        rows.append([str(train), *medians, f"{means[-1]:.1f}"])
     return Measured(
         f"{means[-1]:.1f} mm (mean of medians)",
         [
@@ -283,19 +287,17 @@ def measured(
 
 
 def _tell(sets: dict[str, Measured], text: str, as_json: bool) -> None:
-    if as_json:
-        print_json({"simulated": False, "sets": {name: one.facts for name, one in sets.items()}})
-    else:
-        say(text)
+    told = {"simulated": False, "sets": {name: one.facts for name, one in sets.items()}}
+    tell(told, as_json, lambda _: say(text))
 
 
 def _measure(path: Path, kind: PublicSet, sensor: str | None) -> Measured:
-    from rich.text import Text
-    from tactomo.cli.console import Console
+    from threadpoolctl import threadpool_limits
 
     if sensor is not None and not kind.description:
         raise typer.BadParameter("--description: presses alone are learnt from; leave it out")
-    with Console(stderr=True).status(Text(path.name)):
+    say(f"measuring {path.name}", err=True)
+    with threadpool_limits(1):  # more threads wait for each other where others compute, too
         return kind.measure(path, sensor or kind.description)
 
 
@@ -304,12 +306,9 @@ def _recognised(path: Path) -> PublicSet:
 
     Raises TactomoError where the file cannot be read, or has the arrays of none.
     """
-    from tactomo_models.archive import read_arrays
+    from tactomo_lab.evaluation.measured_sets import read_set
 
-    try:
-        names = list(read_arrays(path))
-    except OSError as error:
-        raise TactomoError(f"cannot read {path}: {error.strerror}", "give a set's .npz") from error
+    names = list(read_set(path, "measured scans"))
     for each in SETS:
         if all(any(name.endswith(array) for name in names) for array in each.arrays):
             return each
@@ -352,3 +351,106 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 
 def _mean(values: Sequence[float]) -> float:
     return sum(values) / len(values)
+
+
+# ------------------------------------------------------------------ one kind of set each
+
+
+@app.command(
+    epilog=examples(
+        "tactomo evaluate ktc ktc2023_training.npz --picture ktc.png",
+        "tactomo evaluate ktc ktc2023_training.npz --level 7 --json",
+    )
+)
+def ktc(
+    file: Annotated[Path, typer.Argument(metavar="FILE.npz", help="Tanks, see above.")],
+    level: Annotated[
+        int | None,
+        typer.Option(min=1, max=7, help="Lose the electrodes that this level has lost, too."),
+    ] = None,
+    sensor: Description = "tank_ktc2023",
+    picture: Picture = None,
+    as_json: JsonOutput = False,
+) -> None:
+    """Segment tanks of the Kuopio Tomography Challenge 2023, and score them as it did.
+
+    FILE holds `injection` (T, 32, 76), the currents of each drive; `measurement` (32, 31), the
+    weights of the electrodes' potentials; `reference` and `voltages` (T, 2356), drive by drive, of
+    the empty and the full tank, nan where electrodes are lost; `truth` (T, 256, 256), 0 water, 1
+    conducts worse, 2 better; and `level` (T,).
+
+    A tank's score is the mean structural similarity of both kinds' images, 1 at best. A network
+    trained on simulated tanks alone makes objects of five linear images, and these are refined
+    until they explain the voltages. Level l of 1 to 7 loses the first 2 (l - 1) electrodes.
+    """
+    from tactomo_lab.commands.pictures import draw_tanks
+    from tactomo_lab.evaluation.ktc import evaluate_challenge, read_challenge
+
+    description = tank_of(sensor)
+    given = read_challenge(file, description)
+    if level is not None:
+        given = given.at_level(level)
+    tanks = list(shown(evaluate_challenge(given, description), len(given.truth), "tanks"))
+    total = sum(tank.score for tank in tanks)
+    attributes = ("level", "readings", "score", "misfit", "seconds")
+    each = [{name: getattr(tank, name) for name in attributes} for tank in tanks]
+
+    def show(console: Console) -> None:
+        made = table("tank", "level", "readings", "score", "misfit", "CPU s")
+        for number, tank in enumerate(tanks):
+            figures = f"{tank.score:.3f}", f"{tank.misfit:.2f}", f"{tank.seconds:.1f}"
+            made.add_row(str(number), str(tank.level), str(tank.readings), *figures)
+        made.add_section()
+        made.add_row("sum", "", "", f"{total:.3f}", style="bold")
+        console.print(made)
+
+    told = {"simulated": False, "score": total, "tanks": each}
+    tell(told, as_json, show, picture, partial(draw_tanks, given.truth, tanks))
+
+
+@app.command(
+    epilog=examples(
+        "tactomo evaluate presses skins_anisotropy.npz --train 100",
+        "tactomo evaluate presses skins_anisotropy.npz --train 800 --json",
+    )
+)
+def presses(
+    skins: Annotated[Path, typer.Argument(metavar="FILE.npz", help="Presses, see above.")],
+    train: Annotated[int, typer.Option(min=1, help="Presses to learn from.")] = 200,
+    as_json: JsonOutput = False,
+) -> None:
+    """Learn each skin from its first presses, and locate its last 800.
+
+    FILE holds for each skin NAME_voltages (P, M), what each press changed, and NAME_xy_mm (P, 2),
+    where it was, both in order of time. Half of the presses not learnt from are judged where they
+    are fewer than 800. What the sheets are made of nobody needs to know: nothing but the presses
+    is learnt from, of each skin by itself.
+    """
+    from threadpoolctl import threadpool_limits
+
+    from tactomo_lab.evaluation.taught_presses import judge, read_skins
+
+    known = read_skins(skins)
+    with threadpool_limits(1):
+        found = list(shown(judge(known, train), len(known), "skins"))
+
+    def show(console: Console) -> None:
+        made = table("error, mm", "judged", "median", "95 %", "in σ", "taught", "since then")
+        for one in found:
+            errors = (f"{one.median_mm:.2f}", f"{one.p95_mm:.1f}")
+            shares = (f"{one.within_sigma:.0%}", f"{one.is_taught:.0%}")
+            since = " ".join(f"{median:.1f}" for median in one.median_mm_since)
+            made.add_row(one.name, str(one.judged), *errors, *shares, since)
+        made.add_section()
+        means = (_mean([getattr(one, of) for one in found]) for of in ("median_mm", "p95_mm"))
+        made.add_row("mean", "", *(f"{mean:.2f}" for mean in means), style="bold")
+        console.print(f"measured presses, learnt from the first {train} of each skin")
+        console.print(made)
+        console.print(
+            "in σ: coordinates within one reported standard uncertainty, 68 % where that is "
+            "right; taught: presses of which the like was taught; since then: medians of the "
+            "quarters of all later presses.",
+            style="dim",
+        )
+
+    tell({"skins": [asdict(one) for one in found]}, as_json, show)

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from tactomo_models.archive import read_arrays
 from tactomo_models.arrays import FloatArray, Image, IntArray
 from tactomo_models.errors import DataError
 from tactomo_models.sensor.description import SensorDescription
 
+from tactomo_lab.evaluation.measured_sets import read_set
 from tactomo_lab.tanks.challenge import every_reading, kept_readings, score
 from tactomo_lab.tanks.fit import TankFit
 from tactomo_lab.tanks.images import pixel_grid
@@ -63,17 +63,9 @@ def read_challenge(path: Path, description: SensorDescription) -> Challenge:
     Raises DataError where the file cannot be read or holds something else.
     """
     keys = ("injection", "measurement", "reference", "voltages", "truth")
-    try:
-        arrays = read_arrays(path)
-        currents, weights, reference, voltages, truth = (arrays[key].astype(float) for key in keys)
-        level = arrays.get("level", np.zeros(len(truth))).astype(int)
-    except OSError as error:
-        raise DataError(f"cannot read {path}: {error.strerror}; give the set's .npz") from error
-    except (KeyError, ValueError) as error:
-        raise DataError(
-            f"{path} is no set of the challenge's tanks ({error}): {', '.join(keys)} are needed, "
-            "all numbers"
-        ) from error
+    arrays = read_set(path, "the challenge's tanks", *keys)
+    currents, weights, reference, voltages, truth = (arrays[key] for key in keys)
+    level = arrays.get("level", np.zeros(len(truth))).astype(int)
     tanks, electrodes = len(truth), description.electrode_count
     readings = currents.shape[-1] * weights.shape[-1]
     shapes = {

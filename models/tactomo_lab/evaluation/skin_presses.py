@@ -12,12 +12,11 @@ sign that is is taken from the training presses, and the other half is left out.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from tactomo_models.archive import read_arrays
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
 from tactomo_models.calibration.press_regression import PressRegression
 from tactomo_models.errors import DataError
@@ -27,6 +26,15 @@ from tactomo_models.physics.tikhonov import EVEN, noser_scale, tikhonov_matrix
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.sensor.pattern import scan_positions
 
+from tactomo_lab.evaluation.measured_sets import read_set
+
+METHODS = (
+    "mean position (no measurement)",
+    "Tikhonov image",
+    "NOSER image, all voltages",
+    "NOSER image",
+    "taught by the other presses (no physics)",
+)
 Estimator = Callable[[IntArray, IntArray], FloatArray]
 
 FOLDS = 10
@@ -67,21 +75,15 @@ def read_presses(path: Path, description: SensorDescription) -> Presses:
 
     Raises DataError where the file cannot be read, or its pattern is not the description's.
     """
-    try:
-        arrays = read_arrays(path)
-        lookup, volts = arrays["lookup"].astype(int), arrays["dv"].astype(float)
-        position = arrays["pos_m"].astype(float)[:, :2]
-    except OSError as error:
-        raise DataError(f"cannot read {path}: {error.strerror}; give the set's .npz") from error
-    except (KeyError, IndexError, ValueError) as error:
-        raise DataError(
-            f"{path} is no set of presses ({error}): lookup, dv and pos_m are needed, as numbers"
-        ) from error
-    if volts.shape != (len(position), len(lookup)) or lookup.shape[1:] != (4,):
+    arrays = read_set(path, "presses", "lookup", "dv", "pos_m")
+    lookup, volts, position = arrays["lookup"].astype(int), arrays["dv"], arrays["pos_m"]
+    of_presses = volts.shape == (len(position), len(lookup)) and position.ndim == 2
+    if not of_presses or lookup.shape[1:] != (4,):
         raise DataError(
             f"{path}: dv is {volts.shape}, lookup {lookup.shape}, pos_m {position.shape}; (n, M), "
             "(M, 4) and (n, 2) are needed"
         )
+    position = position[:, :2]
     order, sign = scan_order(lookup, description)
     changes = np.empty_like(volts)
     changes[:, order] = volts * sign
@@ -109,8 +111,8 @@ def scan_order(lookup: IntArray, description: SensorDescription) -> tuple[IntArr
     return np.array(order), np.array(sign)
 
 
-def localise(presses: Presses, description: SensorDescription) -> list[Localisation]:
-    """Locate every press by each method, fitted to the presses of other folds only."""
+def localise(presses: Presses, description: SensorDescription) -> Iterator[Localisation]:
+    """Locate every press by each of `METHODS`, fitted to the presses of other folds only."""
     imager = _Imager(description, presses, load_or_build_artifact(description))
     positions = presses.positions_m
 
@@ -128,16 +130,9 @@ def localise(presses: Presses, description: SensorDescription) -> list[Localisat
 
         return estimate
 
-    methods: dict[str, Estimator] = {
-        "mean position (no measurement)": mean,
-        "Tikhonov image": image(noser=False, halves=True),
-        "NOSER image, all voltages": image(noser=True, halves=False),
-        "NOSER image": image(noser=True, halves=True),
-        "taught by the other presses (no physics)": taught,
-    }
-    return [
-        Localisation(name, _cross_validated(method, positions)) for name, method in methods.items()
-    ]
+    estimators = (mean, image(False, True), image(True, False), image(True, True), taught)
+    for name, method in zip(METHODS, estimators, strict=True):
+        yield Localisation(name, _cross_validated(method, positions))
 
 
 def _folds(presses: IntArray) -> list[IntArray]:

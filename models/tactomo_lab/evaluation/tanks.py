@@ -21,7 +21,6 @@ from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
-from tactomo_models.archive import read_arrays
 from tactomo_models.arrays import FloatArray, Image
 from tactomo_models.errors import DataError
 from tactomo_models.physics.artifact import Artifact, load_or_build_artifact
@@ -31,6 +30,7 @@ from tactomo_models.scans.reference import Reference, noise_of_reciprocity
 from tactomo_models.scene.reconstruction import Reconstruction
 from tactomo_models.sensor.description import SensorDescription
 
+from tactomo_lab.evaluation.measured_sets import read_set
 from tactomo_lab.scenes import measures
 from tactomo_lab.tanks.fit import TankFit
 from tactomo_lab.tanks.images import pixel_grid, probabilities, signed_image
@@ -75,21 +75,13 @@ class TankOutcome:
 
 
 def read_tanks(path: Path, description: SensorDescription) -> Tanks:
-    """Read `dv` (n, M), `truth` (n, rows, columns) and `name` (n,).
+    """Read `dv` (n, M), `truth` (n, rows, columns) and, if it is there, `name` (n,).
 
     Raises DataError where the file cannot be read or holds something else.
     """
-    try:
-        arrays = read_arrays(path)
-        changes, truth = arrays["dv"].astype(float), arrays["truth"].astype(float)
-        names = arrays["name"]
-    except OSError as error:
-        raise DataError(f"cannot read {path}: {error.strerror}; give the set's .npz") from error
-    except (KeyError, ValueError) as error:
-        raise DataError(
-            f"{path} is no set of tanks ({error}): dv, truth and name are needed, the first two "
-            "numbers"
-        ) from error
+    arrays = read_set(path, "tanks", "dv", "truth")
+    changes, truth = arrays["dv"], arrays["truth"]
+    names = arrays.get("name", np.arange(len(truth)))
     wanted = (len(names), description.measurements)
     if changes.shape != wanted or truth.ndim != 3 or len(truth) != len(names):
         raise DataError(

@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from tactomo_models.archive import read_arrays
 from tactomo_models.arrays import FloatArray
 from tactomo_models.calibration.press_regression import PressRegression
 from tactomo_models.errors import DataError
+
+from tactomo_lab.evaluation.measured_sets import read_set
 
 JUDGED: Final = 800  # of the last presses; half of those not learnt from, where they are fewer
 SINCE: Final = 4  # parts of all later presses, to see errors grow
@@ -51,10 +52,7 @@ def read_skins(path: Path) -> list[SkinPresses]:
 
     Raises DataError where the file cannot be read, or holds no such skin.
     """
-    try:
-        arrays = read_arrays(path)
-    except OSError as error:
-        raise DataError(f"cannot read {path}: {error.strerror}; give the set's .npz") from error
+    arrays = read_set(path, "presses")
     names = [key.removesuffix("_voltages") for key in arrays if key.endswith("_voltages")]
     if not names:
         raise DataError(
