@@ -121,7 +121,7 @@ def _draw_method(
         axes.errorbar(
             point.p50_s * 1e3,
             _shown(point.icc),
-            xerr=[[0.0], [max(0.0, point.p99_s - point.p50_s) * 1e3]],
+            xerr=[[0.0], [max(0.0, point.summary.seconds_99 - point.p50_s) * 1e3]],
             color=colour,
             marker=marker,
             markersize=MARKER if best else 0.7 * MARKER,

@@ -88,26 +88,22 @@ def read_challenge(path: Path, description: SensorDescription) -> Challenge:
     return Challenge(currents, weights, reference, voltages, truth.astype(np.uint8), level)
 
 
-class ChallengeImager:
-    """Finds what stands in the challenge's tanks."""
+def evaluate_challenge(
+    given: Challenge, description: SensorDescription
+) -> Iterator[ChallengeOutcome]:
+    """Find what stands in every tank, and score it.
 
-    def __init__(
-        self,
-        description: SensorDescription,  # of the tank
-    ) -> None:
-        self._model = TankModel(description)
-        self._known: tuple[bytes, TankFit] | None = None  # tanks in a row are read one way
-
-    def find(
-        self, currents: FloatArray, weights: FloatArray, reference: FloatArray, volts: FloatArray
-    ) -> tuple[TankFit, FloatArray]:
-        """What fits one tank of a `Challenge`, and its changes (n,) in the model's unit.
-
-        Raises DataError where the reference is none of this tank.
-        """
-        of_drive, of_reading = every_reading(currents, weights)
+    Raises DataError where a reference is none of this tank.
+    """
+    model = TankModel(description)
+    known: dict[bytes, TankFit] = {}  # of the last way to read: tanks in a row are read one way
+    for currents, reference, volts, truth, level in zip(
+        given.currents, given.reference, given.voltages, given.truth, given.level, strict=True
+    ):
+        begin = time.process_time()
+        of_drive, of_reading = every_reading(currents, given.weights)
         kept = np.isfinite(reference) & np.isfinite(volts)
-        empty = self._model.readings_of_empty(of_drive[kept], of_reading[kept])
+        empty = model.readings_of_empty(of_drive[kept], of_reading[kept])
         # The largest readings tell most, and are nearest to the model's.
         shown = float(empty @ reference[kept])
         if not shown > 0:
@@ -115,26 +111,13 @@ class ChallengeImager:
                 "the reference is no scan of this tank: give injection in amperes into the "
                 "electrodes, measurement as the weights of their potentials, drive by drive"
             )
-        scale = float(empty @ empty) / shown
         key = of_drive.tobytes() + of_reading.tobytes() + kept.tobytes()
-        if self._known is None or self._known[0] != key:
-            readings = Readings(self._model, of_drive[kept], of_reading[kept], empty)
-            self._known = key, TankFit(self._model, readings)
-        return self._known[1], scale * (volts - reference)[kept]
-
-
-def evaluate_challenge(
-    given: Challenge, description: SensorDescription
-) -> Iterator[ChallengeOutcome]:
-    """Find what stands in every tank, and score it."""
-    imager = ChallengeImager(description)
-    for currents, reference, volts, truth, level in zip(
-        given.currents, given.reference, given.voltages, given.truth, given.level, strict=True
-    ):
-        begin = time.process_time()
-        fit, changes = imager.find(currents, given.weights, reference, volts)
-        tank = fit.find(changes, WATER_SIGMA)
-        image = classes(fit.image(tank, *truth.shape))
+        if key not in known:
+            readings = Readings(model, of_drive[kept], of_reading[kept], empty)
+            known = {key: TankFit(model, readings)}
+        changes = float(empty @ empty) / shown * (volts - reference)[kept]
+        tank = known[key].find(changes, WATER_SIGMA)
+        image = classes(known[key].image(tank, *truth.shape))
         seconds = time.process_time() - begin
         found = score(truth, image)
         yield ChallengeOutcome(int(level), len(changes), found, tank.misfit, seconds, image)

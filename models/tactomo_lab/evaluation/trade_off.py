@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 from tactomo_models.batch import BUDGET_S
@@ -45,19 +45,22 @@ def variants(methods: Iterable[str], budgets_s: Sequence[float] = BUDGETS_S) -> 
 
 @dataclass(frozen=True)
 class Point:
-    """How fast and how right a variant is on scenes of one kind; the measures are `Summary`'s."""
+    """How fast and how right a variant is on scenes of one kind."""
 
     scene: SceneKind
     snr_db: float
     variant: Variant
-    frames: int
-    icc: float
-    icc_worst: float
-    count_right: float
-    distrusted: float
-    confidently_wrong: float
-    p50_s: float
-    p99_s: float
+    summary: Summary
+
+    @property
+    def icc(self) -> float:
+        """Mean correlation of the maps with the truth."""
+        return self.summary.icc
+
+    @property
+    def p50_s(self) -> float:
+        """Median processor time of a frame."""
+        return self.summary.seconds
 
 
 def measure(
@@ -71,7 +74,7 @@ def measure(
     first = cases[0]
     kind: SceneKind = "still" if first.is_still else "moving"
     return [
-        _point(kind, first.plan.snr_db, variant, summarise(own)) for variant, own in scores.items()
+        Point(kind, first.plan.snr_db, variant, summarise(own)) for variant, own in scores.items()
     ]
 
 
@@ -84,13 +87,6 @@ def left_out(description: SensorDescription, methods: Iterable[str]) -> dict[str
         except ModelError as error:
             reasons[method] = str(error)
     return reasons
-
-
-def _point(scene: SceneKind, snr_db: float, variant: Variant, summary: Summary) -> Point:
-    names = ("frames", "icc", "icc_worst", "count_right", "distrusted", "confidently_wrong")
-    measured: dict[str, Any] = {name: getattr(summary, name) for name in names}
-    measured |= {"p50_s": summary.seconds, "p99_s": summary.seconds_99}
-    return Point(scene, snr_db, variant, **measured)
 
 
 def panels(points: Iterable[Point]) -> Iterator[list[Point]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -14,14 +15,16 @@ from tactomo_lab.commands import chart as bench_chart
 from tactomo_lab.commands.chart_picture import draw_chart
 from tactomo_lab.evaluation.play import Variant
 from tactomo_lab.evaluation.trade_off import Point
+from tactomo_lab.scenes.measures import summarise
 from tactomo_models import available_methods
 
 Run = Callable[..., Any]
 
 
 def point(method: str, p50_s: float, icc: float, budget_s: float | None = None) -> Point:
-    variant = Variant(method, budget_s)
-    return Point("still", 40.0, variant, 4, icc, icc / 2, 1.0, 0.25, 0.0, p50_s, 2 * p50_s)
+    summary = summarise([])
+    summary = replace(summary, icc=icc, seconds=p50_s, seconds_99=2 * p50_s)
+    return Point("still", 40.0, Variant(method, budget_s), summary)
 
 
 def test_the_table_tells_what_is_on_the_front(tmp_path: Path) -> None:

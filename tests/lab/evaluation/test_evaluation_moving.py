@@ -229,10 +229,10 @@ def test_speed_and_accuracy_are_of_all_frames(
     scene = sequence(paper, simulator, Step("rest", {}), *[Step("still", {"A": press("A")})] * 2)
     done: list[None] = []
     points = measure([scene], [Variant("noser"), Variant("fit", 0.05)], lambda: done.append(None))
-    assert [(p.scene, p.snr_db, str(p.variant), p.frames) for p in points] == [
+    assert [(p.scene, p.snr_db, str(p.variant), p.summary.frames) for p in points] == [
         ("moving", 40.0, "noser", 3),
         ("moving", 40.0, "fit, 50 ms", 3),
     ]
     assert len(done) == 6
     assert points[0].icc < points[1].icc < 1
-    assert 0 < points[0].p50_s <= points[0].p99_s
+    assert 0 < points[0].p50_s <= points[0].summary.seconds_99

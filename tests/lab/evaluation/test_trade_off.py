@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,15 +17,17 @@ from tactomo_lab.evaluation.trade_off import (
     pareto_front,
     variants,
 )
+from tactomo_lab.scenes.measures import summarise
 from tactomo_lab.scenes.still_scenes import scenes
 from tactomo_models import Artifact, SensorDescription, available_methods
 from tactomo_models.methods.registry import BUDGETED
 
 
 def point(p50_s: float, icc: float, snr_db: float = 40.0) -> Point:
-    return Point("still", snr_db, Variant("auto"), 1, icc, icc, 1.0, 0.0, 0.0, p50_s, p50_s)
+    return Point("still", snr_db, Variant("auto"), replace(NOTHING, icc=icc, seconds=p50_s))
 
 
+NOTHING = summarise([])
 FEW = st.sampled_from([0.1, 0.2, 0.3, 0.5])  # so that some are equal
 
 
@@ -76,11 +80,11 @@ def test_still_scenes_are_measured_under_each_budget(
     linear, hasty, patient = measure(drawn, asked, lambda: done.append(None))
     assert [linear.variant, hasty.variant, patient.variant] == asked
     assert len(done) == 3
-    assert {p.frames for p in (linear, hasty, patient)} == {1}
+    assert {p.summary.frames for p in (linear, hasty, patient)} == {1}
     assert {(p.scene, p.snr_db) for p in (linear, hasty, patient)} == {("still", 20.0)}
     assert hasty.icc < patient.icc > linear.icc
-    assert linear.p50_s < hasty.p50_s < patient.p50_s <= patient.p99_s
-    assert hasty.distrusted == 1
+    assert linear.p50_s < hasty.p50_s < patient.p50_s <= patient.summary.seconds_99
+    assert hasty.summary.distrusted == 1
 
 
 def test_methods_whose_network_nobody_trained_are_left_out(small: SensorDescription) -> None:
