@@ -44,6 +44,7 @@ from tactomo_lab.scenes.presets import (
     draw_scene,
 )
 from tactomo_lab.scenes.simulation import (
+    SHARP_M,
     displaced,
     truth_of,
     with_contrast,
@@ -54,7 +55,6 @@ SHARD = 200  # scenes in a file
 SPACING_SHARE = 5 / 6  # of the map's nodes' distance: 2.5 mm on the paper's sensor
 REFINEMENTS = 2
 PARTS = 3  # that each side of a triangle is divided into, where its conductivity is averaged
-SHARP_M = 1e-9  # width of an outline: a point lies inside or outside
 SCENES = "scenes"  # begins the names of the files that hold them
 FORMAT = 2  # raise it when what is drawn or simulated changes
 MANIFEST = "manifest.json"
