@@ -19,7 +19,9 @@ SHOW := sed -un 's/^Collecting \([^=; ]*\).*/  \1/p; s/^Installing.*/  unpacking
 BUILD := --quiet --no-build-isolation --no-deps
 LAB := models/tactomo_lab
 DIST := dist
-SITE = $(DIST)/docs/$(shell sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)
+VERSION = $(shell sed -n 's/^version = "\(.*\)"/\1/p' pyproject.toml)
+SITE = $(DIST)/docs/$(VERSION)
+COMMIT := daemon/tactomo/commit.txt
 
 LOCKED := pyproject.toml --universal --python-version 3.11 --generate-hashes \
   --no-emit-package tactomo-client --no-emit-package tactomo --no-emit-package tactomo-lab
@@ -28,7 +30,7 @@ LOCKED := pyproject.toml --universal --python-version 3.11 --generate-hashes \
 ON_ARM := --python-version 3.11 --python-platform aarch64-manylinux_2_28 --only-binary :all: \
   --no-emit-package tactomo-client --no-emit-package tactomo --no-annotate
 
-.PHONY: help setup run test test-lab test-all test-random test-long test-train test-peers faults soak fleet firmware fuzz lint format schema pictures bench docs wheels deb lock clean
+.PHONY: help setup run test test-lab test-all test-random test-long test-train test-peers faults soak fleet firmware fuzz lint format schema pictures bench docs wheels release-check deb lock clean
 
 help:            ## list these targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -107,12 +109,29 @@ docs: $(DOCS_READY)  ## the documentation as a site: dist/docs/VERSION/index.htm
 	$(BIN)/python -m sphinx -W --keep-going -q -E -d $(VENV)/doctrees -c docs . $(SITE)
 
 # The wheels are made of the source archives, so that these are known to be whole.
-wheels: $(RUN_READY)  ## wheels and source archives of every distribution, in dist/
+wheels: $(RUN_READY)  ## wheels and source archives of every distribution, and an SBOM, in dist/
 	rm -f $(DIST)/*.whl $(DIST)/*.tar.gz
+	mkdir -p $(DIST)
+	$(BIN)/python deploy/sbom.py requirements-run.lock $(VERSION) > $(DIST)/sbom.json
+	git describe --always --dirty --abbrev=12 > $(COMMIT) || rm -f $(COMMIT)
 	for each in $(dir $(wildcard pyproject.toml */*/pyproject.toml)); do \
 	  (cd $$each && $(abspath $(BIN))/python -m hatchling build -t sdist -d $(abspath $(DIST))); done
 	$(BIN)/python -m pip wheel $(BUILD) --wheel-dir $(DIST) $(DIST)/*.tar.gz
+	rm -f $(COMMIT)
 	ls -lh $(DIST)
+
+# The checklist of a release, in order; the first thing that is amiss ends it.
+release-check: $(READY)  ## all that a release must pass: clean, told, linted, built, installed, tested
+	git diff --quiet HEAD || { echo "commit first: there are changes"; exit 1; }
+	grep -q '^## $(VERSION)' CHANGELOG.md || { echo "CHANGELOG.md lacks $(VERSION)"; exit 1; }
+	$(MAKE) lint schema
+	git diff --quiet HEAD || { echo "commit what make schema has written"; exit 1; }
+	$(BIN)/python -m pip install --quiet --dry-run --ignore-installed --no-deps --only-binary :all: \
+	  $(foreach each,2_28 2_17,--platform manylinux_$(each)_aarch64) --python-version 3.11 \
+	  --target $(DIST)/aarch64 -r requirements-aarch64.lock
+	$(MAKE) docs wheels
+	$(BIN)/pytest tests/deploy -n 0 -m 'not long'
+	$(MAKE) test-all
 
 deb: $(READY)    ## the Debian package, for this distribution and processor, in dist/
 	deploy/debian/build.sh $(BIN)/python

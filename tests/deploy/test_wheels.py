@@ -6,6 +6,7 @@ theirs in turn, and no other. `pip check` says whether that is all.
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import tomllib
@@ -112,6 +113,22 @@ def test_the_demo_is_read_by_an_environment_of_the_client_alone(
     with running_demo("--scene", "two_fingers_merge", program=[robot / "tactomo"]) as demo:
         line = first_line_of_the_readme(demo, home, python=controller / "python")
     assert "kPa" in line
+
+
+def test_the_version_names_the_commit_that_was_built(robot: Path, home: Path) -> None:
+    describe = ("git", "-C", repository(), "describe", "--always", "--dirty", "--abbrev=12")
+    commit = subprocess.run(describe, capture_output=True, text=True, check=True).stdout.strip()
+    version = run(robot / "tactomo", "--version", folder=home)
+    assert version.endswith(f" (commit {commit})\n")
+
+
+def test_the_bill_of_materials_names_each_requirement(wheels: dict[str, Path]) -> None:
+    bill = json.loads(wheels["tactomo"].with_name("sbom.json").read_text("utf-8"))
+    parts = {part["name"]: part for part in bill["components"]}
+    project = tomllib.loads((repository() / "pyproject.toml").read_text("utf-8"))["project"]
+    required = {Requirement(line).name for line in project["dependencies"]} - {"tactomo-client"}
+    assert required <= parts.keys()
+    assert all(part["hashes"] for part in parts.values())
 
 
 def test_what_the_service_needs_is_there(robot: Path, home: Path) -> None:

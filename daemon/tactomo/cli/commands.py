@@ -173,6 +173,24 @@ class _Top(Group):
         )
 
 
+def _commit() -> str:
+    """Return the commit that a wheel was built from, or that a checkout is at; or nothing."""
+    import subprocess
+    from pathlib import Path
+
+    here = Path(__file__).parent
+    describe = ["git", "-C", str(here), "describe", "--always", "--dirty", "--abbrev=12"]
+    is_checkout = (here.parents[2] / "hatch_build.py").is_file()
+    try:
+        if is_checkout:
+            commit = subprocess.check_output(describe, stderr=subprocess.DEVNULL, text=True)
+        else:
+            commit = here.with_name("commit.txt").read_text("ascii")
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return f"(commit {commit.strip()})"
+
+
 app = typer.Typer(
     name="tactomo",
     cls=_Top,
@@ -196,7 +214,7 @@ def _start(
     if version:
         from importlib.metadata import version as version_of
 
-        say(f"tactomo {version_of('tactomo')}")
+        say(" ".join(filter(None, ("tactomo", version_of("tactomo"), _commit()))))
         raise typer.Exit
     if context.invoked_subcommand is None:
         say(context.get_help())

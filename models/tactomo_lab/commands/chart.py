@@ -60,14 +60,15 @@ def chart(
 
     prepare_picture(picture)
     prepare_file(table_path(picture))
-    points = measure_chart(name, count, methods)
+    points, warnings = measure_chart(name, count, methods)
+    machine = "; ".join((machine, *warnings))
     rows = rows_of(points)
     write_table(rows, machine, table_path(picture))
     moving_scenes = sequences(count)
     title = (
         f"Simulated, not measured on hardware: sensor {name}, reporting seeds; presses of mixed "
         f"kinds on skins made by hand\n{count} still scenes each of 1 to 4 contacts, "
-        f"{moving_scenes} moving scene{'s' * (moving_scenes > 1)}; one thread of {machine}\n"
+        f"{moving_scenes} moving scene{'s' * (moving_scenes > 1)}; one thread of\n{machine}\n"
         "figures at points: budget of modelled work; pale: something else is both faster and better"
     )
     save_figure(draw_chart(points, title), picture)
@@ -85,8 +86,10 @@ def sequences(count: int) -> int:
     return -(-count // SCENES_A_SEQUENCE)
 
 
-def measure_chart(name: str, count: int, methods: Sequence[str] = ()) -> list[trade_off.Point]:
-    """Measure methods, with a progress bar in the terminal.
+def measure_chart(
+    name: str, count: int, methods: Sequence[str] = ()
+) -> tuple[list[trade_off.Point], list[str]]:
+    """Measure methods, with a progress bar in the terminal; also return what is wrong with times.
 
     Raises:
         ModelError: there are no scenes for such a sensor, or a method of the user's own failed.
@@ -107,7 +110,8 @@ def measure_chart(name: str, count: int, methods: Sequence[str] = ()) -> list[tr
         for number in shown(range(sequences(count)), sequences(count), "simulating moving scenes")
     ]
     frames = sum(len(case.frames) for case in moving)
-    with warned_if_busy(), Progress(console=Console(stderr=True), transient=True) as progress:
+    progress = Progress(console=Console(stderr=True), transient=True)
+    with warned_if_busy() as warnings, progress:
         for cases, budgets_s in (
             *((each, trade_off.STILL_BUDGETS_S) for each in drawn),
             (moving, trade_off.BUDGETS_S),
@@ -118,7 +122,7 @@ def measure_chart(name: str, count: int, methods: Sequence[str] = ()) -> list[tr
             total = len(asked) * (frames if cases is moving else len(cases))
             task = progress.add_task(what, total=total)
             points += trade_off.measure(cases, asked, partial(progress.advance, task))
-    return points
+    return points, warnings
 
 
 def rows_of(points: Sequence[trade_off.Point]) -> list[dict[str, Any]]:

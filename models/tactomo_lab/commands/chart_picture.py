@@ -47,7 +47,22 @@ def draw_chart(points: Sequence[Point], title: str) -> Figure:
         _draw_panel(axes, panel, styles)
     _set_axes(grid, points)
     _name_methods(figure, points, styles)
+    _part_labels(figure, grid)
     return figure
+
+
+def _part_labels(figure: Figure, grid: Any) -> None:
+    """Move labels down until none lies over another one of its panel."""
+    figure.draw_without_rendering()
+    for axes in grid.flat:
+        placed: list[Any] = []
+        for label in sorted(axes.texts, key=lambda text: -text.get_window_extent().y1):
+            while any(label.get_window_extent().overlaps(other) for other in placed):
+                if not isinstance(label.get_gid(), str):  # of a line or a front: stays there
+                    break
+                x, y = label.get_position()
+                label.set_position((x, y - label.get_fontsize() - 1))
+            placed.append(label.get_window_extent())
 
 
 def _name_methods(figure: Figure, points: Sequence[Point], styles: dict[str, Style]) -> None:
@@ -148,6 +163,7 @@ def _name_budgets(axes: Any, series: Sequence[Point], colour: str) -> None:
             va="top",
             fontsize=6,
             color=colour,
+            gid="budget",
         )
 
 

@@ -70,6 +70,32 @@ def test_budgets_that_change_nothing_share_a_name() -> None:
     assert named == {"1 ms to 5 ms", "10 ms"}
 
 
+def test_labels_do_not_overlap() -> None:
+    points = [
+        point(method, 0.01 * (1 + step / 20), 0.9 - step / 1000, budget_s=ms / 1e3)
+        for method in ("auto", "fit", "levelset")
+        for step, ms in enumerate((5, 20, 50))
+    ]
+    figure = draw_chart(points, "a title")
+    (axes,) = figure.axes
+    figure.draw_without_rendering()
+    boxes = [text.get_window_extent() for text in axes.texts if text.get_text().endswith("ms")]
+    assert len(boxes) == 9
+    assert not any(one.overlaps(other) for at, one in enumerate(boxes) for other in boxes[at + 1 :])
+
+
+def test_a_busy_machine_is_told_in_the_picture_and_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[str] = []
+    measured = [point("noser", 0.001, 0.6)], ["the machine was busy"]
+    monkeypatch.setattr(bench_chart, "measure_chart", lambda *_: measured)
+    monkeypatch.setattr(bench_chart, "save_figure", lambda figure, _: drawn.append(figure))
+    bench_chart.chart("paper_square", tmp_path / "chart.png", 1, "a machine")
+    assert "a machine; the machine was busy" in drawn[0].get_suptitle()  # type: ignore[attr-defined]
+    assert "a machine; the machine was busy" in (tmp_path / "chart.csv").read_text()
+
+
 def test_no_two_methods_look_alike() -> None:
     figure = draw_chart([point(method, 0.02, 0.9) for method in available_methods()], "a title")
     (axes,) = figure.axes

@@ -99,17 +99,19 @@ def _moving_scene(sensor: SensorDescription, progress: Progress) -> tuple[Refere
 
 
 @contextmanager
-def warned_if_busy() -> Iterator[None]:
-    """Say on standard error if this process had to wait for others while it measured times."""
+def warned_if_busy() -> Iterator[list[str]]:
+    """Say on standard error if this process had to wait for others while it measured times.
+
+    The list that the block gets holds the same words at its end, for what else shows the times.
+    """
     wall_s, own_s = time.perf_counter(), time.process_time()
-    yield
+    warnings: list[str] = []
+    yield warnings
     share = (time.process_time() - own_s) / (time.perf_counter() - wall_s)
     if share < BUSY:
-        say(
-            f"the machine was busy: this had {share:.0%} of a core, and its times are too long; "
-            "run it again when nothing else runs",
-            err=True,
-        )
+        busy = f"the machine was busy: this had {share:.0%} of a core, and its times are too long"
+        warnings.append(busy)
+        say(f"{busy}; run it again when nothing else runs", err=True)
 
 
 def in_force(name: str) -> MachineSpeed:
