@@ -449,7 +449,7 @@ def test_what_the_daemon_finds_wrong_is_printed_and_nothing_else_is_judged(page:
     wait_until(lambda: page["state"].text == "late")
     assert not page["banner"].is_displayed()
     issue = {"severity": "error", "what": "frames come late", "next_step": "be quick"}
-    noted = {"severity": "warning", "what": "it hums", "next_step": "oil it"}
+    noted = {"severity": "warning", "what": "it hums", "next_step": "`oil it`"}
     page.skin.status |= {"issues": [issue, noted]}
     wait_until(lambda: page["banner"].text == "frames come late: be quick")
     assert page["channels"].text.split("\n")[:4] == [

@@ -171,7 +171,7 @@ function showChannels({ state, ports, rates, events, issues = [] }, isCurrent) {
     dot.dataset.kind = kind;
     dot.title = kind;
     setText(label, name);
-    setText(value, text);
+    setWords(value, text);
   });
 }
 
