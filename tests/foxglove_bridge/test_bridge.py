@@ -328,7 +328,9 @@ def test_wrong_usage(tactomo: Callable[..., Any]) -> None:
     assert result.returncode == 2
     assert "X,Y,Z" in result.stderr
     began = time.monotonic()
-    result = tactomo("foxglove", "--layout", "nowhere/skin.json")
+    result = tactomo(
+        *("foxglove", "left", "--address", "tcp://127.0.0.1:9"), "--layout", "nowhere/skin.json"
+    )
     assert result.returncode == 1
     assert "cannot write nowhere/skin.json" in result.stderr
     assert time.monotonic() - began < 10

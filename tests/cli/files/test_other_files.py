@@ -203,7 +203,7 @@ def test_no_pattern_is_made_up() -> None:
     assert [str(p) for p in fitting_patterns(noise[:, :192])] == ["16:opposite:adjacent"]
 
 
-@pytest.mark.parametrize("degrees", [50, -100])
+@pytest.mark.parametrize("degrees", [pytest.param(50, marks=pytest.mark.slow), -100])
 def test_volts_out_of_phase_are_turned_as_the_reference_is(
     tactomo: Run, tmp_path: Path, degrees: float
 ) -> None:
@@ -293,7 +293,8 @@ def test_any_text_becomes_scans_or_a_named_error(
     read_damaged(path, data)
 
 
-@pytest.mark.parametrize("version", ["5", pytest.param("7.3", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("version", ["5", "7.3"])
 @settings(TAKES_FILES, max_examples=8)  # a program of its own reads each
 @given(data=st.data())
 def test_any_matlab_file_becomes_scans_or_a_named_error(

@@ -165,7 +165,9 @@ def test_a_network_that_says_nonsense_does_no_harm(
 
 
 @pytest.mark.parametrize("step_k", [-1.5, pytest.param(1.5, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("presses", [(), TWO[:1], TWO], ids=len)
+@pytest.mark.parametrize(
+    "presses", [(), TWO[:1], pytest.param(TWO, marks=pytest.mark.slow)], ids=len
+)
 def test_sheets_that_have_drifted_since_the_tare_hide_no_contact_and_make_none(
     paper: SensorDescription,
     methods: dict[str, Reconstructor],

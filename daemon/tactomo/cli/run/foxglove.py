@@ -73,18 +73,20 @@ def foxglove(
     from tactomo_client.keys import as_keys
     from tactomo_foxglove import Bridge
 
-    found = find_sensor(sensors[0] if sensors else None, address, keys)
-    names = sensors or [found.sensor]
+    placement = placement_of(parent, pose)
+    if address is None or not sensors:
+        found = find_sensor(sensors[0] if sensors else None, address, keys)
+        sensors, address = sensors or [found.sensor], found.stream
     if layout is not None:
-        write_layout(layout, names[0])
+        write_layout(layout, sensors[0])
     stop = stop_asked()
     with Bridge(
-        names,
-        found.stream,
+        sensors,
+        address,
         host,
         foxglove_port,
         as_keys(keys),
-        placement_of(parent, pose),
+        placement,
         allow_origin or (),
     ) as bridge:
         _print_addresses(bridge, layout, announce)

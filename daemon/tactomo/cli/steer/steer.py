@@ -97,20 +97,20 @@ def record(
     """
     from tactomo_client import Daemon
 
-    daemon = Daemon(find_control(sensor, address, keys), keys=keys)
-    if what not in ("start", "stop"):
-        if name is not None:
-            raise typer.BadParameter("give one file, or `start FILE`")
-        _record_for(daemon, what, seconds, maps or None)
-        return
-    if seconds is not None:
+    to_file = what not in ("start", "stop")
+    if to_file and name is not None:
+        raise typer.BadParameter("give one file, or `start FILE`")
+    if not to_file and seconds is not None:
         raise typer.BadParameter("--seconds goes with FILE, not with start or stop")
-    if what == "stop":
-        if name is not None or maps:
-            raise typer.BadParameter("stop takes no file, and no --maps")
+    if what == "stop" and (name is not None or maps):
+        raise typer.BadParameter("stop takes no file, and no --maps")
+    daemon = Daemon(find_control(sensor, address, keys), keys=keys)
+    if to_file:
+        _record_for(daemon, what, seconds, maps or None)
+    elif what == "stop":
         _print_recorded(daemon.record_stop())
-        return
-    say(f"recording to {daemon.record_start(name, maps=maps or None).path}")
+    else:
+        say(f"recording to {daemon.record_start(name, maps=maps or None).path}")
 
 
 @app.command(
