@@ -13,6 +13,8 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from tactomo_client.schema import EVENTS
 
+from tactomo.timing import wall_clock_ns
+
 EVENT_PERIOD_S: Final = 1.0
 LONGEST_PERIOD_S: Final = 60.0
 """Between two events of one trouble that goes on: it must not bury all others."""
@@ -115,7 +117,7 @@ class EventBook:
             self._counts[name] += 1
             if severity != "info":
                 self._troubles.pop(name, None)
-                happened = _Happened(severity, detail, next_step, time.time_ns(), now_s)
+                happened = _Happened(severity, detail, next_step, wall_clock_ns(), now_s)
                 self._troubles[name] = happened
             return self._allowance.setdefault(name, _Allowance(now_s)).take(now_s)
 

@@ -23,6 +23,13 @@ FEW: Final = 3.0  # as many of its own periods late, and something has stopped
 LONGEST_PERIOD_S: Final = 60.0
 MINUTE_S: Final = 60.0
 LOOK_S: Final = 1.0
+LATEST_NS: Final = 2**63 - 2**58
+"""In the year 2253: dates are of 63 bits, and a recording may go on for years."""
+
+
+def wall_clock_ns() -> int:
+    """Now on the computer's wall clock, ns since 1970; the nearest that can be told, if far off."""
+    return min(max(time.time_ns(), 0), LATEST_NS)
 
 
 class Durations:

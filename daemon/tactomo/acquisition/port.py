@@ -43,6 +43,7 @@ from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording import REPLAY_SCHEME
 from tactomo.recordings.recording_writer import port_entry, preamble_entry
 from tactomo.scans import ChannelScan, Delivery
+from tactomo.timing import wall_clock_ns
 from tactomo.worker import Worker
 
 RETRY_S: Final = 0.25
@@ -208,7 +209,7 @@ class PortReader(Worker):
         source = self._connection
         data = source.read()
         # The clocks are read here, before anything else is done with the bytes.
-        realtime_ns, monotonic_ns = time.time_ns(), time.monotonic_ns()
+        realtime_ns, monotonic_ns = wall_clock_ns(), time.monotonic_ns()
         if source.moved != self._pass:
             self._begin_pass(source.moved)
         if data:

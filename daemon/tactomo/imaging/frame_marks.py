@@ -17,6 +17,7 @@ from tactomo.recordings.active_recording import ActiveRecording
 from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording_writer import calibration_entry, mark_entry, reference_entry
 from tactomo.scans import DualScan, Mark, Timing
+from tactomo.timing import wall_clock_ns
 
 REPEAT_S: Final = 60.0
 """How often reference and calibration are said again: damage to a file costs a minute of frames."""
@@ -73,7 +74,7 @@ class FrameMarks:
             reference_number=recording.references or None,
             calibration_number=recording.calibrations,
         )
-        recording.add(mark_entry(done, time.monotonic_ns(), time.time_ns()))
+        recording.add(mark_entry(done, time.monotonic_ns(), wall_clock_ns()))
 
     def _tell(self, recording: ActiveRecording, in_force: InForce) -> None:
         """Say reference and calibration, where they are new to the recording, or now and then."""
@@ -89,4 +90,4 @@ class FrameMarks:
         is_new, self._calibration = text != self._calibration, text
         recording.calibrations += is_new
         if is_new or (is_due and recording.calibrations):
-            recording.add(calibration_entry(text, recording.calibrations, now_ns, time.time_ns()))
+            recording.add(calibration_entry(text, recording.calibrations, now_ns, wall_clock_ns()))

@@ -41,7 +41,7 @@ from tactomo.imaging.tare import Taring, is_at_rest
 from tactomo.recordings.recorder import Recorder
 from tactomo.scans import DualScan, Mark, Timing, Volts
 from tactomo.stream.publisher import Publisher
-from tactomo.timing import Durations, Rate
+from tactomo.timing import Durations, Rate, wall_clock_ns
 
 log = structlog.get_logger()
 
@@ -167,7 +167,7 @@ class Imaging:
             is_first and self._kept is not None and self._kept.is_unreadable
         )
         self._before = self._known_before() if contacts else None
-        self._use(tare, time.time_ns())
+        self._use(tare, wall_clock_ns())
         if contacts:
             self._on_event(
                 "reference_disputed",
@@ -304,7 +304,7 @@ class Imaging:
             self._reconstructor.forget_shape()
         self.calibration.obey(mark.calibration)
         if mark.reference is not None and mark.reference is not self.reference:
-            self.reference_realtime_ns = time.time_ns()
+            self.reference_realtime_ns = wall_clock_ns()
             self._reconstructor.set_reference(mark.reference)
             self._note_reference(mark.reference)
 

@@ -20,6 +20,7 @@ from tactomo.errors import RecordingError
 from tactomo.events import OnEvent
 from tactomo.recordings.recorder import Recorder
 from tactomo.recordings.recording import REFERENCE_ARRAYS
+from tactomo.timing import wall_clock_ns
 
 KEEP_S: Final = 60.0
 """How often a reference that follows drift is kept: drift bounds allow for far more than that."""
@@ -42,7 +43,7 @@ class KnownSkin:
     @property
     def age_s(self) -> float:
         """How long ago it held."""
-        age_s = (time.time_ns() - self.realtime_ns) * 1e-9
+        age_s = (wall_clock_ns() - self.realtime_ns) * 1e-9
         return age_s if age_s >= 0 else UNKNOWN_S
 
     @property
@@ -96,7 +97,7 @@ class KeptReference:
         }
         sha256, *devices = self._about(device_ids)
         about = {"description_sha256": sha256, "device_ids": np.array(devices, "U")}
-        arrays |= {**about, "scans": now.scans, "realtime_ns": time.time_ns()}
+        arrays |= {**about, "scans": now.scans, "realtime_ns": wall_clock_ns()}
         try:
             self._recorder.do(lambda: self._write(arrays))
         except RecordingError as error:  # its thread has died, and that was told

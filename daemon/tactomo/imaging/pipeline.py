@@ -30,7 +30,7 @@ from tactomo.events import OnEvent, RateLimit, times
 from tactomo.imaging.imaging import Imaging
 from tactomo.recordings.replay import Replay, ReplayClock
 from tactomo.scans import Delivery, DualScan
-from tactomo.timing import Rate
+from tactomo.timing import Rate, wall_clock_ns
 from tactomo.worker import Worker
 
 IDLE_S: Final = 0.1
@@ -293,7 +293,7 @@ class Pipeline(Worker):
         if reference is None:
             self._imaging.taring.start()
         else:
-            self._imaging.use_reference(reference, time.time_ns())
+            self._imaging.use_reference(reference, wall_clock_ns())
 
     def _gather(self) -> list[DualScan]:
         """Wait for deliveries, for a bounded time; return the dual scans that they complete."""

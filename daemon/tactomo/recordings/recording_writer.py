@@ -25,6 +25,7 @@ from tactomo_protocol import Hello, Scan, encode
 from tactomo.errors import RecordingError
 from tactomo.recordings.recording import DRIFT_ARRAYS, REFERENCE_ARRAYS, REPLAY_SCHEME, Origin
 from tactomo.scans import Mark
+from tactomo.timing import wall_clock_ns
 
 CHUNK_NS: Final = 200_000_000
 """Of a recording's time in one chunk, so in a recovered file, too: damage costs all of a chunk."""
@@ -150,7 +151,7 @@ class RecordingWriter:
         self._path = path
         self._name_is_safe = False
         self._file = _File(path)
-        self._clock_offset_ns = time.time_ns() - time.monotonic_ns()
+        self._clock_offset_ns = wall_clock_ns() - time.monotonic_ns()
         self._writer = Writer(self._file)  # type: ignore[arg-type]
         self._chunk_begun_ns: int | None = None
         self._chunk_port_bytes = 0
@@ -185,7 +186,7 @@ class RecordingWriter:
 
     def add(self, entry: Entry) -> None:
         """Add one message."""
-        log_time_ns = self._clock_offset_ns + entry.monotonic_ns
+        log_time_ns = max(0, self._clock_offset_ns + entry.monotonic_ns)
         self.write(entry.topic, entry.data, log_time_ns, entry.realtime_ns)
 
     def write(self, topic: str, data: bytes, log_time_ns: int, realtime_ns: int) -> None:
@@ -302,7 +303,7 @@ def write_recording(
     )
     path = Path(path).absolute()
     writer = create(path, origin)
-    monotonic_ns, realtime_ns = time.monotonic_ns(), time.time_ns()
+    monotonic_ns, realtime_ns = time.monotonic_ns(), wall_clock_ns()
     hello_at_s = -HELLO_PERIOD_S
     try:
         if reference is not None:

@@ -89,6 +89,7 @@ from tactomo.stream.control import (
     SteerReplay,
 )
 from tactomo.stream.publisher import Publisher
+from tactomo.timing import wall_clock_ns
 from tactomo.worker import Worker
 
 if TYPE_CHECKING:
@@ -475,7 +476,7 @@ class Daemon:
     def _record_message(self, kind: str, data: bytes) -> None:
         active = self._recorder.active
         if active is not None and active.with_maps:
-            active.add(message_entry(kind, data, time.monotonic_ns(), time.time_ns()))
+            active.add(message_entry(kind, data, time.monotonic_ns(), wall_clock_ns()))
 
     def _on_event(
         self, name: str, detail: str, next_step: str = "", about: str = "", reason: str = ""
