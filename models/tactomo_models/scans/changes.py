@@ -15,6 +15,7 @@ from tactomo_protocol import Channel
 
 from tactomo_models.arrays import FloatArray
 from tactomo_models.physics.compiled_sheet import CompiledData
+from tactomo_models.scans.frame_noise import noise_limit
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.sensor.description import SensorDescription
 
@@ -54,6 +55,15 @@ class Changes:
     # (M, K) orthonormal directions of weighted changes that are the sheet's own drift, and the
     # share (K,) of each that is; None where none is allowed for
     drift: tuple[FloatArray, FloatArray] | None = None
+    # the factor by which most voltages have changed since the tare, and what `signal` is without it
+    factor: float = 1.0
+    signal_beyond_factor: float = np.inf
+
+    @property
+    def is_factor(self) -> bool:
+        """Whether a factor that all voltages share, such as a gain's, explains them to noise."""
+        count = int(np.count_nonzero(self.precision))
+        return not self.quiet and self.signal_beyond_factor**2 * count < noise_limit(count)
 
     def judged_by(self, error_ratio: float) -> Changes:
         """The same for a found sheet, whose errors have so many times the even one's variance."""

@@ -22,7 +22,8 @@ class Measurement:
     flags: Flag = field(default_factory=lambda: Flag(0))  #: what stands in the way of trusting them
     #: those of `flags` that the reference brings along: these scans have nothing to add
     standing_flags: Flag = field(default_factory=lambda: Flag(0))
-    faults: tuple[str, ...] = ()  #: in words, which electrodes are left out
+    #: in words, which electrodes are left out, and which channel's gain is another one
+    faults: tuple[str, ...] = ()
     #: seconds spent in each stage of this frame so far
     stage_s: dict[str, float] = field(default_factory=dict)
     may_drift: bool = True  #: whether a drift since the tare may explain what contacts do not

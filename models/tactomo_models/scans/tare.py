@@ -227,6 +227,9 @@ class ChannelTare:
         total = self._total
         if not (quiet or electrodes) and _fell(total * change, total**2 * variance):
             flags |= Flag.REFERENCE_MISMATCH
+        over = 1 + (change * np.sign(self.reference))[valid]
+        common = float(np.median(over)) or 1.0
+        beyond = float(np.mean((over / common - 1) ** 2 / variance[valid]))
         changes = Changes(
             change=change,
             weight=valid / np.sqrt(noise + error),
@@ -237,6 +240,8 @@ class ChannelTare:
             quiet=quiet,
             signal=(statistic / count) ** 0.5,
             precision=valid / variance,
+            factor=common,
+            signal_beyond_factor=beyond**0.5,
         )
         return ChannelResult(changes, flags, electrodes, flags & ~self.flags | verdict.flags)
 
@@ -326,6 +331,9 @@ class Tare:
                 faults.append(_named(name, result.electrodes))
             if result.changes is not None:
                 changes[name] = result.changes
+                if result.changes.is_factor:
+                    factor = result.changes.factor
+                    faults.append(f"all {name} voltages are {factor:.3g} times those of the tare")
         if self._are_swapped(changes):
             flags |= Flag.CHANNELS_SWAPPED
         standing_flags = flags & (LEFT_OUT & ~own_flags | Flag.CREEPING)
@@ -335,13 +343,15 @@ class Tare:
     def _are_swapped(self, changes: Mapping[Channel, Changes]) -> bool:
         """Tell whether the magnitude channel answers more than the structure channel.
 
-        The structure channel's contrast is far the larger, so that no pressing does that.
+        The structure channel's contrast is far the larger, so that no pressing does that. A gain
+        that has changed does, and is no swap: a factor that all voltages share does not count.
         """
         swapped = 2.0  # times the structure channel's signal, that the magnitude channel's is below
         if len(changes) < 2 or not self.sensor.structure_answers_more:
             return False
         magnitude, structure = changes[Channel.MAGNITUDE], changes[Channel.STRUCTURE]
-        return not magnitude.quiet and magnitude.signal > swapped * structure.signal
+        answer = min(magnitude.signal, magnitude.signal_beyond_factor)
+        return not magnitude.quiet and answer > swapped * structure.signal
 
 
 def _channels(sensor: Sensor, reference: Reference, is_even: bool) -> dict[Channel, ChannelTare]:

@@ -8,6 +8,7 @@ a bad contact of an ideal device. What is said for one frame here is counted ove
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -298,7 +299,22 @@ def test_swapped_channels_are_told(
 
     frame = frame_of(paper, artifact, skin, PRESS, at_tare=swap, later=swap, frames=1)
     assert Flag.CHANNELS_SWAPPED in frame.flags
+    assert Flag.CHANNELS_SWAPPED in frame_of(paper, artifact, skin, PRESS, later=swap).flags
     assert Flag.CHANNELS_SWAPPED not in frame_of(paper, artifact, skin, PRESS, frames=1).flags
+
+
+@pytest.mark.parametrize("channel", ["magnitude", "structure"])
+@pytest.mark.parametrize("gain", [0.5, 0.7, 1.3, 2.0])
+def test_a_gain_that_changes_is_told_as_one_and_not_as_a_swap(
+    reconstructor: Reconstructor, skin: Skin, channel: str, gain: float
+) -> None:
+    rest, pressed = (skin.scan(*presses) for presses in ((), (PRESS,)))
+    for scan in (rest, pressed):
+        frame = reconstructor.reconstruct(**{**scan, channel: gain * scan[channel]})
+        assert Flag.MISFIT_HIGH in frame.flags
+        assert Flag.CHANNELS_SWAPPED not in frame.flags
+        is_told = re.search(rf"all {channel} voltages are {gain:g}\d* times", frame.reason)
+        assert bool(is_told) == (scan is rest)
 
 
 @pytest.mark.slow
