@@ -768,6 +768,7 @@ def test_what_was_is_looked_at_and_left_again(page: Page) -> None:
     wait_until(lambda: sum(page.colour(30, -48)) > 350)
     wait_until(lambda: "36.0" in page["contacts"].text)
     assert page["moment"].get_attribute("aria-valuetext") == "60.0 s before the pause"
+    wait_until(lambda: page["readout"].text.startswith("−60 s · "))  # by keyboard, too
     wait_until(lambda: "ago" in page.banner)
     page.skin.sends_frames = False  # what goes wrong now is said while one looks back, too
     wait_until(lambda: page.health == "stale")

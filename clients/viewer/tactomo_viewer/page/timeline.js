@@ -84,10 +84,10 @@ export class Timeline {
     return this.#frameAt(this.#moment) ?? this.frames[0] ?? null;
   }
 
-  /** What was at the pointer, in words; nothing where it is elsewhere. */
+  /** What was at the pointer, or at the moment looked at, in words; nothing where there is neither. */
   get readout() {
-    if (this.pointer === null || !this.options) return "";
-    const at = this.#time(this.pointer);
+    if ((this.pointer === null && !this.isPaused) || !this.options) return "";
+    const at = this.pointer === null ? this.#moment : this.#time(this.pointer);
     const found = this.#frameAt(at);
     const { unit, gapMs } = this.options;
     const contacts = !found || at - found.at > gapMs ? ["no data"]
@@ -95,7 +95,7 @@ export class Timeline {
         const force = quantityText(forceOf(contact), 0);
         return `${contact.id}: ${pressureText(contact, unit)}${force ? `, ${force} N` : ""}`;
       });
-    const near = this.events.filter((event) => Math.abs(this.#x(event.at) - this.pointer) < EVENT_REACH_PX);
+    const near = this.events.filter((event) => Math.abs(this.#x(event.at) - this.#x(at)) < EVENT_REACH_PX);
     const ago = `−${seconds(Math.max(0, (this.pausedAt ?? this.end) - at))}`;
     return [ago, ...contacts, ...near.map(({ name }) => name)].join(" · ");
   }
