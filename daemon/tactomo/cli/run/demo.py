@@ -209,7 +209,8 @@ def _print_addresses(addresses: Mapping[str, Any]) -> None:
     name, stream = addresses["sensor"], addresses["stream"]
     at = "" if len(running("daemon")) == 1 else f" --address {stream}"
     at_twin = "" if len(running("twin")) == 1 else f" --address {addresses.get('twin')}"
-    say(f"{name} is running; Ctrl-C stops everything. Open, and press the skin there by mouse:\n")
+    press = ", and press the skin there by mouse" if "twin" in addresses else ""
+    say(f"{name} is running; Ctrl-C stops everything. Open{press}:\n")
     say(f"    {addresses['viewer']}\n\nOr in another terminal:\n")
     if "twin" in addresses:
         say(f"    tactomo poke press x_mm=10 y_mm=-20{at_twin}")
