@@ -56,7 +56,7 @@ ORDER = {
             "inner_loop",
         ),
         *("sensor", "physics", "scans", "scene", "methods", "simulation"),
-        *("calibration", "health", "drift", "reconstruct", "batch"),
+        *("calibration", "health", "reconstruct", "batch", "drift"),
         *("commissioning", "simulators"),
     ),
     "tactomo": (

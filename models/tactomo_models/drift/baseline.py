@@ -28,7 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import replace
-from typing import Any, Final, Literal, Protocol
+from typing import Any, Final, Literal
 
 import numpy as np
 from tactomo_protocol import Channel
@@ -37,13 +37,12 @@ from tactomo_models.arrays import FloatArray
 from tactomo_models.drift.channel_baseline import ChannelBaseline, Drift
 from tactomo_models.drift.drift_model import DriftSubspace
 from tactomo_models.drift.press_memory import PressMemory
-from tactomo_models.physics.artifact import Artifact
+from tactomo_models.reconstruct import Reconstructor
 from tactomo_models.scans.measurement import Measurement
 from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scans.reference import Reference
 from tactomo_models.scans.tare import Tare
 from tactomo_models.scene.reconstruction import Reconstruction
-from tactomo_models.sensor.description import SensorDescription
 
 State = Literal["waiting", "following", "held", "refused"]
 Scans = dict[Channel, FloatArray | None]
@@ -60,36 +59,6 @@ FAINT = "what a contact left behind is a faint touch, or a skin that has drifted
 NEITHER = "what is seen is no contact that explains it, and no drift that skins reach"
 
 
-class Solver(Protocol):
-    """What reconstructs the frames: a `Reconstructor`."""
-
-    @property
-    def description(self) -> SensorDescription:
-        """The sensor."""
-
-    @property
-    def artifact(self) -> Artifact:
-        """What is precomputed for the sensor."""
-
-    def set_reference(self, reference: Reference) -> None:
-        """Measure changes against the tare, drifted, from now on."""
-
-    def use(self, tare: Tare) -> None:
-        """Measure changes against a tare from now on."""
-
-    def compare(
-        self,
-        magnitude: FloatArray | None,
-        structure: FloatArray | None,
-        *,
-        saturated: Collection[Channel] = (),
-    ) -> Measurement:
-        """What has changed."""
-
-    def solve(self, measurement: Measurement) -> Reconstruction:
-        """What follows from a measurement."""
-
-
 class BaselineTracker:
     """Reconstructs frames against a reference that follows the skin.
 
@@ -100,7 +69,9 @@ class BaselineTracker:
     Not thread-safe: one thread owns it.
     """
 
-    def __init__(self, reconstructor: Solver, time_constant_s: float = TIME_CONSTANT_S) -> None:
+    def __init__(
+        self, reconstructor: Reconstructor, time_constant_s: float = TIME_CONSTANT_S
+    ) -> None:
         self.reference: Reference | None = None  #: the one in force; None before the first tare
         self.moves = 0  #: how often the reference has moved since the tare
         #: why what is seen is not followed; empty while it is, or may be a contact
