@@ -160,8 +160,9 @@ def _statuses(name: str | None, address: str, keys: Path | None) -> Mapping[str,
 
     heard: dict[str, Mapping[str, Any]] = {}
     topics = [b"" if name is None else topic(name, STATUS)]
+    known = as_keys(keys)  # or raises, before there is a socket
     socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
-    connection = connect_subscriber(socket, address, topics, keys=as_keys(keys))
+    connection = connect_subscriber(socket, address, topics, keys=known)
     end_s = time.monotonic() + STATUS_S
     try:
         while (left_s := end_s - time.monotonic()) > 0 and not (name and heard):

@@ -129,10 +129,11 @@ def test_a_clients_folder_must_be_unambiguous(keys: Run, tactomo: Run, tmp_path:
     for name in ("desk", "arm", "leg"):
         tactomo("keys", "make", name, "--keys", tmp_path / name)
     folder = tmp_path / "desk"
-    nobody = tactomo("status", "--keys", folder)
+    there = "--address", "tcp://127.0.0.1:9", "--keys", folder
+    nobody = tactomo("status", *there)
     assert nobody.returncode == 1
     assert "should hold one server's public key, and holds none" in nobody.stderr
     for name in ("arm", "leg"):
         (folder / f"{name}.key").write_bytes((tmp_path / name / f"{name}.key").read_bytes())
-    two = tactomo("watch", "--keys", folder)
+    two = tactomo("watch", *there)
     assert "holds 2: arm.key, leg.key" in two.stderr
