@@ -224,6 +224,11 @@ def deep_toml(path: Path) -> None:
     path.write_text("a = " + "[" * 100_000)
 
 
+def dotted_toml(path: Path) -> None:
+    """A key of twenty thousand parts, whose every beginning is a key, too."""
+    path.write_text("a" + ".a" * 20_000 + " = 1")
+
+
 def titled_description(path: Path) -> None:
     """A description whose title is markup and whose name is none."""
     text = (resources.files("tactomo_models.sensor.shipped") / "paper_square.toml").read_text()
@@ -289,6 +294,7 @@ CORPUS: Final[dict[str, Callable[[Path], None]]] = {
     "other.mcap": deep_metadata,
     "wide.toml": wide_description,
     "deep.toml": deep_toml,
+    "dots.toml": dotted_toml,
     "title.toml": titled_description,
     "deep.json": deep_json,
     "long.eit": long_eit,

@@ -64,7 +64,7 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
         "draw": ("models", "draw", "FILE", "-o", "OUT.svg"),
         "build": ("models", "build", "-d", "FILE", "-o", "OUT.npz"),
         "reconstruct": ("reconstruct", "GOOD.npz", "OUT.npz", "-d", "FILE"),
-        "config": ("daemon", "--config", "FILE"),
+        "config": ("daemon", "FILE"),
     },
     "kept": {
         "info": ("info", "FILE"),
