@@ -35,6 +35,9 @@ class Newcomer:
         self.folder = folder
         self.addresses: dict[str, Any] = {}
         self._instead = dict(instead or {})
+        there = folder / ".run"  # where its programs find each other, and nobody else's
+        there.mkdir(exist_ok=True)
+        self._environment = os.environ | {"PYTHONUNBUFFERED": "1", "XDG_RUNTIME_DIR": str(there)}
         self._running: dict[str, subprocess.Popen[str]] = {}
 
     def __enter__(self) -> Self:
@@ -84,7 +87,13 @@ class Newcomer:
 
     def _finish(self, line: list[str]) -> str:
         done = subprocess.run(
-            line, cwd=self.folder, capture_output=True, text=True, timeout=900, check=False
+            line,
+            cwd=self.folder,
+            env=self._environment,
+            capture_output=True,
+            text=True,
+            timeout=900,
+            check=False,
         )
         assert done.returncode == 0, f"{shlex.join(line)}: {done.stdout}{done.stderr}"
         return done.stdout + done.stderr
@@ -116,7 +125,7 @@ class Newcomer:
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
-            env={**os.environ, "PYTHONUNBUFFERED": "1"},
+            env=self._environment,
         )
         self._running[name] = process
         assert process.stdout is not None
