@@ -23,7 +23,6 @@ from tactomo_models.physics.mesh import SheetMesh
 from tactomo_models.scans.plausibility import DISTRUST
 from tactomo_models.scans.reference import Reference
 from tactomo_models.scene.press import Press, strongest
-from tactomo_models.scene.reconstruction import Reconstruction
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.simulation.simulator import conductivity_ratio, smooth_noise
 from tactomo_models.simulation.skin_drift import SkinDrift, decades_left
@@ -353,37 +352,24 @@ def live(day: Day, *, track: bool = True, every: int = 1) -> Iterator[Seen]:
     player = Player(day.skin.description)
     played = player.play(day.case(track, every), Variant("auto"))
     for frame, (time_s, stretch) in zip(played, day.times(every), strict=True):
-        gain, state = 0.0, "off"
-        if player.tracker is not None:
-            gain, state = player.tracker.drift[Channel.STRUCTURE].gain, player.tracker.state
-        yield _seen(day, time_s, stretch.pressed, frame.made, gain, state)
-
-
-def _seen(
-    day: Day,
-    time_s: float,
-    pressed: TimedPress | None,
-    frame: Reconstruction,
-    gain: float,
-    state: str,
-) -> Seen:
-    near = [
-        contact
-        for contact in frame.contacts
-        if pressed is not None
-        and np.hypot(contact.x_m - pressed.press.x_m, contact.y_m - pressed.press.y_m) < NEAR_M
-    ]
-    return Seen(
-        time_s=time_s,
-        pressed=pressed,
-        shown=bool(near),
-        ghosts=len(frame.contacts) - min(len(near), 1),
-        magnitude=near[0].magnitude if near else float("nan"),
-        truth=float("nan") if pressed is None else day.skin.magnitude_at(pressed, time_s),
-        distrusted=bool(frame.flags & DISTRUST),
-        gain=gain,
-        state=state,
-    )
+        pressed, contacts, tracker = stretch.pressed, frame.made.contacts, player.tracker
+        near = [
+            contact
+            for contact in contacts
+            if pressed is not None
+            and np.hypot(contact.x_m - pressed.press.x_m, contact.y_m - pressed.press.y_m) < NEAR_M
+        ]
+        yield Seen(
+            time_s=time_s,
+            pressed=pressed,
+            shown=bool(near),
+            ghosts=len(contacts) - min(len(near), 1),
+            magnitude=near[0].magnitude if near else float("nan"),
+            truth=float("nan") if pressed is None else day.skin.magnitude_at(pressed, time_s),
+            distrusted=bool(frame.made.flags & DISTRUST),
+            gain=0.0 if tracker is None else tracker.drift[Channel.STRUCTURE].gain,
+            state="off" if tracker is None else tracker.state,
+        )
 
 
 @dataclass(frozen=True)
