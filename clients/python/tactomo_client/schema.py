@@ -318,7 +318,8 @@ class Events:
     channel_lost = EventKind("warning", end="channel_back")
     channel_back = INFO  #: They come again
     #: One channel's scans repeat bit for bit while their counter goes on, though they had noise at
-    #: the tare, or have read nothing else since the first scan of it: they are left out as missing
+    #: the tare: they are left out as missing. One that is frozen all through the first tare cannot
+    #: be told from a source without noise: `tactomo doctor` says that there is no noise at all
     converter_frozen = EventKind("warning", end="converter_back")
     converter_back = INFO  #: They are measured again
     #: A port was closed, unplugged, or cannot be opened; it is tried again

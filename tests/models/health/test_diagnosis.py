@@ -116,6 +116,14 @@ def test_a_lead_that_opens_now_and_then_is_loose_and_not_the_whole_device(
     assert about(found, "snr").level == Level.OK
 
 
+def test_a_channel_that_repeats_itself_bit_for_bit_is_told(patient: Patient) -> None:
+    """A frozen converter, or a source without noise: nobody can tell."""
+    found = about(patient.examine(np.tile(patient.scans(patient.rest())[0], (20, 1))), "snr")
+    assert found.level == Level.ADVICE
+    assert found.detail == "there is no noise at all"
+    assert "repeat one scan" in found.next_step
+
+
 @pytest.mark.parametrize("pair", [(6, 7), (2, 13)])
 def test_two_leads_that_changed_places_are_named(patient: Patient, pair: tuple[int, int]) -> None:
     order = list(range(16))
