@@ -48,6 +48,7 @@ from tactomo.scans import MAX_QUADRATURE
 
 # Of times and electrodes' numbers: seconds since 1970 until 2096.
 MOST = 4e9
+SLOWEST_HZ, FASTEST_HZ = 1e-3, 1e6  # what a hello can say
 TURNED_ROUND = 0.9  # share of voltages of the wrong sign; under an object few change theirs
 AT_REST = ("reference", "baseline", "rest", "empty", "vh")  # vh: homogeneous, in EIDORS' tutorials
 
@@ -85,9 +86,14 @@ class Scans:
         """Return when each scan was taken, (T,) seconds from 0: by rate, or the file's own.
 
         Raises:
-            ImportFileError: neither is known.
+            ImportFileError: neither is known, or no device has that rate.
         """
         if rate_hz is not None:
+            if not SLOWEST_HZ <= rate_hz <= FASTEST_HZ:
+                raise ImportFileError(
+                    f"{rate_hz:g} scans a second are no device's",
+                    f"give --rate from {SLOWEST_HZ:g} to {FASTEST_HZ:.0f}",
+                )
             return np.arange(self.count) / rate_hz
         if self.time_s is None:
             raise ImportFileError("the file does not say when its scans were taken", "give --rate")

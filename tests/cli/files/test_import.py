@@ -125,6 +125,10 @@ def test_the_batch_layout_keeps_channels_reference_and_gaps(tactomo: Run, tmp_pa
     [
         ({"magnitude": np.zeros((4, 207))}, ["--rate", "1"], "real numbers of shape T x 208"),
         ({"magnitude": np.zeros((4, 208))}, [], "give --rate"),
+        *(
+            ({"magnitude": np.zeros((4, 208))}, ["--rate", rate], "are no device's")
+            for rate in ("inf", "nan", "1e308")
+        ),
         (
             {"magnitude": np.zeros((4, 208)), "structure": np.zeros((3, 208))},
             ["--rate", "1"],
