@@ -211,7 +211,7 @@ def test_a_loop_of_1_khz_allocates_nothing_once_frames_come(
 
 
 @pytest.mark.slow
-def test_commands(probe: Path, start: Callable[..., DaemonProcess], tmp_path: Path) -> None:
+def test_commands(probe: Path, start: Callable[..., DaemonProcess]) -> None:
     daemon = start()
 
     def ask(command: str, argument: object = "") -> Any:
@@ -227,8 +227,8 @@ def test_commands(probe: Path, start: Callable[..., DaemonProcess], tmp_path: Pa
     status, told = wait_until(asked_twice, "the same of both clients")
     assert status["ports"] == len(told["ports"]) == 2
     assert status["url"] == told["ports"][0]["url"]
-    path = str(tmp_path / "from-cpp.mcap")
-    assert ask("record_start", "from-cpp.mcap") == path
+    path = ask("record_start", "from-cpp.mcap")
+    assert Path(path).name == "from-cpp.mcap"
     stopped = ask("record_stop")
     assert stopped == {"path": path, "bytes": Path(path).stat().st_size}
     assert ask("set_tier", "noser") == "noser"
