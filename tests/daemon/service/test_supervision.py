@@ -32,7 +32,9 @@ class Hanging(Memory):
 
 class Asked(Daemon):
     def status(self):
-        threading.Event().wait()
+        if threading.current_thread() is not threading.main_thread():  # which tells it at the end
+            threading.Event().wait()
+        return super().status()
 
 configure_logging("info", "json")
 sys.exit(Asked(load_config(sys.argv[1]), reconstructor=Hanging()).run())
