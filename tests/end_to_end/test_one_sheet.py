@@ -114,7 +114,7 @@ def test_what_is_recorded_replays_and_is_plotted(
         subscribe(SENSOR, address=demo.stream, timeout_s=PATIENCE_S) as skin,
     ):
         pressed_frame(demo)
-        with daemon.record(f"{tmp_path.name}-{time.time_ns()}.mcap", maps=True) as recording:
+        with daemon.record("live.mcap", maps=True) as recording:
             live = recording.path
             begin_ns = time.monotonic_ns()  # what was acquired before may not be in it
             since = (frame for frame in skin if frame.acquired_monotonic_ns > begin_ns)

@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -43,13 +44,19 @@ class Demo:
 def running_demo(
     *options: str, program: Sequence[str | Path] = (sys.executable, "-m", "tactomo.cli")
 ) -> Iterator[Demo]:
-    """Start `tactomo demo` on free ports and stop it as Ctrl-C would."""
+    """Start `tactomo demo` on free ports and stop it as Ctrl-C would.
+
+    What it records lies in a folder of its own, as long as it runs.
+    """
     command = [
         *(*program, "demo", "--announce", "--no-browser"),
         *("--sensor", SENSOR, "--viewer-port", "0", "--stream", ANYWHERE, "--control", ANYWHERE),
         *("--twin-control", ANYWHERE, *options),
     ]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=folder) as process,
+    ):
         assert process.stdout is not None
         try:
             for line in process.stdout:
