@@ -332,7 +332,7 @@ class Daemon:
 
     def _last_words(self) -> dict[str, Any]:
         """What one would want to know afterwards of a daemon that is no more."""
-        status = self.status()
+        status = self._status_fields(self._publisher.header)
         troubles = status["events"]["troubles"]
         said = {key: round(status[key]) for key in ("uptime_s", "frames", "dropped_scans")}
         if not troubles:

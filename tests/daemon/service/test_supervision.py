@@ -32,9 +32,7 @@ class Hanging(Memory):
 
 class Asked(Daemon):
     def status(self):
-        if threading.current_thread() is not threading.main_thread():  # which tells it at the end
-            threading.Event().wait()
-        return super().status()
+        threading.Event().wait()
 
 configure_logging("info", "json")
 sys.exit(Asked(load_config(sys.argv[1]), reconstructor=Hanging()).run())
