@@ -29,23 +29,25 @@ COLUMNS: Final = tuple(name for name in Contact.__dataclass_fields__ if name != 
 def print_summary(maps: Path) -> None:
     """Say how many frames have which flag, and list the first contacts."""
     with np.load(maps) as arrays:
-        flags, contacts = arrays["flags"], _contacts(arrays)
+        flags, count = arrays["flags"], len(arrays["contact_frame"])
+        contacts = _contacts(arrays, range(min(count, CONTACTS_SHOWN)))
     names = [name for value in flags for name in Flag(int(value)).names()]
     for name in sorted(set(names), key=lambda each: -names.count(each)):
-        count, what = names.count(name), FLAG_ADVICE[name][0]
-        say(f"{count} of {len(flags)} frames are flagged {name}: {what}")
+        say(
+            f"{names.count(name)} of {len(flags)} frames are flagged {name}: {FLAG_ADVICE[name][0]}"
+        )
     if not names:
         say("no frame is flagged")
     if not contacts:
         say("no contact is found")
         return
     shown = table("frame", "x mm", "y mm", "area mm²", "pressure", "force")
-    for frame, contact in contacts[:CONTACTS_SHOWN]:
+    for frame, contact in contacts:
         place = (f"{value:.1f}" for value in (contact.x_mm, contact.y_mm, contact.area_mm2))
         shown.add_row(str(frame), *place, pressure_words(contact), force_words(contact))
     Console().print(shown)
-    if len(contacts) > CONTACTS_SHOWN:
-        say(f"and {len(contacts) - CONTACTS_SHOWN} contacts more: contact_* in {maps}")
+    if count > CONTACTS_SHOWN:
+        say(f"and {count - CONTACTS_SHOWN} contacts more: contact_* in {maps}")
 
 
 def draw_methods(made: Mapping[str, Path], sensor: SensorDescription, title: str) -> Figure:
@@ -70,9 +72,10 @@ def draw_methods(made: Mapping[str, Path], sensor: SensorDescription, title: str
 def _frames(file: Path, chosen: Sequence[int], sensor: SensorDescription) -> list[Frame]:
     """Return some frames of a file as a stream would have carried them."""
     with np.load(file) as arrays:
-        contacts = _contacts(arrays)
-        images = {name: arrays[name] for name in ("map", "pressure_kpa", "structure")}
-        flags = arrays["flags"]
+        is_chosen = np.isin(arrays["contact_frame"], chosen)
+        contacts = _contacts(arrays, np.flatnonzero(is_chosen).tolist())
+        images = {name: arrays[name][chosen] for name in ("map", "pressure_kpa", "structure")}
+        flags = arrays["flags"][chosen]
     envelope: dict[str, Any] = {
         **{"session": "", "sensor": sensor.name, "sequence": 0},
         **dict.fromkeys(("acquired_realtime_ns", "acquired_monotonic_ns", "age_ns"), 0),
@@ -83,29 +86,30 @@ def _frames(file: Path, chosen: Sequence[int], sensor: SensorDescription) -> lis
     return [
         Frame(
             **envelope,
-            **_images_of(images, index),
+            **_images_of(images, row),
             scan_counter=index,
-            flags=frozenset(Flag(int(flags[index])).names()),
+            flags=frozenset(Flag(int(flags[row])).names()),
             contacts=tuple(contact for frame, contact in contacts if frame == index),
         )
-        for index in chosen
+        for row, index in enumerate(chosen)
     ]
 
 
-def _images_of(images: Mapping[str, Any], index: int) -> dict[str, Any]:
+def _images_of(images: Mapping[str, Any], row: int) -> dict[str, Any]:
     """Return a frame's images; None for one that is NaN throughout, which it does not have."""
-    own = {name: image[index] for name, image in images.items()}
+    own = {name: image[row] for name, image in images.items()}
     return {name: None if np.isnan(image).all() else image for name, image in own.items()}
 
 
-def _contacts(arrays: Any) -> list[tuple[int, Contact]]:
-    """Return each contact with its frame, numbered within that from 1."""
+def _contacts(arrays: Any, rows: Sequence[int]) -> list[tuple[int, Contact]]:
+    """Return contacts in some rows, each with its frame, numbered within that from 1."""
     columns = {name: arrays[ARRAY_COLUMNS.get(name, f"contact_{name}")] for name in COLUMNS}
+    frames = arrays["contact_frame"]
     found: list[tuple[int, Contact]] = []
-    for row, frame in enumerate(arrays["contact_frame"].tolist()):
+    for row in rows:
         values = {name: _known(column[row].item()) for name, column in columns.items()}
-        number = 1 + sum(1 for before, _ in found if before == frame)
-        found.append((frame, Contact(number, **values)))
+        first = int(np.searchsorted(frames, frames[row]))  # frames come in their order
+        found.append((int(frames[row]), Contact(row - first + 1, **values)))
     return found
 
 
