@@ -13,7 +13,6 @@ from tactomo.cli.options import DEFAULT_NAME
 from tactomo.errors import TactomoError
 from tactomo.running import Running, running
 
-STATUS_S: Final = 3.0  # a daemon repeats its status every second
 ALL_S: Final = 1.2  # so long, and every sensor of a stream has been heard
 
 
@@ -54,9 +53,14 @@ def find_sensor(name: str | None, address: str | None, keys: Path | None = None)
 
 def find_control(name: str | None, address: str | None, keys: Path | None) -> str:
     """Return the address of the control socket of the sensor that is meant, see `find_sensor`."""
+    return find_commanded(name, address, keys).control
+
+
+def find_commanded(name: str | None, address: str | None, keys: Path | None) -> Running:
+    """Return the sensor that is meant, see `find_sensor`, whose control socket is its own."""
     found = find_sensor(name, address, keys)
     if address is None:
-        return found.control
+        return found
     from tactomo_client import request
 
     there = request("status", found.control, keys=keys).get("sensor")
@@ -65,7 +69,7 @@ def find_control(name: str | None, address: str | None, keys: Path | None) -> st
             f"{found.control} is the control socket of {there}, not of {found.sensor}",
             "run the command on the computer of its daemon",
         )
-    return found.control
+    return found
 
 
 def newest_status(
@@ -157,13 +161,14 @@ def _statuses(name: str | None, address: str, keys: Path | None) -> Mapping[str,
     from tactomo_client.connection import connect_subscriber
     from tactomo_client.keys import as_keys
     from tactomo_client.messages import STATUS, decode_message, topic
+    from tactomo_client.schema import STALE_AFTER_S
 
     heard: dict[str, Mapping[str, Any]] = {}
     topics = [b"" if name is None else topic(name, STATUS)]
     known = as_keys(keys)  # or raises, before there is a socket
     socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
     connection = connect_subscriber(socket, address, topics, keys=known)
-    end_s = time.monotonic() + STATUS_S
+    end_s = time.monotonic() + STALE_AFTER_S
     try:
         while (left_s := end_s - time.monotonic()) > 0 and not (name and heard):
             if not socket.poll(round(min(left_s, 0.1) * 1e3)):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 from tactomo_client.schema import Calibration, Taught
 
 from tactomo.cli.output import say
-from tactomo.cli.sensors import SensorError, find_control, find_sensor
+from tactomo.cli.sensors import SensorError, find_commanded, find_control
 
 if TYPE_CHECKING:
     from tactomo_client import CalibrationInForce
@@ -30,8 +30,8 @@ def reload_kept(name: str | None, address: str | None, keys: Path | None) -> str
         ClientError: it does not answer, refuses the calibration, or does not let us command.
         SensorError: as `find_sensor` does.
     """
-    sensor = find_sensor(name, address, keys).sensor
-    found = _reloaded(sensor, address, keys).calibration
+    there = find_commanded(name, address, keys)
+    sensor, found = there.sensor, _reloaded(there.control, keys).calibration
     if found is None:
         return f"the daemon of {sensor} found none: pressures are the description's"
     low, high = found.range_kpa
@@ -73,7 +73,7 @@ def taken_up(
     it = "It" if path.absolute() == own.absolute() else f"Copied to {own}, it"
     later = f"{it} is in force when the daemon of {sensor} starts next, or by: {again}"
     try:
-        found = _reloaded(sensor, address, keys)
+        found = _reloaded(find_control(sensor, address, keys), keys)
     except (NoAnswer, SensorError) as error:
         return f"not in force yet: {error.cause}. {later}"
     except CalibrationRefused as error:
@@ -98,11 +98,10 @@ def taken_up(
     )
 
 
-def _reloaded(sensor: str, address: str | None, keys: Path | None) -> CalibrationInForce:
+def _reloaded(control: str, keys: Path | None) -> CalibrationInForce:
     """Ask a sensor's daemon to read what is kept again; returns what is in force."""
     from tactomo_client import Daemon
 
-    control = find_control(sensor, address, keys)
     with Daemon(control, keys=keys, connect_timeout_s=CONNECT_S) as daemon:
         return daemon.reload_calibration()
 
