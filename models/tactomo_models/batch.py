@@ -26,15 +26,20 @@ from tactomo_models.sensor.description import SensorDescription
 Progress = Callable[[int, int], None]
 
 IMAGES = ("map", "pressure_kpa", "structure")
-CONTACT_TYPES = {
-    "contact_frame": np.int64,
-    **{
-        "contact_sigma" if name == "magnitude_sigma" else f"contact_{name}": (
-            "U7" if isinstance(value, str) else type(value)
-        )
-        for name, value in Contact(0, 0.0, 0.0, 0.0).in_mm().items()
+
+
+def _contact_row(frame: int, contact: Contact) -> dict[str, Any]:
+    own = {
+        "contact_sigma" if name == "magnitude_sigma" else f"contact_{name}": value
+        for name, value in contact.in_mm().items()
         if name != "id"
-    },
+    }
+    return {"contact_frame": frame, **own}
+
+
+CONTACT_TYPES = {
+    name: "U7" if isinstance(value, str) else type(value)
+    for name, value in _contact_row(0, Contact(0, 0.0, 0.0, 0.0)).items()
 }
 TYPES = {
     **dict.fromkeys(IMAGES, np.float32),
@@ -258,12 +263,3 @@ def checked(source: Path, name: str, array: Any, shape: tuple[int | None, ...]) 
 def _frame_row(frame: Reconstruction) -> dict[str, Any]:
     names = (*IMAGES, "misfit", "confidence", "force_n", "force_sigma_n")
     return {**{name: getattr(frame, name) for name in names}, "flags": int(frame.flags)}
-
-
-def _contact_row(frame: int, contact: Contact) -> dict[str, Any]:
-    values = contact.in_mm()
-    values["sigma"] = values.pop("magnitude_sigma")
-    return {
-        "contact_frame": frame,
-        **{name: values[name.removeprefix("contact_")] for name in list(CONTACT_TYPES)[1:]},
-    }

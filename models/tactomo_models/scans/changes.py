@@ -55,7 +55,8 @@ class Changes:
     # (M, K) orthonormal directions of weighted changes that are the sheet's own drift, and the
     # share (K,) of each that is; None where none is allowed for
     drift: tuple[FloatArray, FloatArray] | None = None
-    # the factor by which most voltages have changed since the tare, and what `signal` is without it
+    # the factor by which most voltages have changed since the tare, and what `signal` is without
+    # it; of a quiet scan nobody asks
     factor: float = 1.0
     signal_beyond_factor: float = np.inf
 

@@ -227,9 +227,11 @@ class ChannelTare:
         total = self._total
         if not (quiet or electrodes) and _fell(total * change, total**2 * variance):
             flags |= Flag.REFERENCE_MISMATCH
-        over = 1 + (change * np.sign(self.reference))[valid]
-        common = float(np.median(over)) or 1.0
-        beyond = float(np.mean((over / common - 1) ** 2 / variance[valid]))
+        common, beyond = 1.0, np.inf
+        if not quiet:
+            over = 1 + (change * np.sign(self.reference))[valid]
+            common = median(over) or 1.0
+            beyond = float(np.mean((over / common - 1) ** 2 / variance[valid]))
         changes = Changes(
             change=change,
             weight=valid / np.sqrt(noise + error),
