@@ -138,7 +138,7 @@ class Proxy(Relay):
         # To the first of a prefix the daemon says again how it is, to the others we do.
         self._repeat_statuses(joined & before)
         if self._readers.cuts > cuts and self._flood.allows():
-            tell("subscribers_cut", "warning", *SUBSCRIBERS_CUT)
+            self._on_event("subscribers_cut", *SUBSCRIBERS_CUT)
 
     def _on_event(self, name: str, detail: str, next_step: str = "", *_: str, **__: str) -> None:
         tell(name, EVENTS[name].severity, detail, next_step)
