@@ -29,18 +29,25 @@ IMAGES = ("map", "pressure_kpa", "structure")
 
 
 def _contact_row(frame: int, contact: Contact) -> dict[str, Any]:
+    renamed = {"magnitude_sigma": "sigma", "frame": "mount_frame"}  # contact_frame is the frame's
     own = {
-        "contact_sigma" if name == "magnitude_sigma" else f"contact_{name}": value
+        f"contact_{renamed.get(name, name)}": value
         for name, value in contact.in_mm().items()
         if name != "id"
     }
     return {"contact_frame": frame, **own}
 
 
+def _dtype(value: Any) -> Any:
+    if isinstance(value, str):
+        return "U7" if value else "U63"  # a range, a link
+    return np.float64 if isinstance(value, tuple) else type(value)
+
+
 CONTACT_TYPES = {
-    name: "U7" if isinstance(value, str) else type(value)
-    for name, value in _contact_row(0, Contact(0, 0.0, 0.0, 0.0)).items()
+    name: _dtype(value) for name, value in _contact_row(0, Contact(0, 0.0, 0.0, 0.0)).items()
 }
+VECTORS = dict.fromkeys(("contact_position_m", "contact_normal"), (3,))
 TYPES = {
     **dict.fromkeys(IMAGES, np.float32),
     **dict.fromkeys(("misfit", "confidence", "force_n", "force_sigma_n", "seconds"), np.float64),
@@ -122,7 +129,8 @@ def reconstruct_file(
                 failure = failure or frame.failure
                 if progress:
                     progress(index + 1, total)
-            write_whole(target, lambda file: arrays.write(file, dict.fromkeys(IMAGES, nodes)))
+            shapes = {**VECTORS, **dict.fromkeys(IMAGES, nodes)}
+            write_whole(target, lambda file: arrays.write(file, shapes))
     except OSError as error:
         raise DataError(
             f"cannot write {target}: {error.strerror}; name a file in a folder that you may write"

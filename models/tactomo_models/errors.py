@@ -48,6 +48,8 @@ def explain(item: "ErrorDetails") -> str:
         return f"unknown key {key}"
     if item["type"] == "tuple_type":
         return f"{key} = {item['input']!r}: give a list, in brackets"
+    if item["type"] == "finite_number":
+        return f"{key} = {item['input']!r}: give a finite number"
     if item["type"] == "missing":
         return f"{key} is missing"
     if not key:

@@ -30,7 +30,7 @@ from tactomo_models.scans.plausibility import Flag
 from tactomo_models.scans.reference import Reference
 from tactomo_models.scans.tare import Tare
 from tactomo_models.scene.areas import Areas
-from tactomo_models.scene.contacts import contacts_of, pressure_map, total_force
+from tactomo_models.scene.contacts import contacts_of, mounted, pressure_map, total_force
 from tactomo_models.scene.pressure import PressureCurve, PressureRange, described_curve
 from tactomo_models.scene.reconstruction import Reconstruction
 from tactomo_models.scene.tracking import ContactTracker
@@ -358,6 +358,8 @@ class Reconstructor:
                 contacts = (self.taught.corrected(contacts[0], measurement, tier),)
             if not contacts[0].taught:
                 flags |= Flag.UNTAUGHT
+        if self.description.mount is not None:
+            contacts = mounted(contacts, self.description.mount)
         force_n, force_sigma_n = total_force(contacts, self.curve, field)
         pressure = None
         if estimate.tells_pressure and has_magnitude:

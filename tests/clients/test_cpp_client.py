@@ -497,7 +497,8 @@ def examples() -> dict[str, dict[str, Any]]:
     image = np.linspace(0, 1, 12, dtype=np.float32).reshape(3, 4)
     contact = {**CONTACT, "magnitude_sigma": 0.5, "force_n": 2, "pressure_range": "below"}
     soft = {**CONTACT, "pressure_kpa": 120.0, "peak_kpa": 160, "peak_sigma_kpa": 3.0, "edge": 0.5}
-    contacts = [contact | {"max_kpa": 134.0}, soft, dict(CONTACT)]
+    where = {"position_m": [0.1, -0.2, 3], "normal": [0.0, 0.6, 0.8], "frame": "left_forearm"}
+    contacts = [contact | {"max_kpa": 134.0}, {**soft, **where}, dict(CONTACT)]
     total = {"force_n": 41.5, "force_sigma_n": 2}
     fields = {**HEADER, **total, "contacts": contacts, "clock_id": "a", "dated_by": "device"}
     array = {"shape": [3, 4], "dtype": "<f4", "data": image.tobytes()}

@@ -56,7 +56,7 @@ def test_the_arrays_that_are_read_have_their_rows(batch: Path) -> None:
 def test_the_arrays_that_are_written_have_their_rows(batch: Path) -> None:
     told, made = table(PAGE, "## Maps and contacts"), np.load(batch / "out.npz")
     assert told.keys() == made.keys()
-    sizes = {"T": 2, "ny": 21, "nx": 21, "C": len(made["contact_frame"])}
+    sizes = {"T": 2, "ny": 21, "nx": 21, "3": 3, "C": len(made["contact_frame"])}
     assert sizes["C"] == 1
     for name, row in told.items():
         dtype, _, shape = row["Type"].partition(" ")

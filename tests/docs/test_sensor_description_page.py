@@ -21,6 +21,10 @@ TABLES = {
     "`[magnitude.response]`": "MagnitudeResponse",
     "`[structure]`": "StructureChannel",
     "`[structure.response]`": "StructureResponse",
+    "`[mount]`": "Mount",
+    "`[mount.plane]`": "PlaneMount",
+    "`[mount.cylinder]`": "CylinderMount",
+    "`[mount.surface]`": "SurfaceMount",
 }
 
 

@@ -22,6 +22,7 @@ from tactomo_models import (
     SkinSimulator,
 )
 from tactomo_models.batch import read_scans, reconstruct_file
+from variants import variant
 
 PRESSES = [(), (Press(0.02, 0.01, 180.0),), (Press(-0.03, 0.0, 160.0), Press(0.035, 0.03, 190.0))]
 
@@ -84,6 +85,24 @@ def test_the_arrays_are_those_of_the_contract(
     assert 0 <= out["structure"].min() < out["structure"].max() <= 1
     if out["map"][1].max() > 0.25:
         pytest.xfail("whether a disc this small is even stays open, and the mean has a peak")
+
+
+def test_contacts_of_a_mounted_sheet_have_their_place_on_the_robot(
+    tmp_path: Path, paper: SensorDescription, arrays: dict[str, Any]
+) -> None:
+    cylinder = {"radius_m": 0.05, "position_m": (0.0, 0.0, 0.3)}
+    mounted = variant(paper, mount={"frame": "left_forearm", "cylinder": cylinder})
+    out = run(tmp_path, mounted, arrays, "tikhonov")
+    assert len(out["contact_frame"])
+    assert set(out["contact_mount_frame"].tolist()) == {"left_forearm"}
+    angle = out["contact_x_mm"] * 1e-3 / 0.05
+    normal = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
+    assert out["contact_normal"] == pytest.approx(normal)
+    up = np.outer(0.3 + out["contact_y_mm"] * 1e-3, [0, 0, 1])
+    assert out["contact_position_m"] == pytest.approx(0.05 * normal + up)
+    flat = run(tmp_path, paper, arrays, "tikhonov")
+    assert np.isnan(flat["contact_position_m"]).all()
+    assert flat["contact_position_m"].shape == (len(flat["contact_frame"]), 3)
 
 
 @pytest.mark.parametrize("absent", ["missing", "all NaN"])

@@ -33,7 +33,16 @@ TABLES: Final = {
     "### `event`": ("Event",),
 }
 UNITS: Final = {
-    **{"ns": "ns", "us": "µs", "ms": "ms", "s": "s", "mm": "mm", "mm2": "mm²", "kpa": "kPa"},
+    **{
+        "ns": "ns",
+        "us": "µs",
+        "ms": "ms",
+        "s": "s",
+        "m": "m",
+        "mm": "mm",
+        "mm2": "mm²",
+        "kpa": "kPa",
+    },
     **{"n": "N", "hz": "1/s", "ppm": "ppm"},
 }
 ENVELOPE_ROWS: Final = """\
@@ -52,10 +61,12 @@ CPP: Final = {
     **{"str | None": "Text<48> {}", "frozenset[str]": "std::vector<Text<48>> {}"},
     "tuple[Contact, ...]": "std::vector<Contact> {}",
     "tuple[float, float] | Absent": "std::array<double, 2> {}{{}}",
+    "tuple[float, float, float] | None": "std::optional<std::array<double, 3>> {}",
 }
 CPP_OWN: Final = {
     "tier_reason": "Text<255> tier_reason",
     "pressure_range": "PressureRange pressure_range = PressureRange::unknown",
+    "frame": "Text<63> frame",
 }
 
 
@@ -191,6 +202,9 @@ def files_page(schema: dict[str, list[Field]], page: str) -> str:
     rows = table({**schema, "Contact": schema["Contact"][1:]}, ("Contact",), "0.1")
     rows = re.sub(r"(?m)^\| `", "| `contact_", rows)
     rows = rows.replace("contact_magnitude_sigma", "contact_sigma")
+    rows = rows.replace("`contact_frame` | str or nil", "`contact_mount_frame` | U63 (C,)")
+    rows = rows.replace("frame `frame`", "frame `contact_mount_frame`")
+    rows = rows.replace("[float, float, float]", "float64 (C, 3)").replace("are nil", "are NaN")
     rows = re.sub(r"\bnil\b", "NaN", rows.replace(" or nil |", " |").replace("Nil ", "NaN "))
     types = {"float": "float64", "str": "U7", "bool": "bool"}
     for of_stream, of_file in types.items():
@@ -282,9 +296,9 @@ def _each_field(function: str, of: str, fields: list[Field]) -> str:
 
 
 def _allowed(field: Field) -> str:
-    if field.type.startswith("tuple"):
-        return "nothing"
     if not field.type.endswith(" | None"):
+        if field.type.startswith("tuple"):
+            return "nothing"
         return "absence" if field.has_default else "nothing"
     return "both" if field.has_default else "nil"
 

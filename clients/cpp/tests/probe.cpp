@@ -122,6 +122,11 @@ void print_value(const std::array<double, 2>& value) {
     std::printf("[%.17g, %.17g]", value[0], value[1]);
 }
 
+void print_value(const std::optional<std::array<double, 3>>& value) {
+    if (!value) return print("null");
+    std::printf("[%.17g, %.17g, %.17g]", (*value)[0], (*value)[1], (*value)[2]);
+}
+
 void print_value(const tactomo::Contact& contact);
 
 /// A list, each entry by its own print_value.

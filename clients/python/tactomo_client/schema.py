@@ -105,6 +105,12 @@ class Contact:
     #: Whether presses at known places say where it is (`tactomo teach`): `x_mm`, `y_mm` and their
     #: uncertainties are then what was learnt, and `force_n` where forces were
     taught: bool = False
+    #: Where it is on the robot: its centre on the sheet's surface, in the frame `frame`. It, the
+    #: normal and the frame are nil where the sensor description has no ``[mount]``
+    position_m: tuple[float, float, float] | None = None
+    #: Unit vector out of the sheet there, in the frame `frame`: what presses pushes against it
+    normal: tuple[float, float, float] | None = None
+    frame: str | None = None  #: Name of the robot's link that carries the sheet
 
     def exceeds(self, limit_kpa: float) -> Answer:
         """Return whether it presses with `limit_kpa` or more.
@@ -119,6 +125,26 @@ class Contact:
         if self.max_kpa is not None and self.max_kpa < limit_kpa:
             return Answer.NO
         return Answer.CANNOT_TELL
+
+
+def table_row(contact: Contact) -> dict[str, Any]:
+    """Return a contact's fields as the cells of a table: each number of a vector is its own cell.
+
+    `position_m` becomes `position_x_m`, `position_y_m` and `position_z_m`, `normal` likewise;
+    `frame` becomes `mount_frame`, since a table's rows belong to a frame of another kind.
+    """
+    cells: dict[str, Any] = {}
+    for name in wire_fields(Contact):
+        value = getattr(contact, name)
+        if name in ("position_m", "normal"):
+            stem, _, unit = name.partition("_")
+            cells |= {
+                f"{stem}_{axis}{unit and '_'}{unit}": None if value is None else value[number]
+                for number, axis in enumerate("xyz")
+            }
+        else:
+            cells["mount_frame" if name == "frame" else name] = value
+    return cells
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -448,6 +474,17 @@ class Taught:
 
 
 @dataclass(frozen=True, slots=True)
+class Mount:
+    """The robot's link that carries the sheet, and where the sheet lies on the link."""
+
+    frame: str  #: The link's name
+    kind: str  #: ``plane``, ``cylinder`` or ``surface``
+    #: Points of the sheet in the link's frame, m: rows from the bottom, evenly spaced over the
+    #: bounding box
+    surface_m: tuple[tuple[tuple[float, float, float], ...], ...]
+
+
+@dataclass(frozen=True, slots=True)
 class SensorDescription:
     """The sensor: its sheet, its electrodes and what it answers to."""
 
@@ -475,6 +512,8 @@ class SensorDescription:
     #: What presses at known places have taught this skin, if that is in force; may change while the
     #: daemon runs
     taught: Taught | None = None
+    #: Where the sheet lies on the robot; nil where the description does not say
+    mount: Mount | None = None
 
 
 @dataclass(frozen=True, slots=True)

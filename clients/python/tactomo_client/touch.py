@@ -21,12 +21,11 @@ learning scales its inputs by. No value of a known number is changed.
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from tactomo_client.schema import PRESSURE_RANGES, Contact, Frame
+from tactomo_client.schema import PRESSURE_RANGES, Contact, Frame, table_row
 
 
 class Traces:
@@ -60,8 +59,10 @@ if TYPE_CHECKING:
 
 CONTACTS: Final = 16  #: rows for contacts; a hand of five fingers, thrice
 IMAGES: Final = {"pressure_kpa": "pressure_kpa", "magnitude": "map", "structure": "structure"}
-CONTACT_COLUMNS: Final = tuple(field.name for field in fields(Contact))
-"""A contact's fields; `pressure_range` is its place in `frame.PRESSURE_RANGES`."""
+CONTACT_COLUMNS: Final = tuple(
+    name for name in table_row(Contact(0, 0.0, 0.0, 0.0)) if name != "mount_frame"
+)
+"""A contact's numbers; `pressure_range` is its place in `frame.PRESSURE_RANGES`."""
 
 
 class Touch:
@@ -96,7 +97,8 @@ class Touch:
             if trace > self._rows:
                 self.crowded += 1
                 continue
-            row = [_number(getattr(contact, name)) for name in CONTACT_COLUMNS]
+            cells = table_row(contact)
+            row = [_number(cells[name]) for name in CONTACT_COLUMNS]
             table[trace - 1] = [0.0 if number is None else number for number in row]
             is_number[trace - 1] = [number is not None for number in row]
         images = {

@@ -12,6 +12,7 @@ from tactomo_models import Contact, Flag, Reconstruction, SensorDescription
 from tactomo_models.arrays import FloatArray
 from tactomo_models.calibration.calibration_file import PressureCalibration
 from tactomo_models.calibration.taught_skin import TaughtSkin
+from tactomo_models.sensor.mount import Mount
 from tactomo_protocol import Channel, Hello
 
 from tactomo.acquisition.device_clock import DeviceClock
@@ -20,6 +21,9 @@ from tactomo.scans import DualScan, Timing
 from tactomo.stream.publisher import NO_FRAME_YET
 
 MM_PER_M: Final = 1e3
+SURFACE_POINTS: Final = 25
+"""Along x and along y, by which a status tells a curved sheet: around a whole cylinder the chords
+between are 0.9 % of its radius within. Contacts have places of their own, which are exact."""
 
 
 def scan_header(dual: DualScan, timing: Timing) -> dict[str, Any]:
@@ -99,6 +103,22 @@ def description_fields(description: SensorDescription) -> dict[str, Any]:
         "electrodes_mm": (description.electrode_centres_m * MM_PER_M).tolist(),
         "modalities": list(description.channels),
         "magnitude_max": magnitude_max(description),
+        "mount": description.mount and mount_fields(description, description.mount),
+    }
+
+
+def mount_fields(description: SensorDescription, mount: Mount) -> dict[str, Any]:
+    """Return what `status` says about the link that carries the sheet, and where it lies."""
+    x_m, y_m = (
+        np.linspace(-length / 2, length / 2, SURFACE_POINTS)
+        for length in (description.width_m, description.height_m)
+    )
+    places = np.stack(np.meshgrid(x_m, y_m), axis=-1)
+    points, _ = mount.place(places.reshape(-1, 2))
+    return {
+        "frame": mount.frame,
+        "kind": mount.kind,
+        "surface_m": np.round(points, 6).reshape((*places.shape[:2], 3)).tolist(),
     }
 
 
@@ -197,8 +217,10 @@ def _clock(clock: DeviceClock, is_there: bool) -> dict[str, Any]:
 
 
 def _contact(contact: Contact) -> dict[str, Any]:
-    fields = contact.in_mm()
-    return {n: _finite(value) if isinstance(value, float) else value for n, value in fields.items()}
+    fields = {n: _finite(v) if isinstance(v, float) else v for n, v in contact.in_mm().items()}
+    if not contact.frame:
+        fields |= dict.fromkeys(("position_m", "normal", "frame"))
+    return fields
 
 
 def _finite(value: float) -> float | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from tactomo_models.arrays import FloatArray, Image
 from tactomo_models.scene.areas import Areas
 from tactomo_models.scene.pressure import FieldContacts, PressureCurve, PressureRange, pressures_of
+from tactomo_models.sensor.mount import Mount
 
 
 @dataclass(frozen=True)
@@ -52,12 +53,17 @@ class Contact:
     #: whether presses at known places say where it is, and ones of known force how hard it presses;
     #: else the physics alone does
     taught: bool = False
+    #: where it is on the link that carries the sheet, and the sheet's outward normal there, in the
+    #: link's frame; NaN without a mount
+    position_m: tuple[float, float, float] = (float("nan"),) * 3
+    normal: tuple[float, float, float] = (float("nan"),) * 3
+    frame: str = ""  #: that link's name; empty without a mount
 
     def in_mm(self) -> dict[str, Any]:
         """Return its fields by the names that files and messages have: mm and mm², not m and m²."""
         said = {}
         for name, value in vars(self).items():
-            if name.endswith("_m"):
+            if name.endswith("_m") and isinstance(value, float):
                 said[f"{name}m"] = value * 1e3
             elif name.endswith("_m2"):
                 said[f"{name.removesuffix('_m2')}_mm2"] = value * 1e6
@@ -106,6 +112,15 @@ def contacts_of(
             edge=float(edges[k]),
         )
         for k in range(len(areas))
+    )
+
+
+def mounted(contacts: Sequence[Contact], mount: Mount) -> tuple[Contact, ...]:
+    """Return contacts with their places on the link that carries the sheet."""
+    points, normals = mount.place(np.array([(c.x_m, c.y_m) for c in contacts]).reshape(-1, 2))
+    return tuple(
+        replace(contact, position_m=tuple(point), normal=tuple(normal), frame=mount.frame)
+        for contact, point, normal in zip(contacts, points.tolist(), normals.tolist(), strict=True)
     )
 
 

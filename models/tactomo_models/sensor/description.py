@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 from tactomo_protocol import Channel
 
 from tactomo_models.arrays import BoolArray, FloatArray, IntArray
+from tactomo_models.sensor.mount import Mount
 from tactomo_models.sensor.pattern import Pairs, combined, ring_pairs
 from tactomo_models.sensor.response import MagnitudeChannel, StructureChannel
 from tactomo_models.sensor.section import Section
@@ -121,6 +122,7 @@ class SensorDescription(Section):
     map: MapGrid = MapGrid()
     magnitude: MagnitudeChannel | None = None
     structure: StructureChannel | None = None
+    mount: Mount | None = None
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Self:
@@ -138,6 +140,10 @@ class SensorDescription(Section):
                 )
         self._check_listed_pairs()
         self._check_size()
+        if self.mount is not None:
+            x_m, y_m = (each.ravel() for each in np.meshgrid(self.map_x_m, self.map_y_m))
+            nodes_m = np.stack([x_m, y_m], axis=-1)[self.on_sheet(x_m, y_m)]
+            self.mount.check(self.sheet.size_m, nodes_m)
         return self
 
     def _check_listed_pairs(self) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from tactomo_models.errors import DescriptionError, explain
+from tactomo_models.foreign_file import MAX_TEXT_BYTES, read_regular
 from tactomo_models.sensor.description import SensorDescription
 from tactomo_models.toml_file import parse_toml, read_toml
 
@@ -83,13 +84,31 @@ def _read(name: str) -> dict[str, Any]:
     try:
         if name in shipped_descriptions():
             return parse_toml(shipped_text(name))
-        return read_toml(Path(name))
+        return _with_surface(read_toml(Path(name)), Path(name))
     except OSError as error:
         raise _cannot_read(name, error.strerror) from error
     except UnicodeDecodeError as error:
         raise _cannot_read(name, "not UTF-8 text") from error
     except ValueError as error:
         raise DescriptionError(f"{name} is not valid TOML: {error}") from error
+
+
+def _with_surface(described: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Add the text of the surface file that a description names, from beside the description."""
+    mount = described.get("mount")
+    surface = mount.get("surface") if isinstance(mount, dict) else None
+    file = surface.get("file") if isinstance(surface, dict) else None
+    if isinstance(surface, dict) and isinstance(file, str) and "obj" not in surface:
+        try:
+            text = read_regular(path.parent / file, MAX_TEXT_BYTES).decode("utf-8-sig")
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
+            raise DescriptionError(
+                f"{path}: mount.surface.file = {file!r}: cannot read it: {reason}; name an OBJ "
+                "file by its path from the description"
+            ) from error
+        surface["obj"] = text
+    return described
 
 
 def _cannot_read(name: str, reason: str | None) -> DescriptionError:

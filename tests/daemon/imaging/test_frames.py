@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from tactomo.scans import ChannelScan, DualScan, Timing
 from tactomo_client.messages import array_from_wire
 from tactomo_models import Contact, Flag, Reconstruction, load_description
 from tactomo_protocol import Channel, ScanFlag
+from variants import variant
 
 SENSOR = load_description("paper_square")
 CONTACT = Contact(
@@ -74,6 +76,29 @@ def test_what_is_not_known_is_nil() -> None:
     [said] = contacts_fields(0, frame(contacts=(contact,)))["contacts"]
     assert said["magnitude"] is said["magnitude_sigma"] is said["pressure_kpa"] is None
     assert said["max_kpa"] is said["peak_kpa"] is said["edge"] is None
+
+
+def test_a_contact_is_where_it_is_on_the_robot() -> None:
+    where: dict[str, Any] = {
+        "position_m": (0.1, 0.2, 0.3),
+        "normal": (0.0, 0.6, 0.8),
+        "frame": "arm",
+    }
+    mounted = replace(CONTACT, **where)
+    [known, unknown] = contacts_fields(0, frame(contacts=(mounted, CONTACT)))["contacts"]
+    assert {name: known[name] for name in where} == where
+    assert [unknown[name] for name in where] == [None] * 3
+
+
+def test_a_status_says_where_the_sheet_lies() -> None:
+    assert description_fields(SENSOR)["mount"] is None
+    cylinder = {"radius_m": 0.05, "position_m": (0.0, 0.0, 0.2)}
+    mounted = variant(SENSOR, mount={"frame": "arm", "cylinder": cylinder})
+    mount = description_fields(mounted)["mount"]
+    assert (mount["frame"], mount["kind"]) == ("arm", "cylinder")
+    x, y, z = np.array(mount["surface_m"]).T
+    assert np.hypot(x, y) == pytest.approx(0.05, abs=1e-6)
+    assert (z.min(), z.max()) == pytest.approx((0.125, 0.275))
 
 
 def test_a_map_has_its_ends_in_millimetres() -> None:

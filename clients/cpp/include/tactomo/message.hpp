@@ -253,7 +253,14 @@ public:
                    : static_cast<PressureRange>(found - pressure_ranges.begin());
     }
     void read(std::string_view name, std::array<double, 2>& into, Allow) noexcept {
-        into = extent(name);
+        const Token* const token = value(name, Allow::nothing);
+        if (token != nullptr) into = numbers<2>(name, *token);
+    }
+    void read(std::string_view name, std::optional<std::array<double, 3>>& into,
+              Allow allow) noexcept {
+        into.reset();
+        const Token* const token = value(name, allow);
+        if (token != nullptr) into = numbers<3>(name, *token);
     }
     void read(std::string_view name, Image& into, Allow) { image(name, into); }
     void read(std::string_view name, std::vector<Text<48>>& into, Allow) {
@@ -316,20 +323,21 @@ public:
         std::size_t at = index_of(token) + 1;
         for (std::uint32_t entry = 0; entry < token->size; ++entry, at = tape_[at].next) each(at);
     }
-    /// Two positions, [first, last].
-    std::array<double, 2> extent(std::string_view name) noexcept {
-        std::array<double, 2> ends{};
-        const Token* const token = value(name, Token::list);
-        if (token == nullptr || token->size != 2) {
+    /// A list of so many numbers.
+    template <std::size_t N>
+    std::array<double, N> numbers(std::string_view name, const Token& token) noexcept {
+        std::array<double, N> values{};
+        if (token.type != Token::list || token.size != N) {
             fail(name);
-            return ends;
+            return values;
         }
-        for (std::size_t end = 0; end < 2; ++end) {
-            const std::optional<double> read = as_number(token[1 + end]);
-            if (!read) fail(name);
-            ends[end] = read.value_or(0);
+        const Token* entry = &token;
+        for (double& number : values) {
+            const std::optional<double> read = as_number(*++entry);
+            if (!read) return fail(name), values;  // one that is a list has further tokens
+            number = *read;
         }
-        return ends;
+        return values;
     }
     /// A two-dimensional array of float32; cleared where there is none.
     void image(std::string_view name, Image& into) {

@@ -78,6 +78,13 @@ struct ContactFields {
     /// Whether presses at known places say where it is (`tactomo teach`): `x_mm`, `y_mm` and their
     /// uncertainties are then what was learnt, and `force_n` where forces were.
     bool taught = false;
+    /// Where it is on the robot: its centre on the sheet's surface, in the frame `frame`. It, the
+    /// normal and the frame are nil where the sensor description has no `[mount]`.
+    std::optional<std::array<double, 3>> position_m;
+    /// Unit vector out of the sheet there, in the frame `frame`: what presses pushes against it.
+    std::optional<std::array<double, 3>> normal;
+    /// Name of the robot's link that carries the sheet.
+    Text<63> frame;
 };
 
 struct FrameFields {
@@ -182,6 +189,9 @@ void each_field_of_contact(Fields& fields, const Each& each) {
     each("max_kpa", fields.max_kpa, Allow::both);
     each("edge", fields.edge, Allow::both);
     each("taught", fields.taught, Allow::absence);
+    each("position_m", fields.position_m, Allow::both);
+    each("normal", fields.normal, Allow::both);
+    each("frame", fields.frame, Allow::both);
 }
 
 /// Calls `each` with every field's name and value, and what may stand in its place.

@@ -5,10 +5,10 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterable
-from dataclasses import fields
-from typing import IO, Any, Final
+from typing import IO, Final
 
 from tactomo_client import Contact
+from tactomo_client.schema import table_row
 
 from tactomo.cli.files.recorded_frames import Moment
 
@@ -26,8 +26,8 @@ FRAME_COLUMNS: Final = (
     "flags",
     "age_s",
 )
-CONTACT_COLUMNS: Final = tuple(field.name for field in fields(Contact))
-ARRAY_COLUMNS: Final = {"magnitude_sigma": "contact_sigma"}
+CONTACT_COLUMNS: Final = tuple(table_row(Contact(0, 0.0, 0.0, 0.0)))
+ARRAY_COLUMNS: Final = {"magnitude_sigma": "contact_sigma", "frame": "contact_mount_frame"}
 """Columns whose array in the .npz of `tactomo reconstruct` is not named `contact_` and theirs."""
 
 
@@ -46,10 +46,7 @@ def write_contacts(moments: Iterable[Moment], output: IO[bytes]) -> int:
             age_s,
         ]
         for contact in frame.contacts or (None,):
-            writer.writerow([*start, *_cells(contact)])
+            cells = dict.fromkeys(CONTACT_COLUMNS, "") if contact is None else table_row(contact)
+            writer.writerow([*start, *cells.values()])
     text.detach()  # flushes it; the file stays open
     return count
-
-
-def _cells(contact: Contact | None) -> list[Any]:
-    return ["" if contact is None else getattr(contact, name) for name in CONTACT_COLUMNS]

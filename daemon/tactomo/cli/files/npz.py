@@ -36,9 +36,15 @@ CONTACT_TYPES: Final[Mapping[str, str]] = {
             "int": "<i8",
             "str": "<U8",
             "bool": "?",
+            "str | None": "<U63",
         }.get(str(field.type), "<f8")
         for field in fields(Contact)
     },
+}
+
+ROWS: Final[Mapping[str, tuple[int, ...]]] = {
+    **dict.fromkeys(CONTACT_TYPES, ()),
+    **dict.fromkeys(("contact_position_m", "contact_normal"), (3,)),
 }
 
 
@@ -62,7 +68,8 @@ def write_maps(
             axes = axes or _axes(moment.frame)
             count += 1
         shape = (len(axes["y_mm"]), len(axes["x_mm"])) if axes else None
-        arrays.write(output, dict.fromkeys(IMAGES, shape) if shape else {}, **axes)
+        shapes = {**ROWS, **(dict.fromkeys(IMAGES, shape) if shape else {})}
+        arrays.write(output, shapes, **axes)
     return count
 
 
@@ -82,10 +89,10 @@ def _frame_values(moment: Moment) -> dict[str, Any]:
 
 def _contact_values(row: int, contact: Contact) -> dict[str, Any]:
     values = {
-        ARRAY_COLUMNS.get(field.name, f"contact_{field.name}"): _known(getattr(contact, field.name))
+        ARRAY_COLUMNS.get(field.name, f"contact_{field.name}"): getattr(contact, field.name)
         for field in fields(Contact)
     }
-    return {"contact_frame": row, **values}
+    return {"contact_frame": row, **values, "contact_mount_frame": contact.frame or ""}
 
 
 def _known(value: Any) -> Any:

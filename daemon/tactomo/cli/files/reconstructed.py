@@ -107,12 +107,14 @@ def _contacts(arrays: Any, rows: Sequence[int]) -> list[tuple[int, Contact]]:
     frames = arrays["contact_frame"]
     found: list[tuple[int, Contact]] = []
     for row in rows:
-        values = {name: _known(column[row].item()) for name, column in columns.items()}
+        values = {name: _known(column[row].tolist()) for name, column in columns.items()}
         first = int(np.searchsorted(frames, frames[row]))  # frames come in their order
         found.append((int(frames[row]), Contact(row - first + 1, **values)))
     return found
 
 
 def _known(value: Any) -> Any:
-    """Return None for NaN and for a bound that bounds nothing."""
+    """Return None for NaN, a bound that bounds nothing, and what only a mount has."""
+    if isinstance(value, list):
+        return tuple(value) if np.isfinite(value).all() else None
     return None if isinstance(value, float) and not math.isfinite(value) else value
